@@ -134,6 +134,7 @@ def _parser() -> Parser:
     history.add_argument(
         "-n", "--limit", type=within(1, 1e6, int), default=20, metavar="N", help="the latest N (default 20)"
     )
+    add("temperature", client.temperature, "how the gyros' biases follow the temperature, as far as seen")
     add("monitor", monitor.monitor, "watch the daemon until Ctrl-C")
     add("web-token", local.web_token, "where the page is, and the token that its buttons need")
     recordings.add_commands(add)

@@ -99,6 +99,13 @@ async def history(options: argparse.Namespace) -> int:
     return finish(options, reply, answer, show.history_lines(**answer), good=True)
 
 
+async def temperature(options: argparse.Namespace) -> int:
+    """`companion temperature`."""
+    reply = await request(options, {"command": "temperature"})
+    answer = {"imus": reply.get("imus", [])}
+    return finish(options, reply, answer, show.temperature_lines(answer["imus"]), good=True)
+
+
 async def setup(options: argparse.Namespace) -> int:
     """`companion autopilot-setup`."""
     reply = await request(options, {"command": "autopilot-setup"})

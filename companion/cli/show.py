@@ -274,6 +274,27 @@ def _what_became(record: Object) -> str:
     return f"; {written} parameters written" + (f", undone {undone[:19]}" if undone else "")
 
 
+def temperature_lines(imus: Sequence[Object]) -> list[str]:
+    """By IMU, the gyros' bias over temperature."""
+    lines = []
+    for imu in imus:
+        points, power_ups = imu["points"], imu["power_ups"]
+        degc = [point["degc"] for point in points]
+        span = f", {min(degc):.0f} to {max(degc):.0f} degC" if degc else ""
+        lines.append(f"{imu['imu']}: {len(points)} still windows of {power_ups} power-ups{span}")
+        if not imu["curve"]:
+            lines.append("    no curve yet: it takes five power-ups at different temperatures")
+            continue
+        lines.append(f"    {'degC':>6} {'x':>8} {'y':>8} {'z':>8}   sigma, deg/h")
+        lines += [
+            f"    {row['degc']:6.1f} "
+            + " ".join(f"{axis:8.0f}" for axis in row["gyro_deg_h"])
+            + f"   {max(row['sigma_deg_h']):.0f}"
+            for row in imu["curve"]
+        ]
+    return lines or ["nothing seen yet: still windows are remembered as soon as a thermometer is read"]
+
+
 def port_lines(ports: Sequence[SerialPort]) -> list[str]:
     """Serial ports: the name to put into the configuration first, then what it is and who holds it."""
     if not ports:

@@ -13,6 +13,7 @@ import pytest
 
 from companion.calibration.records.history import KEEP_POINTS, PowerUp
 from companion.calibration.records.record import Record, Standing
+from companion.cli.show import temperature_lines
 from companion.daemon.job import Job
 from companion.daemon.offsets import firmware_calibration
 from companion.recording.walk import Recording
@@ -353,6 +354,16 @@ def test_the_gate_closes_by_what_the_temperature_does_to_this_imu(
                 await memory.keep({"fc": day})
             await asyncio.sleep(10.0)
             assert [finding.words for finding in in_force.findings(rig.now_s)] == []
+            async for reply in rig.service.faces.answer({"command": "temperature"}):
+                (seen,) = reply["imus"]
+            assert (seen["imu"], seen["power_ups"]) == ("fc", 9)
+            low, *_, high = seen["curve"]
+            assert (low["degc"], high["degc"]) == (13.0, 34.0)
+            rise = np.subtract(high["gyro_deg_h"], low["gyro_deg_h"]) / 21.0
+            np.testing.assert_allclose(rise, slope_deg_h_k, atol=2.0)
+            lines = temperature_lines(reply["imus"])
+            assert lines[0] == f"fc: {len(seen['points'])} still windows of 9 power-ups, 13 to 34 degC"
+            assert len(lines) == 2 + len(seen["curve"])
             # Nobody sees the output while somebody carries it about.
             in_force._temperatures["fc"], in_force._present = 25.0, {}
             words = [finding.words for finding in in_force.findings(rig.now_s)]

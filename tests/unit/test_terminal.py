@@ -74,6 +74,7 @@ def replies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Object]:
             for request in (
                 {"command": "calibrate", "what": "both", "wait": True},
                 {"command": "history"},
+                {"command": "temperature"},
                 {"command": "undo"},
                 {"command": "cancel"},
                 {"command": "status"},
@@ -123,6 +124,7 @@ COMMANDS = [
     ["cancel"],
     ["undo"],
     ["history"],
+    ["temperature"],
     ["align", "--show"],
     ["autopilot-setup"],
 ]

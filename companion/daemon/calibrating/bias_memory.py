@@ -11,7 +11,7 @@ import datetime
 import logging
 import math
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -20,7 +20,7 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.align_record import ImuAlignmentRecord
-from companion.calibration.records.history import Point, PowerUp, kept
+from companion.calibration.records.history import Point, PowerUp, by_power_up, kept
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import (
@@ -40,13 +40,17 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensors import SerialSensor
 from companion.daemon.stands.alignment import AlignmentInForce
 from companion.errors import AutopilotError, StorageError
+from companion.formats import Object
 from companion.physics.frames import vector
+from companion.physics.units import DEG_H
 from companion.samples import Triad, Vector
 from companion.storage.learned import BiasStore, KnownImu, this_boot
 
 logger = logging.getLogger(__name__)
 
 LOOK_K: Final = 1.0
+STEP_K: Final = 5.0
+"""Between the rows of a curve that is shown."""
 WRITE_EVERY_S: Final = 300.0
 """What still windows tell is written so often at most: a power cut costs no more of it."""
 _MUCH_BETTER: Final = 0.7
@@ -122,6 +126,7 @@ class BiasMemory:
             changed = sorted(key for key in {*known.identity, *now} if known.identity.get(key) != now.get(key))
             what = ", ".join(_IN_WORDS.get(key, key) for key in changed)
             del self._known[name]
+            self._curves.pop(name, None)
             for triad in _TRIADS:
                 self._today.pop((name, triad), None)
             if known.points:
@@ -238,9 +243,19 @@ class BiasMemory:
 
     def _follow(self) -> None:
         """Work out the curves of what is known; blocking."""
-        for name, known in self._known.items():
-            if name in self._sources:
-                self._curves[name] = gyro_curve(known.points, noise_profile(self._profiles.of(name)).gyro)
+        self._curves = {
+            name: gyro_curve(known.points, noise_profile(self._profiles.of(name)).gyro)
+            for name, known in self._known.items()
+            if name in self._sources
+        }
+
+    def temperature(self) -> list[Object]:
+        """By IMU, for `companion temperature`: what still windows have shown, and the curve through them."""
+        return [
+            _by_temperature(name, known.points, self._curves.get(name))
+            for name, known in self._known.items()
+            if name in self._sources
+        ]
 
     async def forget(self, started: Collection[str]) -> None:
         """Forget calibrations that were undone, by when they had begun."""
@@ -328,6 +343,36 @@ class BiasMemory:
         if record is None or self._alignment.unused is not None:
             return None
         return next((imu for imu in record.imus if imu.name == name), None)
+
+
+def _by_temperature(name: str, points: Sequence[Point], curve: Curve | None) -> Object:
+    told = [point for point in points if point.temperature_degc is not None and point.gyro is not None]
+    rows = []
+    if curve is not None:
+        low, high = curve.span_degc
+        steps = [low, *(STEP_K * k for k in range(math.ceil(low / STEP_K), math.ceil(high / STEP_K))), high]
+        for degc in dict.fromkeys(steps):
+            bias, variance = curve.at(degc)
+            rows.append({"degc": round(degc, 2), "gyro_deg_h": _deg_h(bias), "sigma_deg_h": _deg_h(np.sqrt(variance))})
+    return {
+        "imu": name,
+        "power_ups": len(by_power_up(told)),
+        "points": [
+            {
+                "at_unix_s": round(point.unix_s),
+                "degc": point.temperature_degc,
+                "gyro_deg_h": _deg_h(point.gyro.bias),
+                "sigma_deg_h": _deg_h(point.gyro.sigma_use),
+            }
+            for point in told
+            if point.gyro is not None
+        ],
+        "curve": rows,
+    }
+
+
+def _deg_h(axes: Iterable[float]) -> list[float]:
+    return [round(value / DEG_H, 1) for value in axes]
 
 
 def _is_near(point: Point, degc: float) -> bool:

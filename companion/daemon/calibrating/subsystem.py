@@ -88,7 +88,13 @@ class Calibrating(Subsystem):
 
     def commands(self) -> Mapping[str, Handler]:
         """As in the base class; each raises `RequestRefusedError`, or another `CompanionError` once it was taken."""
-        return {"calibrate": self._calibrate, "align": self._align, "cancel": self._cancel, "undo": self._undo}
+        return {
+            "calibrate": self._calibrate,
+            "align": self._align,
+            "cancel": self._cancel,
+            "undo": self._undo,
+            "temperature": self._temperature,
+        }
 
     def status(self) -> Object:  # noqa: D102
         conductor, job = self.conductor, self.conductor.running
@@ -122,6 +128,9 @@ class Calibrating(Subsystem):
         async for reply in self._progress(job):
             yield reply
         yield {"kind": "result", "record": msgspec.to_builtins(job.record)}
+
+    async def _temperature(self, _request: Object, _face: str) -> AsyncIterator[Object]:
+        yield {"kind": "result", "imus": await self._core.offload(self.memory.temperature)}
 
     async def _cancel(self, _request: Object, face: str) -> AsyncIterator[Object]:
         running = self.conductor.cancel(f"{face} cancel")
