@@ -44,7 +44,7 @@ SIDES: Final = {
 }
 """Pitch and roll of each side, by the companion's words."""
 _SIDE = "|".join(SIDES)
-_MISSING = re.compile(rf"(?:half way between ({_SIDE}) and ({_SIDE})|({_SIDE})) is missing")
+_MISSING = re.compile(rf"(?:between ({_SIDE}) and ({_SIDE})|({_SIDE})): ")
 _TURN = re.compile(r"turn it (?:by|on by) (\d+) deg")
 _PLACE = {"level": "level", "on its LEFT side": "left side down", "on its RIGHT side": "right side down",
           "nose DOWN": "nose down", "nose UP": "nose up", "on its BACK": "on its back"}  # fmt: skip

@@ -26,7 +26,7 @@ class Asking:
     def __init__(self, *, yes: bool, error: bool) -> None:
         self.yes, self._error = yes, error
         self._rest = b""
-        self._echoes = yes or not sys.stdin.isatty()
+        self._echoes = not sys.stdin.isatty()
 
     def say(self, *lines: str) -> None:
         """Tell something."""
@@ -35,7 +35,7 @@ class Asking:
     async def ask(
         self, question: str, now: str, put: Callable[[str], None], hint: str = "", choices: Sequence[str] = ()
     ) -> None:
-        """Ask until `put` takes the answer; an empty one is what holds now.
+        """Ask until `put` takes the answer; an empty one is what holds now. With `yes` that is taken, and said.
 
         Args:
             question: in words.
@@ -45,20 +45,22 @@ class Asking:
             choices: usual answers, for a page that makes buttons of them.
 
         Raises:
-            CompanionError: there is nobody to answer any more.
+            CompanionError: there is nobody to answer any more, or, with `yes`, what holds now is no answer.
         """
+        if self.yes:
+            put(now)
+            self.say(f"{question.rstrip('?')}: {now}")
+            return
         self.say("", question, *([f"  {hint}"] if hint else []))
         while True:
             print_lines(f"  [{now}] >" if now else "  >", error=self._error, end=" ")
-            answer = now if self.yes else (await self._line()).strip() or now
+            answer = (await self._line()).strip() or now
             if self._echoes:
                 self.say(answer)
             try:
                 put(answer)
             except ConfigError as error:
                 self.say(f"  {error}")
-                if self.yes:
-                    raise
             else:
                 return
 

@@ -264,12 +264,12 @@ class _Session:
                     question.put(given[question.key])
                 except ConfigError as error:
                     raise ConfigError(f"{question.key}: {error}") from None
-                self.asking.say(f"{question.words} {given[question.key]}")
+                self.asking.say(f"{question.key}: {given[question.key]}")
             elif not self.asking.yes:
                 await self.asking.ask(question.words, question.now, question.put, question.hint, question.choices)
             else:
                 guess = " (a guess)" if question.key in draft.guessed else ""
-                self.asking.say(f"{question.words} {question.now}{guess}")
+                self.asking.say(f"{question.key}: {question.now}{guess}")
 
     def _write(self, text: str, *, keep: bool = True) -> None:
         kept = keeping.put(self._path, text, keep=keep)
@@ -323,7 +323,7 @@ class _Session:
         numbers = " and ".join(str(one["instance"]) for one in found)
         if not found:
             self.asking.say("no others")
-        elif await self.asking.agrees(f"It has IMU {numbers} too: calibrate that as well?", by_default=by_default):
+        elif await self.asking.agrees(f"It has IMU {numbers} too; calibrate that as well?", by_default=by_default):
             draft.wanted["imu"] += found
             self._write(draft.result(), keep=self.answer["state"] == "unchanged")
             self.answer |= {"state": "done", "configuration": draft.wanted}
@@ -379,7 +379,7 @@ def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good:
     """
     is_service = command == "companion"
     if not good:
-        yield f"mend what is BAD above, then: {command} check"
+        yield f"mend what is wrong above, then: {command} check"
     if is_old:
         how = "sudo systemctl restart companion" if is_service else "end it, and start it again"
         yield f"{how}   (it still runs with the old configuration)"

@@ -197,9 +197,8 @@ def monitor_lines(status: Object) -> list[str]:
     if pose is not None:
         heading = f"{_number(pose['heading_deg'], '.1f')} {pose['north'] or ''}"
         lines.append(f"pitch {pose['pitch_deg']:+.2f}  roll {pose['roll_deg']:+.2f}  heading {heading}")
-    links = [*link_rows(status), *((False, "warning", words) for words in status["warnings"])]
-    width = max(len(name) for _, name, _ in links)
-    lines += ["", *(f"{'ok ' if good else 'BAD'}  {name:{width}}  {words}" for good, name, words in links), ""]
+    links = [("ok" if good else "wrong", name, words) for good, name, words in link_rows(status)]
+    lines += ["", *_judged([*links, *(("warning", "", words) for words in status["warnings"])]), ""]
     lines += _bias_lines(status["calibration"])
     lines.append(f"in force: {status['arming']['in_force']}")
     lines += end_lines(status)
@@ -241,8 +240,13 @@ def _held_back(imu: Object, triad: str) -> str:
 
 def finding_lines(findings: Sequence[Finding]) -> list[str]:
     """What a check has found, one line each."""
-    width = max(len(finding.name) for finding in findings)
-    return [f"{'ok ' if finding.good else 'BAD'}  {finding.name:{width}}  {finding.words}" for finding in findings]
+    return _judged([(finding.verdict, finding.name, finding.words) for finding in findings])
+
+
+def _judged(rows: Sequence[tuple[str, str, str]]) -> list[str]:
+    """In columns: ok, warning or wrong; whose; how it stands."""
+    width = max(len(name) for _, name, _ in rows)
+    return [f"{verdict:7}  {name if name != verdict else '':{width}}  {words}" for verdict, name, words in rows]
 
 
 def history_lines(numbers: Sequence[int], records: Sequence[Object], armings: Sequence[Object]) -> list[str]:

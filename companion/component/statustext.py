@@ -14,6 +14,7 @@ from __future__ import annotations
 import asyncio
 import enum
 import math
+import re
 import unicodedata
 from collections import OrderedDict, deque
 from collections.abc import Callable
@@ -24,19 +25,23 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.connection import Budget
 
-CHUNK_BYTES = 50
-MAX_TEXT_BYTES = 4 * CHUNK_BYTES - 1
-"""Longer texts lose their tail; one byte is left for the NUL that marks the last chunk."""
+LINE_BYTES = 50
+"""What one STATUSTEXT holds."""
+MOST_LINES = 5
+"""Longer texts lose their tail."""
 QUEUE_TEXTS = 16
 LINES_PER_S = 2.0
 BURST_LINES = 8.0
 REPEAT_S = 3.0
+GOES_ON = "... "
+"""How a line begins that goes on with the one before it."""
 SPOKEN = 4
 """How many of what was to be heard are kept for those who look on."""
 STALE_S = 20.0
 """What could not be said for so long (no link) is no news any more; results are kept."""
 _REMEMBERED_TEXTS = 32
 _FULL_RETRY_S = 0.1
+_FIGURE = re.compile(r"[-+]?\d+(\.\d| ?(%|mg\b|deg\b|K\b))")
 
 _ASCII = str.maketrans(
     {"°": " deg", "σ": "sigma", "µ": "u", "μ": "u", "²": "^2", "±": "+-", "×": "x", "≤": "<=", "≥": ">=", "≠": "!=",
@@ -83,18 +88,40 @@ def to_ascii(text: str) -> str:
     return "".join(character if " " <= character <= "~" else "?" for character in text)
 
 
-def split_chunks(text: str) -> list[bytes]:
-    """Cut a text into the chunks of STATUSTEXT; all but the last are full, and the last holds a NUL.
+def as_lines(severity: Severity, text: str) -> list[tuple[Severity, str]]:
+    """A plain text as lines of one message each: what is heard of it, if anything is, is the first.
 
-    A text that fits one line is one chunk, full or not. Only a NUL tells the receiver that a chunk is the last, so
-    that a longer text of exactly n full chunks ends with an empty one (MAVLink STATUSTEXT, field `chunk_seq`).
+    Cut is at the last pause that leaves one line, else between any two words, and in good news before the first
+    figure: that is for who reads. MAVLink's own way of longer texts (`chunk_seq`) is not taken: it cuts in the middle
+    of words, many receivers show each part by itself, and what puts them together speaks all of it.
     """
-    data = to_ascii(text).encode("ascii")
-    if len(data) > MAX_TEXT_BYTES:
-        data = data[: MAX_TEXT_BYTES - 3] + b"..."
-    if len(data) <= CHUNK_BYTES:
-        return [data]
-    return [data[start : start + CHUNK_BYTES] for start in range(0, len(data) + 1, CHUNK_BYTES)]
+    found: list[tuple[Severity, str]] = []
+    rest = text
+    while rest:
+        end = _end_of_line(rest, figures=severity is not Severity.NOTICE)
+        found.append((severity, rest[:end]))
+        rest = f"{GOES_ON}{rest[end:].lstrip()}" if end < len(rest) else ""
+        severity = max(severity, Severity.INFO)
+        if rest and len(found) == MOST_LINES:
+            found[-1] = (severity, f"{found[-1][1][: LINE_BYTES - 4]} ...")
+            break
+    return found
+
+
+def _end_of_line(text: str, *, figures: bool) -> int:
+    blanks = [at for at, letter in enumerate(text[: LINE_BYTES + 1]) if letter == " " and at >= len(GOES_ON)]
+    pauses = [
+        at
+        for at in blanks
+        if (text[at - 1] in ":;," or text[at + 1] == "(") and text.count("(", 0, at) == text.count(")", 0, at)
+    ]
+    if not figures and (figure := _FIGURE.search(text)) is not None:
+        pauses = [at for at in pauses if at < figure.start()]
+        if pauses:
+            return pauses[-1]
+    if len(text) <= LINE_BYTES:
+        return len(text)
+    return (pauses or blanks or [LINE_BYTES])[-1]
 
 
 class _Text(NamedTuple):
@@ -127,12 +154,12 @@ class StatusText:
         self._said_s: OrderedDict[tuple[Severity, str], float] = OrderedDict()
         self._sending: deque[mavlink.MAVLink_statustext_message] = deque()
         self._lines = Budget(LINES_PER_S, BURST_LINES)
-        self._next_id = 1
         self._spoken: deque[Spoken] = deque(maxlen=SPOKEN)
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
         """Queue a text; False when it repeats one said within the last seconds, or when the queue is full.
 
+        Of what is to be heard only the first of its lines goes out as such, the rest to be read.
         A result is no repeat, whatever it says: each ends a request of its own. What was said before it belongs to that
         request, and may be said of the next at once.
         """
@@ -147,7 +174,9 @@ class StatusText:
         self._remember(severity, text, now_s)
         self._waiting[weight].append(_Text(severity, text, now_s))
         if severity <= Severity.NOTICE:
-            self._spoken.append(Spoken(self._spoken[-1].number + 1 if self._spoken else 1, text))
+            self._spoken.append(
+                Spoken(self._spoken[-1].number + 1 if self._spoken else 1, as_lines(severity, text)[0][1])
+            )
         self.woken.set()
         return True
 
@@ -180,16 +209,10 @@ class StatusText:
                 waiting.popleft()
                 self.dropped += 1
             if waiting:
-                self._cut(waiting.popleft())
+                text = waiting.popleft()
+                for severity, line in as_lines(text.severity, text.text):
+                    self._sending.append(mavlink.MAVLink_statustext_message(severity, line.encode("ascii")))
                 return
-
-    def _cut(self, text: _Text) -> None:
-        chunks = split_chunks(text.text)
-        text_id = 0
-        if len(chunks) > 1:
-            text_id, self._next_id = self._next_id, self._next_id % 0xFFFF + 1
-        for sequence, chunk in enumerate(chunks):
-            self._sending.append(mavlink.MAVLink_statustext_message(text.severity, chunk, text_id, sequence))
 
     def _make_room(self, weight: Weight) -> bool:
         """Drop the oldest of the lightest texts, unless all that waits is heavier than the new one."""

@@ -141,12 +141,12 @@ class Core:
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
         """As `StatusText.say`: to the people at the ground stations."""
-        return self.texts.say(severity, text, weight)
+        return self.texts.say(severity, text[:1].upper() + text[1:], weight)
 
     def prompt(self, tune: Tune, text: str) -> None:
         """Tell whoever is at the aircraft what to do now: by the buzzer, and in words that are spoken."""
         self.tunes.play(tune)
-        self.texts.say(Severity.NOTICE, text)
+        self.say(Severity.NOTICE, text)
 
 
 class Subsystem:

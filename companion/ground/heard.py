@@ -7,7 +7,7 @@ from typing import Final, Literal, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.statustext import CHUNK_BYTES, to_ascii
+from companion.component.statustext import GOES_ON, to_ascii
 from companion.links.system.listeners import Listeners
 
 FIRMWARES: Final = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", mavlink.MAV_AUTOPILOT_PX4: "PX4"}
@@ -17,7 +17,6 @@ FRESH_S: Final = 3.0
 MAX_PEERS: Final = 64
 """The most senders that are remembered; newcomers beyond are not."""
 MAX_TEXTS: Final = 200
-_MAX_UNFINISHED: Final = 8
 
 Fields = Mapping[str, object]
 
@@ -40,7 +39,7 @@ class Heartbeat(NamedTuple):
 
 
 class Text(NamedTuple):
-    """A whole STATUSTEXT."""
+    """A STATUSTEXT."""
 
     severity: int
     words: str
@@ -78,14 +77,13 @@ class Heard:
         """By the companions of all vehicles, with their system ids, oldest first; the oldest beyond 200 are gone."""
         self.on_text: Listeners[[int, Text]] = Listeners()
         """Told of every text, with its system id."""
-        self._unfinished: dict[tuple[int, int], dict[int, str]] = {}
 
     def update(self, name: str, source: Target, fields: Fields, now_s: float) -> None:
         """Take a HEARTBEAT or STATUSTEXT; others are not looked at."""
         if name == "HEARTBEAT":
             self._heartbeat(source, fields, now_s)
         elif name == "STATUSTEXT" and source.component_id == self.component_id:
-            self._chunk(source.system_id, fields, now_s)
+            self._text(source.system_id, fields, now_s)
 
     def companions(self) -> list[int]:
         """The system ids of the vehicles whose companion was heard."""
@@ -109,8 +107,17 @@ class Heard:
         return beat.system_status == mavlink.MAV_STATE_CALIBRATING
 
     def texts_of(self, system_id: int, since_s: float) -> list[Text]:
-        """What the vehicle's companion has said since then."""
-        return [text for source, text in self.texts if source == system_id and text.at_s >= since_s]
+        """What the vehicle's companion has said since then; a line that goes on is part of the one before it."""
+        found: list[Text] = []
+        for source, text in self.texts:
+            if source != system_id or text.at_s < since_s:
+                continue
+            if found and text.words.startswith(GOES_ON):
+                words = f"{found[-1].words} {text.words.removeprefix(GOES_ON)}"
+                found[-1] = found[-1]._replace(words=words, at_s=text.at_s)
+            else:
+                found.append(text)
+        return found
 
     def summary(self) -> str:
         """Who was heard, in a few words; empty when nobody was."""
@@ -135,21 +142,9 @@ class Heard:
                 _whole(fields, "system_status"), now_s,
             )  # fmt: skip
 
-    def _chunk(self, system_id: int, fields: Fields, now_s: float) -> None:
-        """Join the chunks of long texts; what stays incomplete is forgotten."""
-        words, text_id = str(fields.get("text", "")).rstrip("\0"), _whole(fields, "id")
-        if text_id != 0:
-            key = (system_id, text_id)
-            chunks = self._unfinished.setdefault(key, {})
-            chunks[_whole(fields, "chunk_seq") & 0xFF] = words
-            if len(words) == CHUNK_BYTES:
-                if len(self._unfinished) > _MAX_UNFINISHED:
-                    del self._unfinished[next(iter(self._unfinished))]
-                return
-            del self._unfinished[key]
-            words = "".join(chunks.get(number, "...") for number in range(max(chunks) + 1))
+    def _text(self, system_id: int, fields: Fields, now_s: float) -> None:
         # Whatever it was: on a terminal it can do nothing but be read.
-        text = Text(_whole(fields, "severity"), to_ascii(words), now_s)
+        text = Text(_whole(fields, "severity"), to_ascii(str(fields.get("text", "")).rstrip("\0")), now_s)
         self.texts.append((system_id, text))
         del self.texts[:-MAX_TEXTS]
         self.on_text.tell(system_id, text)

@@ -352,7 +352,7 @@ class Station:
         self, state: State, reason: str, begun_s: float, said: Text | None = None, *, good: bool = False
     ) -> Outcome:
         """How it ended, and what else the companion has warned of meanwhile."""
-        warned = [text for text in self._texts(begun_s) if text.severity <= Severity.WARNING and text is not said]
+        warned = [text for text in self._texts(begun_s) if text.severity <= Severity.WARNING and text != said]
         lines = [f"{state.upper()}: {reason}", *(f"warning: {text.words}" for text in warned)]
         return Outcome(state, reason, good=good, lines=lines, more=self._more(begun_s))
 

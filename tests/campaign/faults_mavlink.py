@@ -509,7 +509,7 @@ async def no_longer_demanded(scene: Scene) -> None:
     assert status, "the status does not say that it wants signatures"
 
 
-_WANTS = "the autopilot signs, and answers nothing that is not signed"
+_WANTS = "the autopilot wants signatures"
 
 
 def _told_of_signatures(scene: Scene) -> int:
@@ -595,7 +595,7 @@ def intruder_faults() -> list[Fault]:
             demands_signatures,
             no_longer_demanded,
             lasts_s=(14.0, 20.0),
-            names=r"it signs what it sends|the autopilot signs, and answers nothing that is not signed",
+            names=r"it signs what it sends|the autopilot wants signatures",
             excused=LOST,
         ),
     ]

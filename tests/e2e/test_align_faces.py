@@ -112,8 +112,8 @@ def test_without_write_nothing_is_written_and_what_is_missing_is_said(tmp_path: 
             assert result.reason.endswith("not written (--write does)")
             np.testing.assert_allclose(read(made, "scale"), list(SCALES.values()), rtol=1e-6)
             said = " ".join(made.ground.texts())
-            assert "on its back is missing: z bias" in said
-            assert re.search(r"nose (up|down) is missing: x (bias|scale)", said)
+            assert "on its back: z bias" in said
+            assert re.search(r"nose (up|down): x (bias|scale)", said)
 
     run_virtual(main())
 

@@ -242,7 +242,7 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
             result = await follow(made, hands, job)
             if not follows:
                 assert result.outcome == "failed"
-                assert result.reason == "the attitude did not follow the new level, or it moved; old values put back"
+                assert result.reason == "the attitude did not follow the new level, or it moved; old values back"
                 assert made.autopilot.parameter(names[0]) == pytest.approx(0.3)
                 return
             assert result.outcome == "done", result

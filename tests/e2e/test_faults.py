@@ -185,7 +185,7 @@ def test_arming_in_the_middle_of_the_write_is_reported_and_mended_once_disarmed(
             rig.double.disarm()
             await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
             assert values(rig.double) == before
-            await rig.until(lambda: any("put back" in text for text in rig.ground.texts()), 5.0)
+            await rig.until(lambda: any("old values back" in text for text in rig.ground.texts()), 5.0)
 
     run_virtual(main())
 

@@ -64,7 +64,7 @@ def test_what_ten_seconds_show_is_final(tmp_path: Path, monkeypatch: pytest.Monk
             before = dict(rig.double.parameters.values)
             result, _ = await calibrated(await rig.ready())
             assert result.outcome == "failed", result
-            assert "old values put back" in result.reason
+            assert "old values back" in result.reason
             assert effect.LOOK_S - 3.0 < looks[-1] - looks[0] < effect.LOOK_S + 1.0
             assert any("does not show: looking longer" in each for each in words)
             assert rig.double.parameters.values == before

@@ -74,7 +74,7 @@ def test_accelerometers_are_held_back_when_the_gradienter_has_moved_until_somebo
             assert [line[:14] for line in drawn if "held back: not written" in line] == ["fc       accel"]
             assert [imu["held_back"] for imu in rig.service.status()["calibration"]["imus"]] == [["accel"], []]
             assert accelerometers(rig) == before
-            assert "the gradienter has moved by 0.3" in said
+            assert "The gradienter has moved by 0.3" in said
             assert "Held back: accelerometers of fc; calibrate on request to write it all the same" in said
             # With what is in force it may arm as ever, and everybody is told.
             answer = rig.service.arming.readiness.answer()
@@ -213,6 +213,6 @@ def test_a_request_that_comes_first_is_written_with_the_warning(tmp_path: Path) 
             assert (await job.finished).outcome == "done"
             assert all(accelerometers(rig)[name] != value for name, value in before.items())
             assert "Held back" not in "".join(rig.ground.texts())
-            assert "the gradienter has moved" in "".join(rig.ground.texts())
+            assert "The gradienter has moved" in "".join(rig.ground.texts())
 
     run_virtual(main())

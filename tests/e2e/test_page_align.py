@@ -82,7 +82,7 @@ def status(stands: Object | None, **more: Any) -> Object:
 
 def stand(up: tuple[float, float, float], **more: Any) -> Object:
     return {
-        "kind": "measurement on all sides", "number": 3, "total": 12, "wish": "nose down is missing: z scale 0.4 %",
+        "kind": "measurement on all sides", "number": 3, "total": 12, "wish": "nose down: z scale uncertain by 0.4 %",
         "hold": {"up": up, "turn_deg": 0.0}, "words": "", "unknown": ["z scale 0.4 %", "x bias 1 mg"],
         "objection": None, "share": 0.25,
         "done": [(0.0, 0.0, -1.0), (1.0, 0.0, 0.0)], "outcome": None, **more,
@@ -135,13 +135,13 @@ def test_the_page_shows_how_to_hold_it_and_asks_for_what_is_pressed(tmp_path: Pa
             await show(tab, status(down, progress=20), "!$('stands').hidden")
             nose_y, fin_y, root_y = await tab.value(TIPS)
             assert nose_y > fin_y + 50.0
-            assert await tab.value("$('wish').textContent") == "nose down is missing"
+            assert await tab.value("$('wish').textContent") == "nose down"
             assert await tab.value("$('still').textContent") == "still unknown: z scale 0.4 %, x bias 1 mg"
             assert await tab.value("document.querySelectorAll('#done li').length") == 12
             assert await tab.value("document.querySelectorAll('#done svg.hold').length") == 2
             assert await tab.value("document.querySelector('#align button').disabled && !$('cancel').disabled")
-            up = stand((1.0, 0.0, 0.0), wish="nose up is missing: x bias 1 mg", share=0.5)
-            await show(tab, status(up, progress=20), "$('wish').textContent === 'nose up is missing'")
+            up = stand((1.0, 0.0, 0.0), wish="nose up: x bias uncertain by 1 mg", share=0.5)
+            await show(tab, status(up, progress=20), "$('wish').textContent === 'nose up'")
             nose_y, fin_y, root_y = await tab.value(TIPS)
             assert nose_y < fin_y - 50.0
             # On its back the fin is below the fuselage; level, above.

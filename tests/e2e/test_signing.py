@@ -290,7 +290,7 @@ def test_an_autopilot_that_wants_signatures_is_named_though_nobody_asks_it_for_a
             assert "give the companion its key" in status["vehicle"]["signing"]["summary"]
             assert not status["vehicle"]["signing"]["good"]
             await asyncio.sleep(40.0)
-            assert lines(caplog, "the autopilot signs, and answers nothing that is not signed") == 1
+            assert lines(caplog, "the autopilot wants signatures") == 1
             no_longer_signing(rig)
             await asyncio.sleep(5.0)
             assert rig.service.status()["vehicle"]["signing"] is None
@@ -341,7 +341,7 @@ def test_another_key_is_named_once_and_forgotten_when_the_keys_are_the_same(
             assert status["headline"]["tone"] != "good"
             # A headline that is bad anyway tells what is worse.
             assert mode == "sign" or "another key" in status["headline"]["reason"]
-            assert lines(caplog, "the autopilot signs with another key than the companion: give both the same one") == 1
+            assert lines(caplog, "the autopilot signs with another key: give both the same one") == 1
             rig.autopilot.require_signatures(KEY, now() + 100 * 100_000)
             await asyncio.sleep(6.0)
             status = rig.service.status()

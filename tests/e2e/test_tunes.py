@@ -25,7 +25,12 @@ def test_a_turn_is_heard_step_by_step(tmp_path: Path) -> None:
             job = turn(made, 2, write=False)
             await made.until(lambda: job.words.startswith("2 of") and "waiting for it to move" in job.words, 60.0)
             hands.turn(made.aircraft.time_at(made.now_s), 90.0)
-            await made.until(lambda: "degrees more" in job.words, 60.0)
+            counted = [0]
+            while "degrees more" not in job.words:
+                counted += [int(seen) for seen in re.findall(r"turned (\d+) of 180 degrees", job.words)]
+                await asyncio.sleep(0.2)
+            assert counted == sorted(counted), "said while it is made"
+            assert abs(counted[-1] - 90) <= 1
             hands.turn(made.aircraft.time_at(made.now_s), 90.0)
             await made.until(lambda: job.words.startswith("3 of"), 60.0)
             hands.turn(made.aircraft.time_at(made.now_s), 180.0)
@@ -45,7 +50,7 @@ def test_a_turn_is_heard_step_by_step(tmp_path: Path) -> None:
                 "90 degrees, not 180: turn it by 90 degrees more",
                 "3 of 3: turn it the same way to its first marks",
                 "Hold still",
-                "Turn on the spot done",
+                "Turn on the spot done:",
             ]
 
     run_virtual(main())

@@ -86,7 +86,13 @@ class Ground:
         return [result for result in self.acks(command) if result != IN_PROGRESS]
 
     def texts(self) -> list[str]:
-        return [m.text for _, m in self.received if isinstance(m, mavlink.MAVLink_statustext_message)]
+        """What was said; a line that goes on is part of the one before it."""
+        found: list[str] = []
+        for _, message in self.received:
+            if isinstance(message, mavlink.MAVLink_statustext_message):
+                whole = f"{found.pop()}{message.text[3:]}" if message.text.startswith("... ") else message.text
+                found.append(whole)
+        return found
 
     def times(self, name: str) -> list[float]:
         return [t_s for t_s, message in self.received if message.get_type() == name]

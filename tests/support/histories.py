@@ -167,7 +167,7 @@ def a_season(directory: Path, number: int = 30) -> list[Record]:
             made = record(
                 k,
                 state="failed",
-                reason="not finished in the time given: waiting for still: gyro fc moves 0.31 deg/s, max 0.10",
+                reason="not finished in the time given: hold still: gyro fc moves 0.31 deg/s, max 0.10",
             )
         elif k % 11 == 5:
             made = record(k, state="cancelled", reason="cancelled by companion cancel")

@@ -86,7 +86,7 @@ def _parents(tree: ast.AST) -> dict[ast.AST, ast.AST]:
     return {child: parent for parent in ast.walk(tree) for child in ast.iter_child_nodes(parent)}
 
 
-def _text(node: ast.AST) -> str | None:
+def template_of(node: ast.AST) -> str | None:
     """The template that a node is, with printf places and the parts of an f-string filled in."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return re.sub(r"%(?:\.\d+)?[sdrgf](?![a-z])", FILLED, node.value)
@@ -131,7 +131,7 @@ def in_source(source: str, where: str) -> list[Message]:
     parents = _parents(tree)
     found = []
     for node in ast.walk(tree):
-        template = _text(node)
+        template = template_of(node)
         if template is None or _is_documentation(node, parents) or isinstance(parents.get(node), ast.JoinedStr):
             continue
         if _is_help(node, parents):

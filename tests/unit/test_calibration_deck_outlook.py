@@ -12,7 +12,7 @@ from companion.calibration.deck.estimate import DeckFound
 from companion.calibration.deck.outlook import Aim, Past, aim, more
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import PROFILES
-from companion.component.statustext import CHUNK_BYTES
+from companion.component.statustext import LINE_BYTES
 from sim.accuracy.deck import Voyage, feed
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.imu_model import DEG_H, ImuModel
@@ -52,7 +52,7 @@ def test_it_fits_into_one_statustext() -> None:
     deg_h = [Aim(sigma, goal, 0).in_words(1.0, "deg/h") for sigma, goal in ((9.96, 5.0), (412.0, 6.13), (52.0, 49.6))]
     mg = [Aim(sigma, goal, 0).in_words(1.0, "mg") for sigma, goal in ((0.271, 0.2), (1.34, 0.051))]
     for left_s, words in itertools.product(seconds, deg_h + mg):
-        assert len(f"Calibration: {more(left_s)}: {words}") <= CHUNK_BYTES
+        assert len(f"{more(left_s)}: {words}") <= LINE_BYTES
     assert (more(1), more(55), more(89), more(91), more(300)) == (
         "some 10 s more", "some 60 s more", "some 90 s more", "some 2 min more", "some 5 min more",
     )  # fmt: skip

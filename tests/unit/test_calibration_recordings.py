@@ -176,7 +176,7 @@ def test_px4_handling_is_rejected_and_the_rest_is_not(flight_controller: tuple[R
     _, played = flight_controller
     for second in range(2, 7):
         assert played.still_s[second] == 0.0
-        assert played.words[second].startswith("waiting for still: gyro fc ")
+        assert played.words[second].startswith("hold still: gyro fc ")
     assert played.still_s[67] >= 59.0
     assert [start for start, end in played.stretches if end - start >= 10.0] in ([7], [8])
 
@@ -233,5 +233,5 @@ def test_xio_walking_is_never_a_calibration() -> None:
     # Stance phases last a few tenths of a second: none makes a whole second while walking (15 s to 34 s).
     assert not [start for start, end in played.stretches if end > 15.0 and start < 34.0]
     assert max(played.still_s.values()) < 10.0
-    with pytest.raises(CalibrationRefusedError, match="waiting for still: gyro fc"):
+    with pytest.raises(CalibrationRefusedError, match="hold still: gyro fc"):
         played.collector.window(played.end_s)

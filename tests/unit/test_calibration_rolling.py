@@ -90,10 +90,10 @@ def test_motion_is_said_with_figures_and_starts_the_count_again() -> None:
     feed.run(2.0)
     line = feed.waiting_for()
     assert line is not None
-    assert line.startswith("waiting for still: gyro fc moves 0.3")
+    assert line.startswith("hold still: gyro fc moves 0.3")
     assert " deg/s, max 0.1" in line
     assert feed.collector.status(feed.now_s).progress == 0.0
-    with pytest.raises(CalibrationRefusedError, match=r"waiting for still: gyro fc moves 0\.3"):
+    with pytest.raises(CalibrationRefusedError, match=r"hold still: gyro fc moves 0\.3"):
         feed.collector.window(feed.now_s)
 
 

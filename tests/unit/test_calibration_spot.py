@@ -211,8 +211,8 @@ def test_hands_hold_it_in_any_orientation_and_put_it_onto_another_spot() -> None
 @pytest.mark.parametrize(
     ("words", "force_g"),
     [
-        ("[  8 %] 2 of 12: 1 done. Now on its back is missing: z bias 30 mg; waiting for it to move", (0, 0, 1)),
-        ("Align 3/12: half way between level and nose up is missing: x bias 2 mg", (0.5**0.5, 0, -(0.5**0.5))),
+        ("[  8 %] 2 of 12: on its back: z bias uncertain by 30 mg; waiting for it to move", (0, 0, 1)),
+        ("3 of 12: between level and nose up: x bias uncertain by 2 mg", (0.5**0.5, 0, -(0.5**0.5))),
         ("Place vehicle nose DOWN and press any key.", (-1, 0, 0)),
         ("Place vehicle on its LEFT side and press any key.", (0, 1, 0)),
     ],
@@ -224,7 +224,7 @@ def test_hands_follow_what_is_asked_for(words: str, force_g: tuple[float, ...]) 
     np.testing.assert_allclose(aircraft.truth_at(10.0).force_m_s2, np.multiply(force_g, G), atol=1e-9)
     assert not hands.follow("2 of 12: measuring, 3 of 12 s, hands off", 10.0)
     assert hands.follow("1 of 5: 100 degrees, not 180: turn it by 80 degrees more", 10.0)
-    assert hands.follow("3 of 3: 2 done. Now turn it the same way to its first marks", 20.0)
+    assert hands.follow("3 of 3: turn it the same way to its first marks", 20.0)
     assert aircraft.pose_at(30.0).heading_deg == pytest.approx(40.0)
     assert aircraft.pose_at(30.0).pitch_deg == pytest.approx(1.0)
 

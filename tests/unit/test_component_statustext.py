@@ -1,4 +1,4 @@
-"""STATUSTEXT: chunks as an independent receiver puts them together, limits, and what is dropped."""
+"""STATUSTEXT: lines as an independent receiver has them, limits, and what is dropped."""
 
 from __future__ import annotations
 
@@ -8,80 +8,103 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.own_parameters import Parameter
-from companion.component.statustext import Severity, StatusText, Weight, split_chunks, to_ascii
+from companion.component.statustext import GOES_ON, Severity, StatusText, Weight, as_lines, to_ascii
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.component import Ground, bench
 from tests.support.virtual_time import run_virtual
 
 
-def put_together(lines: list[tuple[bytes, int, int]]) -> list[str]:
-    """A receiver by the letter of the message's definition: (text[50], id, chunk_seq) to whole texts."""
-    done: list[str] = []
-    parts: dict[int, list[bytes]] = {}
-    for field, text_id, sequence in lines:
-        assert len(field) == 50
-        words, _, _ = field.partition(b"\0")
-        if text_id == 0:
-            assert sequence == 0
-            done.append(words.decode("ascii"))
-            continue
-        assert sequence == len(parts.setdefault(text_id, []))
-        parts[text_id].append(words)
-        if b"\0" in field:
-            done.append(b"".join(parts.pop(text_id)).decode("ascii"))
-    assert parts == {}
-    return done
-
-
-def statustexts(ground: Ground) -> list[tuple[bytes, int, int]]:
-    """What is on the wire: the payloads, padded again as the receiver pads them."""
+def said(ground: Ground) -> list[tuple[int, str]]:
+    """What is on the wire: severity and text, by the letter of the message's definition."""
     found = []
     for raw in ground.raw:
         assert raw[0] == 0xFD
         if int.from_bytes(raw[7:10], "little") == 253:
             payload = raw[10 : 10 + raw[1]].ljust(54, b"\0")
-            found.append((payload[1:51], int.from_bytes(payload[51:53], "little"), payload[53]))
+            assert payload[51:] == b"\0\0\0", "no line is a part of another"
+            found.append((payload[0], payload[1:51].partition(b"\0")[0].decode("ascii")))
     return found
+
+
+def texts(ground: Ground) -> list[str]:
+    return [text for _, text in said(ground)]
+
+
+def put_together(lines: list[str]) -> str:
+    return " ".join([lines[0], *(line.removeprefix(GOES_ON) for line in lines[1:])])
 
 
 @pytest.mark.parametrize("length", [1, 49, 50, 51, 99, 100, 101, 149, 150, 199])
 def test_texts_of_every_length_arrive_whole(length: int) -> None:
-    text = "".join(chr(ord("!") + i % 90) for i in range(length))
+    text = ("some words: and more, " * 10)[:length].strip()
 
     async def main() -> None:
         async with bench() as b:
             b.texts.say(Severity.INFO, text)
             await asyncio.sleep(3)
-            lines = statustexts(b.ground)
-            assert put_together(lines) == [text]
-            assert (lines[0][1] == 0) == (length <= 50)
-
-    run_virtual(main())
-
-
-def test_a_text_too_long_loses_its_tail_and_says_so() -> None:
-    async def main() -> None:
-        async with bench() as b:
-            b.texts.say(Severity.INFO, "x" * 5000)
-            await asyncio.sleep(3)
-            (text,) = put_together(statustexts(b.ground))
-            assert text == "x" * 196 + "..."
+            assert put_together(texts(b.ground)) == text
+            assert (len(texts(b.ground)) == 1) == (length <= 50)
 
     run_virtual(main())
 
 
 @settings(max_examples=300)
-@given(st.text(max_size=300))
-def test_any_text_is_cut_into_chunks_that_can_be_put_together(text: str) -> None:
-    chunks = split_chunks(text)
-    lines = [(chunk.ljust(50, b"\0"), int(len(chunks) > 1), i) for i, chunk in enumerate(chunks)]
-    (whole,) = put_together(lines)
-    expected = to_ascii(text)
-    assert whole == expected or (whole == expected[:196] + "..." and len(expected) > 199)
-    assert len(chunks) <= 4
+@given(st.sampled_from(Severity), st.text(st.characters(codec="ascii"), max_size=300))
+def test_any_text_is_cut_into_lines_that_can_be_put_together(severity: Severity, text: str) -> None:
+    text = to_ascii(text)
+    lines = as_lines(severity, text)
+    assert all(0 < len(line) <= 50 for _, line in lines)
+    assert len(lines) <= 5
+    assert [at for at, _ in lines] == [severity, *[max(severity, Severity.INFO)] * len(lines)][: len(lines)]
+    whole = "".join([line.removeprefix(GOES_ON) if number else line for number, (_, line) in enumerate(lines)])
+    if not lines[4:]:
+        assert whole.replace(" ", "") == text.replace(" ", "")
+
+
+@pytest.mark.parametrize(
+    ("severity", "text", "heard"),
+    [
+        (Severity.NOTICE, "Calibration done: sigma 4.7 deg/h, 0.13 mg", "Calibration done:"),
+        (Severity.NOTICE, "Armed: calibrated 3 min ago, 4.7 deg/h", "Armed: calibrated 3 min ago,"),
+        (Severity.NOTICE, "2 of 12: on its back: z bias uncertain by 30 mg", "2 of 12: on its back:"),
+        (Severity.NOTICE, "2 of 3: turn it by 180 degrees, onto its marks", None),
+        (Severity.WARNING, "Before flight: reboot PX4: tilt 1.2 deg off", None),
+        (
+            Severity.WARNING,
+            "The gradienter has moved by 0.31 deg (x +0.25, y -0.18): all accelerometers (fc, own) differ alike",
+            "The gradienter has moved by 0.31 deg",
+        ),
+        (
+            Severity.ERROR,
+            "Calibration failed: armed during the measurement; nothing was written",
+            "Calibration failed: armed during the measurement;",
+        ),
+        (
+            Severity.ERROR,
+            "no pause in it however long it goes on and on and on",
+            "no pause in it however long it goes on and on and",
+        ),
+    ],
+)
+def test_what_is_heard_is_one_line_that_ends_at_a_pause(severity: Severity, text: str, heard: str | None) -> None:
+    async def main() -> None:
+        async with bench() as b:
+            b.texts.say(severity, text)
+            await asyncio.sleep(5)
+            assert said(b.ground)[0] == (severity, heard or text)
+            assert [at for at, _ in said(b.ground)[1:]] == [Severity.INFO] * (len(said(b.ground)) - 1)
+            assert put_together(texts(b.ground)) == text
+            assert [one.text for one in b.texts.spoken] == [heard or text]
+
+    run_virtual(main())
+
+
+def test_a_text_too_long_loses_its_tail_and_says_so() -> None:
+    lines = [line for _, line in as_lines(Severity.INFO, "word " * 1000)]
+    assert len(lines) == 5
+    assert lines[-1].endswith(" ...")
 
 
 @pytest.mark.parametrize(
@@ -98,20 +121,6 @@ def test_text_becomes_plain_ascii(text: str, expected: str) -> None:
     assert to_ascii(text) == expected
 
 
-def test_severity_is_kept_and_ids_differ() -> None:
-    async def main() -> None:
-        async with bench() as b:
-            for severity in Severity:
-                b.texts.say(severity, "a" * 60 + severity.name)
-                await asyncio.sleep(5)
-            messages = [m for _, m in b.ground.received if isinstance(m, mavlink.MAVLink_statustext_message)]
-            assert [m.severity for m in messages] == [s for severity in Severity for s in (severity, severity)]
-            assert len({m.id for m in messages}) == len(Severity)
-            assert 0 not in {m.id for m in messages}
-
-    run_virtual(main())
-
-
 def test_a_request_cancelled_and_made_again_at_once_is_heard_to_start_again() -> None:
     async def main() -> None:
         async with bench() as b:
@@ -121,7 +130,7 @@ def test_a_request_cancelled_and_made_again_at_once_is_heard_to_start_again() ->
                 assert b.texts.say(Severity.NOTICE, text, weight)
                 await asyncio.sleep(0.3)
             await asyncio.sleep(1.0)
-            assert put_together(statustexts(b.ground)) == story
+            assert texts(b.ground) == story
 
     run_virtual(main())
 
@@ -222,14 +231,14 @@ def test_a_full_transport_delays_texts_and_values_but_loses_none() -> None:
             await asyncio.sleep(0.1)
             transmit = b.link._transmit
             b.link.attach(lambda data: False)
-            b.texts.say(Severity.NOTICE, "x" * 120, Weight.RESULT)
+            b.texts.say(Severity.NOTICE, "x", Weight.RESULT)
             for name in ("CMP_A", "CMP_B", "CMP_C"):
                 b.component.parameters.set(name, 5)
             await asyncio.sleep(5)
             assert b.ground.texts() == []
             b.link.attach(transmit)
             await asyncio.sleep(1)
-            assert put_together(statustexts(b.ground)) == ["x" * 120]
+            assert texts(b.ground) == ["x"]
             assert len(b.ground.times("PARAM_VALUE")) == 3
 
     run_virtual(main())

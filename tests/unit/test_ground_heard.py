@@ -1,4 +1,4 @@
-"""What the ground makes of what it hears: who is there, texts in chunks, and what to say when nobody is."""
+"""What the ground makes of what it hears: who is there, its texts, and what to say when nobody is."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def beat(heard: Heard, system: int, component: int, *, now_s: float = 10.0, **fi
     heard.update("HEARTBEAT", Target(system, component), {**defaults, **fields}, now_s)
 
 
-def say(heard: Heard, text: str, text_id: int = 0, sequence: int = 0, *, component: int = 191) -> None:
-    fields: Fields = {"severity": 6, "text": text, "id": text_id, "chunk_seq": sequence}
+def say(heard: Heard, text: str, *, component: int = 191) -> None:
+    fields: Fields = {"severity": 6, "text": text}
     heard.update("STATUSTEXT", Target(1, component), fields, 10.0)
 
 
@@ -49,26 +49,15 @@ def test_work_is_seen_in_the_heartbeat_but_only_in_a_new_one() -> None:
     assert heard.busy(1, 10.0) is True
 
 
-def test_long_texts_are_put_together_from_their_chunks() -> None:
+def test_lines_that_go_on_are_one_text() -> None:
     heard = Heard(191)
-    text = "".join(chr(ord("!") + i % 90) for i in range(120))
-    say(heard, text[:50], 7, 0)
-    say(heard, "in between", 0, 0)
-    say(heard, text[50:100], 7, 1)
-    assert said(heard) == ["in between"]
-    say(heard, text[100:], 7, 2)
-    assert said(heard) == ["in between", text]
+    say(heard, "Calibration failed: armed in the middle;")
+    say(heard, "... old values back")
     say(heard, "another vehicle's autopilot", component=1)
-    assert len(said(heard)) == 2
-
-
-def test_a_text_of_full_chunks_ends_with_an_empty_one_and_a_gap_shows() -> None:
-    heard = Heard(191)
-    say(heard, "a" * 50, 7, 0)
-    say(heard, "", 7, 1)
-    say(heard, "b" * 50, 8, 0)
-    say(heard, "end", 8, 2)
-    assert said(heard) == ["a" * 50, "b" * 50 + "..." + "end"]
+    say(heard, "Hold still 5 s")
+    assert said(heard) == ["Calibration failed: armed in the middle;", "... old values back", "Hold still 5 s"]
+    whole = [text.words for text in heard.texts_of(1, 0.0)]
+    assert whole == ["Calibration failed: armed in the middle; old values back", "Hold still 5 s"]
 
 
 def test_what_a_terminal_would_obey_is_not_passed_on() -> None:
@@ -79,9 +68,6 @@ def test_what_a_terminal_would_obey_is_not_passed_on() -> None:
 
 def test_what_never_ends_is_forgotten() -> None:
     heard = Heard(191)
-    for text_id in range(1, 1000):
-        say(heard, "x" * 50, text_id, 0)
-    assert len(heard._unfinished) < 20
     for number in range(1000):
         say(heard, f"text {number}")
     assert len(heard.texts) <= 200

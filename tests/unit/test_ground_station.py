@@ -60,7 +60,7 @@ def test_it_says_what_it_waits_for_and_how_it_ends() -> None:
             await station.find(None, 5.0)
             asking = asyncio.create_task(station.calibrate(What.BOTH, None, reboot=False))
             await until_started(b)
-            b.texts.say(Severity.INFO, "Calibration: waiting for still: gyro moves 0.31 deg/s, max 0.10")
+            b.texts.say(Severity.INFO, "Hold still: gyro moves 0.31 deg/s, max 0.10")
             await asyncio.sleep(1.0)
             for percent in (75, 85):
                 b.service.jobs[0].progress_percent = percent
@@ -74,7 +74,7 @@ def test_it_says_what_it_waits_for_and_how_it_ends() -> None:
             assert "warning: Before flight: reboot PX4: tilt 1.2 deg off" in outcome.lines
             assert outcome.answer["gyro_sigma_deg_h"] == 2.5
             assert outcome.answer["accel_sigma_mg"] is None, "0 is how the companion says that it has none"
-            assert "Calibration: waiting for still: gyro moves 0.31 deg/s, max 0.10" in notes.texts
+            assert "Hold still: gyro moves 0.31 deg/s, max 0.10" in notes.texts
             assert notes.stages[-2:] == ["writing to the autopilot", "checking that the autopilot uses the new values"]
 
     run_virtual(main())

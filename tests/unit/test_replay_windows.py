@@ -95,7 +95,7 @@ def test_windows_that_are_refused_are_counted_by_reason(
     assert counts.pop("no samples") == 2
     # It shakes, or it turns.
     assert sum(counts.values()) == 3
-    assert all(why.startswith("no 5 s at rest in it: waiting for still: gyro imu") for why in counts)
+    assert all(why.startswith("no 5 s at rest in it: hold still: gyro imu") for why in counts)
     # Only windows that follow on one another are held against each other.
     assert by_axis(answer, 60.0)["gyro x"]["pairs"] == 4 + 4 + 3
 

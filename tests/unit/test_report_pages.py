@@ -215,7 +215,7 @@ def test_nothing_from_a_file_becomes_a_tag(tmp_path: Path) -> None:
 
 def test_a_failure_says_why(tmp_path: Path) -> None:
     failed = record(
-        state="failed", reason="not finished in the time given: waiting for still: gyro fc moves 0.31 deg/s, max 0.10"
+        state="failed", reason="not finished in the time given: hold still: gyro fc moves 0.31 deg/s, max 0.10"
     )
     RecordStore(tmp_path).save(failed, white_trace(failed, moved=True))
     found = Page(_calibration(tmp_path))

@@ -70,9 +70,9 @@ class WriteFailedError(AutopilotError):
     ) -> None:
         words = f"{kind}: {reason}"
         if left_changed:
-            words += f"; NOT put back: {', '.join(left_changed)}"
+            words += f"; old values NOT back in {', '.join(left_changed)}"
         elif any(parameter.outcome == "rolled_back" for parameter in written.values()):
-            words += "; the old values are back"
+            words += "; old values back"
         super().__init__(words)
         self.kind: FailureKind = kind
         self.reason = reason

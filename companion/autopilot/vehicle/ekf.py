@@ -20,6 +20,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.links.system.waiting import comes
 from companion.physics.units import DEG
 
+TAKES_IN: Final = "EKF takes in new offsets"
 SETTLED_RAD_S: Final = 0.02 * DEG
 """Per axis: 72 deg/h. An EKF whose bias has just been reset wanders up to 52 deg/h on the ground (9.3.1); and 72 deg/h
 for the 40 s that it lasts turn the heading by 0.8 deg, less than a compass knows."""
@@ -70,8 +71,8 @@ class EkfWatch:
             if self._vehicle.boots != boots:
                 return "the autopilot restarted while its EKF settled"
             return (
-                "this autopilot does not tell whether its EKF has settled (no AHRS message): wait 2 min before"
-                " take-off, or restart it"
+                "wait 2 min before take-off, or restart the autopilot: it does not tell whether its EKF has settled"
+                " (no AHRS message)"
             )
         bias: float | None = None
         asked_s = loop.time()
@@ -82,12 +83,12 @@ class EkfWatch:
             if bias is not None and bias <= SETTLED_RAD_S:
                 return None
             if self._vehicle.arm_state is ArmState.ARMED:
-                return f"armed while the EKF was still settling ({_words(bias)}): the heading may turn for a minute"
+                return f"the heading may turn for a minute: armed before the EKF had settled ({_words(bias)})"
             if loop.time() >= give_up_s:
                 return (
                     f"the EKF has not settled within {within_s:.0f} s ({_words(bias)}): wait, or restart the autopilot"
                 )
-            go_on(f"EKF settling: {_words(bias)}; seconds as a rule, {give_up_s - loop.time():.0f} at most")
+            go_on(f"{TAKES_IN}: {give_up_s - loop.time():.0f} s at most")
             silent_s = loop.time() - (self._seen[-1][0] if self._seen else asked_s)
             if min(silent_s, loop.time() - asked_s) > _FIRST_WITHIN_S:
                 asked_s = loop.time()
@@ -129,4 +130,4 @@ class EkfWatch:
 
 
 def _words(bias_rad_s: float | None) -> str:
-    return "bias not known yet" if bias_rad_s is None else f"{bias_rad_s / DEG:.2f} deg/s"
+    return "bias unknown" if bias_rad_s is None else f"{bias_rad_s / DEG:.2f} deg/s"

@@ -23,7 +23,6 @@ FACE_DEG: Final = 30.0
 _STAND_SIGMA_M_S2: Final = 0.03 * MG
 """What the mean of a coming stand will be good for, about."""
 _AXES: Final = "xyz"
-HALF_WAY: Final = "half way "
 _SIDES: Final = {
     "level": (0, 0, -1),
     "on its back": (0, 0, 1),
@@ -41,17 +40,12 @@ class Missing:
 
     side: str
     figure: str
-    """Of which axis, with its sigma."""
+    """Of which axis, with its sigma; or why there is to be another stand."""
     unknown: tuple[str, ...] = ()
     """All that are not known well enough, likewise, the worst first."""
 
     def __str__(self) -> str:
-        return f"{self.side} is missing: {self.figure}"
-
-    @property
-    def aloud(self) -> str:
-        """The stand alone, in 39 characters at most."""
-        return self.side.removeprefix(HALF_WAY)
+        return f"{self.side}: {self.figure}"
 
 
 def missing(found: Faces, vehicle_from_sensor: Matrix) -> Missing | None:
@@ -104,7 +98,7 @@ def _not_seen(found: Faces, vehicle_from_sensor: Matrix) -> list[tuple[str, Arra
 def _all_sides(vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
     faces = {name: np.array(up, dtype=np.float64) for name, up in _SIDES.items()}
     edges = {
-        f"{HALF_WAY}between {a} and {b}": (faces[a] + faces[b]) / np.sqrt(2.0)
+        f"between {a} and {b}": (faces[a] + faces[b]) / np.sqrt(2.0)
         for a, b in itertools.combinations(faces, 2)
         if not faces[a] @ faces[b]
     }
@@ -126,14 +120,14 @@ def _figure(found: Faces, which: int) -> str:
     assert which < FIGURES
     axis, sigma = _AXES[which % 3], _sigma(found)[which]
     if which in range(*BIAS.indices(FIGURES)):
-        return f"{axis} bias {sigma / MG:.2g} mg"
+        return f"{axis} bias uncertain by {sigma / MG:.2g} mg"
     assert which in range(*SCALE.indices(FIGURES))
-    return f"{axis} scale {100.0 * sigma:.2g} %"
+    return f"{axis} scale uncertain by {100.0 * sigma:.2g} %"
 
 
 def up_of(side: str) -> tuple[float, float, float]:
     """Up in the aircraft's axes, forward, right, down, of length 1, where it is held as `Missing.side` says."""
-    names = side.removeprefix(f"{HALF_WAY}between ").split(" and ")
+    names = side.removeprefix("between ").split(" and ")
     up = np.sum([_SIDES[name] for name in names], axis=0)
     x, y, z = (up / np.linalg.norm(up)).tolist()
     return x, y, z

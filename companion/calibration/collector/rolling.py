@@ -314,7 +314,7 @@ class RollingCollector(Intake):
         if said[0].fault:
             return Obstacle(words, moving)
         boat = f"; on a boat? {self._settings.on_a_boat}" if self._swell.is_regular else ""
-        return Obstacle(f"waiting for still: {words}{boat}", moving)
+        return Obstacle(f"hold still: {words}{boat}", moving)
 
     def _waiting_for(self, now_s: float) -> Obstacle | None:
         if (moves := self._obstacle(now_s)) is not None:

@@ -141,7 +141,7 @@ def unseen_turn(solution: Solution | None) -> tuple[str, ...]:
         return ()
     turn = solution.turn
     if not turn.is_told:
-        return ("assumed Earth-fixed: nothing saw whether the ground turns",)
+        return ("nothing saw whether the ground turns (a boat?)",)
     if turn.by == "earlier calibrations" and not turn.is_chance:
         return (f"the aircraft {turn.in_words}, or its gyros are unlike in earlier power-ups: sigma widened",)
     return ()

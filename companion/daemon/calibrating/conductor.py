@@ -27,7 +27,7 @@ from companion.daemon.calibrating.course import Course
 from companion.daemon.calibrating.results import Results
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.core import Core
-from companion.daemon.job import ALIGNMENT, BY_STANDS, FACES, TURN, Job, JobCancelledError, Undone
+from companion.daemon.job import ALIGNMENT, FACES, TURN, Job, JobCancelledError, Undone
 from companion.daemon.offsets.ledger import Recovery
 from companion.daemon.stands.align_steps import Plan
 from companion.daemon.stands.aligner import Aligner
@@ -232,11 +232,9 @@ class Conductor:
         logger.log(logging.ERROR if result.outcome == "failed" else logging.INFO, "%s", words)
         if not (job.automatic and result.outcome == "failed" and self._vehicle.arm_state is ArmState.ARMED):
             # The pilot who has just armed has no use for the end of what nobody asked for.
-            if job.kind in BY_STANDS and result.outcome == "done":
-                # The figures are for who reads.
-                self._say(Severity.NOTICE, f"{job.kind.capitalize()} done", Weight.RESULT)
-                severity = Severity.INFO
             self._say(max(severity, Severity.WARNING) if job.automatic else severity, words, Weight.RESULT)
+            if self.why_not((Rung.PENDING,)) is not None:
+                self._say(Severity.WARNING, "Old values NOT back: disarm, keep it connected", Weight.RESULT)
         if not job.automatic and result.outcome != "cancelled":
             self._tunes.play(Tune.DONE if result.outcome == "done" else Tune.FAILED)
         self.on_ended.tell(job, result)

@@ -51,25 +51,12 @@ AGAIN_S: Final = 60.0
 _Doubt = Literal["other key", "unsigned", "old"]
 _Kind = Literal["wants ours", "other key", "unsigned", "old"]
 
-_WORDS: Final[dict[_Kind, tuple[str, str]]] = {
-    "wants ours": (
-        "the autopilot signs, and answers nothing that is not signed: give the companion its key (signing_key_file)",
-        "Autopilot wants signatures: give us its key",
-    ),
-    "other key": (
-        "the autopilot signs with another key than the companion: give both the same one",
-        "Autopilot signs with another key: give both one",
-    ),
-    "unsigned": (
-        "the autopilot does not sign on this link and is not believed: give it the companion's key",
-        "Autopilot does not sign: give it our key",
-    ),
-    "old": (
-        "the autopilot's signatures are older than before and not believed: wait some seconds, or restart it",
-        "Autopilot's signatures are old: wait, or restart it",
-    ),
+_WORDS: Final[dict[_Kind, str]] = {
+    "wants ours": "the autopilot wants signatures: give the companion its key (signing_key_file)",
+    "other key": "the autopilot signs with another key: give both the same one",
+    "unsigned": "the autopilot does not sign and is not believed: give it the companion's key",
+    "old": "the autopilot's signatures are old, not believed: wait some seconds, or restart it",
 }
-"""In full, and in one line of STATUSTEXT."""
 
 
 _TELLING: Final[dict[bool, tuple[_Doubt, ...]]] = {True: ("other key", "unsigned", "old"), False: ("other key",)}
@@ -103,7 +90,7 @@ class _SignatureWatch:
     @property
     def warning(self) -> str | None:
         """What does not fit, and what to do; None while all does, or nobody is heard."""
-        return None if self._kind is None else _WORDS[self._kind][0]
+        return None if self._kind is None else _WORDS[self._kind]
 
     def update(self, now_s: float) -> None:
         """See how it is now, and say what has changed."""
@@ -115,9 +102,8 @@ class _SignatureWatch:
             told_s = self._told_s.get(found, -math.inf)
             if now_s - told_s >= AGAIN_S:
                 self._told_s[found], self._was_told = now_s, True
-                words, line = _WORDS[found]
-                logger.warning("mavlink: %s", words)
-                self._say(Severity.WARNING, line, Weight.NEWS)
+                logger.warning("mavlink: %s", _WORDS[found])
+                self._say(Severity.WARNING, _WORDS[found], Weight.NEWS)
         elif before is not None and self._was_told and (self._signing is not None or self._vehicle.alive):
             self._was_told = False
             words = "Autopilot answers again" if self._signing is None else "Autopilot's signatures are right again"
@@ -259,7 +245,11 @@ class LinkSigning:
             reason, system, component = stranger
             logger.warning("mavlink: %d/%d %s: its messages are %s", system, component, _WHY[reason], self._fate)
             if signing.required:
-                self._say(Severity.WARNING, f"{system}/{component} {_WHY[reason]}: ignored", Weight.NEWS)
+                self._say(
+                    Severity.WARNING,
+                    f"Somebody {_WHY[reason]}, and is ignored: system {system}, component {component}",
+                    Weight.NEWS,
+                )
 
     # --- words
 

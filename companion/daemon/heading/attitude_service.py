@@ -243,7 +243,7 @@ class AttitudeService:
         warning = self.health.warning
         if warning is not None and self._warned is None:
             logger.warning("%s", warning)
-            self._say(Severity.WARNING, warning.capitalize(), Weight.NEWS)
+            self._say(Severity.WARNING, warning, Weight.NEWS)
         self._warned = warning
 
     def _say_once(self, severity: Severity, words: str, now_s: float) -> None:

@@ -232,9 +232,9 @@ class Ditherer:
         deadline_s = loop.time() + BACK_WITHIN_S
         while loop.time() < deadline_s and self._vehicle.arm_state is not ArmState.ARMED:
             if not self._ledger.pending:
-                return "old offsets put back"
+                return "old values back"
             await asyncio.sleep(POLL_S)
-        return "old offsets NOT back yet: disarm, keep it connected"
+        return "old values NOT back yet: disarm, keep it connected"
 
 
 def _offsets(calibration: ImuCalibration, shift: Array) -> dict[str, float]:

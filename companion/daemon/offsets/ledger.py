@@ -226,7 +226,7 @@ class Recovery:
             with self._changing():
                 await self._writer.restore(ours)
         await self.ledger.undone()
-        words = f"Interrupted write: {f'{len(ours)} old values put back' if ours else 'nothing of ours was in force'}"
+        words = f"Interrupted write: {f'{len(ours)} old values back' if ours else 'nothing of ours was in force'}"
         if foreign:
             words += f"; changed by others, left alone: {', '.join(foreign)}"
         logger.warning("%s", words)

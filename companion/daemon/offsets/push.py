@@ -184,7 +184,7 @@ class Pusher:
             return f"{reason}; old values NOT back in {', '.join(left)}: {end}"
         with contextlib.suppress(StorageError):
             await self._ledger.undone()
-        return f"{reason}; old values put back"
+        return f"{reason}; old values back"
 
     async def _no_longer_in_force(self, plan: Plan) -> list[str]:
         """What somebody has changed while we looked at the telemetry."""
@@ -325,10 +325,9 @@ class Conclusion:
         go_on = _going_on(job)
         job.lasts(settles_within_s(plan.firmware))
         try:
-            go_on("EKF settling")
             words = await self._firmware.settle(plan.gyros, plan.firmware, go_on)
         except JobCancelledError as cancelled:
-            words = f"{cancelled} while the EKF was settling: the new offsets stay, wait 2 min before take-off"
+            words = f"wait 2 min before take-off: {cancelled} while the EKF took in the new offsets, which stay"
         if words is not None:
             draft.warnings.append(words)
             self._say(Severity.WARNING, words, Weight.NEWS)

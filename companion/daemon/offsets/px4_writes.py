@@ -248,7 +248,7 @@ class Px4Writes:
         except WriteFailedError as error:
             if steps and error.left_changed and self._vehicle.arm_state is ArmState.ARMED:
                 # Between the steps the offsets are wrong on purpose, and while it is armed nobody may mend that.
-                self._say(Severity.CRITICAL, "DISARM NOW: gyro/accel offsets are off", Weight.RESULT)
+                self._say(Severity.CRITICAL, "DISARM NOW: the offsets are wrong", Weight.RESULT)
             if error.kind == "not as believed" and not self._watch.learned:
                 # Nothing was learned: the same slot again, and not for ever.
                 raise WriteFailedError("without effect", error.reason, error.written, error.left_changed) from error

@@ -30,6 +30,7 @@ class Rivalry:
         self.stop_rivals = core.config.push.stop_rivals
         """Whether they are to be switched off with the next write."""
         self._told: set[str] = set()
+        """Those that the ground stations have heard of since they were switched on; status shows them always."""
         self._disarmed_s = self._rebooted_s = -math.inf
         self._was_armed = False
         core.vehicle.on_event.add(self._on_event)
@@ -67,14 +68,14 @@ class Rivalry:
             self._was_armed = False
         elif event == "rebooted":
             self._rebooted_s, self._was_armed = now_s, False
-            self._told.clear()
 
     def _on_read(self, name: str, before: ImuCalibration | None, after: ImuCalibration) -> None:
+        self._told &= {rival.name for rival in after.rivals}
         for rival in after.rivals:
             if rival.name not in self._told and (rival.until_boot or not self.stop_rivals):
                 self._told.add(rival.name)
-                what = "gyro+accel" if rival.accelerometers else "gyro"
-                words = f"{rival.name} may overwrite {what} biases"
+                what = "all" if rival.accelerometers else "gyro"
+                words = f"The autopilot may rewrite {what} offsets: set {rival.parameter} to 0"
                 if rival.until_boot:
                     words = "Reboot PX4: its gyro calibration still runs"
                 self._say(Severity.WARNING, words, Weight.NEWS)
@@ -84,16 +85,16 @@ class Rivalry:
     def _compare(self, name: str, before: ImuCalibration, after: ImuCalibration) -> None:
         gyros = before.gyro_offset_rad_s != after.gyro_offset_rad_s
         accelerometers = before.accel_offset_m_s2 != after.accel_offset_m_s2
-        what = " and ".join(w for w, changed in (("gyro", gyros), ("accelerometer", accelerometers)) if changed)
-        if not what:
+        if not (gyros or accelerometers):
             return
+        what = "all" if gyros and accelerometers else "gyro" if gyros else "accelerometer"
         rival = self._culprit(after.rivals, accelerometers=accelerometers)
         if rival is not None:
             logger.warning("imu %s: %s offsets rewritten by the autopilot itself (%s)", name, what, rival.words)
-            words = f"{rival.name} rewrote {what} biases of {name}"
+            words = f"The autopilot rewrote {what} offsets of {name}: {rival.name}"
         else:
             logger.warning("imu %s: %s offsets rewritten by somebody else", name, what)
-            words = f"Somebody rewrote the {what} biases of {name}"
+            words = f"Somebody rewrote {what} offsets of {name}"
         self._say(Severity.WARNING, words, Weight.NEWS)
 
     def _culprit(self, rivals: Sequence[Rival], *, accelerometers: bool) -> Rival | None:

@@ -10,7 +10,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import msgspec
 
@@ -63,6 +63,13 @@ class Finding:
     words: str
     remedy: str = ""
     port: str = ""
+
+    @property
+    def verdict(self) -> Literal["ok", "warning", "wrong"]:
+        """In one word: what is good has a remedy only where it may not stay so."""
+        if not self.good:
+            return "wrong"
+        return "warning" if self.remedy or self.name == "warning" else "ok"
 
 
 def configured_sensors(config: Config) -> list[Configured]:

@@ -48,8 +48,6 @@ class _Known(NamedTuple):
     """The stand that is missing, in words; None where nothing is."""
     hold: Hold = Hold(LEVEL)
     """The same as a picture."""
-    aloud: str = ""
-    """The same, to be heard."""
     unknown: tuple[str, ...] = ()
     """As in `Missing`."""
 
@@ -103,7 +101,7 @@ class Facing:
         draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._core.vehicle.system_id)
         draft.warnings += local.warnings
         if known.wish is not None:
-            draft.warnings.append(f"after {MOST} stands {known.wish}")
+            draft.warnings.append(f"after {MOST} stands {known.wish.partition(': ')[2]}")
         measured = self._measured(windows[-1], known.by_imu)
         try:
             if write and known.wish is None:
@@ -117,7 +115,7 @@ class Facing:
         if not write:
             self._machine.on(Event.NOTHING_TO_WRITE)
         elif known.wish is not None:
-            raise CalibrationRefusedError(f"nothing was written: after {MOST} stands {known.wish}")
+            raise CalibrationRefusedError(f"nothing was written: after {MOST} stands {known.wish.partition(': ')[2]}")
         return _in_words(known.by_imu, written=write)
 
     async def _next(self, job: Job, known: _Known, number: int) -> Window:
@@ -132,7 +130,7 @@ class Facing:
                     return window, f"it stands as in stand {again + 1}: {known.wish}"
             return window, None
 
-        asked = Asked(number, max(EXPECTED, number), known.wish or "", known.hold, known.aloud, known.unknown)
+        asked = Asked(number, max(EXPECTED, number), known.wish or "", known.hold, known.unknown)
         # No stand hangs on another, so that a flight in between costs nothing.
         return await self._stands.next(job, asked, take, if_armed=None)
 
@@ -141,7 +139,7 @@ class Facing:
             earlier = before.by_imu[name].left_out if name in before.by_imu else ()
             for stand in set(found.left_out) - set(earlier):
                 off_mg = float(found.off_m_s2[stand]) / MG
-                self._core.say(Severity.WARNING, f"Stand {stand + 1} is {off_mg:+.1f} mg off: left out")
+                self._core.say(Severity.NOTICE, f"Stand {stand + 1} is left out: it is {off_mg:+.1f} mg off")
 
     # --- working out
 
@@ -161,7 +159,7 @@ class Facing:
             raise CalibrationRefusedError("no IMU whose accelerometers can be read")
         if wish is None:
             return _Known(by_imu, None)
-        return _Known(by_imu, str(wish), Hold(up_of(wish.side)), wish.aloud, wish.unknown)
+        return _Known(by_imu, str(wish), Hold(up_of(wish.side)), wish.unknown)
 
     def _face(self, imu: ImuWindow) -> Face:
         """In the sensor's own axes, in which firmwares scale."""

@@ -41,7 +41,7 @@ USED_AFTER_S: Final = 1.5
 """Both firmwares look at their parameters once a second."""
 POLL_S: Final = 0.25
 _UP: Final = np.array([0.0, 0.0, -1.0])
-REBOOT: Final = "PX4's attitude follows the new level after a restart: reboot the autopilot before flight"
+REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the new level after that"
 
 
 class Level(NamedTuple):
@@ -162,7 +162,7 @@ class LevelWrites:
             except WriteFailedError as error:
                 return f"{reason}; old values NOT back in {', '.join(error.left_changed)}: will be once disarmed"
         await self._ledger.undone()
-        return f"{reason}; old values put back"
+        return f"{reason}; old values back"
 
 
 def _angle_deg(one: Array, other: Array) -> float:

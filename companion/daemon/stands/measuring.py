@@ -118,7 +118,7 @@ class Measuring:
         now_s = asyncio.get_running_loop().time()
         if words != self._said and not job.automatic and now_s - self._said_s >= every_s:
             self._said, self._said_s = words, now_s
-            self._core.say(Severity.INFO, f"Calibration: {words}")
+            self._core.say(Severity.INFO, words)
 
     def _check_imus(self, failures: dict[str, int]) -> None:
         for name, imu in self._imus.items():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple, TypeVar
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from companion.calibration.means.windows import Window
 from companion.component.service import JobResult
-from companion.component.statustext import CHUNK_BYTES, Severity
+from companion.component.statustext import LINE_BYTES, Severity
 from companion.component.tunes import Tune
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -32,6 +33,10 @@ from companion.physics.units import DEG
 STAND_S: Final = 12.0
 """Seconds of stillness for each stand: averaging beyond 10 s buys an accelerometer nothing (method section 2.3)."""
 SETTLE_S: Final = 1.0
+STOP_WITHIN_DEG: Final = 5.0
+"""Who would be that near what is asked for, or beyond, by the next look is told to stop."""
+TURNS_DEG: Final = 2.0
+"""From one look to the next, a second later."""
 ARMED: Final = "armed during the alignment; the earlier one stays in force"
 
 _T = TypeVar("_T")
@@ -48,15 +53,13 @@ class Asked(NamedTuple):
     """How to stand it."""
     hold: Hold
     """The same as a picture."""
-    aloud: str = ""
-    """The same in at most 39 characters, where the wish up to its first colon is longer."""
     unknown: tuple[str, ...] = ()
     """What the stands so far leave open, the worst first."""
 
     @property
-    def spoken(self) -> str:
-        """One line of STATUSTEXT, to be heard."""
-        return f"{self.number} of {self.total}: {self.aloud or self.wish.partition(':')[0]}"
+    def words(self) -> str:
+        """The same, counted; what comes behind its last pause need not be heard."""
+        return f"{self.number} of {self.total}: {self.wish}"
 
 
 class StandsShown(msgspec.Struct):
@@ -87,14 +90,14 @@ class Stands:
         self._core, self._machine, self._collector, self._say = core, core.machine, core.collector, core.say
         self._imus, self._measuring = imus, measuring
         self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
-        self._end_s: float | None = None
+        self._last: Window | None = None
         self._first: dict[str, dict[str, float]] = {}
         self.shown: StandsShown | None = None
         """None before the first alignment."""
 
     def begin(self, job: Job) -> None:
         """The next stand is the first, of this job."""
-        self._end_s, self._first = None, {}
+        self._last, self._first = None, {}
         self._collector.count_turns(wanted=True)
         self.shown = shown = StandsShown(job.kind, 1, 1, "", Hold(LEVEL))
 
@@ -121,12 +124,11 @@ class Stands:
         shown = self._show(asked)
         if number > 1:
             self._core.tunes.play(Tune.NEXT)
-        self._say(Severity.NOTICE, asked.spoken)
-        if (whole := f"{number} of {total}: {wish}") != asked.spoken:
-            self._say(Severity.INFO, whole)
+        self._say(Severity.NOTICE, asked.words)
         # Whoever asks may yet put it down on a better spot: what was before that does not count.
-        since_s = loop.time() if self._end_s is None else self._end_s
-        moved, why, held = self._end_s is None, "", False
+        since_s = loop.time() if self._last is None else self._last.end_s
+        moved, why, held = self._last is None, "", False
+        turn = self._turn(asked)
         while True:
             now_s = loop.time()
             status, waiting_for, hold_still_s = await self._measuring.read_state(job, if_armed)
@@ -139,11 +141,13 @@ class Stands:
             standing = moved and (waiting_for is None or hold_still_s is not None)
             share = min(max(still_s, 0.0) / self._stand_s, 1.0) if standing else 0.0
             if not moved:
-                words = f"{why or f'{number - 1} done. Now {wish}'}; waiting for it to move"
+                words = f"{why or wish}; waiting for it to move"
             elif not standing:
-                words = f"{why or wish}; {waiting_for}"
+                words = f"{why or wish}; {(moving and turn(now_s)) or waiting_for}"
             else:
+                turned = turn(now_s)
                 words = f"measuring, {max(still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
+                words += f" ({turned})" if turned else ""
                 if not held:
                     held = True
                     self._core.prompt(Tune.HOLD_STILL, "Hold still")
@@ -154,7 +158,7 @@ class Stands:
                 window = await self._core.window(since_s=since_s + SETTLE_S)
                 found, objection = take(window)
                 if objection is None:
-                    self._end_s = window.end_s
+                    self._last = window
                     self._first = self._first or self._offsets()
                     shown.done.append(_up(window))
                     return found
@@ -163,19 +167,37 @@ class Stands:
                 self._object(objection, asked)
             await job.pause(POLL_S)
 
+    def _turn(self, asked: Asked) -> Callable[[float], str]:
+        """What tells how far it has been turned by now, counted once a second, and says once when to stop."""
+        last, wanted_deg, looked_s, turned_deg, told = self._last, asked.hold.turn_deg, -math.inf, math.nan, False
+
+        def words(now_s: float) -> str:
+            nonlocal looked_s, turned_deg, told
+            if last is None or not wanted_deg:
+                return ""
+            if now_s - looked_s >= 1.0:
+                imu, before_deg = last.imus[0], turned_deg
+                counted = self._collector.counted(imu.name, last.end_s, now_s, np.array(imu.gyro_rad_s))
+                looked_s, turned_deg = now_s, math.nan if counted is None else abs(counted.angle_rad) / DEG
+                per_look_deg = turned_deg - before_deg
+                if not told and per_look_deg > TURNS_DEG and turned_deg + per_look_deg > wanted_deg - STOP_WITHIN_DEG:
+                    told = True
+                    self._say(Severity.NOTICE, "Stop turning")
+            return "" if math.isnan(turned_deg) else f"turned {turned_deg:.0f} of {wanted_deg:.0f} degrees"
+
+        return words
+
     def _show(self, asked: Asked) -> StandsShown:
         shown = self.shown
         assert shown is not None
-        shown.number, shown.total, shown.wish, shown.hold, _, shown.unknown = asked
+        shown.number, shown.total, shown.wish, shown.hold, shown.unknown = asked
         return shown
 
     def _object(self, objection: str, asked: Asked) -> None:
-        """In one line to be heard; where that holds no more than the reason, with what is asked for once more."""
-        if len(objection) <= CHUNK_BYTES:
-            self._core.prompt(Tune.WRONG, objection)
-        else:
-            self._core.prompt(Tune.WRONG, objection.partition(":")[0])
-            self._say(Severity.NOTICE, asked.spoken)
+        """Where it is too long to be heard whole, with what is asked for once more."""
+        self._core.prompt(Tune.WRONG, objection)
+        if len(objection) > LINE_BYTES:
+            self._say(Severity.NOTICE, asked.words)
 
     async def take(
         self, job: Job, plan: Plan, taken: Sequence[Taken], see: Callable[[Window], Taken], if_armed: str | None = ARMED
