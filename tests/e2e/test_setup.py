@@ -352,7 +352,7 @@ def test_the_service_is_started_with_it(
     out, err = capsys.readouterr()
     answer = json.loads(out)
     assert told.read_text().splitlines() == ["enable companion.service", "restart companion.service"]
-    assert "Start the companion now, and at every boot?" in err
+    assert "Start the companion now, and at every boot: yes" in err
     if works:
         assert (code, answer["state"]) == (0, "done")
         assert [step["outcome"] for step in answer["steps"]] == ["done", "done"]

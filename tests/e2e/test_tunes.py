@@ -48,7 +48,9 @@ def test_a_turn_is_heard_step_by_step(tmp_path: Path) -> None:
                 "2 of 3: turn it by 180 degrees, onto its marks",
                 "Hold still",
                 "90 degrees, not 180: turn it by 90 degrees more",
+                "Stop turning",
                 "3 of 3: turn it the same way to its first marks",
+                "Stop turning",
                 "Hold still",
                 "Turn on the spot done:",
             ]
