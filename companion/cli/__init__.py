@@ -35,7 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(logs.OneLineFormatter())
-    options = _parser().parse_args(arguments)
+    # What -c and --json are where neither part of the command line has them.
+    options = _parser().parse_args(arguments, argparse.Namespace(json=False))
     try:
         return asyncio.run(_dispatch(options))
     except ConfigError as error:
@@ -64,7 +65,7 @@ async def _dispatch(options: argparse.Namespace) -> int:
 
 def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
     print_lines(f"companion: {reason}", error=True)
-    if getattr(options, "json", False):
+    if options.json:
         print_json({"state": state, "reason": reason})
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from companion.calibration.records.record import outcome_word
 from companion.cli import show
-from companion.cli.terminal import DONE, FAILED, AddCommand, load_config, print_json, print_lines, seconds
+from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds
 from companion.daemon.faces.control import ask
 
 Object = dict[str, Any]
@@ -43,11 +43,7 @@ def finish(options: argparse.Namespace, reply: Object, answer: Object, lines: li
     if reply["kind"] == "error":
         answer, lines, good = {"state": "refused", "reason": reply["reason"]}, [], False
         print_lines(f"companion: {reply['reason']}", error=True)
-    if getattr(options, "json", False):
-        print_json(answer)
-    else:
-        print_lines(*lines)
-    return DONE if good else FAILED
+    return conclude(options, answer, lines, good=good)
 
 
 async def status(options: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from companion.cli.terminal import DONE, FAILED, Parser, print_json, print_lines, seconds, within
+from companion.cli.terminal import Parser, conclude, seconds, within
 from companion.errors import ConfigError, LinkError, NobodyHeardError
 
 if TYPE_CHECKING:
@@ -112,11 +112,7 @@ async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Aw
                 raise NobodyHeardError("; ".join(filter(None, (str(error), link.unbelieved())))) from None
             async with _interruptible(station):
                 outcome = await work(station)
-    if getattr(options, "json", False):
-        print_json(outcome.answer)
-    else:
-        print_lines(*outcome.lines)
-    return DONE if outcome.good else FAILED
+    return conclude(options, outcome.answer, outcome.lines, good=outcome.good)
 
 
 @contextlib.asynccontextmanager

@@ -18,6 +18,7 @@ from companion.cli.terminal import (
     USAGE,
     AddCommand,
     Parser,
+    conclude,
     config_path,
     load_config,
     print_address,
@@ -123,7 +124,7 @@ async def _first_run(path: Path) -> None:
     if is_writable(path):
         asks = Parser()
         add_command(lambda *_: asks)
-        await session.setup(asks.parse_args(FIRST_RUN), goes_on=True)
+        await session.setup(asks.parse_args(FIRST_RUN, argparse.Namespace(json=False)), goes_on=True)
 
 
 async def ports(options: argparse.Namespace) -> int:
@@ -132,7 +133,7 @@ async def ports(options: argparse.Namespace) -> int:
 
     found = list_ports()
     listened = None if options.listen is None else await _listen(options.listen, found)
-    if getattr(options, "json", False):
+    if options.json:
         answer: dict[str, object] = {"ports": [dataclasses.asdict(port) for port in found]}
         if listened is not None:
             answer["heard"] = {port: _heard(heard) for port, heard in listened.items()}
@@ -140,8 +141,11 @@ async def ports(options: argparse.Namespace) -> int:
         return DONE
     if not options.listen:
         print_lines(*show.port_lines(found))
-    for port, heard in (listened or {}).items():
-        print_lines(*show.heard_lines(port, heard))
+    if listened is not None:
+        from companion.setup.survey import in_words
+
+        print_lines(*(f"{port}: {in_words(port, heard)}" for port, heard in listened.items()))
+        print_lines("companion setup takes them into the configuration", error=True)
     return DONE
 
 
@@ -177,7 +181,7 @@ async def lua(options: argparse.Namespace) -> int:
     from companion.lua import ARMING_SCRIPT, INSTALLATION
 
     script = ARMING_SCRIPT.read_text(encoding="utf-8")
-    if getattr(options, "json", False):
+    if options.json:
         print_json({"name": ARMING_SCRIPT.name, "script": script, "installation": list(INSTALLATION)})
         return DONE
     sys.stdout.write(script)
@@ -196,7 +200,7 @@ async def web_token(options: argparse.Namespace) -> int:
     host, port = split_address(config.web.bind)
     url = page_url(host, port)
     token = None if is_loopback(host) else kept_token(config.storage.path)
-    if getattr(options, "json", False):
+    if options.json:
         print_json({"url": url, "token": token})
     else:
         print_address(url, token)
@@ -211,17 +215,9 @@ async def check(options: argparse.Namespace) -> int:
     findings = await run_check(config, options.seconds)
     good = all(finding.good for finding in findings)
     reason = "; ".join(f"{finding.name}: {finding.words}" for finding in findings if not finding.good)
-    if getattr(options, "json", False):
-        print_json(
-            {
-                "state": "good" if good else "failed",
-                "reason": reason,
-                "findings": [dataclasses.asdict(finding) for finding in findings],
-            }
-        )
-    else:
-        print_lines(*show.finding_lines(findings))
-    return DONE if good else FAILED
+    state, found = "good" if good else "failed", [dataclasses.asdict(finding) for finding in findings]
+    answer = {"state": state, "reason": reason, "findings": found}
+    return conclude(options, answer, show.finding_lines(findings), good=good)
 
 
 async def install(options: argparse.Namespace) -> int:
@@ -245,13 +241,12 @@ def _target(options: argparse.Namespace, executable: str) -> Target:
 
 
 def _tell(options: argparse.Namespace, steps: Iterable[Step]) -> int:
-    as_json = getattr(options, "json", False)
     done: list[Step] = []
     for step in steps:
         done.append(step)
-        print_lines(step.line(dry_run=options.dry_run), error=as_json)
+        print_lines(step.line(dry_run=options.dry_run), error=options.json)
     failed = [step for step in done if step.outcome == "failed"]
-    if as_json:
+    if options.json:
         reason = "; ".join(f"{step.what}: {step.words}" for step in failed)
         state = "failed" if failed else "would be done" if options.dry_run else "done"
         print_json({"state": state, "reason": reason, "steps": [dataclasses.asdict(step) for step in done]})
@@ -262,8 +257,7 @@ def _tell(options: argparse.Namespace, steps: Iterable[Step]) -> int:
 
 async def report(options: argparse.Namespace) -> int:
     """`companion report`."""
-    as_json = getattr(options, "json", False)
-    if options.output == "-" and as_json:
+    if options.output == "-" and options.json:
         print_lines("companion report: -o - and --json both want stdout", error=True)
         return USAGE
     directory = _storage(options)
@@ -271,13 +265,13 @@ async def report(options: argparse.Namespace) -> int:
         path, damaged = _make(options, directory)
     except CompanionError as error:
         print_lines(f"companion: {error}", error=True)
-        if as_json:
+        if options.json:
             print_json({"state": "failed", "reason": str(error), "file": None})
         return FAILED
     skipped = f"skipped: {'; '.join(damaged)}" if damaged else ""
     if skipped:
         print_lines(f"companion: {skipped}", error=True)
-    if as_json:
+    if options.json:
         print_json({"state": "done", "reason": skipped, "file": str(path)})
     elif path is not None:
         print_lines(path)

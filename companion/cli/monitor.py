@@ -38,7 +38,7 @@ async def monitor(options: argparse.Namespace) -> int:
     """Watch until Ctrl-C; a daemon that goes away is waited for."""
     path = load_config(options).control.path
     view: _Json | _Screen | _Lines
-    if getattr(options, "json", False):
+    if options.json:
         view = _Json()
     else:
         view = _Screen() if sys.stdout.isatty() and os.environ.get("TERM", "dumb") != "dumb" else _Lines()

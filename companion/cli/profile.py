@@ -13,11 +13,9 @@ import msgspec
 
 from companion.cli.replay_log import add_table_options
 from companion.cli.terminal import (
-    DONE,
-    FAILED,
     AddCommand,
+    conclude,
     load_config,
-    print_json,
     print_lines,
     seconds,
     storage_path,
@@ -119,17 +117,13 @@ async def profile(options: argparse.Namespace) -> int:
             state, reason = "refused", f"not saved: {'; '.join(results[0].broken)}"
         else:
             saved = store.write(_to_save(results[0], options.save))
-    if getattr(options, "json", False):
-        answer = {"state": state, "reason": reason, "file": None if saved is None else str(saved)}
-        print_json({**answer, "imus": [_object(result) for result in results]})
-    else:
-        for result in results:
-            print_lines(*_lines(result))
-        if saved is not None:
-            print_lines(f'saved: {saved}; profile = "{options.save}" in [[imu]] takes it, after a restart')
+    lines = [line for result in results for line in _lines(result)]
+    if saved is not None:
+        lines.append(f'saved: {saved}; profile = "{options.save}" in [[imu]] takes it, after a restart')
     if state == "refused":
         print_lines(f"companion: {reason}", error=True)
-    return DONE if state == "done" else FAILED
+    answer = {"state": state, "reason": reason, "file": None if saved is None else str(saved)}
+    return conclude(options, {**answer, "imus": [_object(result) for result in results]}, lines, good=state == "done")
 
 
 def _compared(options: argparse.Namespace) -> NoiseProfile | None:

@@ -13,7 +13,7 @@ import msgspec
 
 from companion.cli import replay_log, show
 from companion.cli.client import finish
-from companion.cli.terminal import DONE, FAILED, AddCommand, load_config, print_json, print_lines, seconds
+from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds
 from companion.daemon.faces.control import ask
 from companion.errors import ConfigError
 
@@ -102,11 +102,7 @@ def _replay_recording(options: argparse.Namespace) -> int:
     )
     for note in result.notes:
         print_lines(f"note: {note}", error=True)
-    if getattr(options, "json", False):
-        print_json({"state": state, "reason": reason, **msgspec.to_builtins(result)})
-    else:
-        print_lines(*lines)
-    return DONE if good else FAILED
+    return conclude(options, {"state": state, "reason": reason, **msgspec.to_builtins(result)}, lines, good=good)
 
 
 def _lines(result: Result) -> list[str]:

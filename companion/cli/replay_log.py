@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from companion.cli import show
-from companion.cli.terminal import DONE, FAILED, print_json, print_lines, storage_path, within
+from companion.cli.terminal import conclude, print_lines, storage_path, within
 from companion.errors import ConfigError, StorageError
 from companion.physics.units import DEG_H, MG
 
@@ -94,12 +94,10 @@ def replay(options: argparse.Namespace) -> int:
     if options.windows is not None:
         return _windows(options, log, given)
     found = estimate(log, given)
-    if getattr(options, "json", False):
-        print_json({**msgspec.to_builtins(found.record), "log": msgspec.to_builtins(found.used)})
-    else:
-        used = used_lines(found.used, at_rest=given.platform == "ground")
-        print_lines(*show.record_lines(msgspec.to_builtins(found.record)), *used)
-    return DONE if found.record.state == "done" else FAILED
+    record = msgspec.to_builtins(found.record)
+    lines = [*show.record_lines(record), *used_lines(found.used, at_rest=given.platform == "ground")]
+    answer = {**record, "log": msgspec.to_builtins(found.used)}
+    return conclude(options, answer, lines, good=found.record.state == "done")
 
 
 def _log(options: argparse.Namespace) -> StillLog:
@@ -155,14 +153,12 @@ def _windows(options: argparse.Namespace, log: StillLog, given: Given) -> int:
     found = windows(log, given, options.windows)
     reason = "" if found.axes else "no two windows in a row that can be calibrated"
     state = "done" if found.axes else "failed"
-    if getattr(options, "json", False):
-        said = {"left_out": log.left_out, "notes": log.notes}
-        print_json({"state": state, "reason": reason, "windows": msgspec.to_builtins(found), "log": said})
-    else:
-        print_lines(*window_lines(found), *(f"note: {note}" for note in log.notes))
     if reason:
         print_lines(f"companion: {reason}", error=True)
-    return DONE if found.axes else FAILED
+    said = {"left_out": log.left_out, "notes": log.notes}
+    answer = {"state": state, "reason": reason, "windows": msgspec.to_builtins(found), "log": said}
+    lines = [*window_lines(found), *(f"note: {note}" for note in log.notes)]
+    return conclude(options, answer, lines, good=bool(found.axes))
 
 
 def window_lines(found: Windows) -> list[str]:

@@ -45,9 +45,8 @@ async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
         options: of the command line.
         goes_on: the daemon starts behind it, in this process.
     """
-    as_json = getattr(options, "json", False)
     if options.page is None:
-        session = _Session(options, Asking(yes=options.yes, error=as_json))
+        session = _Session(options, Asking(yes=options.yes, error=options.json))
         await _to_the_end(session)
     else:
         from companion.cli.by_page import PageAsking
@@ -57,13 +56,13 @@ async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
             await _to_the_end(session)
             then = "the companion starts, and its own page follows" if goes_on else "this page closes"
             await asking.agrees(f"Read all of it? Then {then}.")
-    if as_json:
+    if options.json:
         print_json(session.answer)
     return DONE if session.answer["state"] != "failed" else FAILED
 
 
 def _bind(options: argparse.Namespace) -> str:
-    if options.yes or getattr(options, "json", False):
+    if options.yes or options.json:
         raise ConfigError("--page asks a person: it goes neither with --yes nor with --json")
     if (wrong := bind_problem(options.page, "--page")) is not None:
         raise ConfigError(wrong)
@@ -185,7 +184,7 @@ class _Session:
             self.asking.say(f"  {place}: {words}")
 
         found = await survey(ports, udp, tell, draft.lines)
-        if not self.asking.yes:
+        if not self.asking.yes and options.page is None:
             self.asking.say("", "Enter takes what stands in [brackets]; Ctrl-C ends, and nothing is written.")
         return found
 

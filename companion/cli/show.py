@@ -12,9 +12,7 @@ from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
     from companion.daemon.process.check import Finding
-    from companion.links.serial.listening import Heard
     from companion.links.serial.ports import SerialPort
-    from companion.protocols.guess import Candidate, Line
 
 Object = dict[str, Any]
 
@@ -316,37 +314,4 @@ def port_lines(ports: Sequence[SerialPort]) -> list[str]:
             lines.append("    the kernel's console is on it: remove its console= from the kernel's command line")
         if port.holders:
             lines.append("    in use by " + ", ".join(f"{holder.name} ({holder.pid})" for holder in port.holders))
-    return lines
-
-
-def heard_lines(port: str, heard: Heard | str) -> list[str]:
-    """Who speaks on a port, and the lines for the configuration."""
-    if isinstance(heard, str):
-        return [f"# not listened to: {heard}"]
-    if heard.candidate is None or heard.line is None:
-        if heard.stranger is not None:
-            return [f"# {port} at {heard.line}: {heard.stranger}"]
-        if not heard.bytes_heard:
-            return [f"# {port}: silent (power? wiring? does it speak only when it is asked?)"]
-        return [f"# {port}: {heard.bytes_heard} bytes, nothing known at any usual speed (levels? another protocol?)"]
-    lines = [f"# {port} at {heard.line}: {heard.candidate.protocol}, {heard.candidate.accepted} frames"]
-    for number, kind in enumerate(heard.candidate.kinds):
-        section = _section_lines(port, heard.candidate, kind, heard.line)
-        # One device in two sections is seldom what is wanted: the second is there to be uncommented.
-        lines += ["# at a pinch also:", *(f"# {line}" for line in section)] if number else section
-    return lines
-
-
-def _section_lines(port: str, candidate: Candidate, kind: str, line: Line) -> list[str]:
-    lines = ["[[imu]]", 'name = "own"', 'source = "serial"'] if kind == "imu" else [f"[{kind}]"]
-    lines += [f'port = "{port}"', f"baud = {line.baud}"]
-    if kind != "imu":
-        lines.append(f'parity = "{line.parity}"')
-    lines.append(f'protocol = "{candidate.protocol}"')
-    if kind == "gradienter":
-        from companion.protocols.registry import PROTOCOLS
-
-        known = PROTOCOLS["gradienter"][candidate.protocol].law
-        hint = "" if known else '  # or "slope", "euler": its data sheet, or docs/calibration.md, tells'
-        lines.append(f'law = "{known or "axis"}"{hint}')
     return lines

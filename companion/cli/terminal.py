@@ -10,7 +10,7 @@ import math
 import shlex
 import shutil
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, NoReturn
 from urllib.parse import quote
@@ -160,6 +160,15 @@ def within(least: float, most: float, kind: type[float] = float, unit: str = "")
 
 seconds: Final = within(1e-3, 1e6, unit=" s")
 """The type of an argument that is a time in seconds."""
+
+
+def conclude(options: argparse.Namespace, answer: Any, lines: Iterable[object], *, good: bool) -> int:
+    """Print a command's result, as JSON or as lines for people; gives the exit code."""
+    if options.json:
+        print_json(answer)
+    else:
+        print_lines(*lines)
+    return DONE if good else FAILED
 
 
 def print_json(value: Any) -> None:

@@ -128,20 +128,21 @@ async def survey(ports: Sequence[str], udp: Sequence[int], tell: Tell, believed:
             found = await listen_udp(port)
         except LinkError as error:
             found = str(error)
-        tell(f"UDP {port}", _in_words(f"UDP {port}", found))
+        tell(f"UDP {port}", in_words(f"UDP {port}", found))
         return found
 
     def first(port: str) -> list[Line]:
         return [*(line for name, line in believed.items() if same_port(name, port)), *AUTOPILOT_LINES]
 
     serial, datagrams = await asyncio.gather(
-        listen_to_all(ports, first, lambda port, found: tell(port, _in_words(port, found))),
+        listen_to_all(ports, first, lambda port, found: tell(port, in_words(port, found))),
         asyncio.gather(*(one(port) for port in udp)),
     )
     return Survey(serial, dict(zip(udp, datagrams, strict=True)))
 
 
-def _in_words(place: str, found: Heard | HeardUdp | str) -> str:
+def in_words(place: str, found: Heard | HeardUdp | str) -> str:
+    """What was heard at a place, in one line."""
     if isinstance(found, str):
         return f"left alone: {found.removeprefix(f'{place}: ')}"
     if isinstance(found, HeardUdp):

@@ -30,8 +30,6 @@ NOT_MESSAGES = {
     "at a start", "while still", "after a flight",
     # A key of `counts` in `status --json`: its words have a row.
     "clock back",
-    # Lines of a configuration, which `companion ports --listen` prints.
-    'name = "own"', 'source = "serial"',
     # What an error of the operating system is recognised by.
     "Operation timed out",
 }  # fmt: skip
