@@ -35,8 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(logs.OneLineFormatter())
-    # What -c and --json are where neither part of the command line has them.
-    options = _parser().parse_args(arguments, argparse.Namespace(json=False))
+    options = _options(arguments)
     try:
         return asyncio.run(_dispatch(options))
     except ConfigError as error:
@@ -56,6 +55,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The reader of our output is gone (| head): nothing is left to say, and nobody to say it to.
         sys.stderr.close()
         return FAILED
+
+
+def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """What the command line says; --json where no part of it does."""
+    return _parser().parse_args(arguments, argparse.Namespace(json=False))
 
 
 async def _dispatch(options: argparse.Namespace) -> int:

@@ -73,7 +73,7 @@ def test_the_session_happens_as_shown(
             for command, expected in session(path):
                 words = shlex.split(command)
                 assert words[0] == "companion", f"{path.name}: {command}: only the companion's commands can be run"
-                code = await cli._dispatch(cli._parser().parse_args(words[1:]))
+                code = await cli._dispatch(cli._options(words[1:]))
                 output = capsys.readouterr()
                 said = output.err + output.out
                 assert code == DONE, f"{command}: {said}"
