@@ -77,8 +77,8 @@ class ParameterClient:
         """Names that this boot of the autopilot has shown not to have: told by silence, that takes seconds to learn."""
         self._types: dict[str, int] = {}
         """MAV_PARAM_TYPE by name, as heard since the last restart; so these exist, however silent it is about them."""
-        link.subscribe(mavlink.MAVLink_param_value_message, self._on_value)
-        link.subscribe(mavlink.MAVLink_param_error_message, self._on_error)
+        vehicle.hear(mavlink.MAVLink_param_value_message, self._on_value)
+        vehicle.hear(mavlink.MAVLink_param_error_message, self._on_error)
         vehicle.on_event.add(self._on_event)
 
     async def read(self, name: str) -> float:
@@ -303,8 +303,6 @@ class ParameterClient:
         return mavlink.MAVLink_param_set_message(*self._target(), _wire_name(name), carried, kind)
 
     def _on_value(self, message: mavlink.MAVLink_param_value_message, _t_s: float) -> None:
-        if not self.vehicle.sent(message):
-            return
         name, value = message.param_id, decode(message, bytewise=self._bytewise)
         self._absent.discard(name)
         if len(self._types) < _REMEMBERED_TYPES or name in self._types:
@@ -315,11 +313,10 @@ class ParameterClient:
         self.on_value.tell(name, value)
 
     def _on_error(self, message: mavlink.MAVLink_param_error_message, _t_s: float) -> None:
-        addressed = message.target_system in (0, self._link.system_id) and message.target_component in (
-            0,
-            self._link.component_id,
-        )
-        if not self.vehicle.sent(message) or not addressed or message.error == _NO_ERROR:
+        system, component = (0, self._link.system_id), (0, self._link.component_id)
+        if message.target_system not in system or message.target_component not in component:
+            return
+        if message.error == _NO_ERROR:
             return
         for inbox in self._inboxes:
             if inbox.name == message.param_id:

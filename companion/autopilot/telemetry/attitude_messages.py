@@ -81,11 +81,11 @@ class TimesyncResponder:
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.answered = 0
-        self._link, self._vehicle = link, vehicle
-        link.subscribe(mavlink.MAVLink_timesync_message, self._on_timesync)
+        self._link = link
+        vehicle.hear(mavlink.MAVLink_timesync_message, self._on_timesync)
 
     def _on_timesync(self, message: mavlink.MAVLink_timesync_message, _t_s: float) -> None:
-        if message.tc1 == 0 and self._vehicle.sent(message):
+        if message.tc1 == 0:
             now_ns = round(asyncio.get_running_loop().time() * 1e9)
             self._link.send(mavlink.MAVLink_timesync_message(now_ns, message.ts1))
             self.answered += 1

@@ -169,27 +169,19 @@ def own_parameters(wanted: Wanted) -> list[Parameter]:
     assert set(AT_ARM) == set(get_args(AtArm))
     gyro, accel = wanted.settings.target_gyro_sigma_rad_s / DEG_H, wanted.settings.target_accel_sigma_m_s2 / MG
 
-    def set_gyro_target(deg_h: float) -> None:
-        wanted.retarget(target_gyro_sigma_rad_s=deg_h * DEG_H)
-
-    def set_accel_target(mg: float) -> None:
-        wanted.retarget(target_accel_sigma_m_s2=mg * MG)
-
-    def set_push(value: float) -> None:
-        wanted.switch(push=bool(_whole("CMP_PUSH", value)))
-
-    def set_tunes(value: float) -> None:
-        wanted.switch(tunes=bool(_whole("CMP_TUNES", value)))
-
-    def set_at_arm(value: float) -> None:
-        wanted.switch(at_arm=AT_ARM[_whole("CMP_AT_ARM", value)])
-
+    aim, switch = wanted.retarget, wanted.switch
     return [
-        Parameter("CMP_GYR_TGT", gyro, 0.01, LARGEST, set_gyro_target),
-        Parameter("CMP_ACC_TGT", accel, 0.0001, LARGEST, set_accel_target),
-        Parameter("CMP_PUSH", wanted.push, 0.0, 1.0, set_push),
-        Parameter("CMP_AT_ARM", AT_ARM.index(wanted.at_arm), 0.0, 2.0, set_at_arm),
-        Parameter("CMP_TUNES", wanted.tunes, 0.0, 1.0, set_tunes),
+        Parameter("CMP_GYR_TGT", gyro, 0.01, LARGEST, lambda value: aim(target_gyro_sigma_rad_s=value * DEG_H)),
+        Parameter("CMP_ACC_TGT", accel, 0.0001, LARGEST, lambda value: aim(target_accel_sigma_m_s2=value * MG)),
+        Parameter("CMP_PUSH", wanted.push, 0.0, 1.0, lambda value: switch(push=bool(_whole("CMP_PUSH", value)))),
+        Parameter(
+            "CMP_AT_ARM",
+            AT_ARM.index(wanted.at_arm),
+            0.0,
+            2.0,
+            lambda value: switch(at_arm=AT_ARM[_whole("CMP_AT_ARM", value)]),
+        ),
+        Parameter("CMP_TUNES", wanted.tunes, 0.0, 1.0, lambda value: switch(tunes=bool(_whole("CMP_TUNES", value)))),
         Parameter("CMP_STATE", 0.0, 0.0, 3.0),
         Parameter("CMP_GYR_SIG", 0.0, 0.0, LARGEST),
         Parameter("CMP_ACC_SIG", 0.0, 0.0, LARGEST),

@@ -17,7 +17,6 @@ from companion.autopilot.telemetry.attitude_messages import (
     microseconds,
     vision_position_estimate,
 )
-from companion.autopilot.vehicle.commands import StandingRequests
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.component.statustext import Severity, Weight
 from companion.configured import models
@@ -36,8 +35,6 @@ logger = logging.getLogger(__name__)
 
 TICK_S: Final = 0.1
 LOOK_S: Final = 0.5
-ATTITUDE_RATE_HZ: Final = 10.0
-"""Rate of ATTITUDE asked of the autopilot, for comparison."""
 VFR_HUD_RATE_HZ: Final = 5.0
 AIRSPEED_OLD_S: Final = 1.0
 INTERNAL: Final = "internal error; the log has the details"
@@ -107,15 +104,11 @@ class AttitudeService:
         """Of `run`, so that it is seen to go on."""
         self._config, self._vehicle, self._say = config, vehicle, core.say
         self.carrier = Carrier(core, carrying_imu(config), in_force, alignment)
-        self.difference = Difference(link, vehicle, self.carrier.now, self.carrier.kept_at)
+        self.difference = Difference(vehicle, self.carrier.now, self.carrier.kept_at)
         self.health = Health(self.carrier, self.difference, vehicle)
         self.sender = Sender(link, models.attitude_rate_hz(config), full=config.push.attitude == "full")
         self.timesync = TimesyncResponder(link, vehicle)
-        self._wanted = StandingRequests(vehicle.commands)
-        self._wanted.add(mavlink.MAVLink_attitude_message, ATTITUDE_RATE_HZ)
-        link.subscribe(mavlink.MAVLink_attitude_message, self._on_attitude)
-        link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
-        link.subscribe(mavlink.MAVLink_vfr_hud_message, self._on_vfr_hud)
+        vehicle.hear(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
         self._fixed_wing = False
         self._airspeed_s = -math.inf
         self._looked_s = -math.inf
@@ -178,22 +171,18 @@ class AttitudeService:
             return
         self.sender.send(firmware, attitude, self.carrier.reset_counter, read_s)
 
-    def _on_attitude(self, message: mavlink.MAVLink_attitude_message, t_s: float) -> None:
-        if self._vehicle.sent(message):
-            self._wanted.heard(message, t_s)
-
     def _on_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, _t_s: float) -> None:
-        if self._vehicle.sent(message) and not self._fixed_wing and message.type == mavlink.MAV_TYPE_FIXED_WING:
+        if not self._fixed_wing and message.type == mavlink.MAV_TYPE_FIXED_WING:
             self._fixed_wing = True
-            self._wanted.add(mavlink.MAVLink_vfr_hud_message, VFR_HUD_RATE_HZ)
+            self._vehicle.hear(mavlink.MAVLink_vfr_hud_message, self._on_vfr_hud, VFR_HUD_RATE_HZ)
 
     def _on_vfr_hud(self, message: mavlink.MAVLink_vfr_hud_message, t_s: float) -> None:
         """Of a fixed wing only: of others ArduPilot says the speed over ground here."""
-        if not self._vehicle.sent(message):
-            return
-        self._wanted.heard(message, t_s)
-        flies = self._fixed_wing and self.carrier.phase == "flight"
-        good = flies and math.isfinite(message.airspeed) and message.airspeed > SLOWEST_AIRSPEED_M_S
+        good = (
+            self.carrier.phase == "flight"
+            and math.isfinite(message.airspeed)
+            and message.airspeed > SLOWEST_AIRSPEED_M_S
+        )
         self.carrier.flies_at(message.airspeed if good else None)
         self._airspeed_s = t_s
 
@@ -224,8 +213,6 @@ class AttitudeService:
         if self._autopilot_imu is not None:
             kind = self._autopilot_imu.stream.kind
             self.carrier.steps_by(kind.gyro_step_rad_s if kind is not None and kind.truncates else 0.0)
-        if self._vehicle.alive:
-            self._wanted.ask_for_missing(now_s)
         self.health.judge(now_s)
         if now_s - self._looked_s >= LOOK_S:
             self._looked_s = now_s

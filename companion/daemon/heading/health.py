@@ -22,7 +22,6 @@ from companion.attitude.quaternion import (
 )
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.daemon.heading.carrier import Carrier
-from companion.links.mavlink.link import MavlinkLink
 from companion.physics.units import DEG
 
 SILENT_S: Final = 0.2
@@ -30,6 +29,8 @@ HEADING_SIGMA_DEG: Final = 15.0
 TILT_SIGMA_DEG: Final = 15.0
 DIFFERS_SIGMAS: Final = 3.0
 DIFFERS_S: Final = 5.0
+ATTITUDE_RATE_HZ: Final = 10.0
+"""Rate of ATTITUDE asked of the autopilot, for comparison."""
 THEIR_TILT_DEG: Final = 2.0
 """One sigma of the error of the autopilot's own tilt, with trim (AHRS_TRIM) and mounting errors."""
 THEIR_HEADING_DEG: Final = 5.0
@@ -58,16 +59,15 @@ class Difference:
 
     def __init__(
         self,
-        link: MavlinkLink,
         vehicle: Vehicle,
         now: Callable[[], Attitude | None],
         kept_at: Callable[[float], tuple[float, Quaternion] | None],
     ) -> None:
-        self._vehicle, self._now, self._kept_at = vehicle, now, kept_at
+        self._now, self._kept_at = now, kept_at
         self._offset_s: float | None = None
         self._heard_s = -math.inf
         self.forget()
-        link.subscribe(mavlink.MAVLink_attitude_message, self._on_attitude)
+        vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, ATTITUDE_RATE_HZ)
 
     def forget(self) -> None:
         """What we carry has been set anew."""
@@ -91,7 +91,7 @@ class Difference:
 
     def _on_attitude(self, message: mavlink.MAVLink_attitude_message, t_s: float) -> None:
         angles = (message.roll, message.pitch, message.yaw)
-        if not self._vehicle.sent(message) or not all(map(math.isfinite, angles)):
+        if not all(map(math.isfinite, angles)):
             return
         late_s = self._late_s(message.time_boot_ms * 1e-3, t_s)
         ours = self._now()

@@ -15,14 +15,13 @@ import re
 from typing import ClassVar
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import LineDecoder, RejectedError
+from companion.protocols.decoding.base import DAMAGED, LineDecoder, RejectedError
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample
 
 _DEGREES = re.compile(rb"[+-]?\d{1,3}\.\d{1,3}")
 _COUNTS = re.compile(rb"[+-]?\d{1,6}")
 _FRAGMENT = re.compile(rb"[-+0-9., ]+")
-_DAMAGED = re.compile(rb"[\x00\x80-\xff]")
 _COUNTS_LIMIT = 32768
 _SURE = 3
 """After so many three-number lines running, one lone number is the debris of two lines, until it has company."""
@@ -32,12 +31,8 @@ class Hmr3300Decoder(LineDecoder):
     """Lines of an HMR3300 or HMR3200; gives `CompassSample`, or `MagSample` in counts in mode *M."""
 
     LIMIT: ClassVar[int] = 40
-
-    def __init__(self, seconds_per_byte: float = 0.0) -> None:
-        super().__init__(seconds_per_byte)
-        self._follows_line_end = True
-        self._triples = 0
-        self._singles = 0
+    _follows_line_end = True
+    _triples = _singles = 0
 
     def interrupted(self) -> None:
         """Forget the line under way, and do not believe the next one: it may lack its first digits."""
@@ -52,7 +47,7 @@ class Hmr3300Decoder(LineDecoder):
             # A bare line feed in mid-stream may have been a line's first digit; after a gap it is the end of the CR LF.
             self._follows_line_end = bool(line) or not follows_line_end
             return None
-        if _DAMAGED.search(line):
+        if DAMAGED.search(line):
             raise RejectedError(reasons.PARITY)
         text = line.removesuffix(b"\r")
         if text == line or b"\r" in text:

@@ -23,7 +23,7 @@ import math
 from typing import Final, Literal
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import RejectedError, SentenceDecoder, check_vector
+from companion.protocols.decoding.base import RejectedError, SentenceDecoder, check_vector, full_circle, out_of_range
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
@@ -58,13 +58,9 @@ _FIELDS: Final = (b"MAGX", b"MAGY", b"MAGZ")
 class NmeaDecoder(SentenceDecoder):
     """Sentences of compasses; gives `CompassSample`, `TiltSample` where there is no heading, and `MagSample`."""
 
-    def __init__(self, seconds_per_byte: float = 0.0) -> None:
-        super().__init__(seconds_per_byte)
-        self._heading_from = _NOBODY
-        """The sentence that gives headings, and when it was last heard."""
-        self._heading_s = 0.0
-        self._tilt_from = _NOBODY
-        self._tilt_s = 0.0
+    _heading_from = _tilt_from = _NOBODY
+    """The sentences that give headings and tilts, and when they were last heard."""
+    _heading_s = _tilt_s = 0.0
 
     def interrupted(self) -> None:
         """Forget the sentence under way, and which one leads: it may be another device."""
@@ -94,7 +90,7 @@ class NmeaDecoder(SentenceDecoder):
                 heading_deg = (heading_deg + _easting(fields[2], fields[3])) % 360.0
         elif fields[2] not in marks:
             raise RejectedError(reasons.NOT_A_MEASUREMENT if rank == _THS else reasons.UNKNOWN_FIELD)
-        heading_deg = _full_circle(heading_deg)
+        heading_deg = full_circle(heading_deg)
         self._claim_heading(rank, t_s)
         samples.append(CompassSample(t_s, heading_deg, None, None, north))
 
@@ -124,8 +120,8 @@ class NmeaDecoder(SentenceDecoder):
             pitch_deg, roll_deg = pitch_deg * _DEGREES_PER_MIL, roll_deg * _DEGREES_PER_MIL
             heading_deg *= _DEGREES_PER_MIL
         if not (-90.0 <= pitch_deg <= 90.0 and -90.0 <= roll_deg <= 90.0):
-            raise _out_of_range(pitch_deg + roll_deg)
-        heading_deg = _full_circle(heading_deg)
+            raise out_of_range(pitch_deg + roll_deg)
+        heading_deg = full_circle(heading_deg)
         if no_heading:
             samples.append(TiltSample(t_s, roll_deg, pitch_deg))
         else:
@@ -149,7 +145,7 @@ class NmeaDecoder(SentenceDecoder):
             samples.append(TiltSample(t_s, roll_deg, pitch_deg))
         else:
             north = _NORTHS[_CCD]
-            samples.append(CompassSample(t_s, _full_circle(heading_deg), pitch_deg, roll_deg, north))
+            samples.append(CompassSample(t_s, full_circle(heading_deg), pitch_deg, roll_deg, north))
 
     def _xdr(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
         if len(fields) % 4 != 1:
@@ -187,24 +183,11 @@ def _check_statuses(statuses: tuple[bytes, bytes, bytes]) -> None:
         raise RejectedError(reasons.ALARM)
 
 
-def _out_of_range(value: float) -> RejectedError:
-    return RejectedError(reasons.OUT_OF_RANGE if math.isfinite(value) else reasons.NON_FINITE)
-
-
-def _full_circle(heading_deg: float) -> float:
-    """The same heading, where a device has rounded 359.96 to 360.0."""
-    if heading_deg == 360.0:
-        return 0.0
-    if not 0.0 <= heading_deg < 360.0:
-        raise _out_of_range(heading_deg)
-    return heading_deg
-
-
 def _easting(field: bytes, side: bytes) -> float:
     """A deviation, to the east positive."""
     value = float(field)
     if not 0.0 <= value <= 180.0:
-        raise _out_of_range(value)
+        raise out_of_range(value)
     if side == b"E":
         return value
     if side != b"W":
@@ -218,7 +201,7 @@ def _tilt(field: bytes) -> float:
         raise RejectedError(reasons.OVER_RANGE)
     value = float(field)
     if not -90.0 <= value <= 90.0:
-        raise _out_of_range(value)
+        raise out_of_range(value)
     return value
 
 

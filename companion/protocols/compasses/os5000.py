@@ -15,7 +15,7 @@ import re
 from typing import Final
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import TEMPERATURE_LIMIT_DEGC, RejectedError, SentenceDecoder
+from companion.protocols.decoding.base import TEMPERATURE_LIMIT_DEGC, RejectedError, SentenceDecoder, full_circle
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
 FIELD_LIMIT_GAUSS: Final = 2.0
@@ -43,31 +43,19 @@ class Os5000Decoder(SentenceDecoder):
         if pitch is None or roll is None:
             if heading is None:
                 raise RejectedError(reasons.NOTHING_OF_USE)
-            samples.append(CompassSample(t_s, _heading(heading), None, None, None, temperature_degc))
+            samples.append(CompassSample(t_s, full_circle(float(heading)), None, None, None, temperature_degc))
         else:
             pitch_deg, roll_deg = float(pitch), float(roll)
             if not (-90.0 <= pitch_deg <= 90.0 and -180.0 <= roll_deg <= 180.0):
                 raise RejectedError(reasons.OUT_OF_RANGE)
             if heading is None:
-                samples.append(_tilt(t_s, roll_deg, pitch_deg, temperature_degc))
+                if abs(roll_deg) > 90.0:  # upside down: no gradienter
+                    raise RejectedError(reasons.OUT_OF_RANGE)
+                samples.append(TiltSample(t_s, roll_deg, pitch_deg, temperature_degc))
             else:
-                samples.append(CompassSample(t_s, _heading(heading), pitch_deg, roll_deg, None, temperature_degc))
+                heading_deg = full_circle(float(heading))
+                samples.append(CompassSample(t_s, heading_deg, pitch_deg, roll_deg, None, temperature_degc))
         if more and (vector := _VECTOR.search(more)):
             x, y, z = (float(field) / 1000.0 for field in vector.groups())
             if max(abs(x), abs(y), abs(z)) <= FIELD_LIMIT_GAUSS:
                 samples.append(MagSample(t_s, (x, y, z)))
-
-
-def _heading(field: bytes) -> float:
-    heading_deg = float(field)
-    if heading_deg == 360.0:  # 359.96, rounded by the device
-        return 0.0
-    if not 0.0 <= heading_deg < 360.0:
-        raise RejectedError(reasons.OUT_OF_RANGE)
-    return heading_deg
-
-
-def _tilt(t_s: float, roll_deg: float, pitch_deg: float, temperature_degc: float | None) -> TiltSample:
-    if abs(roll_deg) > 90.0:  # upside down: no gradienter
-        raise RejectedError(reasons.OUT_OF_RANGE)
-    return TiltSample(t_s, roll_deg, pitch_deg, temperature_degc)

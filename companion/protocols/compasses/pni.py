@@ -70,11 +70,9 @@ class PniDecoder(FrameDecoder):
     A frame with pitch and roll but no heading gives a `TiltSample` (law "euler").
     """
 
-    def __init__(self, seconds_per_byte: float = 0.0) -> None:
-        super().__init__(seconds_per_byte)
-        self._little = False
-        self._contrary = 0
-        """Frames running that are measurements only in the other byte order."""
+    _little = False
+    _contrary = 0
+    """Frames running that are measurements only in the other byte order."""
 
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         if buffer[at]:

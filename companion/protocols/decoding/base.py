@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import binascii
 import math
+import re
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable
@@ -25,12 +26,11 @@ _STALL_S = 10.0
 
 
 class RejectedError(Exception):
-    """A frame cannot be used; its one argument is the reason to count. Never leaves this room."""
+    """A frame cannot be used; the reason is a counter of `Decoder.rejected`. Never leaves this room."""
 
-    @property
-    def reason(self) -> str:
-        """Which counter of `Decoder.rejected` it belongs to."""
-        return str(self.args[0])
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
 
 
 class Decoder(ABC):
@@ -98,11 +98,8 @@ class LineDecoder(Decoder):
     """
 
     LIMIT: ClassVar[int] = 80
-
-    def __init__(self, seconds_per_byte: float = 0.0) -> None:
-        super().__init__(seconds_per_byte)
-        self._partial = b""
-        self._cut = False
+    _partial = b""
+    _cut = False
 
     def feed(self, data: bytes, t_s: float) -> list[Sample]:  # noqa: D102 - as in the base class
         text = self._partial + data
@@ -154,10 +151,8 @@ class SentenceDecoder(Decoder):
     LIMIT: ClassVar[int] = 160
     """Bytes of a sentence from its "$" on; what is longer is none."""
 
-    def __init__(self, seconds_per_byte: float = 0.0) -> None:
-        super().__init__(seconds_per_byte)
-        self._partial = b""
-        """From the "$" of the sentence under way; empty outside of one."""
+    _partial = b""
+    """From the "$" of the sentence under way; empty outside of one."""
 
     def feed(self, data: bytes, t_s: float) -> list[Sample]:  # noqa: D102 - as in the base class
         text = self._partial + data.replace(b"\r", b"\n")
@@ -286,6 +281,28 @@ def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | 
         and -TEMPERATURE_LIMIT_DEGC <= temperature <= TEMPERATURE_LIMIT_DEGC
     ):
         raise RejectedError(reasons.OUT_OF_RANGE)
+
+
+DAMAGED: Final = re.compile(rb"[\x00\x80-\xff]")
+"""What text never holds: a byte that came with the wrong parity, or was read at the wrong speed."""
+
+
+def out_of_range(value: float) -> RejectedError:
+    """For a value that is beyond its range, or no number."""
+    return RejectedError(reasons.OUT_OF_RANGE if math.isfinite(value) else reasons.NON_FINITE)
+
+
+def full_circle(heading_deg: float) -> float:
+    """The same heading, where a device has rounded 359.96 to 360.0.
+
+    Raises:
+        RejectedError: it is beyond a circle.
+    """
+    if heading_deg == 360.0:
+        return 0.0
+    if not 0.0 <= heading_deg < 360.0:
+        raise out_of_range(heading_deg)
+    return heading_deg
 
 
 def check_vector(vector: Vector) -> None:

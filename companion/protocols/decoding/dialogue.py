@@ -23,9 +23,8 @@ LONGEST_PAUSE_S: Final = 64.0
 class Dialogue(ABC):
     """The companion's half of the conversation with one device, on one opened port after another."""
 
-    def __init__(self) -> None:
-        self.words = ""
-        """What was last asked of the device, for people; empty while nothing was ("stream started with S")."""
+    words = ""
+    """What was last asked of the device, for people; empty while nothing was ("stream started with S")."""
 
     @abstractmethod
     def opened(self, t_s: float) -> None:
@@ -51,16 +50,13 @@ class PollDialogue(Dialogue):
     """Said before the first question, and before the one after a question in vain: it may have been without power."""
     PERIOD_S: ClassVar[float]
     NAME: ClassVar[str]
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._quiet_until_s = self._next_s = 0.0
-        self._asked_s: float | None = None
-        """When the question was put that has not been answered yet."""
-        self._since_asked = 0
-        """Bytes that came since then."""
-        self._set_up = False
-        self._unanswered = 0
+    _quiet_until_s = _next_s = 0.0
+    _asked_s: float | None = None
+    """When the question was put that has not been answered yet."""
+    _since_asked = 0
+    """Bytes that came since then."""
+    _set_up = False
+    _unanswered = 0
 
     def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
         self._quiet_until_s, self._asked_s, self._set_up, self._unanswered = t_s + SILENT_S, None, False, 0
@@ -100,12 +96,9 @@ class WakeDialogue(Dialogue):
 
     SAYINGS: ClassVar[tuple[tuple[bytes, str], ...]]
     """What to send, and the words for it."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._quiet_since_s: float | None = None
-        self._pause_s = SILENT_S
-        self._next = 0
+    _quiet_since_s: float | None = None
+    _pause_s = SILENT_S
+    _next = 0
 
     def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
         self._quiet_since_s, self._pause_s, self._next, self.words = t_s, SILENT_S, 0, ""

@@ -149,23 +149,20 @@ class Stim300Decoder(FrameDecoder):
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)
-        self._in_step = True
         self._forget()
 
     def _forget(self) -> None:
         """It may be another device, or the same with other settings."""
+        self._in_step = True
         self._accel_bits = [_ASSUMED_BITS] * 3
         self._range_known = False
-        self._rest_bits = 0
-        """The range in which gravity has been seen since `_rest_ticks`."""
-        self._rest_ticks = 0
+        self._rest_bits = self._rest_ticks = 0
+        """The range in which gravity has been seen, and for how long."""
         self._counter: int | None = None
-        self._imu_unit_right = True
-        self._inclination_unit_right = True
+        self._imu_unit_right = self._inclination_unit_right = True
 
     def interrupted(self) -> None:  # noqa: D102 - as in the base class
         super().interrupted()
-        self._in_step = True
         self._forget()
 
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:

@@ -255,33 +255,26 @@ class VectorNavDecoder(FrameDecoder):
         return self._accept(samples, _decode, buffer[at:end], self._time_of(origin + end + 1), end=end)
 
 
+_SENTENCES: dict[bytes, tuple[int, slice, slice]] = {
+    b"VNYMR": (12, slice(3, 12), slice(0, 0)),
+    b"VNIMU": (11, slice(0, 9), slice(9, 10)),
+}
+"""How many numbers there are, and which are field, force and rate, and the temperature."""
+
+
 def _decode(sentence: bytes, t_s: float) -> list[Sample]:
     """The samples in one sentence, `$VN...*hh`."""
-    fields = body_of_sentence(sentence).split(b",")
-    head = fields[0]
-    if head == b"VNYMR":
-        return _decode_ymr(fields, t_s)
-    if head == b"VNIMU":
-        return _decode_imu(fields, t_s)
+    head, *fields = body_of_sentence(sentence).split(b",")
     if head == b"VNERR":
         raise RejectedError("VNERR")
-    raise RejectedError(reasons.REPLY if head in _REPLIES else reasons.UNKNOWN_SENTENCE)
-
-
-def _decode_ymr(fields: list[bytes], t_s: float) -> list[Sample]:
-    if len(fields) != 13:
+    if head not in _SENTENCES:
+        raise RejectedError(reasons.REPLY if head in _REPLIES else reasons.UNKNOWN_SENTENCE)
+    count, vectors, temperature = _SENTENCES[head]
+    if len(fields) != count:
         raise RejectedError(reasons.FIELD_COUNT)
-    *_, mx, my, mz, ax, ay, az, gx, gy, gz = numbers(fields[1:])
-    gyro_rad_s, accel_m_s2 = (gx, gy, gz), (ax, ay, az)
-    check_imu(gyro_rad_s, accel_m_s2, None)
-    return [ImuSample(t_s, gyro_rad_s, accel_m_s2), MagSample(t_s, (mx, my, mz))]
-
-
-def _decode_imu(fields: list[bytes], t_s: float) -> list[Sample]:
-    if len(fields) != 12:
-        raise RejectedError(reasons.FIELD_COUNT)
-    mx, my, mz, ax, ay, az, gx, gy, gz, temperature_degc, _pressure_kpa = numbers(fields[1:])
-    gyro_rad_s, accel_m_s2 = (gx, gy, gz), (ax, ay, az)
+    values = numbers(fields)
+    mx, my, mz, ax, ay, az, gx, gy, gz = values[vectors]
+    gyro_rad_s, accel_m_s2, temperature_degc = (gx, gy, gz), (ax, ay, az), next(iter(values[temperature]), None)
     check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
     return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc), MagSample(t_s, (mx, my, mz))]
 

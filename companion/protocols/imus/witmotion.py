@@ -52,15 +52,12 @@ class WitMotionDecoder(FrameDecoder):
     without its neighbour neither is used.
     """
 
-    def __init__(self, seconds_per_byte: float = 0.0) -> None:
-        super().__init__(seconds_per_byte)
-        self._good_at = -1
-        """Stream position of a frame that was found good when it followed another, or that waits for one to follow."""
-        self._accel: tuple[int, Vector, float] | None = None
-        """End of the last acceleration's frame, which waits for its rate; m/s^2, degrees Celsius."""
+    _good_at = -1
+    """Stream position of a frame that was found good when it followed another, or that waits for one to follow."""
+    _accel: tuple[int, Vector, float] | None = None
+    """End of the last acceleration's frame, which waits for its rate; m/s^2, degrees Celsius."""
 
-    def interrupted(self) -> None:
-        """Forget the frames and the epoch under way."""
+    def interrupted(self) -> None:  # noqa: D102 - as in the base class
         super().interrupted()
         self._drop_accel()
 

@@ -48,10 +48,7 @@ class XsensDecoder(FrameDecoder):
     device_clock_wraps_s: ClassVar[float | None] = 2**32 / _TICKS_A_SECOND
     clock_from_start: ClassVar[bool] = True
     sequence_modulus: ClassVar[int | None] = 2**16
-
-    def __init__(self, seconds_per_byte: float = 0.0) -> None:
-        super().__init__(seconds_per_byte)
-        self._temperature_degc: float | None = None
+    _temperature_degc: float | None = None
 
     def interrupted(self) -> None:  # noqa: D102 - as in the base class
         super().interrupted()
@@ -165,10 +162,8 @@ class XsensDialogue(WakeDialogue):
     SAYINGS = ((bytes.fromhex("FAFF1000F1"), "measurement started with GoToMeasurement"),)
     WAKE_UP: ClassVar[bytes] = bytes.fromhex("FAFF3E00C3")
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._tail = b""
-        self._woken = False
+    _tail = b""
+    _woken = False
 
     def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
         super().opened(t_s)

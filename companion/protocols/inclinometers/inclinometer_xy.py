@@ -14,7 +14,7 @@ import re
 from typing import ClassVar, Literal
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import LineDecoder, RejectedError
+from companion.protocols.decoding.base import DAMAGED, LineDecoder, RejectedError
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import TiltSample
 
@@ -23,7 +23,6 @@ _DEGREES = re.compile(rb"[+-]\d\d\.(\d{2,3})")
 _SENTINEL = re.compile(rb"\+{3,}|-{3,}")
 _SINGLE_AXIS = re.compile(rb"[+-]\d\d\.\d{2,3}")
 _ECHO = re.compile(rb"[A-Za-z*]{1,8}")
-_DAMAGED = re.compile(rb"[\x00\x80-\xff]")
 _SURE = 4
 """How many readings in a row with fewer decimals than before make them the device's way; fewer have lost a digit."""
 
@@ -34,17 +33,11 @@ class InclinometerXyDecoder(LineDecoder):
     """Pairs of lines of an `X=.../Y=...` gradienter; gives `TiltSample`, timed at the end of the Y line."""
 
     LIMIT: ClassVar[int] = 64
+    _x_deg: float | Literal["spoiled"] | None = None
+    """The X that waits for its Y; "spoiled" when it was rejected, and its Y with it."""
+    _x_bytes = _decimals = _fewer_running = 0
 
-    def __init__(self, seconds_per_byte: float = 0.0) -> None:
-        super().__init__(seconds_per_byte)
-        self._x_deg: float | Literal["spoiled"] | None = None
-        """The X that waits for its Y; "spoiled" when it was rejected, and its Y with it."""
-        self._x_bytes = 0
-        self._decimals = 0
-        self._fewer_running = 0
-
-    def interrupted(self) -> None:
-        """Forget the line and the X under way."""
+    def interrupted(self) -> None:  # noqa: D102 - as in the base class
         super().interrupted()
         self._drop_x()
 
@@ -75,7 +68,7 @@ class InclinometerXyDecoder(LineDecoder):
         return self._x_bytes + len(line) + 1
 
     def _why_no_axis(self, line: bytes, *, cut: bool) -> str:
-        if _DAMAGED.search(line):
+        if DAMAGED.search(line):
             return reasons.PARITY
         if cut:
             return reasons.TOO_LONG
@@ -85,9 +78,7 @@ class InclinometerXyDecoder(LineDecoder):
         """What stands in front of the last axis of a line: an echo, or something that has lost its line end."""
         if not cut and _ECHO.fullmatch(before):
             return
-        self.rejected[
-            reasons.PARITY if _DAMAGED.search(before) else reasons.TOO_LONG if cut else reasons.CUT_SHORT
-        ] += 1
+        self.rejected[reasons.PARITY if DAMAGED.search(before) else reasons.TOO_LONG if cut else reasons.CUT_SHORT] += 1
         self._drop_x()
 
     def _x(self, text: bytes) -> None:
@@ -108,7 +99,7 @@ class InclinometerXyDecoder(LineDecoder):
         return TiltSample(t_s, x_deg, y_deg)
 
     def _degrees(self, text: bytes) -> float:
-        if _DAMAGED.search(text):
+        if DAMAGED.search(text):
             raise RejectedError(reasons.PARITY)
         value = text.removesuffix(b"\r")
         if value == text:

@@ -19,7 +19,13 @@ import re
 from typing import ClassVar, Final
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import TEMPERATURE_LIMIT_DEGC, LineDecoder, RejectedError, body_of_sentence
+from companion.protocols.decoding.base import (
+    DAMAGED,
+    TEMPERATURE_LIMIT_DEGC,
+    LineDecoder,
+    RejectedError,
+    body_of_sentence,
+)
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import TiltSample
 
@@ -36,7 +42,6 @@ _TCM: Final = re.compile(rb"\$P%bR%b\*.." % (_PADDED, _PADDED))
 _TILTS: Final = {b"D": re.compile(rb"%b|%b" % (_PADDED, _PLAIN)), b"M": re.compile(_MICRORADIANS)}
 
 _START: Final = re.compile(rb".*(?=\$)", re.DOTALL)
-_DAMAGED: Final = re.compile(rb"[\x00\x80-\xff]")
 
 
 class JewellDecoder(LineDecoder):
@@ -60,7 +65,7 @@ class JewellDecoder(LineDecoder):
 
 def _why(text: bytes, *, cut: bool) -> str:
     """Why this is no line, or no line any more."""
-    if _DAMAGED.search(text):
+    if DAMAGED.search(text):
         return reasons.PARITY
     if cut:
         return reasons.TOO_LONG
@@ -70,7 +75,7 @@ def _why(text: bytes, *, cut: bool) -> str:
 
 
 def _reading(text: bytes, t_s: float) -> TiltSample:
-    if _DAMAGED.search(text):
+    if DAMAGED.search(text):
         raise RejectedError(reasons.PARITY)
     if b"\r" in text:
         raise RejectedError(reasons.LINE_END)
