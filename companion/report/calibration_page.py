@@ -10,7 +10,7 @@ import msgspec
 
 from companion.calibration.collector.trace import Trace
 from companion.calibration.records.record import Arming, ImuRecord, Outcome, Record, outcome_word
-from companion.report.markup import Child, Markup, join, number, tag
+from companion.report.markup import Child, Markup, cell, join, number, row, tag
 from companion.report.page import (
     AXES,
     MAX_IMUS,
@@ -29,8 +29,6 @@ from companion.report.page import (
 )
 from companion.report.seconds import stillness
 from companion.samples import Triad
-
-MAX_WRITTEN: Final = 60
 
 _OUTCOMES: Final[dict[Outcome, tuple[str, str]]] = {
     "verified": ("ok", "read back, and seen in the telemetry"),
@@ -70,7 +68,7 @@ def calibration_page(material: Material, now: datetime.datetime) -> str:
         if len(record.imus) > MAX_IMUS
         else None,
         _written(record),
-        _armings(material),
+        join(tag("h2", "Armed with it"), arming_items(material.armings)) if material.armings else None,
         _pose(record),
         stillness(material.trace, material.no_trace),
         _drift(material),
@@ -153,16 +151,14 @@ def _triad(imu: ImuRecord, triad: Triad) -> Markup:
     rows = []
     for k in range(3):
         value, sigma = with_sigma(bias[k], use[k], unit)
+        key = f"{imu.name}.{triad}.{{}}.{AXES[k]}".format
         rows.append(
-            tag(
-                "tr",
-                tag("td", AXES[k]),
-                tag("td", value, data_key=f"{imu.name}.{triad}.bias.{AXES[k]}"),
-                tag("td", "±", sigma, data_key=f"{imu.name}.{triad}.sigma_use.{AXES[k]}"),
-                tag("td", with_sigma(0.0, stat[k], unit)[1], data_key=f"{imu.name}.{triad}.sigma_stat.{AXES[k]}"),
-                tag("td", with_sigma(left[k], use[k], unit)[0], data_key=f"{imu.name}.{triad}.residual.{AXES[k]}")
-                if left
-                else None,
+            row(
+                AXES[k],
+                cell(key("bias"), value),
+                cell(key("sigma_use"), "±", sigma),
+                cell(key("sigma_stat"), with_sigma(0.0, stat[k], unit)[1]),
+                cell(key("residual"), with_sigma(left[k], use[k], unit)[0]) if left else None,
             )
         )
     heads = ["", "bias", "σ use", "σ stat", *(["residual"] if left else [])]
@@ -187,41 +183,28 @@ def _written(record: Record) -> Markup | None:
         if not imu.written:
             continue
         rows = []
-        for name, one in list(imu.written.items())[:MAX_WRITTEN]:
+        for name, one in imu.written.items():
             seen.add(one.outcome)
             class_, _ = _OUTCOMES[one.outcome]
+            head = tag("td", name, ": ", tag("strong", outcome_word(one.outcome), class_=class_), colspan="3")
+            values = (("before", one.before), ("after", one.after), ("read back", one.read_back))
             rows += [
-                tag(
-                    "tr",
-                    tag("td", name, ": ", tag("strong", outcome_word(one.outcome), class_=class_), colspan="3"),
-                    class_="name",
-                ),
-                tag(
-                    "tr",
-                    tag("td", tag("small", "before"), _setting(one.before), data_key=f"{name}.before"),
-                    tag("td", tag("small", "after"), _setting(one.after), data_key=f"{name}.after"),
-                    tag("td", tag("small", "read back"), _setting(one.read_back), data_key=f"{name}.read_back"),
+                row(head, class_="name"),
+                row(
+                    *(
+                        cell(f"{name}.{words.replace(' ', '_')}", tag("small", words), _setting(value))
+                        for words, value in values
+                    ),
                     class_="values",
                 ),
             ]
-        more = len(imu.written) - MAX_WRITTEN
-        parts += [
-            tag("h3", f"IMU {imu.name}"),
-            tag("table", *rows, class_="setting"),
-            tag("p", f"{more} more are not shown.") if more > 0 else None,
-        ]
+        parts += [tag("h3", f"IMU {imu.name}"), tag("table", *rows, class_="setting")]
     parts += [tag("p", f"{outcome_word(outcome)}: {_OUTCOMES[outcome][1]}.", class_="soft") for outcome in sorted(seen)]
     return tag("section", *parts)
 
 
 def _setting(value: float | None) -> Markup:
     return tag("span", "unknown") if value is None else number(value, ".6g")
-
-
-def _armings(material: Material) -> Markup | None:
-    if not material.armings:
-        return None
-    return join(tag("h2", "Armed with it"), arming_items(material.armings))
 
 
 # ----------------------------------------------------------------------------------------------------------- pose
@@ -233,48 +216,28 @@ def _pose(record: Record) -> Markup:
     if pose is None:
         parts.append(card("", "Not determined."))
     else:
-        rows = [
-            (words, key, value, sigma)
-            for words, key, value, sigma in (
-                ("pitch, nose up", "theta", pose.theta_deg, pose.sigma_deg.theta),
-                ("roll, right side down", "gamma", pose.gamma_deg, pose.sigma_deg.gamma),
-                ("heading, true", "psi", pose.psi_deg, pose.sigma_deg.psi),
-            )
-        ]
-        parts.append(
-            tag(
-                "table",
-                *(
-                    tag(
-                        "tr",
-                        tag("td", words),
-                        tag("td", _angle(value, sigma, "" if key == "psi" else "+"), data_key=f"pose.{key}"),
-                    )
-                    for words, key, value, sigma in rows
-                ),
-            )
+        angles = (
+            ("pitch, nose up", "theta", pose.theta_deg, pose.sigma_deg.theta, "+"),
+            ("roll, right side down", "gamma", pose.gamma_deg, pose.sigma_deg.gamma, "+"),
+            ("heading, true", "psi", pose.psi_deg, pose.sigma_deg.psi, ""),
         )
+        rows = (
+            row(words, cell(f"pose.{key}", _angle(value, sigma, sign))) for words, key, value, sigma, sign in angles
+        )
+        parts.append(tag("table", *rows))
     if record.magnetic is not None:
         parts.append(tag("p", f"Compass: {record.magnetic.in_words()}."))
     if site is not None:
         facts = (
-            ("latitude", "latitude", site.latitude_deg, ".4f", "deg"),
-            ("height", "height", site.height_m, ".0f", "m"),
-            ("gravity", "gravity", site.gravity_m_s2, ".5f", "m/s²"),
-            ("declination", "declination", site.declination_deg, "+.2f", "deg"),
+            ("latitude", site.latitude_deg, ".4f", "deg"),
+            ("height", site.height_m, ".0f", "m"),
+            ("gravity", site.gravity_m_s2, ".5f", "m/s²"),
+            ("declination", site.declination_deg, "+.2f", "deg"),
         )
-        rows_of_site = [
-            tag(
-                "tr",
-                tag("td", words),
-                tag(
-                    "td",
-                    *(["unknown"] if value is None else [number(value, form), f" {unit}"]),
-                    data_key=f"site.{key}",
-                ),
-            )
-            for words, key, value, form, unit in facts
-        ]
+        rows_of_site = (
+            row(what, cell(f"site.{what}", *(["unknown"] if value is None else [number(value, form), f" {unit}"])))
+            for what, value, form, unit in facts
+        )
         parts.append(tag("table", *rows_of_site))
         parts.append(tag("p", f"Place from: {site.source or 'nobody'}.", class_="soft"))
     return tag("section", *parts)

@@ -136,9 +136,7 @@ def _too_close(places: Sequence[float]) -> bool:
     return len(apart) > 1 and min(apart) < _DOT_SHARE * (places[-1] - places[0])
 
 
-def drift(
-    points: Sequence[Point], triad: Triad, *, name: str, this: int | None = None, height: float = 84.0
-) -> Markup | None:
+def drift(points: Sequence[Point], triad: Triad, *, name: str, this: int | None = None) -> Markup | None:
     """Three plots, one an axis, of a bias against time; None where there is nothing to show."""
     unit, unit_name = UNITS[triad]
     numbered = not clock_is_sound(points)
@@ -164,7 +162,7 @@ def drift(
             across,
             svg.linear([end for pair in ends for end in pair], ticks=3),
             name=f"{name} {AXES[axis]}: bias against time",
-            height=height,
+            height=84.0,
             x_label=label if axis == 2 else None,
             y_label=f"{AXES[axis]}, {unit_name}",
         )
@@ -182,16 +180,8 @@ def drift(
 
 def arming_items(armings: Sequence[Arming]) -> Markup:
     """Armings as a list, in the order given."""
-    items = []
-    for arming in armings:
-        bad = arming.state == "uncalibrated"
-        items.append(
-            tag(
-                "li",
-                tag("strong", f"{moment(arming.armed_at)}: "),
-                tag("strong", "UNCALIBRATED: ", class_="bad") if bad else None,
-                f"{arming.state}: " if arming.state == "checked" else None,
-                arming.reason,
-            )
-        )
-    return tag("ul", *items)
+    states = {"uncalibrated": tag("strong", "UNCALIBRATED: ", class_="bad"), "checked": "checked: "}
+    return tag(
+        "ul",
+        *(tag("li", tag("strong", f"{moment(one.armed_at)}: "), states.get(one.state), one.reason) for one in armings),
+    )

@@ -110,12 +110,10 @@ class Plot:
         across = self._left + self._x.share(x) * (WIDTH - self._left - _RIGHT)
         return across, self._top + (1.0 - self._y.share(y)) * self._height
 
-    def band(self, first: float, last: float, class_: str = "band") -> None:
+    def band(self, first: float, last: float) -> None:
         """Shade what lies between two places of the horizontal axis."""
         left, right = self.at(first, self._y.low)[0], self.at(last, self._y.low)[0]
-        self._below.append(
-            tag("rect", x=_n(left), y=_n(self._top), width=_n(right - left), height=_n(self._height), class_=class_)
-        )
+        self._below.append(_rect(left, self._top, right - left, self._height, "band"))
 
     def line(self, points: Sequence[Pair], class_: str) -> None:
         """Join points."""
@@ -154,14 +152,7 @@ class Plot:
             height = self.at(self._x.low, place)[1]
             grid.append(_path(f"M{_n(self._left)} {_n(height)}H{_n(WIDTH - _RIGHT)}", "grid"))
             grid.append(tag("text", label, x=_n(self._left - 6.0), y=_n(height + 4.5), class_="end"))
-        frame = tag(
-            "rect",
-            x=_n(self._left),
-            y=_n(self._top),
-            width=_n(WIDTH - self._left - _RIGHT),
-            height=_n(self._height),
-            class_="frame",
-        )
+        frame = _rect(self._left, self._top, WIDTH - self._left - _RIGHT, self._height, "frame")
         labels: list[Markup] = []
         if self._x_label:
             middle = (self._left + WIDTH - _RIGHT) / 2.0
@@ -183,14 +174,11 @@ class Plot:
 
 def strip(left: float, right: float, middle: float, height: float, class_: str) -> Markup:
     """A block from `left` to `right`, upright around `middle`; all in the plot's units."""
-    return tag(
-        "rect",
-        x=_n(left),
-        y=_n(middle - height / 2.0),
-        width=_n(max(right - left, 0.6)),
-        height=_n(height),
-        class_=class_,
-    )
+    return _rect(left, middle - height / 2.0, max(right - left, 0.6), height, class_)
+
+
+def _rect(x: float, y: float, width: float, height: float, class_: str) -> Markup:
+    return tag("rect", x=_n(x), y=_n(y), width=_n(width), height=_n(height), class_=class_)
 
 
 def legend(*entries: tuple[str, str]) -> Markup:
