@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Sequence
+from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.arm_authorisation import ArmAuthoriser, ArmingScript
 from companion.component.commands import CommandServer, Permission
-from companion.component.named_values import NamedValues
 from companion.component.no_files import refuse_files
 from companion.component.own_parameters import OwnParameters, Parameter
 from companion.component.service import ArmGate, CalibrationService
@@ -21,6 +21,11 @@ from companion.links.mavlink.link import MavlinkLink
 
 HEARTBEAT_PERIOD_S = 1.0
 _RETRY_S = 0.05
+PROGRESS: Final = "CMP_PROG"
+"""Percent of the calibration under way; 100 where none is."""
+READY: Final = "CMP_READY"
+"""1: it may arm; 0: not now."""
+IDLE_BEATS: Final = 5
 
 
 class Component:
@@ -39,18 +44,18 @@ class Component:
         parameters: Sequence[Parameter],
         senders: Senders,
     ) -> None:
-        self._link, self._service, self._texts, self._tunes = link, service, texts, tunes
+        self._link, self._service, self._gate, self._texts, self._tunes = link, service, gate, texts, tunes
         self._woken = texts.woken
         self._known_as = link.system_id
         """The system id under which we were heard last."""
         self._next_heartbeat_s = -math.inf
+        self._beats = 0
         self.turns = 0
         """Turns of the working loop, so that it is seen to go on."""
         self.permission = Permission(senders)
         self.parameters = OwnParameters(link, parameters, texts.say, self._woken.set, self.permission)
         self._commands = CommandServer(link, service, texts.say, self._woken.set, self.permission)
         self._script = ArmingScript(link, gate)
-        self._values = NamedValues(link, service, gate)
         self._authoriser = ArmAuthoriser(link, gate, texts.say)
         refuse_files(link)
         link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
@@ -78,7 +83,7 @@ class Component:
         if now_s >= self._next_heartbeat_s:
             if self._link.connected:
                 self._link.send(heartbeat(self._service.mav_state))
-                self._values.beat(now_s)
+                self._tell_values(now_s)
                 # The rhythm is kept, but what a stall has missed is not made up for.
                 next_s = self._next_heartbeat_s + HEARTBEAT_PERIOD_S
                 self._next_heartbeat_s = next_s if next_s > now_s else now_s + HEARTBEAT_PERIOD_S
@@ -94,6 +99,20 @@ class Component:
             self._texts.step(now_s),
             self._tunes.step(now_s),
         )
+
+    def _tell_values(self, now_s: float) -> None:
+        """Progress and readiness, for Mission Planner's Quick tab: at every beat while it calibrates, else every fifth.
+
+        Mission Planner shows those of any component of the vehicle (`propagateNamedFloats`), QGroundControl those in
+        its MAVLink inspector: some 12 bytes a second.
+        """
+        self._beats += 1
+        if self._service.mav_state != mavlink.MAV_STATE_CALIBRATING and self._beats % IDLE_BEATS:
+            return
+        ready = self._gate.answer().verdict == "accept"
+        for name, value in ((PROGRESS, float(self._service.progress_percent)), (READY, float(ready))):
+            boot_ms = int(now_s * 1e3) % 2**32
+            self._link.send(mavlink.MAVLink_named_value_float_message(boot_ms, name.encode("ascii"), value))
 
     def _follow_vehicle(self) -> None:
         """Be heard under the vehicle's system id as soon as the link belongs to it."""

@@ -23,6 +23,7 @@ from companion.config.sections import Compass, Config, Gradienter, GradienterPro
 from companion.links.serial.bytestream import PortSettings
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H, MG
+from companion.protocols.guess import Line
 from companion.protocols.registry import PROTOCOLS, Kind, ProtocolInfo, part_for
 from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
 
@@ -262,9 +263,19 @@ class SerialDevice:
         return PortSettings(self.port, self.baud, self.parity)
 
     @property
+    def line(self) -> Line:
+        """How its line is set."""
+        return Line(self.baud, self.parity)
+
+    @property
     def name(self) -> str:
         """That of its first role; its bytes have it in a recording."""
         return self.roles[0].name
+
+    @property
+    def kind(self) -> Kind:
+        """That of its first role."""
+        return self.roles[0].kind
 
 
 def serial_devices(config: Config) -> list[SerialDevice]:

@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.commands import REMEMBER_FINAL_S
 from companion.ground.heard import Ack, Target
+from companion.links.system.waiting import comes
 
 if TYPE_CHECKING:
     from companion.ground.link import GroundLink
@@ -110,10 +111,7 @@ class Exchange:
         self._confirmation += 1
 
     async def _hears(self, within_s: float) -> bool:
-        try:
-            async with asyncio.timeout(within_s):
-                await self._answered.wait()
-        except TimeoutError:
+        if not await comes(self._answered, within_s):
             return False
         self._answered.clear()
         return True

@@ -50,7 +50,7 @@ def calibrate(rig: Rig) -> Job:
 
 def place(rig: Rig, latitude_deg: float, height_m: float) -> Callable[[], Message]:
     def message() -> Message:
-        boot_ms = round((rig.service.core.vehicle.boot.latest_s or 0.0) * 1e3)
+        boot_ms = round((rig.service.core.vehicle.boot.clock.latest_s or 0.0) * 1e3)
         lat, lon, alt = round(latitude_deg * 1e7), round(rig.site.longitude_deg * 1e7), round(height_m * 1e3)
         return mavlink.MAVLink_global_position_int_message(boot_ms, lat, lon, alt, 0, 0, 0, 0, 0)
 

@@ -82,7 +82,7 @@ class BootWatch:
 
     def __init__(self, link: MavlinkLink, sent: Callable[[Message], bool], on_restart: Callable[[], None]) -> None:
         self._sent, self._on_restart = sent, on_restart
-        self._clock = BootClock()
+        self.clock = BootClock()
         self._heard = asyncio.Event()
         for kind in (
             mavlink.MAVLink_system_time_message, mavlink.MAVLink_global_position_int_message,
@@ -92,15 +92,6 @@ class BootWatch:
             link.subscribe(kind, self._on_boot_ms)
         link.subscribe(mavlink.MAVLink_raw_imu_message, self._on_boot_us)
         link.subscribe(mavlink.MAVLink_highres_imu_message, self._on_boot_us)
-
-    @property
-    def latest_s(self) -> float | None:
-        """The time since boot that was heard last."""
-        return self._clock.latest_s
-
-    def begin_anew(self) -> None:
-        """Another firmware runs there now."""
-        self._clock = BootClock()
 
     async def wait(self, timeout_s: float) -> bool:
         """Wait for the next message that carries the time since boot; False: none came in time."""
@@ -117,7 +108,7 @@ class BootWatch:
             self._follow(message.time_usec * 1e-6, t_s)
 
     def _follow(self, boot_s: float, t_s: float) -> None:
-        restarted = self._clock.rebooted(boot_s, t_s)
+        restarted = self.clock.rebooted(boot_s, t_s)
         self._heard.set()
         if restarted:
             self._on_restart()

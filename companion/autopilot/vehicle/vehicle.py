@@ -15,7 +15,7 @@ from typing import Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.vehicle.boot_clock import BootWatch
+from companion.autopilot.vehicle.boot_clock import BootClock, BootWatch
 from companion.autopilot.vehicle.commands import Commands, StandingRequests
 from companion.autopilot.vehicle.heartbeats import (
     ArmingWatch,
@@ -272,7 +272,7 @@ class Vehicle:
             return False
         # Another firmware has been flashed while we heard nothing.
         self.firmware = firmware
-        self.boot.begin_anew()
+        self.boot.clock = BootClock()
         self._arming.flashed()
         self._restarted()
         return True
@@ -369,14 +369,14 @@ class Moment:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle, self._t_s = vehicle, asyncio.get_running_loop().time()
-        self._boot_s, self._boots = vehicle.boot.latest_s, vehicle.boots
+        self._boot_s, self._boots = vehicle.boot.clock.latest_s, vehicle.boots
 
     def has_passed(self, seconds: float) -> bool:
         """Whether so much time has gone by on both clocks; or on ours alone, where the other tells nothing."""
         gone_s = asyncio.get_running_loop().time() - self._t_s
         if gone_s < seconds:
             return False
-        vehicle, boot_s = self._vehicle, self._vehicle.boot.latest_s
+        vehicle, boot_s = self._vehicle, self._vehicle.boot.clock.latest_s
         if self._boot_s is None or boot_s is None or vehicle.boots != self._boots or not vehicle.alive:
             return True
         return boot_s - self._boot_s >= seconds or gone_s >= _SLOWEST * seconds

@@ -5,7 +5,6 @@ With a daemon running the ports are its, so it is asked; otherwise every port is
 
 from __future__ import annotations
 
-import asyncio
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,42 +15,21 @@ import msgspec
 
 from companion.autopilot.firmware.port_parameters import baud_of, port_needs
 from companion.config.sections import Config, Imu
-from companion.configured.models import cannot_work, doubtful, serial_devices
+from companion.configured.models import SerialDevice, cannot_work, doubtful, serial_devices
 from companion.daemon.devices.sensor_health import ABSENT
 from companion.daemon.faces.control import ask, process_behind
 from companion.daemon.process.service import Service
-from companion.errors import DaemonDeniedError, DaemonUnreachableError, LinkError
+from companion.errors import DaemonDeniedError, DaemonUnreachableError
 from companion.formats import Object
 from companion.links.serial.faults import port_faults, same_ports, unnamed
-from companion.links.serial.listening import Heard, listen
+from companion.links.serial.listening import Heard, listen_to_all
 from companion.links.serial.ports import ROOT, list_ports
 from companion.protocols.guess import Line
-from companion.protocols.registry import PROTOCOLS, Kind, main_kind
+from companion.protocols.registry import PROTOCOLS, main_kind
 
 STOP_FIRST: Final = "to try other speeds: sudo systemctl stop companion, then companion check again"
 ONLY_CHECKING: Final = "only a check is running: start companion run"
 _TO_BE_TRIED: Final = ("undecodable", "damaged")
-
-
-@dataclass(frozen=True, slots=True)
-class Configured:
-    """One of our own sensors as the configuration has it."""
-
-    name: str
-    kind: Kind
-    port: str
-    protocol: str
-    line: Line
-
-    @property
-    def section(self) -> str:
-        """Where its keys stand."""
-        return f'[[imu]] "{self.name}"' if self.kind == "imu" else f"[{self.kind}]"
-
-    @property
-    def is_serial(self) -> bool:
-        """Whether it is on a port of this machine."""
-        return self.port.startswith("/")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,17 +50,14 @@ class Finding:
         return "warning" if self.remedy or self.name == "warning" else "ok"
 
 
-def configured_sensors(config: Config) -> list[Configured]:
-    """Our own sensors; one that serves several sections once, under its first."""
-    return [
-        Configured(device.name, device.roles[0].kind, device.port, device.info.name, Line(device.baud, device.parity))
-        for device in serial_devices(config)
-    ]
+def _section(sensor: SerialDevice) -> str:
+    """Where its keys stand."""
+    return f'[[imu]] "{sensor.name}"' if sensor.kind == "imu" else f"[{sensor.kind}]"
 
 
 def _ports(config: Config) -> dict[str, str]:
     """Ports of this machine, by the names of those that use them."""
-    ports = {sensor.name: sensor.port for sensor in configured_sensors(config) if sensor.is_serial}
+    ports = {sensor.name: sensor.port for sensor in serial_devices(config) if not sensor.settings.is_tcp}
     if config.mavlink.url.startswith("serial:"):
         ports["autopilot"] = config.mavlink.url.removeprefix("serial:").rpartition(":")[0]
     return ports
@@ -99,10 +74,9 @@ def where_it_may_be(config: Config, root: Path = ROOT) -> Finding | None:
 
 def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> list[Finding]:
     """What the system has against the configured ports."""
-    sensors = configured_sensors(config)
     ports = _ports(config)
     among = list_ports(root)
-    fast = {sensor.name for sensor in sensors if sensor.kind == "imu"}
+    fast = {sensor.name for sensor in serial_devices(config) if sensor.kind == "imu"}
     found = [
         Finding(name, fault.good, str(fault), fault.remedy, port)
         for name, port in ports.items()
@@ -121,14 +95,12 @@ async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -
     tried at other settings.
     """
     devices = {device["name"]: device for device in status["devices"]}
-    sick = [
-        sensor for sensor in configured_sensors(config) if devices.get(sensor.name, {}).get("trouble") in _TO_BE_TRIED
-    ]
+    sick = [sensor for sensor in serial_devices(config) if devices.get(sensor.name, {}).get("trouble") in _TO_BE_TRIED]
     tried: dict[str, Heard | str] = {}
     if may_listen:
-        serial = [sensor for sensor in sick if sensor.is_serial]
-        heard = await asyncio.gather(*(_try(sensor) for sensor in serial))
-        tried = dict(zip((sensor.name for sensor in serial), heard, strict=True))
+        lines = {sensor.port: [sensor.line] for sensor in sick if not sensor.settings.is_tcp}
+        heard = await listen_to_all(list(lines), lines.__getitem__)
+        tried = {sensor.name: heard[sensor.port] for sensor in sick if sensor.port in heard}
     return [
         finding
         for sensor in sick
@@ -136,14 +108,7 @@ async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -
     ]
 
 
-async def _try(sensor: Configured) -> Heard | str:
-    try:
-        return await listen(sensor.port, [sensor.line])
-    except LinkError as error:
-        return str(error)
-
-
-def _explain(sensor: Configured, device: Object, heard: Heard | str | None, *, may_listen: bool) -> list[Finding]:
+def _explain(sensor: SerialDevice, device: Object, heard: Heard | str | None, *, may_listen: bool) -> list[Finding]:
     def bad(words: str, remedy: str = "") -> list[Finding]:
         said = f"{words}: {remedy}" if remedy else words
         return [Finding(sensor.name, good=False, words=said, remedy=remedy, port=sensor.port)]
@@ -154,7 +119,7 @@ def _explain(sensor: Configured, device: Object, heard: Heard | str | None, *, m
         speaks = device.get("speaks")
         if isinstance(speaks, str):
             return bad(*_other_protocol(sensor, speaks))
-        if sensor.is_serial and not may_listen:
+        if not sensor.settings.is_tcp and not may_listen:
             return bad("it may be set to another speed or parity", STOP_FIRST)
         return []
     if heard.stranger is not None:
@@ -164,15 +129,15 @@ def _explain(sensor: Configured, device: Object, heard: Heard | str | None, *, m
             return []
         return bad(f"{heard.bytes_heard} bytes came, nothing known at any usual speed", "wire, levels, protocol?")
     lines = _line_keys(sensor, heard.line)
-    if heard.candidate.protocol == sensor.protocol:
+    if heard.candidate.protocol == sensor.info.name:
         if not lines:
             return []
-        return bad(f"it sends at {heard.line}, not {sensor.line}", f"set {' and '.join(lines)} in {sensor.section}")
+        return bad(f"it sends at {heard.line}, not {sensor.line}", f"set {' and '.join(lines)} in {_section(sensor)}")
     words, remedy = _other_protocol(sensor, heard.candidate.protocol)
     return bad(words, f"{remedy} with {' and '.join(lines)}" if lines else remedy)
 
 
-def _line_keys(sensor: Configured, line: Line) -> list[str]:
+def _line_keys(sensor: SerialDevice, line: Line) -> list[str]:
     keys = []
     if line.baud != sensor.line.baud:
         keys.append(f"baud = {line.baud}")
@@ -181,11 +146,11 @@ def _line_keys(sensor: Configured, line: Line) -> list[str]:
     return keys
 
 
-def _other_protocol(sensor: Configured, protocol: str) -> tuple[str, str]:
-    change = f'set protocol = "{protocol}" in {sensor.section}'
-    main, right = main_kind(protocol), f"give {sensor.section} the port of the {sensor.kind}"
+def _other_protocol(sensor: SerialDevice, protocol: str) -> tuple[str, str]:
+    change = f'set protocol = "{protocol}" in {_section(sensor)}'
+    main, right = main_kind(protocol), f"give {_section(sensor)} the port of the {sensor.kind}"
     if main == sensor.kind:
-        return f"this is {protocol}, not {sensor.protocol}", change
+        return f"this is {protocol}, not {sensor.info.name}", change
     if protocol in PROTOCOLS[sensor.kind]:
         return f"this is {protocol}, a device for {main}", f"{right}; or, to make do with it as {sensor.kind}, {change}"
     return f"this is {protocol}, a device for {main}", right

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from companion.errors import LinkError
+from companion.links.system.waiting import comes
 from companion.protocols.heartbeat import Heartbeat, heartbeats
 
 USUAL_PORTS: Final = (14540, 14550, 14551)
@@ -45,10 +46,7 @@ async def listen_udp(port: int, *, host: str = "0.0.0.0", seconds: float = LISTE
     except OSError as error:
         raise LinkError(f"UDP {port}: {error.strerror or error}") from None
     try:
-        async with asyncio.timeout(seconds):
-            await heard.enough.wait()
-    except TimeoutError:
-        pass
+        await comes(heard.enough, seconds)
     finally:
         transport.close()
     return HeardUdp(

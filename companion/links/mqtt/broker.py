@@ -64,8 +64,8 @@ def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
         context = ssl.create_default_context(cafile=settings.ca_file)
         if settings.cert_file is not None and settings.key_file is not None:
             where = Path(settings.key_file)
-            _look(Path(settings.cert_file))
-            _look(where)
+            for file in (Path(settings.cert_file), where):
+                file.open("rb").close()  # OpenSSL does not say which of them it cannot read
             # Without a password of ours OpenSSL would ask at the terminal for that of an encrypted key.
             context.load_cert_chain(settings.cert_file, settings.key_file, password=lambda: "")
     except ssl.SSLError as error:
@@ -74,11 +74,6 @@ def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
     except OSError as error:
         raise LinkError(f"{error.filename or where}: {_why(error)}") from None
     return context
-
-
-def _look(path: Path) -> None:
-    with path.open("rb"):
-        pass
 
 
 def _why(error: OSError) -> str:

@@ -7,7 +7,6 @@ to without being asked for, and never one that another program holds.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import Final
 from companion.errors import LinkError
 from companion.links.serial.port import SerialOpener, close_serial
 from companion.links.serial.ports import ROOT, SerialPort, find_holders
+from companion.links.system.waiting import comes
 from companion.protocols.guess import (
     ENOUGH_BYTES,
     Candidate,
@@ -130,8 +130,7 @@ async def _bytes_at(path: str, line: Line, most_s: float) -> bytes:
         since_s = loop.time()
         looked, mavlink = 0, False
         while not ended.is_set():
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(ended.wait(), _LOOK_S)
+            await comes(ended, _LOOK_S)
             past_s = loop.time() - since_s
             if len(data) > looked:
                 looked = len(data)
