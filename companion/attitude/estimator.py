@@ -90,7 +90,8 @@ class AttitudeEstimator:
 
     def __init__(self, settings: AttitudeSettings) -> None:
         self._strapdown = Strapdown()
-        self._heading = HeadingAid()
+        self.compass = HeadingAid()
+        """What became of the compass readings."""
         self._history: deque[tuple[float, Quaternion]] = deque()
         self._aligned = False
         self._still_s = 0.0
@@ -135,7 +136,7 @@ class AttitudeEstimator:
         """
         ned_from_body = from_matrix(np.asarray(body_from_ned).T)
         self._strapdown.restart(multiply(ned_from_body, conjugate(self._sensor_from_vehicle)), t_s)
-        self._leveller, self._heading = Leveller(self._settings.gravity_m_s2), HeadingAid()
+        self._leveller, self.compass = Leveller(self._settings.gravity_m_s2), HeadingAid()
         self._uncertainty.restart(np.asarray(covariance))
         self._history.clear()
         self._forget_rest()
@@ -157,11 +158,6 @@ class AttitudeEstimator:
     def gyro_bias_rad_s(self) -> Triple:
         """What is subtracted now, vehicle FRD: the calibration's bias with what rest has added to it."""
         return rotate(conjugate(self._sensor_from_vehicle), self._strapdown.bias_rad_s)
-
-    @property
-    def compass(self) -> HeadingAid:
-        """What became of the compass readings."""
-        return self._heading
 
     # ------------------------------------------------------------------------------------------------- samples
 
@@ -265,7 +261,7 @@ class AttitudeEstimator:
         if abs(pitch) > STEEP_RAD:
             return False
         innovation_rad = math.remainder(heading_true_rad - yaw, 2.0 * math.pi)
-        gain = self._heading.gain(t_s, innovation_rad, self._uncertainty.heading_sigma_rad, sigma_rad)
+        gain = self.compass.gain(t_s, innovation_rad, self._uncertainty.heading_sigma_rad, sigma_rad)
         if gain == 0.0:
             return False
         self._leveller.turn_heading(gain * innovation_rad)

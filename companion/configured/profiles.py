@@ -58,5 +58,5 @@ class Profiles:
             return f"{profile.name}, {profile.origin}"
         if profile is None:
             return "none: sigmas are those of the worst common parts"
-        by = "of the catalogue" if self._imus[name].profile is not None else "of the catalogue, by its device id"
-        return f"{profile}, {by}"
+        by = "" if self._imus[name].profile is not None else ", by its device id"
+        return f"{profile}, of the catalogue{by}"

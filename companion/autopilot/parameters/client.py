@@ -194,7 +194,10 @@ class ParameterClient:
                 if other is not None and tries > _TRIES:
                     break
                 self._require_disarmed(name)
-                deadline_s = self._send(self._set_message(name, carried, kind), inbox)
+                message = mavlink.MAVLink_param_set_message(*self._target(), _wire_name(name), carried, kind)
+                # Nothing may be awaited between the guard and this.
+                self.writes += self._link.send(message)
+                deadline_s = self._deadline_s()
                 while (answer := await self._next(inbox, deadline_s)) is not None:
                     if isinstance(answer, Refusal):
                         raise ParameterRefusedError(f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer.text}")
@@ -242,12 +245,7 @@ class ParameterClient:
     def _learn_loss(self, tries: int) -> None:
         self._repeated += _LOSS_MEMORY * (float(tries > 1) - self._repeated)
 
-    def _send(
-        self, message: mavlink.MAVLink_param_set_message | mavlink.MAVLink_param_request_read_message, inbox: Inbox
-    ) -> float:
-        """Send; the deadline of the answer. Nothing may be awaited between the guard and this."""
-        if self._link.send(message) and isinstance(message, mavlink.MAVLink_param_set_message):
-            self.writes += 1
+    def _deadline_s(self) -> float:
         return asyncio.get_running_loop().time() + self._timeout_s
 
     async def _next(self, inbox: Inbox, deadline_s: float) -> float | Refusal | None:
@@ -258,8 +256,9 @@ class ParameterClient:
 
     async def _ask(self, inbox: Inbox, name: str, index: int) -> float | Refusal | None:
         """One PARAM_REQUEST_READ and the first answer to it."""
-        deadline_s = self._send(self._read_message(name, index), inbox)
-        answer = await self._next(inbox, deadline_s)
+        message = mavlink.MAVLink_param_request_read_message(*self._target(), _wire_name(name), index)
+        self._link.send(message)
+        answer = await self._next(inbox, self._deadline_s())
         if isinstance(answer, float):
             self._answering = inbox.name if index < 0 else self._answering
         return answer
@@ -295,12 +294,6 @@ class ParameterClient:
         if self.vehicle.system_id is None:
             raise ParameterTimeoutError("no autopilot has been heard yet")
         return self.vehicle.system_id, self.vehicle.component_id
-
-    def _read_message(self, name: str, index: int) -> mavlink.MAVLink_param_request_read_message:
-        return mavlink.MAVLink_param_request_read_message(*self._target(), _wire_name(name), index)
-
-    def _set_message(self, name: str, carried: float, kind: int) -> mavlink.MAVLink_param_set_message:
-        return mavlink.MAVLink_param_set_message(*self._target(), _wire_name(name), carried, kind)
 
     def _on_value(self, message: mavlink.MAVLink_param_value_message, _t_s: float) -> None:
         name, value = message.param_id, decode(message, bytewise=self._bytewise)

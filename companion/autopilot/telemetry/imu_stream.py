@@ -71,11 +71,6 @@ class _Source:
     def absent(self) -> bool:
         return self.zeros >= _ABSENT_AFTER
 
-    def forget(self) -> None:
-        """The autopilot may be another firmware now."""
-        self.rate, self.refused, self.zeros, self.recent, self.reason = 0, False, 0, 0, ""
-        self.last_s = self.device_s = -math.inf
-
 
 class ImuStream:
     """Asks for one IMU's messages (1, 2 or 3), keeps them coming and hands on their samples in vehicle FRD.
@@ -289,18 +284,13 @@ class ImuStream:
     def _on_event(self, event: VehicleEvent) -> None:
         if event in ("lost", "rebooted"):
             self._lose("the autopilot restarted" if event == "rebooted" else "no heartbeat from the autopilot")
-            for source in self._sources:
-                source.forget()
             self._restart.set()
 
     def _on_message(self, message: Message, t_s: float) -> None:
         if not self._vehicle.sent(message):
             return
-        kind = type(message)
-        for source in self._sources:
-            if source.message.message is kind:
-                break
-        else:
+        source = next((each for each in self._sources if each.message.message is type(message)), None)
+        if source is None:
             return
         reading = source.message.decode(message)
         if isinstance(reading, str):
@@ -317,8 +307,7 @@ class ImuStream:
             return
         source.device_s, source.last_s, source.zeros, source.reason = reading.t_device_s, t_s, 0, ""
         source.recent += 1
-        if not self._arrived.is_set():
-            self._arrived.set()
+        self._arrived.set()
         if reading.temperature_degc is not None:
             self._temperature = (reading.temperature_degc, t_s)
         if source is self._current:

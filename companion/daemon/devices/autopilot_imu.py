@@ -142,9 +142,8 @@ class AutopilotImu:
         now_s = asyncio.get_running_loop().time()
         holds = assumed is not None and _same(assumed, fresh)
         if announced is not None and holds:
-            logger.warning(
-                "%s: %s = %.6g was announced and is not in force", self.name, announced.name, announced.value
-            )
+            words = "%s: %s = %.6g was announced and is not in force"
+            logger.warning(words, self.name, announced.name, announced.value)
             holds = now_s - announced.t_s <= CONFIRMED_WITHIN_S
         elif announced is not None:
             logger.warning("%s: somebody set %s to %.6g; measuring afresh", self.name, announced.name, announced.value)

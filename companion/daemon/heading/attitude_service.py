@@ -183,7 +183,7 @@ class AttitudeService:
             and math.isfinite(message.airspeed)
             and message.airspeed > SLOWEST_AIRSPEED_M_S
         )
-        self.carrier.flies_at(message.airspeed if good else None)
+        self.carrier.airspeed_m_s = message.airspeed if good else None
         self._airspeed_s = t_s
 
     # --- the rhythm
@@ -209,10 +209,10 @@ class AttitudeService:
 
     async def _turn(self, now_s: float) -> None:
         if now_s - self._airspeed_s > AIRSPEED_OLD_S:
-            self.carrier.flies_at(None)
+            self.carrier.airspeed_m_s = None
         if self._autopilot_imu is not None:
             kind = self._autopilot_imu.stream.kind
-            self.carrier.steps_by(kind.gyro_step_rad_s if kind is not None and kind.truncates else 0.0)
+            self.carrier.gyro_step_rad_s = kind.gyro_step_rad_s if kind is not None and kind.truncates else 0.0
         self.health.judge(now_s)
         if now_s - self._looked_s >= LOOK_S:
             self._looked_s = now_s

@@ -163,8 +163,9 @@ class Carrier:
         self.reset_counter = 0
         """Counts the alignments at which the heading jumped."""
         self.airspeed_m_s: float | None = None
+        """Forward, of a fixed wing in the air; None elsewhere, and where nobody says it."""
         self.gyro_step_rad_s = 0.0
-        """Of a stream of truncated integers."""
+        """Of a stream of truncated integers; 0 of one of floats."""
         self.waiting_for = "waiting for a calibration"
         """What an alignment needs."""
         self._core = core
@@ -211,14 +212,6 @@ class Carrier:
                 heading += local.declination_deg * DEG
                 sigma_deg = math.hypot(sigma_deg, local.declination_sigma_deg)
             estimator.add_heading(sample.t_s, heading, sigma_deg * DEG)
-
-    def flies_at(self, airspeed_m_s: float | None) -> None:
-        """Forward, of a fixed wing in the air; None elsewhere, and where nobody says it."""
-        self.airspeed_m_s = airspeed_m_s
-
-    def steps_by(self, gyro_step_rad_s: float) -> None:
-        """How coarse the integers of the stream are; 0 for one of floats."""
-        self.gyro_step_rad_s = gyro_step_rad_s
 
     def forget(self) -> None:
         """Begin anew: on the ground, with the calibration in force."""

@@ -204,12 +204,11 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
         findings.append(await _heading(config))
     if config.calibration.at_arm == "gate":
         findings.append(_gate(config, status["arming"]["setup"]))
-    for kind in ("gradienter", "compass"):
+    for kind, without in (
+        ("gradienter", "gyros only (accelerometers by hand: companion align faces)"),
+        ("compass", "gyro sigma widened by the Earth's rate"),
+    ):
         if getattr(config, kind) is None:
-            without = {
-                "gradienter": "gyros only (accelerometers by hand: companion align faces)",
-                "compass": "gyro sigma widened by the Earth's rate",
-            }[kind]
             findings.append(Finding(kind, good=True, words=f"not configured: {without}"))
     return findings
 
