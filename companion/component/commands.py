@@ -52,13 +52,6 @@ _RESULTS = {
     "failed": mavlink.MAV_RESULT_FAILED,
     "cancelled": MAV_RESULT_CANCELLED,
 }
-_REFUSALS = {
-    "armed": mavlink.MAV_RESULT_DENIED,
-    "unknown": mavlink.MAV_RESULT_DENIED,
-    "nothing_to_undo": mavlink.MAV_RESULT_DENIED,
-    "other": mavlink.MAV_RESULT_DENIED,
-    "busy": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
-}
 _WORDS = {
     What.BOTH: "gyros and accelerometers",
     What.GYROS: "gyros",
@@ -241,7 +234,8 @@ class CommandServer:
             self._refuse(key, mavlink.MAV_RESULT_FAILED, f"{name} failed: internal error, see the log", now_s)
             return
         if isinstance(job, Refusal):
-            self._refuse(key, _REFUSALS[job.kind], f"{name} refused: {job.reason}", now_s)
+            later, never = mavlink.MAV_RESULT_TEMPORARILY_REJECTED, mavlink.MAV_RESULT_DENIED
+            self._refuse(key, later if job.kind == "busy" else never, f"{name} refused: {job.reason}", now_s)
             return
         self._finals.pop(key, None)
         self._running = _Running(key, request, job)

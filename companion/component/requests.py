@@ -110,15 +110,9 @@ def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refused
         if value != 0 and not (number in (1, 3, 5) and value == 1):
             allowed = "0 or 1" if number in (1, 3, 5) else "0"
             return _denied(f"Calibration refused: param{number} {value:g}, allowed {allowed}")
-    match (parameters[0] == 1, parameters[4] == 1):
-        case (True, True):
-            return Calibrate(What.BOTH)
-        case (True, False):
-            return Calibrate(What.GYROS)
-        case (False, True):
-            return Calibrate(What.ACCELEROMETERS)
-        case _:
-            return _denied("Calibration refused: set param1 or param5 to 1")
+    chosen = {(1, 1): What.BOTH, (1, 0): What.GYROS, (0, 1): What.ACCELEROMETERS}
+    what = chosen.get((int(parameters[0]), int(parameters[4])))
+    return _denied("Calibration refused: set param1 or param5 to 1") if what is None else Calibrate(what)
 
 
 def _request_message(message_id: float) -> SendVersion | Refused:

@@ -7,6 +7,7 @@ import datetime
 from collections.abc import Iterator, Sequence
 from typing import Final, Literal
 
+from companion.autopilot.firmware.port_parameters import baud_of
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.collector.outlook import Settings
@@ -65,24 +66,18 @@ def imu_rate_hz(config: Config) -> float:
 
     An autopilot whose line is full drops what does not fit, and answers late (57600 baud: 38 Hz for one IMU).
     """
-    kind, _, rest = config.mavlink.url.partition(":")
-    if kind != "serial":
-        return IMU_RATE_HZ
-    bytes_per_s = int(rest.rpartition(":")[2]) / BITS_PER_BYTE
+    baud = baud_of(config.mavlink.url)
     instances = [imu.instance or 1 for imu in config.imu if imu.source == "autopilot"]
     each_time = sum(HIGHRES_BYTES if instance == 1 else SCALED_BYTES for instance in instances)
-    if not each_time:
+    if baud is None or not each_time:
         return IMU_RATE_HZ
-    return max(LEAST_IMU_RATE_HZ, min(IMU_RATE_HZ, LINE_SHARE * bytes_per_s / each_time))
+    return max(LEAST_IMU_RATE_HZ, min(IMU_RATE_HZ, LINE_SHARE * baud / BITS_PER_BYTE / each_time))
 
 
 def attitude_rate_hz(config: Config) -> float:
     """How often the attitude may be sent without filling a serial line (57600 baud: 22 Hz)."""
-    wanted = config.push.attitude_rate_hz
-    kind, _, rest = config.mavlink.url.partition(":")
-    if kind != "serial":
-        return wanted
-    return min(wanted, LINE_SHARE * int(rest.rpartition(":")[2]) / BITS_PER_BYTE / VISION_BYTES)
+    wanted, baud = config.push.attitude_rate_hz, baud_of(config.mavlink.url)
+    return wanted if baud is None else min(wanted, LINE_SHARE * baud / BITS_PER_BYTE / VISION_BYTES)
 
 
 def cannot_work(config: Config) -> list[str]:

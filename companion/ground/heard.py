@@ -127,7 +127,8 @@ class Heard:
             if target.component_id == mavlink.MAV_COMP_ID_AUTOPILOT1 and beat.kind not in _NO_VEHICLES
         ]
         others = [
-            f"{target.system_id}/{target.component_id}" + (" (a ground station)" if _is_station(beat) else "")
+            f"{target.system_id}/{target.component_id}"
+            + (" (a ground station)" if beat.kind == mavlink.MAV_TYPE_GCS else "")
             for target, beat in sorted(self.heartbeats.items())
             if target.component_id != mavlink.MAV_COMP_ID_AUTOPILOT1 or beat.kind in _NO_VEHICLES
         ]
@@ -148,10 +149,6 @@ class Heard:
         self.texts.append((system_id, text))
         del self.texts[:-MAX_TEXTS]
         self.on_text.tell(system_id, text)
-
-
-def _is_station(beat: Heartbeat) -> bool:
-    return beat.kind == mavlink.MAV_TYPE_GCS
 
 
 def _whole(fields: Fields, name: str) -> int:

@@ -80,9 +80,8 @@ def read_ulog(path: Path) -> list[StillLog]:
         logs = [log for log in _ulog_imus(path, data) if log is not None]
     if not logs:
         raise StorageError(f"{path}: no samples of an IMU in it")
-    if not dropouts:
-        return logs
-    return [_with_note(log, f"{dropouts} gaps in it, in which PX4 could not write") for log in logs]
+    notes = (f"{dropouts} gaps in it, in which PX4 could not write",) if dropouts else ()
+    return [msgspec.structs.replace(log, notes=(*log.notes, *notes)) for log in logs]
 
 
 def _ulog_imus(path: Path, data: dict[tuple[str, int], dict[str, Any]]) -> Iterator[StillLog | None]:
@@ -204,10 +203,6 @@ class _Formats(dict[int, Any]):
         if found.len < _HEAD:
             raise _EndlessError
         super().__setitem__(number, found)
-
-
-def _with_note(log: StillLog, note: str) -> StillLog:
-    return msgspec.structs.replace(log, notes=(*log.notes, note))
 
 
 @contextlib.contextmanager

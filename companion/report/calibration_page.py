@@ -151,14 +151,14 @@ def _triad(imu: ImuRecord, triad: Triad) -> Markup:
     rows = []
     for k in range(3):
         value, sigma = with_sigma(bias[k], use[k], unit)
-        key = f"{imu.name}.{triad}.{{}}.{AXES[k]}".format
+        of, axis = f"{imu.name}.{triad}", AXES[k]
         rows.append(
             row(
-                AXES[k],
-                cell(key("bias"), value),
-                cell(key("sigma_use"), "±", sigma),
-                cell(key("sigma_stat"), with_sigma(0.0, stat[k], unit)[1]),
-                cell(key("residual"), with_sigma(left[k], use[k], unit)[0]) if left else None,
+                axis,
+                cell(f"{of}.bias.{axis}", value),
+                cell(f"{of}.sigma_use.{axis}", "±", sigma),
+                cell(f"{of}.sigma_stat.{axis}", with_sigma(0.0, stat[k], unit)[1]),
+                cell(f"{of}.residual.{axis}", with_sigma(left[k], use[k], unit)[0]) if left else None,
             )
         )
     heads = ["", "bias", "σ use", "σ stat", *(["residual"] if left else [])]

@@ -63,7 +63,7 @@ class RecordStore:
         path, trace_path = self._path(number), self._trace_path(number)
         try:
             if trace is not None:
-                write_atomically(trace_path, _packed(traces.to_json(trace)))
+                write_atomically(trace_path, zlib.compress(traces.to_json(trace), wbits=_GZIP))
             elif trace_path.exists():
                 # Left by a power cut before its record was written.
                 remove_durably(trace_path)
@@ -178,11 +178,6 @@ class RecordStore:
         except OSError as error:
             raise StorageError(f"{self._folder}: cannot be listed: {error.strerror}") from error
         return sorted(int(match[1]) for match in map(kind.fullmatch, names) if match)
-
-
-def _packed(data: bytes) -> bytes:
-    packer = zlib.compressobj(wbits=_GZIP)
-    return packer.compress(data) + packer.flush()
 
 
 def _unpacked(data: bytes) -> bytes:

@@ -75,23 +75,17 @@ class AxisVerdict:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Verdict:
-    """One vector.
-
-    Attributes:
-        axes: a verdict for each parameter.
-        fraction: of the expected step that was made, over all axes; None when nothing was to be moved.
-        fraction_sigma: its standard deviation.
-        residual: mean after the write minus truth, vehicle FRD.
-        problems: a line for each thing that is not right.
-        hidden: the parameters whose step could not be judged.
-    """
+    """One vector."""
 
     axes: tuple[AxisVerdict, AxisVerdict, AxisVerdict]
     fraction: float | None
+    """Of the expected step that was made, over all axes; None when nothing was to be moved."""
     fraction_sigma: float | None
     residual: Vector
+    """Mean after the write minus truth, vehicle FRD."""
     problems: tuple[str, ...]
     hidden: tuple[str, ...]
+    """The parameters whose step could not be judged."""
 
     @property
     def ok(self) -> bool:

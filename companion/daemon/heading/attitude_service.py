@@ -250,11 +250,10 @@ class AttitudeService:
 
     def status(self) -> Object:
         """For `companion status` and `check`: one line among the devices."""
-        if not self._running:
-            return {"name": "attitude", "kind": "attitude", "good": True, "summary": "starts with companion run"}
         # That nothing has been calibrated yet is no fault of a device.
-        good = self.health.pushing or self.carrier.alignments == 0
-        return {"name": "attitude", "kind": "attitude", "good": good, "summary": self._summary()}
+        good = not self._running or self.health.pushing or self.carrier.alignments == 0
+        summary = self._summary() if self._running else "starts with companion run"
+        return {"name": "attitude", "kind": "attitude", "good": good, "summary": summary}
 
     def _summary(self) -> str:
         if not self.health.pushing:

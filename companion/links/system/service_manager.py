@@ -23,7 +23,7 @@ class ServiceManager:
     """
 
     def __init__(self, address: str | None, watchdog_s: float | None = None) -> None:
-        self._address = address
+        self._address = address or ""
         self.watchdog_s = watchdog_s if address is not None else None
         self._socket: socket.socket | None = None
         self._status = ""
@@ -87,18 +87,15 @@ class ServiceManager:
 
     def _send(self, *lines: str) -> bool:
         """One datagram; False when it could not be delivered (said once) or nobody is there."""
-        if self._socket is None or self._address is None:
+        if self._socket is None:
             return False
-        address = self._address if self._address[0] == "/" else "\0" + self._address[1:]
+        # A name that begins with "@" is in no folder, and begins with a zero to the kernel.
+        address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
         try:
             self._socket.sendto("\n".join(lines).encode(), address)
         except OSError as error:
-            logger.log(
-                logging.DEBUG if self._warned else logging.WARNING,
-                "the service manager cannot be told at %s: %s",
-                self._address,
-                error.strerror or error,
-            )
+            level, why = logging.DEBUG if self._warned else logging.WARNING, error.strerror or error
+            logger.log(level, "the service manager cannot be told at %s: %s", self._address, why)
             self._warned = True
             return False
         return True
