@@ -69,17 +69,14 @@ class Permission:
     """Judges and counts; says in the log once for each sender what it was refused."""
 
     def __init__(self, senders: Senders) -> None:
-        self._senders = senders
+        self.senders = senders
+        """Who may."""
         self.refused: Counter[tuple[int, int]] = Counter()
         """By sender: the first 32."""
 
-    def allow(self, senders: Senders) -> None:
-        """From now on these may."""
-        self._senders = senders
-
     def refuses(self, sender: tuple[int, int], what: str) -> str:
         """Why a sender (system, component) may not ask for this, in a few words; empty when it may."""
-        if sender in self._senders:
+        if sender in self.senders:
             return ""
         system, component = sender
         if sender not in self.refused and len(self.refused) < MAX_REMEMBERED:

@@ -114,12 +114,12 @@ def test_telemetry_is_only_for_now() -> None:
 def test_waiting_for_something_and_for_nothing() -> None:
     async def main() -> None:
         box = Outbox()
-        await box.empty()
+        await box.emptied.wait()
         waiting = asyncio.create_task(box.next())
         await asyncio.sleep(0)
         box.keep("status", b"online")
         parcel = await waiting
-        emptied = asyncio.create_task(box.empty())
+        emptied = asyncio.create_task(box.emptied.wait())
         await asyncio.sleep(0)
         assert not emptied.done()
         box.sent(parcel)

@@ -126,8 +126,8 @@ class Automatic:
     async def _consider(self) -> None:
         if not self.wanted:
             return
-        if self._in_force.foreign is not None and self.stopped is None:
-            self._stop(self._in_force.foreign)
+        if self._in_force.offsets.foreign is not None and self.stopped is None:
+            self._stop(self._in_force.offsets.foreign)
         if self.why_not() is not None or not self._is_needed() or not self._is_possible():
             return
         try:

@@ -85,10 +85,11 @@ class InForce:
         """What was in force before a restart that kept the offsets: it counts again once a window agrees."""
         self._held_back = HeldBack()
         self._present: dict[Key, Present] = {}
-        self._temperatures: dict[str, float] = {}
+        self.temperatures_degc: dict[str, float] = {}
+        """Of each IMU that tells one, when its output was last looked at."""
         self._measured_s = self._looked_s = -1.0
         self._worth_since_s: float | None = None
-        self._offsets = OffsetWatch(core.vehicle, imus, self._lose)
+        self.offsets = OffsetWatch(core.vehicle, imus, self._lose)
         self.calibration: Record | None = None
         """The last finished calibration of this run, while at least one of its values is in force."""
         self.undone = False
@@ -96,11 +97,6 @@ class InForce:
         solver.alignment.on_change.add(self._realigned)
 
     # --- what is known
-
-    @property
-    def foreign(self) -> str | None:
-        """What somebody else has changed since the last request, in few words."""
-        return self._offsets.foreign
 
     @property
     def what(self) -> What:
@@ -118,7 +114,7 @@ class InForce:
                     found += self._held_back.left_of((name, triad), [Finding(held, words)])
                 continue
             profile = noise_profile(self._core.profiles.of(name))
-            degc = self._temperatures.get(name)
+            degc = self.temperatures_degc.get(name)
             seen = Seen(
                 now_s=now_s,
                 temperature_degc=degc,
@@ -181,10 +177,6 @@ class InForce:
             return None
         return next((imu for imu in self.calibration.imus if imu.name == name), None)
 
-    def temperature_degc(self, name: str) -> float | None:
-        """The temperature of an IMU when its output was last looked at; None where it tells none."""
-        return self._temperatures.get(name)
-
     def reading(self) -> str | None:
         """An autopilot IMU whose offsets are not known at this moment, and why, in one line."""
         for name, imu in self._imus.items():
@@ -197,7 +189,7 @@ class InForce:
     def _on_ended(self, job: Job, result: JobResult) -> None:
         """A calibration or an undo has come to its end: what the autopilot has now is of our doing."""
         self._forget()
-        self._offsets.on_ended(job, result)
+        self.offsets.on_ended(job, result)
         done = result.outcome == "done"
         if job.kind == "undo":
             if done and job.undid_calibration:
@@ -254,10 +246,10 @@ class InForce:
     def poll(self, *, writing: bool) -> None:
         """See whether anybody has changed the autopilot's offsets, unless we may be changing them just now."""
         if writing:
-            self._offsets.let_go()
+            self.offsets.let_go()
             self._forget()
         else:
-            self._offsets.poll()
+            self.offsets.poll()
 
     def _lose(self, name: str, why: Why) -> None:
         if why is not Why.REBOOTED:  # which has kept them
@@ -293,13 +285,13 @@ class InForce:
         if window.end_s == self._measured_s:
             return False
         self._measured_s = window.end_s
-        known = self._offsets.known()
+        known = self.offsets.known()
         try:
             solution, _ = await self._solver.solve(window, self.what)
         except CalibrationRefusedError:
             self._forget()
             return True
-        if known == self._offsets.known():  # else the offsets have changed while it was worked out
+        if known == self.offsets.known():  # else the offsets have changed while it was worked out
             self._note(solution, window.end_s, window.end_s - window.start_s)
             await self._memory.look(solution)
         return True
@@ -308,7 +300,7 @@ class InForce:
         worth = False
         for imu in solution.imus:
             if imu.temperature_degc is not None:
-                self._temperatures[imu.name] = imu.temperature_degc
+                self.temperatures_degc[imu.name] = imu.temperature_degc
             settled = np.sqrt(np.diag(imu.covariance))
             found = (
                 (imu.gyro_rad_s, imu.gyro_sigma_use_rad_s, settled[:3]),

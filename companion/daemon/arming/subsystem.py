@@ -94,7 +94,7 @@ def shown_calibration(in_force: InForce, now_s: float) -> dict[str, object] | No
         "started_at": record.started_at,
         "calibrated_ago_s": round(now_s - calibrated_s, 1) if known and calibrated_s is not None else None,
         "confirmed_ago_s": round(now_s - confirmed_s, 1) if confirmed_s is not None else None,
-        "imus": [_imu(imu, in_force.temperature_degc(imu.name)) for imu in record.imus],
+        "imus": [_imu(imu, in_force.temperatures_degc.get(imu.name)) for imu in record.imus],
     }
 
 

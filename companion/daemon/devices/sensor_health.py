@@ -63,7 +63,7 @@ class SensorHealth:
         found = self._flood(now_s) or self.stream.trouble(now_s) or self._stuck
         if found is None:
             return None
-        return Trouble(found.key, f"{line_of(self.link)}: {found.words}", found.implausible)
+        return Trouble(found.key, f"{self.link.settings}: {found.words}", found.implausible)
 
     def _is_flooded(self, now_s: float) -> bool:
         budget = self.link.budget
@@ -153,9 +153,3 @@ class SensorHealth:
             "speaks": self.stream.speaks,
             "port": self.link.settings.url,
         }
-
-
-def line_of(link: ByteLink) -> str:
-    """The port and how it is set, for people."""
-    port = link.settings
-    return port.url if port.is_tcp else f"{port.url} at {port.baud} baud, parity {port.parity}"

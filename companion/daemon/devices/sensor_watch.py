@@ -133,7 +133,9 @@ class SensorWatch:
 
     def _tell(self, sensor: SerialSensor, trouble: Trouble) -> None:
         """To the ground stations: no calibration comes to an end with it, and what was written with it may be wrong."""
-        self._say(Severity.WARNING, f"{sensor.name}: {trouble.words.removeprefix(f'{sensor.line}: ')}", Weight.NEWS)
+        self._say(
+            Severity.WARNING, f"{sensor.name}: {trouble.words.removeprefix(f'{sensor.link.settings}: ')}", Weight.NEWS
+        )
 
     async def run(self) -> None:
         """Look until cancelled."""

@@ -11,7 +11,7 @@ from typing import Final
 
 from companion.configured.models import Role, SerialDevice, parts_of
 from companion.daemon.core import Offload
-from companion.daemon.devices.sensor_health import SensorHealth, line_of
+from companion.daemon.devices.sensor_health import SensorHealth
 from companion.links.serial.bytestream import ByteLink
 from companion.links.serial.ports import find_holders
 from companion.links.system.connection import Budget
@@ -68,9 +68,10 @@ class SensorRole:
         now_s = asyncio.get_running_loop().time()
         if self._last_s is not None and now_s - self._last_s < SILENT_AFTER_S:
             return None
+        port = sensor.link.settings
         if self.kind == "compass" and (north := sensor.other_north) is not None:
-            return f'{sensor.line}: its headings are {north}, compass.reference is another; set reference = "{north}"'
-        return f"{sensor.line}: {sensor.protocol} frames come, but none with {_WANTED[self.kind]}; is it set so?"
+            return f'{port}: its headings are {north}, compass.reference is another; set reference = "{north}"'
+        return f"{port}: {sensor.protocol} frames come, but none with {_WANTED[self.kind]}; is it set so?"
 
     def status(self) -> dict[str, object]:
         """For `companion status` and `check`."""
@@ -258,11 +259,6 @@ class SerialSensor:
         return self.dialogue.words if self.dialogue is not None else ""
 
     # --- how it is
-
-    @property
-    def line(self) -> str:
-        """The port and how it is set, for people."""
-        return line_of(self.link)
 
     @property
     def problem(self) -> str | None:

@@ -63,7 +63,7 @@ _TELLING: Final[dict[bool, tuple[_Doubt, ...]]] = {True: ("other key", "unsigned
 """By whether signatures are required: where they are not, an autopilot may still be without a key."""
 
 
-class _SignatureWatch:
+class SignatureWatch:
     """Whether the autopilot and we believe each other: who signs, with which key; what to do where that does not fit.
 
     Nobody has to be asking the autopilot for anything: a signature that is not right shows in all that it sends. Only
@@ -169,7 +169,7 @@ class LinkSigning:
             # From the first byte on: what comes before the key is read is not believed either.
             self.signing = Signing(required=self.mode == "require")
             link.signing = self.signing
-        self._watch = _SignatureWatch(link, vehicle, self.signing, say)
+        self.watch = SignatureWatch(link, vehicle, self.signing, say)
         link.subscribe(mavlink.MAVLink_setup_signing_message, self._on_setup)
 
     def load(self) -> None:
@@ -184,7 +184,7 @@ class LinkSigning:
         if signing is None:
             while True:
                 await asyncio.sleep(LOOK_S)
-                self._watch.update(asyncio.get_running_loop().time())
+                self.watch.update(asyncio.get_running_loop().time())
         while signing.key is None:
             await asyncio.sleep(KEY_AGAIN_S)
             self._take_key(signing)
@@ -193,7 +193,7 @@ class LinkSigning:
                 if signing.clock.now() > self._reserved - int(RESERVE_BEFORE_S * TICKS_PER_S):
                     await self._keep(signing, AHEAD_S)
                 self._tell(signing)
-                self._watch.update(asyncio.get_running_loop().time())
+                self.watch.update(asyncio.get_running_loop().time())
                 await asyncio.sleep(LOOK_S)
         finally:
             # An orderly end reserves nothing: the next start goes on from here.
@@ -262,7 +262,7 @@ class LinkSigning:
         if self.trouble:
             return self.trouble
         # Only who claims to be an autopilot explains why none is heard.
-        ((reason, number),) = self._watch.dropped.most_common(1) or [("unsigned", 0)]
+        ((reason, number),) = self.watch.dropped.most_common(1) or [("unsigned", 0)]
         if number == 0 or self._vehicle.alive:
             return None
         return {
@@ -272,26 +272,21 @@ class LinkSigning:
             "no key": f"{number} messages dropped: the signing key is still being read",
         }[reason]
 
-    @property
-    def warning(self) -> str | None:
-        """That the autopilot and we do not believe each other, and what to do; None where they do."""
-        return self._watch.warning
-
     def status(self) -> dict[str, Any] | None:
         """For `companion status`; None while signing is off and nothing asks for it."""
         signing = self.signing
         if signing is None:
-            if self.warning is None:
+            if self.watch.warning is None:
                 return None
             signing = Signing(required=False)  # nobody was checked
         doubted = sum(signing.doubted.values())
-        summary = self.rejecting or self.trouble or self.warning
+        summary = self.rejecting or self.trouble or self.watch.warning
         if not summary:
             summary = f"{signing.verified} messages checked"
             if doubted:
                 summary += f", {doubted} {'dropped' if signing.required else 'not signed with our key'}"
         return {
-            "good": self.rejecting is None and not self.trouble and self.warning is None,
+            "good": self.rejecting is None and not self.trouble and self.watch.warning is None,
             "mode": self.mode,
             "summary": summary,
             "verified": signing.verified,

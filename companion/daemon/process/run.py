@@ -53,7 +53,7 @@ RELOADABLE: Final[Mapping[str, Apply]] = {
     "push.parameters": _parameter("CMP_PUSH"),
     "component.tunes": _parameter("CMP_TUNES"),
     "push.stop_rivals": lambda service, value: service.offsets.rivalry.switch(stop_rivals=value),
-    "mavlink.allow": lambda service, value: service.faces.component.permission.allow(Senders(value)),
+    "mavlink.allow": lambda service, value: setattr(service.faces.component.permission, "senders", Senders(value)),
     "log.level": lambda _, value: logging.getLogger().setLevel(value.upper()),
 }
 """What can change without a restart, and how."""
@@ -175,7 +175,7 @@ class _Process:
             self._reload_wanted.clear()
             self._manager.reloading()
             try:
-                self._supervisor.note(await self._reloader.reload())
+                self._supervisor.note = await self._reloader.reload()
             finally:
                 self._manager.ready()
 

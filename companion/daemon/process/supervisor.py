@@ -99,15 +99,12 @@ class Supervisor:
         watched = watched_of(service)
         self.beats = Beats(watched)
         self._tasks = {each.name: each.task for each in watched}
-        self._note = ""
+        self.note = ""
+        """Said before everything else in the status; empty: nothing."""
         self.stopping = False
         """The tasks are being ended: nobody is missed any more."""
         self._missed: set[str] = set()
         self._status_failed = False
-
-    def note(self, words: str) -> None:
-        """Say this before everything else in the status; empty: nothing."""
-        self._note = words
 
     def stop(self) -> None:
         """The tasks are being ended from now on."""
@@ -147,7 +144,7 @@ class Supervisor:
     def _words(self, overdue: dict[str, float]) -> str:
         if not self._manager.listens:
             return ""
-        notes = [self._note] if self._note else []
+        notes = [self.note] if self.note else []
         if self.stopping:
             notes.append("stopping")
         notes += [f"HUNG: {name}" for name in overdue]

@@ -168,7 +168,7 @@ class MqttLink:
         if self.connected:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(within_s):
-                    await self.outbox.empty()
+                    await self.outbox.emptied.wait()
 
     async def _serve(self) -> None:
         """One connection, to its end.

@@ -46,8 +46,9 @@ class Outbox:
         self._answers: deque[Parcel] = deque()
         self._passing: dict[str, bytes] = {}
         self._filled = asyncio.Event()
-        self._empty = asyncio.Event()
-        self._empty.set()
+        self.emptied = asyncio.Event()
+        """Set while everything was sent."""
+        self.emptied.set()
         self._open = False
         self.dropped = 0
         """Answers that nobody will get."""
@@ -125,13 +126,9 @@ class Outbox:
             self._answers.popleft()
         self._tell()
 
-    async def empty(self) -> None:
-        """Wait until everything was sent."""
-        await self._empty.wait()
-
     def _tell(self) -> None:
         if len(self):
             self._filled.set()
-            self._empty.clear()
+            self.emptied.clear()
         else:
-            self._empty.set()
+            self.emptied.set()

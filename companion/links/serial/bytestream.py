@@ -63,6 +63,10 @@ class PortSettings:
         """Whether the other end is a socket (ser2net, a simulator) and not a device."""
         return self.url.startswith("tcp://")
 
+    def __str__(self) -> str:
+        """For people."""
+        return self.url if self.is_tcp else f"{self.url} at {self.baud} baud, parity {self.parity}"
+
     @property
     def seconds_per_byte(self) -> float:
         """Line time of one byte: start bit, 8 data bits, parity bit if any, stop bit. 0 for tcp://, where unknown."""
