@@ -169,13 +169,9 @@ class AttitudeEstimator:
         still: bool = False,
         airspeed_m_s: float | None = None,
     ) -> None:
-        """Take samples in the order of time; without an alignment they are left.
+        """Take samples, in the sensor's axes and in the order of time; without an alignment they are left.
 
-        Args:
-            samples: in the sensor's axes.
-            phase: how much acceleration is to be expected.
-            still: whether the aircraft is known to stand still; then the gyro biases are refined.
-            airspeed_m_s: forward, where known: what turning makes of it is then no tilt (omega x V).
+        While it stands still gyro biases are refined. What turning at a forward airspeed makes is no tilt (omega x V).
         """
         if not self._aligned:
             return

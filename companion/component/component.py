@@ -101,10 +101,9 @@ class Component:
         )
 
     def _tell_values(self, now_s: float) -> None:
-        """Progress and readiness, for Mission Planner's Quick tab: at every beat while it calibrates, else every fifth.
+        """Progress and readiness, with some 12 bytes a second: at every beat while it calibrates, else every fifth.
 
-        Mission Planner shows those of any component of the vehicle (`propagateNamedFloats`), QGroundControl those in
-        its MAVLink inspector: some 12 bytes a second.
+        Mission Planner shows them in its Quick tab (`propagateNamedFloats`), QGroundControl in its MAVLink inspector.
         """
         self._beats += 1
         if self._service.mav_state != mavlink.MAV_STATE_CALIBRATING and self._beats % IDLE_BEATS:

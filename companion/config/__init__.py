@@ -92,11 +92,7 @@ def parse(text: str, name: str, saved: Saved | None = None) -> Config:
 
 
 def _with_saved_profiles(config: Config, name: str, saved: Saved | None) -> Config:
-    """The configuration with the figures of saved profiles in the place of their names.
-
-    Raises:
-        ConfigError: one line that names file and key: an unknown name, or a profile that cannot be read.
-    """
+    """The configuration with the figures of saved profiles in the place of their names."""
     imus = []
     for index, imu in enumerate(config.imu):
         key = f"{name}: 'imu[{index}].profile': found"

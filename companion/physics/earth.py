@@ -35,9 +35,7 @@ _STRENGTH_SIGMA_NT: Final = 138.0
 def gravity_m_s2(latitude_deg: float, height_m: float) -> float:
     """Normal gravity by Somigliana's formula, with height (WGS 84; method section 3, "gravity").
 
-    Args:
-        latitude_deg: geodetic.
-        height_m: above the ellipsoid; sea level serves (its 100 m at most are 31 micro-g).
+    The latitude is geodetic, the height above the ellipsoid; sea level serves (its 100 m at most are 31 micro-g).
     """
     s2 = math.sin(latitude_deg * DEG) ** 2
     surface = 9.7803253359 * (1 + 0.00193185265241 * s2) / math.sqrt(1 - 0.00669437999014 * s2)

@@ -171,9 +171,7 @@ class Calibrations:
         window = self._windows.get(-1 if detail.window is None else detail.window)
         self.where, self._solved_with = detail.where, detail.offsets
         used = detail.alignment
-        self._alignment = (
-            AlignmentUsed(measured_at="", offset_deg=(used[0], used[1]), sigma_deg=used[2]) if used else None
-        )
+        self._alignment = AlignmentUsed(measured_at="", offset_deg=used[:2], sigma_deg=used[2]) if used else None
         if window is None:
             self._no_solution = "its measurement is not in the recording"
             return

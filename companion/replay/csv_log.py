@@ -54,10 +54,7 @@ _DECIMAL_COMMA: Final = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?")
 
 
 class _Lines:
-    """The lines of a file, with the number of the one that was read last.
-
-    A last line that does not end is left out once there were others: the log may have been cut there.
-    """
+    """The lines of a file, with the number of the one read last; a last one that is cut is left out."""
 
     def __init__(self, file: TextIO, path: Path) -> None:
         self.number = 0

@@ -167,10 +167,7 @@ def factors(units: Mapping[str, str]) -> Floats:
 
 
 def _noise(t_s: Floats, values: Floats) -> tuple[float, float]:
-    """Scatter of a second's mean on the noisiest axis, in the quieter seconds, and what their white noise makes of it.
-
-    Infinite where there are few seconds.
-    """
+    """Scatter of a second's mean on the noisiest axis, in the quieter seconds, and its white part; infinite of few."""
     slots = np.floor(t_s - t_s[0]).astype(np.int64) if len(t_s) else np.zeros(0, dtype=np.int64)
     starts = np.flatnonzero(np.diff(slots, prepend=-1))
     if len(starts) < _LEAST_PAIRS + 2:

@@ -155,10 +155,7 @@ async def wait_until_over(parameters: ParameterClient, before: Mapping[str, floa
 
 
 async def _pause(answer: asyncio.Future[int | None]) -> None:
-    """Until the answer or the next look; an answer that has come does not shorten the next one.
-
-    Offsets may stay at zero after it, and looking without a pause would fill the line.
-    """
+    """Until the answer or the next look; no earlier answer shortens that: looking without a pause fills the line."""
     if answer.done():
         await asyncio.sleep(_LOOK_S)
     else:

@@ -253,16 +253,16 @@ def changes_for(
     Raises:
         CalibrationRefusedError: a value that is not plausible, see the limits at the top.
     """
-    names = calibration.parameters
+    names, far = calibration.parameters, calibration.far_step
     changes: list[Change] = []
     if accel_residual_m_s2 is not None:
         after = accel_offset_after(calibration, accel_residual_m_s2)
-        far = calibration.far_step.accel_m_s2 if calibration.far_step else None
-        changes += vector_changes(names.accel_offset, calibration.accel_offset_m_s2, after, far)
+        step = far.accel_m_s2 if far else None
+        changes += vector_changes(names.accel_offset, calibration.accel_offset_m_s2, after, step)
     if gyro_residual_rad_s is not None:
         after = gyro_offset_after(calibration, gyro_residual_rad_s)
-        far = calibration.far_step.gyro_rad_s if calibration.far_step else None
-        changes += vector_changes(names.gyro_offset, calibration.gyro_offset_rad_s, after, far)
+        step = far.gyro_rad_s if far else None
+        changes += vector_changes(names.gyro_offset, calibration.gyro_offset_rad_s, after, step)
     return changes
 
 
@@ -338,15 +338,9 @@ def whole_bias(
 
 def whole_of(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:
     """Whole gyro and accelerometer bias of an IMU whose owner subtracts offsets already."""
-    gyro, accel = whole_bias(calibration, _residual(found.gyro_rad_s), _residual(found.accel_m_s2))
-    return (
-        np.array(gyro) if found.gyro_rad_s is not None else None,
-        np.array(accel) if found.accel_m_s2 is not None else None,
-    )
-
-
-def _residual(found: Array | None) -> Vector:
-    return (0.0, 0.0, 0.0) if found is None else _vector(found)
+    residuals = [(0.0, 0.0, 0.0) if one is None else _vector(one) for one in (found.gyro_rad_s, found.accel_m_s2)]
+    gyro, accel = map(np.array, whole_bias(calibration, *residuals))
+    return gyro if found.gyro_rad_s is not None else None, accel if found.accel_m_s2 is not None else None
 
 
 def accel_taken_off(calibration: ImuCalibration) -> Array:

@@ -57,12 +57,9 @@ class EkfWatch:
         return self._mean(0.0)
 
     async def settle(self, within_s: float, go_on: Callable[[str], None]) -> str | None:
-        """Wait until the estimate has settled; arming and a restart end the waiting.
+        """Wait until the estimate has settled (None), armed or restarted: what a pilot should know.
 
         `go_on` is told every look how far it is; what it raises ends the waiting too.
-
-        Returns:
-            None when it has settled; else what a pilot should know.
         """
         loop = asyncio.get_running_loop()
         self._seen.clear()  # what came before the write says nothing
@@ -108,10 +105,7 @@ class EkfWatch:
         self._vehicle.commands.request_message_interval(message_id, _RATE_HZ)
 
     def _mean(self, at_least_s: float) -> float | None:
-        """Of the last 2 s, or of as much more as it takes to see so long: a busy serial link lets few AHRS through.
-
-        None when not that much has been seen.
-        """
+        """Of the last 2 s, or of as much more as it takes on a busy line to see so long; None when it was not."""
         now_s = asyncio.get_running_loop().time()
         taken: list[tuple[float, float, float, float]] = []
         for each in reversed(self._seen):

@@ -179,10 +179,7 @@ class InForce:
 
     def reading(self) -> str | None:
         """An autopilot IMU whose offsets are not known at this moment, and why, in one line."""
-        for name, imu in self._imus.items():
-            if imu.stream.problem or imu.calibration is None:
-                return f"imu {name}: {imu.stream.problem or imu.problem}"
-        return None
+        return next((f"imu {name}: {imu.obstacle}" for name, imu in self._imus.items() if imu.obstacle), None)
 
     # --- what happens
 

@@ -105,6 +105,11 @@ class AutopilotImu:
             self._invalidate("offsets written")
 
     @property
+    def obstacle(self) -> str:
+        """Why nothing of it counts at this moment, in one line; empty: it does."""
+        return self.stream.problem or ("" if self.calibration is not None else self.problem)
+
+    @property
     def in_force(self) -> ImuCalibration:
         """What the autopilot subtracts.
 
@@ -246,8 +251,8 @@ def not_ready(vehicle: Vehicle, imus: Mapping[str, AutopilotImu]) -> str | None:
     if vehicle.arm_state is ArmState.UNKNOWN:
         return "waiting for the autopilot's heartbeat"
     for imu in imus.values():
-        if imu.stream.problem or imu.calibration is None:
-            return f"waiting for imu {imu.name}: {imu.stream.problem or imu.problem}"
+        if imu.obstacle:
+            return f"waiting for imu {imu.name}: {imu.obstacle}"
     return None
 
 

@@ -78,12 +78,9 @@ class MotionWitness:
                 seconds.append((batch.slot, down, turned_deg))
 
     def tilted_deg(self, near_since_s: float, since_s: float, until_s: float) -> float:
-        """By how much it has tilted and stayed so; the least that any IMU saw.
+        """By how much it has tilted since `near_since_s`, and stayed so since `since_s`; the least that any IMU saw.
 
-        Args:
-            near_since_s: since when the sensor shows about what it shows now; the pose then is compared with.
-            since_s: since when it shows exactly that; only what has stayed since then counts.
-            until_s: its latest reading.
+        So long the sensor has shown about, and exactly, what it shows now; `until_s`: its latest reading.
         """
         return min((self._tilted_deg(each, since_s) for each in self._heard(near_since_s, until_s)), default=0.0)
 
@@ -180,13 +177,14 @@ class SensorWatch:
 
     def implausible(self) -> str | None:
         """A sensor whose readings look good and are not, and why; None where there is none."""
-        now_s = asyncio.get_running_loop().time()
-        found = ((sensor.name, sensor.health.trouble(now_s)) for sensor in self._sensors)
-        return next((f"{name}: {each.words}" for name, each in found if each is not None and each.implausible), None)
+        return next((words for plausible, words in self._troubles() if not plausible), None)
 
     def worst(self) -> str | None:
         """Of the sensor that troubles most what is wrong, with its name; None while all do well."""
+        return next((words for _, words in self._troubles()), None)
+
+    def _troubles(self) -> list[tuple[bool, str]]:
+        """Whether it looks plausible, and which sensor's it is in words; the worst first."""
         now_s = asyncio.get_running_loop().time()
         found = [(sensor.name, sensor.health.trouble(now_s)) for sensor in self._sensors]
-        troubles = sorted((not each.implausible, f"{name}: {each.words}") for name, each in found if each is not None)
-        return troubles[0][1] if troubles else None
+        return sorted((not each.implausible, f"{name}: {each.words}") for name, each in found if each is not None)

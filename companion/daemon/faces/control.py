@@ -59,11 +59,7 @@ class ControlServer:
         """How many are served, urgent or not."""
 
     async def __aenter__(self) -> Self:
-        """Bind the socket, replacing a stale one.
-
-        Raises:
-            LinkError: another daemon answers there, or the path cannot be bound.
-        """
+        """Bind the socket, replacing a stale one; a LinkError where another daemon answers, or it cannot be bound."""
         listener = _bind(self._path)
         if self._group is not None:
             _open_to(self._path, self._group)
@@ -108,11 +104,7 @@ class ControlServer:
             writer.transport.abort()
 
     async def _request(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Object | None:
-        """What a client asks; None: nothing that can be understood, which it has been told.
-
-        Raises:
-            TimeoutError: it does not ask in time.
-        """
+        """What a client asks; None: nothing that can be understood, which it is told; TimeoutError: not in time."""
         try:
             async with asyncio.timeout(REQUEST_TIMEOUT_S):
                 line = await reader.readline()
@@ -152,11 +144,7 @@ class ControlServer:
 
 
 async def _write(writer: asyncio.StreamWriter, reply: Object) -> None:
-    """Send one line.
-
-    Raises:
-        ConnectionError: the other side is gone, or does not read.
-    """
+    """Send one line; a ConnectionError where the other side is gone, or does not read."""
     writer.write(msgspec.json.encode(reply) + b"\n")
     try:
         async with asyncio.timeout(ANSWER_TIMEOUT_S):
@@ -166,11 +154,7 @@ async def _write(writer: asyncio.StreamWriter, reply: Object) -> None:
 
 
 async def _finish(writer: asyncio.StreamWriter) -> None:
-    """Close when the other side has everything.
-
-    Raises:
-        OSError: it is gone, or does not read; of which a `TimeoutError` is one.
-    """
+    """Close when the other side has everything; an OSError where it is gone, or does not read."""
     writer.close()
     async with asyncio.timeout(ANSWER_TIMEOUT_S):
         await writer.wait_closed()
@@ -196,10 +180,7 @@ def _bind(path: Path) -> socket.socket:
 
 
 def _open_to(path: Path, group: str) -> None:
-    """Let the members of a group use the socket; where that is not to be had it stays closed to them, and it is said.
-
-    No privilege is needed: one may give a file of one's own to any group that one is a member of.
-    """
+    """Let a group of which we are a member use the socket; where that cannot be it stays closed, and it is said."""
     try:
         os.chown(path, -1, grp.getgrnam(group).gr_gid)
         path.chmod(0o660)
@@ -220,11 +201,7 @@ def _who_may(path: Path) -> str:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove a socket that nobody listens on any more.
-
-    Raises:
-        LinkError: somebody answers there, or what is there is no socket.
-    """
+    """Remove a socket that nobody listens on any more; a LinkError where somebody does, or it is no socket."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:

@@ -51,11 +51,7 @@ class Heading(Subsystem):
         return {"autopilot-setup": self._answer_setup}
 
     async def _answer_setup(self, _request: Object, _face: str) -> AsyncIterator[Object]:
-        """What is set, what should be, and what to do: for our heading, the gate, the offsets, and the port.
-
-        Raises:
-            AutopilotError: it does not answer, or cannot take in a heading.
-        """
+        """What is set, what should be, and what to do: for our heading, the gate, the offsets, and the port."""
         firmware = self._core.vehicle.firmware
         wanted = wanted_for(firmware)
         found = await self._core.parameters.read_many([one.parameter for one in wanted], optional=True)

@@ -28,12 +28,8 @@ logger = logging.getLogger(__name__)
 class Service:
     """The daemon, subsystem by subsystem; each knows only those above it here.
 
-    Args:
-        config: what to run.
-        link: the MAVLink connection; a test may have put it on a wire of its own.
-        offload: runs a blocking call elsewhere.
-        imu_rate_hz: asked of the autopilot for each IMU, which may grant less; None: what the connection can carry.
-        only_listening: why nothing may be started, where it must change nothing; None: it works.
+    A test may have put the link on a wire of its own. `offload` runs a blocking call elsewhere; `only_listening` says
+    why nothing may be started, where it must change nothing.
     """
 
     def __init__(

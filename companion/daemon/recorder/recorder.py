@@ -247,11 +247,7 @@ class Recorder(Subsystem):
                 self.fault = None
 
     async def _in_thread(self, function: Callable[..., T], *arguments: object) -> T:
-        """Run a call that touches a file; a cancel waits for its end, since two of them must never overlap.
-
-        Raises:
-            StorageError: as the call; and for any fault of the program in it.
-        """
+        """Run a call that touches a file; a cancel waits for its end, since two of them must never overlap."""
         task: asyncio.Future[T] = asyncio.ensure_future(self._offload(function, *arguments))
         try:
             return await asyncio.shield(task)

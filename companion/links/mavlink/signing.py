@@ -81,13 +81,8 @@ def _digest(key: bytes, packet: bytes | bytearray) -> bytes:
 class SigningClock:
     """Time for signatures: never the same twice, never back, whatever the system's clock does.
 
-    A board without a battery-backed clock starts in 1970: then it goes on from `start`, and takes over the time of the
-    first message that is signed with our key.
-
-    Args:
-        start: ticks; later than all that was used before.
-        wall_s: Unix time.
-        uptime: as `uptime_s`.
+    A board without a battery-backed clock starts in 1970: then it goes on from `start` (ticks, later than all that was
+    used before), and takes over the time of the first message that is signed with our key.
     """
 
     def __init__(

@@ -22,6 +22,7 @@ from companion.links.mqtt.broker import explain, is_of_protocol, is_open_to_all,
 from companion.links.mqtt.filter import LEAVE_DEADLINE_S, MAX_PACKET_BYTES, MqttFilter
 from companion.links.mqtt.outbox import Outbox
 from companion.links.system.connection import Backoff, Reconnection
+from companion.links.system.waiting import comes
 
 if TYPE_CHECKING:
     import aiomqtt
@@ -166,18 +167,10 @@ class MqttLink:
     async def flush(self, within_s: float) -> None:
         """Wait until everything was sent, if there is a connection, and for so long at most."""
         if self.connected:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(within_s):
-                    await self.outbox.emptied.wait()
+            await comes(self.outbox.emptied, within_s)
 
     async def _serve(self) -> None:
-        """One connection, to its end.
-
-        Raises:
-            LinkError: password or certificates cannot be used, or the broker sends what is not taken.
-            OSError: no broker is reached.
-            aiomqtt.MqttError: it refuses, or the connection is lost.
-        """
+        """One connection, to its end; raises LinkError, OSError or aiomqtt.MqttError for why."""
         import aiomqtt
 
         password = await self._offload(read_password, self.settings)

@@ -67,12 +67,7 @@ class MqttFilter:
         """Why the connection was ended here: a `BrokerFaultError`, a `NoGreetingError` or an `OSError`."""
 
     async def __aenter__(self) -> Self:
-        """Reach the broker.
-
-        Raises:
-            OSError: it cannot be reached, or TLS fails.
-            UnicodeError: the host cannot be a name.
-        """
+        """Reach the broker; raises OSError where that or TLS fails, UnicodeError where the host cannot be a name."""
         try:
             async with asyncio.timeout(CONNECT_DEADLINE_S):
                 connection = socket.socket(fileno=await connect(self._host, self._port))
@@ -148,13 +143,7 @@ class MqttFilter:
     async def _inwards(
         self, reader: asyncio.StreamReader, library: asyncio.StreamWriter, writer: asyncio.StreamWriter
     ) -> None:
-        """Hand packets to the library until the broker ends the connection.
-
-        Raises:
-            BrokerFaultError: a packet that is not taken, or a flood.
-            NoGreetingError: the first packet is none of a broker's.
-            OSError: TLS fails.
-        """
+        """Hand packets to the library until the broker ends the connection; what is not taken raises."""
         loop = asyncio.get_running_loop()
         budget, flood_since_s = Budget(BYTES_PER_S, BYTES_PER_S), 0.0
         library.transport.set_write_buffer_limits(0)
@@ -216,12 +205,9 @@ def _is_wanted(kind: int) -> bool:
 
 
 def _properties_at(kind: int, body: bytes) -> int:
-    """Where the properties begin that nothing is made of here; behind the body: nowhere.
+    """Where the properties begin, of which nothing is made here; behind the body: nowhere.
 
-    The library takes longer to decode properties than to do everything else.
-
-    Raises:
-        ValueError: a message has a topic that is none, at which the library would stumble.
+    The library takes long to decode them. A topic that is none, at which it would stumble, is a ValueError.
     """
     if kind & 0xF0 != PUBLISH:
         return {PUBACK: 3, SUBACK: 2, DISCONNECT: 1}.get(kind, len(body))

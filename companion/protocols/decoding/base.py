@@ -189,9 +189,7 @@ class SentenceDecoder(Decoder):
     def _read(self, body: bytes, t_s: float, samples: list[Sample]) -> None:
         """Append the samples, one or more, of what stood between "$" and "*"; its checksum was right.
 
-        Raises:
-            RejectedError: the sentence is to be counted as rejected; nothing was appended.
-            ValueError: the same, from `float` and its like: a field is not a number.
+        What is to be counted as rejected raises RejectedError, or ValueError as `float`; nothing was appended then.
         """
 
     def _last_sentence(self, text: bytes) -> bytes:

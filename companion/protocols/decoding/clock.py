@@ -152,12 +152,9 @@ class SampleTimes:
         self._newest_s = -math.inf
 
     def place(self, samples: list[Sample], read_s: float, frame_s: float = 0.0) -> list[Sample]:
-        """The samples of one feed with their times; those that get none are dropped and counted.
+        """The samples of one feed, timed when their frame's last byte had come, with their times; some get none.
 
-        Args:
-            samples: in their order, timed when their frame's last byte had come.
-            read_s: when the bytes were read that completed them.
-            frame_s: line time of one frame; its sample was taken before its first byte was sent.
+        They were taken before the first byte of a frame, `frame_s` long, was sent.
         """
         placed: list[Sample] = []
         frame_at_s, frame_t_s = math.nan, math.nan

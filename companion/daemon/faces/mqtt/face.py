@@ -24,6 +24,7 @@ from companion.formats import Object
 from companion.links.mqtt.client import Incoming, MqttLink
 
 logger = logging.getLogger(__name__)
+_json: Final = msgspec.json.encode
 
 LOOK_S: Final = 0.2
 """The attitude goes out at every look: at most 5 a second."""
@@ -288,7 +289,3 @@ class MqttFace:
     def _respond(self, command: str, response: Object, *, droppable: bool) -> None:
         if self.topics is not None and self.link is not None:
             self.link.outbox.answer(self.topics.response(command), _json(response), droppable=droppable)
-
-
-def _json(value: object) -> bytes:
-    return msgspec.json.encode(value)
