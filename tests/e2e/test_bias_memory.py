@@ -365,7 +365,7 @@ def test_the_gate_closes_by_what_the_temperature_does_to_this_imu(
             assert lines[0] == f"fc: {len(seen['points'])} still windows of 9 power-ups, 13 to 34 degC"
             assert len(lines) == 2 + len(seen["curve"])
             # Nobody sees the output while somebody carries it about.
-            in_force._temperatures["fc"], in_force._present = 25.0, {}
+            in_force.temperatures_degc["fc"], in_force._present = 25.0, {}
             words = [finding.words for finding in in_force.findings(rig.now_s)]
             gyros = [word for word in words if word.startswith("gyro")]
             moved = [float(word.split()[3]) for word in gyros if word.endswith(" deg/h off, 5 K warmer")]
