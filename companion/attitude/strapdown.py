@@ -40,7 +40,6 @@ class Stretch(NamedTuple):
     """What happened in about `STEP_S` seconds."""
 
     t_s: float
-    """Its end."""
     span_s: float
     force_m_s2: Triple
     """Mean specific force in E."""

@@ -91,7 +91,6 @@ class Uncertainty:
         self._covariance[2, 2] = (known + gain * sigma_rad) ** 2
 
     def _rest_variance(self, seconds: float) -> float:
-        """Of one axis' mean rate over so many seconds."""
         return self._noise.white**2 / seconds + self._noise.floor**2
 
     def rest_sigma(self, seconds: float) -> Array:

@@ -78,7 +78,6 @@ class Component:
             self._texts.step(loop.time())
 
     def _step(self, now_s: float) -> float:
-        """Do what is due; returns when something is due next."""
         self._follow_vehicle()
         if now_s >= self._next_heartbeat_s:
             if self._link.connected:

@@ -17,7 +17,6 @@ from companion.config.sections import Config
 from companion.errors import ConfigError
 
 _LONGEST: Final = 200
-"""The most characters of a found value that a message quotes."""
 _INT_BITS: Final = 63
 _briefly: Final = reprlib.Repr()
 _briefly.maxstring = _briefly.maxother = _briefly.maxlong = 80

@@ -54,7 +54,6 @@ class Ack(NamedTuple):
     result: int
     progress: int
     detail: int
-    """`result_param2`."""
 
 
 class Vehicle(NamedTuple):

@@ -94,7 +94,6 @@ _VERTICAL: Final = 1e-9
 
 
 def _horizontal_axes(up: Array) -> tuple[Array, Array]:
-    """Unit vectors along the first axis' horizontal projection, and to the right of it."""
     ahead = horizontal(np.array([1.0, 0.0, 0.0]), up)
     size = float(np.linalg.norm(ahead))
     if size <= _VERTICAL:

@@ -20,7 +20,6 @@ _FRAMES: Final = (
     re.compile(rb"(?=\xfe(\x09.(..)\x00(.{9}))(..))", re.DOTALL),
 )
 _EXTRA: Final = 50
-"""CRC_EXTRA of HEARTBEAT."""
 _NO_AUTOPILOT: Final = 8
 _TYPE, _AUTOPILOT = 4, 5
 _GROUND_STATION: Final = 6
@@ -34,9 +33,7 @@ class Heartbeat:
     system_id: int
     component_id: int
     kind: int
-    """MAV_TYPE."""
     autopilot: int
-    """MAV_AUTOPILOT."""
 
     @property
     def is_autopilot(self) -> bool:

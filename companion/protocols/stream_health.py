@@ -43,7 +43,6 @@ _HARMLESS: Final = frozenset(
     }
     | {reasons.UNKNOWN_FIELD, reasons.UNKNOWN_GROUP, reasons.UNKNOWN_SENTENCE}
 )
-"""Reasons for rejecting a frame that came whole."""
 _DAMAGED_SHARE: Final = 0.1
 _DAMAGED_FRAMES: Final = 3
 _RESTART_GAP_S: Final = 0.3

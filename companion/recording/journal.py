@@ -56,7 +56,6 @@ class Solved(msgspec.Struct, frozen=True, kw_only=True):
     """What a calibration was worked out from, besides the readings."""
 
     window: int | None
-    """The number of its means."""
     refined: Window | None
     """The means that a dither found: they come of other readings than those of the window."""
     where: Whereabouts

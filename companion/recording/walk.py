@@ -115,7 +115,6 @@ class Recording:
             self.cut_short = str(error) or "damaged: a record ends too early"
 
     def _file(self, wanted: Callable[[str], bool]) -> Iterator[Item]:
-        """What is in the file."""
         data, size = self._data, len(self._data)
         at, room = len(MAGIC), MOST_BYTES + MOST_TIMES * size
         if size < at:
@@ -137,7 +136,6 @@ class Recording:
         raise _DamagedError(f"cut at byte {size}")
 
     def _records(self, data: bytes, wanted: Callable[[str], bool]) -> Iterator[Item]:
-        """What is in some records."""
         from mcap import records
 
         at, size, topic_of = 0, len(data), self._topic_of

@@ -106,7 +106,6 @@ def _ulog_imus(path: Path, data: dict[tuple[str, int], dict[str, Any]]) -> Itera
 _KINDS: Final = {"IMU": 0, "IMU2": 1, "IMU3": 2}
 """Messages and their instances; newer firmware has one kind, with the instance in it."""
 _HEAD: Final = 3
-"""Bytes before every message's body."""
 _FIELDS: Final = ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ")
 
 

@@ -150,7 +150,6 @@ class Calibrations:
         """The offsets in force when that was measured; by now others may have been written."""
         self._no_solution = ""
         self._refused: str | None = None
-        """Why the estimator refuses here what was measured then."""
         self._alignment: AlignmentUsed | None = None
 
     def begin(self) -> None:

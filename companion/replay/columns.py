@@ -65,7 +65,6 @@ _ALIASES: Final[dict[str, str]] = {
     **{name: name for name in TILT},
 }
 _TIME_NAMES: Final = {"millis": "ms", "micros": "us", "timeus": "us", "time_usec": "us", "millisecond": "ms"}
-"""Names of time that say their unit by themselves."""
 _UNIT_WORDS: Final = {
     "rad/s": "rad_s", "rads": "rad_s", "rad/sec": "rad_s", "radps": "rad_s", "rad_s": "rad_s",
     "deg/s": "deg_s", "deg/sec": "deg_s", "degs": "deg_s", "dps": "deg_s", "deg_s": "deg_s", "degree/s": "deg_s",
@@ -101,7 +100,6 @@ class Column(msgspec.Struct, frozen=True, kw_only=True):
     what: str
     """The quantity, as in `UNITS`."""
     name: str
-    """As it stands in the file."""
     unit: str | None
     """None: nothing says it."""
 
@@ -112,7 +110,6 @@ class Columns(msgspec.Struct, frozen=True, kw_only=True):
     names: tuple[str, ...]
     """All, as they stand in the file."""
     used: dict[str, Column]
-    """By quantity."""
 
     def named(self, units: dict[str, str]) -> str:
         """The table's columns by our own names, as --columns takes them; `units` of quantities replace theirs."""

@@ -42,7 +42,6 @@ _LONGEST: Final = 1 << 14
 """The most characters of a line: a hundred columns have a tenth of that."""
 _REMARKS: Final = ("#", "//", "%")
 _NO_NUMBER: Final = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "--", "nil", "#n/a"))
-"""What loggers write where they have no number."""
 _MOST_TEXTS: Final = 60
 """Lines of text before the numbers: a logger's preamble, the names, the units."""
 _AT_ONCE: Final = 4096
@@ -349,7 +348,6 @@ class _Table:
 
 _SEPARATORS: Final = (";", "\t", ",", " ")
 _AROUND: Final = ' "\t\r\n'
-"""What may stand around a number."""
 
 
 def _fields(text: str, separator: str) -> list[str]:

@@ -98,7 +98,6 @@ class Result(msgspec.Struct, frozen=True):
     estimate: Record | None
     """Of the last still stretch, where no calibration is in the recording."""
     seconds: float
-    """Of recorded time."""
     cut_short: str | None
     notes: list[str]
     """What a reader should know: other versions, samples that do not decode as they did."""
@@ -117,7 +116,6 @@ class Replay:
         self._roles: dict[str, tuple[Role, ...]] = {}
         """Of each device, by the name that its bytes have."""
         self._autopilots: list[str] = []
-        """IMUs whose samples come over MAVLink."""
         self._telemetry = Telemetry()
         self._calibrations = Calibrations()
         self._handlers: dict[str, Callable[[bytes], None] | None] = {}

@@ -13,10 +13,8 @@ from companion.config.sections import Noise
 from companion.physics.frames import Floats
 
 NAME: Final = "imu"
-"""What the IMU of a log that names none is called."""
 
 LAST_S: Final = 1e11
-"""The latest time, by any clock."""
 
 
 class Poses(msgspec.Struct, frozen=True, kw_only=True):
@@ -27,7 +25,6 @@ class Poses(msgspec.Struct, frozen=True, kw_only=True):
     heading_deg: Floats | None = None
     """(n,)."""
     magnetic: bool = False
-    """Whether the heading is from magnetic north."""
     field_gauss: Floats | None = None
     """(n, 3), in the IMU's axes."""
 

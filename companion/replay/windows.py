@@ -29,7 +29,6 @@ MOST_WINDOWS: Final = 100_000
 PAUSE_S: Final = 3.0
 """A sensor that was silent for longer may have been switched off."""
 HORIZON_S: Final = 180.0
-"""What sigma_use speaks of."""
 _AXES: Final = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
 _SAME_RAD: Final = 1.0 * DEG
 """More than any bias drifts by: gravity from elsewhere is another pose."""

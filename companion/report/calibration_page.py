@@ -90,7 +90,6 @@ def _headline(material: Material) -> Markup:
 
 
 def _in_short(record: Record) -> str:
-    """What a pilot wants to know first."""
     outcomes = [written.outcome for imu in record.imus for written in imu.written.values()]
     found = ", ".join(imu.name for imu in record.imus)
     words = f"Biases found of {found}. " if record.state == "done" and found else ""

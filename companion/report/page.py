@@ -28,7 +28,6 @@ _MOST: Final = 1e4
 _DOT_SHARE: Final = 0.015
 """How wide a dot is, of a plot's width."""
 _LATEST_S: Final = 230 * 365.25 * 86400
-"""The year 2200."""
 MAX_WARNINGS: Final = 40
 MAX_IMUS: Final = 4
 """The most IMUs shown: three of an autopilot and our own. More are mentioned: a page stays below half a megabyte."""

@@ -13,7 +13,6 @@ from companion.storage.records import Entry, RecordStore
 from companion.storage.state import BoundedList
 
 MAX_EARLIER: Final = 60
-"""The most calibrations in the drift plots of a page."""
 
 
 def material(directory: Path, wanted: str | None) -> Material:

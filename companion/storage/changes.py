@@ -152,7 +152,6 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
 
 ChangeFile = StateFile[ChangeSet]
-"""One change set on disk, or none."""
 
 
 class ChangeLog:

@@ -79,7 +79,6 @@ def _check_biases(found: _File) -> None:
 
 SIGNING_FILE: Final = "mavlink-signing-time.json"
 MOST_UPTIME_S: Final = 3.2e9
-"""A century."""
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
 

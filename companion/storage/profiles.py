@@ -42,7 +42,6 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
     format_version: int
     name: str
     saved_at: str
-    """UTC."""
     imu: str
     gyro: AllanModel
     """rad/s (times sqrt(s), 1, over sqrt(s))."""

@@ -33,7 +33,6 @@ class ArduPilotParameters(ImuParameters):
     tcal_enable: str
     """Temperature calibration: 0 off, 1 on, 2 learning."""
     use: str
-    """Whether the autopilot uses this IMU."""
 
 
 def parameters_of(instance: int) -> ArduPilotParameters:

@@ -27,7 +27,6 @@ class Wanted:
     bits: bool = False
     """The value's bits are to be set, others stay as they are."""
     optional: bool = False
-    """Some releases do without it."""
 
     def after(self, before: float) -> float:
         """What it is to become."""

@@ -266,7 +266,6 @@ async def _read_rotation(parameters: ParameterClient, gyro: Slot, accel: Slot) -
 
 
 def _bus(slot: Slot) -> int:
-    """The kind of bus in a device id."""
     return slot.device_id & 0b111
 
 

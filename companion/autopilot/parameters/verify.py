@@ -51,7 +51,6 @@ class Observation:
     expected_step: Vector
     """What the output had to move by (`imu_calibration.output_step`)."""
     truth: Vector
-    """What the sensor had to read."""
     tolerance: float
     """What may remain of the residual besides noise."""
     orientation: Matrix | None = None
@@ -158,7 +157,6 @@ def _judge_axis(parameter: str, expected: float, made: float, sigma: float, slac
 
 
 def _matched_filter(made: Array, expected: Array, sigma: Array, resolution: float) -> tuple[float | None, float | None]:
-    """The weighted least-squares fraction of `expected` in `made`, and its sigma."""
     floor = np.maximum(sigma, max(resolution, 1e-12))
     weight = float(np.sum((expected / floor) ** 2))
     if not math.isfinite(weight) or weight == 0.0:

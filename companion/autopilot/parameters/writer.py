@@ -65,8 +65,6 @@ _ROUNDS: Final = 2
 
 @dataclasses.dataclass(slots=True)
 class _Item:
-    """A change on its way."""
-
     change: Change
     sent: bool = False
     confirmed: bool = False

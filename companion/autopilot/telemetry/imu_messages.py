@@ -105,7 +105,6 @@ RAW: Final = ImuMessage(_integer_kind("RAW_IMU"), mavlink.MAVLink_raw_imu_messag
 """Its name notwithstanding: calibrated and filtered, the same as SCALED_IMU (ArduPilot)."""
 
 ARDUPILOT: Final = {1: (HIGHRES, SCALED, RAW), 2: (SCALED2,), 3: (SCALED3,)}
-"""Messages by instance, the best first."""
 
 PX4: Final = {1: (SCALED,), 2: (SCALED2,), 3: (SCALED3,)}
 """Never HIGHRES_IMU: PX4 takes EKF2's own estimate of the bias off it, so at rest it tells nothing."""

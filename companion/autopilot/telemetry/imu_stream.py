@@ -51,8 +51,6 @@ _TEMPERATURE_AGE_S: Final = 5.0
 
 @dataclasses.dataclass(slots=True)
 class _Source:
-    """One message as a possible source of samples."""
-
     message: ImuMessage
     rates_hz: Sequence[float]
     rate: int = 0
@@ -99,7 +97,6 @@ class ImuStream:
         self.turns = 0
         """Turns of `run`, one at least every `BEAT_WITHIN_S`, whether samples come or not."""
         self.rejected: Counter[str] = Counter()
-        """Messages that gave no sample, by reason."""
         self._vehicle, self._instance = vehicle, instance
         self._on_sample, self._on_kind_change = on_sample, on_kind_change
         self._rates_hz = [rate_hz, *(rate for rate in SLOWER_RATES_HZ if rate < rate_hz)]
@@ -135,7 +132,6 @@ class ImuStream:
     # --- which message, at which rate
 
     async def _serve(self) -> None:
-        """From finding the autopilot to losing it."""
         if not self._vehicle.alive:
             self._lose("no heartbeat from the autopilot")
         self.turns += 1

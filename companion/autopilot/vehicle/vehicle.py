@@ -84,12 +84,9 @@ class Vehicle:
         self.signs = False
         """Whether its last heartbeat was signed (MAVLink 2)."""
         self.boots = 0
-        """How many restarts were seen."""
         self.place = TimeAndPlace(is_carried)
-        """What it says of time and place."""
         self.commands = Commands(link, lambda: None if self.system_id is None else (self.system_id, self.component_id))
         self.boot = BootWatch(link, self.sent, self._restarted)
-        """Its time since boot."""
         self._link = link
         self._latch = Latch(system_id)
         self._heartbeat_s: float | None = None
@@ -346,7 +343,6 @@ class Vehicle:
         self._tell("rebooted")
 
     def _of_ours(self, handler: Handler[M]) -> Handler[M]:
-        """The handler, called only with what the latched autopilot has sent."""
 
         def hear(message: M, t_s: float) -> None:
             if self.sent(message):

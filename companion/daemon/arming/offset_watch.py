@@ -22,8 +22,6 @@ logger = logging.getLogger(__name__)
 
 
 class _Known(msgspec.Struct, frozen=True):
-    """The offsets that the autopilot had when they were looked at last."""
-
     offsets: tuple[float, ...]
     """Gyro offsets first; not by name, since what is learned of PX4's slots gives the same IMU other names."""
     boots: int

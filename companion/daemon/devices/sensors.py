@@ -27,7 +27,6 @@ RATE_SPAN_S: Final = 2.0
 TICK_S: Final = 0.02
 """Between two things that are said, and between two looks while a conversation goes on."""
 COARSE_S: Final = 0.25
-"""Between two looks otherwise."""
 LIVELY_S: Final = 1.0
 """How long after something was said a conversation counts as going on."""
 LOOK_AGAIN_S: Final = 60.0
@@ -170,7 +169,6 @@ class SerialSensor:
                 self.dialogue.opened(now_s)
 
     def _on_gap(self) -> None:
-        """Bytes are missing from here on."""
         self._together.drain()
         self._interrupted(asyncio.get_running_loop().time())
 

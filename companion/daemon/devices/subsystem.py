@@ -34,7 +34,6 @@ class Devices(Subsystem):
         rate_hz = models.imu_rate_hz(core.config) if imu_rate_hz is None else imu_rate_hz
         imus = [imu for imu in core.config.imu if imu.source == "autopilot"]
         self.imus = {imu.name: AutopilotImu(core, imu, self.slots, rate_hz) for imu in imus}
-        """The autopilot's IMUs, by name."""
         self.sensors = [
             SerialSensor(device, self._take, core.offload, core.link.together) for device in serial_devices(core.config)
         ]

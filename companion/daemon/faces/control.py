@@ -190,7 +190,6 @@ def _open_to(path: Path, group: str) -> None:
 
 
 def _who_may(path: Path) -> str:
-    """Who may use a socket that refused us."""
     try:
         found = path.stat()
         if found.st_mode & stat.S_IWGRP:

@@ -39,7 +39,6 @@ VFR_HUD_RATE_HZ: Final = 5.0
 AIRSPEED_OLD_S: Final = 1.0
 INTERNAL: Final = "internal error; the log has the details"
 SAID_AGAIN_S: Final = 30.0
-"""The same stop is not told more often."""
 SHORTEST_S: Final = 0.02
 """The least time between two messages: ArduPilot drops what comes sooner (autopilots section 6)."""
 SHOWN_EVERY_S: Final = 0.2
@@ -54,7 +53,6 @@ class Sender:
     def __init__(self, link: MavlinkLink, rate_hz: float, *, full: bool) -> None:
         self.sent = 0
         self.rate_hz = 0.0
-        """Of late."""
         self._link, self._full = link, full
         self._period_s = max(1.0 / rate_hz, SHORTEST_S)
         self._next_s = self._last_s = self._left_s = self._shown_s = -math.inf

@@ -156,7 +156,6 @@ class Carrier:
         self.imu = imu
         self.estimator: AttitudeEstimator | None = None
         self.heard_s = -math.inf
-        """When the last sample was taken."""
         self.phase: Phase = "ground"
         self.still = False
         self.alignments = 0

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 REBOOT: Final = "then restart the autopilot: they act from then on"
 OLDEST_S: Final = 1.0
-"""A reading older than this is none."""
 DECLINATION_EVERY_S: Final = 60.0
 
 

@@ -243,7 +243,6 @@ def _device(device: Object, elsewhere: Finding | None) -> Finding:
 
 
 def _gate(config: Config, setup: Object) -> Finding:
-    """Whether anybody asks before arming."""
     if not config.push.parameters:
         return Finding("arming", good=False, words="at_arm = gate with push.parameters = false never opens")
     if not setup["known"]:
@@ -253,13 +252,11 @@ def _gate(config: Config, setup: Object) -> Finding:
 
 
 async def _heading(config: Config) -> Finding:
-    """Whether the autopilot takes in our heading."""
     replies = [reply async for reply in ask(config.control.path, {"command": "autopilot-setup"})]
     return Finding("heading", good=replies[-1].get("state") == "applied", words=replies[-1]["reason"])
 
 
 def _storage(directory: Path) -> Finding:
-    """Whether records can be kept."""
     place = directory
     while not place.exists() and place != place.parent:
         place = place.parent

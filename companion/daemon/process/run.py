@@ -122,8 +122,6 @@ async def run(config: Config, path: Path) -> None:
 
 
 class _Process:
-    """One run of the service."""
-
     def __init__(self, service: Service, path: Path, manager: ServiceManager) -> None:
         self._service, self._manager = service, manager
         self._supervisor = Supervisor(service, manager)

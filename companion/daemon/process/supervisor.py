@@ -44,11 +44,9 @@ class Watched(NamedTuple):
 
     name: str
     task: str
-    """As the service calls it."""
     within_s: float
     """How long a turn of it may take."""
     who: Turning
-    """Runs in it."""
 
 
 class Beats:
@@ -159,7 +157,6 @@ class Supervisor:
 
 
 def _where(task_name: str) -> str:
-    """Where a task waits, for the log."""
     for task in asyncio.all_tasks():
         if task.get_name() == task_name:
             inner = task.get_coro()

@@ -88,8 +88,6 @@ def _coarse(where: Whereabouts) -> tuple[object, ...]:
 
 @dataclasses.dataclass(slots=True)
 class _OnRequest:
-    """A recording that somebody asked for."""
-
     file: RecordingFile
     lost_before: int
     """Messages that were lost in all when it began."""
@@ -384,7 +382,6 @@ class Recorder(Subsystem):
 
 
 def _kept(folder: Path) -> Path:
-    """A name that the ring does not delete."""
     try:
         folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
         numbers = [int(path.stem[5:]) for path in folder.glob("kept-*.mcap") if path.stem[5:].isdecimal()]

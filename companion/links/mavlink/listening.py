@@ -26,7 +26,6 @@ class HeardUdp:
     """Autopilots first."""
     datagrams: int
     from_here: bool
-    """Whether all of them came from this computer."""
 
     @property
     def autopilot(self) -> Heartbeat | None:

@@ -197,7 +197,6 @@ class Signing:
         return frame[-_TAIL] if signed and self._is_ours(frame) else None
 
     def _is_ours(self, frame: bytes | bytearray) -> bool:
-        """Whether a signed packet was signed with our key."""
         if self.key is None:
             return False
         return hmac.compare_digest(_digest(self.key, frame[:-_HASH]), bytes(frame[-_HASH:]))

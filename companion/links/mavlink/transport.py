@@ -36,7 +36,6 @@ _URL = re.compile(r"(?P<kind>udpin|udpout|tcp|serial):(?P<where>.+):(?P<number>\
 _PASSING_ERRORS = frozenset({errno.ECONNREFUSED, errno.ENOBUFS, errno.EAGAIN})
 
 Peer = tuple[Any, ...]
-"""An address as the socket gives it."""
 
 
 async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None = None) -> None:

@@ -78,7 +78,6 @@ class MqttLink:
         self.settings, self.client_id = settings, client_id
         self.outbox = Outbox()
         self.connections = 0
-        """How often the broker was reached."""
         self._will, self._subscriptions, self._on_message = will, tuple(subscriptions), on_message
         self._offload = offload
         self._reconnection = Reconnection("mqtt", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S)
@@ -325,7 +324,6 @@ def _inbox(take: Callable[[aiomqtt.Message], None]) -> type[asyncio.Queue[aiomqt
 
 
 async def _enter(client: aiomqtt.Client, broker: MqttFilter) -> None:
-    """Wait until the broker has accepted or refused us."""
     entering = asyncio.get_running_loop().create_task(client.__aenter__(), name="mqtt connect")
     try:
         await asyncio.shield(entering)
@@ -339,7 +337,6 @@ async def _enter(client: aiomqtt.Client, broker: MqttFilter) -> None:
 
 
 async def _leave(client: aiomqtt.Client) -> None:
-    """Say goodbye if that is still possible."""
     import aiomqtt
 
     with contextlib.suppress(aiomqtt.MqttError, OSError, TimeoutError):

@@ -45,7 +45,6 @@ _QOS: Final = 0x06
 _QOS_2: Final = 0x04
 _MQTT_5: Final = 5
 _DIGITS: Final = 4
-"""The most bytes that a length has."""
 
 
 class BrokerFaultError(LinkError):
@@ -245,7 +244,6 @@ def _size(length: int) -> str:
 
 
 async def _outwards(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Hand on what the library says, until it leaves."""
     with contextlib.suppress(ConnectionError):
         while data := await reader.read(MAX_PACKET_BYTES):
             writer.write(data)

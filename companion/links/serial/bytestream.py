@@ -119,7 +119,6 @@ class ByteLink:
         """What waits for the next read, whenever this stream is collected; None: nothing."""
         self.bytes_received = 0
         self.reconnects = 0
-        """How often the port was opened again after it had been open."""
         self.turns = 0
         """Turns of `run`, one at least every `BEAT_WITHIN_S`, whether bytes come or not."""
         self.last_byte_s: float | None = None

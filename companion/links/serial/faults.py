@@ -151,7 +151,6 @@ def _name(port: str, found: SerialPort) -> Iterator[PortFault]:
 
 
 def _processes(root: Path) -> Iterator[tuple[int, str, tuple[str, ...]]]:
-    """Number, name and command line of every process."""
     try:
         entries = sorted((root / "proc").iterdir())
     except OSError:

@@ -19,7 +19,6 @@ from companion.protocols.decoding.base import TEMPERATURE_LIMIT_DEGC, RejectedEr
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
 FIELD_LIMIT_GAUSS: Final = 2.0
-"""Three times the strongest natural field."""
 
 _NUMBER: Final = rb"([-+]?\d{1,7}(?:\.\d{1,6})?)"
 _TAGS: Final = re.compile(rb"(?:C%b)?(?:P%b)?(?:R%b)?(?:T%b)?((?:[A-Z][a-z]?%b)*)" % ((_NUMBER,) * 5))

@@ -34,7 +34,6 @@ HEADING_UNSURE: Final = "heading unsure"
 """The device says that its heading is wrong by more than 10 degrees (TRAX p. 49, kHeadingStatus 3)."""
 NOT_CALIBRATED: Final = "not calibrated by the user"
 BYTE_ORDER: Final = "byte order"
-"""Floats in the other order than those before."""
 
 _MOD_INFO, _SET_COMPONENTS, _GET_DATA, _DATA = 1, 3, 4, 5
 _COMMANDS: Final = frozenset((1, 3, 4, 6, 7, 9, 10, 11, 12, 13, 15, 21, 22, 24, 25, 29, 31, 36, 43, 46, 49, 52, 79, 80))

@@ -130,7 +130,6 @@ class LineDecoder(Decoder):
         self._partial, self._cut = b"", False
 
     def _frame_bytes(self, line: bytes) -> int:
-        """Bytes of the frame that ends with this line."""
         return len(line) + 1
 
     @abstractmethod
@@ -366,7 +365,6 @@ class FrameDecoder(Decoder):
         """
 
     def _skip_to(self, start: bytes, buffer: bytes, at: int) -> int:
-        """Pass over what cannot begin a frame."""
         found = buffer.find(start, at)
         return len(buffer) if found < 0 else found
 

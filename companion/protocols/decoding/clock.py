@@ -145,7 +145,6 @@ class SampleTimes:
     def __init__(self, clock_wraps_s: float | None = None, sequence_modulus: int | None = None) -> None:
         self.clock = DeviceClock(clock_wraps_s)
         self.dropped: Counter[str] = Counter()
-        """Samples that got no time, by reason."""
         self._modulus = sequence_modulus
         self._raw_sequence: int | None = None
         self._sequence = 0

@@ -54,7 +54,6 @@ class PollDialogue(Dialogue):
     _asked_s: float | None = None
     """When the question was put that has not been answered yet."""
     _since_asked = 0
-    """Bytes that came since then."""
     _set_up = False
     _unanswered = 0
 
@@ -95,7 +94,6 @@ class WakeDialogue(Dialogue):
     """
 
     SAYINGS: ClassVar[tuple[tuple[bytes, str], ...]]
-    """What to send, and the words for it."""
     _quiet_since_s: float | None = None
     _pause_s = SILENT_S
     _next = 0

@@ -221,7 +221,6 @@ class MqttFace:
             self._faulty = True
 
     async def _publish_changes(self, link: MqttLink, topics: Topics) -> None:
-        """Put what has changed into the outbox."""
         now_s = asyncio.get_running_loop().time()
         state = self._conductor.state.shown
         if state != self._state or now_s - self._state_s >= STATE_S:

@@ -131,8 +131,6 @@ class Respond(Protocol):
 
 
 class _Known:
-    """A request that came with a transaction."""
-
     def __init__(self, request: Request, at_s: float) -> None:
         self.request, self.at_s = request, at_s
         self.response: Object | None = None
