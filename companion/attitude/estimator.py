@@ -117,12 +117,8 @@ class AttitudeEstimator:
         latitude = settings.latitude_deg
         north, east, down = (0.0, 0.0, 0.0) if latitude is None else earth_rate_ned_rad_s(latitude).tolist()
         self._earth: Triple = (north, east, down)
-        self._uncertainty = Uncertainty(
-            settings.gyro_noise,
-            turn.T @ settings.gyro_covariance @ turn,
-            settings.accel_sigma_m_s2,
-            settings.gravity_m_s2,
-        )
+        covariance, sigma = turn.T @ settings.gyro_covariance @ turn, settings.accel_sigma_m_s2
+        self._uncertainty = Uncertainty(settings.gyro_noise, covariance, sigma, settings.gravity_m_s2)
 
     # ------------------------------------------------------------------------------------------------- alignment
 
@@ -162,12 +158,7 @@ class AttitudeEstimator:
     # ------------------------------------------------------------------------------------------------- samples
 
     def update(
-        self,
-        samples: Sequence[ImuSample],
-        *,
-        phase: Phase,
-        still: bool = False,
-        airspeed_m_s: float | None = None,
+        self, samples: Sequence[ImuSample], *, phase: Phase, still: bool = False, airspeed_m_s: float | None = None
     ) -> None:
         """Take samples, in the sensor's axes and in the order of time; without an alignment they are left.
 

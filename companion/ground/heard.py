@@ -120,17 +120,15 @@ class Heard:
 
     def summary(self) -> str:
         """Who was heard, in a few words; empty when nobody was."""
-        vehicles = [
-            f"system {target.system_id} ({FIRMWARES.get(beat.autopilot, f'autopilot type {beat.autopilot}')})"
-            for target, beat in sorted(self.heartbeats.items())
-            if target.component_id == mavlink.MAV_COMP_ID_AUTOPILOT1 and beat.kind not in _NO_VEHICLES
-        ]
-        others = [
-            f"{target.system_id}/{target.component_id}"
-            + (" (a ground station)" if beat.kind == mavlink.MAV_TYPE_GCS else "")
-            for target, beat in sorted(self.heartbeats.items())
-            if target.component_id != mavlink.MAV_COMP_ID_AUTOPILOT1 or beat.kind in _NO_VEHICLES
-        ]
+        vehicles, others = [], []
+        for (system, component), beat in sorted(self.heartbeats.items()):
+            if component == mavlink.MAV_COMP_ID_AUTOPILOT1 and beat.kind not in _NO_VEHICLES:
+                vehicles.append(
+                    f"system {system} ({FIRMWARES.get(beat.autopilot, f'autopilot type {beat.autopilot}')})"
+                )
+            else:
+                station = " (a ground station)" if beat.kind == mavlink.MAV_TYPE_GCS else ""
+                others.append(f"{system}/{component}{station}")
         return ", ".join([*vehicles, *others])
 
     def _heartbeat(self, source: Target, fields: Fields, now_s: float) -> None:

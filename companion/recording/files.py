@@ -207,11 +207,7 @@ class Ring:
     """Files of limited size in all, numbered, as the wall clock may be wrong in the field; the oldest go first."""
 
     def __init__(
-        self,
-        folder: Path,
-        most_bytes: int,
-        opener: Opener = open_new,
-        free_bytes: FreeBytes = _free_bytes,
+        self, folder: Path, most_bytes: int, opener: Opener = open_new, free_bytes: FreeBytes = _free_bytes
     ) -> None:
         self.folder, self.most_bytes = folder, most_bytes
         self.bytes_in_all = 0

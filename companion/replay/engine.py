@@ -154,13 +154,7 @@ class Replay:
             draft = Draft(datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC))
             estimate = self._calibrations.estimate(self._collector, self._now_s, draft, seconds)
         notes = [*self._version_notes(), *self._notes, *(f"{words}: {n} times" for words, n in self._strange.items())]
-        return Result(
-            calibrations=self._calibrations.again,
-            estimate=estimate,
-            seconds=seconds,
-            cut_short=self._recording.cut_short,
-            notes=notes,
-        )
+        return Result(self._calibrations.again, estimate, seconds, self._recording.cut_short, notes)
 
     def _version_notes(self) -> list[str]:
         ours = versions()
@@ -208,17 +202,12 @@ class Replay:
             topics.RECORD: self._take_record,
             topics.MAVLINK_IN: self._take_mavlink,
         }
-        if topic in known:
-            return known[topic]
         if topic.startswith(topics.SERIAL):
-            name = topic.removeprefix(topics.SERIAL)
-            return functools.partial(self._take_serial, name)
-        if topic.startswith(topics.IMU) and self._config is not None:
-            name = topic.removeprefix(topics.IMU)
-            if name in self._autopilots:
-                return functools.partial(self._take_telemetry, name)
+            return functools.partial(self._take_serial, topic.removeprefix(topics.SERIAL))
         # Samples of serial devices come from their bytes.
-        return None
+        if topic.startswith(topics.IMU) and (name := topic.removeprefix(topics.IMU)) in self._autopilots:
+            return functools.partial(self._take_telemetry, name)
+        return known.get(topic)
 
     def _start(self, data: bytes) -> None:
         config = self._config

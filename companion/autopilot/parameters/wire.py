@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 import struct
-from typing import Final
+from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -134,11 +134,10 @@ class Inbox:
             return None
 
 
-class Refusal:
+class Refusal(NamedTuple):
     """A PARAM_ERROR."""
 
-    def __init__(self, code: int) -> None:
-        self.code = code
+    code: int
 
     @property
     def text(self) -> str:

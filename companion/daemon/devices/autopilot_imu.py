@@ -224,8 +224,7 @@ class AutopilotImu:
 
     def status(self) -> dict[str, object]:
         """For `companion status` and `check`."""
-        problem = self.stream.problem or self.problem
-        kind = self.stream.kind
+        problem, kind = self.stream.problem or self.problem, self.stream.kind
         return {
             "name": self.name,
             "kind": "autopilot imu",
