@@ -112,10 +112,7 @@ def is_aircraft(message: mavlink.MAVLink_heartbeat_message) -> bool:
 
 def firmware_of(message: mavlink.MAVLink_heartbeat_message) -> Firmware:
     """Which firmware a heartbeat is of."""
-    known: dict[int, Firmware] = {
-        mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
-        mavlink.MAV_AUTOPILOT_PX4: "px4",
-    }
+    known: dict[int, Firmware] = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", mavlink.MAV_AUTOPILOT_PX4: "px4"}
     return known.get(message.autopilot, "other")
 
 

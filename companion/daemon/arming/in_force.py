@@ -179,7 +179,8 @@ class InForce:
 
     def reading(self) -> str | None:
         """An autopilot IMU whose offsets are not known at this moment, and why, in one line."""
-        return next((f"imu {name}: {imu.obstacle}" for name, imu in self._imus.items() if imu.obstacle), None)
+        found = ((name, imu.obstacle) for name, imu in self._imus.items())
+        return next((f"imu {name}: {obstacle}" for name, obstacle in found if obstacle is not None), None)
 
     # --- what happens
 

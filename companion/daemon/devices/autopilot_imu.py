@@ -105,9 +105,9 @@ class AutopilotImu:
             self._invalidate("offsets written")
 
     @property
-    def obstacle(self) -> str:
-        """Why nothing of it counts at this moment, in one line; empty: it does."""
-        return self.stream.problem or ("" if self.calibration is not None else self.problem)
+    def obstacle(self) -> str | None:
+        """Why nothing of it counts at this moment, in one line; None: it does."""
+        return self.stream.problem or (self.problem if self.calibration is None else None)
 
     @property
     def in_force(self) -> ImuCalibration:
@@ -250,7 +250,7 @@ def not_ready(vehicle: Vehicle, imus: Mapping[str, AutopilotImu]) -> str | None:
     if vehicle.arm_state is ArmState.UNKNOWN:
         return "waiting for the autopilot's heartbeat"
     for imu in imus.values():
-        if imu.obstacle:
+        if imu.obstacle is not None:
             return f"waiting for imu {imu.name}: {imu.obstacle}"
     return None
 

@@ -113,10 +113,9 @@ async def run(config: Config, path: Path) -> None:
     try:
         await _Process(Service(config), path, manager).run()
     except BaseExceptionGroup as group:
-        known = group.subgroup(CompanionError)
-        if known is None:
+        if (known := group.subgroup(CompanionError)) is None:
             raise
-        raise CompanionError("; ".join(str(error) for error in _leaves(known))) from group
+        raise CompanionError("; ".join(map(str, _leaves(known)))) from group
     finally:
         manager.close()
 

@@ -136,8 +136,7 @@ class _Udp(asyncio.DatagramProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
-        if not self.closed.done():
-            self.closed.set_result(None)
+        self.closed.set_result(None)
         self._fail(exc)
 
     def error_received(self, exc: Exception) -> None:
