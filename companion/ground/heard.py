@@ -9,8 +9,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.statustext import GOES_ON, to_ascii
 from companion.links.system.listeners import Listeners
+from companion.protocols.heartbeat import FIRMWARES
 
-FIRMWARES: Final = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", mavlink.MAV_AUTOPILOT_PX4: "PX4"}
 _NO_VEHICLES: Final = frozenset({mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_CONTROLLER})
 FRESH_S: Final = 3.0
 """A heartbeat older than this says nothing about now: they come once a second, and two may be lost in a row."""

@@ -188,8 +188,7 @@ class Automatic:
                 self._stop(f"failed {FAILURES} times")
 
     def _count(self, job: Job) -> None:
-        record = job.record
-        parameters = sum(len(imu.written) for imu in record.imus) if record is not None else 0
+        parameters = sum(len(imu.written) for imu in job.record.imus) if job.record is not None else 0
         if parameters:
             write = AutomaticWrite(datetime.datetime.now(tz=datetime.UTC).timestamp(), parameters)
             self._writes = [*self._writes, write][-PER_DAY - 8 :]
