@@ -275,8 +275,8 @@ class _Pass:
                 return  # seconds of a deck end in tens
             self._still_s = glance.still_s
         if last or now_s - self._verdicts_from_s >= _LOOK_S:
-            for slot, good, seen in collector.snapshot(self._verdicts_from_s, None).seconds:
-                said = next((each.verdict for each in seen if each.verdict.words), None)
+            for slot, good, verdicts in collector.snapshot(self._verdicts_from_s, None).seconds:
+                said = next((each for each in verdicts.values() if each.words), None)
                 words = "beginning" if said is None else said.words
                 kind = words if said is None or said.fault else "moving"
                 self._verdicts[slot] = ("", "") if good else (words, kind)

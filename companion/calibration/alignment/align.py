@@ -129,10 +129,10 @@ def align(
     sigma = model.sigma[sought]
     covariance[np.ix_(sought, sought)] = spread * inverse * np.outer(sigma, sigma)
     return Alignment(
-        offset_deg=at.offset_rad / DEG,
+        offset_deg=at.values[model.offset] / DEG,
         offset_covariance_deg2=covariance[model.offset, model.offset] / DEG**2,
         imus=tuple(_imu(model, at, covariance, k) for k in range(len(model.names))),
-        slope_deg=float(np.hypot(*at.spot)) / DEG if any(stand.on_spot for stand in stands) else 0.0,
+        slope_deg=float(np.hypot(*at.values[model.spot])) / DEG if any(stand.on_spot for stand in stands) else 0.0,
         attitudes=tuple(at.attitudes),
         chi_square=chi_square,
         freedom=freedom,

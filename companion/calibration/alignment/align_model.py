@@ -124,19 +124,26 @@ class Part(enum.IntEnum):
 class Unknowns:
     """Everything that is sought, at its present value."""
 
-    offset_rad: Array
-    spot: Array
-    gravity_m_s2: float
-    rate_rad_s: Array
-    turn_scale: float
+    values: Array
+    """(size,) in SI units, as `Model` has them; zero in the place of the attitudes' errors."""
     attitudes: list[Matrix]
     """C_k, body from ground."""
-    imus: Array
-    """(imus, parts, 3), SI units."""
+
+    @property
+    def gravity_m_s2(self) -> float:
+        """Its strength."""
+        return float(self.values[Model.gravity.start])
+
+    @property
+    def imus(self) -> Array:
+        """(imus, parts, 3)."""
+        return self.values[Model.turn.stop + 3 * len(self.attitudes) :].reshape(-1, len(Part), 3)
 
 
 class Model:
     """Residuals and their derivatives, every one divided by its sigma."""
+
+    offset, spot, gravity, rate, turn = slice(0, 2), slice(2, 4), slice(4, 5), slice(5, 8), slice(8, 9)
 
     def __init__(
         self, law: Law, vehicle_from_sensor: Matrix, stands: Sequence[Stand], ground: Ground, priors: Priors
@@ -145,9 +152,7 @@ class Model:
         self.stands, self.ground, self.priors = stands, ground, priors
         self.names = [imu.name for imu in stands[0].imus]
         count = len(self.names)
-        self.offset, self.spot, self.gravity, self.rate = slice(0, 2), slice(2, 4), slice(4, 5), slice(5, 8)
-        self.turn = slice(8, 9)
-        self._poses = 9
+        self._poses = self.turn.stop
         self._first_imu = self._poses + 3 * len(stands)
         self.size = self._first_imu + 15 * count
         sigma = np.full(self.size, _ANYHOW_RAD)
@@ -159,16 +164,13 @@ class Model:
         sigma[self.turn] = priors.turn_scale
         self.damped = 3 * len(stands) + (2 if sigma[2] > 0.0 else 0)
         """How many parameters only the readings determine."""
-        each = [
-            priors.misalignment_deg * DEG,
-            priors.scale,
-            priors.shear,
-            priors.accel_bias_m_s2,
-            priors.gyro_bias_rad_s,
-        ]
+        angle, bias = priors.misalignment_deg * DEG, (priors.accel_bias_m_s2, priors.gyro_bias_rad_s)
+        each = [angle, priors.scale, priors.shear, *bias]
         sigma[self._first_imu :] = np.tile(np.repeat(each, 3), count)
         self.sigma = sigma
         """Of every parameter before any reading; 0: not sought."""
+        self._known = np.zeros(self.size)
+        self._known[self.gravity], self._known[self.rate] = ground.gravity_m_s2, ground.rate_rad_s
 
     # --- where each parameter stands in the vector
 
@@ -186,36 +188,16 @@ class Model:
     def begin(self, attitudes: list[Matrix]) -> Unknowns:
         """A first guess from attitudes alone."""
         spots = [a.T @ DOWN for a, stand in zip(attitudes, self.stands, strict=True) if stand.on_spot]
-        return Unknowns(
-            offset_rad=np.zeros(2),
-            spot=np.mean(spots, axis=0)[:2] if spots else np.zeros(2),
-            gravity_m_s2=self.ground.gravity_m_s2,
-            rate_rad_s=self.ground.rate_rad_s.copy(),
-            turn_scale=0.0,
-            attitudes=list(attitudes),
-            imus=np.zeros((len(self.names), len(Part), 3)),
-        )
+        at = Unknowns(self._known.copy(), list(attitudes))
+        at.values[self.spot] = np.mean(spots, axis=0)[:2] if spots else 0.0
+        return at
 
     def step(self, at: Unknowns, by: Array) -> None:
         """Change everything by one step."""
-        at.offset_rad = at.offset_rad + by[self.offset]
-        at.spot = at.spot + by[self.spot]
-        at.gravity_m_s2 += float(by[self.gravity][0])
-        at.rate_rad_s = at.rate_rad_s + by[self.rate]
-        at.turn_scale += float(by[self.turn][0])
+        at.values = at.values + by
+        at.values[self._poses : self._first_imu] = 0.0
         for k in range(len(self.stands)):
             at.attitudes[k] = _turned(-by[self.pose(k)]) @ at.attitudes[k]
-        at.imus += by[self._first_imu :].reshape(at.imus.shape)
-
-    def _values(self, at: Unknowns) -> Array:
-        """The parameters that have a prior, as they are; zero for the others."""
-        values = np.zeros(self.size)
-        values[self.offset] = at.offset_rad
-        values[self.gravity] = at.gravity_m_s2 - self.ground.gravity_m_s2
-        values[self.rate] = at.rate_rad_s - self.ground.rate_rad_s
-        values[self.turn] = at.turn_scale
-        values[self._first_imu :] = at.imus.ravel()
-        return values
 
     # --- residuals
 
@@ -239,10 +221,11 @@ class Model:
                 self._heading(rows, at, k)
             if stand.on_spot:
                 placement = np.full(2, self.priors.placement_deg * DEG)
-                by = rows.add(Row("spot", k + 1), at.spot - (attitude.T @ DOWN)[:2], placement)
+                by = rows.add(Row("spot", k + 1), at.values[self.spot] - (attitude.T @ DOWN)[:2], placement)
                 by[:, self.pose(k)] = (attitude.T @ -skew(DOWN))[:2]
                 by[:, self.spot] = -np.eye(2)
-        values = self._values(at)
+        off = at.values - self._known
+        off[self.spot] = 0.0  # the readings alone tell it
         for part in (slice(p, p + 1) for p in range(self.size)):
             if self.sigma[part] > 0.0:
                 is_zero = part.start < self.offset.stop
@@ -250,7 +233,7 @@ class Model:
                     self._poses <= part.start < self._first_imu
                 )
                 row = Row("zero" if is_zero else "nothing" if of_readings else "prior")
-                by = rows.add(row, -values[part], self.sigma[part])
+                by = rows.add(row, -off[part], self.sigma[part])
                 by[0, part] = 1.0
         return rows.stacked()
 
@@ -267,7 +250,9 @@ class Model:
         counted = self.stands[k].heading_rad - self.stands[k - 1].heading_rad
         turned = at.attitudes[k] @ at.attitudes[k - 1].T
         sine, cosine = turned[0, 1] - turned[1, 0], turned[0, 0] + turned[1, 1]
-        off = math.remainder(counted * (1.0 - at.turn_scale) - math.atan2(sine, cosine), 2.0 * math.pi)
+        off = math.remainder(
+            counted * (1.0 - float(at.values[self.turn.start])) - math.atan2(sine, cosine), 2.0 * math.pi
+        )
         by = rows.add(Row("turn", k + 1), np.array([off]), np.array([self.stands[k].heading_sigma_rad]))
         for stand, changes in ((k, -_AXES @ turned), (k - 1, turned @ _AXES)):
             across = cosine * (changes[:, 0, 1] - changes[:, 1, 0]) - sine * (changes[:, 0, 0] + changes[:, 1, 1])
@@ -283,7 +268,7 @@ class Model:
         # On the sphere of directions the readings' Jacobian is the left inverse of that of the direction.
         by_up = np.linalg.pinv(up_jacobian(self._law, x_deg, y_deg)) @ self._mounting.T
         sigma = np.array(stand.tilt_sigma_deg) * DEG
-        by = rows.add(Row("gradienter", k + 1), read * DEG - at.offset_rad, sigma)
+        by = rows.add(Row("gradienter", k + 1), read * DEG - at.values[self.offset], sigma)
         by[:, self.offset] = np.eye(2)
         by[:, self.pose(k)] = by_up @ skew(up)
 
@@ -312,7 +297,7 @@ class Model:
 
     def _gyro(self, rows: _Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand) -> None:
         k, i = where
-        rate = at.attitudes[k] @ at.rate_rad_s
+        rate = at.attitudes[k] @ at.values[self.rate]
         read = imu.gyro_rad_s - rate - at.imus[i, Part.GYRO_BIAS]
         by = rows.add(Row("gyro", k + 1, imu.name), read, imu.gyro_sigma_rad_s)
         by[:, self.pose(k)] = skew(rate)

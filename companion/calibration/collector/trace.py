@@ -15,7 +15,6 @@ import msgspec
 
 from companion import formats
 from companion.calibration.collector.intake import Kind, Source
-from companion.calibration.seconds.batch import Batch
 from companion.calibration.stillness.gates import Verdict
 
 FORMAT_VERSION: Final = 2
@@ -82,19 +81,14 @@ def from_json(data: bytes) -> Trace:
     return trace
 
 
-class _Seen(msgspec.Struct, frozen=True):
-    """One source in one second."""
-
-    kind: Kind
-    name: str
-    verdict: Verdict
-    batch: Batch | None
+Second = tuple[int, bool, dict[tuple[Kind, str], Verdict]]
+"""Its number, whether it was good, and what the gate of each source said."""
 
 
 class Snapshot(msgspec.Struct, frozen=True):
     """The seconds of one calibration, not packed yet; `trace` may run in another thread."""
 
-    seconds: tuple[tuple[int, bool, tuple[_Seen, ...]], ...]
+    seconds: tuple[Second, ...]
     started_s: float
     measured_s: tuple[float, float] | None
     cut: bool
@@ -102,13 +96,8 @@ class Snapshot(msgspec.Struct, frozen=True):
     def trace(self, started_at: str) -> Trace:
         """Pack it; takes milliseconds."""
         origin = math.floor(self.started_s)
-        names: dict[tuple[Kind, str], None] = {}
-        for _, _, seen in self.seconds:
-            names.update({(one.kind, one.name): None for one in seen})
-        columns = {
-            key: [next((one for one in seen if (one.kind, one.name) == key), None) for _, _, seen in self.seconds]
-            for key in names
-        }
+        names = dict.fromkeys(name for _, _, said in self.seconds for name in said)
+        columns = {name: [said.get(name) for _, _, said in self.seconds] for name in names}
         measured = self.measured_s
         return Trace(
             started_at=started_at,
@@ -121,7 +110,7 @@ class Snapshot(msgspec.Struct, frozen=True):
                     kind=kind,
                     name=name,
                     words=tuple(_words(one) for one in column),
-                    fault=tuple(one is not None and one.verdict.fault for one in column),
+                    fault=tuple(one is not None and one.fault for one in column),
                 )
                 for (kind, name), column in columns.items()
             ),
@@ -132,15 +121,14 @@ class TraceLog:
     """The latest seconds as they were judged, whatever became of them."""
 
     def __init__(self) -> None:
-        self._seconds: deque[tuple[int, bool, tuple[_Seen, ...]]] = deque(maxlen=MAX_SECONDS)
+        self._seconds: deque[Second] = deque(maxlen=MAX_SECONDS)
 
     def add(self, slot: int, sources: Sequence[Source], *, good: bool) -> None:
         """Take one second that has just been judged."""
         if self._seconds and slot <= self._seconds[-1][0]:
             # The clock went back: what was before cannot be set against what comes.
             self._seconds.clear()
-        seen = (_Seen(each.kind, each.name, each.verdict, each.batches.batches.get(slot)) for each in sources)
-        self._seconds.append((slot, good, tuple(seen)))
+        self._seconds.append((slot, good, {(each.kind, each.name): each.verdict for each in sources}))
 
     def snapshot(self, started_s: float, measured_s: tuple[float, float] | None) -> Snapshot:
         """Everything since a calibration was asked for, or since its window began where that was earlier."""
@@ -152,7 +140,5 @@ class TraceLog:
         return Snapshot(kept, started_s, measured_s, cut)
 
 
-def _words(seen: _Seen | None) -> str | None:
-    if seen is None:
-        return ""
-    return None if seen.verdict.still else seen.verdict.words[:MAX_WORDS]
+def _words(said: Verdict | None) -> str | None:
+    return "" if said is None else None if said.still else said.words[:MAX_WORDS]

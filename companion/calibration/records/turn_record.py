@@ -23,7 +23,7 @@ class TurnImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """What the accelerometers of the aircraft read too much when its base is level."""
     level_sigma_mg: Vector
     gyro_bias_deg_h: Determined
-    written: dict[str, WrittenParameter]
+    written: dict[str, WrittenParameter] = {}
     """Empty where nothing was to be written."""
 
 
@@ -60,12 +60,5 @@ def turn_imu_record(
     imu: ImuAlignment, temperature_degc: float | None, written: dict[str, WrittenParameter]
 ) -> TurnImuRecord:
     """One IMU in the units that people know."""
-    whole = imu_record(imu, temperature_degc)
-    return TurnImuRecord(
-        name=whole.name,
-        temperature_degc=temperature_degc,
-        level_bias_mg=whole.level_bias_mg,
-        level_sigma_mg=whole.level_sigma_mg,
-        gyro_bias_deg_h=whole.gyro_bias_deg_h,
-        written=written,
-    )
+    told = msgspec.convert(imu_record(imu, temperature_degc), TurnImuRecord, from_attributes=True)
+    return msgspec.structs.replace(told, written=written)
