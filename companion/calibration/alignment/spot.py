@@ -35,19 +35,14 @@ ALONE: Final = Priors(scale=PRIOR_SCALE, shear=PRIOR_SHEAR, misalignment_deg=3.0
 """Of accelerometers that nobody has calibrated, on a board that was put in by eye."""
 
 
-def turned(stands: Sequence[Stand], ground: Ground, priors: Priors = ALONE) -> Alignment:
-    """What two or four headings on one spot tell; level bias and slope are determined, little else is.
-
-    Args:
-        stands: on one spot, without a gradienter's readings.
-        ground: gravity and the Earth's rate.
-        priors: what was known before.
+def turned(stands: Sequence[Stand], ground: Ground) -> Alignment:
+    """What two or four headings on one spot tell, with no gradienter: level bias and slope, little else.
 
     Raises:
         CalibrationRefusedError: the readings cannot belong together.
     """
     try:
-        return align("slope", np.eye(3), stands, ground, priors)
+        return align("slope", np.eye(3), stands, ground, ALONE)
     except CalibrationRefusedError:
         raise CalibrationRefusedError("the readings do not belong together: is the orientation right?") from None
 

@@ -30,10 +30,7 @@ class Passage(msgspec.Struct, frozen=True):
 def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> Passage:
     """Integrate n + 1 samples, of which the first was the last one of the passage before (trapezoids).
 
-    Args:
-        times_s: (n + 1,) ascending, n at least 1.
-        rates_rad_s: (n + 1, 3) in the body's axes.
-        forces_m_s2: likewise.
+    Times (n + 1,) ascend, n is at least 1; rates and forces are (n + 1, 3) in the body's axes.
     """
     steps = np.diff(times_s)
     rates = (rates_rad_s[1:] + rates_rad_s[:-1]) / 2.0

@@ -219,13 +219,15 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """The part of sigma_use for a warm-up too small to see, which only time takes away."""
     accel_sigma_warm_up_m_s2: Vector | None = None
 
+    def _of(self, triad: Triad) -> tuple[Vector | None, Vector | None, Vector | None]:
+        """sigma_use, the residual and the part of sigma_use for a warm-up."""
+        if triad == "gyro":
+            return self.gyro_sigma_use_rad_s, self.residual_gyro_rad_s, self.gyro_sigma_warm_up_rad_s
+        return self.accel_sigma_use_m_s2, self.residual_accel_m_s2, self.accel_sigma_warm_up_m_s2
+
     def sigma_in_force(self, triad: Triad) -> Vector | None:
         """sigma_use of what the offsets leave; those not written again are off by what was found, too."""
-        sigma, residual = (
-            (self.gyro_sigma_use_rad_s, self.residual_gyro_rad_s)
-            if triad == "gyro"
-            else (self.accel_sigma_use_m_s2, self.residual_accel_m_s2)
-        )
+        sigma, residual, _ = self._of(triad)
         if sigma is None or residual is None or triad not in self.unchanged:
             return sigma
         x, y, z = map(math.hypot, sigma, residual)
@@ -233,11 +235,7 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     def settled_sigma(self, triad: Triad) -> Vector | None:
         """sigma_use without that part, which moves old and new offsets alike."""
-        whole, part = (
-            (self.gyro_sigma_use_rad_s, self.gyro_sigma_warm_up_rad_s)
-            if triad == "gyro"
-            else (self.accel_sigma_use_m_s2, self.accel_sigma_warm_up_m_s2)
-        )
+        whole, _, part = self._of(triad)
         if whole is None or part is None:
             return whole
         x, y, z = (math.sqrt(max(use**2 - of**2, 0.0)) for use, of in zip(whole, part, strict=True))

@@ -334,10 +334,8 @@ def _prior(known: Sequence[_Known], used: Sequence[_Known]) -> Prior | None:
             f"measured_{unit}": vector(one.measured),
             "shift_sigma": vector(witness.difference / witness.sigma),
         }
+        by_temperature = expected.by_temperature
         found[one.triad] = kind(
-            used=one in used,
-            power_ups=expected.power_ups,
-            temperature_model=expected.by_temperature,
-            **figures,
+            used=one in used, power_ups=expected.power_ups, temperature_model=by_temperature, **figures
         )
     return Prior(**{triad: found.get(triad) for triad in _TRIADS}) if found else None  # type: ignore[arg-type]
