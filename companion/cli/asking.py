@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from companion.cli.terminal import print_lines
-from companion.config.words import shown
 from companion.errors import CompanionError, ConfigError
+from companion.setup.draft import one_of
 
 _MOST_BYTES: Final = 4096
 
@@ -70,9 +70,7 @@ class Asking:
 
         def put(words: str) -> None:
             nonlocal found
-            if words.lower() not in ("y", "yes", "n", "no"):
-                raise ConfigError(f"found {shown(words)}; allowed: yes or no")
-            found = words.lower().startswith("y")
+            found = one_of(words, ("yes", "no")) == "yes"
 
         await self.ask(question, "yes" if by_default else "no", put, choices=("yes", "no"))
         return found

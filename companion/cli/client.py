@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import asyncio
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from companion.calibration.records.record import outcome_word
 from companion.cli import show
 from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds
 from companion.daemon.faces.control import ask
@@ -188,14 +187,7 @@ def faces_lines(record: Object) -> list[str]:
     lines = [f"measured {record['measured_at'][:19]} UTC in {len(record['stands'])} stands"]
     for imu in record["imus"]:
         lines.append(f"{imu['name']}: stands miss gravity by {imu['scatter_mg']:.2f} mg")
-        for words, unit, key, form, scale in (
-            ("accel bias", "mg", "accel_bias_mg", "+.3f", 1.0),
-            ("accel scale", "%", "accel_scale", "+.4f", 0.01),
-            ("accel shear", "%", "accel_shear", "+.4f", 0.01),
-        ):
-            found = imu[key]
-            lines.append(f"  {words:16} {unit:6} {show.axes(found['value'], found['sigma'], form, scale)}")
-        lines += _written_lines(imu["written"])
+        lines += [*_figure_lines(imu), *show.written_lines(imu["written"])]
     return lines + [f"warning: {words}" for words in record["warnings"]]
 
 
@@ -219,7 +211,7 @@ def turn_lines(record: Object) -> list[str]:
         lines.append(
             f"  {'bias when level':16} {'mg':6} {show.axes(imu['level_bias_mg'], imu['level_sigma_mg'], '+.3f')}"
         )
-        lines += _written_lines(imu["written"])
+        lines += show.written_lines(imu["written"])
     if (board := record["board"]) is not None:
         roll, pitch = board["sigma_deg"]
         lines.append(
@@ -227,15 +219,21 @@ def turn_lines(record: Object) -> list[str]:
             f" pitch {board['pitch_deg']:+.3f} +- {pitch:.3f} deg"
             + ("" if board["written"] else "; companion align turn --level tells it the autopilot")
         )
-        lines += _written_lines(board["written"])
+        lines += show.written_lines(board["written"])
     return lines + [f"warning: {words}" for words in record["warnings"]]
 
 
-def _written_lines(written: Object) -> list[str]:
-    return [
-        f"  {name:18} {one['before']:+.6f} -> {one['after']:+.6f}  {outcome_word(one['outcome'])}"
-        for name, one in written.items()
-    ]
+def _figure_lines(imu: Object) -> Iterator[str]:
+    """What an alignment has found of an IMU and knows on all axes."""
+    for words, unit, key, form, scale in (
+        ("accel bias", "mg", "accel_bias_mg", "+.3f", 1.0),
+        ("accel scale", "%", "accel_scale", "+.4f", 0.01),
+        ("accel shear", "%", "accel_shear", "+.4f", 0.01),
+        ("misalignment", "deg", "misalignment_deg", "+.3f", 1.0),
+        ("gyro bias", "deg/h", "gyro_bias_deg_h", "+.1f", 1.0),
+    ):
+        if key in imu and all((found := imu[key]).get("known", ())):
+            yield f"  {words:16} {unit:6} {show.axes(found['value'], found['sigma'], form, scale)}"
 
 
 def alignment_lines(record: Object) -> list[str]:
@@ -250,15 +248,7 @@ def alignment_lines(record: Object) -> list[str]:
         lines.append(f"{imu['name']}:")
         level = show.axes(imu["level_bias_mg"], imu["level_sigma_mg"], "+.3f")
         lines.append(f"  {'bias when level':16} {'mg':6} {level}")
-        for words, unit, key, form, scale in (
-            ("accel bias", "mg", "accel_bias_mg", "+.3f", 1.0),
-            ("accel scale", "%", "accel_scale", "+.4f", 0.01),
-            ("misalignment", "deg", "misalignment_deg", "+.3f", 1.0),
-            ("gyro bias", "deg/h", "gyro_bias_deg_h", "+.1f", 1.0),
-        ):
-            found = imu[key]
-            if all(found["known"]):
-                lines.append(f"  {words:16} {unit:6} {show.axes(found['value'], found['sigma'], form, scale)}")
+        lines += _figure_lines(imu)
     lines += [f"warning: {words}" for words in record["warnings"]]
     configured = record["gradienter"]["offset_deg"]
     lines += [

@@ -162,11 +162,10 @@ async def _listen(wanted: Sequence[str], found: Sequence[SerialPort]) -> dict[st
 def _heard(heard: Heard | str) -> dict[str, object]:
     if isinstance(heard, str):
         return {"good": False, "reason": heard}
-    candidate, line = heard.candidate, heard.line
+    candidate = heard.candidate
     return {
         "good": candidate is not None,
-        "baud": line.baud if line is not None else None,
-        "parity": line.parity if line is not None else None,
+        **({"baud": None, "parity": None} if heard.line is None else heard.line._asdict()),
         "protocol": candidate.protocol if candidate is not None else None,
         "kinds": list(candidate.kinds) if candidate is not None else [],
         "frames": candidate.accepted if candidate is not None else 0,

@@ -286,10 +286,8 @@ class _Session:
             async for _ in ask(parsed.control.path, {"command": "status"}):
                 pass
             runs = True
-        except DaemonDeniedError:
-            runs = True
-        except DaemonUnreachableError:
-            runs = False
+        except DaemonUnreachableError as error:
+            runs = isinstance(error, DaemonDeniedError)
         good, checks = True, not runs and not self._options.no_check
         if checks:
             await self._take_other_imus(draft, parsed, by_default=is_new)

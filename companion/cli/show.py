@@ -59,13 +59,17 @@ def _imu_lines(imu: Object) -> list[str]:
         if imu[bias] is None:
             continue
         lines.append(f"  {triad:5} bias {unit} {axes(imu[bias], imu[sigma], form, scale)}{_held_back(imu, triad)}")
-    for name, written in imu["written"].items():
-        lines.append(
-            f"  {name:16} {_number(written['before'], '+.6f')} -> {written['after']:+.6f}"
-            f"  {outcome_word(written['outcome'])}"
-        )
+    lines += written_lines(imu["written"])
     lines += [f"  warning: {warning}" for warning in imu["warnings"]]
     return lines
+
+
+def written_lines(written: Object) -> list[str]:
+    """What became of each parameter."""
+    return [
+        f"  {name:16} {_number(one['before'], '+.6f')} -> {one['after']:+.6f}  {outcome_word(one['outcome'])}"
+        for name, one in written.items()
+    ]
 
 
 def axes(values: Sequence[float], sigmas: Sequence[float], form: str, scale: float = 1.0) -> str:

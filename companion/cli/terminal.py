@@ -53,6 +53,8 @@ def print_address(url: str, token: str | None) -> None:
     whole = f"{url}#token={quote(token)}"
     print_lines(f"token: {token}")
     print_lines(f"open once on the phone: {whole}")
+    if ".local:" in url:
+        print_lines("(a phone that does not find that name: the board's number, which hostname -I says, in its place)")
     if sys.stdout.isatty() and (sys.stdout.encoding or "").lower().startswith("utf"):
         drawn = _code(whole)
         if (wide := len(drawn[0])) > shutil.get_terminal_size().columns:

@@ -178,7 +178,7 @@ class Draft:
             "Where is it calibrated: on the ground, or on a deck (a boat)?",
             "",
             self.wanted.get("vehicle", {}).get("platform", "ground"),
-            lambda words: self._put("vehicle", "platform", _one_of(words, get_args(Platform)), "ground"),
+            lambda words: self._put("vehicle", "platform", one_of(words, get_args(Platform)), "ground"),
             get_args(Platform),
         )
         if (gradienter := self.section("gradienter")) is not None:
@@ -190,7 +190,7 @@ class Draft:
                 if known
                 else "Its data sheet tells, or docs/calibration.md. A wrong one costs milli-g.",
                 gradienter["law"],
-                lambda words: self._put("gradienter", "law", _one_of(words, get_args(Law))),
+                lambda words: self._put("gradienter", "law", one_of(words, get_args(Law))),
                 get_args(Law),
             )
         kinds: Sequence[Kind] = ("gradienter", "compass", "imu")
@@ -230,7 +230,7 @@ def storage_beside(path: Path) -> Path:
     return path.absolute().with_name("companion-state")
 
 
-def _one_of(words: str, allowed: Sequence[str]) -> str:
+def one_of(words: str, allowed: Sequence[str]) -> str:
     """The choice that begins so."""
     found = [choice for choice in allowed if words and choice.startswith(words.strip().lower())]
     if len(found) != 1:
