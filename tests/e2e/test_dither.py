@@ -304,7 +304,7 @@ def test_a_dither_that_is_interrupted_leaves_the_offsets_as_they_were(tmp_path: 
             fate(rig, job)
             result = await job.finished
             assert result.outcome == ("cancelled" if fate is cancelled else "failed"), result
-            assert "put back" in result.reason or "NOT back" in result.reason
+            assert "values back" in result.reason or "NOT back" in result.reason
             await rig.until(lambda: not rig.service.offsets.ledger.pending, 120.0)
             assert offsets(rig) == before
             assert ChangeLog(tmp_path).journal.read() is None
