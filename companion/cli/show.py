@@ -186,7 +186,8 @@ def end_lines(status: Object) -> list[str]:
     """Where the page is, and how the last calibration ended."""
     page, last = status["page"], status["last"]
     lines = [] if page is None else [f"page: {'' if page['good'] else 'none: '}{page['summary']}"]
-    found = f"{last['state']} at {last['started_at']}: {last['reason']}" if last is not None else "none yet"
+    when = "" if last is None else last["started_at"][:16].replace("T", " ")
+    found = "none yet" if last is None else f"{last['state']} at {when} UTC: {last['reason']}"
     return [*lines, f"last calibration: {found}"]
 
 

@@ -175,7 +175,7 @@ class RollingCollector(Intake):
             enough=enough,
             progress=min(progress, 1.0 if enough else 0.99),
             sources=sources,
-            measuring=f"still for {self._stretch.good} s, measuring",
+            measuring=f"still for {self._stretch.good} s",
         )
 
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:

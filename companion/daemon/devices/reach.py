@@ -70,11 +70,7 @@ class Reach:
         if self._vehicle.firmware == "px4":
             return self._px4_words()
         if self._vehicle.firmware == "ardupilot":
-            return True, (
-                "none heard (none connected?). ArduPilot lets one reach the companion once it has heard our heartbeat,"
-                " unless the options of either link say not to forward (MAVn_OPTIONS bit 1; before 4.7"
-                " SERIALn_OPTIONS bit 10)"
-            )
+            return True, "none heard (none connected? or a link set not to forward: MAVn_OPTIONS bit 1)"
         return True, "none heard"
 
     def _px4_words(self) -> tuple[bool, str]:

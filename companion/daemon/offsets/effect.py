@@ -99,7 +99,7 @@ class EffectWatch:
                 try:
                     after = await self._core.window(since_s=since_s)
                 except CalibrationRefusedError as error:
-                    words = f"checking the new offsets: {error}"
+                    words = str(error)
                 else:
                     verdicts = {target.name: self._judge(target, before, after) for target in watched}
                     words = _inconclusive(verdicts, loop.time() - since_s)
@@ -121,7 +121,7 @@ class EffectWatch:
                 words = f"hold still {self._look_s - status.still_s:.0f} s more"
         if words and looked_s < TELEMETRY_S:
             return TELEMETRY  # which was not taken during the write
-        return f"checking the new offsets: {words}" if words else ""
+        return words
 
     def _judge(self, target: Target, before: Window, after: Window) -> list[Verdict]:
         sides = Sides(

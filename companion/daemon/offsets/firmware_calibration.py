@@ -138,9 +138,8 @@ class FirmwareCalibration:
         warnings = [calibration.words] if calibration.words else []
         if collateral:
             warnings.append(
-                "to reset its EKF the firmware calibrated all its gyros; besides ours that changed"
-                f" {', '.join(f'{c.parameter} ({c.before:.6g} -> {c.after:.6g})' for c in collateral)};"
-                " undo puts these back too"
+                "the firmware's gyro calibration, which resets its EKF, has changed others too:"
+                f" {', '.join(c.parameter for c in collateral)}; undo puts them back"
             )
         return Done(written, collateral, calibration.outcome, tuple(warnings))
 
