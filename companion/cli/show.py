@@ -186,8 +186,8 @@ def end_lines(status: Object) -> list[str]:
     """Where the page is, and how the last calibration ended."""
     page, last = status["page"], status["last"]
     lines = [] if page is None else [f"page: {'' if page['good'] else 'none: '}{page['summary']}"]
-    when = "" if last is None else last["started_at"][:16].replace("T", " ")
-    found = "none yet" if last is None else f"{last['state']} at {when} UTC: {last['reason']}"
+    when = "" if last is None else last["started_at"][:16].replace("T", " ") + " UTC"
+    found = "none yet" if last is None else f"{last['state']} at {when}: {last['reason']}"
     return [*lines, f"last calibration: {found}"]
 
 

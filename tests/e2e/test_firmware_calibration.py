@@ -136,7 +136,7 @@ def test_with_a_temperature_calibration_on_any_imu_it_is_left_out_and_the_ekf_wa
             assert sent.commands == 0
             assert job.record is not None
             assert "INS_TCAL2_ENABLE is on" in " ".join(job.record.warnings)
-            assert any(each.startswith("EKF takes in new offsets: ") for each in words), words
+            assert any(each.startswith("EKF adjusting: ") for each in words), words
             rig.double.update_estimator(rig.now_s)
             assert np.abs(rig.double.estimator.omega_i).max() < 80 * DEG_H
 
@@ -164,7 +164,7 @@ def test_arming_or_a_cancel_while_the_ekf_settles_ends_the_waiting_and_not_the_r
             await rig.ready()
             before = imu_parameters(rig)
             job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: job.words.startswith("EKF takes in"), 90.0)
+            await rig.until(lambda: job.words.startswith("EKF adjusting"), 90.0)
             act(rig)
             await rig.until(job.finished.done, 3.0)
             assert job.record is not None

@@ -54,7 +54,7 @@ def test_it_has_settled_when_the_mean_of_two_seconds_is_below_72_deg_h() -> None
     assert words is None
     # 0.3 deg/s is down to 0.02 after 13.5 s; the mean lags by a second.
     assert 13.0 < took_s < 16.0
-    assert said[0] == "EKF takes in new offsets: 30 s at most"
+    assert said[0] == "EKF adjusting: 30 s at most"
 
 
 def test_a_busy_link_that_lets_an_ahrs_through_now_and_then_is_enough() -> None:

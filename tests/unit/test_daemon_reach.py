@@ -70,4 +70,4 @@ def test_ardupilot_needs_nothing_but_our_heartbeat() -> None:
     good, words = words_of(ScriptedAutopilot(parameters={"INS_GYR_CAL": 0.0}))
     assert good
     assert "none heard" in words
-    assert "heard our heartbeat" in words
+    assert "set not to forward" in words

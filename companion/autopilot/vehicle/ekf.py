@@ -20,7 +20,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.links.system.waiting import comes
 from companion.physics.units import DEG
 
-TAKES_IN: Final = "EKF takes in new offsets"
+ADJUSTING: Final = "EKF adjusting"
 SETTLED_RAD_S: Final = 0.02 * DEG
 """Per axis: 72 deg/h. An EKF whose bias has just been reset wanders up to 52 deg/h on the ground (9.3.1); and 72 deg/h
 for the 40 s that it lasts turn the heading by 0.8 deg, less than a compass knows."""
@@ -85,7 +85,7 @@ class EkfWatch:
                 return (
                     f"the EKF has not settled within {within_s:.0f} s ({_words(bias)}): wait, or restart the autopilot"
                 )
-            go_on(f"{TAKES_IN}: {give_up_s - loop.time():.0f} s at most")
+            go_on(f"{ADJUSTING}: {give_up_s - loop.time():.0f} s at most")
             silent_s = loop.time() - (self._seen[-1][0] if self._seen else asked_s)
             if min(silent_s, loop.time() - asked_s) > _FIRST_WITHIN_S:
                 asked_s = loop.time()

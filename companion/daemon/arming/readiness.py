@@ -12,7 +12,7 @@ import math
 from typing import Final, Literal
 
 from companion.autopilot.firmware.firmwares import settle_s
-from companion.autopilot.vehicle.ekf import TAKES_IN
+from companion.autopilot.vehicle.ekf import ADJUSTING
 from companion.calibration.machine import State
 from companion.calibration.records.validity import Why
 from companion.component.service import ArmAnswer
@@ -40,7 +40,7 @@ _IN_THE_MIDDLE: Final[dict[State, str]] = {
     State.WRITING: "writing offsets",
     State.VERIFYING: "checking new offsets",
     State.RESTARTING: "restarting autopilot",
-    State.SETTLING: TAKES_IN,
+    State.SETTLING: ADJUSTING,
     State.UNDOING: "putting back old offsets",
 }
 _LOOKED_AT: Final[dict[Why, str]] = {
