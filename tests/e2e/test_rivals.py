@@ -126,6 +126,6 @@ def test_ardupilot_without_a_ground_station_is_told_what_routing_needs(tmp_path:
             await asyncio.sleep(6.0)
             ground = rig.service.status()["ground_stations"]
             assert ground["good"]
-            assert "heard our heartbeat" in ground["summary"]
+            assert "set not to forward" in ground["summary"]
 
     run_virtual(main())
