@@ -133,18 +133,28 @@ def test_samples_that_bunch_on_their_way_count_by_their_devices_clock() -> None:
     assert off_deg(counted(arrives_s=0.03)) == pytest.approx(0.0, abs=0.1)
 
 
-def test_a_device_that_begins_anew_counts_by_the_hosts_clock_and_a_second_copy_of_a_sample_not_at_all() -> None:
+def test_a_second_copy_of_a_sample_does_not_count_and_a_device_that_began_anew_tells_nothing() -> None:
     counter = TurnCounter()
     assert counter.counted(0.0, 1.0, np.zeros(3), np.eye(3)) is None
     for k in range(1000):
-        for _ in range(2):
+        for _ in range(1 + (k % 3 == 0)):
             counter.add(sample(k / 100.0, 700.0 + k / 100.0, [0.0, 0.0, 0.1]))
     once = counter.counted(1.0, 9.0, np.zeros(3), np.eye(3))
     assert once is not None
     assert once.angle_rad == pytest.approx(0.8, abs=0.002)
     for k in range(1000, 2000):
         counter.add(sample(k / 100.0, (k - 1500) % 1000 / 100.0, [0.0, 0.0, 0.1]))
-    anew = counter.counted(11.0, 19.0, np.zeros(3), np.eye(3))
-    assert anew is not None
-    assert anew.angle_rad == pytest.approx(0.8, abs=0.002)
+    assert counter.counted(11.0, 14.0, np.zeros(3), np.eye(3)) is not None
+    assert counter.counted(11.0, 19.0, np.zeros(3), np.eye(3)) is None
     assert counter.counted(1.0, 9.0, np.zeros(3), np.eye(3)) is None, "let go"
+
+
+@pytest.mark.parametrize(("pace", "angle_rad"), [(0.5, 0.4), (0.0, 0.8)], ids=["at half its pace", "stands still"])
+def test_a_firmware_that_runs_slower_than_time_counts_by_its_own(pace: float, angle_rad: float) -> None:
+    """A simulated one on a busy computer turns as its own clock says; a clock that stands still says nothing."""
+    counter = TurnCounter()
+    for k in range(1000):
+        counter.add(sample(k / 100.0, 700.0 + pace * k / 100.0, [0.0, 0.0, 0.1]))
+    found = counter.counted(1.0, 9.0, np.zeros(3), np.eye(3))
+    assert found is not None
+    assert found.angle_rad == pytest.approx(angle_rad, abs=0.003)

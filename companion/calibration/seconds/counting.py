@@ -23,7 +23,7 @@ LEAST_SAMPLES: Final = 8
 HOLE_S: Final = 0.05
 """Beyond the stream's interval: an aircraft that hands turn by 60 deg/s turns by 3 degrees meanwhile."""
 AT_REST_S: Final = 0.5
-"""In less nobody turns it from rest to rest. So far may device and host disagree on how long it took, too."""
+"""In less nobody turns it from rest to rest."""
 MOVES_RAD_S: Final = math.radians(0.5)
 SIGMA_RAD: Final = math.radians(0.15)
 """Of each turn, besides scale and stamps: axes that are not square, of an aircraft that is tilted on its way."""
@@ -67,6 +67,8 @@ class TurnCounter:
         rows = rows[old : int(np.searchsorted(rows[:, 0], end_s))]
         if len(rows) < LEAST_SAMPLES or rows[0, 0] - start_s > AT_REST_S or end_s - rows[-1, 0] > AT_REST_S:
             return None
+        if (np.diff(rows[:, 1]) < -AT_REST_S).any():  # the device has begun anew
+            return None
         times, rates = _in_time(rows)
         gaps = np.diff(times)
         if len(gaps) == 0 or gaps.max() > AT_REST_S:
@@ -89,8 +91,7 @@ class TurnCounter:
 def _in_time(rows: Floats) -> tuple[Floats, Floats]:
     """Times and rates: by the device's clock where it has one, for on their way samples bunch, and come twice."""
     device_s, order = np.unique(rows[:, 1], return_index=True)
-    spans_s = float(np.ptp(rows[:, 0])), float(np.ptp(rows[:, 1]))
-    if abs(spans_s[0] - spans_s[1]) < AT_REST_S:
+    if np.isfinite(device_s).all() and 2 * len(device_s) > len(rows):
         return device_s, rows[order, 2:]
     return rows[:, 0], rows[:, 2:]
 
