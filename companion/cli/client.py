@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import asyncio
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Final
 
 from companion.cli import show
 from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds
@@ -187,7 +187,8 @@ def faces_lines(record: Object) -> list[str]:
     lines = [f"measured {record['measured_at'][:19]} UTC in {len(record['stands'])} stands"]
     for imu in record["imus"]:
         lines.append(f"{imu['name']}: stands miss gravity by {imu['scatter_mg']:.2f} mg")
-        lines += [*_figure_lines(imu), *show.written_lines(imu["written"])]
+        lines += [_figure_line(imu, key) for key in ("accel_bias_mg", "accel_scale", "accel_shear")]
+        lines += show.written_lines(imu["written"])
     return lines + [f"warning: {words}" for words in record["warnings"]]
 
 
@@ -223,17 +224,18 @@ def turn_lines(record: Object) -> list[str]:
     return lines + [f"warning: {words}" for words in record["warnings"]]
 
 
-def _figure_lines(imu: Object) -> Iterator[str]:
-    """What an alignment has found of an IMU and knows on all axes."""
-    for words, unit, key, form, scale in (
-        ("accel bias", "mg", "accel_bias_mg", "+.3f", 1.0),
-        ("accel scale", "%", "accel_scale", "+.4f", 0.01),
-        ("accel shear", "%", "accel_shear", "+.4f", 0.01),
-        ("misalignment", "deg", "misalignment_deg", "+.3f", 1.0),
-        ("gyro bias", "deg/h", "gyro_bias_deg_h", "+.1f", 1.0),
-    ):
-        if key in imu and all((found := imu[key]).get("known", ())):
-            yield f"  {words:16} {unit:6} {show.axes(found['value'], found['sigma'], form, scale)}"
+_FIGURES: Final = {
+    "accel_bias_mg": ("accel bias", "mg", "+.3f", 1.0),
+    "accel_scale": ("accel scale", "%", "+.4f", 0.01),
+    "accel_shear": ("accel shear", "%", "+.4f", 0.01),
+    "misalignment_deg": ("misalignment", "deg", "+.3f", 1.0),
+    "gyro_bias_deg_h": ("gyro bias", "deg/h", "+.1f", 1.0),
+}
+
+
+def _figure_line(imu: Object, key: str) -> str:
+    words, unit, form, scale = _FIGURES[key]
+    return f"  {words:16} {unit:6} {show.axes(imu[key]['value'], imu[key]['sigma'], form, scale)}"
 
 
 def alignment_lines(record: Object) -> list[str]:
@@ -248,7 +250,8 @@ def alignment_lines(record: Object) -> list[str]:
         lines.append(f"{imu['name']}:")
         level = show.axes(imu["level_bias_mg"], imu["level_sigma_mg"], "+.3f")
         lines.append(f"  {'bias when level':16} {'mg':6} {level}")
-        lines += _figure_lines(imu)
+        known = [key for key in _FIGURES if key != "accel_shear" and all(imu[key]["known"])]
+        lines += [_figure_line(imu, key) for key in known]
     lines += [f"warning: {words}" for words in record["warnings"]]
     configured = record["gradienter"]["offset_deg"]
     lines += [
