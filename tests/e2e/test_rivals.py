@@ -86,6 +86,26 @@ def test_a_start_that_measured_the_gyros_itself_is_told_as_such(tmp_path: Path) 
     run_virtual(main())
 
 
+def test_a_rival_is_told_once_while_it_is_on_whatever_restarts(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with quick(tmp_path, parameters=ON).running() as rig:
+            told = "The autopilot may rewrite gyro offsets: set INS_GYR_CAL to 0"
+            await rig.ready()
+            for boots in (1, 2):
+                rig.double.reboot()
+                await rig.until(lambda: rig.service.core.vehicle.boots == boots, 60.0)  # noqa: B023 - awaited at once
+                await rig.ready()
+            await asyncio.sleep(5.0)
+            assert rig.ground.texts().count(told) == 1
+            assert rig.service.status()["warnings"], "to be read always"
+            rig.double.write_as_another_station("INS_GYR_CAL", 0.0)
+            await rig.until(lambda: not rig.service.status()["warnings"], 30.0)
+            rig.double.write_as_another_station("INS_GYR_CAL", 1.0)
+            await rig.until(lambda: rig.ground.texts().count(told) == 2, 30.0)
+
+    run_virtual(main())
+
+
 def test_what_somebody_else_wrote_is_told_as_such(tmp_path: Path) -> None:
     async def main() -> None:
         async with quick(tmp_path).running() as rig:

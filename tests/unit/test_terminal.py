@@ -23,6 +23,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.cli import logs, main, monitor
 from companion.cli.logs import JournalFormatter, OneLineFormatter
+from companion.cli.show import finding_lines
 from companion.daemon.process.check import Finding
 from companion.errors import LinkError
 from companion.ground.display import Display
@@ -223,6 +224,18 @@ def test_what_the_check_finds(
     out, said = capsys.readouterr()
     assert "owned" in clean(out)
     assert clean(said) == f"the autopilot says {SHOWN}\n"
+
+
+def test_each_line_of_the_check_begins_with_its_verdict() -> None:
+    found = [
+        Finding("fc", good=True, words="it sends"),
+        Finding("own", good=False, words="silent", remedy="plug it in"),
+        Finding("compass", good=True, words="the name changes", remedy="set port"),
+        Finding("warning", good=True, words="INS_GYR_CAL = 1"),
+    ]
+    assert [line.split()[:2] for line in finding_lines(found)] == [
+        ["ok", "fc"], ["wrong", "own"], ["warning", "compass"], ["warning", "INS_GYR_CAL"],
+    ]  # fmt: skip
 
 
 @pytest.mark.real_clock
