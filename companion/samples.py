@@ -32,6 +32,8 @@ class ImuSample(msgspec.Struct, frozen=True, gc=False):
     """The device's own clock, None where the protocol has none; unwrapped by `Decoder.receive`."""
     breaks: int = 0
     """How often before the device had restarted or its clock had jumped: it may be another one, its biases new ones."""
+    shared_variance: tuple[float, ...] | None = None
+    """(6,) of an error that it has in common with those around it, gyro then accelerometer; None: there is none."""
 
 
 class TiltSample(msgspec.Struct, frozen=True, gc=False):

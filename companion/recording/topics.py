@@ -98,6 +98,7 @@ def imu_json(sample: ImuSample, message: str | None) -> bytes:
         + (f',"sequence":{sample.sequence}' if sample.sequence is not None else "")
         + (f',"t_device_s":{sample.t_device_s!r}' if _known(sample.t_device_s) else "")
         + (f',"message":"{message}"' if message is not None else "")
+        + (f',"shared_variance":{list(sample.shared_variance)!r}' if sample.shared_variance is not None else "")
     )
     return f"{text}}}".encode()
 
@@ -112,6 +113,7 @@ class ImuEntry(msgspec.Struct, frozen=True, gc=False):
     sequence: int | None = None
     t_device_s: float | None = None
     message: str | None = None
+    shared_variance: tuple[float, ...] | None = None
 
 
 def record_json(record: Record, t_s: float) -> bytes:

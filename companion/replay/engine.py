@@ -18,6 +18,7 @@ import msgspec
 
 from companion.autopilot.telemetry import imu_messages
 from companion.autopilot.telemetry.imu_messages import ImuMessage, Reading
+from companion.autopilot.telemetry.pairing import floats_kind
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.records.record import Record, from_json
 from companion.calibration.solution.draft import Draft
@@ -48,6 +49,8 @@ class Telemetry:
         self._pending: dict[str, deque[tuple[float, Reading]]] = {}
         for each in {*sum(imu_messages.ARDUPILOT.values(), ()), *sum(imu_messages.PX4.values(), ())}:
             self._listen(each)
+        paired = [message for messages in imu_messages.PX4.values() for message in messages]
+        self._paired = {floats_kind(each.kind).message for each in paired}
 
     def _listen(self, kind: ImuMessage) -> None:
         pending = self._pending[kind.kind.message] = deque(maxlen=PENDING)
@@ -79,9 +82,11 @@ class Telemetry:
                 again = msgspec.json.decode(topics.imu_json(sample, entry.message), type=topics.ImuEntry)
                 return sample, _NOT_THE_SAME if again != entry else None
         sample = ImuSample(
-            entry.t_s, entry.gyro_rad_s, entry.accel_m_s2, entry.temperature_degc, None, entry.t_device_s
-        )
-        return sample, _NOT_THERE
+            entry.t_s, entry.gyro_rad_s, entry.accel_m_s2, entry.temperature_degc, None, entry.t_device_s,
+            shared_variance=entry.shared_variance,
+        )  # fmt: skip
+        # What was made of two messages is in no single one.
+        return sample, None if entry.message in self._paired else _NOT_THERE
 
 
 _UNUSABLE: Final = (

@@ -108,6 +108,8 @@ class Board(AutopilotDouble):
             VehicleImu(model, n, ids[n], self.parameters, external=n in external, rate_hz=imu_rate_hz, seed=seed)
             for n, model in enumerate(imus)
         ]
+        self.primary_imu = 0
+        """Number of the IMU that flies, which HIGHRES_IMU shows."""
         self._frozen: dict[int, Sample] = {}
 
     def residual(self, instance: int, loop_s: float) -> Bias:

@@ -4,6 +4,10 @@ Only what a companion can see and must reckon with (autopilots 9.2, 9.3.2): the 
 Earth's rotation known; the vertical accelerometer bias likewise. Of a horizontal one everything goes into the tilt at
 the start (attitude is aligned by it); a later change goes mostly into a bias estimate, so that after a write the old
 tilt stays, for minutes, until a reboot. An offset that is taken clears the estimate.
+
+What others see of the biases is published once a second, or as soon as one has moved by 0.001 (rad/s, m/s^2), and
+stands still between (`PublishSensorBias` of EKF2.cpp); at rest it wanders by fractions of a deg/h from one time to the
+next (seen on the real one, 2026-11: 0.2 to 0.5 deg/h, up to 10 micro-g).
 """
 
 from __future__ import annotations
@@ -19,6 +23,9 @@ ACCEL_LIMIT_M_S2, GYRO_LIMIT_RAD_S = 0.4, 0.15
 _LEARNS_S = 1.05
 _SHARE_EARLY, _SHARE_LATE, _SETTLES_S = 0.3, 0.2, 60.0
 """Part of a horizontal change that the tilt takes: about half soon after a start, a fifth later."""
+_PUBLISHED_EVERY_S, _PUBLISHED_STEP = 1.0, 0.001
+_WANDER = np.array([0.4 * math.radians(1.0 / 3600.0)] * 3 + [5e-6 * STANDARD_GRAVITY_M_S2] * 3)
+"""From one publication to the next; what has gathered goes back by a fiftieth."""
 _OBVIOUS_M_S2 = 0.5
 """More than this cannot be a bias: it is taken for a tilt."""
 
@@ -26,7 +33,11 @@ _OBVIOUS_M_S2 = 0.5
 class Ekf2:
     """States in vehicle FRD; `update` wants the current errors of the corrected IMU output (output minus truth)."""
 
-    def __init__(self) -> None:
+    def __init__(self, seed: int = 0) -> None:
+        self.published = np.zeros(6)
+        """Biases as the telemetry has them: rad/s, m/s^2."""
+        self._published_s = 0.0
+        self._random, self._wander = np.random.default_rng([seed, 11]), np.zeros(6)
         self.gyro_bias_rad_s = np.zeros(3)
         self.accel_bias_m_s2 = np.zeros(3)
         self._tilt_m_s2 = np.zeros(2)
@@ -39,6 +50,7 @@ class Ekf2:
     def reset(self, t_s: float, accel_error: Array) -> None:
         """A start at this time: level is what the accelerometer says."""
         self.gyro_bias_rad_s, self.accel_bias_m_s2 = np.zeros(3), np.zeros(3)
+        self.published, self._published_s = np.zeros(6), t_s
         self._tilt_m_s2 = accel_error[:2].copy()
         self.time_s = self._started_s = t_s
         self.accel_steady_since_s = self.gyro_steady_since_s = t_s
@@ -74,3 +86,8 @@ class Ekf2:
         self.accel_bias_m_s2[:2] += learnt * (1.0 - share) * mismatch
         np.clip(self.accel_bias_m_s2, -ACCEL_LIMIT_M_S2, ACCEL_LIMIT_M_S2, out=self.accel_bias_m_s2)
         self.time_s = t_s
+        now = np.concatenate((self.gyro_bias_rad_s, self.accel_bias_m_s2))
+        moved = np.linalg.norm((now + self._wander - self.published).reshape(2, 3), axis=1).max() > _PUBLISHED_STEP
+        if moved or t_s - self._published_s >= _PUBLISHED_EVERY_S:
+            self._wander = 0.98 * self._wander + _WANDER * self._random.standard_normal(6)
+            self.published, self._published_s = now + self._wander, t_s

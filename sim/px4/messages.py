@@ -25,6 +25,8 @@ _SCALED_IMU = (
     mavlink.MAVLink_scaled_imu2_message,
     mavlink.MAVLink_scaled_imu3_message,
 )
+_PUBLISHED_AFTER_S = 0.0008
+"""SCALED_IMU tells when a sample was published, HIGHRES_IMU when it was taken."""
 _HOLD_MODE = 4 << 16 | 3 << 24
 
 
@@ -45,13 +47,11 @@ def heartbeat(double: Board, loop_s: float) -> Message:
 
 
 def highres_imu(double: Board, loop_s: float) -> Message:
-    """HIGHRES_IMU: the first IMU less what the estimator takes for its bias; the temperature is the air's."""
+    """HIGHRES_IMU: the primary IMU less the published estimate of its bias; the temperature is the air's."""
     t_s = double.aircraft.time_at(loop_s)
-    sample_s, output = double.imu_output(0, loop_s)
+    sample_s, output = double.imu_output(double.primary_imu, loop_s)
     double.update_estimators(loop_s)
-    estimator = double.vehicle_imus[0].estimator
-    gx, gy, gz = (output[:3] - estimator.gyro_bias_rad_s).tolist()
-    ax, ay, az = (output[3:] - estimator.accel_bias_m_s2).tolist()
+    gx, gy, gz, ax, ay, az = (output - double.vehicle_imus[double.primary_imu].estimator.published).tolist()
     mx, my, mz = (magnetic_body(double, t_s) * 0.001).tolist()
     return mavlink.MAVLink_highres_imu_message(
         double.boot_us(double.aircraft.loop_time_of(sample_s)), ax, ay, az, gx, gy, gz, mx, my, mz,
@@ -69,7 +69,7 @@ def scaled_imu(double: Board, loop_s: float, index: int) -> Message | None:
     milli_rad = [truncated_16(float(value) * 1000.0) for value in output[:3]]
     magnetic = [truncated_16(float(value)) for value in magnetic_body(double, t_s)]
     temperature = round(double.imus[index].temperature_degc(t_s) * 100.0) or 1  # 0 means "not known"
-    boot_ms = double.boot_ms(double.aircraft.loop_time_of(sample_s))
+    boot_ms = double.boot_ms(double.aircraft.loop_time_of(sample_s) + _PUBLISHED_AFTER_S)
     kind = (
         mavlink.MAVLink_scaled_imu_message,
         mavlink.MAVLink_scaled_imu2_message,

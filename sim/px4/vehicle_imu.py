@@ -46,7 +46,7 @@ class VehicleImu:
     ) -> None:
         self.model, self.index, self.device_id, self.external = model, index, device_id, external
         self.interval_s = 1.0 / rate_hz
-        self.estimator = Ekf2()
+        self.estimator = Ekf2(seed * 10 + index)
         self._store = store
         self._random = np.random.default_rng([seed, 3, index])
         steps = np.repeat([model.spec.gyro.step, model.spec.accel.step], 3)

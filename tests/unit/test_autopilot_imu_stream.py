@@ -276,7 +276,7 @@ def test_repeated_packets_count_once_and_strangers_never() -> None:
     run_virtual(main())
 
 
-def test_px4_highres_is_never_used_since_its_estimated_bias_is_taken_off() -> None:
+def test_px4_highres_alone_is_never_used_since_its_estimated_bias_is_taken_off() -> None:
     async def main() -> None:
         autopilot = ScriptedAutopilot(autopilot=mavlink.MAV_AUTOPILOT_PX4)
         async with aboard(autopilot) as (stream, _, _):

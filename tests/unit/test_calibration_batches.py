@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +12,12 @@ from companion.calibration.means.losses import lost
 from companion.calibration.seconds.batch import MAX_SAMPLES, Batch, BatchSource
 
 
-def fill(source: BatchSource, rows: list[tuple[float, ...]], start_s: float, rate_hz: float, **more: float) -> None:
+def fill(source: BatchSource, rows: list[tuple[float, ...]], start_s: float, rate_hz: float, **more: Any) -> None:
     for index, row in enumerate(rows):
         source.add(start_s + (index + 0.5) / rate_hz, row, **more)
 
 
-def one(rows: list[tuple[float, ...]], limits: tuple[float, ...] = (1e3,), **more: float) -> Batch:
+def one(rows: list[tuple[float, ...]], limits: tuple[float, ...] = (1e3,), **more: Any) -> Batch:
     """The batch that one second of rows becomes, after a partial second."""
     source = BatchSource(limits, 10)
     source.add(99.9, rows[0])

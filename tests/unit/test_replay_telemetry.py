@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.recording import topics
 from companion.replay.engine import Telemetry
+from companion.samples import ImuSample
 
 DIALECT: Any = mavlink
 
@@ -33,3 +35,13 @@ def test_what_came_too_long_ago_or_not_yet_is_not_found(
     assert strange == (None if found else "a sample is not in the MAVLink bytes")
     assert (sample.t_s, sample.t_device_s) == (t_s, t_device_s)
     assert sample.gyro_rad_s + sample.accel_m_s2 == pytest.approx((2e-3, 3e-3, 4e-3, *accel))
+
+
+def test_a_sample_made_of_two_messages_is_taken_as_recorded_with_what_it_may_be_off_by() -> None:
+    recorded = ImuSample(
+        5.0, (2e-3, 3e-3, 4e-3), (0.1, 0.2, -9.8), 30.0, None, 4.0, shared_variance=(1e-12,) * 3 + (1e-8,) * 3
+    )
+    text = topics.imu_json(recorded, "HIGHRES_IMU+SCALED_IMU")
+    sample, strange = Telemetry().sample(msgspec.json.decode(text, type=topics.ImuEntry))
+    assert strange is None
+    assert sample == recorded

@@ -7,17 +7,18 @@ believed but the messages that arrive: the answer to a request only saves time.
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.telemetry import imu_messages
-from companion.autopilot.telemetry.imu_messages import ImuMessage, Reading, StreamKind
+from companion.autopilot.telemetry.imu_messages import Reading, StreamKind
+from companion.autopilot.telemetry.pairing import LEAST_HZ, UNLIKE, Pairing, floats_kind
+from companion.autopilot.telemetry.source import ABSENT_AFTER, Source
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.system.waiting import comes
@@ -44,30 +45,8 @@ _TURN_S: Final = 1.0
 BEAT_WITHIN_S: Final = 20.0
 """A request may wait behind fifteen others, each of which goes unanswered (`autopilot.commands`)."""
 _REFUSED: Final = -1
-_ABSENT_AFTER: Final = 10
 _TEMPERATURE_RATE_HZ: Final = 2.0
 _TEMPERATURE_AGE_S: Final = 5.0
-
-
-@dataclasses.dataclass(slots=True)
-class _Source:
-    message: ImuMessage
-    rates_hz: Sequence[float]
-    rate: int = 0
-    refused: bool = False
-    last_s: float = -math.inf
-    recent: int = 0
-    zeros: int = 0
-    reason: str = ""
-    device_s: float = -math.inf
-
-    @property
-    def name(self) -> str:
-        return self.message.kind.message
-
-    @property
-    def absent(self) -> bool:
-        return self.zeros >= _ABSENT_AFTER
 
 
 class ImuStream:
@@ -101,11 +80,20 @@ class ImuStream:
         self._on_sample, self._on_kind_change = on_sample, on_kind_change
         self._rates_hz = [rate_hz, *(rate for rate in SLOWER_RATES_HZ if rate < rate_hz)]
         self._link = link
-        self._sources: list[_Source] = []
-        self._current: _Source | None = None
+        self._sources: list[Source] = []
+        self._current: Source | None = None
         self._temperature: tuple[float, float] | None = None
+        self.pairing = Pairing()
+        self._pairing: Pairing | None = None
+        """Of PX4."""
+        self._floats_again_s = -math.inf
         self._restart = asyncio.Event()
         self._arrived = asyncio.Event()
+
+    @property
+    def own_kind(self) -> StreamKind | None:
+        """That of the one message by which the IMU is known, which offsets just written are seen by."""
+        return None if self._current is None else self._current.message.kind
 
     @property
     def rate_hz(self) -> float | None:
@@ -116,6 +104,7 @@ class ImuStream:
         """Keep the samples coming until cancelled; raises nothing else."""
         messages = {*imu_messages.ARDUPILOT[self._instance], *imu_messages.PX4[self._instance]}
         subscriptions = [self._link.subscribe(each.message, self._on_message) for each in messages]
+        subscriptions.append(self._link.subscribe(imu_messages.HIGHRES.message, self._on_floats))
         subscriptions.append(self._vehicle.on_event.add(self._on_event))
         try:
             while True:
@@ -146,7 +135,10 @@ class ImuStream:
             self._lose("this autopilot is neither ArduPilot nor PX4: what its IMU messages carry is not known")
             await self._pause(60.0)
             return
-        self._sources = [_Source(message, self._rates_hz) for message in messages]
+        self._sources = [Source(message, self._rates_hz) for message in messages]
+        paired = self._vehicle.firmware == "px4" and self._rates_hz[0] >= LEAST_HZ
+        self._pairing = self.pairing if paired else None
+        self.pairing.forget()
         self._temperature = None
         while not self._restart.is_set():
             found = await self._find()
@@ -158,7 +150,7 @@ class ImuStream:
             else:
                 await self._keep(found)
 
-    async def _find(self) -> _Source | None:
+    async def _find(self) -> Source | None:
         """The first source, best first, that sends."""
         for source in self._sources:
             for _ in range(_ASKS):
@@ -173,7 +165,7 @@ class ImuStream:
                     source.rate += 1  # the denial may have been lost or be late
         return None
 
-    async def _ask(self, source: _Source) -> int | None:
+    async def _ask(self, source: Source) -> int | None:
         """Ask for a message at the fastest rate that is not denied: the last answer, None when none came in time."""
         while True:
             self.turns += 1
@@ -189,7 +181,7 @@ class ImuStream:
                 source.refused, source.reason = True, "not supported"
             return _REFUSED if source.refused else result
 
-    async def _sends(self, source: _Source) -> bool:
+    async def _sends(self, source: Source) -> bool:
         """Whether the source brings a sample within the time of a silence."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + SILENCE_S
@@ -202,17 +194,20 @@ class ImuStream:
                 break
         return False
 
-    async def _keep(self, source: _Source) -> None:
+    async def _keep(self, source: Source) -> None:
         """Serve from a source until it falls silent for good, a better one sends, or the autopilot is lost."""
         loop = asyncio.get_running_loop()
         self._switch(source)
         silent_asks = 0
         asked_s = temperature_s = better_s = loop.time()
         await self._ask_for_temperature(source)
+        self._floats_again_s = -math.inf  # PX4 may send them by itself, at another rate
+        await self._ask_for_floats(source, asked_s)
         for each in self._sources:
             each.recent = 0
         while not await self._pause(_LOOK_S):
             now_s = loop.time()
+            await self._ask_for_floats(source, now_s)
             better = self._better_than(source)
             if better is not None:
                 self._switch(better)
@@ -237,7 +232,7 @@ class ImuStream:
                 if await self._ask(source) == _REFUSED:
                     return
 
-    def _better_than(self, source: _Source) -> _Source | None:
+    def _better_than(self, source: Source) -> Source | None:
         """A better source that has begun to send at a useful rate."""
         found = None
         for each in self._sources[: self._sources.index(source)]:
@@ -246,12 +241,12 @@ class ImuStream:
             each.recent = 0
         return found
 
-    async def _ask_for_better(self, source: _Source) -> None:
+    async def _ask_for_better(self, source: Source) -> None:
         for each in self._sources[: self._sources.index(source)]:
             if not each.refused and not each.reason:
                 await self._ask(each)
 
-    async def _ask_for_temperature(self, source: _Source) -> None:
+    async def _ask_for_temperature(self, source: Source) -> None:
         """HIGHRES_IMU carries the barometer's; the IMU's comes with the integer messages."""
         if source.message is imu_messages.HIGHRES:
             for each in self._sources[1:]:
@@ -259,6 +254,14 @@ class ImuStream:
                 result = await self._vehicle.commands.request_message_interval(message_id, _TEMPERATURE_RATE_HZ)
                 if result in (mavlink.MAV_RESULT_ACCEPTED, None):
                     return
+
+    async def _ask_for_floats(self, source: Source, now_s: float) -> None:
+        """PX4's floats, to be paired with its integers; by itself it may send them at a rate that never pairs."""
+        if self._pairing is not None and not self._pairing.known and now_s >= self._floats_again_s:
+            rate_hz = source.rates_hz[source.rate] * UNLIKE
+            result = await self._vehicle.commands.request_message_interval(imu_messages.HIGHRES.message.id, rate_hz)
+            answered = result == mavlink.MAV_RESULT_ACCEPTED
+            self._floats_again_s = now_s + (_BETTER_AGAIN_S if answered else SILENCE_S)
 
     def _temperature_is_old(self, now_s: float) -> bool:
         return self._temperature is None or now_s - self._temperature[1] > _TEMPERATURE_AGE_S
@@ -295,7 +298,7 @@ class ImuStream:
             return
         if reading.all_zero:
             self.rejected["all zero"] += 1
-            source.zeros = min(source.zeros + 1, _ABSENT_AFTER)
+            source.zeros = min(source.zeros + 1, ABSENT_AFTER)
             self._arrived.set()
             return
         if -0.5 < reading.t_device_s - source.device_s <= 0.0:
@@ -307,14 +310,38 @@ class ImuStream:
         if reading.temperature_degc is not None:
             self._temperature = (reading.temperature_degc, t_s)
         if source is self._current:
+            self._take(reading, source.message.kind, t_s)
+
+    def _take(self, reading: Reading, kind: StreamKind, t_s: float) -> None:
+        if self._pairing is not None:
+            self._pairing.add_integers(reading)
+            self._set_kind(floats_kind(kind) if self._pairing.known else kind)
+        if self.kind is kind:
             self._hand_on(reading, t_s)
 
-    def _hand_on(self, reading: Reading, t_s: float) -> None:
+    def _on_floats(self, message: Message, t_s: float) -> None:
+        """PX4's HIGHRES_IMU, whichever IMU it shows."""
+        if self._pairing is None or not self._vehicle.sent(message):
+            return
+        reading = imu_messages.HIGHRES.decode(message)
+        if isinstance(reading, str):
+            return
+        self._pairing.add_floats(reading)
+        if self._pairing.known and self.kind is not None and not self.kind.truncates:
+            corrected, variance = self._pairing.corrected(reading)
+            self._hand_on(corrected, t_s, variance)
+
+    def _hand_on(self, reading: Reading, t_s: float, shared_variance: tuple[float, ...] | None = None) -> None:
         self.samples += 1
         self.problem = ""
         known = self._temperature
         temperature = None if known is None or t_s - known[1] > _TEMPERATURE_AGE_S else known[0]
-        self._on_sample(ImuSample(t_s, reading.gyro_rad_s, reading.accel_m_s2, temperature, None, reading.t_device_s))
+        self._on_sample(
+            ImuSample(
+                t_s, reading.gyro_rad_s, reading.accel_m_s2, temperature, None, reading.t_device_s,
+                shared_variance=shared_variance,
+            )
+        )  # fmt: skip
 
     def _lose(self, problem: str) -> None:
         self._switch(None)
@@ -323,16 +350,19 @@ class ImuStream:
             logger.log(logging.WARNING if self._vehicle.alive else logging.DEBUG, "IMU %d: %s", self._instance, problem)
         self.problem = problem
 
-    def _switch(self, source: _Source | None) -> None:
+    def _switch(self, source: Source | None) -> None:
         if source is self._current:
             return
         self._current = source
-        kind = None if source is None else source.message.kind
         if source is not None:
             self.problem = ""
-            logger.info("IMU %d: %s at up to %g Hz", self._instance, source.name, source.rates_hz[source.rate])
+        self._set_kind(None if source is None else source.message.kind)
+
+    def _set_kind(self, kind: StreamKind | None) -> None:
         if kind != self.kind:
             self.kind = kind
+            if kind is not None:
+                logger.info("IMU %d: %s at up to %g Hz", self._instance, kind.message, self.rate_hz)
             if self._on_kind_change is not None:
                 self._on_kind_change(kind)
 

@@ -191,7 +191,7 @@ class Intake(ABC):
             self._counters[name].add(sample)
         stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
         row = sample.gyro_rad_s + sample.accel_m_s2
-        if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp):
+        if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp, sample.shared_variance):
             self._note_up(name, sample)
             self._evaluate()
 

@@ -200,6 +200,8 @@ def estimates(
     flicker = _flicker(slots, level, measured, flicker)
     quantum, half_step = _quantisation(batches, steps)
     quantum, half_step = np.where(whole.of, whole.hidden, quantum), np.where(whole.of, whole.unknown, half_step)
+    shared = _columns([[np.broadcast_to(batch.shared_variance, 6) for batch in item] for item in batches])
+    quantum = np.sqrt(np.square(quantum) + shared.mean(axis=0))
     # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
     # by anything from nothing to slope * H / 2.
     going_on = np.square(slope * horizon_s / 2.0) / 3.0

@@ -69,6 +69,8 @@ class Batch(msgspec.Struct, frozen=True):
     """Of a stream of integers; None for floats, and for a second that spans more than `MAX_LEVELS`."""
     allan: Floats = np.zeros((0, 0))
     """(k, c) Allan variances at averaging times of 1/2, 1/4 ... 1/32 of the second, each of four samples or more."""
+    shared_variance: Floats | float = 0.0
+    """Of an error that its samples, and those of other seconds, have in common."""
 
 
 def summary(
@@ -257,6 +259,7 @@ class BatchSource:
         self._rows: list[tuple[float, ...]] = []
         self._stamps: list[float | None] = []
         self._degc: list[float] = []
+        self._shared_variance: tuple[float, ...] | None = None
 
     def forget(self) -> None:
         """Drop all batches and the second under way; what was counted stays."""
@@ -269,7 +272,12 @@ class BatchSource:
         self._clear()
 
     def add(
-        self, t_s: float, row: tuple[float, ...], temperature_degc: float | None = None, stamp: float | None = None
+        self,
+        t_s: float,
+        row: tuple[float, ...],
+        temperature_degc: float | None = None,
+        stamp: float | None = None,
+        shared_variance: tuple[float, ...] | None = None,
     ) -> bool:
         """Take one sample; True when a second has ended with it, or its clock is found to have gone back."""
         ended = False
@@ -286,6 +294,7 @@ class BatchSource:
         self._times.append(t_s)
         self._rows.append(row)
         self._stamps.append(stamp)
+        self._shared_variance = shared_variance
         if temperature_degc is not None and math.isfinite(temperature_degc):
             self._degc.append(temperature_degc)
         return ended
@@ -369,6 +378,8 @@ class BatchSource:
             circle=self._circle,
             steps=self.steps,
         )
+        if self._shared_variance is not None:
+            batch = msgspec.structs.replace(batch, shared_variance=np.array(self._shared_variance))
         if self.on_second is not None:
             self.on_second(batch, times, rows)
         return batch

@@ -98,10 +98,12 @@ class AutopilotImu:
         """While we write its offsets ourselves: no samples count, and nobody reads in between."""
         self._ours += 1
         self.calibration = self._known = None
+        self.stream.pairing.pause(paused=True)
         try:
             yield
         finally:
             self._ours -= 1
+            self.stream.pairing.pause(paused=self._ours > 0)
             self._invalidate("offsets written")
 
     @property
@@ -143,6 +145,7 @@ class AutopilotImu:
         if is_other_part or self._grid != (fresh.gyro_grid_rad_s, fresh.accel_grid_m_s2):
             self._grid = (fresh.gyro_grid_rad_s, fresh.accel_grid_m_s2)
             self._kind_changed(self.stream.kind)
+        self.stream.pairing.set_lines(*fresh.lines())
         self.on_read.tell(known, fresh)
         now_s = asyncio.get_running_loop().time()
         holds = assumed is not None and _same(assumed, fresh)

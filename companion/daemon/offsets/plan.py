@@ -141,7 +141,7 @@ class Planner:
                         " (companion align, or calibrate --gyros)",
                     )
                 draft.warn(found.name, *warnings_about(calibration, changes))
-                kind = imu.stream.kind if imu is not None else None
+                kind = imu.stream.own_kind if imu is not None else None
                 targets.append(Target(found.name, calibration, tuple(changes), found, kind, watched=imu is not None))
         self._refuse_shared(targets)
         if targets:
