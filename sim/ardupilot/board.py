@@ -90,6 +90,13 @@ class Board(AutopilotDouble):
         self.calibrations = Calibrations(self._paths, self.parameters, self.random)
         self._frozen: dict[int, Array] = {}
 
+    def exchange_imu(self, model: ImuModel, device_id: int) -> None:
+        """Another sensor in the place of IMU 1: its id comes with the restart, the offsets stay (`register_accel`)."""
+        self._paths[0] = InertialPath(model, 1, self.parameters, seed=device_id)
+        for half in ("GYR", "ACC"):
+            self.parameters.set(f"INS_{half}_ID", device_id)
+        self.reboot()
+
     def residual(self, instance: int, loop_s: float) -> Bias:
         """What is left in the output of IMU `instance` (1..3) after offsets and scales: output minus truth, FRD."""
         t_s = self.aircraft.time_at(loop_s)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,13 @@ import pytest
 from companion.calibration.records.faces_record import FacesRecord
 from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.component.service import JobResult, Refusal
+from companion.component.service import Refusal
 from companion.daemon.job import Job
 from sim.ardupilot.double import offset_names
 from sim.hands import Hands
 from sim.imu_model import MG
 from tests.e2e.test_calibration import calibrated, started
+from tests.support.by_hand import alone, follow
 from tests.support.rig import ACCEL_BIAS_MG, Rig
 from tests.support.virtual_time import run_virtual
 
@@ -28,29 +28,9 @@ SCALES = {"INS_ACCSCAL_X": 1.004, "INS_ACCSCAL_Y": 0.997, "INS_ACCSCAL_Z": 1.002
 
 
 def rig(folder: Path, **more: Any) -> tuple[Rig, Hands]:
-    """An autopilot and nothing else; its scales are wrong, its offsets have never been measured."""
+    """Its scales are wrong, its offsets have never been measured."""
     options: dict[str, Any] = {"imu_rate_hz": 10.0, "parameters": SCALES} | more
-    made = Rig(folder, **options)
-    made.config = msgspec.structs.replace(made.config, gradienter=None, compass=None)
-    made.devices.clear()
-    return made, Hands(made.aircraft, propped_deg=4.0, seed=3)
-
-
-Meddle = Callable[[int], tuple[float, float] | None]
-
-
-async def follow(rig: Rig, hands: Hands, job: Job, meddle: Meddle = lambda _: None) -> JobResult:
-    """Hold it as the words say, by hand; or as `meddle(stand)` says, once."""
-    done = 1
-    while not job.finished.done():
-        if job.words.startswith(f"{done + 1} of") and "waiting for it to move" in job.words:
-            done, now_s = done + 1, rig.aircraft.time_at(rig.now_s)
-            if (otherwise := meddle(done)) is not None:
-                hands.hold(now_s, *otherwise)
-            else:
-                assert hands.follow(job.words, now_s), job.words
-        await asyncio.sleep(0.5)
-    return job.finished.result()
+    return alone(folder, propped_deg=4.0, **options)
 
 
 def faced(rig: Rig, *, write: bool) -> Job:
@@ -114,23 +94,6 @@ def test_without_write_nothing_is_written_and_what_is_missing_is_said(tmp_path: 
             said = " ".join(made.ground.texts())
             assert "on its back: z bias" in said
             assert re.search(r"nose (up|down): x (bias|scale)", said)
-
-    run_virtual(main())
-
-
-def test_a_stand_given_twice_and_a_cancel(tmp_path: Path) -> None:
-    made, hands = rig(tmp_path)
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            job = faced(made, write=True)
-            again = asyncio.ensure_future(follow(made, hands, job, lambda stand: (3.0, -2.0) if stand == 3 else None))
-            await made.until(lambda: "it stands as in stand 1: " in job.words, 200.0)
-            assert made.service.calibrating.conductor.cancel("test")
-            result = await again
-            assert result.outcome == "cancelled"
-            np.testing.assert_allclose(read(made, "scale"), list(SCALES.values()), rtol=1e-6)
 
     run_virtual(main())
 
@@ -199,33 +162,6 @@ def test_px4s_offsets_are_written_and_such_scales_as_it_starts_with(
             assert not isinstance(undone, Refusal)
             assert (await undone.finished).outcome == "done"
             assert {name: made.autopilot.parameter(name) for name in names} == old
-
-    run_virtual(main())
-
-
-@pytest.mark.parametrize("what", ["armed", "restarted"])
-def test_the_stands_so_far_outlive_an_arming_and_a_restart_of_the_autopilot(tmp_path: Path, what: str) -> None:
-    made, hands = rig(tmp_path)
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            job = faced(made, write=True)
-            task = asyncio.ensure_future(follow(made, hands, job))
-            await made.until(lambda: job.words.startswith("4 of"), 200.0)
-            if what == "armed":
-                made.double.arm()
-                await made.until(lambda: "armed: it goes on once it is disarmed" in job.words, 30.0)
-                await asyncio.sleep(20.0)
-                made.double.armed = False
-            else:
-                made.double.reboot()
-            result = await task
-            assert result.outcome == "done", result
-            record = job.product
-            assert isinstance(record, FacesRecord)
-            assert len(record.stands) <= 13
-            np.testing.assert_allclose(read(made, "scale"), 1.0, atol=2e-4)
 
     run_virtual(main())
 

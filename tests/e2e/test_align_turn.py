@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
 from companion.calibration.records.turn_record import TurnRecord
-from companion.component.service import JobResult, Refusal
+from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.daemon.stands.turning import TurnAsked
 from sim.aircraft import Pose
@@ -20,8 +19,8 @@ from sim.earth import mounting_matrix
 from sim.hands import Hands
 from sim.imu_model import MG
 from sim.px4.calibration import SensorCalibration
-from tests.e2e.test_align_faces import follow as by_sides
 from tests.e2e.test_calibration import calibrated, started
+from tests.support.by_hand import NOTHING, Meddle, alone, follow
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -30,31 +29,21 @@ FLAT = Pose(pitch_deg=0.4, roll_deg=-0.3, heading_deg=40.0)
 TARGET_MG = 0.25
 
 
-def rig(
-    folder: Path, pose: Pose, firmware: Literal["ardupilot", "px4"] = "ardupilot", **more: Any
-) -> tuple[Rig, Hands]:
-    """An autopilot and nothing else."""
-    made = Rig(folder, pose=pose, firmware=firmware, imu_rate_hz=25.0, **more)
-    made.config = msgspec.structs.replace(made.config, gradienter=None, compass=None)
-    made.devices.clear()
-    return made, Hands(made.aircraft, placement_deg=0.02, seed=4)
-
-
-async def follow(rig: Rig, hands: Hands, job: Job, bump_before: int = 0) -> JobResult:
-    """Turn it whenever the words ask for it."""
-    done = 1
-    while not job.finished.done():
-        if job.words.startswith(f"{done + 1} of") and "waiting for it to move" in job.words:
-            done += 1
-            if done == bump_before:
-                hands.bump(0.4, 0.0)
-            assert hands.follow(job.words, rig.aircraft.time_at(rig.now_s)), job.words
-        await asyncio.sleep(0.5)
-    return job.finished.result()
+def rig(folder: Path, pose: Pose, firmware: str = "ardupilot", **more: Any) -> tuple[Rig, Hands]:
+    return alone(folder, placement_deg=0.02, pose=pose, firmware=firmware, **{"imu_rate_hz": 25.0} | more)
 
 
 def turn(rig: Rig, headings: int, *, write: bool) -> Job:
     return started(rig.service.calibrating.conductor.start_turn(TurnAsked(headings, write=write), "test", 900.0))
+
+
+async def turned(rig: Rig, hands: Hands, headings: int, *, write: bool, meddle: Meddle = NOTHING) -> TurnRecord:
+    """What came of it, all being well."""
+    job = turn(rig, headings, write=write)
+    result = await follow(rig, hands, job, meddle)
+    assert result.outcome == "done", result
+    assert isinstance(job.product, TurnRecord)
+    return job.product
 
 
 def true_mg(rig: Rig) -> Any:
@@ -80,12 +69,8 @@ def test_the_level_is_found_on_a_slope_and_written(tmp_path: Path, headings: int
             await made.ready()
             names = offset_names(1, "accel")
             old = [made.double.parameter(name) for name in names]
-            job = turn(made, headings, write=True)
-            result = await follow(made, hands, job)
-            assert result.outcome == "done", result
-            assert result.reason.endswith("written")
-            record = job.product
-            assert isinstance(record, TurnRecord)
+            record = await turned(made, hands, headings, write=True)
+            assert made.service.calibrating.conductor.reason.endswith("written")
             assert record.checked
             assert record.slope_deg == pytest.approx(float(np.hypot(pose.pitch_deg, pose.roll_deg)), abs=0.06)
             (imu,) = record.imus
@@ -133,12 +118,16 @@ def test_half_a_turn_and_back_on_a_steep_slope_says_how_little_it_knows(tmp_path
 def test_a_spot_that_moved_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
     made, hands = rig(tmp_path, FLAT)
 
+    def tip(stand: int, _: float) -> None:
+        if stand == 3:
+            hands.bump(0.4, 0.0)
+
     async def main() -> None:
         async with made.running():
             await made.ready()
             old = [made.double.parameter(name) for name in offset_names(1, "accel")]
             job = turn(made, 2, write=True)
-            result = await follow(made, hands, job, bump_before=3)
+            result = await follow(made, hands, job, tip)
             assert result.outcome == "failed"
             assert "the spot moved" in result.reason
             assert [made.double.parameter(name) for name in offset_names(1, "accel")] == old
@@ -152,11 +141,7 @@ def test_px4s_offsets_are_written_too(tmp_path: Path) -> None:
     async def main() -> None:
         async with made.running():
             await made.ready()
-            job = turn(made, 4, write=True)
-            result = await follow(made, hands, job)
-            assert result.outcome == "done", result
-            record = job.product
-            assert isinstance(record, TurnRecord)
+            record = await turned(made, hands, 4, write=True)
             (imu,) = record.imus
             assert set(imu.written) == {"CAL_ACC0_XOFF", "CAL_ACC0_YOFF", "CAL_ACC0_ZOFF"}
             assert {one.outcome for one in imu.written.values()} == {"verified"}
@@ -178,7 +163,7 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
             assert isinstance(refused, Refusal)
             assert "align faces --write first" in refused.reason
             job = started(first.service.calibrating.conductor.start_faces("test", 2000.0, write=True))
-            result = await by_sides(first, hand, job)
+            result = await follow(first, hand, job)
             assert result.outcome == "done", result
 
     async def level() -> None:
@@ -230,7 +215,7 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
         async with made.running():
             await made.ready()
             old = {name: made.autopilot.parameter(name) for name in ("CAL_ACC0_XOFF", "CAL_ACC0_YOFF", "CAL_ACC0_ZOFF")}
-            result = await by_sides(
+            result = await follow(
                 made, hands, started(made.service.calibrating.conductor.start_faces("test", 2000.0, write=True))
             )
             assert result.outcome == "done", result
@@ -262,35 +247,5 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
             assert not isinstance(undone, Refusal)
             assert (await undone.finished).reason.endswith("old values back: faces")
             assert {name: made.autopilot.parameter(name) for name in old} == old
-
-    run_virtual(main())
-
-
-@pytest.mark.parametrize("what", ["armed", "restarted"])
-def test_the_headings_so_far_outlive_an_arming_and_a_restart_of_the_autopilot(tmp_path: Path, what: str) -> None:
-    made, hands = rig(tmp_path, STEEP)
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            job = turn(made, 4, write=False)
-            task = asyncio.ensure_future(follow(made, hands, job))
-            await made.until(lambda: job.words.startswith("3 of"), 200.0)
-            if what == "armed":
-                made.double.arm()
-                await made.until(lambda: "armed: it goes on once it is disarmed" in job.words, 30.0)
-                await asyncio.sleep(20.0)
-                made.double.armed = False
-            else:
-                made.double.reboot()
-            result = await task
-            assert result.outcome == "done", result
-            record = job.product
-            assert isinstance(record, TurnRecord)
-            assert len(record.stands) == 5
-            (imu,) = record.imus
-            off = np.abs(np.subtract(imu.level_bias_mg, residual_mg(made, record)))[:2]
-            assert (off < 3.0 * np.array(imu.level_sigma_mg)[:2]).all()
-            assert max(imu.level_sigma_mg[:2]) < 0.5
 
     run_virtual(main())

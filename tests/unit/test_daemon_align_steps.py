@@ -18,6 +18,7 @@ from companion.daemon.stands.align_steps import (
     Seen,
     asked_turn_deg,
     hold,
+    leaned,
     objection,
     request,
 )
@@ -71,6 +72,24 @@ def test_quarters_in_any_order() -> None:
     assert "make it 90, 180 or 270" in (objection(plan, taken, stands(350.0 + 45.0)) or "")
 
 
+def test_quarters_out_of_order_are_led_to_the_one_that_is_open() -> None:
+    plan = Plan("zero", headings=4, back=True)
+    taken = [stands(10.0), stands(190.0), stands(283.0)]
+    assert request(plan, taken) == "turn it by 180 degrees on its spot"
+    assert objection(plan, taken, stands(6.0)) == "0 degrees again: turn it on by 90 degrees"
+    assert objection(plan, taken, stands(185.0)) == "180 degrees again: turn it on by 270 degrees"
+    assert asked_turn_deg(plan, [*taken, stands(102.0)]) == 270.0
+
+
+def test_a_lean_within_a_stand_is_told_from_noise() -> None:
+    noise = 0.001 * np.random.default_rng(7).standard_normal((12, 3))
+    still = np.array([0.3, -0.2, -9.8]) + noise
+    assert leaned(still) == 0.0
+    slowly = still + np.outer(np.linspace(0.0, 9.81 * math.radians(0.15), 12), [0.0, 1.0, 0.0])
+    assert leaned(slowly) == pytest.approx(0.1, abs=0.02)  # from the middle of the first third to that of the last
+    assert leaned(slowly[:5]) == 0.0
+
+
 def test_tilts_to_sides_not_yet_taken() -> None:
     plan = Plan("tilts")
     spot = [stands(350.0), stands(80.0), stands(170.0), stands(260.0)]
@@ -95,7 +114,8 @@ def test_tilts_to_sides_not_yet_taken() -> None:
 )
 def test_a_turn_that_nobody_counted_is_taken_as_asked(plan: Plan, number: int, turn_deg: float) -> None:
     """And always goes on: turned back, the gyros' scale would stay unknown."""
-    assert asked_turn_deg(plan, number) == turn_deg
+    taken = [stands(asked_turn_deg(plan, [stands(0.0)]) * k + 10.0) for k in range(number)]
+    assert asked_turn_deg(plan, taken) == turn_deg
 
 
 SIDES = ("level", "on its back", "nose up", "nose down", "left side down", "right side down")

@@ -148,7 +148,7 @@ class AutopilotImu:
         self.stream.pairing.set_lines(*fresh.lines())
         self.on_read.tell(known, fresh)
         now_s = asyncio.get_running_loop().time()
-        holds = assumed is not None and _same(assumed, fresh)
+        holds = assumed is not None and same(assumed, fresh)
         if announced is not None and holds:
             words = "%s: %s = %.6g was announced and is not in force"
             logger.warning(words, self.name, announced.name, announced.value)
@@ -258,7 +258,8 @@ def not_ready(vehicle: Vehicle, imus: Mapping[str, AutopilotImu]) -> str | None:
     return None
 
 
-def _same(one: ImuCalibration, other: ImuCalibration) -> bool:
+def same(one: ImuCalibration, other: ImuCalibration) -> bool:
+    """Whether both correct the same sensors alike."""
     return (
         one.corrections == other.corrections
         and one.tcal_enable == other.tcal_enable

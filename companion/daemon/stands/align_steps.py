@@ -6,6 +6,7 @@ Pure: what the next stand should be, in words, from the stands so far.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Final
@@ -34,6 +35,8 @@ _TILTED: Final = {
     "right side down": (0.0, -_SIN, -_COS),
 }
 HEADINGS: Final = 4
+LEAST_SECONDS: Final = 6
+LEANED_SIGMAS: Final = 5.0
 BY_EYE_SIGMA_DEG: Final = 10.0
 """Of a turn that nobody counted and that was made as asked."""
 
@@ -88,7 +91,7 @@ def request(plan: Plan, taken: Sequence[Seen]) -> str:
             return f"tilt it to another side, prop it up: not {' or '.join(done)} again"
         return "tilt it 20 to 28 degrees, prop it up: nose up, nose down, left or right side down"
     if plan.on_spot >= HEADINGS:
-        return "turn it by 90 degrees on its spot"
+        return f"turn it by {_to_next_deg(taken, taken[-1]):.0f} degrees on its spot"
     if number == 1:
         return "turn it by 180 degrees, onto its marks"
     return "turn it the same way to its first marks"
@@ -102,14 +105,14 @@ def hold(plan: Plan, taken: Sequence[Seen]) -> Hold:
     if number >= plan.on_spot:
         done = {_side(taken[0].up, seen.up) for seen in taken[plan.on_spot :]}
         return Hold(next((up for side, up in _TILTED.items() if side not in done), LEVEL))
-    return Hold(LEVEL, asked_turn_deg(plan, number))
+    return Hold(LEVEL, asked_turn_deg(plan, taken))
 
 
-def asked_turn_deg(plan: Plan, number: int) -> float:
-    """By how much it is to be turned after so many stands."""
-    if number >= plan.on_spot:  # a tilt
+def asked_turn_deg(plan: Plan, taken: Sequence[Seen]) -> float:
+    """By how much it is to be turned after these stands."""
+    if len(taken) >= plan.on_spot:  # a tilt
         return 0.0
-    return QUARTER_DEG if plan.on_spot >= HEADINGS else 180.0
+    return _to_next_deg(taken, taken[-1]) if plan.on_spot >= HEADINGS else 180.0
 
 
 def objection(plan: Plan, taken: Sequence[Seen], now: Seen) -> str | None:
@@ -122,7 +125,7 @@ def objection(plan: Plan, taken: Sequence[Seen], now: Seen) -> str | None:
     if number < plan.on_spot:
         turned = _wrapped(now.heading_deg - first.heading_deg)
         if plan.on_spot >= HEADINGS and number < HEADINGS:
-            return _quarter(taken, turned)
+            return _quarter(taken, now)
         wanted = 180.0 if number == 1 else 0.0
         off = _wrapped(turned - wanted)
         if abs(off) > TURN_TOLERANCE_DEG:
@@ -138,14 +141,26 @@ def objection(plan: Plan, taken: Sequence[Seen], now: Seen) -> str | None:
     return None
 
 
-def _quarter(taken: Sequence[Seen], turned_deg: float) -> str | None:
-    near = round(turned_deg / QUARTER_DEG) * QUARTER_DEG
+def _quarter(taken: Sequence[Seen], now: Seen) -> str | None:
+    turned_deg = now.heading_deg - taken[0].heading_deg
+    near = _quarters(taken[0], now) * QUARTER_DEG
     if abs(_wrapped(turned_deg - near)) > TURN_TOLERANCE_DEG:
         return f"{turned_deg % 360.0:.0f} degrees: make it 90, 180 or 270"
-    for seen in taken:
-        if abs(_wrapped(seen.heading_deg - taken[0].heading_deg - near)) <= APART_DEG:
-            return f"{near % 360.0:.0f} degrees again: turn it on by 90 degrees"
+    if any(_quarters(taken[0], seen) * QUARTER_DEG == near for seen in taken):
+        return f"{near:.0f} degrees again: turn it on by {_to_next_deg(taken, now):.0f} degrees"
     return None
+
+
+def _quarters(first: Seen, now: Seen) -> int:
+    return round((now.heading_deg - first.heading_deg) / QUARTER_DEG) % HEADINGS
+
+
+def _to_next_deg(taken: Sequence[Seen], now: Seen) -> float:
+    """How far it is to be turned on, clockwise, to the next heading that is still open: the first, after all others."""
+    done = {_quarters(taken[0], seen) for seen in taken}
+    open_ones = {0} if len(done) == HEADINGS else set(range(HEADINGS)) - done
+    at = _quarters(taken[0], now)
+    return next(turn for turn in range(1, HEADINGS + 1) if (at + turn) % HEADINGS in open_ones) * QUARTER_DEG
 
 
 def _apart_deg(one: Array, other: Array) -> float:
@@ -166,3 +181,20 @@ def _side(level: Array, up: Array) -> str:
 
 def _wrapped(angle_deg: float) -> float:
     return (angle_deg + 180.0) % 360.0 - 180.0
+
+
+def leaned(forces_m_s2: Array) -> float:
+    """By how much up moved in the aircraft from one third of a stand to another, in degrees; 0 where it may be noise.
+
+    Args:
+        forces_m_s2: (seconds, 3), means of an accelerometer.
+    """
+    if len(forces_m_s2) < LEAST_SECONDS:
+        return 0.0
+    # Second differences know nothing of a steady lean; of white noise they have six times the variance.
+    noise = math.sqrt(np.square(np.diff(forces_m_s2, 2, axis=0)).mean() / 6.0)
+    thirds = np.array([third.mean(axis=0) for third in np.array_split(forces_m_s2, 3)])
+    ups = thirds / np.linalg.norm(thirds, axis=1)[:, None]
+    apart = max(_apart_deg(one, other) for one, other in itertools.combinations(ups, 2))
+    chance = LEANED_SIGMAS * noise * math.sqrt(6.0 / len(forces_m_s2)) / float(np.linalg.norm(forces_m_s2[0])) / DEG
+    return apart if apart > chance else 0.0

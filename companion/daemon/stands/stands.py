@@ -15,12 +15,14 @@ from typing import Final, NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.calibration.collector.outlook import Glance
 from companion.calibration.means.windows import Window
 from companion.component.service import JobResult
 from companion.component.statustext import LINE_BYTES, Severity
 from companion.component.tunes import Tune
 from companion.daemon.core import Core
-from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.devices.autopilot_imu import AutopilotImu, same
 from companion.daemon.job import Job
 from companion.daemon.stands import align_steps
 from companion.daemon.stands.align_steps import LEVEL, Hold, Plan, Seen
@@ -37,7 +39,14 @@ STOP_WITHIN_DEG: Final = 5.0
 """Who would be that near what is asked for, or beyond, by the next look is told to stop."""
 TURNS_DEG: Final = 2.0
 """From one look to the next, a second later."""
+EARLY_S: Final = 3.0
+"""A stand that has been measured for so long and moves was moved too early; before, it is still being set down."""
+STILL_MOVING_S: Final = 20.0
+"""Whoever takes that long to move it may not know that a hand or the wind is still on it."""
 ARMED: Final = "armed during the alignment; the earlier one stays in force"
+
+LEANED_DEG: Final = 0.03
+"""Half of it is in the mean: as much as marks leave when they are met again."""
 
 _T = TypeVar("_T")
 
@@ -83,6 +92,21 @@ class StandsShown(msgspec.Struct):
     """None while it runs."""
 
 
+class _Attempt:
+    """At one stand, until it is the one that was asked for."""
+
+    def __init__(self, since_s: float, *, moved: bool) -> None:
+        self.since_s, self.moved = since_s, moved
+        """Since when it has not moved; whether it has at all since the stand before, or since it was objected to."""
+        self.still_s = 0.0
+        self.moving_s = math.inf
+        """Since when it has moved without a pause."""
+        self.why = ""
+        """What was wrong last."""
+        self.told = False
+        """To hold still."""
+
+
 class Stands:
     """Of one aircraft, for one job at a time."""
 
@@ -91,7 +115,7 @@ class Stands:
         self._imus, self._measuring = imus, measuring
         self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
         self._last: Window | None = None
-        self._first: dict[str, dict[str, float]] = {}
+        self._first: dict[str, ImuCalibration] = {}
         self.shown: StandsShown | None = None
         """None before the first alignment."""
 
@@ -126,45 +150,47 @@ class Stands:
             self._core.tunes.play(Tune.NEXT)
         self._say(Severity.NOTICE, asked.words)
         # Whoever asks may yet put it down on a better spot: what was before that does not count.
-        since_s = loop.time() if self._last is None else self._last.end_s
-        moved, why, held = self._last is None, "", False
+        at = _Attempt(loop.time() if self._last is None else self._last.end_s, moved=self._last is None)
         turn = self._turn(asked)
         while True:
             now_s = loop.time()
             status, waiting_for, hold_still_s = await self._measuring.read_state(job, if_armed)
             self._check_known()
-            moving = self._collector.glance(now_s).moving
-            if moving:
-                moved, since_s = True, now_s
-            still_s = min(status.still_s, now_s - since_s - SETTLE_S)
+            glance = self._collector.glance(now_s)
+            self._look(at, glance, now_s, asked)
+            at.still_s = min(status.still_s, now_s - at.since_s - SETTLE_S)
             # What only has to go on standing still is measured from its first second on, and told so.
-            standing = moved and (waiting_for is None or hold_still_s is not None)
-            share = min(max(still_s, 0.0) / self._stand_s, 1.0) if standing else 0.0
-            if not moved:
-                words = f"{why or wish}; waiting for it to move"
+            standing = at.moved and (waiting_for is None or hold_still_s is not None)
+            share = min(max(at.still_s, 0.0) / self._stand_s, 1.0) if standing else 0.0
+            if not at.moved:
+                words = f"{at.why or wish}; waiting for it to move"
             elif not standing:
-                words = f"{why or wish}; {(moving and turn(now_s)) or waiting_for}"
+                words = f"{at.why or wish}; {(glance.moving and turn(now_s)) or waiting_for}"
             else:
                 turned = turn(now_s)
-                words = f"measuring, {max(still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
+                words = f"measuring, {max(at.still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
                 words += f" ({turned})" if turned else ""
-                if not held:
-                    held = True
+                if not at.told:
+                    at.told = True
                     self._core.prompt(Tune.HOLD_STILL, "Hold still")
             self._measuring.show(measuring=share > 0.0)
             job.progress(100.0 * (number - 1 + share) / total, f"{number} of {total}: {words}")
-            shown.words, shown.share, shown.objection = words, round(share, 3), why or None
-            if moved and waiting_for is None and still_s >= self._stand_s:
-                window = await self._core.window(since_s=since_s + SETTLE_S)
+            shown.words, shown.share, shown.objection = words, round(share, 3), at.why or None
+            if at.moved and waiting_for is None and at.still_s >= self._stand_s:
+                window = await self._core.window(since_s=at.since_s + SETTLE_S)
                 found, objection = take(window)
-                if objection is None:
+                if (leaned := self._leaned(window)) is not None:
+                    at.since_s = now_s
+                    self._object(leaned, asked, at)
+                elif objection is None:
                     self._last = window
                     self._first = self._first or self._offsets()
                     shown.done.append(_up(window))
                     return found
-                moved, why = False, objection
-                self._measuring.show(measuring=False)
-                self._object(objection, asked)
+                else:
+                    at.moved = False
+                    self._measuring.show(measuring=False)
+                    self._object(objection, asked, at)
             await job.pause(POLL_S)
 
     def _turn(self, asked: Asked) -> Callable[[float], str]:
@@ -187,14 +213,39 @@ class Stands:
 
         return words
 
+    def _look(self, at: _Attempt, glance: Glance, now_s: float, asked: Asked) -> None:
+        """Whether it moves, and say so to who may not know: it was measured already, or it takes long."""
+        if not glance.moving:
+            at.moving_s = math.inf
+            return
+        if glance.moves is not None and at.moved:
+            at.moving_s = min(at.moving_s, now_s)
+            if at.still_s >= EARLY_S:
+                words = f"it moved after {at.still_s:.0f} of {self._stand_s:.0f} seconds: hands off"
+                self._object(words, asked, at)
+            elif now_s - at.moving_s >= STILL_MOVING_S:
+                at.moving_s = now_s
+                self._say(Severity.NOTICE, "It still moves: set it down, hands off")
+        at.moved, at.since_s, at.still_s = True, now_s, 0.0
+
     def _show(self, asked: Asked) -> StandsShown:
         shown = self.shown
         assert shown is not None
         shown.number, shown.total, shown.wish, shown.hold, shown.unknown = asked
         return shown
 
-    def _object(self, objection: str, asked: Asked) -> None:
+    def _leaned(self, window: Window) -> str | None:
+        """Of a hand that is taken off too slowly for a movement, or of ground that gives way."""
+        seconds = self._collector.snapshot(window.start_s, None).forces_m_s2(window.imus[0].name)
+        forces = [force for second, force in seconds.items() if window.start_s <= second < window.end_s]
+        leaned_deg = align_steps.leaned(np.array(forces))
+        if leaned_deg < LEANED_DEG:
+            return None
+        return f"it leaned by {leaned_deg:.2g} degrees: hands off, firm ground"
+
+    def _object(self, objection: str, asked: Asked, at: _Attempt) -> None:
         """Where it is too long to be heard whole, with what is asked for once more."""
+        at.why, at.told = objection, False
         self._core.prompt(Tune.WRONG, objection)
         if len(objection) > LINE_BYTES:
             self._say(Severity.NOTICE, asked.words)
@@ -219,13 +270,13 @@ class Stands:
         """
         if not taken:
             return Taken(now, Seen(up, 0.0), first_sigma_deg)
-        before, (imu, *_) = taken[-1].window, now.imus
+        seen, before, (imu, *_) = [one.seen for one in taken], taken[-1].window, now.imus
         bias = (np.array(before.imus[0].gyro_rad_s) + np.array(imu.gyro_rad_s)) / 2.0
         counted = self._collector.counted(imu.name, before.end_s, now.start_s, bias)
-        turn_deg, sigma_deg = align_steps.asked_turn_deg(plan, len(taken)), align_steps.BY_EYE_SIGMA_DEG
+        turn_deg, sigma_deg = align_steps.asked_turn_deg(plan, seen), align_steps.BY_EYE_SIGMA_DEG
         if counted is not None:
             turn_deg, sigma_deg = counted.angle_rad / DEG, counted.sigma_rad / DEG
-        return Taken(now, Seen(up, taken[-1].seen.heading_deg + turn_deg), sigma_deg, counted=True)
+        return Taken(now, Seen(up, seen[-1].heading_deg + turn_deg), sigma_deg, counted=True)
 
     @contextlib.contextmanager
     def imus_alone(self) -> Iterator[None]:
@@ -245,16 +296,25 @@ class Stands:
             AutopilotError: they cannot be read.
         """
         for name, imu in self._imus.items():
-            if not await imu.refresh():
+            holds = await imu.refresh()
+            self._check_known()
+            if not holds:
                 raise _changed(name)
 
     def _check_known(self) -> None:
-        for name, offsets in self._offsets().items() if self._first else ():
-            if self._first.get(name, offsets) != offsets:
-                raise _changed(name)
+        for name, imu in self._imus.items():
+            first, now = self._first.get(name), imu.calibration
+            if first is None or now is None or same(first, now):
+                continue
+            for old, new in ((first.accel_id, now.accel_id), (first.gyro_id, now.gyro_id)):
+                if old != new:
+                    raise CalibrationRefusedError(
+                        f"imu {name} was exchanged in between (device id {old}, now {new}): align again"
+                    )
+            raise _changed(name)
 
-    def _offsets(self) -> dict[str, dict[str, float]]:
-        return {name: imu.calibration.corrections for name, imu in self._imus.items() if imu.calibration is not None}
+    def _offsets(self) -> dict[str, ImuCalibration]:
+        return {name: imu.calibration for name, imu in self._imus.items() if imu.calibration is not None}
 
 
 def _up(window: Window) -> tuple[float, float, float]:

@@ -1,0 +1,190 @@
+"""Stands by hand that go wrong as they do in a field: each is named, costs that stand only, and spoils no figure."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.calibration.records.faces_record import FacesRecord
+from companion.calibration.records.turn_record import TurnRecord
+from companion.component.service import JobResult
+from companion.daemon.job import Job
+from sim.aircraft import Pose
+from sim.hands import Hands
+from sim.imu_model import MG, ImuModel
+from sim.motions import Turn, Vibration
+from tests.e2e.test_align_faces import SCALES, read
+from tests.e2e.test_align_turn import FLAT, STEEP, true_mg
+from tests.e2e.test_page import WEB, press
+from tests.support.by_hand import Meddle, alone, follow
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+MOVES_S = 6.0
+ID = 0x3A0002 + (7 << 8)
+"""Another sensor of the same type."""
+
+
+async def run(rig: Rig, hands: Hands, meddle: Meddle, **asked: object) -> tuple[JobResult, Job]:
+    """As the page asks for it."""
+    status, reason = await press(rig, "align", **asked)
+    assert status == 200, reason
+    job = rig.service.calibrating.conductor.running
+    assert job is not None
+    return await follow(rig, hands, job, meddle), job
+
+
+def said(rig: Rig) -> str:
+    return "\n".join(rig.ground.texts())
+
+
+class Clumsy:
+    """Whoever makes the stands: at each does one thing wrong, once; asked again, does it as the words say."""
+
+    def __init__(self, rig: Rig, hands: Hands) -> None:
+        self.wrong: dict[int, Callable[[float], object]] = {}
+        """By stand; from that aircraft time on."""
+        self._rig, self._hands = rig, hands
+
+    def __call__(self, number: int, t_s: float) -> object:
+        wrong = self.wrong.pop(number, None)
+        return None if wrong is None else wrong(t_s)
+
+    def rocks(self, t_s: float) -> None:
+        """Rests a hand on the wing, which trembles for half a minute."""
+        self._rig.aircraft.add(
+            Vibration(start_s=t_s + MOVES_S, duration_s=30.0, frequency_hz=1.0, amplitude_m_s2=0.0, rocking_deg_s=0.3)
+        )
+
+    def lets_go(self, t_s: float) -> None:
+        """Leans on the wing, and lets go of it so slowly that no gyro is sure."""
+        self._rig.aircraft.add(Turn(start_s=t_s, duration_s=MOVES_S, roll_deg=0.3))
+        self._rig.aircraft.add(Turn(start_s=t_s + MOVES_S + 2.0, duration_s=10.0, roll_deg=-0.3))
+
+    def arms(self, _: float) -> None:
+        """And disarms after a while."""
+        loop = asyncio.get_running_loop()
+        loop.call_later(MOVES_S + 4.0, self._rig.double.arm)
+        loop.call_later(MOVES_S + 20.0, self._rig.double.disarm)
+
+    def restarts(self, _: float) -> None:
+        """The autopilot."""
+        self._rig.double.reboot()
+
+    def turns_on_too_early(self, t_s: float) -> bool:
+        """After some seconds of the stand."""
+        self._hands.turn(t_s, 90.0)
+        self._hands.turn(t_s + MOVES_S + 6.0, 90.0)
+        return True
+
+    def tilts_too_early(self, t_s: float) -> bool:
+        """Likewise, to another side."""
+        self._hands.hold(t_s, 90.0, 0.0)
+        self._hands.hold(t_s + MOVES_S + 6.0, -90.0, 0.0)
+        return True
+
+    def lifts_it(self, t_s: float) -> bool:
+        """And puts it back as it was."""
+        self._rig.aircraft.add(Turn(start_s=t_s, duration_s=4.0, pitch_deg=10.0))
+        self._rig.aircraft.add(Turn(start_s=t_s + 4.0, duration_s=4.0, pitch_deg=-10.0))
+        return True
+
+
+NAMED = (
+    "seconds: hands off",  # moved too early
+    "It still moves: set it down, hands off",
+    "degrees: hands off, firm ground",
+)
+
+
+def test_all_that_goes_wrong_on_all_sides_and_then_on_the_spot(tmp_path: Path) -> None:
+    """Some five seconds of processor: two long alignments, on one aircraft, for each of a dozen mishaps."""
+    made, hands = alone(tmp_path, placement_deg=0.02, propped_deg=4.0, imu_rate_hz=10.0, parameters=SCALES, more=WEB)
+    clumsy = Clumsy(made, hands)
+
+    def stands_done() -> int:
+        return len(made.service.status()["stands"]["done"])
+
+    async def sides() -> None:
+        clumsy.wrong = {2: clumsy.tilts_too_early, 3: clumsy.lifts_it, 4: clumsy.rocks, 5: clumsy.lets_go,
+                        6: clumsy.arms, 7: clumsy.restarts}  # fmt: skip
+        result, job = await run(made, hands, clumsy, action="faces", write=True)
+        assert result.outcome == "done", result
+        assert isinstance(job.product, FacesRecord)
+        assert stands_done() == len(job.product.stands) <= 13
+        for words in (*NAMED, "it stands as in stand 2"):
+            assert words in said(made), words
+        np.testing.assert_allclose(read(made, "scale"), 1.0, atol=2e-4)
+        np.testing.assert_allclose(read(made, "accel") / MG, true_mg(made), atol=0.15)
+
+    async def level() -> None:
+        clumsy.wrong = {2: clumsy.turns_on_too_early, 3: clumsy.lifts_it, 4: clumsy.rocks, 5: clumsy.restarts}
+        result, job = await run(made, hands, clumsy, action="turn", level=True)
+        assert result.outcome == "done", result
+        assert isinstance(job.product, TurnRecord)
+        assert stands_done() == len(job.product.stands) == 5
+        for words in ("it moved after 5 of 12 seconds", "180 degrees again: turn it on by 90 degrees"):
+            assert words in said(made), words
+        trim = np.degrees([made.double.parameter(f"AHRS_TRIM_{axis}") for axis in "XY"])
+        np.testing.assert_allclose(trim, 0.0, atol=0.05)  # the board sits straight
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            await sides()
+            hands.spot(made.aircraft.time_at(made.now_s), STEEP.pitch_deg, STEEP.roll_deg)
+            await asyncio.sleep(15.0)
+            await level()
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(("headings", "pose"), [(2, FLAT), (4, STEEP)])
+def test_a_turn_in_which_much_goes_wrong_writes_what_is_true(tmp_path: Path, headings: int, pose: Pose) -> None:
+    made, hands = alone(tmp_path, placement_deg=0.02, imu_rate_hz=25.0, pose=pose, more=WEB)
+    clumsy = Clumsy(made, hands)
+    clumsy.wrong = {1: clumsy.rocks, 2: clumsy.lets_go, 3: clumsy.arms, 4: clumsy.turns_on_too_early}
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            result, job = await run(made, hands, clumsy, action="turn", headings=headings, write=True)
+            assert result.outcome == "done", result
+            assert isinstance(job.product, TurnRecord)
+            (imu,) = job.product.imus
+            sigma_mg = np.array(imu.level_sigma_mg)[:2]
+            assert sigma_mg.max() < 0.5
+            assert (np.abs(read(made, "accel") / MG - true_mg(made))[:2] < 3.0 * sigma_mg).all()
+            assert "degrees: hands off, firm ground" in said(made)
+
+    run_virtual(main())
+
+
+def test_an_imu_that_is_exchanged_between_the_stands_is_named_and_nothing_is_written(tmp_path: Path) -> None:
+    made, hands = alone(tmp_path, propped_deg=1.0, placement_deg=0.02, imu_rate_hz=10.0, more=WEB)
+    other = ImuModel(made.aircraft, "icm42688p", seed=9, accel_bias_m_s2=[8.0 * MG, -9.0 * MG, 7.0 * MG])
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            for number, what in enumerate(("faces", "turn")):
+                old = [read(made, one).tolist() for one in ("accel", "scale")]
+                device_id = ID + (number << 8)
+
+                def meddle(stand: int, _: float, device_id: int = device_id) -> None:
+                    if stand == 3:
+                        made.double.exchange_imu(other, device_id)
+
+                result, _ = await run(made, hands, meddle, action=what, write=True)
+                assert result.outcome == "failed"
+                assert "imu fc was exchanged in between (device id" in result.reason
+                assert f"now {device_id}): align again" in result.reason
+                assert [read(made, one).tolist() for one in ("accel", "scale")] == old
+                hands.spot(made.aircraft.time_at(made.now_s), 0.5, 0.5)
+                await asyncio.sleep(20.0)
+
+    run_virtual(main())
