@@ -39,7 +39,7 @@ async def run(rig: Rig, hands: Hands, meddle: Meddle, **asked: object) -> tuple[
 
 
 def said(rig: Rig) -> str:
-    return "\n".join(rig.ground.texts())
+    return "\n".join(rig.ground.texts()).lower()
 
 
 class Clumsy:
@@ -96,7 +96,7 @@ class Clumsy:
 
 NAMED = (
     "seconds: hands off",  # moved too early
-    "It still moves: set it down, hands off",
+    "it still moves: set it down, hands off",
     "degrees: hands off, firm ground",
 )
 
