@@ -294,6 +294,11 @@ class Intake(ABC):
         """For how long the device of an IMU had been on when that was heard last; None where it does not tell."""
         return self._up[name][1] if name in self._up else None
 
+    def forces_m_s2(self, imu: str, start_s: float, end_s: float) -> list[Array]:
+        """The mean specific force of each second between two times, (3,) in the IMU's own axes."""
+        batches = self._imus[imu].batches.batches
+        return [batches[slot].mean[3:] for slot in sorted(batches) if start_s <= slot < end_s]
+
     def count_turns(self, *, wanted: bool) -> None:
         """Begin to keep what turns on a spot are counted by, or stop it."""
         self._counters = {name: TurnCounter() for name in self._imus} if wanted else {}

@@ -16,7 +16,6 @@ import msgspec
 from companion import formats
 from companion.calibration.collector.intake import Kind, Source
 from companion.calibration.stillness.gates import Verdict
-from companion.physics.frames import Floats
 
 FORMAT_VERSION: Final = 2
 """Of 1 it leaves out the noise of each IMU."""
@@ -116,15 +115,6 @@ class Snapshot(msgspec.Struct, frozen=True):
                 for (kind, name), column in columns.items()
             ),
         )
-
-    def forces_m_s2(self, imu: str) -> dict[int, Floats]:
-        """By second, the mean specific force that an IMU has read, (3,) in its own axes."""
-        return {
-            slot: one.batch.mean[3:]
-            for slot, _, seen in self.seconds
-            for one in seen
-            if one.kind == "imu" and one.name == imu and one.batch is not None
-        }
 
 
 class TraceLog:

@@ -236,8 +236,7 @@ class Stands:
 
     def _leaned(self, window: Window) -> str | None:
         """Of a hand that is taken off too slowly for a movement, or of ground that gives way."""
-        seconds = self._collector.snapshot(window.start_s, None).forces_m_s2(window.imus[0].name)
-        forces = [force for second, force in seconds.items() if window.start_s <= second < window.end_s]
+        forces = self._collector.forces_m_s2(window.imus[0].name, window.start_s, window.end_s)
         leaned_deg = align_steps.leaned(np.array(forces))
         if leaned_deg < LEANED_DEG:
             return None
