@@ -24,6 +24,8 @@ HOLE_S: Final = 0.05
 """Beyond the stream's interval: an aircraft that hands turn by 60 deg/s turns by 3 degrees meanwhile."""
 AT_REST_S: Final = 0.5
 """In less nobody turns it from rest to rest."""
+LATE_S: Final = 0.05
+"""Of the way of a sample; by more one of the clocks did not keep its pace: a simulated firmware on a busy computer."""
 MOVES_RAD_S: Final = math.radians(0.5)
 SIGMA_RAD: Final = math.radians(0.15)
 """Of each turn, besides scale and stamps: axes that are not square, of an aircraft that is tilted on its way."""
@@ -69,9 +71,9 @@ class TurnCounter:
             return None
         if (np.diff(rows[:, 1]) < -AT_REST_S).any():  # the device has begun anew
             return None
-        times, rates = _in_time(rows)
+        times, rates, late_s = _in_time(rows)
         gaps = np.diff(times)
-        if len(gaps) == 0 or gaps.max() > AT_REST_S:
+        if len(gaps) == 0 or max(gaps.max(), late_s) > AT_REST_S:
             return None
         rates = (rates + np.sign(rates) * cut_rad_s / 2.0) @ vehicle_from_sensor.T - bias_rad_s
         # While it stands it does not turn, whatever integers and a bias that wanders make of minutes of it.
@@ -85,15 +87,19 @@ class TurnCounter:
         angle_rad = _turned_rad(times, rates)
         # What every fourth sample counts by itself differs by twice as much as sampling and stamps make of all.
         parts = [_turned_rad(times[k::4], rates[k::4]) - angle_rad for k in range(4)]
-        return Counted(angle_rad, math.hypot(SIGMA_RAD, float(np.linalg.norm(parts)) / math.sqrt(12.0)))
+        off_pace = abs(angle_rad) * max(late_s - LATE_S, 0.0) / float(np.ptp(times))
+        return Counted(angle_rad, math.hypot(SIGMA_RAD, float(np.linalg.norm(parts)) / math.sqrt(12.0), off_pace))
 
 
-def _in_time(rows: Floats) -> tuple[Floats, Floats]:
-    """Times and rates: by the device's clock where it has one, for on their way samples bunch, and come twice."""
+def _in_time(rows: Floats) -> tuple[Floats, Floats, float]:
+    """Times and rates, and by how much the host's clock disagrees on how long it took.
+
+    By the device's clock where it has one, for on their way samples bunch, and come twice.
+    """
     device_s, order = np.unique(rows[:, 1], return_index=True)
     if np.isfinite(device_s).all() and 2 * len(device_s) > len(rows):
-        return device_s, rows[order, 2:]
-    return rows[:, 0], rows[:, 2:]
+        return device_s, rows[order, 2:], abs(float(np.ptp(rows[:, 0]) - np.ptp(device_s)))
+    return rows[:, 0], rows[:, 2:], 0.0
 
 
 def _turned_rad(times_s: Floats, rates_rad_s: Floats) -> float:
