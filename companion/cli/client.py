@@ -55,13 +55,8 @@ async def status(options: argparse.Namespace) -> int:
 async def calibrate(options: argparse.Namespace) -> int:
     """`companion calibrate`."""
     what = "gyros" if options.gyros else "accelerometers" if options.accelerometers else "both"
-    wanted = {
-        "command": "calibrate",
-        "what": what,
-        "wait": options.wait,
-        "timeout_s": options.timeout,
-        "reboot": options.reboot,
-    }
+    wanted = {"command": "calibrate", "what": what, "wait": options.wait}
+    wanted |= {"timeout_s": options.timeout, "reboot": options.reboot}
     reply = await request(options, wanted)
     if "record" in reply:
         record = reply["record"]
