@@ -85,7 +85,7 @@ async def undo(options: argparse.Namespace) -> int:
 async def history(options: argparse.Namespace) -> int:
     """`companion history`."""
     reply = await request(options, {"command": "history", "limit": options.limit})
-    answer = {key: reply.get(key, []) for key in ("numbers", "records", "armings")}
+    answer = {key: reply.get(key, []) for key in ("numbers", "records", "armings", "by_hand")}
     return finish(options, reply, answer, show.history_lines(**answer), good=True)
 
 

@@ -120,6 +120,7 @@ def status_lines(status: Object) -> list[str]:
         + (f", {arming['words']}" if arming["verdict"] != "accept" else "")
     )
     lines.append(f"in force: {arming['in_force']}")
+    lines += [f"by hand, {_minute(one['measured_at'])} UTC: {by_hand_words(one)}" for one in status["by_hand"]]
     lines += [f"profile {each['imu']}: {each['summary']}" for each in status["profiles"]]
     lines += end_lines(status)
     if status["undoable"]:
@@ -136,7 +137,9 @@ def undo_line(steps: Sequence[Object]) -> str:
     step, more = steps[0], len(steps) - 1
     when = f" of {_minute(step['at'])} UTC" if step["at"] else ""
     several = f" and all since {_minute(step['since'])}" if step["since"] != step["at"] else ""
-    words = f"undo takes back: {step['what'] or 'last write'}{when}{several}, {len(step['parameters'])} parameters"
+    words = (
+        f"the next undo takes back: {step['what'] or 'last write'}{when}{several}, {len(step['parameters'])} parameters"
+    )
     return words + (f"; {more} more after it" if more else "")
 
 
@@ -252,16 +255,21 @@ def _judged(rows: Sequence[tuple[str, str, str]]) -> list[str]:
     return [f"{verdict:7}  {name if name != verdict else '':{width}}  {words}" for verdict, name, words in rows]
 
 
-def history_lines(numbers: Sequence[int], records: Sequence[Object], armings: Sequence[Object]) -> list[str]:
-    """Past calibrations and the latest armings, one line each, newest first; numbers as `companion report` takes."""
-    if not records:
-        return ["no calibrations yet"]
-    lines = [f"{'no.':>4} {'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]
+def history_lines(
+    numbers: Sequence[int], records: Sequence[Object], armings: Sequence[Object], by_hand: Sequence[Object]
+) -> list[str]:
+    """Past calibrations and alignments and the latest armings, newest first; numbers as `companion report` takes."""
+    lines = ["no calibrations yet"]
+    if records:
+        lines = [f"{'no.':>4} {'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]
     lines += [
         f"{number:4} {record['started_at'][:19]:20} {record.get('system_id') or '?':>7} {record['state']:10}"
         f" {record['duration_s']:5.0f}s  {record['reason']}{_what_became(record)}"
         for number, record in zip(numbers, records, strict=True)
     ]
+    if by_hand:
+        lines.append(f"{'':4} {'by hand (UTC)':20} what came of it")
+        lines += [f"{'':4} {one['measured_at'][:19]:20} {by_hand_words(one)}" for one in by_hand]
     if armings:
         lines.append(f"{'':4} {'armed (UTC)':20} in force")
         lines += [
@@ -270,6 +278,19 @@ def history_lines(numbers: Sequence[int], records: Sequence[Object], armings: Se
             for arming in armings
         ]
     return lines
+
+
+def by_hand_words(done: Object) -> str:
+    """What came of an alignment, and whether that is in force."""
+    words = (
+        f"{done['what']}: {done['reason']}" if done["state"] == "done" else f"{done['what']} failed: {done['reason']}"
+    )
+    if not (number := len(done["written"])):
+        return words
+    if done["undone_at"]:
+        return f"{words}; {number} parameters written, undone {_minute(done['undone_at'])}"
+    in_force = {True: ", in force", False: ", not in force as written any more", None: ""}[done["in_force"]]
+    return f"{words}; {number} parameters written{in_force}"
 
 
 def _what_became(record: Object) -> str:

@@ -236,7 +236,14 @@ class BoundedList(Generic[T]):
         Raises:
             StorageError: it could not be written.
         """
-        entries = [*self.read(), entry][-self._keep :]
+        self.write([*self.read(), entry][-self._keep :])
+
+    def write(self, entries: list[T]) -> None:
+        """Keep these in the place of what was kept.
+
+        Raises:
+            StorageError: they could not be written.
+        """
         self._file.write(_Entries(entries))
 
 

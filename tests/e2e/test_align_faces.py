@@ -14,8 +14,10 @@ import pytest
 from companion.calibration.records.faces_record import FacesRecord
 from companion.calibration.records.record import Record
 from companion.calibration.request import What
+from companion.cli.show import status_lines
 from companion.component.service import Refusal
 from companion.daemon.job import Job
+from companion.daemon.stands.by_hand import ByHand
 from sim.ardupilot.double import offset_names
 from sim.hands import Hands
 from sim.imu_model import MG
@@ -66,6 +68,9 @@ def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tmp_path
             np.testing.assert_allclose(imu.accel_scale.value, wrong, atol=2e-4)
             assert {one.outcome for one in imu.written.values()} == {"verified"}
             assert set(imu.written) == set(old)
+            (shown,) = made.service.status()["by_hand"]
+            assert (shown["what"], shown["reason"], shown["in_force"]) == ("faces", result.reason, True)
+            assert set(shown["written"]) == set(old)
             # A calibration of the gyros afterwards does not put them out of reach.
             gyros = {name: made.double.parameter(name) for name in offset_names(1, "gyro")}
             assert (await calibrated(made, What.GYROS))[0].outcome == "done"
@@ -76,6 +81,14 @@ def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tmp_path
                 assert result.reason.endswith(f"old values back: {what}")
                 assert {name: made.double.parameter(name) for name in gyros} == gyros
             assert {name: made.double.parameter(name) for name in old} == old
+            again = ByHand(made.service.core, made.service.devices.imus)
+            again.load()
+            for kept in (made.service.calibrating.by_hand, again):
+                (shown,) = kept.history()
+                assert shown["undone_at"] is not None
+                assert shown["in_force"] is False
+            (words,) = [line for line in status_lines(made.service.status()) if line.startswith("by hand, ")]
+            assert re.search(r" UTC: faces: accel bias known to .*: written; 6 parameters written, undone 20", words)
 
     run_virtual(main())
 

@@ -71,7 +71,16 @@ def test_it_starts_says_so_and_writes_nothing(
 
 @pytest.mark.parametrize(
     "name",
-    ["alignment.json", "faces.json", "biases.json", "automatic.json", "armings.json", "records", "records/000001.json"],
+    [
+        "alignment.json",
+        "faces.json",
+        "reboot-owed.json",
+        "biases.json",
+        "automatic.json",
+        "armings.json",
+        "records",
+        "records/000001.json",
+    ],
 )
 def test_nothing_else_in_the_storage_ends_or_hangs_the_start(tmp_path: Path, name: str) -> None:
     (tmp_path / name).parent.mkdir(exist_ok=True)

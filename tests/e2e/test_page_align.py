@@ -76,7 +76,7 @@ def status(stands: Object | None, **more: Any) -> Object:
         "progress": None, "pose": None, "calibration": None, "last": None, "devices": [], "mqtt": None, "warnings": [],
         "arming": {"state": "calibrated", "in_force": "", "setup": None, "quality": {"gyro": none, "accel": none}},
         "ground_stations": {"good": True, "summary": ""}, "recording": {"fault": None}, "automatic": {"stopped": None},
-        "why_no_undo": "nothing", "spoken": [], "stands": stands, **more,
+        "why_no_undo": "nothing", "undoable": [], "by_hand": [], "spoken": [], "stands": stands, **more,
     }  # fmt: skip
 
 

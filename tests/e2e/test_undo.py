@@ -281,10 +281,10 @@ def test_all_that_can_be_undone_is_shown_in_words() -> None:
     kept = Undoable(1, (step(FIRST, *WRITES[0]),)).and_then(first).and_then(step(FIRST, *WRITES[3], 2))
     first_words, *lines = [undo_line([each.shown() for each in kept.steps[k:]]) for k in range(3)]
     assert first_words == (
-        "undo takes back: auto calibration of 2026-11-23 06:02 UTC and all since 2026-11-23 06:01, 3 parameters;"
-        " 1 more after it"
+        "the next undo takes back: auto calibration of 2026-11-23 06:02 UTC and all since 2026-11-23 06:01,"
+        " 3 parameters; 1 more after it"
     )
     assert lines == [
-        "undo takes back: calibration of 2026-11-23 06:00 UTC, 6 parameters",
+        "the next undo takes back: calibration of 2026-11-23 06:00 UTC, 6 parameters",
         "undo: nothing is left to take back",
     ]

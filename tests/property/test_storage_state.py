@@ -12,6 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.calibration.records.record import Arming
+from companion.daemon.offsets.reboot_owed import owed_in
+from companion.daemon.stands.by_hand import Done
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, FacesStore, signing_time_in
 from companion.storage.records import RecordStore
@@ -59,13 +61,15 @@ def test_any_bytes_in_any_file(data: bytes) -> None:
         folder = Path(name)
         (folder / "records").mkdir()
         files = ("journal.json", "undo-1.json", "alignment.json", "biases.json", "armings.json", SIGNING_FILE)
-        for file in (*files, "faces.json", "records/000001.json"):
+        for file in (*files, "faces.json", "reboot-owed.json", "by-hand.json", "records/000001.json"):
             (folder / file).write_bytes(data)
         log = ChangeLog(folder)
         log.journal.load()
         log.undo_of(1).load()
         AlignmentStore(folder).load()
         FacesStore(folder).load()
+        owed_in(folder).load()
+        BoundedList(folder / "by-hand.json", Done, 5).read()
         BiasStore(folder).read()
         BoundedList(folder / "armings.json", Arming, 5).read()
         signing_time_in(folder).load()

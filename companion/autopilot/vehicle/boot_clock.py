@@ -40,8 +40,13 @@ class BootClock:
         self._suspected_s = 0.0
 
     @property
+    def latest(self) -> tuple[float, float] | None:
+        """The time since boot that was heard last, and when."""
+        return self._last
+
+    @property
     def latest_s(self) -> float | None:
-        """The time since boot that was heard last."""
+        """That time alone."""
         return None if self._last is None else self._last[0]
 
     def rebooted(self, boot_s: float, t_s: float) -> bool:

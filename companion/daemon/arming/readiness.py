@@ -23,7 +23,7 @@ from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core
 from companion.daemon.offsets.effect import LOOK_S
-from companion.daemon.offsets.push import Conclusion
+from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad
 
@@ -121,11 +121,11 @@ class Readiness:
     """The arm gate's answer, and what goes with it: `run` keeps it fresh."""
 
     def __init__(
-        self, core: Core, conclusion: Conclusion, conductor: Conductor, in_force: InForce, automatic: Automatic
+        self, core: Core, owed: RebootOwed, conductor: Conductor, in_force: InForce, automatic: Automatic
     ) -> None:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
         self._wanted, self._on_deck = core.wanted, core.config.vehicle.platform == "deck"
-        self.in_force, self._automatic, self._conclusion = in_force, automatic, conclusion
+        self.in_force, self._automatic, self._owed = in_force, automatic, owed
         self._forecast = Forecast(core, conductor)
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
@@ -226,7 +226,7 @@ class Readiness:
     @property
     def owed(self) -> str | None:
         """What the pilot has to do to the autopilot before it flies; None when nothing."""
-        return self._conclusion.owed
+        return self._owed.words
 
     def looked_at(self, now_s: float) -> ArmAnswer | None:
         """For how long to hold still, where the next look at the output will tell; None where it is not waited for."""

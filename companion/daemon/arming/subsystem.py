@@ -27,10 +27,11 @@ class Arming(Subsystem):
 
     def __init__(self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating) -> None:
         self._core, self._store, self._conductor = core, calibrating.store, calibrating.conductor
+        self._by_hand = calibrating.by_hand
         # In this order they hear of a calibration's end: who starts the next one asks what is in force.
         self.in_force = InForce(core, devices.imus, calibrating.conductor, calibrating.solver, calibrating.memory)
         self.automatic = Automatic(core, devices.imus, calibrating.conductor, self.in_force)
-        self.readiness = Readiness(core, calibrating.conclusion, calibrating.conductor, self.in_force, self.automatic)
+        self.readiness = Readiness(core, offsets.owed, calibrating.conductor, self.in_force, self.automatic)
         self.armings = Armings(core, self.readiness)
         self.gate_setup = GateSetup(core, self.readiness)
 
@@ -75,6 +76,7 @@ class Arming(Subsystem):
             "numbers": list(found),
             "records": [msgspec.to_builtins(record) for record in records],
             "armings": [msgspec.to_builtins(arming) for arming in armings[:limit]],
+            "by_hand": self._by_hand.history()[:limit],
         }
 
 

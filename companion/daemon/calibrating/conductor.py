@@ -31,11 +31,12 @@ from companion.daemon.job import ALIGNMENT, FACES, TURN, Job, JobCancelledError,
 from companion.daemon.offsets.ledger import Recovery
 from companion.daemon.stands.align_steps import Plan
 from companion.daemon.stands.aligner import Aligner
+from companion.daemon.stands.by_hand import ByHand
 from companion.daemon.stands.facing import Facing
 from companion.daemon.stands.turning import TurnAsked, Turning
 from companion.errors import CompanionError
 from companion.links.system.listeners import Listeners
-from companion.storage.changes import AUTOMATIC
+from companion.storage.changes import AUTOMATIC, BY_HAND
 
 logger = logging.getLogger(__name__)
 
@@ -52,11 +53,12 @@ class Conductor:
         turning: Turning,
         recovery: Recovery,
         results: Results,
+        by_hand: ByHand,
     ) -> None:
         self._machine, self._wanted, self._only_listening = core.machine, core.wanted, core.only_listening
         self._vehicle, self._collector, self._say, self._tunes = core.vehicle, core.collector, core.say, core.tunes
         self._course, self._aligner, self._facing, self._turning = course, aligner, facing, turning
-        self._recovery, self._results = recovery, results
+        self._recovery, self._results, self._by_hand = recovery, results, by_hand
         self._has_gradienter = core.config.gradienter is not None
         self._on_deck = core.config.vehicle.platform == "deck"
         self._starts = StartLimit()
@@ -164,7 +166,9 @@ class Conductor:
         job = Job(kind, what, requester, asyncio.get_running_loop().time() + timeout_s)
 
         async def work() -> None:
-            self._end(job, await _result(job, run(job)))
+            result = await _result(job, run(job))
+            await self._by_hand.keep(job, result)
+            self._end(job, result)
 
         return self._start(job, Event.REQUEST, work())
 
@@ -288,7 +292,11 @@ class Conductor:
     async def _undo(self, job: Job, *, force: bool) -> None:
         async def run() -> str:
             step, written = await self._recovery.undo(force=force)
-            job.deliver(Undone(step, written, by_hand=not await self._results.undone(step)))
+            if by_hand := step.origin.what in BY_HAND:
+                await self._by_hand.undone(step)
+            else:
+                by_hand = not await self._results.undone(step)
+            job.deliver(Undone(step, written, by_hand))
             self._machine.on(Event.CONCLUDED)
             return f"{len(written)} old values back{step.origin.what and f': {step.origin.what}'}"
 

@@ -31,10 +31,11 @@ from companion.daemon.calibrating.bias_memory import BiasMemory
 from companion.daemon.calibrating.solver import Given, Solver
 from companion.daemon.core import Core
 from companion.daemon.job import Job
+from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.effect import TELEMETRY
 from companion.daemon.offsets.plan import Planner
-from companion.daemon.offsets.push import WATCHING, Conclusion, Pusher
+from companion.daemon.offsets.push import WATCHING, Pusher
 from companion.daemon.stands.measuring import Measuring
 from companion.links.system.listeners import Listeners
 from companion.samples import Triad

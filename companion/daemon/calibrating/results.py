@@ -12,7 +12,7 @@ from companion.component.statustext import Severity
 from companion.daemon.calibrating.bias_memory import BiasMemory
 from companion.daemon.core import Core
 from companion.errors import StorageError
-from companion.storage.changes import BY_HAND, ChangeSet
+from companion.storage.changes import ChangeSet
 from companion.storage.records import RecordStore
 
 logger = logging.getLogger(__name__)
@@ -61,8 +61,6 @@ class Results:
 
     async def undone(self, step: ChangeSet) -> bool:
         """Note that what was written in this step is in force no more; whether it was of calibrations."""
-        if step.origin.what in BY_HAND:
-            return False
         now = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
         try:
             marked: list[str] = await self._offload(self._store.mark_undone, step, now)

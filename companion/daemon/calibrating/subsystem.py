@@ -21,13 +21,14 @@ from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import Job
+from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.dither import Ditherer
-from companion.daemon.offsets.push import Conclusion
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.accel_writes import AccelWrites
 from companion.daemon.stands.align_steps import HEADINGS, Plan
 from companion.daemon.stands.aligner import Aligner
 from companion.daemon.stands.alignment import AlignmentInForce
+from companion.daemon.stands.by_hand import ByHand
 from companion.daemon.stands.faces_in_force import FacesInForce
 from companion.daemon.stands.facing import Facing
 from companion.daemon.stands.level_writes import LevelWrites
@@ -69,20 +70,24 @@ class Calibrating(Subsystem):
         self.solver = Solver(core, self.alignment, self.faces, own)
         self.solving = Solving(core, self.solver, self.memory)
         ditherer = Ditherer(core, imus, offsets.writer, offsets.ledger)
-        self.conclusion = Conclusion(core, offsets.effect, offsets.firmware)
-        course = Course(core, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, self.conclusion)
+        conclusion = Conclusion(core, offsets.effect, offsets.firmware, offsets.owed)
+        course = Course(core, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, conclusion)
         self.stands = stands = Stands(core, imus, measuring)
-        writes = AccelWrites(core, imus, offsets, self.conclusion)
+        writes = AccelWrites(core, imus, offsets, conclusion)
         aligner = Aligner(core, stands, self.alignment)
         facing = Facing(core, imus, stands, writes, self.faces)
         levels = LevelWrites(core, imus, offsets, own)
         turning = Turning(core, imus, stands, writes, levels, self.faces)
         self._results = Results(core, self.store, self.memory)
-        self.conductor = Conductor(core, course, aligner, facing, turning, offsets.recovery, self._results)
+        self.by_hand = ByHand(core, imus)
+        self.conductor = Conductor(
+            core, course, aligner, facing, turning, offsets.recovery, self._results, self.by_hand
+        )
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.alignment.load()
         self.faces.load()
+        self.by_hand.load()
         self.memory.load()
         self._results.load()
 
@@ -106,6 +111,7 @@ class Calibrating(Subsystem):
             "still_s": round(still.still_s, 1),
             "waiting_for": still.waiting_for,
             "alignment": self.alignment.status(),
+            "by_hand": self.by_hand.latest(),
             "stands": msgspec.to_builtins(self.stands.shown),
             "last": _summary(conductor.last),
         }

@@ -17,13 +17,13 @@ import msgspec
 from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.autopilot.firmware.gyro_calibration import wait_until_over
 from companion.autopilot.parameters.change import NothingWrittenError, WriteFailedError
-from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.parameters.writer import Change, ParameterWriter
-from companion.autopilot.vehicle.vehicle import ArmState, Firmware, Vehicle
+from companion.autopilot.vehicle.vehicle import ArmState, Firmware
 from companion.calibration.records.record import WrittenParameter
-from companion.component.statustext import Say, Severity, Weight
-from companion.daemon.core import Offload
+from companion.component.statustext import Severity, Weight
+from companion.daemon.core import Core, Offload
+from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
 from companion.links.system.listeners import Listeners
 from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
@@ -174,15 +174,14 @@ class Recovery:
 
     def __init__(
         self,
-        vehicle: Vehicle,
-        parameters: ParameterClient,
+        core: Core,
         writer: ParameterWriter,
         ledger: Ledger,
-        say: Say,
         changing: Callable[[], contextlib.AbstractContextManager[None]],
+        owed: RebootOwed,
     ) -> None:
-        self._vehicle, self._parameters, self._writer = vehicle, parameters, writer
-        self.ledger, self._say, self._changing = ledger, say, changing
+        self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
+        self._writer, self.ledger, self._changing, self._owed = writer, ledger, changing, owed
         self.on_recovered: Listeners[str] = Listeners()
         """Told, in words, of what was put in order."""
 
@@ -261,7 +260,9 @@ class Recovery:
         async with self.ledger.transaction(step):
             with self._changing():
                 written = await self._writer.undo(ours)
+            await self._owed.after(ours)
             await self.ledger.undone()
+        self._owed.say()
         return step, written
 
     async def _sort(self, changes: ChangeSet) -> tuple[Sequence[Change], Sequence[str]]:

@@ -1,4 +1,4 @@
-"""Biases into the autopilot: write, look in the telemetry, put back what did not work, see that the rest is used."""
+"""Biases into the autopilot: write, look in the telemetry, put back what did not work."""
 
 from __future__ import annotations
 
@@ -9,35 +9,28 @@ import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from typing import Final
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
 from companion.autopilot.firmware.gyro_calibration import GyroParameters
-from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.autopilot.firmware.px4 import stale_tilt_deg
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
 from companion.autopilot.parameters.verify import Verdict
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.parameters.writer import ParameterWriter
-from companion.autopilot.vehicle.commands import result_name
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
 from companion.calibration.solution.draft import Draft
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
-from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.job import Job, JobCancelledError
 from companion.daemon.offsets.effect import EffectWatch, in_short
-from companion.daemon.offsets.firmware_calibration import FirmwareCalibration, settles_within_s
+from companion.daemon.offsets.firmware_calibration import FirmwareCalibration
 from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.offsets.plan import Plan, Target
 from companion.daemon.offsets.px4_writes import Px4Writes
+from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.errors import (
     AutopilotError,
-    AutopilotRebootedError,
     NotDisarmedError,
-    ParameterTimeoutError,
     StorageError,
 )
 from companion.storage.changes import ChangeSet, Origin
@@ -47,17 +40,8 @@ logger = logging.getLogger(__name__)
 DISARMED_WITHIN_S: Final = 10.0
 """How long a heartbeat lost just before the write is waited for."""
 GoOn = Callable[[str], None]
-STORED_AFTER_S: Final = 3.0
-"""PX4 saves its parameters up to 2 s after a change, ArduPilot from a queue (autopilots section 8)."""
-ANSWER_S: Final = 3.0
-BACK_WITHIN_S: Final = 60.0
-CONCLUDING_PERCENT: Final = 95.0
 WATCHING: Final = "watching the telemetry take the new offsets"
 POLL_S: Final = 0.2
-GATED_TILT_DEG: Final = 0.3
-"""Tilt that PX4 may have kept from before a write, above which it has to be restarted before it flies. A smaller one is
-what its EKF2 shows of the biases of an uncalibrated sensor (autopilots 9.3)."""
-READ_ATTEMPTS: Final = 3
 
 
 class Pusher:
@@ -72,9 +56,10 @@ class Pusher:
         px4: Px4Writes,
         firmware: FirmwareCalibration,
         effect: EffectWatch,
+        owed: RebootOwed,
     ) -> None:
         self._vehicle, self._parameters, self._imus, self._machine = core.vehicle, core.parameters, imus, core.machine
-        self._writer, self._ledger, self._wanted = writer, ledger, core.wanted
+        self._writer, self._ledger, self._wanted, self._owed = writer, ledger, core.wanted, owed
         self._px4, self._firmware, self._effect = px4, firmware, effect
 
     async def offsets_still_hold(self) -> bool:
@@ -142,6 +127,7 @@ class Pusher:
         if problems:
             raise AutopilotError(await self._roll_back(plan, draft, "; ".join(problems)))
         try:
+            await self._owed.after(plan.changes)
             await self._ledger.done(self._kept(job, plan, draft))
         except StorageError as error:  # what cannot be undone later must not stay
             raise AutopilotError(await self._roll_back(plan, draft, str(error))) from error
@@ -202,14 +188,14 @@ class Pusher:
         return changing(imu for name, imu in self._imus.items() if everything or name in ours)
 
     async def _wait_disarmed(self) -> None:
-        await _heartbeat(self._vehicle, DISARMED_WITHIN_S)
+        await heartbeat(self._vehicle, DISARMED_WITHIN_S)
         if self._vehicle.arm_state is ArmState.ARMED:
             raise NotDisarmedError("armed; nothing written")
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             raise NotDisarmedError("no heartbeat; nothing written")
 
 
-async def _heartbeat(vehicle: Vehicle, within_s: float) -> None:
+async def heartbeat(vehicle: Vehicle, within_s: float) -> None:
     """Wait for so long at most until it is known whether it is armed."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(within_s):
@@ -241,158 +227,3 @@ def _note_verdicts(plan: Plan, target: Target, verdicts: list[Verdict], draft: D
             seen = verdict.ok and (not verdict.hidden or target.solution.dithered)
             plan.mark(draft, [axis.parameter], "verified" if seen else verdict.outcome(axis.parameter))
     return problems
-
-
-def _going_on(job: Job, otherwise: str = "") -> GoOn:
-    def go_on(words: str) -> None:
-        job.check_cancelled()
-        job.progress(CONCLUDING_PERCENT, words or otherwise)
-
-    return go_on
-
-
-class NotRebootedError(AutopilotError):
-    """The autopilot was not restarted; what was written is in force all the same."""
-
-
-def why_not(calibrations: Sequence[ImuCalibration], changes: Sequence[Change]) -> str | None:
-    """Why a restart would do harm, or None."""
-    after = {change.parameter: change.after for change in changes}
-    gyros = {name for calibration in calibrations for name in calibration.parameters.gyro_offset}
-    for rival in (rival for calibration in calibrations for rival in calibration.rivals):
-        if rival.acts == "at a start" and after.get(rival.parameter) != 0.0 and gyros & set(after):
-            return (
-                f"not rebooted: {rival.parameter} = {rival.value} would measure the gyros anew at the start and"
-                f" throw these gyro offsets away; set {rival.parameter} to 0 first (push.stop_rivals = true does)"
-            )
-    return None
-
-
-class Conclusion:
-    """What follows a write that is done and stays: a restart where one was asked for, or the settling of the EKF."""
-
-    def __init__(self, core: Core, effect: EffectWatch, firmware: FirmwareCalibration) -> None:
-        self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
-        self._machine, self._effect, self._firmware = core.machine, effect, firmware
-        self._stale: tuple[int, float] | None = None
-        """Boots seen when a write left a stale tilt behind, and its size in degrees."""
-
-    @property
-    def owed(self) -> str | None:
-        """Why it must be restarted before it may arm, in few words; None when it need not."""
-        if self._stale is None or self._stale[0] != self._vehicle.boots or self._stale[1] < GATED_TILT_DEG:
-            return None
-        return f"reboot PX4: tilt {self._stale[1]:.1f} deg off"
-
-    async def conclude(self, job: Job, plan: Plan, before: Window, draft: Draft) -> None:
-        """See to it that what was written is used, and say what the pilot still has to do.
-
-        Raises:
-            AutopilotError: the autopilot has not come back, or not with what was written.
-        """
-        boots = self._vehicle.boots
-        if not_rebooted := await self._restart(job, plan, before, draft) if job.reboot else "":
-            draft.warnings.append(not_rebooted)
-            self._say(Severity.WARNING, not_rebooted, Weight.NEWS)
-        if not job.reboot or not_rebooted:
-            # A small step after a large one leaves what the large one has left.
-            left_deg = self._stale[1] if self._stale is not None and self._stale[0] == boots else 0.0
-            self._stale = (boots, max(left_deg, stale_tilt_deg(plan.changes)))
-        if (owed := self.owed) is not None:
-            draft.warnings.append(f"{owed} for minutes after such a step (companion calibrate --reboot does it)")
-            self._say(Severity.WARNING, f"Before flight: {owed}", Weight.RESULT)
-        self._machine.on(Event.VERIFIED)
-        if self._vehicle.boots == boots:  # after a restart the EKF has started afresh
-            await self._settle(job, plan, draft)
-            if self._vehicle.boots != boots:
-                await self._survived(plan, draft)
-        self._machine.on(Event.CONCLUDED)
-
-    async def _restart(self, job: Job, plan: Plan, before: Window, draft: Draft) -> str:
-        """Restart it; why that was not done or not seen to its end, or empty."""
-        go_on = _going_on(job, "watching the telemetry after the reboot")
-        self._machine.on(Event.REBOOT)
-        try:
-            draft.notes.append(await self._after(plan, before, draft.warnings.append, go_on))
-        except NotRebootedError as error:
-            return str(error)
-        except JobCancelledError as cancelled:
-            return f"{cancelled} before the reboot was confirmed; the new offsets stay"
-        return ""
-
-    async def _settle(self, job: Job, plan: Plan, draft: Draft) -> None:
-        """The write is done and stays; a cancel ends only the waiting for the autopilot's EKF."""
-        go_on = _going_on(job)
-        job.lasts(settles_within_s(plan.firmware))
-        try:
-            words = await self._firmware.settle(plan.gyros, plan.firmware, go_on)
-        except JobCancelledError as cancelled:
-            words = f"wait 2 min before take-off: {cancelled} while the EKF took in the new offsets, which stay"
-        if words is not None:
-            draft.warnings.append(words)
-            self._say(Severity.WARNING, words, Weight.NEWS)
-
-    async def _survived(self, plan: Plan, draft: Draft) -> None:
-        """After a restart that nobody here asked for: see that what was written is still there."""
-        await _heartbeat(self._vehicle, BACK_WITHIN_S)
-        changed = {name: now async for name, now in not_as_written(self._read, plan.changes)}
-        if changed:
-            plan.mark(draft, changed, "failed")
-            raise AutopilotError(f"the autopilot restarted and replaced {', '.join(changed)}: calibrate again")
-
-    async def _after(self, plan: Plan, before: Window, warn: Callable[[str], None], go_on: GoOn) -> str:
-        """Restart the autopilot and see that the new offsets are in force; in words."""
-        harm = why_not([target.calibration for target in plan.targets], plan.changes)
-        if harm is not None:
-            raise NotRebootedError(harm)
-        await self._reboot(go_on)
-        changed = {name: now async for name, now in not_as_written(self._read, plan.changes)}
-        if changed:
-            stored = {change.parameter: change.after for change in plan.changes}
-            after = (
-                f"{name} is {now:.6g} after the reboot, {stored[name]:.6g} had been stored"
-                for name, now in changed.items()
-            )
-            raise AutopilotError("; ".join(after))
-        verdicts, unseen = await self._effect.judge(plan, before, go_on, self._vehicle.boots)
-        found = (verdicts or {}).items()
-        problems = [f"imu {name}: {in_short(verdict)}" for name, each in found for verdict in each if not verdict.ok]
-        if problems:
-            raise AutopilotError(f"after the reboot: {'; '.join(problems)}")
-        if unseen:
-            warn(f"rebooted, and the parameters are as written; their effect was not seen: {unseen}")
-            return "rebooted"
-        return "rebooted, offsets in force"
-
-    async def _reboot(self, go_on: GoOn) -> None:
-        """Restart it, disarmed, once all is stored, and wait until it is back."""
-        loop = asyncio.get_running_loop()
-        stored_s = loop.time() + STORED_AFTER_S
-        while loop.time() < stored_s:
-            go_on("waiting until the autopilot has stored the new offsets")
-            await asyncio.sleep(POLL_S)
-        boots = self._vehicle.boots
-        await self._vehicle.fresh_heartbeat()
-        if self._vehicle.arm_state is not ArmState.DISARMED:
-            raise NotRebootedError("not rebooted: the aircraft is not surely disarmed")
-        logger.info("rebooting %s", self._vehicle.name)
-        reboot = mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
-        result = await self._vehicle.commands.send(reboot, 1.0, timeout_s=ANSWER_S)
-        if result not in (mavlink.MAV_RESULT_ACCEPTED, None):
-            raise NotRebootedError(f"not rebooted: {self._vehicle.name} refused ({result_name(result or 0)})")
-        # No answer proves nothing: it may have gone down with it.
-        back_s = loop.time() + BACK_WITHIN_S
-        while self._vehicle.boots == boots or self._vehicle.arm_state is not ArmState.DISARMED:
-            if loop.time() > back_s:
-                if self._vehicle.boots == boots and self._vehicle.alive:
-                    raise NotRebootedError(f"not rebooted: {self._vehicle.name} did not answer and has not restarted")
-                raise AutopilotError(
-                    f"{self._vehicle.name} was rebooted and is not back, disarmed, within {BACK_WITHIN_S:.0f} s"
-                )
-            await asyncio.sleep(POLL_S)
-
-    async def _read(self, name: str) -> float:
-        for _ in range(READ_ATTEMPTS - 1):
-            with contextlib.suppress(AutopilotRebootedError, ParameterTimeoutError):
-                return await self._parameters.read(name)
-        return await self._parameters.read(name)

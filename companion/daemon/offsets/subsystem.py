@@ -15,6 +15,7 @@ from companion.daemon.offsets.ledger import Ledger, Recovery
 from companion.daemon.offsets.plan import Planner
 from companion.daemon.offsets.push import Pusher
 from companion.daemon.offsets.px4_writes import Px4Writes
+from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.daemon.offsets.rivalry import Rivalry
 from companion.formats import Object
 from companion.storage.changes import ChangeLog
@@ -30,16 +31,17 @@ class Offsets(Subsystem):
         self._vehicle = vehicle
         self.ledger = Ledger(ChangeLog(config.storage.path), core.offload)
         self.writer = ParameterWriter(parameters, vehicle)
-        self.rivalry = Rivalry(core, imus)
+        self.rivalry, self.owed = Rivalry(core, imus), RebootOwed(core)
         px4 = Px4Writes(core.link, vehicle, self.writer, self.ledger, devices.slots, core.say)
         ekf, platform = EkfWatch(vehicle), config.vehicle.platform
         self.firmware = FirmwareCalibration(vehicle, parameters, self.writer, self.ledger, ekf, platform)
         self.effect = EffectWatch(core, px4)
         self.planner = Planner(core, imus, devices.slots, self.rivalry)
-        self.pusher = Pusher(core, imus, self.writer, self.ledger, px4, self.firmware, self.effect)
-        self.recovery = Recovery(vehicle, parameters, self.writer, self.ledger, core.say, devices.changing)
+        self.pusher = Pusher(core, imus, self.writer, self.ledger, px4, self.firmware, self.effect, self.owed)
+        self.recovery = Recovery(core, self.writer, self.ledger, devices.changing, self.owed)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
+        self.owed.load()
         self.ledger.load()
         if self.ledger.fault is not None:
             # Stay and say so: a daemon that is gone is harder to understand from the field.
@@ -59,4 +61,4 @@ class Offsets(Subsystem):
         return [step.shown() for step in self.ledger.steps(self._vehicle.system_id)]
 
     def tasks(self) -> Sequence[Task]:  # noqa: D102
-        return [("recovery", self.recovery.run)]
+        return [("recovery", self.recovery.run), ("reboot-owed", self.owed.run)]

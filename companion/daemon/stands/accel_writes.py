@@ -16,8 +16,9 @@ from companion.component.service import WRITTEN_PERCENT
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
+from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.plan import Plan, Target
-from companion.daemon.offsets.push import WATCHING, Conclusion
+from companion.daemon.offsets.push import WATCHING
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import CalibrationRefusedError
 

@@ -62,7 +62,7 @@ class LevelWrites:
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], offsets: Offsets, own: OwnAttitude) -> None:
         self._core, self._machine, self._imus, self._own = core, core.machine, imus, own
-        self._ledger, self._writer = offsets.ledger, offsets.writer
+        self._ledger, self._writer, self._owed = offsets.ledger, offsets.writer, offsets.owed
 
     async def write(self, job: Job, board: Mounting, last: Window, origin: Origin) -> Level:
         """Write and look; the aircraft stands still as in the last stand.
@@ -93,6 +93,8 @@ class LevelWrites:
                     raise AutopilotError(
                         await self._put_back(plan, "the attitude did not follow the new level, or it moved")
                     )
+                if warning == REBOOT:
+                    await self._owed.after(plan.changes)
                 await self._ledger.done(kept)
         for event in (Event.VERIFIED, Event.CONCLUDED):
             self._machine.on(event)

@@ -57,6 +57,7 @@ function show(status) {
   $("last").hidden = !missed;
   if (missed) $("last").textContent = "the last one: " + (last.reason.startsWith(last.state) ? last.reason : `${last.state}: ${last.reason}`);
   links(status);
+  byHand(status.by_hand);
   aloud(status);
   stands(status.stands);
   // Whether it may is the daemon's to say, with the reason; here only what makes no sense at all is off.
@@ -142,6 +143,13 @@ function calibration(found, arming) {
         earlier(found, imu.name, "gyro")),
       ...axes(["x", "y", "z"], 2, imu.accel_bias_mg, imu.accel_sigma_mg, "mg ± sigma", "accelerometer bias", imu.held_back.includes("accel"),
         earlier(found, imu.name, "accel"))];
+  }));
+}
+function byHand(found) {
+  $("by-hand").replaceChildren(...found.map(one => {
+    const written = Object.keys(one.written).length;
+    const end = one.undone_at ? `undone ${utc(one.undone_at)}` : one.in_force ? "in force" : one.in_force === false ? "not as written any more" : "";
+    return make("p", `${one.what}, ${utc(one.measured_at)}: ${one.state === "done" ? "" : "failed: "}${one.reason}` + (written && end ? `; ${end}` : ""), "note");
   }));
 }
 function link(good, name, words) {

@@ -1,0 +1,119 @@
+"""What stands have told and written, from the first to the last of them: for history and status."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+from collections.abc import Mapping
+
+import msgspec
+
+from companion.autopilot.parameters.wire import same_float32
+from companion.calibration.records.align_record import AlignmentRecord
+from companion.calibration.records.faces_record import FacesRecord
+from companion.calibration.records.turn_record import TurnRecord
+from companion.component.service import JobResult
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import Job
+from companion.errors import StorageError
+from companion.formats import Object
+from companion.storage.changes import ChangeSet
+from companion.storage.state import BoundedList
+
+logger = logging.getLogger(__name__)
+
+KEEP = 50
+
+
+class Done(msgspec.Struct, frozen=True, kw_only=True):
+    """One alignment that has come to an end of its own."""
+
+    what: str
+    """"zero", "tilts", "turn", "level" or "faces"."""
+    state: str
+    """"done" or "failed"."""
+    measured_at: str
+    """UTC, ISO 8601; the host's clock."""
+    reason: str
+    system_id: int | None
+    written: dict[str, float]
+    """What of it has come into the autopilot, by parameter."""
+    undone_at: str | None = None
+
+
+class ByHand:
+    """Keeps the latest of them, on disk and in memory."""
+
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
+        self._file = BoundedList(core.config.storage.path / "by-hand.json", Done, KEEP)
+        self._vehicle, self._offload, self._imus = core.vehicle, core.offload, imus
+        self._done: list[Done] = []
+
+    def load(self) -> None:
+        """Read what was kept before this start; blocking."""
+        self._done = self._file.read()
+
+    async def keep(self, job: Job, result: JobResult) -> None:
+        """Remember how a job with stands has ended, where it has come so far."""
+        record = job.product
+        if result.outcome == "cancelled" or not isinstance(record, AlignmentRecord | FacesRecord | TurnRecord):
+            return
+        board = record.board.written if isinstance(record, TurnRecord) and record.board is not None else {}
+        parts = [] if isinstance(record, AlignmentRecord) else [imu.written for imu in record.imus]
+        written = {
+            name: one.after
+            for part in (*parts, board)
+            for name, one in part.items()
+            if one.outcome in ("verified", "stored")
+        }
+        done = Done(
+            what="level" if board else record.kind,
+            state=result.outcome,
+            measured_at=record.measured_at,
+            reason=result.reason,
+            system_id=self._vehicle.system_id,
+            written=written,
+        )
+        await self._write([*self._done, done][-KEEP:])
+
+    async def undone(self, step: ChangeSet) -> None:
+        """What was written in this step is in force no more."""
+        now = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
+        await self._write(
+            [
+                msgspec.structs.replace(each, undone_at=now) if each.measured_at == step.origin.at else each
+                for each in self._done
+            ]
+        )
+
+    async def _write(self, done: list[Done]) -> None:
+        self._done = done
+        try:
+            await self._offload(self._file.write, done)
+        except StorageError as error:
+            logger.error("the history does not show it: %s", error)  # noqa: TRY400 - one line
+
+    def history(self) -> list[Object]:
+        """All that is kept, the latest first, each with whether it is in force."""
+        return [self._shown(done) for done in reversed(self._done)]
+
+    def latest(self) -> list[Object]:
+        """The last of each kind on this aircraft, the latest first."""
+        here = {done.what: done for done in self._done if done.system_id == self._vehicle.system_id}
+        return [self._shown(done) for done in sorted(here.values(), key=self._done.index, reverse=True)]
+
+    def _shown(self, done: Done) -> Object:
+        return {**msgspec.to_builtins(done), "in_force": self._in_force(done)}
+
+    def _in_force(self, done: Done) -> bool | None:
+        """Whether the autopilot has all that was written; None where nothing was, or nobody looks at it."""
+        if done.undone_at is not None:
+            return False
+        if done.system_id != self._vehicle.system_id:
+            return None
+        now: dict[str, float] = {}
+        for imu in self._imus.values():
+            now |= {} if imu.calibration is None else imu.calibration.corrections
+        seen = [same_float32(now[name], value) for name, value in done.written.items() if name in now]
+        return all(seen) if seen else None
