@@ -239,9 +239,8 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
             written = [made.autopilot.parameter(name) for name in names]
             np.testing.assert_allclose(written, true_deg, atol=0.05)
             assert {one.outcome for one in record.board.written.values()} == {"verified"}
-            owed = made.service.offsets.owed.words
-            assert bool(owed) is not follows
-            assert not owed or made.service.status()["headline"]["word"] != "READY"
+            assert made.service.offsets.owed.words == "reboot PX4: tilt 1.2 deg off"
+            assert made.service.status()["headline"]["word"] != "READY"
             undone = made.service.calibrating.conductor.start_undo("test")
             assert not isinstance(undone, Refusal)
             assert (await undone.finished).outcome == "done"
