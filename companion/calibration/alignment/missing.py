@@ -120,9 +120,13 @@ def _figure(found: Faces, which: int) -> str:
     assert which < FIGURES
     axis, sigma = _AXES[which % 3], _sigma(found)[which]
     if which in range(*BIAS.indices(FIGURES)):
-        return f"{axis} bias uncertain by {sigma / MG:.2g} mg"
+        return f"{axis} bias uncertain by {_two_digits(sigma / MG)} mg"
     assert which in range(*SCALE.indices(FIGURES))
-    return f"{axis} scale uncertain by {100.0 * sigma:.2g} %"
+    return f"{axis} scale uncertain by {_two_digits(100.0 * sigma)} %"
+
+
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def up_of(side: str) -> tuple[float, float, float]:
