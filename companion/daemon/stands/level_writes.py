@@ -39,6 +39,8 @@ SEEN_SHARE: Final = 0.2
 WITHIN_S: Final = 15.0
 USED_AFTER_S: Final = 1.5
 """Both firmwares look at their parameters once a second."""
+LATEST_S: Final = 4.0
+"""Of the attitude counts: on a busy link it comes seconds late, and an estimator wanders."""
 POLL_S: Final = 0.25
 _UP: Final = np.array([0.0, 0.0, -1.0])
 REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the new level after that"
@@ -131,7 +133,7 @@ class LevelWrites:
         boots = self._core.vehicle.boots
         while loop.time() < since_s + WITHIN_S and self._core.vehicle.boots == boots:
             job.check_cancelled()
-            now = self._own.up(since_s)
+            now = self._own.up(max(since_s, loop.time() - LATEST_S))
             if before is not None and now is not None:
                 if _angle_deg(plan.turn @ before, before) < SEEN_DEG:
                     return "stored", "the new level is too near the old one to be seen"
