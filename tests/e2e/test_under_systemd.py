@@ -113,7 +113,11 @@ async def set_up(machine: Machine, configuration: str) -> None:
     _, out, _ = await machine.run("cat", CONFIGURATION, "/var/lib/private/companion/web-token")
     assert tomllib.loads(out.removesuffix(f"{token}\n"))["gradienter"]["port"] == ports[0]
     assert out.endswith(f"{token}\n"), "the page of the daemon takes the same token"
-    assert (await machine.show("companion-setup", "ActiveState"))["ActiveState"] == "inactive"
+
+    async def has_ended() -> bool:
+        return (await machine.show("companion-setup", "ActiveState"))["ActiveState"] == "inactive"
+
+    await until(has_ended)
     code, out, _ = await machine.run(COMPANION, "setup", *ports, "--yes", "--no-service", check=False)
     assert code == 0
     assert "says all this already" in out
