@@ -183,8 +183,9 @@ def _vector(values: Array) -> tuple[float, float, float]:
 def section(runs: list[PowerUpRun], each: int) -> Section:
     """So many aircraft of every part."""
     lines = [
-        "the gyros' bias at power-up, rms error in deg/h: by the curve, sigma, 2 sigma cover; over the scatter;",
-        "what the last calibration has left; the same with a cubic learned in one warm-up",
+        "the gyros' bias at power-up, rms error in deg/h: by the curve, sigma, 2 sigma cover;",
+        "over the scatter;",
+        "what the last calibration has left; that with a cubic learned in one warm-up",
         "",
         f"{'':12}{'scatter':>8}{'curve':>8}{'sigma':>8}{'cover':>9}{'ratio':>8}{'last':>8}{'cubic':>8}",
     ]
@@ -214,6 +215,7 @@ def section(runs: list[PowerUpRun], each: int) -> Section:
     low, high = AMBIENT_DEGC
     lines += [
         "",
-        f"{DAYS} days of 5 to 15 min between {low:g} and {high:g} degC, 10 to 25 K of own warmth, still now and then.",
+        f"{DAYS} days of 5 to 15 min between {low:g} and {high:g} degC, 10 to 25 K of own warmth,",
+        "still now and then.",
     ]
     return Section(f"At power-up, by temperature ({each} aircraft of each part)", lines, figures, claims)
