@@ -117,6 +117,9 @@ class Forecast:
         return max(1.0, math.ceil(end_s - now_s))
 
 
+OLDEST_SAID_S: Final = 2.0
+
+
 class Readiness:
     """The arm gate's answer, and what goes with it: `run` keeps it fresh."""
 
@@ -129,6 +132,8 @@ class Readiness:
         self._forecast = Forecast(core, conductor)
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
+        self._said = -math.inf, math.inf
+        """When it was said last how long to hold still until it is calibrated, and how long."""
         self._has_gated = False
         self._woken = asyncio.Event()
         self.turns = 0
@@ -251,7 +256,13 @@ class Readiness:
             return math.ceil(self._forecast.whole_s)
         # Before anything is known of the noise this is the longest there is: waiting may only get shorter.
         whole_s = status.still_s / status.progress if status.progress > 0.0 else self._wanted.settings.max_s
-        return max(1.0, math.ceil(whole_s - status.still_s)) + math.ceil(self._forecast.whole_s)
+        left_s = max(1.0, math.ceil(whole_s - status.still_s)) + math.ceil(self._forecast.whole_s)
+        asked_s, said_s = self._said
+        # Only a movement makes it longer. Where PX4's readings come in floats from now on it stands still for a moment.
+        if self._collector.glance(now_s).moves is None and now_s - asked_s < OLDEST_SAID_S:
+            left_s = min(left_s, said_s)
+        self._said = now_s, left_s
+        return left_s
 
     # --- in words, for arming, status and history
 
