@@ -33,6 +33,8 @@ POLL_S: Final = 0.25
 BY_ITSELF: Final = "calibrates by itself"
 STEADY_S: Final = 2.0
 """How long it must have been still when somebody arms: whoever arms has just let go of it."""
+OLDEST_SAID_S: Final = 2.0
+"""A countdown that was not asked for meanwhile begins anew."""
 OLDEST_ANSWER_S: Final = 1.5
 """An answer that was not renewed for so long (the loop stood still) is none."""
 _IN_THE_MIDDLE: Final[dict[State, str]] = {
@@ -115,9 +117,6 @@ class Forecast:
             end_s = end_s if started_again else min(end_s, promised_s)
         self._promised = (state, end_s)
         return max(1.0, math.ceil(end_s - now_s))
-
-
-OLDEST_SAID_S: Final = 2.0
 
 
 class Readiness:
