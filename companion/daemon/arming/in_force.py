@@ -36,7 +36,7 @@ from companion.component.service import JobResult
 from companion.config.sections import Config, Imu
 from companion.configured import models
 from companion.daemon.arming.offset_watch import OffsetWatch
-from companion.daemon.calibrating.bias_memory import BiasMemory
+from companion.daemon.biases.memory import BiasMemory
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.held_back import HeldBack, Key
 from companion.daemon.calibrating.solver import Solver
@@ -119,7 +119,7 @@ class InForce:
                 now_s=now_s,
                 temperature_degc=degc,
                 present=self._present.get((name, triad)),
-                drift=self._memory.drift(name, held.temperature_degc, degc) if triad == "gyro" else None,
+                drift=self._memory.curves.drift(name, held.temperature_degc, degc) if triad == "gyro" else None,
             )
             model = profile.gyro if triad == "gyro" else profile.accel
             against = judge(triad, name, held, model, self._limits, seen)

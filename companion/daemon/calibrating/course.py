@@ -26,8 +26,8 @@ from companion.component.service import WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.component.tunes import Tune
 from companion.config.sections import Platform
+from companion.daemon.biases.memory import BiasMemory
 from companion.daemon.calibrating import held_back
-from companion.daemon.calibrating.bias_memory import BiasMemory
 from companion.daemon.calibrating.solver import Given, Solver
 from companion.daemon.core import Core
 from companion.daemon.job import Job

@@ -9,7 +9,7 @@ import msgspec
 
 from companion.calibration.records.record import Record
 from companion.component.statustext import Severity
-from companion.daemon.calibrating.bias_memory import BiasMemory
+from companion.daemon.biases.memory import BiasMemory
 from companion.daemon.core import Core
 from companion.errors import StorageError
 from companion.storage.changes import ChangeSet

@@ -12,7 +12,7 @@ from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.calibration.records.record import Record
 from companion.calibration.request import What, is_time_limit
 from companion.component.service import Refusal
-from companion.daemon.calibrating.bias_memory import BiasMemory
+from companion.daemon.biases.memory import BiasMemory
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.course import Course, Solving
 from companion.daemon.calibrating.results import Results

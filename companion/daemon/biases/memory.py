@@ -1,4 +1,4 @@
-"""What is kept of calibrations: the records, and the biases of each IMU with what they say of today.
+"""What is kept of the biases of each IMU, and what they say of today.
 
 A change of sensor, profile or mounting forgets them. What was calibrated in this run of the daemon, with the sensor
 powered all the while, is remembered besides: it says most.
@@ -10,17 +10,14 @@ import asyncio
 import datetime
 import logging
 import math
-import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Final
 
 import msgspec
-import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
+from companion.autopilot.firmware.imu_calibration import whole_of
 from companion.calibration.noise.allan import noise_profile
-from companion.calibration.records.align_record import ImuAlignmentRecord
-from companion.calibration.records.history import Point, PowerUp, by_power_up, kept
+from companion.calibration.records.history import Point, kept
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import (
@@ -29,12 +26,11 @@ from companion.calibration.solution.prior import (
     Now,
     expect,
     expect_today,
-    gyro_curve,
     pose_effect,
 )
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
-from companion.calibration.temperature.curve import Curve
-from companion.config.sections import Noise
+from companion.daemon.biases.curves import Curves
+from companion.daemon.biases.whose import Whose, changed
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensors import SerialSensor
@@ -42,27 +38,16 @@ from companion.daemon.stands.alignment import AlignmentInForce
 from companion.errors import AutopilotError, StorageError
 from companion.formats import Object
 from companion.physics.frames import vector
-from companion.physics.units import DEG_H
-from companion.samples import Triad, Vector
-from companion.storage.learned import BiasStore, KnownImu, this_boot
+from companion.samples import Triad
+from companion.storage.learned import BiasStore, KnownImu
 
 logger = logging.getLogger(__name__)
 
 LOOK_K: Final = 1.0
-STEP_K: Final = 5.0
-"""Between the rows of a curve that is shown."""
 WRITE_EVERY_S: Final = 300.0
 """What still windows tell is written so often at most: a power cut costs no more of it."""
 _MUCH_BETTER: Final = 0.7
 _TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
-_IN_WORDS: Final = {
-    "system": "vehicle",
-    "gyro": "gyro (device id)",
-    "accel": "accelerometer (device id)",
-    "scale": "accelerometer scale",
-    "tcal": "temperature calibration",
-}
-"""Of what is not said as it is called."""
 
 
 class _Reference(msgspec.Struct):
@@ -77,29 +62,21 @@ class BiasMemory:
     """Asked before a result is used, and told of it afterwards."""
 
     def __init__(
-        self,
-        core: Core,
-        imus: Mapping[str, AutopilotImu],
-        sensors: Sequence[SerialSensor],
-        alignment: AlignmentInForce,
+        self, core: Core, imus: Mapping[str, AutopilotImu], sensors: Sequence[SerialSensor], used: AlignmentInForce
     ) -> None:
-        config = core.config
-        self._config, self._vehicle, self._imus = config, core.vehicle, imus
-        self._profiles = core.profiles
-        self._alignment, self._offload, self._collector = alignment, core.offload, core.collector
-        self._sensors = {role.name: sensor for sensor in sensors for role in sensor.roles if role.kind == "imu"}
-        self._sources = {imu.name: imu for imu in config.imu}
-        self._store = BiasStore(config.storage.path)
+        self._config, self._profiles, self._offload = core.config, core.profiles, core.offload
+        self._imus, self._alignment = imus, used
+        self.whose = Whose(core, imus, sensors, used)
+        self.curves = Curves(core)
+        self._store = BiasStore(core.config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], _Reference] = {}
-        self._curves: dict[str, Curve | None] = {}
         self._written_s = -math.inf
-        self._host = this_boot() or os.urandom(8).hex()
 
     def load(self) -> None:
         """Read what was kept before this start; blocking."""
         self._known = self._store.read()
-        self._follow()
+        self.curves.follow(self._known)
 
     # --- before a result is used
 
@@ -119,14 +96,13 @@ class BiasMemory:
     def forgotten(self) -> dict[str, str]:
         """Forget what belongs to another sensor than there is now; by IMU, why, in one line."""
         found: dict[str, str] = {}
-        for name in self._sources:
-            known, now = self._known.get(name), self._identity(name)
-            if known is None or known.identity == now:
+        for name in self.whose.names:
+            known = self._known.get(name)
+            if known is None or self._is_of_today(name, known):
                 continue
-            changed = sorted(key for key in {*known.identity, *now} if known.identity.get(key) != now.get(key))
-            what = ", ".join(_IN_WORDS.get(key, key) for key in changed)
+            what = changed(known.identity, self.whose.identity(name, known.identity))
             del self._known[name]
-            self._curves.pop(name, None)
+            self.curves.forget(name)
             for triad in _TRIADS:
                 self._today.pop((name, triad), None)
             if known.points:
@@ -145,17 +121,17 @@ class BiasMemory:
 
     def _expected(self, imu: ImuSolution, shared: Shared, unix_s: float, *, wanted: bool) -> ExpectedImu:
         name = imu.name
-        effect = pose_effect(self._aligned(name))
+        effect = pose_effect(self.whose.aligned(name))
         if not wanted:
             return ExpectedImu(name=name, effect=effect)
         now = Now(
             unix_s=unix_s,
-            power_up=self.power_up(name, unix_s),
+            power_up=self.whose.power_up(name, unix_s),
             temperature_degc=imu.temperature_degc,
             k_s=imu.k_s,
             up=vector(shared.up),
             gravity_m_s2=shared.gravity_m_s2,
-            zero=self._zero(),
+            zero=self.whose.zero(),
         )
         earlier = self._known[name].points if name in self._known else ()
         profile = noise_profile(self._profiles.of(name))
@@ -181,14 +157,14 @@ class BiasMemory:
             doubts,
             started_at=started_at,
             unix_s=unix_s,
-            power_ups={imu.name: self.power_up(imu.name, unix_s) for imu in solution.imus},
-            zero=self._zero(),
+            power_ups={imu.name: self.whose.power_up(imu.name, unix_s) for imu in solution.imus},
+            zero=self.whose.zero(),
         )
 
     async def keep(self, found: Mapping[str, Point]) -> None:
         """Remember a calibration that has come to a good end; that it cannot be kept on disk is only logged."""
         for name, point in found.items():
-            known = self._known.get(name) or KnownImu(identity=self._identity(name))
+            known = self._of(name)
             # As many as the disk keeps: what is asked must not depend on when the daemon was started.
             self._known[name] = msgspec.structs.replace(known, points=kept((*known.points, point)))
             for triad in _TRIADS:
@@ -209,7 +185,7 @@ class BiasMemory:
         weighed: Weighed = await self._offload(weigh, solution, whole, expectation)
         found = self.measured(solution, whole, weighed.doubts, "", unix_s)
         for name in news:
-            point, known = found[name], self._known.get(name) or KnownImu(identity=self._identity(name))
+            point, known = found[name], self._of(name)
             if any(of is not None and of.is_outlier for of in (point.gyro, point.accel)):
                 continue
             others = [earlier for earlier in known.points if not _is_window_like(earlier, point)]
@@ -220,7 +196,7 @@ class BiasMemory:
 
     def _tells_more(self, imu: ImuSolution, unix_s: float) -> bool:
         """Whether a window is the first at its temperature since the power came, or much better than that one."""
-        known, power_up = self._known.get(imu.name), self.power_up(imu.name, unix_s)
+        known, power_up = self._known.get(imu.name), self.whose.power_up(imu.name, unix_s)
         if imu.gyro_rad_s is None or imu.temperature_degc is None:
             return False
         if known is None:
@@ -231,31 +207,7 @@ class BiasMemory:
             if point.gyro is not None and point.power_up.is_same(power_up) and _is_near(point, imu.temperature_degc)
         ]
         best = min((max(one.sigma_stat) for one in same), default=math.inf)
-        return known.identity == self._identity(imu.name) and imu.gyro_sigma_stat_rad_s.max() < _MUCH_BETTER * best
-
-    def drift(self, name: str, degc: float | None, now_degc: float | None) -> tuple[Vector, Vector] | None:
-        """By how much the gyros' bias has moved since it was so warm, rad/s, and its variance; None: not known."""
-        curve = self._curves.get(name)
-        if curve is None or degc is None or now_degc is None:
-            return None
-        mean, variance = curve.change(degc, now_degc)
-        return vector(mean), vector(variance)
-
-    def _follow(self) -> None:
-        """Work out the curves of what is known; blocking."""
-        self._curves = {
-            name: gyro_curve(known.points, noise_profile(self._profiles.of(name)).gyro)
-            for name, known in self._known.items()
-            if name in self._sources
-        }
-
-    def temperature(self) -> list[Object]:
-        """By IMU, for `companion temperature`: what still windows have shown, and the curve through them."""
-        return [
-            _by_temperature(name, known.points, self._curves.get(name))
-            for name, known in self._known.items()
-            if name in self._sources
-        ]
+        return self._is_of_today(imu.name, known) and imu.gyro_sigma_stat_rad_s.max() < _MUCH_BETTER * best
 
     async def forget(self, started: Collection[str]) -> None:
         """Forget calibrations that were undone, by when they had begun."""
@@ -271,7 +223,7 @@ class BiasMemory:
         await self._write()
 
     async def _write(self) -> None:
-        await self._offload(self._follow)
+        await self._offload(self.curves.follow, dict(self._known))
         self._written_s = asyncio.get_running_loop().time()
         try:
             await self._offload(self._store.write, dict(self._known))
@@ -283,7 +235,7 @@ class BiasMemory:
         found = point.of(triad)
         if found is None:
             return
-        session = self._session(name)
+        session = self.whose.session(name)
         before = self._today.get((name, triad))
         same = before is not None and before.session == session and before.point.zero == point.zero
         if before is not None and same and found.is_outlier and before.contradicted < 2:
@@ -291,88 +243,19 @@ class BiasMemory:
             return
         self._today[name, triad] = _Reference(session, point)
 
+    def _of(self, name: str) -> KnownImu:
+        return self._known.get(name) or KnownImu(identity=self.whose.identity(name, {}))
+
+    def _is_of_today(self, name: str, known: KnownImu) -> bool:
+        return known.identity == self.whose.identity(name, known.identity)
+
+    def temperature(self) -> list[Object]:
+        """For `companion temperature`."""
+        return self.curves.shown(self._known)
+
     def _reference(self, name: str, triad: Triad) -> Point | None:
         found = self._today.get((name, triad))
-        return found.point if found is not None and found.session == self._session(name) else None
-
-    # --- whose it is
-
-    def power_up(self, name: str, unix_s: float) -> PowerUp:
-        """Since when the sensor of an IMU has been powered, at a wall clock time."""
-        up_s = self._collector.up_s(name)
-        return PowerUp(host=self._host, since_unix_s=None if up_s is None else round(unix_s - up_s, 1))
-
-    def _session(self, name: str) -> str:
-        """Another one as soon as the sensor may have been without power."""
-        if name in self._imus:
-            return f"boot {self._vehicle.boots}"
-        sensor = self._sensors.get(name)
-        if sensor is None:
-            return ""
-        return f"{sensor.link.reconnects} {sensor.decoder.times.clock.breaks} {sorted(sensor.health.counts.items())}"
-
-    def _zero(self) -> str | None:
-        """Which zero of the gradienter is in force: another one has another error."""
-        gradienter, used = self._config.gradienter, self._alignment.used
-        if gradienter is None:
-            return None
-        at = used.measured_at if used is not None else "configured"
-        mounting = _plain(gradienter.mounting)
-        return f"{gradienter.protocol} {gradienter.law} {mounting} {_plain(gradienter.offset_deg)} {at}"
-
-    def _identity(self, name: str) -> dict[str, str]:
-        source = self._sources[name]
-        profile = source.profile.name if isinstance(source.profile, Noise) else source.profile
-        found: dict[str, str] = {"source": source.source, "profile": profile or "unknown"}
-        if source.source == "serial":
-            return {**found, "protocol": source.protocol or "", "mounting": _plain(source.mounting)}
-        calibration = self._imus[name].calibration if name in self._imus else None
-        known = self._known.get(name)
-        found |= {
-            "instance": str(source.instance or 1),
-            "system": str(self._vehicle.system_id),
-            "firmware": str(self._vehicle.firmware),
-        }
-        if calibration is not None:
-            return found | _of_autopilot(calibration)
-        # What is not known at the moment is no change.
-        return {**(known.identity if known is not None else {}), **found}
-
-    def _aligned(self, name: str) -> ImuAlignmentRecord | None:
-        record = self._alignment.record
-        if record is None or self._alignment.unused is not None:
-            return None
-        return next((imu for imu in record.imus if imu.name == name), None)
-
-
-def _by_temperature(name: str, points: Sequence[Point], curve: Curve | None) -> Object:
-    told = [point for point in points if point.temperature_degc is not None and point.gyro is not None]
-    rows = []
-    if curve is not None:
-        low, high = curve.span_degc
-        steps = [low, *(STEP_K * k for k in range(math.ceil(low / STEP_K), math.ceil(high / STEP_K))), high]
-        for degc in dict.fromkeys(steps):
-            bias, variance = curve.at(degc)
-            rows.append({"degc": round(degc, 2), "gyro_deg_h": _deg_h(bias), "sigma_deg_h": _deg_h(np.sqrt(variance))})
-    return {
-        "imu": name,
-        "power_ups": len(by_power_up(told)),
-        "points": [
-            {
-                "at_unix_s": round(point.unix_s),
-                "degc": point.temperature_degc,
-                "gyro_deg_h": _deg_h(point.gyro.bias),
-                "sigma_deg_h": _deg_h(point.gyro.sigma_use),
-            }
-            for point in told
-            if point.gyro is not None
-        ],
-        "curve": rows,
-    }
-
-
-def _deg_h(axes: Iterable[float]) -> list[float]:
-    return [round(value / DEG_H, 1) for value in axes]
+        return found.point if found is not None and found.session == self.whose.session(name) else None
 
 
 def _is_near(point: Point, degc: float) -> bool:
@@ -383,17 +266,3 @@ def _is_window_like(earlier: Point, now: Point) -> bool:
     """Whether it is a window that nobody calibrated from, of the same power-up and temperature."""
     near = now.temperature_degc is not None and _is_near(earlier, now.temperature_degc)
     return not earlier.started_at and near and earlier.power_up.is_same(now.power_up)
-
-
-def _of_autopilot(calibration: ImuCalibration) -> dict[str, str]:
-    return {
-        "gyro": str(calibration.gyro_id),
-        "accel": str(calibration.accel_id),
-        "orientation": _plain((np.round(calibration.orientation, 4) + 0.0).ravel().tolist()),
-        "scale": _plain(calibration.accel_scale),
-        "tcal": str(calibration.tcal_enable),
-    }
-
-
-def _plain(value: object) -> str:
-    return " ".join(f"{each:.6g}" for each in value) if isinstance(value, list | tuple) else str(value)

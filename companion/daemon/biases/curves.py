@@ -1,0 +1,90 @@
+"""The curves of bias over temperature of the IMUs that there are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.records.history import Point, by_power_up
+from companion.calibration.solution.prior import gyro_curve
+from companion.calibration.temperature.curve import Curve
+from companion.daemon.core import Core
+from companion.formats import Object
+from companion.physics.frames import vector
+from companion.physics.units import DEG_H
+from companion.samples import Vector
+from companion.storage.learned import KnownImu
+
+STEP_K: Final = 5.0
+"""Between the rows of a curve that is shown."""
+
+
+class Curves:
+    """Worked out anew whenever more is known."""
+
+    def __init__(self, core: Core) -> None:
+        self._profiles = core.profiles
+        self._names = {imu.name for imu in core.config.imu}
+        self._of: dict[str, Curve | None] = {}
+
+    def follow(self, known: Mapping[str, KnownImu]) -> None:
+        """Work out the curves of what is known; blocking."""
+        self._of = {
+            name: gyro_curve(each.points, noise_profile(self._profiles.of(name)).gyro)
+            for name, each in known.items()
+            if name in self._names
+        }
+
+    def forget(self, name: str) -> None:
+        """Of an IMU that is another one now."""
+        self._of.pop(name, None)
+
+    def drift(self, name: str, degc: float | None, now_degc: float | None) -> tuple[Vector, Vector] | None:
+        """By how much the gyros' bias has moved since it was so warm, rad/s, and its variance; None: not known."""
+        curve = self._of.get(name)
+        if curve is None or degc is None or now_degc is None:
+            return None
+        mean, variance = curve.change(degc, now_degc)
+        return vector(mean), vector(variance)
+
+    def shown(self, known: Mapping[str, KnownImu]) -> list[Object]:
+        """By IMU, for `companion temperature`: what still windows have shown, and the curve through them."""
+        return [
+            _by_temperature(name, each.points, self._of.get(name))
+            for name, each in known.items()
+            if name in self._names
+        ]
+
+
+def _by_temperature(name: str, points: Sequence[Point], curve: Curve | None) -> Object:
+    told = [point for point in points if point.temperature_degc is not None and point.gyro is not None]
+    rows = []
+    if curve is not None:
+        low, high = curve.span_degc
+        steps = [low, *(STEP_K * k for k in range(math.ceil(low / STEP_K), math.ceil(high / STEP_K))), high]
+        for degc in dict.fromkeys(steps):
+            bias, variance = curve.at(degc)
+            rows.append({"degc": round(degc, 2), "gyro_deg_h": _deg_h(bias), "sigma_deg_h": _deg_h(np.sqrt(variance))})
+    return {
+        "imu": name,
+        "power_ups": len(by_power_up(told)),
+        "points": [
+            {
+                "at_unix_s": round(point.unix_s),
+                "degc": point.temperature_degc,
+                "gyro_deg_h": _deg_h(point.gyro.bias),
+                "sigma_deg_h": _deg_h(point.gyro.sigma_use),
+            }
+            for point in told
+            if point.gyro is not None
+        ],
+        "curve": rows,
+    }
+
+
+def _deg_h(axes: Iterable[float]) -> list[float]:
+    return [round(value / DEG_H, 1) for value in axes]

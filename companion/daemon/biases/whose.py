@@ -1,0 +1,118 @@
+"""Which sensor an IMU's biases are of, and since when it has been powered."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.calibration.records.align_record import ImuAlignmentRecord
+from companion.calibration.records.history import PowerUp
+from companion.config.sections import Noise
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.devices.sensors import SerialSensor
+from companion.daemon.stands.alignment import AlignmentInForce
+from companion.storage.learned import this_boot
+
+_IN_WORDS: Final = {
+    "system": "vehicle",
+    "gyro": "gyro (device id)",
+    "accel": "accelerometer (device id)",
+    "scale": "accelerometer scale",
+    "tcal": "temperature calibration",
+}
+"""Of what is not said as it is called."""
+
+
+class Whose:
+    """Of the IMUs of the configuration."""
+
+    def __init__(
+        self,
+        core: Core,
+        imus: Mapping[str, AutopilotImu],
+        sensors: Sequence[SerialSensor],
+        used: AlignmentInForce,
+    ) -> None:
+        self._config, self._vehicle, self._imus = core.config, core.vehicle, imus
+        self._alignment, self._collector = used, core.collector
+        self._sensors = {role.name: sensor for sensor in sensors for role in sensor.roles if role.kind == "imu"}
+        self._sources = {imu.name: imu for imu in core.config.imu}
+        self._host = this_boot() or os.urandom(8).hex()
+
+    @property
+    def names(self) -> Collection[str]:
+        """Of the IMUs."""
+        return self._sources.keys()
+
+    def power_up(self, name: str, unix_s: float) -> PowerUp:
+        """Since when the sensor of an IMU has been powered, at a wall clock time."""
+        up_s = self._collector.up_s(name)
+        return PowerUp(host=self._host, since_unix_s=None if up_s is None else round(unix_s - up_s, 1))
+
+    def session(self, name: str) -> str:
+        """Another one as soon as the sensor may have been without power."""
+        if name in self._imus:
+            return f"boot {self._vehicle.boots}"
+        sensor = self._sensors.get(name)
+        if sensor is None:
+            return ""
+        return f"{sensor.link.reconnects} {sensor.decoder.times.clock.breaks} {sorted(sensor.health.counts.items())}"
+
+    def zero(self) -> str | None:
+        """Which zero of the gradienter is in force: another one has another error."""
+        gradienter, used = self._config.gradienter, self._alignment.used
+        if gradienter is None:
+            return None
+        at = used.measured_at if used is not None else "configured"
+        mounting = _plain(gradienter.mounting)
+        return f"{gradienter.protocol} {gradienter.law} {mounting} {_plain(gradienter.offset_deg)} {at}"
+
+    def identity(self, name: str, before: Mapping[str, str]) -> dict[str, str]:
+        """What makes it another sensor, or its biases others, if it changes; `before` where nothing is known now."""
+        source = self._sources[name]
+        profile = source.profile.name if isinstance(source.profile, Noise) else source.profile
+        found: dict[str, str] = {"source": source.source, "profile": profile or "unknown"}
+        if source.source == "serial":
+            return {**found, "protocol": source.protocol or "", "mounting": _plain(source.mounting)}
+        calibration = self._imus[name].calibration if name in self._imus else None
+        found |= {
+            "instance": str(source.instance or 1),
+            "system": str(self._vehicle.system_id),
+            "firmware": str(self._vehicle.firmware),
+        }
+        if calibration is not None:
+            return found | _of_autopilot(calibration)
+        # What is not known at the moment is no change.
+        return {**before, **found}
+
+    def aligned(self, name: str) -> ImuAlignmentRecord | None:
+        """What the alignment in force says of it."""
+        record = self._alignment.record
+        if record is None or self._alignment.unused is not None:
+            return None
+        return next((imu for imu in record.imus if imu.name == name), None)
+
+
+def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """What is another one than before, in words."""
+    keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
+    return ", ".join(_IN_WORDS.get(key, key) for key in keys)
+
+
+def _of_autopilot(calibration: ImuCalibration) -> dict[str, str]:
+    return {
+        "gyro": str(calibration.gyro_id),
+        "accel": str(calibration.accel_id),
+        "orientation": _plain((np.round(calibration.orientation, 4) + 0.0).ravel().tolist()),
+        "scale": _plain(calibration.accel_scale),
+        "tcal": str(calibration.tcal_enable),
+    }
+
+
+def _plain(value: object) -> str:
+    return " ".join(f"{each:.6g}" for each in value) if isinstance(value, list | tuple) else str(value)
