@@ -324,9 +324,11 @@ def test_what_is_seen_while_it_warms_up_is_remembered_although_nobody_calibrates
     run_virtual(main())
 
 
-@pytest.mark.parametrize(("slope_deg_h_k", "closes"), [(1.0, False), (54.0, True)])
+@pytest.mark.parametrize(
+    ("slope_deg_h_k", "slope_mg_k", "closes"), [(1.0, 0.0, False), (54.0, 0.8, True)]
+)
 def test_the_gate_closes_by_what_the_temperature_does_to_this_imu(
-    tmp_path: Path, slope_deg_h_k: float, closes: bool
+    tmp_path: Path, slope_deg_h_k: float, slope_mg_k: float, closes: bool
 ) -> None:
     """Five kelvin, which without a curve are too many for every part."""
 
@@ -340,16 +342,19 @@ def test_the_gate_closes_by_what_the_temperature_does_to_this_imu(
             await calibrated(rig)
             (first,) = memory._known["fc"].points[-1:]
             assert first.gyro is not None
+            assert first.accel is not None
             random = np.random.default_rng(3)
             for run in range(1, 9):
                 degc = 10.0 + 3.0 * run
                 bias = random.normal(0.0, 5.0, 3) + slope_deg_h_k * (degc - 20.0)
+                accel = np.add(first.accel.bias, (random.normal(0.0, 0.1, 3) + slope_mg_k * (degc - 20.0)) * MG)
                 day = msgspec.structs.replace(
                     first,
                     started_at=f"day {run}",
                     power_up=since(run),
                     temperature_degc=degc,
                     gyro=msgspec.structs.replace(first.gyro, bias=tuple((bias * DEG_H).tolist())),
+                    accel=msgspec.structs.replace(first.accel, bias=tuple(accel.tolist())),
                 )
                 await memory.keep({"fc": day})
             await asyncio.sleep(10.0)
@@ -370,7 +375,9 @@ def test_the_gate_closes_by_what_the_temperature_does_to_this_imu(
             gyros = [word for word in words if word.startswith("gyro")]
             moved = [float(word.split()[3]) for word in gyros if word.endswith(" deg/h off, 5 K warmer")]
             assert moved == ([pytest.approx(5.0 * 54.0, rel=0.05)] if closes else [])
-            # Nothing is known of the accelerometers' curve.
-            assert [word for word in words if word not in gyros] == ["imu fc: 5 K warmer than calibrated"]
+            accels = [word for word in words if word not in gyros]
+            moved = [float(word.split()[3]) for word in accels if word.endswith(" mg off, 5 K warmer")]
+            assert moved == ([pytest.approx(5.0 * 0.8, rel=0.1)] if closes else [])
+            assert len(words) == (2 if closes else 0)
 
     run_virtual(main())

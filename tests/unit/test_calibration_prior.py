@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.align_record import Determined, ImuAlignmentRecord
 from companion.calibration.records.history import Measured, Point, PowerUp, believed, by_power_up
-from companion.calibration.solution.prior import Expected, Now, expect, expect_today, pose_effect, student_limit
+from companion.calibration.solution.prior import (
+    Expected,
+    Now,
+    curve_of,
+    expect,
+    expect_today,
+    pose_effect,
+    student_limit,
+)
 from companion.samples import Triad
 from tests.prior_study import CASES, STEADY, Case, study
 from tests.support.windows import ned_from_body
@@ -319,6 +327,50 @@ def test_in_one_power_up_it_is_where_it_was_but_for_temperature_and_drift() -> N
     later = expect_today(msgspec.structs.replace(last, unix_s=-1e6), "gyro", now(20.0), ASSUMED, gyro)
     assert later is not None
     assert later.variance > soon.variance
+
+
+def test_in_one_power_up_a_curve_moves_it_and_says_how_well_that_is_known() -> None:
+    """30 deg/h a kelvin, seen over eight days of five points each."""
+    random, gyro = np.random.default_rng(7), noise_profile("icm42688p").gyro
+    days = []
+    for day in range(8):
+        offset = random.normal(0.0, 40.0, 3)
+        for degc in 15.0 + day + np.arange(0.0, 20.0, 4.0):
+            bias = (offset + 30.0 * degc + random.normal(0.0, 1.0, 3)) * DEG_H
+            days.append(point(bias.tolist(), f"day {day}", temperature=float(degc)))
+    curve = curve_of(days, "gyro", gyro)
+    last = msgspec.structs.replace(point([1e-4, 2e-4, 3e-4], "today", temperature=20.0), unix_s=1e6)
+    warm = expect_today(last, "gyro", now(30.0), ASSUMED, gyro, curve)
+    blind = expect_today(last, "gyro", now(30.0), ASSUMED, gyro)
+    assert warm is not None
+    assert blind is not None
+    assert last.gyro is not None
+    off = np.subtract(warm.value, last.gyro.bias) - 300.0 * DEG_H
+    assert np.abs(off).max() < 3.0 * np.sqrt(max(warm.variance))
+    assert np.sqrt(max(warm.variance)) < 60.0 * DEG_H < 540.0 * DEG_H < np.sqrt(min(blind.variance))
+    # Beyond what was seen nobody knows.
+    hot = expect_today(last, "gyro", now(60.0), ASSUMED, gyro, curve)
+    assert hot is not None
+    assert np.sqrt(min(hot.variance)) > 10.0 * 54.0 * DEG_H
+
+
+def test_accelerometers_have_a_curve_too_unless_they_never_stood_alike() -> None:
+    random, accel = np.random.default_rng(8), noise_profile("icm42688p").accel
+    still, tilted = [], []
+    for day in range(8):
+        for k, degc in enumerate(15.0 + day + np.arange(0.0, 16.0, 4.0)):
+            bias = (0.3 * degc + random.normal(0.0, 0.02, 3)) * MG
+            still.append(point(bias.tolist(), f"day {day}", triad="accel", temperature=float(degc)))
+            roll = 0.5 * k
+            tilted.append(msgspec.structs.replace(still[-1], up=(0.0, float(np.sin(roll)), float(-np.cos(roll)))))
+    curve = curve_of(still, "accel", accel)
+    assert curve is not None
+    change, variance = curve.change((20.0, 0.0), (30.0, 0.0))
+    np.testing.assert_allclose(change, 3.0 * MG, atol=3.0 * np.sqrt(variance.max()))
+    assert np.sqrt(variance.max()) < 0.5 * MG
+    # Scale times another part of gravity may have done all of it.
+    loose = curve_of(tilted, "accel", accel)
+    assert loose is None or np.sqrt(loose.change((20.0, 0.0), (30.0, 0.0))[1].min()) > 2.0 * np.sqrt(variance.max())
 
 
 # --- over many histories

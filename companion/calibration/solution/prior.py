@@ -31,7 +31,7 @@ from companion.calibration.records.history import Measured, Point, PowerUp, beli
 from companion.calibration.records.record import Effective
 from companion.calibration.temperature.curve import Curve, Node, PowerUpNodes, fit
 from companion.physics.frames import Array, Floats, Matrix, skew, vector
-from companion.physics.units import DEG, DEG_H, MG
+from companion.physics.units import DEG, DEG_H, MG, G
 from companion.samples import Triad, Vector
 
 LEVEL: Final = np.array([0.0, 0.0, -1.0])
@@ -216,7 +216,10 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
     zeros = [group[-1].zero_sigma_rad * now.gravity_m_s2 if triad == "accel" else 0.0 for group in groups]
     nodes = [
         PowerUpNodes(
-            [_node(point, bias, one, told=told) for point, one, bias in zip(group, found, biases, strict=True)],
+            [
+                _node(point, bias, float(np.square(one.sigma_stat).mean()), told=told)
+                for point, one, bias in zip(group, found, biases, strict=True)
+            ],
             common_variance=float(np.square(pose).mean()) + zero**2,
         )
         for group, found, (biases, pose), zero in zip(groups, seen, here, zeros, strict=True)
@@ -242,52 +245,61 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
     )
 
 
-def gyro_curve(points: Sequence[Point], model: AllanModel) -> Curve | None:
-    """How the gyros' bias follows the temperature within a power-up; None where little is known of that."""
-    groups = believed(points, "gyro")
+def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve | None:
+    """How a bias follows the temperature within a power-up; None where little is known of that."""
+    groups = believed(points, triad)
     if len(groups) < WEIGHS_FROM or not _told(groups):
         return None
-    nodes = [
-        PowerUpNodes([_node(point, np.array(found.bias), found, told=True) for point in group if (found := point.gyro)])
-        for group in groups
-    ]
-    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K["gyro"], least_order=1)
+    nodes = [PowerUpNodes([_along(group[0], point, triad) for point in group]) for group in groups]
+    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad], least_order=1)
     assert curve is not None
     low, high = curve.span_degc
-    _, variance = curve.change(low, low + 1.0)
-    return curve if high > low and variance.max() < (_KNOWN * CATALOGUE_PER_K["gyro"]) ** 2 else None
+    _, variance = curve.change((low, 0.0), (low + 1.0, 0.0))
+    return curve if high > low and variance.max() < (_KNOWN * CATALOGUE_PER_K[triad]) ** 2 else None
+
+
+def _along(first: Point, point: Point, triad: Triad) -> Node:
+    """One of a power-up; the accelerometers' bias is another one at another attitude than the first."""
+    found = _of(point, triad)
+    variance = float(np.square(found.sigma_stat).mean())
+    if triad == "accel":
+        _, sigma = pose_effect(None).change(G, np.array(point.up), np.array(first.up))
+        variance += float(np.square(sigma).mean())
+    return _node(point, np.array(found.bias), variance, told=True)
 
 
 def _told(groups: Sequence[Sequence[Point]]) -> bool:
     return all(point.temperature_degc is not None for group in groups for point in group)
 
 
-def _in_run(model: AllanModel) -> float:
-    return float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * _SHORTEST_GAP_S))
+def _in_run(model: AllanModel, gap_s: float = _SHORTEST_GAP_S) -> float:
+    """Variance by which a bias wanders."""
+    return float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * gap_s))
 
 
-def expect_today(last: Point, triad: Triad, now: Now, effect: PoseEffect, model: AllanModel) -> Expected | None:
-    """What an earlier calibration in this very power-up says of now; None where it did not measure this."""
+def expect_today(
+    last: Point, triad: Triad, now: Now, effect: PoseEffect, model: AllanModel, curve: Curve | None = None
+) -> Expected | None:
+    """What an earlier calibration in this very power-up says of now; None where it did not measure this.
+
+    The temperature has moved it by what the `curve` of this triad says; without one, by what parts move.
+    """
     found = last.of(triad)
     if found is None:
         return None
     bias, pose = _here([last], [found], triad, now, effect)
-    if last.temperature_degc is None or now.temperature_degc is None:
-        change_k = TEMPERATURE_SIGMA_K
-    else:
-        change_k = now.temperature_degc - last.temperature_degc
-    gap_s = max(abs(now.unix_s - last.unix_s), _SHORTEST_GAP_S)
-    drift = float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * gap_s))
-    variance = (
-        np.square(found.sigma_use)
-        + np.square(found.sigma_shared)
-        + np.square(pose[0])
-        + (CATALOGUE_PER_K[triad] * change_k) ** 2
-        + drift
-    )
+    change, of_change = np.zeros(3), (CATALOGUE_PER_K[triad] * TEMPERATURE_SIGMA_K) ** 2
+    if last.temperature_degc is not None and now.temperature_degc is not None:
+        then, at = (last.temperature_degc, last.k_s), (now.temperature_degc, now.k_s)
+        if curve is not None:
+            change, of_change = curve.change(then, at)
+        else:
+            of_change = (CATALOGUE_PER_K[triad] * (at[0] - then[0])) ** 2
+    drift = _in_run(model, max(abs(now.unix_s - last.unix_s), _SHORTEST_GAP_S))
+    variance = np.square(found.sigma_use) + np.square(found.sigma_shared) + np.square(pose[0]) + of_change + drift
     same = triad == "accel" and last.zero == now.zero
     return Expected(
-        value=vector(bias[0]),
+        value=vector(bias[0] + change),
         variance=vector(variance),
         limit=GATE_SIGMAS,
         power_ups=1,
@@ -303,9 +315,9 @@ def _of(point: Point, triad: Triad) -> Measured:
     return found
 
 
-def _node(point: Point, bias: Array, found: Measured, *, told: bool) -> Node:
+def _node(point: Point, bias: Array, variance: float, *, told: bool) -> Node:
     degc, k_s = (point.temperature_degc or 0.0, point.k_s) if told else (0.0, 0.0)
-    return Node(degc, vector(bias), float(np.square(found.sigma_stat).mean()), k_s)
+    return Node(degc, vector(bias), variance, k_s)
 
 
 def _here(

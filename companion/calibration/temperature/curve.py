@@ -112,13 +112,13 @@ class Curve:
         outside = (steepest * self.beyond_k(degc)) ** 2
         return x @ self.coefficients, self.scatter + float(x @ self.covariance @ x) * self.widening + outside
 
-    def change(self, degc: float, then_degc: float) -> tuple[Array, Array]:
-        """By how much the bias of one power-up is more at `then_degc` than at `degc`, and its variance, (3,) each.
+    def change(self, then: tuple[float, float], now: tuple[float, float]) -> tuple[Array, Array]:
+        """By how much the bias of one power-up is more now than then, and its variance, (3,) each.
 
-        Of a curve of order 1 and more.
+        Both are a temperature and how fast it rises, degC and K/s. Of a curve of order 1 and more.
         """
-        outside = (self.per_kelvin * abs(self.beyond_k(then_degc) - self.beyond_k(degc))) ** 2
-        x = self._row(self._inside(then_degc), 0.0) - self._row(self._inside(degc), 0.0)
+        outside = (self.per_kelvin * abs(self.beyond_k(now[0]) - self.beyond_k(then[0]))) ** 2
+        x = self._row(self._inside(now[0]), now[1]) - self._row(self._inside(then[0]), then[1])
         variance = float(x @ self.covariance[1:, 1:] @ x) * self.widening + outside
         return x @ self.coefficients[1:], variance
 

@@ -119,7 +119,7 @@ class InForce:
                 now_s=now_s,
                 temperature_degc=degc,
                 present=self._present.get((name, triad)),
-                drift=self._memory.curves.drift(name, held.temperature_degc, degc) if triad == "gyro" else None,
+                drift=self._memory.curves.drift(name, triad, held.temperature_degc, degc),
             )
             model = profile.gyro if triad == "gyro" else profile.accel
             against = judge(triad, name, held, model, self._limits, seen)

@@ -10,13 +10,13 @@ import numpy as np
 
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.history import Point, by_power_up
-from companion.calibration.solution.prior import gyro_curve
+from companion.calibration.solution.prior import curve_of
 from companion.calibration.temperature.curve import Curve
 from companion.daemon.core import Core
 from companion.formats import Object
 from companion.physics.frames import vector
 from companion.physics.units import DEG_H
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 from companion.storage.learned import KnownImu
 
 STEP_K: Final = 5.0
@@ -29,32 +29,39 @@ class Curves:
     def __init__(self, core: Core) -> None:
         self._profiles = core.profiles
         self._names = {imu.name for imu in core.config.imu}
-        self._of: dict[str, Curve | None] = {}
+        self._of: dict[tuple[str, Triad], Curve | None] = {}
 
     def follow(self, known: Mapping[str, KnownImu]) -> None:
         """Work out the curves of what is known; blocking."""
-        self._of = {
-            name: gyro_curve(each.points, noise_profile(self._profiles.of(name)).gyro)
-            for name, each in known.items()
-            if name in self._names
-        }
+        of: dict[tuple[str, Triad], Curve | None] = {}
+        for name in known.keys() & self._names:
+            profile = noise_profile(self._profiles.of(name))
+            of[name, "gyro"] = curve_of(known[name].points, "gyro", profile.gyro)
+            of[name, "accel"] = curve_of(known[name].points, "accel", profile.accel)
+        self._of = of
 
     def forget(self, name: str) -> None:
         """Of an IMU that is another one now."""
-        self._of.pop(name, None)
+        self._of = {key: curve for key, curve in self._of.items() if key[0] != name}
 
-    def drift(self, name: str, degc: float | None, now_degc: float | None) -> tuple[Vector, Vector] | None:
-        """By how much the gyros' bias has moved since it was so warm, rad/s, and its variance; None: not known."""
-        curve = self._of.get(name)
+    def of(self, name: str, triad: Triad) -> Curve | None:
+        """None: not known."""
+        return self._of.get((name, triad))
+
+    def drift(
+        self, name: str, triad: Triad, degc: float | None, now_degc: float | None
+    ) -> tuple[Vector, Vector] | None:
+        """By how much its bias has moved since it was so warm, rad/s or m/s^2, and its variance; None: not known."""
+        curve = self.of(name, triad)
         if curve is None or degc is None or now_degc is None:
             return None
-        mean, variance = curve.change(degc, now_degc)
+        mean, variance = curve.change((degc, 0.0), (now_degc, 0.0))
         return vector(mean), vector(variance)
 
     def shown(self, known: Mapping[str, KnownImu]) -> list[Object]:
         """By IMU, for `companion temperature`: what still windows have shown, and the curve through them."""
         return [
-            _by_temperature(name, each.points, self._of.get(name))
+            _by_temperature(name, each.points, self.of(name, "gyro"))
             for name, each in known.items()
             if name in self._names
         ]

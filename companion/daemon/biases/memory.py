@@ -16,12 +16,13 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.firmware.imu_calibration import whole_of
-from companion.calibration.noise.allan import noise_profile
+from companion.calibration.noise.allan import AllanModel, noise_profile
 from companion.calibration.records.history import Point, kept
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import (
     Expectation,
+    Expected,
     ExpectedImu,
     Now,
     expect,
@@ -135,13 +136,17 @@ class BiasMemory:
         )
         earlier = self._known[name].points if name in self._known else ()
         profile = noise_profile(self._profiles.of(name))
-        gyro, accel = self._reference(name, "gyro"), self._reference(name, "accel")
+
+        def today(triad: Triad, model: AllanModel) -> Expected | None:
+            last, curve = self._reference(name, triad), self.curves.of(name, triad)
+            return None if last is None else expect_today(last, triad, now, effect, model, curve)
+
         return ExpectedImu(
             name=name,
             gyro=expect(earlier, "gyro", now, effect, profile.gyro),
             accel=expect(earlier, "accel", now, effect, profile.accel),
-            gyro_today=expect_today(gyro, "gyro", now, effect, profile.gyro) if gyro is not None else None,
-            accel_today=expect_today(accel, "accel", now, effect, profile.accel) if accel is not None else None,
+            gyro_today=today("gyro", profile.gyro),
+            accel_today=today("accel", profile.accel),
             effect=effect,
         )
 
