@@ -324,9 +324,7 @@ def test_what_is_seen_while_it_warms_up_is_remembered_although_nobody_calibrates
     run_virtual(main())
 
 
-@pytest.mark.parametrize(
-    ("slope_deg_h_k", "slope_mg_k", "closes"), [(1.0, 0.0, False), (54.0, 0.8, True)]
-)
+@pytest.mark.parametrize(("slope_deg_h_k", "slope_mg_k", "closes"), [(1.0, 0.0, False), (54.0, 0.8, True)])
 def test_the_gate_closes_by_what_the_temperature_does_to_this_imu(
     tmp_path: Path, slope_deg_h_k: float, slope_mg_k: float, closes: bool
 ) -> None:

@@ -288,13 +288,12 @@ def expect_today(
     if found is None:
         return None
     bias, pose = _here([last], [found], triad, now, effect)
-    change, of_change = np.zeros(3), (CATALOGUE_PER_K[triad] * TEMPERATURE_SIGMA_K) ** 2
+    kelvin = TEMPERATURE_SIGMA_K
     if last.temperature_degc is not None and now.temperature_degc is not None:
-        then, at = (last.temperature_degc, last.k_s), (now.temperature_degc, now.k_s)
-        if curve is not None:
-            change, of_change = curve.change(then, at)
-        else:
-            of_change = (CATALOGUE_PER_K[triad] * (at[0] - then[0])) ** 2
+        kelvin = now.temperature_degc - last.temperature_degc
+    change, of_change = np.zeros(3), np.full(3, (CATALOGUE_PER_K[triad] * kelvin) ** 2)
+    if curve is not None and last.temperature_degc is not None and now.temperature_degc is not None:
+        change, of_change = curve.change((last.temperature_degc, last.k_s), (now.temperature_degc, now.k_s))
     drift = _in_run(model, max(abs(now.unix_s - last.unix_s), _SHORTEST_GAP_S))
     variance = np.square(found.sigma_use) + np.square(found.sigma_shared) + np.square(pose[0]) + of_change + drift
     same = triad == "accel" and last.zero == now.zero
