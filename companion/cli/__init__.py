@@ -139,7 +139,15 @@ def _parser() -> Parser:
     history.add_argument(
         "-n", "--limit", type=within(1, 1e6, int), default=20, metavar="N", help="the latest N (default 20)"
     )
-    add("temperature", client.temperature, "how the gyros' biases follow the temperature, as far as seen")
+    temperature = add("temperature", client.temperature, "how the gyros' biases follow the temperature, as far as seen")
+    what = temperature.add_mutually_exclusive_group()
+    what.add_argument("--write", action="store_true", help="write the curves into the autopilot (disarmed and still)")
+    what.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="the same, also over a temperature calibration that is not the companion's",
+    )
+    what.add_argument("--undo", action="store_true", help="put back what was there before the curves")
     add("monitor", monitor.monitor, "watch the daemon until Ctrl-C")
     add("web-token", local.web_token, "where the page is, and the token that its buttons need")
     recordings.add_commands(add)

@@ -74,9 +74,9 @@ async def cancel(options: argparse.Namespace) -> int:
     return _finish_briefly(options, await request(options, {"command": "cancel"}))
 
 
-async def undo(options: argparse.Namespace) -> int:
-    """`companion undo`."""
-    reply = await request(options, {"command": "undo", "force": options.force})
+async def undo(options: argparse.Namespace, wanted: Object | None = None) -> int:
+    """`companion undo`, or that of a single kind of write."""
+    reply = await request(options, wanted or {"command": "undo", "force": options.force})
     answer = {key: reply.get(key) for key in ("state", "reason", "written", "undone", "undoable")}
     lines = [f"{answer['state']}: {answer['reason']}", show.undo_line(answer["undoable"] or ())]
     return finish(options, reply, answer, lines, good=answer["state"] == "done")
@@ -90,7 +90,15 @@ async def history(options: argparse.Namespace) -> int:
 
 
 async def temperature(options: argparse.Namespace) -> int:
-    """`companion temperature`."""
+    """`companion temperature`; Ctrl-C cancels a write in the daemon too."""
+    if options.undo:
+        return await undo(options, {"command": "temperature", "action": "undo"})
+    if options.write or options.overwrite:
+        wanted = {"command": "temperature", "action": "write", "overwrite": options.overwrite}
+        reply = await request(options, wanted, {"command": "cancel"})
+        answer: Object = {key: reply.get(key) for key in ("state", "reason", "written")}
+        lines = [f"{str(answer['state']).upper()}: {answer['reason']}", *show.curves_written_lines(answer["written"])]
+        return finish(options, reply, answer, lines, good=answer["state"] == "done")
     reply = await request(options, {"command": "temperature"})
     answer = {"imus": reply.get("imus", [])}
     return finish(options, reply, answer, show.temperature_lines(answer["imus"]), good=True)

@@ -323,6 +323,14 @@ def temperature_lines(imus: Sequence[Object]) -> list[str]:
     return lines or ["nothing seen yet: still windows are remembered as soon as a thermometer is read"]
 
 
+def curves_written_lines(written: Object | None) -> list[str]:
+    """What was written of curves over temperature."""
+    if written is None:
+        return []
+    lines = [f"{name}: {len(each)} parameters" for name, each in written["imus"].items()]
+    return lines + [f"warning: {words}" for words in written["warnings"]]
+
+
 def port_lines(ports: Sequence[SerialPort]) -> list[str]:
     """Serial ports: the name to put into the configuration first, then what it is and who holds it."""
     if not ports:

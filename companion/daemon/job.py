@@ -17,7 +17,7 @@ from companion.calibration.solution.doubt import Doubt
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
 from companion.samples import Triad
-from companion.storage.changes import ChangeSet
+from companion.storage.changes import BY_TEMPERATURE, ChangeSet
 
 ALIGNMENT: Final = "gradienter alignment"
 """The kind of job that calibrates nothing."""
@@ -25,7 +25,9 @@ FACES: Final = "measurement on all sides"
 """The kind of job that measures accelerometers in any orientation."""
 TURN: Final = "turn on the spot"
 """The kind of job that finds the level by that alone."""
-BY_STANDS: Final = (ALIGNMENT, FACES, TURN)
+TEMPERATURE: Final = "temperature curve"
+"""The kind of job that writes what still windows have shown over temperature."""
+NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, TEMPERATURE)
 """Those that are not calibrations."""
 
 
@@ -36,10 +38,18 @@ class Undone(msgspec.Struct, frozen=True):
     written: dict[str, WrittenParameter]
     """What was put back; less than the step where others have changed something."""
     by_hand: bool
-    """Whether it was of what stands had told, so that the last calibration is as it was."""
+    """Whether it was of what stands or curves had told, so that the last calibration is as it was."""
 
 
-Product = Record | AlignmentRecord | FacesRecord | TurnRecord | Undone
+class CurvesWritten(msgspec.Struct, frozen=True):
+    """Curves over temperature that are in the autopilot now."""
+
+    imus: dict[str, dict[str, WrittenParameter]]
+    """By IMU and parameter."""
+    warnings: tuple[str, ...]
+
+
+Product = Record | AlignmentRecord | FacesRecord | TurnRecord | Undone | CurvesWritten
 
 
 class JobCancelledError(Exception):
@@ -95,7 +105,7 @@ class Job:
     @property
     def short(self) -> str:
         """What it is, as the command line calls it."""
-        return {FACES: "faces", TURN: "turn"}.get(self.kind, self.kind)
+        return {FACES: "faces", TURN: "turn", TEMPERATURE: BY_TEMPERATURE}.get(self.kind, self.kind)
 
     @property
     def record(self) -> Record | None:

@@ -24,7 +24,8 @@ _SYSTEM_IDS: Final = range(1, 256)
 MOST_STEPS: Final = 10
 """Writes that can be undone one after the other; the oldest one makes room."""
 AUTOMATIC: Final = "auto calibration"
-BY_HAND: Final = ("faces", "turn", "level")
+BY_TEMPERATURE: Final = "temperature"
+BY_HAND: Final = ("faces", "turn", "level", BY_TEMPERATURE)
 """What leaves no calibration's record."""
 
 
@@ -48,7 +49,7 @@ class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What has made a write."""
 
     what: Annotated[str, msgspec.Meta(pattern=r"^[a-z ]{0,30}\Z")] = ""
-    """As people call it: "calibration", "auto calibration", "faces", "turn", "level"; empty: not kept."""
+    """As people call it: "calibration", "auto calibration", or one of `BY_HAND`; empty: not kept."""
     at: Moment = ""
     """UTC, ISO 8601, by the host's clock: when that began; for calibrations `started_at` of the record."""
     since: Moment = ""

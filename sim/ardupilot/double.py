@@ -37,8 +37,8 @@ class ArduPilotDouble(Board):
     It is an `End` (attach, receive) on which the companion is plugged in; `ground` is a second one for a ground
     station. `run` sends what is due; answers need only the running loop. Time is the loop's clock.
 
-    Not modelled: flight, notches, temperature calibration (INS_TCALn_* can be read and written, nothing more), MAVFTP,
-    missions, logs, SETUP_SIGNING (`require_signatures` stands for it), 6-position calibration, the 10 s that
+    Not modelled: flight, notches, the learning of a temperature calibration (INS_TCALn_ENABLE = 2), MAVFTP, missions,
+    logs, SETUP_SIGNING (`require_signatures` stands for it), 6-position calibration, the 10 s that
     consistency checks must pass before arming.
 
     Arguments are those of `Board`.

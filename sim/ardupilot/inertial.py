@@ -1,8 +1,9 @@
 """From the sensor to the autopilot's output: offsets, scales, board orientation and the 20 Hz filter.
 
-    gyro_body  = R_b (raw - GYROFFS)
-    accel_body = R_b diag(ACCSCAL) (raw - ACCOFFS)
+    gyro_body  = R_b (raw - warm - GYROFFS)
+    accel_body = R_b diag(ACCSCAL) (raw - warm - ACCOFFS)
 
+where `warm` is what the temperature calibration takes off (autopilots 10.1),
 then a second-order low-pass. Telemetry shows samples of the filtered value, not means; their noise is therefore that of
 the filter's output (N^2 times 44 Hz at 20 Hz cut-off), whatever the message rate, and correlated over some 20 ms. The
 filter is carried forward exactly between messages, so the mean over a long time has the variance N^2/T.
@@ -14,7 +15,7 @@ import math
 
 import numpy as np
 
-from sim.ardupilot.parameters import ParameterStore, offset_names
+from sim.ardupilot.parameters import ParameterStore, caltemp_name, offset_names, tcal_name, tcal_names
 from sim.earth import Array, mounting_matrix
 from sim.firmware.rotations import rotation_matrix
 from sim.imu_model import ImuModel
@@ -23,6 +24,7 @@ RAW_RATE_HZ = 1000.0
 """Rate of the sensor's own samples; their rounding adds white noise."""
 ORIENTATION_PERIOD_S = 1.0
 _MOVING_STEP_S = 0.0025
+_TCAL_REFERENCE_DEGC = 35.0
 _DAMPING = math.sqrt(0.5)
 
 
@@ -55,6 +57,7 @@ class InertialPath:
         self._revision = -1
         self._offset = np.zeros(6)
         self._scale = np.ones(6)
+        self._tcal: tuple[float, float, list[Array], Array] | None = None
         self._board = np.eye(3)
         self._board_checked_s = -math.inf
 
@@ -108,12 +111,32 @@ class InertialPath:
             self._offset[:3] = store.vector(offset_names(self.instance, "gyro"))
             self._offset[3:] = store.vector(offset_names(self.instance, "accel"))
             self._scale[3:] = store.vector(offset_names(self.instance, "scale"))
+            self._tcal = self._read_tcal()
         if not armed and t_s >= self._board_checked_s + ORIENTATION_PERIOD_S:
             self._board = orientation_matrix(store)
             self._board_checked_s = t_s
-        board_axes = (raw - self._offset) * self._scale
+        board_axes = (raw - self._warm(t_s) - self._offset) * self._scale
         result: Array = (board_axes.reshape(2, 3) @ self._board.T).ravel()
         return result
+
+    def _warm(self, t_s: float) -> Array:
+        """What INS_TCALn_* takes off, (6): zero at CALTEMP, and level beyond TMIN and TMAX."""
+        if self._tcal is None:
+            return np.zeros(6)
+        low, high, coefficients, caltemps = self._tcal
+        now = min(max(self.model.temperature_degc(t_s), low), high) - _TCAL_REFERENCE_DEGC
+        then = np.clip(caltemps, low, high) - _TCAL_REFERENCE_DEGC
+        return np.asarray(sum(each * (now**order - then**order) for order, each in enumerate(coefficients, start=1)))
+
+    def _read_tcal(self) -> tuple[float, float, list[Array], Array] | None:
+        """TMIN, TMAX, by order the coefficients of the six axes, and their CALTEMPs; None: not enabled."""
+        values, number = self._store.effective, self.instance
+        if values[tcal_name(number, "ENABLE")] != 1:
+            return None
+        orders = zip(tcal_names(number, "GYR"), tcal_names(number, "ACC"), strict=True)
+        coefficients = [np.array([values[name] for name in (*gyro, *accel)]) * 1e-6 for gyro, accel in orders]
+        caltemps = np.repeat([values[caltemp_name(number, "GYR")], values[caltemp_name(number, "ACC")]], 3)
+        return values[tcal_name(number, "TMIN")], values[tcal_name(number, "TMAX")], coefficients, caltemps
 
     def board(self) -> Array:
         """The orientation in use, board to vehicle."""

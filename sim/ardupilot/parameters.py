@@ -40,6 +40,17 @@ def caltemp_name(instance: int, kind: Literal["GYR", "ACC"]) -> str:
     return f"INS{instance}_{kind}_CALTEMP" if instance > 3 else f"INS_{kind}{instance}_CALTEMP"
 
 
+def tcal_name(instance: int, what: str) -> str:
+    """Name of a parameter of the temperature calibration."""
+    return f"INS{instance}_TCAL_{what}" if instance > 3 else f"INS_TCAL{instance}_{what}"
+
+
+def tcal_names(instance: int, kind: Literal["GYR", "ACC"]) -> list[tuple[str, str, str]]:
+    """Names of its coefficients, first to third order."""
+    x, y, z = AXES
+    return [(base + x, base + y, base + z) for base in (f"{tcal_name(instance, kind)}{order}_" for order in (1, 2, 3))]
+
+
 class ParameterStore:
     """Name to value. `values` is what is read back; `effective` is what the firmware works with."""
 
@@ -170,7 +181,7 @@ def _imu_parameters(instance: int, *, exists: bool) -> dict[str, tuple[float, in
         f"INS_USE{number}": (1, INT8),
         f"INS_GYR{instance}_CALTEMP": (-300.0, REAL32),
         f"INS_ACC{instance}_CALTEMP": (-300.0, REAL32),
-        f"INS_TCAL{instance}_ENABLE": (0, INT8),
+        **_tcal_parameters(instance),
     }
     table |= {f"INS_POS{instance}_{axis}": (0.0, REAL32) for axis in AXES}
     return table
@@ -188,8 +199,15 @@ def _auxiliary_parameters(instance: int, *, exists: bool) -> dict[str, tuple[flo
         f"INS{instance}_USE": (1, INT8),
         f"INS{instance}_GYR_CALTEMP": (-300.0, REAL32),
         f"INS{instance}_ACC_CALTEMP": (-300.0, REAL32),
-        f"INS{instance}_TCAL_ENABLE": (0, INT8),
+        **_tcal_parameters(instance),
     }
+
+
+def _tcal_parameters(instance: int) -> dict[str, tuple[float, int]]:
+    table: dict[str, tuple[float, int]] = {tcal_name(instance, "ENABLE"): (0, INT8)}
+    table |= {tcal_name(instance, "TMIN"): (0.0, REAL32), tcal_name(instance, "TMAX"): (70.0, REAL32)}
+    names = [name for kind in ("ACC", "GYR") for family in tcal_names(instance, kind) for name in family]
+    return table | dict.fromkeys(names, (0.0, REAL32))
 
 
 def device_id(instance: int) -> int:

@@ -101,7 +101,6 @@ def test_after_the_write_the_output_is_the_truth(
         accel_scale=scale,
         gyro_id=1,
         accel_id=1,
-        tcal_enable=None,
         orientation=rotation,
         zero_is_uncalibrated=True,
     )

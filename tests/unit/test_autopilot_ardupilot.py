@@ -12,6 +12,7 @@ from companion.autopilot.firmware.ardupilot import parameters_of
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import (
     ImuCalibration,
+    Thermal,
     accel_offset_after,
     changes_for,
     gyro_offset_after,
@@ -74,19 +75,19 @@ def test_names_of_the_instances_of_which_the_first_is_irregular() -> None:
     assert one.accel_offset[1] == "INS_ACCOFFS_Y"
     assert one.accel_scale[2] == "INS_ACCSCAL_Z"
     assert (one.gyro_id, one.accel_id, one.use) == ("INS_GYR_ID", "INS_ACC_ID", "INS_USE")
-    assert one.gyro_caltemp == "INS_GYR1_CALTEMP"
+    assert one.tcal.gyro_caltemp == "INS_GYR1_CALTEMP"
     assert two.gyro_offset[0] == "INS_GYR2OFFS_X"
     assert two.accel_offset[0] == "INS_ACC2OFFS_X"
     assert two.accel_scale[0] == "INS_ACC2SCAL_X"
     assert (two.gyro_id, two.accel_id, two.use) == ("INS_GYR2_ID", "INS_ACC2_ID", "INS_USE2")
-    assert (two.gyro_caltemp, two.tcal_enable) == ("INS_GYR2_CALTEMP", "INS_TCAL2_ENABLE")
+    assert (two.tcal.gyro_caltemp, two.tcal.enable) == ("INS_GYR2_CALTEMP", "INS_TCAL2_ENABLE")
     assert three.accel_offset[2] == "INS_ACC3OFFS_Z"
-    assert one.tcal_enable == "INS_TCAL1_ENABLE"
+    assert one.tcal.enable == "INS_TCAL1_ENABLE"
     four = parameters_of(4)
     assert four.gyro_offset == ("INS4_GYROFFS_X", "INS4_GYROFFS_Y", "INS4_GYROFFS_Z")
-    assert (four.gyro_id, four.gyro_caltemp, four.use) == ("INS4_GYR_ID", "INS4_GYR_CALTEMP", "INS4_USE")
+    assert (four.gyro_id, four.tcal.gyro_caltemp, four.use) == ("INS4_GYR_ID", "INS4_GYR_CALTEMP", "INS4_USE")
     for names in (one, two, three, four):
-        for name in (*names.gyro_offset, *names.accel_scale, names.tcal_enable):
+        for name in (*names.gyro_offset, *names.accel_scale, names.tcal.enable):
             assert len(name) <= 16
     with pytest.raises(AutopilotError, match="IMU 6"):
         parameters_of(6)
@@ -98,7 +99,7 @@ def test_reads_what_is_there() -> None:
     assert calibration.accel_offset_m_s2 == (f32(0.1), f32(0.2), f32(0.3))
     assert calibration.accel_scale == (f32(1.01), f32(0.99), 1.0)
     assert (calibration.gyro_id, calibration.accel_id) == (2752772, 2753028)
-    assert (calibration.tcal_enable, calibration.rivals) == (0, ())
+    assert (calibration.thermal, calibration.rivals) == (Thermal(values={"INS_TCAL1_ENABLE": 0.0}), ())
     assert np.array_equal(calibration.orientation, np.eye(3))
     assert calibration.warnings == ()
 
@@ -163,7 +164,7 @@ def test_an_instance_that_does_not_exist() -> None:
 def test_a_1_mb_board_without_temperature_calibration_by_param_error_or_by_silence() -> None:
     missing = {name: value for name, value in IMU1.items() if name != "INS_TCAL1_ENABLE"}
     for param_errors in (True, False):
-        assert read(missing, autopilot=ScriptedAutopilot(param_errors=param_errors)).tcal_enable is None
+        assert read(missing, autopilot=ScriptedAutopilot(param_errors=param_errors)).thermal == Thermal()
 
 
 def only_warning(**changed: float) -> str:
@@ -217,7 +218,6 @@ def plain(**changes: object) -> ImuCalibration:
         accel_scale=(1.0, 1.0, 1.0),
         gyro_id=1,
         accel_id=1,
-        tcal_enable=0,
         orientation=np.eye(3),
         zero_is_uncalibrated=True,
     )

@@ -1,7 +1,7 @@
 """ArduPilot's bias parameters: names, what R is made of, and what is odd about them.
 
 R is the board orientation, AHRS_ORIENTATION (autopilots 1.2); AHRS_TRIM turns the reported attitude only, never IMU
-data. `CALTEMP` is left alone, for then new = old + residual holds (recipe (a) of autopilots 1.6).
+data. A calibration leaves `CALTEMP` alone, for then new = old + residual holds (recipe (a) of autopilots 1.6).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import dataclasses
 import math
 from typing import Final
 
+from companion.autopilot.firmware.ardupilot_tcal import TcalParameters, names_of, read_thermal
 from companion.autopilot.firmware.imu_calibration import ACCEL_SCALE_RANGE, ImuCalibration, ImuParameters, read_rivals
 from companion.autopilot.parameters.client import ParameterClient, read_integer, read_offsets, read_scales
 from companion.errors import AutopilotError, AutopilotRebootedError
@@ -21,17 +22,13 @@ INSTANCES: Final = (1, 2, 3, 4, 5)
 
 TRIM: Final = ("AHRS_TRIM_X", "AHRS_TRIM_Y")
 """Roll and pitch of the board against the aircraft, rad; taken off the attitude, never off IMU data."""
-_TCAL_LEARNING: Final = 2
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ArduPilotParameters(ImuParameters):
     """The names of one IMU's parameters; the first instance is irregular, 4 and 5 are again (autopilots 1.1)."""
 
-    gyro_caltemp: str
-    """Temperature of the gyro's calibration, deg C; never written."""
-    tcal_enable: str
-    """Temperature calibration: 0 off, 1 on, 2 learning."""
+    tcal: TcalParameters
     use: str
 
 
@@ -43,17 +40,15 @@ def parameters_of(instance: int) -> ArduPilotParameters:
     """
     if instance not in INSTANCES:
         raise AutopilotError(f"IMU {instance} is not known; allowed are {', '.join(map(str, INSTANCES))}")
-    # INS_GYROFFS, INS_GYR2OFFS, INS4_GYROFFS; but INS_GYR1_CALTEMP, INS_TCAL1_ENABLE.
-    ins, number = (f"INS{instance}_", "") if instance > 3 else ("INS_", str(instance))
-    n = "" if instance == 1 else number
+    # INS_GYROFFS, INS_GYR2OFFS, INS4_GYROFFS; but INS_GYR1_CALTEMP, INS_TCAL1_ENABLE (`ardupilot_tcal`).
+    ins, n = (f"INS{instance}_", "") if instance > 3 else ("INS_", "" if instance == 1 else str(instance))
     return ArduPilotParameters(
         gyro_offset=_xyz(f"{ins}GYR{n}OFFS_{{}}"),
         accel_offset=_xyz(f"{ins}ACC{n}OFFS_{{}}"),
         accel_scale=_xyz(f"{ins}ACC{n}SCAL_{{}}"),
         gyro_id=f"{ins}GYR{n}_ID",
         accel_id=f"{ins}ACC{n}_ID",
-        gyro_caltemp=f"{ins}GYR{number}_CALTEMP",
-        tcal_enable=f"{ins}TCAL{number}_ENABLE",
+        tcal=names_of(instance),
         use=f"{ins}USE{n}",
     )
 
@@ -75,12 +70,7 @@ async def read_calibration(parameters: ParameterClient, instance: int) -> ImuCal
     for sensor, name, found in (("gyro", names.gyro_id, gyro_id), ("accelerometer", names.accel_id, accel_id)):
         if found == 0:
             raise AutopilotError(f"the autopilot has no IMU {instance}: {name} = 0, so there is no {sensor}")
-    tcal_enable = await read_integer(parameters, names.tcal_enable)
-    if tcal_enable == _TCAL_LEARNING:
-        raise AutopilotError(
-            f"{names.tcal_enable} = 2: IMU {instance} is learning its temperature calibration;"
-            " let it finish, or set it to 0 or 1"
-        )
+    thermal = await read_thermal(parameters, instance)
     calibration = ImuCalibration(
         instance=instance,
         parameters=names,
@@ -90,7 +80,7 @@ async def read_calibration(parameters: ParameterClient, instance: int) -> ImuCal
         gyro_id=gyro_id,
         accel_id=accel_id,
         orientation=await read_board_rotation(parameters),
-        tcal_enable=tcal_enable,
+        thermal=thermal,
         zero_is_uncalibrated=True,
         rivals=await read_rivals(parameters),
     )

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from companion.autopilot.firmware import ardupilot, px4
+from companion.autopilot.firmware import ardupilot, ardupilot_tcal, px4
 from companion.autopilot.firmware.imu_calibration import (
     MAX_ACCEL_OFFSET_M_S2,
     MAX_ACCEL_RESIDUAL_M_S2,
@@ -22,9 +22,11 @@ from companion.autopilot.firmware.imu_calibration import (
     rivals_of,
 )
 from companion.autopilot.firmware.px4 import SLOTS, SlotMemory
+from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.calibration.records.record import Outcome, WrittenParameter
+from companion.calibration.temperature.polynomial import Polynomial
 from companion.errors import AutopilotError
 from companion.samples import Triad
 
@@ -52,6 +54,25 @@ async def read_calibration(
     if firmware == "px4":
         return await px4.read_calibration(parameters, instance, memory or SlotMemory())
     raise AutopilotError("this autopilot is neither ArduPilot nor PX4; it is not supported")
+
+
+async def thermal_changes(
+    parameters: ParameterClient, calibration: ImuCalibration, gyro: Polynomial, degc: float
+) -> list[Change]:
+    """What to write so that a curve of the gyros is in force and the output at this temperature stays as it is.
+
+    Args:
+        parameters: of the autopilot.
+        calibration: in force.
+        gyro: in the IMU's axes, about 35 degC.
+        degc: of the IMU now.
+
+    Raises:
+        AutopilotError: this firmware has no temperature calibration, or as `ParameterClient.read`.
+    """
+    if parameters.vehicle.firmware == "ardupilot":
+        return await ardupilot_tcal.thermal_changes(parameters, calibration, gyro, degc)
+    raise AutopilotError("only ArduPilot's temperature calibration is written")
 
 
 def settle_s(firmware: Firmware | None) -> float:
@@ -90,8 +111,10 @@ GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
 ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
 ACCEL_SCALE: Final = Range(0.5, 2.0)
 """With others nothing is calibrated."""
-_CALTEMP: Final = Range(-300.0, 200.0, unit="deg C")
+_DEGC: Final = Range(-300.0, 200.0, unit="deg C")
 """-300: not known."""
+_TCAL: Final = Range(-1e6, 1e6)
+"""Millionths of rad/s or m/s^2 a kelvin, square kelvin, cubic kelvin."""
 _DEVICE_ID: Final = Range(0.0, 2.0**24, whole=True)
 _TRIM: Final = Range(-math.radians(10.0), math.radians(10.0), unit="rad")
 """ArduPilot cuts it off there."""
@@ -111,8 +134,11 @@ def _offsets(names: ImuParameters) -> dict[str, Range]:
 def _ardupilot() -> dict[str, Range]:
     found: dict[str, Range] = {}
     for names in map(ardupilot.parameters_of, ardupilot.INSTANCES):
-        # Its own gyro calibration, which we start, sets the last two: what it has overwritten is put back.
-        found |= {**_offsets(names), names.gyro_caltemp: _CALTEMP, names.gyro_id: _DEVICE_ID}
+        # Its own gyro calibration, which we start, sets CALTEMP and id: what it has overwritten is put back.
+        tcal = names.tcal
+        found |= {**_offsets(names), **dict.fromkeys(tcal.deciding, _TCAL)}
+        found |= dict.fromkeys((tcal.gyro_caltemp, tcal.accel_caltemp, tcal.low, tcal.high), _DEGC)
+        found |= {tcal.enable: _SWITCH, names.gyro_id: _DEVICE_ID}
     return found | dict.fromkeys(ardupilot.TRIM, _TRIM)
 
 

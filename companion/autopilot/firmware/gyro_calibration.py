@@ -78,11 +78,11 @@ async def read_gyro_parameters(parameters: ParameterClient) -> GyroParameters:
     if not present:
         raise AutopilotError("the autopilot has no gyro offsets")
     rest = await parameters.read_many(name for names in present.values() for name in names.gyro_offset[1:])
-    more = [name for names in present.values() for name in (names.gyro_caltemp, names.gyro_id, names.tcal_enable)]
+    more = [name for names in present.values() for name in (names.tcal.gyro_caltemp, names.gyro_id, names.tcal.enable)]
     found = await parameters.read_many(more, optional=True)
     if vehicle.boots != boots:
         raise AutopilotRebootedError(f"{vehicle.name} restarted while its gyro parameters were read")
-    tcal = tuple(names.tcal_enable for names in present.values() if found.get(names.tcal_enable))
+    tcal = tuple(names.tcal.enable for names in present.values() if found.get(names.tcal.enable))
     values = {name: value for name, value in {**first, **rest, **found}.items() if not name.endswith("_ENABLE")}
     gyros = tuple(number for number, names in present.items() if found.get(names.gyro_id, 1.0))
     return GyroParameters(values, gyros, tcal)

@@ -6,9 +6,9 @@ Per sample both firmwares compute, with R their rotation from the IMU's axes to 
     accel = R diag(accel_scale) (raw - accel_offset)
 
 so offsets live in the IMU's own axes, before scale and before rotation. A temperature calibration, where one is
-active, takes its part off `raw` first. The firmwares differ in the names of the parameters, in what R is made of and
-in what they do with a value: `ardupilot` and `px4` read, `firmwares` picks. What in the autopilot itself overwrites
-offsets of ours later is a `Rival`: found here, and said with what it does.
+active (`Thermal`), takes its part off `raw` first. The firmwares differ in the names of the parameters, in what R is
+made of and in what they do with a value: `ardupilot` and `px4` read, `firmwares` picks. What in the autopilot itself
+overwrites offsets of ours later is a `Rival`: found here, and said with what it does.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ from companion.autopilot.parameters.client import ParameterClient, read_integer
 from companion.autopilot.parameters.wire import float32, same_float32
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.calibration.solution.solve import ImuSolution
+from companion.calibration.temperature.polynomial import NOTHING, Polynomial
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, MG
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 
 Acts = Literal["at a start", "while still", "after a flight"]
 
@@ -167,6 +168,22 @@ class FarStep:
     scale: Vector
 
 
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Thermal:
+    """What a firmware's temperature calibration takes off the readings of one IMU, in the IMU's axes."""
+
+    enabled_by: str = ""
+    """The parameter that has switched it on; empty where it takes nothing off."""
+    values: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """What decides about it, by parameter, as far as it was read."""
+    gyro: Polynomial = NOTHING
+    accel: Polynomial = NOTHING
+
+    def taken_off(self, degc: float | None) -> tuple[Array, Array]:
+        """At a temperature, rad/s and m/s^2, (3,) each; where none is known, nothing."""
+        return (np.zeros(3), np.zeros(3)) if degc is None else (self.gyro.at(degc), self.accel.at(degc))
+
+
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ImuCalibration:
     """What the autopilot corrects one IMU with, as read."""
@@ -181,8 +198,8 @@ class ImuCalibration:
     accel_id: int | None
     orientation: Matrix
     """3x3, the IMU's axes to the vehicle's FRD: R."""
-    tcal_enable: int | None = None
-    """ArduPilot's temperature calibration; None where the firmware has none."""
+    thermal: Thermal = Thermal()
+    """What is taken off besides, by temperature."""
     zero_is_uncalibrated: bool = False
     """Three accelerometer offsets of exactly zero mean "not calibrated"."""
     far_step: FarStep | None = None
@@ -228,9 +245,15 @@ class ImuCalibration:
         scale = np.asarray(self.accel_scale if accel_scale is None else accel_scale, dtype=np.float64)
         return np.ones(3) if np.linalg.norm(scale - 1.0) <= self.scale_unused_within else scale
 
+    def thermal_change(self, triad: Triad, degc: float, then_degc: float) -> Array:
+        """By how much less the output of one half is at another temperature, by `thermal`, (3,), vehicle FRD."""
+        half = 0 if triad == "gyro" else 1
+        change = self.thermal.taken_off(then_degc)[half] - self.thermal.taken_off(degc)[half]
+        return self.orientation @ (change if triad == "gyro" else np.asarray(self.accel_scale) * change)
+
     def contradicts(self, values: Mapping[str, float]) -> bool:
-        """Whether one of these parameters is among the corrections and has another value there."""
-        known = self.corrections
+        """Whether one of these parameters corrects this IMU and has another value there."""
+        known = {**self.corrections, **self.thermal.values}
         return any(name in known and not same_float32(known[name], value) for name, value in values.items())
 
 
@@ -336,21 +359,27 @@ def output_step(
 
 
 def whole_bias(
-    calibration: ImuCalibration, gyro_residual_rad_s: Vector, accel_residual_m_s2: Vector
+    calibration: ImuCalibration,
+    gyro_residual_rad_s: Vector,
+    accel_residual_m_s2: Vector,
+    degc: float | None = None,
 ) -> tuple[Vector, Vector]:
-    """The sensor's whole bias: what it would show without any offset (its scale kept) minus truth, vehicle FRD.
+    """The sensor's whole bias: what it would show without any correction (its scale kept) minus truth, vehicle FRD.
 
-    residual + R gyro_offset, and residual + R diag(accel_scale) accel_offset.
+    residual + R (gyro_offset + gyro_thermal), and residual + R diag(accel_scale) (accel_offset + accel_thermal), at the
+    temperature of the residual.
     """
-    rotation = calibration.orientation
-    gyro = np.asarray(gyro_residual_rad_s) + rotation @ np.asarray(calibration.gyro_offset_rad_s)
-    return vector(gyro), vector(np.asarray(accel_residual_m_s2) + rotation @ accel_taken_off(calibration))
+    rotation, scale = calibration.orientation, np.asarray(calibration.accel_scale)
+    gyro, accel = calibration.thermal.taken_off(degc)
+    gyro = np.asarray(gyro_residual_rad_s) + rotation @ (gyro + calibration.gyro_offset_rad_s)
+    accel = np.asarray(accel_residual_m_s2) + rotation @ (scale * (accel + calibration.accel_offset_m_s2))
+    return vector(gyro), vector(accel)
 
 
 def whole_of(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:
-    """Whole gyro and accelerometer bias of an IMU whose owner subtracts offsets already."""
-    residuals = [(0.0, 0.0, 0.0) if one is None else _vector(one) for one in (found.gyro_rad_s, found.accel_m_s2)]
-    gyro, accel = map(np.array, whole_bias(calibration, *residuals))
+    """Whole gyro and accelerometer bias of an IMU whose owner corrects it already."""
+    rate, force = ((0.0, 0.0, 0.0) if one is None else _vector(one) for one in (found.gyro_rad_s, found.accel_m_s2))
+    gyro, accel = map(np.array, whole_bias(calibration, rate, force, found.temperature_degc))
     return gyro if found.gyro_rad_s is not None else None, accel if found.accel_m_s2 is not None else None
 
 

@@ -29,7 +29,7 @@ from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.job import BY_STANDS, Job
+from companion.daemon.job import NO_CALIBRATION, Job
 from companion.errors import AutopilotError, StorageError
 from companion.storage.state import BoundedList
 
@@ -164,7 +164,7 @@ class Automatic:
     # --- what comes of it
 
     def _on_ended(self, job: Job, result: JobResult) -> None:
-        if job.kind in BY_STANDS:
+        if job.kind in NO_CALIBRATION:
             return
         now_s = asyncio.get_running_loop().time()
         if job.kind == "undo":

@@ -16,7 +16,7 @@ from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.records.validity import Why
 from companion.component.service import JobResult
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.job import BY_STANDS, Job
+from companion.daemon.job import NO_CALIBRATION, Job
 
 logger = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ class OffsetWatch:
         self._written, self._failed = {}, result.outcome != "done"
         if job.kind == "undo":
             return
-        if not job.automatic and job.kind not in BY_STANDS:
+        if not job.automatic and job.kind not in NO_CALIBRATION:
             self.foreign = None
         if not self._failed and job.record is not None:
             self._asked_restart = job.reboot

@@ -13,6 +13,7 @@ from companion.calibration.records.history import Point, by_power_up
 from companion.calibration.solution.prior import curve_of
 from companion.calibration.temperature.curve import Curve
 from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.formats import Object
 from companion.physics.frames import vector
 from companion.physics.units import DEG_H
@@ -26,8 +27,8 @@ STEP_K: Final = 5.0
 class Curves:
     """Worked out anew whenever more is known."""
 
-    def __init__(self, core: Core) -> None:
-        self._profiles = core.profiles
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
+        self._profiles, self._imus = core.profiles, imus
         self._names = {imu.name for imu in core.config.imu}
         self._of: dict[tuple[str, Triad], Curve | None] = {}
 
@@ -51,11 +52,14 @@ class Curves:
     def drift(
         self, name: str, triad: Triad, degc: float | None, now_degc: float | None
     ) -> tuple[Vector, Vector] | None:
-        """By how much its bias has moved since it was so warm, rad/s or m/s^2, and its variance; None: not known."""
+        """By how much its output has moved since it was so warm, rad/s or m/s^2, and its variance; None: not known."""
         curve = self.of(name, triad)
         if curve is None or degc is None or now_degc is None:
             return None
         mean, variance = curve.change((degc, 0.0), (now_degc, 0.0))
+        calibration = self._imus[name].calibration if name in self._imus else None
+        if calibration is not None:  # which takes a part of it off by temperature itself
+            mean = mean - calibration.thermal_change(triad, degc, now_degc)
         return vector(mean), vector(variance)
 
     def shown(self, known: Mapping[str, KnownImu]) -> list[Object]:

@@ -31,7 +31,7 @@ from companion.calibration.solution.prior import (
 )
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.daemon.biases.curves import Curves
-from companion.daemon.biases.whose import Whose, changed
+from companion.daemon.biases.whose import Whose, as_kept, changed
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensors import SerialSensor
@@ -68,7 +68,7 @@ class BiasMemory:
         self._config, self._profiles, self._offload = core.config, core.profiles, core.offload
         self._imus, self._alignment = imus, used
         self.whose = Whose(core, imus, sensors, used)
-        self.curves = Curves(core)
+        self.curves = Curves(core, imus)
         self._store = BiasStore(core.config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], _Reference] = {}
@@ -76,7 +76,7 @@ class BiasMemory:
 
     def load(self) -> None:
         """Read what was kept before this start; blocking."""
-        self._known = self._store.read()
+        self._known = {name: as_kept(known) for name, known in self._store.read().items()}
         self.curves.follow(self._known)
 
     # --- before a result is used
@@ -255,7 +255,8 @@ class BiasMemory:
         return known.identity == self.whose.identity(name, known.identity)
 
     def temperature(self) -> list[Object]:
-        """For `companion temperature`."""
+        """For `companion temperature`; blocking."""
+        self.curves.follow(dict(self._known))
         return self.curves.shown(self._known)
 
     def _reference(self, name: str, triad: Triad) -> Point | None:

@@ -160,14 +160,36 @@ class Conductor:
             return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
         if self._on_deck:
             return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
+        what = What.BOTH if kind == ALIGNMENT else What.ACCELEROMETERS
+        return self.start_job(kind, what, requester, timeout_s, missing, run)
+
+    def start_job(
+        self,
+        kind: str,
+        what: What,
+        requester: str,
+        timeout_s: float,
+        missing: str | None,
+        run: Callable[[Job], Awaitable[str]],
+    ) -> Job | Refusal:
+        """Start what is no calibration, or say why not.
+
+        Args:
+            kind: one of `NO_CALIBRATION`.
+            what: which biases it is about.
+            requester: for the log.
+            timeout_s: for what waits for stillness.
+            missing: why it cannot be done on this aircraft, if so.
+            run: does it, and says in words what came of it.
+        """
         if (refusal := self._refusal(requester, missing)) is not None:
             return refusal
-        what = What.BOTH if kind == ALIGNMENT else What.ACCELEROMETERS
         job = Job(kind, what, requester, asyncio.get_running_loop().time() + timeout_s)
 
         async def work() -> None:
             result = await _result(job, run(job))
             await self._by_hand.keep(job, result)
+            self._collector.retarget(self._wanted.settings)
             self._end(job, result)
 
         return self._start(job, Event.REQUEST, work())

@@ -12,6 +12,7 @@ from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.calibration.records.record import Record
 from companion.calibration.request import What, is_time_limit
 from companion.component.service import Refusal
+from companion.daemon.biases.into_autopilot import IntoAutopilot
 from companion.daemon.biases.memory import BiasMemory
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.course import Course, Solving
@@ -20,7 +21,7 @@ from companion.daemon.calibrating.solver import Solver
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.job import Job
+from companion.daemon.job import TEMPERATURE, Job
 from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.subsystem import Offsets
@@ -80,6 +81,7 @@ class Calibrating(Subsystem):
         turning = Turning(core, imus, stands, writes, levels, self.faces)
         self._results = Results(core, self.store, self.memory)
         self.by_hand = ByHand(core, imus)
+        self._into_autopilot = IntoAutopilot(core, imus, measuring, self.memory, offsets, conclusion)
         self.conductor = Conductor(
             core, course, aligner, facing, turning, offsets.recovery, self._results, self.by_hand
         )
@@ -135,8 +137,37 @@ class Calibrating(Subsystem):
             yield reply
         yield {"kind": "result", "record": msgspec.to_builtins(job.record)}
 
-    async def _temperature(self, _request: Object, _face: str) -> AsyncIterator[Object]:
-        yield {"kind": "result", "imus": await self._core.offload(self.memory.temperature)}
+    async def _temperature(self, request: Object, face: str) -> AsyncIterator[Object]:
+        """Show the curves, write them, or put back what was there before them."""
+        action, into = request.get("action"), self._into_autopilot
+        if action == "undo":
+            await self._hear()
+            if (why := into.why_no_undo()) is not None:
+                raise RequestRefusedError(Refusal("nothing_to_undo", why))
+            async for reply in self._undo(request, face):
+                yield reply
+        elif action == "write":
+            job = _accepted(
+                self.conductor.start_job(
+                    TEMPERATURE,
+                    What.GYROS,
+                    f"{face} temperature",
+                    ALIGN_TIMEOUT_S,
+                    into.why_not(),
+                    lambda job: into.run(job, overwrite=request.get("overwrite") is True),
+                )
+            )
+            async for reply in self._progress(job):
+                yield reply
+            result = job.finished.result()
+            yield {
+                "kind": "result",
+                "state": result.outcome,
+                "reason": result.reason,
+                "written": msgspec.to_builtins(job.product),
+            }
+        else:
+            yield {"kind": "result", "imus": await self._core.offload(self.memory.temperature)}
 
     async def _cancel(self, _request: Object, face: str) -> AsyncIterator[Object]:
         running = self.conductor.cancel(f"{face} cancel")
@@ -146,9 +177,7 @@ class Calibrating(Subsystem):
         yield {"kind": "result", "state": self.conductor.state.shown, "reason": reason}
 
     async def _undo(self, request: Object, face: str) -> AsyncIterator[Object]:
-        vehicle = self._core.vehicle
-        if vehicle.heartbeat_age_s is None:  # the daemon may have started just now
-            await comes(vehicle.found, HEARD_WITHIN_S)
+        await self._hear()
         job = _accepted(self.conductor.start_undo(f"{face} undo", force=request.get("force") is True))
         result = await asyncio.shield(job.finished)
         yield {
@@ -159,6 +188,11 @@ class Calibrating(Subsystem):
             "undone": None if job.undone is None else job.undone.step.shown(),
             "undoable": self._offsets.undoable(),
         }
+
+    async def _hear(self) -> None:
+        vehicle = self._core.vehicle
+        if vehicle.heartbeat_age_s is None:  # the daemon may have started just now
+            await comes(vehicle.found, HEARD_WITHIN_S)
 
     async def _align(self, request: Object, face: str) -> AsyncIterator[Object]:
         """Show, forget or measure the alignment."""

@@ -262,7 +262,7 @@ def same(one: ImuCalibration, other: ImuCalibration) -> bool:
     """Whether both correct the same sensors alike."""
     return (
         one.corrections == other.corrections
-        and one.tcal_enable == other.tcal_enable
+        and one.thermal == other.thermal
         and (one.gyro_id, one.accel_id) == (other.gyro_id, other.accel_id)
         and np.array_equal(one.orientation, other.orientation)
     )

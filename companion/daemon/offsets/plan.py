@@ -48,6 +48,13 @@ class Target:
     """Whether its output is in the telemetry that we collect."""
     read_m_s2: Vector = (0.0, 0.0, 0.0)
     """What its accelerometers read before; needed where scales are changed."""
+    unseen: tuple[Change, ...] = ()
+    """Changes that together leave the output as it is."""
+
+    @property
+    def all(self) -> tuple[Change, ...]:
+        """In the order of writing."""
+        return (*self.changes, *self.unseen)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -65,7 +72,7 @@ class Plan:
     @property
     def changes(self) -> tuple[Change, ...]:
         """All that we calibrate, in the order of writing."""
-        return tuple(change for target in self.targets for change in target.changes)
+        return tuple(change for target in self.targets for change in target.all)
 
     @property
     def gyros(self) -> tuple[Change, ...]:
@@ -81,7 +88,7 @@ class Plan:
         """Enter what became of the parameters."""
         for target in self.targets:
             kept = draft.written.setdefault(target.name, {})
-            kept.update({c.parameter: written[c.parameter] for c in target.changes if c.parameter in written})
+            kept.update({c.parameter: written[c.parameter] for c in target.all if c.parameter in written})
 
     def mark(self, draft: Draft, parameters: Collection[str], outcome: Outcome) -> None:
         """Change what was entered of these."""

@@ -1,0 +1,162 @@
+"""Curves of the gyros' biases over temperature into the autopilot's own temperature calibration, when asked to.
+
+The output at the temperature of that moment stays as it is, and that is what is looked at before it may stay.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.autopilot.firmware.firmwares import thermal_changes
+from companion.autopilot.firmware.imu_calibration import Thermal
+from companion.autopilot.parameters.wire import same_float32
+from companion.calibration.machine import Event
+from companion.calibration.means.windows import ImuWindow, Window
+from companion.calibration.solution.draft import Draft
+from companion.calibration.solution.solve import ImuSolution
+from companion.calibration.temperature.polynomial import of_curve
+from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
+from companion.daemon.biases.memory import BiasMemory
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import CurvesWritten, Job
+from companion.daemon.offsets.conclusion import Conclusion
+from companion.daemon.offsets.plan import Plan, Target
+from companion.daemon.offsets.push import WATCHING
+from companion.daemon.offsets.subsystem import Offsets
+from companion.daemon.stands.measuring import Measuring
+from companion.errors import CalibrationRefusedError
+from companion.storage.changes import BY_TEMPERATURE
+
+
+class _Found(NamedTuple):
+    """What is to be written."""
+
+    targets: tuple[Target, ...]
+    words: tuple[str, ...]
+    """By IMU."""
+    left: tuple[str, ...]
+    """Why others are left as they are."""
+
+
+class IntoAutopilot:
+    """Writes them; all or nothing."""
+
+    def __init__(
+        self,
+        core: Core,
+        imus: Mapping[str, AutopilotImu],
+        measuring: Measuring,
+        memory: BiasMemory,
+        offsets: Offsets,
+        conclusion: Conclusion,
+    ) -> None:
+        self._core, self._imus, self._measuring, self._memory = core, imus, measuring, memory
+        self._pusher, self._ledger, self._conclusion = offsets.pusher, offsets.ledger, conclusion
+
+    def why_not(self) -> str | None:
+        """Why nothing could be written; None where all is well."""
+        if not self._imus:
+            return "there is no IMU of the autopilot: none is configured"
+        return None if self._core.wanted.push else "nothing is written while push.parameters is false"
+
+    def why_no_undo(self) -> str | None:
+        """Why curves cannot be put back now; None where the latest write is of them."""
+        steps = self._ledger.steps(self._core.vehicle.system_id)
+        after = [step.origin.what or "a write" for step in steps]
+        if BY_TEMPERATURE not in after:
+            return "no curve was written that could be undone"
+        later = after[: after.index(BY_TEMPERATURE)]
+        return None if not later else f"written since: {', '.join(later)}; companion undo puts that back first"
+
+    async def run(self, job: Job, *, overwrite: bool) -> str:
+        """Measure, write and look; returns in words what was written.
+
+        Args:
+            job: what is told of it.
+            overwrite: also where the autopilot has a temperature calibration that is not ours.
+
+        Raises:
+            CompanionError: it failed, and why; the old values are back, or it is said which are not.
+            JobCancelledError: cancelled; likewise.
+        """
+        draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._core.vehicle.system_id)
+        await self._core.offload(self._memory.temperature)
+        self._measuring.begin()
+        window = await self._measuring.measure(job)
+        if not await self._pusher.offsets_still_hold():
+            raise CalibrationRefusedError("the autopilot's values were changed in between: try again")
+        job.progress(MEASURED_PERCENT, "reading the autopilot's temperature calibration")
+        found = await self._find(window, overwrite=overwrite)
+        if not found.targets:
+            raise CalibrationRefusedError("; ".join(found.left))
+        draft.warnings += found.left
+        if not any(target.all for target in found.targets):
+            self._core.machine.on(Event.NOTHING_TO_WRITE)
+            return "already in force"
+
+        def go_on(words: str) -> None:
+            job.check_cancelled()
+            job.progress(WRITTEN_PERCENT, words or WATCHING)
+
+        plan = await self._pusher.push(job, Plan(found.targets, self._core.vehicle.boots), window, draft, go_on)
+        await self._conclusion.conclude(job, plan, window, draft)
+        warnings = (*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each))
+        job.deliver(CurvesWritten(draft.written, warnings))
+        return f"written: {'; '.join(found.words)}"
+
+    async def _find(self, window: Window, *, overwrite: bool) -> _Found:
+        targets, words, left = [], [], []
+        for means in window.imus:
+            if means.name not in self._imus:
+                continue
+            imu, curve = self._imus[means.name], self._memory.curves.of(means.name, "gyro")
+            calibration, name, degc = imu.in_force, means.name, means.temperature_degc
+            if curve is None:
+                left.append(f"imu {name}: no curve yet (companion temperature)")
+            elif degc is None:
+                left.append(f"imu {name}: it tells no temperature now")
+            elif calibration.thermal.enabled_by and not overwrite and not self._is_ours(calibration.thermal):
+                left.append(
+                    f"imu {name}: {calibration.thermal.enabled_by} is on, and not by the companion: kept"
+                    " (companion temperature --overwrite replaces it)"
+                )
+            else:
+                polynomial = of_curve(curve, calibration.orientation)
+                changes = await thermal_changes(self._core.parameters, calibration, polynomial, degc)
+                kind = imu.stream.own_kind
+                targets.append(
+                    Target(name, calibration, (), _as_before(means), kind, watched=True, unseen=tuple(changes))
+                )
+                low, high = curve.span_degc
+                words.append(f"{name}, {low:.0f} to {high:.0f} degC")
+        return _Found(tuple(targets), tuple(words), tuple(left or ["no IMU of the autopilot was measured"]))
+
+    def _is_ours(self, thermal: Thermal) -> bool:
+        """Whether it is as our writes have left it."""
+        ours: dict[str, float | None] = {}
+        for step in reversed(self._ledger.steps(self._core.vehicle.system_id)):
+            if step.origin.what == BY_TEMPERATURE:
+                ours |= {one.parameter: one.after for one in step.changes}
+        found = [(ours[name], value) for name, value in thermal.values.items() if name in ours]
+        return bool(found) and all(after is not None and same_float32(after, now) for after, now in found)
+
+
+def _as_before(means: ImuWindow) -> ImuSolution:
+    """What its output must go on to read."""
+    sigma = np.concatenate([means.gyro_sigma_use_rad_s, means.accel_sigma_use_m_s2])
+    return ImuSolution(
+        name=means.name,
+        samples=means.samples,
+        temperature_degc=means.temperature_degc,
+        gyro_rad_s=np.zeros(3),
+        accel_m_s2=np.zeros(3),
+        gyro_sigma_stat_rad_s=np.array(means.gyro_sigma_stat_rad_s),
+        accel_sigma_stat_m_s2=np.array(means.accel_sigma_stat_m_s2),
+        covariance=np.diag(sigma**2),
+        warnings=(),
+    )
