@@ -88,11 +88,6 @@ class Truth(NamedTuple):
     """Specific force (n, 3): (0, 0, -g) when level at rest."""
 
 
-def warming(start_degc: float, end_degc: float, time_constant_s: float) -> Callable[[float], float]:
-    """A temperature that goes exponentially from one value to another, as a box that was just switched on."""
-    return lambda t_s: end_degc + (start_degc - end_degc) * math.exp(-max(t_s, 0.0) / time_constant_s)
-
-
 class VirtualAircraft:
     """The truth.
 

@@ -8,7 +8,7 @@ in time, the same for every reader and every sampling rate; only white noise and
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from sim.aircraft import Truth, VirtualAircraft
 from sim.earth import STANDARD_GRAVITY_M_S2, Array, mounting_matrix
+from sim.thermal import Curve, Piece
 
 DEG_H = math.radians(1.0) / 3600.0
 """rad/s per deg/h."""
@@ -44,7 +45,9 @@ class AxisNoise:
     walk: float = 0.0
     """K, unit / sqrt(s)."""
     per_kelvin: float = 0.0
-    """Bias per kelvin away from the reference temperature."""
+    """Bias per kelvin away from the reference temperature; one sigma of it where a piece is drawn."""
+    scatter: float = 0.0
+    """One sigma of the bias of a power-up about that of another, at one temperature."""
     step: float = 0.0
     """Quantisation of the output; 0 for floats."""
     limit: float = math.inf
@@ -60,14 +63,20 @@ class ImuSpec:
     accel: AxisNoise
     reference_degc: float = 25.0
 
+    def piece(self, random: np.random.Generator, usual: Array) -> Piece:
+        """One piece of it, with these usual biases (6,) and a curve of its own."""
+        scatter = np.repeat([self.gyro.scatter, self.accel.scatter], 3)
+        return Piece.drawn(random, usual, scatter, np.repeat([self.gyro.per_kelvin, self.accel.per_kelvin], 3))
 
-def _triad(*, white: float, floor: float, per_kelvin: float, step: float, limit: float) -> AxisNoise:
+
+def _triad(*, white: float, floor: float, per_kelvin: float, scatter: float, step: float, limit: float) -> AxisNoise:
     """Figures from an Allan floor, with K such that the walk reaches the floor at 1000 s (as the method assumes)."""
     return AxisNoise(
         white=white,
         flicker=floor / 0.664,
         walk=floor * math.sqrt(3.0 / 1000.0),
         per_kelvin=per_kelvin,
+        scatter=scatter,
         step=step,
         limit=limit,
     )
@@ -78,32 +87,43 @@ _G = STANDARD_GRAVITY_M_S2
 
 # Noise and floors: method section 2.2. Steps and ranges are the parts' usual digital formats; temperature figures of
 # the two Analog Devices parts, which are compensated inside, and the ADIS16405's accelerometer are assumptions.
+# Scatter: method section 1.3 for the ADIS16405, the others' is assumed.
 # VN-100: VectorNav's data sheet (0.0035 deg/s/rtHz, 5 to 7 deg/h, 0.14 mg/rtHz, 0.04 mg); its temperature is assumed.
 PARTS: dict[str, ImuSpec] = {
     "icm42688p": ImuSpec(
         name="icm42688p",
-        gyro=_triad(white=7.1 * DEG_H, floor=3 * DEG_H, per_kelvin=18 * DEG_H, step=_DPS / 262.4, limit=2000 * _DPS),
-        accel=_triad(white=49.5 * UG, floor=10 * UG, per_kelvin=0.15 * MG, step=_G / 32768, limit=16 * _G),
+        gyro=_triad(white=7.1 * DEG_H, floor=3 * DEG_H, per_kelvin=18 * DEG_H, scatter=30 * DEG_H,
+            step=_DPS / 262.4, limit=2000 * _DPS),
+        accel=_triad(white=49.5 * UG, floor=10 * UG, per_kelvin=0.15 * MG, scatter=0.5 * MG,
+            step=_G / 32768, limit=16 * _G),
     ),
     "bmi088": ImuSpec(
         name="bmi088",
-        gyro=_triad(white=35.6 * DEG_H, floor=2 * DEG_H, per_kelvin=54 * DEG_H, step=_DPS / 16.384, limit=2000 * _DPS),
-        accel=_triad(white=124 * UG, floor=20 * UG, per_kelvin=0.2 * MG, step=24 * _G / 32768, limit=24 * _G),
+        gyro=_triad(white=35.6 * DEG_H, floor=2 * DEG_H, per_kelvin=54 * DEG_H, scatter=60 * DEG_H,
+            step=_DPS / 16.384, limit=2000 * _DPS),
+        accel=_triad(white=124 * UG, floor=20 * UG, per_kelvin=0.2 * MG, scatter=1.0 * MG,
+            step=24 * _G / 32768, limit=24 * _G),
     ),
     "adis16470": ImuSpec(
         name="adis16470",
-        gyro=_triad(white=20.4 * DEG_H, floor=8 * DEG_H, per_kelvin=4 * DEG_H, step=0.0, limit=2000 * _DPS),
-        accel=_triad(white=63 * UG, floor=13 * UG, per_kelvin=0.02 * MG, step=0.0, limit=40 * _G),
+        gyro=_triad(white=20.4 * DEG_H, floor=8 * DEG_H, per_kelvin=4 * DEG_H, scatter=15 * DEG_H,
+            step=0.0, limit=2000 * _DPS),
+        accel=_triad(white=63 * UG, floor=13 * UG, per_kelvin=0.02 * MG, scatter=0.3 * MG,
+            step=0.0, limit=40 * _G),
     ),
     "adis16405": ImuSpec(
         name="adis16405",
-        gyro=_triad(white=120 * DEG_H, floor=25 * DEG_H, per_kelvin=36 * DEG_H, step=0.05 * _DPS, limit=300 * _DPS),
-        accel=_triad(white=350 * UG, floor=200 * UG, per_kelvin=0.3 * MG, step=3.33 * MG, limit=18 * _G),
+        gyro=_triad(white=120 * DEG_H, floor=25 * DEG_H, per_kelvin=36 * DEG_H, scatter=70 * DEG_H,
+            step=0.05 * _DPS, limit=300 * _DPS),
+        accel=_triad(white=350 * UG, floor=200 * UG, per_kelvin=0.3 * MG, scatter=1.6 * MG,
+            step=3.33 * MG, limit=18 * _G),
     ),
     "vn100": ImuSpec(
         name="vn100",
-        gyro=_triad(white=8.9 * DEG_H, floor=5 * DEG_H, per_kelvin=9 * DEG_H, step=0.0, limit=2000 * _DPS),
-        accel=_triad(white=99 * UG, floor=40 * UG, per_kelvin=0.05 * MG, step=0.0, limit=16 * _G),
+        gyro=_triad(white=8.9 * DEG_H, floor=5 * DEG_H, per_kelvin=9 * DEG_H, scatter=15 * DEG_H,
+            step=0.0, limit=2000 * _DPS),
+        accel=_triad(white=99 * UG, floor=40 * UG, per_kelvin=0.05 * MG, scatter=0.3 * MG,
+            step=0.0, limit=16 * _G),
     ),
     "white_only": ImuSpec(
         name="white_only", gyro=AxisNoise(white=7.1 * DEG_H), accel=AxisNoise(white=49.5 * UG)
@@ -207,7 +227,7 @@ class ImuModel:
     """One IMU on the aircraft. Vectors are in the IMU's own axes unless a name says otherwise.
 
     Reading = M (truth in sensor axes) + bias(t) + white noise, rounded to the step, cut at the limit; with
-    bias(t) = turn-on bias + flicker + walk + per_kelvin (T - T_ref) and M = scale and misalignment.
+    bias(t) = turn-on bias + flicker + walk + curve(T - T_ref) and M = scale and misalignment.
 
     Args:
         spec: a part of `PARTS`, by name or as a structure of your own.
@@ -217,6 +237,7 @@ class ImuModel:
         gyro_shear, accel_shear: how far x and y, x and z, y and z are from square.
         mounting_deg: roll, pitch, yaw of the sensor's axes seen from the vehicle's (a MAVLink rotation's angles).
         thermometer_off_k: what its own thermometer shows too much.
+        curve: of this piece, over the temperature; without one each axis moves as the part says a piece may.
     """
 
     def __init__(
@@ -225,8 +246,8 @@ class ImuModel:
         spec: ImuSpec | str = "icm42688p",
         *,
         seed: int = 0,
-        gyro_bias_rad_s: Sequence[float] = (0.0, 0.0, 0.0),
-        accel_bias_m_s2: Sequence[float] = (0.0, 0.0, 0.0),
+        gyro_bias_rad_s: Sequence[float] | Array = (0.0, 0.0, 0.0),
+        accel_bias_m_s2: Sequence[float] | Array = (0.0, 0.0, 0.0),
         gyro_scale: Sequence[float] = (0.0, 0.0, 0.0),
         accel_scale: Sequence[float] = (0.0, 0.0, 0.0),
         gyro_misalignment_rad: Sequence[float] = (0.0, 0.0, 0.0),
@@ -235,15 +256,17 @@ class ImuModel:
         accel_shear: Sequence[float] = (0.0, 0.0, 0.0),
         mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
         thermometer_off_k: float = 0.0,
+        curve: Curve | None = None,
     ) -> None:
         self.aircraft = aircraft
         self.spec = PARTS[spec] if isinstance(spec, str) else spec
         self.mounting = mounting_matrix(*mounting_deg)
         """Sensor to vehicle FRD."""
         self._turn_on = np.concatenate([gyro_bias_rad_s, accel_bias_m_s2]).astype(np.float64)
-        self._thermometer_off_k = thermometer_off_k
+        self.thermometer: Callable[[float], float] = lambda degc: degc + thermometer_off_k
+        """What it makes of the temperature; bad ones may be put in its place."""
         gyro, accel = self.spec.gyro, self.spec.accel
-        self._per_kelvin = np.repeat([gyro.per_kelvin, accel.per_kelvin], 3)
+        self.curve = curve or Curve((np.repeat([gyro.per_kelvin, accel.per_kelvin], 3),))
         self._white = np.repeat([gyro.white, accel.white], 3)
         self._slow = _SlowPath(
             np.repeat([gyro.flicker, accel.flicker], 3), np.repeat([gyro.walk, accel.walk], 3), [seed, 1]
@@ -270,7 +293,7 @@ class ImuModel:
 
     def temperature_degc(self, t_s: float) -> float:
         """What its own thermometer says."""
-        return self.aircraft.temperature_degc(t_s) + self._thermometer_off_k
+        return self.thermometer(self.aircraft.temperature_degc(t_s))
 
     def true_bias(self, t_s: float) -> Bias:
         """The additive bias now: turn-on, flicker, walk and temperature."""
@@ -336,14 +359,14 @@ class ImuModel:
 
     def _bias(self, t_s: Array) -> Array:
         thin = _thin(t_s)
-        kelvin = np.interp(t_s, thin, self.aircraft.temperatures_degc(thin)) - self.spec.reference_degc
-        out = self._turn_on + kelvin[:, None] * self._per_kelvin
+        degc = np.interp(t_s, thin, self.aircraft.temperatures_degc(thin - self.curve.lag_s))
+        out = self._turn_on + self.curve.at((degc - self.spec.reference_degc)[:, None])
         result: Array = out if self._slow.silent else out + self._slow.at(t_s)
         return result
 
     def _bias_at(self, t_s: float) -> Array:
-        kelvin = self.aircraft.temperature_degc(t_s) - self.spec.reference_degc
-        out = self._turn_on + kelvin * self._per_kelvin
+        degc = self.aircraft.temperature_degc(t_s - self.curve.lag_s)
+        out = self._turn_on + self.curve.at(degc - self.spec.reference_degc)
         return out if self._slow.silent else out + self._slow.at_one(t_s)
 
 

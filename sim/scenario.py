@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal
 
+import numpy as np
 from pygeomag.geomag import GeoMag
 
 from sim.aircraft import Pose, Site, VirtualAircraft
@@ -14,9 +15,10 @@ from sim.ardupilot.double import ArduPilotDouble
 from sim.devices import HMR3300, Gradienter, Law, SerialDevice
 from sim.families import fit, law_of, make
 from sim.firmware.double import AutopilotDouble
-from sim.imu_model import DEG_H, MG, ImuModel
+from sim.imu_model import DEG_H, MG, PARTS, ImuModel
 from sim.motions import Motion
 from sim.px4.double import PX4Double
+from sim.thermal import Board
 
 Firmware = Literal["ardupilot", "px4"]
 
@@ -78,6 +80,8 @@ def demo(
     board_deg: tuple[float, float] = (0.0, 0.0),
     gradienter_offset_deg: tuple[float, float] = GRADIENTER_OFFSET_DEG,
     devices: tuple[str, str, str] = DEMO_DEVICES,
+    warms: tuple[float, float, float] | None = None,
+    power_up: int = 0,
 ) -> Scenario:
     """A small aircraft on uneven ground near Beijing, 40 N, 116 E, 50 m: pitch 5, roll -3, heading 40 degrees.
 
@@ -102,8 +106,15 @@ def demo(
         gradienter_offset_deg: what the gradienter shows too much, x and y.
         devices: families of IMU, gradienter and compass, by their names in `sim.families`; law and errors are those of
             the usual ones, any other has none.
+        warms: the air's temperature in degC, by how many kelvin the aircraft gets warmer by itself, and with which time
+            constant in s; then each IMU has a curve of its own over temperature, by the seed.
+        power_up: the same aircraft on another day: each has then other biases, about those usual ones.
     """
-    aircraft = VirtualAircraft(pose, site_at(40.0, 116.0, 50.0, unix_s), motions=motions, unix_s=unix_s)
+    air_degc, rise_k, time_constant_s = warms or (25.0, 0.0, 1.0)
+    temperature_degc = Board(rise_k, time_constant_s).switched_on(air_degc)
+    aircraft = VirtualAircraft(
+        pose, site_at(40.0, 116.0, 50.0, unix_s), motions=motions, temperature_degc=temperature_degc, unix_s=unix_s
+    )
 
     def imu(
         number: int,
@@ -113,14 +124,19 @@ def demo(
         mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
         scale: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> ImuModel:
+        usual = np.concatenate([np.multiply(rates_deg_h, DEG_H), np.multiply(forces_mg, MG)])
+        piece = PARTS[name].piece(np.random.default_rng([seed, number]), usual)
+        if power_up:
+            usual = piece.turned_on(np.random.default_rng([seed, number, power_up]))
         return ImuModel(
             aircraft,
             name,
-            seed=seed * 10 + number,
-            gyro_bias_rad_s=[value * DEG_H for value in rates_deg_h],
-            accel_bias_m_s2=[value * MG for value in forces_mg],
+            seed=(seed + 1000 * power_up) * 10 + number,
+            gyro_bias_rad_s=usual[:3],
+            accel_bias_m_s2=usual[3:],
             accel_scale=scale,
             mounting_deg=mounting_deg,
+            curve=piece.curve if warms is not None else None,
         )
 
     board = (*board_deg, 0.0)

@@ -51,6 +51,15 @@ def parser() -> argparse.ArgumentParser:
     ):
         command = commands.add_parser(name, help=text, description=text)
         add_world_options(command)
+        command.add_argument(
+            "--warms", type=float, nargs=3, metavar=("AIR", "RISE", "SECONDS"),
+            help="air at so many degC, in which it gets so many kelvin warmer by itself, with that time constant; its"
+            " IMUs have curves over temperature, by the seed (default: 25 degC, and nothing warms)",
+        )  # fmt: skip
+        command.add_argument(
+            "--power-up", type=int, default=0, metavar="N",
+            help="the same aircraft switched on another day: its biases are off by what its parts scatter (default 0)",
+        )  # fmt: skip
         if name != "autopilot":
             tables: tuple[Iterable[str], ...] = (IMUS, GRADIENTERS, COMPASSES)
             for role, table, usual in zip(Devices._fields, tables, DEMO_DEVICES, strict=True):
@@ -247,6 +256,8 @@ def main(argv: Sequence[str]) -> int:
         gyr_cal_at_boot=autopilot and arguments.gyr_cal,
         firmware=arguments.firmware if autopilot else "ardupilot",
         devices=(arguments.imu, arguments.gradienter, arguments.compass) if devices else DEMO_DEVICES,
+        warms=arguments.warms,
+        power_up=arguments.power_up,
     )
     directory: Path | None = None
     made_here = devices and arguments.dir is None

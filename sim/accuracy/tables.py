@@ -100,8 +100,8 @@ def report(
         found["by-hand"] = by_hand_table.section(many(by_hand, boards, jobs), each)
     if "power-up" in only:
         each = max(runs // 20, 1)
-        progress(f"power-up: {each} aircraft of each of {len(temperature.SCATTER)} parts")
-        days = [(part, seed, number) for part in temperature.SCATTER for number in range(each)]
+        progress(f"power-up: {each} aircraft of each of {len(temperature.TRIED)} parts")
+        days = [(part, seed, number) for part in temperature.TRIED for number in range(each)]
         found["power-up"] = temperature.section(many(temperature.power_up, days, jobs), each)
     if "paper" in only:
         found["paper"] = _paper(errata(seed, 400))

@@ -1,7 +1,7 @@
 """Aircraft that are switched on day after day at other temperatures: what is known of the gyros at the next power-up.
 
-Each has one curve over temperature, a die that is behind its thermometer, and an offset of its own at every power-up;
-each day it warms up by itself and stands still now and then. The days are means of still seconds, drawn directly.
+Pieces and boards are those of `sim.thermal`; each day one warms up and stands still now and then. The days are means of
+still seconds, drawn directly.
 """
 
 from __future__ import annotations
@@ -18,18 +18,17 @@ from companion.calibration.solution.prior import Now, expect, pose_effect
 from sim.accuracy.figures import Claim, Section, covered, rms
 from sim.earth import Array
 from sim.imu_model import DEG_H, PARTS, AxisNoise
+from sim.thermal import Board, Piece
 
 DAYS: Final = 20
-SCATTER: Final = {"icm42688p": 30.0, "bmi088": 60.0, "adis16405": 70.0}
-"""From one power-up to the next at one temperature, deg/h, the wandering within each included; the ADIS16405's by
-method section 1.3, the others are assumed."""
+TRIED: Final = ("icm42688p", "bmi088", "adis16405")
+"""Their scatter includes the wandering within each power-up."""
 AMBIENT_DEGC: Final = (5.0, 40.0)
 SESSION_S: Final = (300.0, 900.0)
 AT_MOST: Final = 1.3
 COVERS: Final = (93.0, 98.0)
 TCAL_K: Final = 10.0
 """ArduPilot's own calibration over temperature wants at least this."""
-REFERENCE_DEGC: Final = 25.0
 _SHORTEST_S: Final = 3
 _THERMOMETER_K: Final = 0.05
 _TAUS_S: Final = 3.0 ** np.arange(8.0)
@@ -59,33 +58,29 @@ class _Day:
 
 
 class _Aircraft:
-    def __init__(self, noise: AxisNoise, scatter: float, random: np.random.Generator) -> None:
+    def __init__(self, noise: AxisNoise, random: np.random.Generator) -> None:
         self._noise, self._random = noise, random
         self._flicker_sigma = noise.flicker * math.sqrt(math.log(3.0) / math.pi)
-        wander = len(_TAUS_S) * self._flicker_sigma**2
-        assert scatter**2 > wander
-        self._scatter = math.sqrt(scatter**2 - wander)
-        slope = noise.per_kelvin
-        self._curve = random.normal(0.0, (slope, slope / 40.0, slope / 1600.0), (3, 3))
-        self._lag_s, self._slow_s = random.uniform(5.0, 30.0), random.uniform(100.0, 600.0)
-        self._rise_k = random.uniform(10.0, 25.0)
-        self._usual = random.normal(0.0, 1000.0 * DEG_H, 3)
+        offset = math.sqrt(noise.scatter**2 - len(_TAUS_S) * self._flicker_sigma**2)
+        usual = random.normal(0.0, 1000.0 * DEG_H, 3)
+        self._piece = Piece.drawn(random, usual, np.full(3, offset), np.full(3, noise.per_kelvin))
+        self._board = Board.drawn(random)
 
     def day(self) -> _Day:
         random, count = self._random, int(self._random.uniform(*SESSION_S))
-        offset = self._usual + random.normal(0.0, self._scatter, 3)
+        turned_on = self._piece.turned_on(random)
         # Three times in ten it is switched on again while it is warm.
         cold = 1.0 if random.random() < 0.7 else random.uniform()
-        left = self._rise_k * cold * np.exp(-np.arange(count) / self._slow_s)
-        degc, k_s = random.uniform(*AMBIENT_DEGC) + self._rise_k - left, left / self._slow_s
-        die = degc - self._lag_s * k_s - REFERENCE_DEGC
-        bias = offset + np.stack([die, die**2, die**3], axis=1) @ self._curve.T + self._flicker(count)
+        temperature = self._board.switched_on(random.uniform(*AMBIENT_DEGC), cold)
+        curve = self._piece.curve
+        degc, die = (np.array([temperature(second - late) for second in range(count)]) for late in (0.0, curve.lag_s))
+        bias = turned_on + curve.at((die - PARTS[TRIED[0]].reference_degc)[:, None]) + self._flicker(count)
         still, second = np.zeros(count, dtype=bool), int(random.uniform(5.0, 60.0))
         while second < count:
             length = int(random.uniform(5.0, 120.0))
             still[second : second + length] = True
             second += length + int(random.uniform(5.0, 60.0))
-        return _Day(degc + random.normal(0.0, _THERMOMETER_K, count), k_s, bias, still)
+        return _Day(degc + random.normal(0.0, _THERMOMETER_K, count), np.gradient(degc), bias, still)
 
     def _flicker(self, count: int) -> Array:
         """Of many time constants: Gauss-Markov processes that add up to it."""
@@ -131,8 +126,8 @@ class _Aircraft:
 def power_up(part: str, seed: int, number: int) -> PowerUpRun:
     """One aircraft of a part: twenty days, and what is known when it is switched on again."""
     random = np.random.default_rng([seed, number])
-    scatter = SCATTER[part] * DEG_H
-    aircraft = _Aircraft(PARTS[part].gyro, scatter, random)
+    scatter = PARTS[part].gyro.scatter
+    aircraft = _Aircraft(PARTS[part].gyro, random)
     known: tuple[Point, ...] = ()
     once: list[Point] = []
     for day in range(DAYS):
@@ -148,7 +143,6 @@ def power_up(part: str, seed: int, number: int) -> PowerUpRun:
         unix_s=86400.0 * DAYS,
         power_up=PowerUp(host="today", since_unix_s=86400.0 * DAYS),
         temperature_degc=float(today.degc[0]),
-        k_s=float(today.k_s[0]),
         up=_UP,
         gravity_m_s2=9.8,
         zero=None,
@@ -191,7 +185,8 @@ def section(runs: list[PowerUpRun], each: int) -> Section:
     ]
     figures: dict[str, Any] = {}
     claims = []
-    for k, (part, scatter) in enumerate(SCATTER.items()):
+    for k, part in enumerate(TRIED):
+        scatter = PARTS[part].gyro.scatter / DEG_H
         own = runs[each * k : each * (k + 1)]
         error, sigma, last, tcal = (
             np.array([getattr(run, n) for run in own]) for n in ("error", "sigma", "last", "tcal")

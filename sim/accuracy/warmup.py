@@ -27,9 +27,9 @@ from sim.accuracy.stand import (
     solved,
     stand,
 )
-from sim.aircraft import warming
 from sim.earth import Array
 from sim.imu_model import DEG_H, PARTS, UG
+from sim.thermal import warming
 
 NEXT_MINUTE_S: Final = 60.0
 WARMING: Final = ("adis16405", "icm42688p", "bmi088", "vn100")

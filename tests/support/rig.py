@@ -23,6 +23,7 @@ from sim.flight import MovingAircraft, Route
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.px4.double import PX4Double
 from sim.scenario import site_at
+from sim.thermal import Curve
 from tests.support.component import Ground
 from tests.support.wire import Wire
 
@@ -84,7 +85,8 @@ class Rig:
     """One aircraft, its autopilot, its devices, the daemon, and a ground station behind the autopilot.
 
     Nothing calibrates by itself unless `at_arm` says so: most tests ask for what they look at. Its IMUs are slower than
-    most: what hangs on a rate says so itself, and every other test is as good at a quarter of the work.
+    most: what hangs on a rate says so itself, and every other test is as good at a quarter of the work. `curve` is of
+    the autopilot's first IMU.
     """
 
     def __init__(
@@ -116,11 +118,17 @@ class Rig:
         recordings_mb: int = 0,
         route: Route | None = None,
         site: Site | None = None,
+        temperature_degc: float | Callable[[float], float] = 25.0,
+        curve: Curve | None = None,
         **autopilot: Any,
     ) -> None:
         self.imu_rate_hz, self.feed_s = imu_rate_hz if baud is None else None, feed_s
         self.site: Site = site or site_at(40.0, 116.0, 50.0)
-        self.aircraft = VirtualAircraft(pose, self.site) if route is None else MovingAircraft(route, pose, self.site)
+        self.aircraft = (
+            VirtualAircraft(pose, self.site, temperature_degc=temperature_degc)
+            if route is None
+            else MovingAircraft(route, pose, self.site)
+        )
         self.model = ImuModel(
             self.aircraft,
             part,
@@ -130,6 +138,7 @@ class Rig:
             mounting_deg=mounting_deg,
             thermometer_off_k=THERMOMETER_OFF_K,
             accel_scale=accel_scale,
+            curve=curve,
         )
         if firmware == "px4":
             # Nobody looks at them, and half of the time goes there; but they are what a serial line has to carry.

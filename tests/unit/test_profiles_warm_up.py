@@ -12,9 +12,10 @@ import pytest
 from companion.calibration.noise.allan import WARM_UP, WARM_UP_K, noise_profile
 from companion.cli import main as companion
 from companion.storage.profiles import ProfileStore
-from sim.aircraft import VirtualAircraft, warming
+from sim.aircraft import VirtualAircraft
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG, ImuModel
+from sim.thermal import warming
 
 TAU_S = 300.0
 

@@ -11,6 +11,8 @@ import pytest
 from sim.aircraft import Pose, VirtualAircraft
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG, PARTS, AxisNoise, ImuModel, ImuSpec
+from sim.scenario import demo
+from sim.thermal import Board, Curve
 from tests.support.extent import extent
 
 
@@ -135,3 +137,36 @@ def test_a_bias_too_far_back_is_refused_not_invented() -> None:
     imu.true_bias(6.0 * 3600.0)
     with pytest.raises(ValueError, match="no longer kept"):
         imu.true_bias(1.0)
+
+
+def test_a_piece_follows_its_own_curve_and_the_die_is_as_warm_as_its_thermometer_was_before() -> None:
+    board = Board(rise_k=20.0, time_constant_s=300.0)
+    temperature = board.switched_on(5.0)
+    assert [temperature(t_s) for t_s in (0.0, 1e6)] == pytest.approx([5.0, 25.0])
+    assert board.switched_on(5.0, cold=0.0)(0.0) == pytest.approx(25.0)
+    powers = tuple(np.full(6, value) for value in (2.0, 0.1, -0.003))
+    imu = ImuModel(
+        VirtualAircraft(temperature_degc=temperature), "perfect", thermometer_off_k=0.5, curve=Curve(powers, lag_s=20.0)
+    )
+    for t_s in (0.0, 20.0, 320.0):
+        kelvin = 25.0 - 20.0 * math.exp(-max(t_s - 20.0, 0.0) / 300.0) - 25.0
+        expected = 2.0 * kelvin + 0.1 * kelvin**2 - 0.003 * kelvin**3
+        assert imu.true_bias(t_s).gyro_rad_s == pytest.approx([expected] * 3)
+        assert imu.mean_bias(t_s, t_s).accel_m_s2 == pytest.approx([expected] * 3)
+        assert imu.temperature_degc(t_s) == pytest.approx(temperature(t_s) + 0.5)
+
+
+def test_power_ups_scatter_about_what_is_usual_for_a_piece_and_its_curve_stays() -> None:
+    random = np.random.default_rng(3)
+    usual = np.arange(6.0)
+    pieces = [PARTS["bmi088"].piece(random, usual) for _ in range(200)]
+    slopes = np.array([piece.curve.powers[0] for piece in pieces])
+    assert slopes.std(axis=0) == pytest.approx([54.0 * DEG_H] * 3 + [0.2 * MG] * 3, rel=0.2)
+    biases = np.array([pieces[0].turned_on(random) for _ in range(400)])
+    assert biases.std(axis=0) == pytest.approx([60.0 * DEG_H] * 3 + [1.0 * MG] * 3, rel=0.15)
+    assert biases.mean(axis=0) - usual == pytest.approx(np.zeros(6), abs=0.2 * MG)
+    one, again = (demo(warms=(5.0, 20.0, 300.0), power_up=day) for day in (1, 2))
+    first, second = (world.flight_controller_imus[0] for world in (one, again))
+    assert first.temperature_degc(0.0) == 5.0
+    assert np.array_equal(first.curve.powers, second.curve.powers)
+    assert (first.true_bias(0.0).gyro_rad_s != second.true_bias(0.0).gyro_rad_s).all()

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim.aircraft import Pose, Site, VirtualAircraft, warming
+from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.devices import Gradienter
 from sim.earth import body_from_ned, earth_rate_ned_rad_s, mounting_matrix, normal_gravity_m_s2
 from sim.motions import Handling, Knock, Motion, SlowTurn, Turn, Vibration
+from sim.thermal import warming
 
 CASES: list[dict[str, Any]] = json.loads(
     (Path(__file__).parents[1] / "vectors" / "method.json").read_text(encoding="utf-8")

@@ -2,16 +2,17 @@
 
 The bias of power-up s at the temperature T is
 
-    o_s + c1 d + c2 d^2 + c3 d^3 + k dT/dt,    d = (T - 35 degC) / 20 K,
+    o_s + c1 d + c2 d^2 + c3 d^3,    d = (T - lag dT/dt - 35 degC) / 20 K,
 
-with an offset o_s of its own, scattered about a mean with the variance tau^2 (run to run), and one curve for all; k is
-the lag of the die behind its thermometer, by which heating and cooling differ. Generalised least squares over the
-means of still seconds at one temperature (`Node`): within a power-up its offset is free, between power-ups it is tau.
+with an offset o_s of its own, scattered about a mean with the variance tau^2 (run to run), and one curve for all; the
+die is as warm as its thermometer was `lag` before, by which heating and cooling differ. Generalised least squares over
+the means of still seconds at one temperature (`Node`): within a power-up its offset is free, between power-ups it is
+tau.
 The coefficients have a prior as wide as the catalogue's parts move, so that a curve that has seen little is uncertain
 where it has seen nothing.
 
-Each power-up in turn is foretold by the others, at its first node: that decides how many terms there are, and tau is
-such that those errors are as large as is said.
+Each power-up in turn is foretold by the others, at its first node: that decides the lag and how many terms there are,
+and tau is such that those errors are as large as is said.
 """
 
 from __future__ import annotations
@@ -29,10 +30,7 @@ from companion.samples import Vector
 
 REFERENCE_DEGC: Final = 35.0
 UNIT_K: Final = 20.0
-UNIT_K_S: Final = 1.0 / 60.0
-"""Of the terms: 20 K, and a kelvin a minute."""
-_LAG_K: Final = 0.5
-"""By so much the die is behind its thermometer at a kelvin a minute; one sigma."""
+LAGS_S: Final = (0.0, 10.0, 20.0, 30.0)
 VALID_K: Final = 3.0
 """How far beyond the temperatures seen the curve goes on (method section 3)."""
 FEWEST: Final = 3
@@ -45,7 +43,7 @@ _AT_LEAST: Final = 0.5
 _RANGE: Final = 18.0
 """Of the logarithm of the scatter's variance, about that of a kelvin."""
 _HALVINGS: Final = 25
-_PRIOR_K: Final = np.array([_LAG_K, UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
+_PRIOR_K: Final = np.array([UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
 """One sigma of each term's coefficient, in kelvin of what parts move."""
 
 
@@ -74,7 +72,8 @@ class Curve:
     """What the next power-up's bias will be.
 
     Attributes:
-        order: 0 a mean, 1 a line and so on; from 1 on with the lag.
+        order: 0 a mean, 1 a line and so on.
+        lag_s: of the die behind its thermometer.
         coefficients: mean and those of the terms, (1 + terms, 3).
         covariance: of these, for an axis that scatters as usual.
         widening: of each axis, (3,).
@@ -87,6 +86,7 @@ class Curve:
     """
 
     order: int
+    lag_s: float
     coefficients: Matrix
     covariance: Matrix
     widening: Array
@@ -103,11 +103,11 @@ class Curve:
 
     def at(self, degc: float, k_s: float = 0.0) -> tuple[Array, Array]:
         """Bias of the next power-up at a temperature and its variance, (3,) each; it ends where it is not valid."""
-        x = _with_one(self._row(self._inside(degc), k_s)[None])[0]
+        x = _with_one(self._row(degc, k_s)[None])[0]
         steepest = self.per_kelvin
         if self.order:
             low, high = self.span_degc
-            along = self._row(high, 0.0) - self._row(low, 0.0)
+            along = self._row(high) - self._row(low)
             steepest = max(steepest, float(np.abs(along @ self.coefficients[1:]).max()) / max(high - low, VALID_K))
         outside = (steepest * self.beyond_k(degc)) ** 2
         return x @ self.coefficients, self.scatter + float(x @ self.covariance @ x) * self.widening + outside
@@ -118,15 +118,13 @@ class Curve:
         Both are a temperature and how fast it rises, degC and K/s. Of a curve of order 1 and more.
         """
         outside = (self.per_kelvin * abs(self.beyond_k(now[0]) - self.beyond_k(then[0]))) ** 2
-        x = self._row(self._inside(now[0]), now[1]) - self._row(self._inside(then[0]), then[1])
+        x = self._row(*now) - self._row(*then)
         variance = float(x @ self.covariance[1:, 1:] @ x) * self.widening + outside
         return x @ self.coefficients[1:], variance
 
-    def _inside(self, degc: float) -> float:
-        return min(max(degc, self.span_degc[0] - VALID_K), self.span_degc[1] + VALID_K)
-
-    def _row(self, degc: float, k_s: float) -> Array:
-        return _terms(np.array([degc]), np.array([k_s]))[0, _of_order(self.order)]
+    def _row(self, degc: float, k_s: float = 0.0) -> Array:
+        die_degc = min(max(degc - self.lag_s * k_s, self.span_degc[0] - VALID_K), self.span_degc[1] + VALID_K)
+        return _terms(np.array([die_degc]))[0, : self.order]
 
 
 def fit(
@@ -142,12 +140,18 @@ def fit(
     """
     if len(power_ups) < FEWEST:
         return None
-    sums = _Sums.of(power_ups, in_run_variance)
     seen = [node.degc for one in power_ups for node in one.nodes]
-    best: Curve | None = None
-    for order in range(least_order, _MOST_ORDER + 1 if max(seen) > min(seen) else least_order + 1):
-        found = _Fit(sums, order, in_run_variance, per_kelvin).curve((min(seen), max(seen)))
-        if best is None or found.foretold < _BETTER * best.foretold:
+    span = min(seen), max(seen)
+    most = _MOST_ORDER if span[1] > span[0] else least_order
+    rates = any(node.k_s for one in power_ups for node in one.nodes)
+    lagging = [_Sums.of(power_ups, lag_s, in_run_variance) for lag_s in (LAGS_S if rates and most else LAGS_S[:1])]
+    fullest = [_Fit(sums, most, in_run_variance, per_kelvin).curve(span) for sums in lagging]
+    full = min(fullest, key=lambda curve: curve.foretold)
+    sums = lagging[fullest.index(full)]
+    fewer = [_Fit(sums, order, in_run_variance, per_kelvin).curve(span) for order in range(least_order, most)]
+    best, *more = *fewer, full
+    for found in more:
+        if found.foretold < _BETTER * best.foretold:
             best = found
     return best
 
@@ -156,28 +160,29 @@ def fit(
 class _Sums:
     """Of every power-up, axis 0, what least squares need of its nodes, for the largest model."""
 
+    lag_s: float
     variance: Floats
     """Of the weighted mean, (n,)."""
     common: Floats
     """(n,)."""
     mean: Floats
-    """Weighted mean of the terms, (n, 4)."""
+    """Weighted mean of the terms, (n, 3)."""
     bias: Floats
     """Likewise, (n, 3)."""
     normal: Floats
-    """About the means, (n, 4, 4)."""
+    """About the means, (n, 3, 3)."""
     right: Floats
-    """(n, 4, 3)."""
+    """(n, 3, 3)."""
     first: Floats
-    """Terms of the first node, (n, 4)."""
+    """Terms of the first node, (n, 3)."""
     first_bias: Floats
     first_variance: Floats
 
     @classmethod
-    def of(cls, power_ups: Sequence[PowerUpNodes], in_run_variance: float) -> _Sums:
+    def of(cls, power_ups: Sequence[PowerUpNodes], lag_s: float, in_run_variance: float) -> _Sums:
         rows = []
         for one in power_ups:
-            terms = _terms(np.array([node.degc for node in one.nodes]), np.array([node.k_s for node in one.nodes]))
+            terms = _terms(np.array([node.degc - lag_s * node.k_s for node in one.nodes]))
             bias = np.array([node.bias for node in one.nodes])
             variance = np.array([node.variance for node in one.nodes]) + in_run_variance
             share = 1.0 / variance
@@ -188,14 +193,14 @@ class _Sums:
                 1.0 / total, one.common_variance, mean, mean_bias,
                 about.T @ (terms - mean), about.T @ (bias - mean_bias), terms[0], bias[0], variance[0],
             ))  # fmt: skip
-        return cls(*(np.array(each) for each in zip(*rows, strict=True)))
+        return cls(lag_s, *(np.array(each) for each in zip(*rows, strict=True)))
 
 
 class _Fit:
     """One order."""
 
     def __init__(self, sums: _Sums, order: int, in_run_variance: float, per_kelvin: float) -> None:
-        some = _of_order(order)
+        some = slice(order)
         self._sums, self._order, self._in_run, self._per_kelvin = sums, order, in_run_variance, per_kelvin
         self._first, between = _with_one(sums.first[:, some]), _with_one(sums.mean[:, some])
         self._squares = between[:, :, None] * between[:, None, :]
@@ -217,6 +222,7 @@ class _Fit:
         widening = np.maximum(np.mean(np.square(error) / variance[:, None], axis=0), 1.0) * freedom / (freedom - 2.0)
         return Curve(
             order=self._order,
+            lag_s=self._sums.lag_s,
             coefficients=covariance @ right.sum(axis=0),
             covariance=covariance,
             widening=widening,
@@ -259,14 +265,10 @@ class _Fit:
         return self._sums.first_bias - said, variance
 
 
-def _terms(degc: Floats, k_s: Floats) -> Floats:
-    """Lag, line, square, cubic; (n, 4)."""
+def _terms(degc: Floats) -> Floats:
+    """Line, square, cubic; (n, 3)."""
     d = (degc - REFERENCE_DEGC) / UNIT_K
-    return np.stack([k_s / UNIT_K_S, d, d**2, d**3], axis=1)
-
-
-def _of_order(order: int) -> slice:
-    return slice(0, 1 + order if order else 0)
+    return np.stack([d, d**2, d**3], axis=1)
 
 
 def _with_one(terms: Floats) -> Floats:
