@@ -100,14 +100,16 @@ def test_heating_and_cooling_differ_by_the_lag_of_the_die() -> None:
     np.testing.assert_allclose(cooling - heating, 10.0 * 20.0 * 0.06, atol=2.0)
 
 
-def test_beyond_what_was_seen_it_ends_and_says_so() -> None:
+def test_beyond_what_was_seen_it_goes_straight_on_and_says_so() -> None:
     nodes, _ = part(np.random.default_rng(2), 10.0, (20.0,), 8)
     curve = fit(nodes, 1.0, PER_K)
     assert curve is not None
     low, high = curve.span_degc
     assert curve.beyond_k(high + 3.0) == curve.beyond_k(low - 3.0) == 0.0
     assert curve.beyond_k(high + 10.0) == pytest.approx(7.0)
-    assert (curve.at(high + 10.0)[0] == curve.at(high + 3.0)[0]).all()
+    steps = np.diff([curve.at(high + 3.0 + k)[0] for k in range(4)], axis=0)
+    np.testing.assert_allclose(steps, 20.0, atol=2.0)
+    np.testing.assert_allclose(steps[0], steps[2], rtol=1e-6)
     assert np.sqrt(curve.at(high + 10.0)[1]).min() > 7.0 * PER_K
 
 

@@ -33,7 +33,7 @@ class Stage:
         aircraft = options.pop("aircraft", None) or VirtualAircraft(POSE)
         spec, count = options.pop("spec", "white_only"), options.pop("imus", 1)
         imus = [
-            ImuModel(aircraft, spec, seed=n, gyro_bias_rad_s=GYRO_BIAS, accel_bias_m_s2=ACCEL_BIAS)  # type: ignore[arg-type]
+            ImuModel(aircraft, spec, seed=n, gyro_bias_rad_s=GYRO_BIAS, accel_bias_m_s2=ACCEL_BIAS)
             for n in range(count)
         ]
         options["parameters"] = {"INS_GYR_CAL": 0, **options.pop("parameters", {})}

@@ -102,7 +102,7 @@ class Curve:
         return max(self.span_degc[0] - VALID_K - degc, degc - self.span_degc[1] - VALID_K, 0.0)
 
     def at(self, degc: float, k_s: float = 0.0) -> tuple[Array, Array]:
-        """Bias of the next power-up at a temperature and its variance, (3,) each; it ends where it is not valid."""
+        """Bias of the next power-up at a temperature and its variance, (3,) each; straight on where it is not valid."""
         x = _with_one(self._row(degc, k_s)[None])[0]
         steepest = self.per_kelvin
         if self.order:
@@ -123,8 +123,11 @@ class Curve:
         return x @ self.coefficients[1:], variance
 
     def _row(self, degc: float, k_s: float = 0.0) -> Array:
-        die_degc = min(max(degc - self.lag_s * k_s, self.span_degc[0] - VALID_K), self.span_degc[1] + VALID_K)
-        return _terms(np.array([die_degc]))[0, : self.order]
+        die_degc = degc - self.lag_s * k_s
+        edge_degc = min(max(die_degc, self.span_degc[0] - VALID_K), self.span_degc[1] + VALID_K)
+        d = (edge_degc - REFERENCE_DEGC) / UNIT_K
+        straight_on = np.array([1.0, 2.0 * d, 3.0 * d * d]) * (die_degc - edge_degc) / UNIT_K
+        return (_terms(np.array([edge_degc]))[0] + straight_on)[: self.order]
 
 
 def fit(
