@@ -127,7 +127,7 @@ class Curve:
         edge_degc = min(max(die_degc, self.span_degc[0] - VALID_K), self.span_degc[1] + VALID_K)
         d = (edge_degc - REFERENCE_DEGC) / UNIT_K
         straight_on = np.array([1.0, 2.0 * d, 3.0 * d * d]) * (die_degc - edge_degc) / UNIT_K
-        return (_terms(np.array([edge_degc]))[0] + straight_on)[: self.order]
+        return np.asarray(_terms(np.array([edge_degc]))[0] + straight_on)[: self.order]
 
 
 def fit(
