@@ -53,7 +53,7 @@ def of_curve(curve: Curve, orientation: Matrix) -> Polynomial:
     """
     low, high = curve.span_degc
     terms = np.zeros((4, 3))
-    found = curve.coefficients[2:]
+    found = curve.coefficients[1:]
     terms[1 : 1 + len(found)] = found @ orientation / UNIT_K ** np.arange(1.0, 1.0 + len(found))[:, None]
     _, first, second, third = map(vector, terms)
     return Polynomial(coefficients=(ZERO, first, second, third), low_degc=low, high_degc=high)
