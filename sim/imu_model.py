@@ -7,9 +7,10 @@ in time, the same for every reader and every sampling rate; only white noise and
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -277,6 +278,13 @@ class ImuModel:
         self._ideal = np.zeros(6)
         self._gyro_matrix = _response(gyro_scale, gyro_misalignment_rad, gyro_shear) @ self.mounting.T
         self._accel_matrix = _response(accel_scale, accel_misalignment_rad, accel_shear) @ self.mounting.T
+
+    def in_steps(self, gyro_rad_s: float, accel_m_s2: float) -> ImuModel:
+        """The same sensor behind another converter, which takes its place: the two draw from the same noise."""
+        other, spec = copy.copy(self), self.spec
+        gyro, accel = replace(spec.gyro, step=gyro_rad_s), replace(spec.accel, step=accel_m_s2)
+        other.spec = replace(spec, gyro=gyro, accel=accel)
+        return other
 
     def turn_on(self, gyro_bias_rad_s: Sequence[float] | Array, accel_bias_m_s2: Sequence[float] | Array) -> None:
         """Another power-up: the bias begins elsewhere."""

@@ -15,7 +15,7 @@ import numpy as np
 from sim.aircraft import VirtualAircraft
 from sim.earth import body_from_ned
 from sim.imu_model import ImuModel
-from sim.sitl.hil_frames import Codec, on_fifo_grid, pressure_hpa
+from sim.sitl.hil_frames import FIFO_STEPS, Codec, on_fifo_grid, pressure_hpa
 from sim.sitl.samples import Sample, SampleBlocks
 
 FRAME_HZ = 250
@@ -54,7 +54,9 @@ class HilBackend:
         if not 1 <= len(imus) <= 2:
             raise ValueError(f"imus: found {len(imus)}; allowed: 1 or 2")
         self._aircraft = aircraft
-        self.blocks = SampleBlocks(aircraft, imus)
+        # Rounded once: a sensor's finer steps would all but fall on the middle between two of the firmware's.
+        first = imus[0].in_steps(FIFO_STEPS[0], FIFO_STEPS[3])
+        self.blocks = SampleBlocks(aircraft, [first, *imus[1:]])
         self._wanted_port = port
         declination = math.radians(aircraft.site.declination_deg)
         north, down = field_gauss

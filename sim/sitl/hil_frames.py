@@ -26,7 +26,7 @@ _ABOVE = 1e-3
 
 
 def on_fifo_grid(reading: Sequence[float]) -> list[float]:
-    """A reading of sensor 0 rounded to the firmware's steps, so that its cutting off changes nothing.
+    """A reading of sensor 0, in the firmware's steps already, put so that its cutting off changes nothing.
 
     A real sensor rounds. Left to the firmware, half a step (110 deg/h, 0.24 mg) would go missing on every axis, and
     the sensor's bias would not be the model's.

@@ -6,6 +6,7 @@ import asyncio
 import json
 import socket
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import Pose, VirtualAircraft
-from sim.imu_model import DEG_H, MG, ImuModel
+from sim.imu_model import DEG_H, MG, PARTS, ImuModel
 from sim.motions import Turn
 from sim.sitl.hil_backend import FRAME_HZ, HilBackend
 from sim.sitl.hil_frames import Codec, on_fifo_grid
@@ -251,10 +252,13 @@ def test_a_restarted_px4_begins_at_time_zero_again() -> None:
     asyncio.run(main())
 
 
-def test_sensor_0_has_the_models_mean_after_the_firmware_has_cut_it_to_16_bits() -> None:
+@pytest.mark.parametrize("part", ["white_only", "icm42688p"])
+def test_sensor_0_has_the_models_mean_after_the_firmware_has_cut_it_to_16_bits(part: str) -> None:
     aircraft = VirtualAircraft(TILTED)
-    imu = ImuModel(aircraft, "white_only", seed=2, gyro_bias_rad_s=[100 * DEG_H, -60 * DEG_H, 170 * DEG_H])
-    blocks = SampleBlocks(aircraft, [imu])
+    gyro, accel = (replace(triad, flicker=0.0) for triad in (PARTS[part].gyro, PARTS[part].accel))
+    steady = replace(PARTS[part], gyro=gyro, accel=accel)
+    imu = ImuModel(aircraft, steady, seed=2, gyro_bias_rad_s=[100 * DEG_H, -60 * DEG_H, 170 * DEG_H])
+    blocks = HilBackend(aircraft, [imu]).blocks
     rows = [on_fifo_grid(blocks.next(0.004, n * 0.004).readings[0]) for n in range(40_000)]
     sent = np.array(rows, dtype=np.float32)
     # The firmware divides in single precision by 2000/32768 deg/s and g/2048 and converts to int16.
