@@ -30,7 +30,7 @@ from sim.sitl.ground import GroundStation
 from sim.sitl.observe import residual
 from sim.sitl.residuals import ground_station
 from tests.sitl.craft import BINARIES, missing, world
-from tests.support.extent import LONG
+from tests.support.extent import extent
 
 MIDDLE_DEGC = 35.0
 CURVE = np.array([[30.0, -20.0, 12.0], [0.5, 0.8, -0.6], [0.02, -0.01, 0.03]])
@@ -143,7 +143,9 @@ def rms_over_ten_k(left: dict[float, Array]) -> dict[float, float]:
 
 
 @pytest.mark.sitl
-@pytest.mark.skipif(not LONG, reason="five warm-ups in real time take half an hour; TESTS=long does them")
+@pytest.mark.skipif(
+    not extent(whole=True, a_slice=False), reason="five warm-ups in real time take half an hour; TESTS=long does them"
+)
 def test_five_partial_warm_ups_leave_less_than_its_own_learner_does_after_one(tmp_path: Path) -> None:
     async def main() -> None:
         random = np.random.default_rng(17)
