@@ -123,12 +123,10 @@ class AttitudeEstimator:
     # ------------------------------------------------------------------------------------------------- alignment
 
     def align(self, t_s: float | None, body_from_ned: Matrix, covariance: Matrix) -> None:
-        """Begin from an attitude found otherwise: gradienter and compass (calibration.solve).
+        """Begin from an attitude (3, 3) that was found otherwise at `t_s`; None: at the next sample.
 
-        Args:
-            t_s: when it was so; None: at the next sample.
-            body_from_ned: (3, 3); any heading where none is known.
-            covariance: (3, 3) in NED, rad^2; (2, 2) at least `HEADING_UNKNOWN_RAD` squared where none is known.
+        Its covariance is (3, 3) in NED, rad^2. Where no heading is known any will do, with a variance of at least
+        `HEADING_UNKNOWN_RAD` squared.
         """
         ned_from_body = from_matrix(np.asarray(body_from_ned).T)
         self._strapdown.restart(multiply(ned_from_body, conjugate(self._sensor_from_vehicle)), t_s)

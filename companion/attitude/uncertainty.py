@@ -32,11 +32,8 @@ _BIAS_WANDERS_S: Final = 300.0
 class Uncertainty:
     """The covariance.
 
-    Args:
-        noise: of the gyro, rad/s.
-        bias_covariance: (3, 3) of the gyro bias that is subtracted, sensor axes, (rad/s)^2: sigma_use, not sigma_stat.
-        accel_sigma_m_s2: (3,) of the accelerometer bias that is subtracted; levels the aircraft wrongly for ever.
-        gravity_m_s2: local.
+    Of the gyro bias that is subtracted: (3, 3), sensor axes, (rad/s)^2, of sigma_use, not sigma_stat. The sigma (3,) of
+    the accelerometer bias levels the aircraft wrongly for ever.
     """
 
     def __init__(

@@ -16,12 +16,7 @@ _MOST_BYTES: Final = 4096
 
 
 class Asking:
-    """Asks on stdout, takes answers from stdin.
-
-    Args:
-        yes: ask nobody.
-        error: whether questions go to stderr, because stdout is for JSON.
-    """
+    """Asks on stdout, or on stderr where stdout is for JSON; takes answers from stdin. `yes`: nobody is asked."""
 
     def __init__(self, *, yes: bool, error: bool) -> None:
         self.yes, self._error = yes, error
@@ -37,12 +32,7 @@ class Asking:
     ) -> None:
         """Ask until `put` takes the answer; an empty one is what holds now. With `yes` that is taken, and said.
 
-        Args:
-            question: in words.
-            now: the answer that holds if none is given.
-            put: takes an answer; raises ConfigError, in one line, where it is none.
-            hint: what helps to answer.
-            choices: usual answers, for a page that makes buttons of them.
+        `put` raises ConfigError, in one line, where it is none; `choices` are for a page that makes buttons of them.
 
         Raises:
             CompanionError: there is nobody to answer any more, or, with `yes`, what holds now is no answer.

@@ -23,9 +23,7 @@ SHOWN_S: Final = 1.0
 class PageAsking(Asking):
     """Says all in the terminal too, asks on the page alone; an async context manager, which the page is there within.
 
-    Args:
-        bind: HOST:PORT of the page.
-        storage: the daemon's; its page takes the same token.
+    The storage is the daemon's, whose page takes the same token.
     """
 
     def __init__(self, bind: str, storage: Path) -> None:
@@ -35,7 +33,7 @@ class PageAsking(Asking):
         self._question: Object | None = None
         self._answered: asyncio.Future[str] | None = None
         self._number = 0
-        self._page = Page(bind, storage, self._take, self._status, _on_the_spot)
+        self._page = Page(bind, storage, self._take, self._status, asyncio.to_thread)
 
     async def __aenter__(self) -> Self:
         """Open the page.
@@ -104,7 +102,3 @@ class PageAsking(Asking):
         else:
             headline = {"word": "YOUR ANSWER", "reason": "", "tone": "wait"}
         return {"headline": headline, "setup": {"lines": self._lines, "question": question}}
-
-
-async def _on_the_spot(function: Callable[..., Any], *arguments: Any) -> Any:
-    return function(*arguments)

@@ -18,10 +18,7 @@ Object = dict[str, Any]
 async def request(options: argparse.Namespace, wanted: Object, at_interrupt: Object | None = None) -> Object:
     """Send a request, show its progress on stderr, return its last reply.
 
-    Args:
-        options: of the command line.
-        wanted: the request.
-        at_interrupt: what to ask at Ctrl-C, where it has begun: its reply is the last then. None: it is only left.
+    At Ctrl-C, where it has begun, `at_interrupt` is asked, and its reply is the last; None: it is only left.
     """
     reply: Object = {}
     shown = ""
@@ -177,22 +174,10 @@ async def align(options: argparse.Namespace) -> int:
     if reply["kind"] != "error":
         state = answer["state"].upper()
         lines = [f"{state}: {answer['reason']}" if answer["reason"] else state]
-        found = answer["alignment"]
-        if found:
-            lines += {"faces": faces_lines, "turn": turn_lines}.get(found["kind"], alignment_lines)(found)
+        lines += stands_lines(answer["alignment"]) if answer["alignment"] else []
         lines += sides_lines(answer.get("accelerometers", ()))
     good = answer.get("state") in ("done", "in force") or (action == "show" and answer.get("state") != "refused")
     return finish(options, reply, answer, lines, good=good)
-
-
-def faces_lines(record: Object) -> list[str]:
-    """Accelerometers as a person reads them: what was found, and what became of the parameters."""
-    lines = [f"measured {record['measured_at'][:19]} UTC in {len(record['stands'])} stands"]
-    for imu in record["imus"]:
-        lines.append(f"{imu['name']}: stands miss gravity by {imu['scatter_mg']:.2f} mg")
-        lines += [_figure_line(imu, key) for key in ("accel_bias_mg", "accel_scale", "accel_shear")]
-        lines += show.written_lines(imu["written"])
-    return lines + [f"warning: {words}" for words in record["warnings"]]
 
 
 def sides_lines(imus: Sequence[Object]) -> list[str]:
@@ -206,27 +191,6 @@ def sides_lines(imus: Sequence[Object]) -> list[str]:
     return lines
 
 
-def turn_lines(record: Object) -> list[str]:
-    """A turn without a gradienter as a person reads it."""
-    when, stands = record["measured_at"][:19], len(record["stands"])
-    lines = [f"measured {when} UTC in {stands} stands; the spot slopes by {record['slope_deg']:.2f} deg"]
-    for imu in record["imus"]:
-        lines.append(f"{imu['name']}:")
-        lines.append(
-            f"  {'bias when level':16} {'mg':6} {show.axes(imu['level_bias_mg'], imu['level_sigma_mg'], '+.3f')}"
-        )
-        lines += show.written_lines(imu["written"])
-    if (board := record["board"]) is not None:
-        roll, pitch = board["sigma_deg"]
-        lines.append(
-            f"the board of {board['imu']} sits at roll {board['roll_deg']:+.3f} +- {roll:.3f},"
-            f" pitch {board['pitch_deg']:+.3f} +- {pitch:.3f} deg"
-            + ("" if board["written"] else "; companion align turn --level tells it the autopilot")
-        )
-        lines += show.written_lines(board["written"])
-    return lines + [f"warning: {words}" for words in record["warnings"]]
-
-
 _FIGURES: Final = {
     "accel_bias_mg": ("accel bias", "mg", "+.3f", 1.0),
     "accel_scale": ("accel scale", "%", "+.4f", 0.01),
@@ -234,33 +198,44 @@ _FIGURES: Final = {
     "misalignment_deg": ("misalignment", "deg", "+.3f", 1.0),
     "gyro_bias_deg_h": ("gyro bias", "deg/h", "+.1f", 1.0),
 }
+_SHOWN: Final = {"faces": ("accel_bias_mg", "accel_scale", "accel_shear"), "turn": ()}
+"""Of other kinds all but the shear, as far as the stands tell."""
 
 
-def _figure_line(imu: Object, key: str) -> str:
-    words, unit, form, scale = _FIGURES[key]
-    return f"  {words:16} {unit:6} {show.axes(imu[key]['value'], imu[key]['sigma'], form, scale)}"
-
-
-def alignment_lines(record: Object) -> list[str]:
-    """An alignment as a person reads it: the zero, what it means, then each IMU, then what to copy."""
-    (x, y), sigma = record["offset_deg"], record["sigma_deg"]
-    when, stands, worth_mg = record["measured_at"][:19], len(record["stands"]), 1e3 * math.radians(sigma)
-    lines = [
-        f"measured {when} UTC in {stands} stands; the spot slopes by {record['slope_deg']:.2f} deg",
-        f"gradienter zero: x {x:+.4f} y {y:+.4f} deg, sigma {sigma:.4f} deg, {worth_mg:.2f} mg horizontally",
-    ]
+def stands_lines(record: Object) -> list[str]:
+    """What stands have told, as a person reads it: the spot, the zero, each IMU, the board, then what to copy."""
+    slope = f"; the spot slopes by {record['slope_deg']:.2f} deg" if "slope_deg" in record else ""
+    lines = [f"measured {record['measured_at'][:19]} UTC in {len(record['stands'])} stands{slope}"]
+    zero: list[str] = []
+    if "gradienter" in record:
+        (x, y), sigma, configured = record["offset_deg"], record["sigma_deg"], record["gradienter"]["offset_deg"]
+        worth_mg = 1e3 * math.radians(sigma)
+        lines.append(
+            f"gradienter zero: x {x:+.4f} y {y:+.4f} deg, sigma {sigma:.4f} deg, {worth_mg:.2f} mg horizontally"
+        )
+        zero = [
+            "in the configuration the same is said by these lines (then: companion align --forget):",
+            "    [gradienter]",
+            f"    offset_deg = [{configured[0] + x:.4f}, {configured[1] + y:.4f}]",
+            f"    sigma_deg = {sigma:.4f}",
+        ]
     for imu in record["imus"]:
-        lines.append(f"{imu['name']}:")
-        level = show.axes(imu["level_bias_mg"], imu["level_sigma_mg"], "+.3f")
-        lines.append(f"  {'bias when level':16} {'mg':6} {level}")
-        known = [key for key in _FIGURES if key != "accel_shear" and all(imu[key]["known"])]
-        lines += [_figure_line(imu, key) for key in known]
-    lines += [f"warning: {words}" for words in record["warnings"]]
-    configured = record["gradienter"]["offset_deg"]
-    lines += [
-        "in the configuration the same is said by these lines (then: companion align --forget):",
-        "    [gradienter]",
-        f"    offset_deg = [{configured[0] + x:.4f}, {configured[1] + y:.4f}]",
-        f"    sigma_deg = {sigma:.4f}",
-    ]
-    return lines
+        scatter = f" stands miss gravity by {imu['scatter_mg']:.2f} mg" if "scatter_mg" in imu else ""
+        lines.append(f"{imu['name']}:{scatter}")
+        if "level_bias_mg" in imu:
+            level = show.axes(imu["level_bias_mg"], imu["level_sigma_mg"], "+.3f")
+            lines.append(f"  {'bias when level':16} {'mg':6} {level}")
+        known = [key for key in _FIGURES if key != "accel_shear" and key in imu and all(imu[key]["known"])]
+        for key in _SHOWN.get(record["kind"], known):
+            words, unit, form, scale = _FIGURES[key]
+            lines.append(f"  {words:16} {unit:6} {show.axes(imu[key]['value'], imu[key]['sigma'], form, scale)}")
+        lines += show.written_lines(imu.get("written", {}))
+    if (board := record.get("board")) is not None:
+        roll, pitch = board["sigma_deg"]
+        lines.append(
+            f"the board of {board['imu']} sits at roll {board['roll_deg']:+.3f} +- {roll:.3f},"
+            f" pitch {board['pitch_deg']:+.3f} +- {pitch:.3f} deg"
+            + ("" if board["written"] else "; companion align turn --level tells it the autopilot")
+        )
+        lines += show.written_lines(board["written"])
+    return [*lines, *(f"warning: {words}" for words in record["warnings"]), *zero]

@@ -36,12 +36,7 @@ class _Place:
 
 
 class LimitedHandler(logging.StreamHandler[TextIO]):
-    """Writes what the budgets allow.
-
-    Args:
-        stream: where to.
-        clock: in seconds, never goes back.
-    """
+    """Writes what the budgets allow; the clock is in seconds and never goes back."""
 
     def __init__(self, stream: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(stream)
@@ -83,11 +78,7 @@ class JournalFormatter(OneLineFormatter):
 
 
 def set_up(level: str) -> None:
-    """Log to stderr from a level on.
-
-    Args:
-        level: debug, info, warning or error.
-    """
+    """Log to stderr from a level on: debug, info, warning or error."""
     handler = LimitedHandler(sys.stderr)
     if goes_to_journal(sys.stderr):
         handler.setFormatter(JournalFormatter("%(levelname)s %(message)s"))

@@ -44,7 +44,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--law", choices=("axis", "slope", "euler"), default="axis", help="of columns tilt_x, tilt_y (default axis)"
     )
     log.add_argument(
-        "--tilt-lag", type=within(0.0, 10.0), default=0.0, metavar="S", help="by which the tilt follows (default 0)"
+        "--tilt-lag",
+        type=within(0.0, 10.0),
+        default=0.0,
+        metavar="S",
+        dest="tilt_lag_s",
+        help="by which the tilt follows (default 0)",
     )
     log.add_argument(
         "--platform", choices=("ground", "deck"), default="ground", help="deck: it swayed, on a boat (default ground)"
@@ -59,6 +64,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=within(0.0, 1e6),
         default=0.0,
         metavar="S",
+        dest="powered_s",
         help="for so long it had been switched on when the log began (default 0): what it may still warm up",
     )
     log.add_argument(
@@ -127,24 +133,10 @@ def _given(options: argparse.Namespace) -> Given:
             if getattr(options, name) is not None:
                 found = f"--{name.replace('_', '-')}"
                 raise ConfigError(f"{found}: found --platform deck; allowed: tilt and heading in the log, no windows")
-    wanted = options.profile
-    return Given(
-        pitch_deg=options.pitch_deg,
-        roll_deg=options.roll_deg,
-        heading_deg=options.heading_deg,
-        sigma_deg=options.sigma_deg,
-        heading_sigma_deg=options.heading_sigma_deg,
-        latitude_deg=options.latitude_deg,
-        longitude_deg=options.longitude_deg,
-        height_m=options.height_m,
-        law=options.law,
-        tilt_lag_s=options.tilt_lag,
-        platform=options.platform,
-        powered_s=options.powered,
-        mounting=options.mounting,
-        profile=None if wanted is None else given_profile(wanted, lambda: storage_path(options)),
-        any_bias=options.any_bias,
-    )
+    given = Given(**{name: getattr(options, name) for name in Given.__struct_fields__})
+    if options.profile is None:
+        return given
+    return msgspec.structs.replace(given, profile=given_profile(options.profile, lambda: storage_path(options)))
 
 
 def _windows(options: argparse.Namespace, log: StillLog, given: Given) -> int:

@@ -39,12 +39,7 @@ CHECK_S: Final = 5.0
 
 
 async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
-    """`companion setup`.
-
-    Args:
-        options: of the command line.
-        goes_on: the daemon starts behind it, in this process.
-    """
+    """`companion setup`; `goes_on`: the daemon starts behind it, in this process."""
     if options.page is None:
         session = _Session(options, Asking(yes=options.yes, error=options.json))
         await _to_the_end(session)
@@ -170,7 +165,7 @@ class _Session:
     async def _listen(self, draft: Draft) -> Survey:
         """Everything that can be listened to; not a byte is sent."""
         options = self._options
-        ports = [*map(_absolute, options.ports)] or ports_to_try(list_ports())
+        ports = [*map(os.path.abspath, options.ports)] or ports_to_try(list_ports())
         udp = tuple(options.udp or USUAL_PORTS)
         self.asking.say(
             f"Listening to {len(ports)} serial port{'' if len(ports) == 1 else 's'} and UDP"
@@ -364,16 +359,7 @@ class _Session:
 
 
 def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: bool, checks: bool) -> Iterator[str]:
-    """What to do, in this order.
-
-    Args:
-        parsed: the configuration.
-        command: how the companion is called with it.
-        is_old: what runs has another configuration.
-        runs: something does.
-        good: nothing is missing.
-        checks: that has been looked at.
-    """
+    """What to do, in this order; `is_old`: what runs has another configuration; `checks`: `good` was looked at."""
     is_service = command == "companion"
     if not good:
         yield f"mend what is wrong above, then: {command} check"
@@ -392,7 +378,3 @@ def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good:
     ashore = parsed.vehicle.platform == "ground"
     if ashore and parsed.gradienter is None and any(imu.source == "autopilot" for imu in parsed.imu):
         yield f"{command} align faces --write   (once: accelerometers too, held on all sides by hand, 5 min)"
-
-
-def _absolute(port: str) -> str:
-    return os.path.abspath(port)

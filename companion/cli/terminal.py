@@ -32,13 +32,7 @@ AddCommand = Callable[[str, Command, str], argparse.ArgumentParser]
 
 
 def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
-    """Print lines for people, or JSON: the one door to the terminal, by which nothing goes that it would obey.
-
-    Args:
-        lines: each is one, whatever is in it.
-        error: to stderr.
-        end: of each.
-    """
+    """Print lines for people, or JSON: the one door to the terminal, by which nothing goes that it would obey."""
     stream = sys.stderr if error else sys.stdout
     for line in lines:
         stream.write(printable(str(line)) + end)
@@ -76,13 +70,9 @@ def _code(text: str) -> list[str]:
 
 
 def load_config(options: argparse.Namespace, *, profiles: bool = False, forgiving: bool = False) -> Config:
-    """The configuration that -c names, or the default one.
+    """The configuration that -c names, or the default one; with the saved noise profiles that it names, or without.
 
-    Args:
-        options: of the command line.
-        profiles: read the saved noise profiles that it names too; who only asks the daemon may not be allowed to, and
-            leaves them be.
-        forgiving: one of them that is damaged is no reason to refuse the configuration.
+    Who only asks the daemon may not be allowed to read those. `forgiving`: a damaged one is no reason to refuse.
     """
 
     def saved(directory: Path) -> SavedProfiles | None:

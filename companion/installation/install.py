@@ -125,17 +125,12 @@ _WOULD: Final[dict[Outcome, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Where to install.
-
-    Args:
-        root: the machine's, or a folder that is to become one.
-        prefix: whose `lib` takes what is ours.
-        executable: the companion, as the machine will have it.
-        dry_run: change nothing, only tell.
-    """
+    """Where to install."""
 
     root: Path
+    """The machine's, or a folder that is to become one."""
     prefix: Path
+    """Whose `lib` takes what is ours."""
     executable: str
     dry_run: bool = False
 

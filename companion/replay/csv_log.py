@@ -77,13 +77,9 @@ class _Lines:
 
 
 def read(path: Path, columns: str | None = None, rate_hz: float | None = None, name: str = NAME) -> StillLog:
-    """All that is of use in a CSV file.
+    """All that is of use in a CSV file: semicolons, tabs, commas or blanks; "#", "//" and "%" begin a remark.
 
-    Args:
-        path: fields separated by semicolons, tabs, commas or blanks; "#", "//" and "%" begin a remark.
-        columns: names of the columns in their order, in place of the file's own.
-        rate_hz: of a log without times, or whose times are of no use.
-        name: what the IMU is called.
+    `columns` in their order stand in place of the file's own, a rate in place of its times.
 
     Raises:
         StorageError: one line with the number of the line, what was found and what is allowed.

@@ -50,16 +50,9 @@ def seconds_per(steps: Floats) -> str | None:
 
 
 def units_of(columns: Columns, t_s: Floats, readings: Floats, where: str) -> tuple[dict[str, str], list[str]]:
-    """Units of the IMU's columns.
+    """The unit of each of the IMU's columns, of which names say it or do not, and what to say about them.
 
-    Args:
-        columns: whose names say units, or do not.
-        t_s: (n,) times.
-        readings: (n, 6) as they stand in the file.
-        where: the file, for words.
-
-    Returns:
-        The unit of each quantity, and what to say about them.
+    Times are (n,), readings (n, 6) as they stand in the file.
 
     Raises:
         StorageError: the size contradicts a name, or does not tell.

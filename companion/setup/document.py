@@ -62,10 +62,6 @@ def toml(value: Any) -> str:
 def render(text: str, wanted: Mapping[str, Any]) -> str:
     """The text, changed so far that it says what is wanted; lines that say so already stay as they are.
 
-    Args:
-        text: of a file that can be read.
-        wanted: sections by name, each a table, or a list of tables.
-
     Raises:
         CompanionError: it is written in a way in which single lines cannot be changed.
     """

@@ -48,12 +48,7 @@ class Question:
 
 @dataclass
 class Draft:
-    """A file on its way to another content.
-
-    Args:
-        text: as it is, or the sample.
-        is_new: it is the sample, whose values nobody has meant.
-    """
+    """A file on its way to another content; a new one is the sample, whose values nobody has meant."""
 
     text: str
     is_new: bool

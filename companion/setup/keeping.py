@@ -54,12 +54,7 @@ def holds(path: Path, text: str) -> bool:
 
 
 def put(path: Path, text: str, *, keep: bool = True) -> Path | None:
-    """Write the file at once and whole; where the old content went, None if there was none but the sample.
-
-    Args:
-        path: of the file.
-        text: its new content.
-        keep: whether the old content is somebody's.
+    """Write the file at once and whole; where the old content went, None if it is nobody's, or there was none.
 
     Raises:
         StorageError: it cannot be written; then the old one is still there.

@@ -44,8 +44,6 @@ class FoundDevice:
     line: Line
     kind: Kind
     """What it is bought as."""
-    also: tuple[Kind, ...]
-    """What else it can serve as, at a pinch."""
 
     def __str__(self) -> str:
         """For people."""
@@ -76,16 +74,12 @@ class Survey:
 
     def devices(self, kind: Kind) -> list[FoundDevice]:
         """Those that are bought as this."""
-        found = []
-        for port, heard in self.serial.items():
-            if isinstance(heard, str) or heard.candidate is None or heard.line is None:
-                continue
-            protocol, kinds = heard.candidate.protocol, heard.candidate.kinds
-            main = main_kind(protocol)
-            if main == kind:
-                also = tuple(each for each in kinds if each != main)
-                found.append(FoundDevice(port, protocol, heard.line, main, also))
-        return found
+        return [
+            FoundDevice(port, heard.candidate.protocol, heard.line, kind)
+            for port, heard in self.serial.items()
+            if not isinstance(heard, str) and heard.candidate is not None and heard.line is not None
+            if main_kind(heard.candidate.protocol) == kind
+        ]
 
     def silent(self, port: str) -> bool:
         """Whether nobody of use is at a serial port, as far as was listened to; one that somebody holds is not."""

@@ -84,12 +84,7 @@ def _bare(token: str) -> str:
 
 
 class Access:
-    """The rules for one address.
-
-    Args:
-        token: that an action needs.
-        handed_out: whether the page gets it by itself.
-    """
+    """The rules for one address: the token that an action needs, and whether the page gets it by itself."""
 
     def __init__(self, token: str, *, handed_out: bool) -> None:
         self.token, self.handed_out = token, handed_out

@@ -51,13 +51,7 @@ class BadRequestError(Exception):
 
 
 class Exchange:
-    """The server's side of one connection.
-
-    Args:
-        reader: of the connection.
-        writer: of the connection.
-        always: headers of every answer.
-    """
+    """The server's side of one connection; `always` are headers of every answer."""
 
     def __init__(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, always: tuple[tuple[str, str], ...]

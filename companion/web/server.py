@@ -64,14 +64,9 @@ FACE: Final = "the page's"
 
 
 class Page:
-    """Serves the page; `run` it as a task of its own.
+    """Serves the page at HOST:PORT; `run` it as a task of its own.
 
-    Args:
-        bind: HOST:PORT.
-        directory: the storage; the token is kept there when others than this board can reach the page.
-        answer: does what is asked.
-        status: the state to show.
-        offload: for the disk.
+    The token is kept in the storage when others than this board can reach it.
     """
 
     def __init__(

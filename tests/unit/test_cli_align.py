@@ -14,7 +14,7 @@ import pytest
 
 from companion import cli, config
 from companion.calibration.records.align_record import AlignmentRecord, GradienterSettings
-from companion.cli.client import alignment_lines
+from companion.cli.client import stands_lines
 from companion.errors import StorageError
 from companion.storage.learned import AlignmentStore
 from companion.storage.state import unsealed
@@ -63,7 +63,7 @@ def test_no_daemon(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypat
 
 
 def test_the_lines_for_the_configuration_hold_the_whole_offset() -> None:
-    lines = alignment_lines(msgspec.to_builtins(RECORD))
+    lines = stands_lines(msgspec.to_builtins(RECORD))
     assert "    offset_deg = [0.1200, -0.0300]" in lines
     assert "    sigma_deg = 0.0125" in lines
     # 0.0125 deg of g.

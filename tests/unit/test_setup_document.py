@@ -38,8 +38,8 @@ sigma_deg = 0.02
 [mqtt]
 host = "box"
 """
-TILT = FoundDevice("/dev/tilt", "inclinometer_xy", Line(9600, "even"), "gradienter", ())
-RION = FoundDevice("/dev/rion", "rion", Line(9600, "none"), "gradienter", ("compass",))
+TILT = FoundDevice("/dev/tilt", "inclinometer_xy", Line(9600, "even"), "gradienter")
+RION = FoundDevice("/dev/rion", "rion", Line(9600, "none"), "gradienter")
 
 
 def comments(text: str) -> list[str]:

@@ -75,9 +75,9 @@ def test_a_device_that_works_as_it_is_gets_no_further_keys() -> None:
     """A configuration that leaves the speed to the protocol stays as its owner wrote it."""
     draft = Draft(OWN, is_new=False)
     assert draft.lines == {"/dev/tilt": Line(9600, "none")}
-    draft.take(FoundDevice("/dev/tilt", "inclinometer_xy", Line(9600, "none"), "gradienter", ()))
+    draft.take(FoundDevice("/dev/tilt", "inclinometer_xy", Line(9600, "none"), "gradienter"))
     assert draft.result() == OWN
-    draft.take(FoundDevice("/dev/tilt", "inclinometer_xy", Line(2400, "none"), "gradienter", ()))
+    draft.take(FoundDevice("/dev/tilt", "inclinometer_xy", Line(2400, "none"), "gradienter"))
     assert "baud = 2400\n" in draft.result()
     assert "parity" not in draft.result()
 

@@ -164,8 +164,7 @@ class _Seen(msgspec.Struct, frozen=True):
 class TurnWatch:
     """Sees every second of all sources, and says how fast the platform turns.
 
-    Args:
-        span: seconds of the longest window.
+    `span`: seconds of the longest window.
     """
 
     def __init__(self, span: int) -> None:
