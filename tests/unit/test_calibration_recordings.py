@@ -186,7 +186,7 @@ def test_px4_warm_up_is_flagged_and_the_end_value_is_better_than_the_mean(
 ) -> None:
     recording, played = flight_controller
     window = played.collector.window(played.end_s).imus[0]
-    drift = next(line for line in window.warnings if line.startswith("warm-up: gyro fc drifts "))
+    drift = next(line for line in window.drifting if line.startswith("warm-up: gyro fc drifts "))
     assert 0.8 <= float(drift.split()[4]) <= 2.4
     rest = recording.t_s >= window_start(played)
     mean = recording.gyro[rest].mean(axis=0)

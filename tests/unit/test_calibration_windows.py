@@ -125,7 +125,7 @@ def test_a_ramp_is_taken_at_the_end_of_the_window_and_flagged() -> None:
     means[:, 0] += slope * np.arange(0.5, 60.0)
     window = window_of(imu("fc"), batches_of(means))
     assert window.gyro_rad_s[0] == pytest.approx(60.0 * slope, abs=3.0 * DEG_H)
-    assert any("warm-up: gyro fc drifts 0.8 deg/h per second" in line for line in window.warnings)
+    assert any("warm-up: gyro fc drifts 0.8 deg/h per second" in line for line in window.drifting)
     # Twice the sigma of a mean, and a horizon that may drift on: slope * H / 2 / sqrt(3).
     assert window.gyro_sigma_stat_rad_s[0] == pytest.approx(2.0 * window.gyro_sigma_stat_rad_s[1], rel=0.35)
     assert window.gyro_sigma_use_rad_s[0] > slope * 90.0 / math.sqrt(3.0)
@@ -250,9 +250,9 @@ def test_a_slope_of_the_parts_own_flicker_is_no_warm_up_and_a_real_one_is() -> N
     for _ in range(60):
         bias = np.stack([coloured(rng, 4096, bias_only) for _ in range(6)], axis=1)[2000:2060]
         readings = bias + rng.normal(0.0, model.white, (60, 6))
-        flagged += any("warm-up" in line for line in window_of(source, batches_of(readings)).warnings)
+        flagged += any("warm-up" in line for line in window_of(source, batches_of(readings)).drifting)
         # Whose part nobody knows, its wander cannot be told from a warm-up.
-        blind += any("warm-up" in line for line in window_of(nobody, batches_of(readings * DEG_H)).warnings)
+        blind += any("warm-up" in line for line in window_of(nobody, batches_of(readings * DEG_H)).drifting)
     assert flagged <= 4
     assert blind > 20
     slope = 1.5

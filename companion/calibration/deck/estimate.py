@@ -17,7 +17,8 @@ from companion.calibration.deck.fluid import Compared, Level, compare
 from companion.calibration.deck.smoother import Believed, Found, smooth
 from companion.calibration.deck.stream import ImuSecond, Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
-from companion.calibration.means.windows import ImuInput, ImuWindow, Window, drifts, warmed
+from companion.calibration.means.warming import drifting
+from companion.calibration.means.windows import ImuInput, ImuWindow, Window
 from companion.calibration.noise.allan import AllanModel, floor_variance, slope_variance
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Floats, Matrix, vector
@@ -198,7 +199,8 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             gyro_sigma_use_rad_s=vector(use[:3]),
             accel_sigma_use_m_s2=vector(use[3:]),
             temperature_degc=float(np.mean(temperatures)) if temperatures else None,
-            warnings=(*drifts(imu.name, found.ramp_rad_s2), *warmed(imu.name, temperatures)),
+            warnings=(),
+            drifting=drifting(imu.name, np.append(found.ramp_rad_s2, np.zeros(3)), temperatures),
             named=imu.profile.is_named,
             covariance=covariance,
             by_earth=found.by_earth @ _level_axes(found.body_to_ned[-1]),

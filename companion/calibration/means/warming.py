@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -19,8 +19,8 @@ import numpy as np
 from companion.calibration.noise.allan import WARM_UP_K
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats, Matrix, vector
-from companion.physics.units import DEG_H
-from companion.samples import Vector
+from companion.physics.units import DEG_H, MG
+from companion.samples import Triad, Vector
 
 QUICKEST_S: Final = 60.0
 """The shortest time constant of a warm-up: boards take 1 to 20 min."""
@@ -31,12 +31,49 @@ _LATER_S: Final = (120.0, 600.0, 3600.0)
 _WORTH_WAITING: Final = 2.0 / 3.0
 """Of the present sigma: what is no better than that is no reason to wait."""
 _FEWEST: Final = 3
+_TEMPERATURE_WARNING_K: Final = 3.0
 _NOTHING: Final = 1.0
 """Variance of a slope of which the window tells nothing, (rad/s^2)^2 or (m/s^3)^2: beyond every warm-up."""
 _OF_STEPS: Final = math.sqrt(3.0)
 """One sigma of a slope over T by readings that are off by at most A is sqrt(3) A / T; its largest is 3 A / T."""
+_BENT_SIGMAS: Final = 3.0
+"""Of the curvature of a temperature's way, beyond which it is no line."""
 _STEPS_K: Final = (1.0, 0.5, 0.25, 0.1, 0.05, 0.01)
 """Resolutions of thermometers, coarse ones first."""
+
+
+class Line(msgspec.Struct, frozen=True, kw_only=True):
+    """One triad's readings over a window as a straight line; vehicle FRD, rad/s or m/s^2, and those a second."""
+
+    slope: Vector
+    slope_variance: Vector
+    ramp: Vector
+    """What of the slope was seen as a ramp, so that the mean that is given is its end."""
+    level_variance: Vector
+    """Of the mean over the window for the next minutes, without any slope."""
+
+
+class Path(msgspec.Struct, frozen=True, kw_only=True):
+    """How the temperature went through a window, a line or a parabola."""
+
+    degc: Vector
+    """At its beginning, in its middle and at its end."""
+    span_s: float
+    variance: float
+    """Of how far the end is from the mean."""
+
+    @property
+    def mean_degc(self) -> float:
+        """Over the window."""
+        start, middle, end = self.degc
+        return (start + 4.0 * middle + end) / 6.0
+
+    @property
+    def states(self) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
+        """Temperature and how fast it rose, degC and K/s, at these three."""
+        start, middle, end = self.degc
+        mean, change = (end - start) / self.span_s, 2.0 * (end - 2.0 * middle + start) / self.span_s
+        return (start, mean - change), (middle, mean), (end, mean + change)
 
 
 class Warming(msgspec.Struct, frozen=True, kw_only=True):
@@ -56,6 +93,19 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
     k_s: float | None
     """How fast its thermometer goes up; None: it has none."""
     k_s_variance: float = 0.0
+    gyro_line: Line | None = None
+    accel_line: Line | None = None
+    path: Path | None = None
+    """None: its temperature is not known to have changed."""
+
+    @property
+    def half_s(self) -> float:
+        """Middle of the window to its end."""
+        return self.lever_s - NEXT_S / 2.0
+
+    def line(self, triad: Triad) -> Line | None:
+        """Of one triad; None where there is no such thing."""
+        return self.gyro_line if triad == "gyro" else self.accel_line
 
     @property
     def rate_k_s(self) -> float:
@@ -120,19 +170,47 @@ def likely_k_s(powered_s: float) -> float:
 
 def temperature_rate(batches: Sequence[Batch]) -> tuple[float, float] | None:
     """How fast a thermometer goes up, K/s, and the variance of that; None where there is none, or too little of it."""
+    found = _fitted(batches, 1)
+    return None if found is None else (found[0][1], found[1][1])
+
+
+def temperature_path(batches: Sequence[Batch]) -> Path | None:
+    """How a thermometer went through a window; None where it is not known to have changed."""
+    line, bent = _fitted(batches, 1), _fitted(batches, 2)
+    if line is None or abs(line[0][1]) < 2.0 * math.sqrt(line[1][1]):
+        return None
+    is_bent = bent is not None and abs(bent[0][2]) > _BENT_SIGMAS * math.sqrt(bent[1][2])
+    (level, k_s, bend), (_, of_k_s, of_bend) = bent if bent is not None and is_bent else line
+    half_s = (batches[-1].slot + 1.0 - batches[0].slot) / 2.0
+    at = np.array([-half_s, 0.0, half_s])
+    return Path(
+        degc=vector(level + k_s * at + bend * at**2),
+        span_s=2.0 * half_s,
+        variance=of_k_s * half_s**2 + of_bend * (2.0 / 3.0 * half_s**2) ** 2,
+    )
+
+
+def _fitted(batches: Sequence[Batch], degree: int) -> tuple[Vector, Vector] | None:
+    """Of a line or a parabola through the temperatures, about the middle of the window: coefficients and variances."""
     known = [(batch.slot, batch.temperature_degc) for batch in batches if batch.temperature_degc is not None]
-    if len(known) < _FEWEST:
+    if len(known) < _FEWEST + degree - 1:
         return None
     table = np.array(known, dtype=np.float64)
-    time, degc = table[:, 0] - table[:, 0].mean(), table[:, 1]
-    spread = float(np.square(time).sum())
-    centred = degc - degc.mean()
-    slope = float(time @ centred) / spread
-    residual = centred - slope * time
-    scatter = float(residual @ residual) / (len(known) - 2)
-    hidden = _resolution_k(degc) / 2.0
-    span_s = float(table[-1, 0] - table[0, 0] + 1.0)
-    return slope, scatter / spread + (_OF_STEPS * hidden / span_s) ** 2
+    half_s = (table[-1, 0] - table[0, 0] + 1.0) / 2.0
+    time = (table[:, 0] + 0.5 - (batches[0].slot + batches[-1].slot + 1.0) / 2.0) / half_s
+    terms = time[:, None] ** np.arange(degree + 1)
+    inverse = np.linalg.inv(terms.T @ terms)
+    mean = float(table[:, 1].mean())
+    found = inverse @ terms.T @ (table[:, 1] - mean)
+    residual = table[:, 1] - mean - terms @ found
+    scatter = float(residual @ residual) / max(len(known) - degree - 1, 1)
+    # The same for every term: a step that is hidden at one end bends as much as it turns.
+    hidden = (_OF_STEPS * _resolution_k(table[:, 1]) / 4.0) ** 2
+    unit = half_s ** np.arange(3.0)
+    value, variance = np.zeros(3), np.zeros(3)
+    found[0] += mean
+    value[: degree + 1], variance[: degree + 1] = found, scatter * np.diag(inverse) + hidden
+    return vector(value / unit), vector(variance / np.square(unit))
 
 
 def _resolution_k(degc: Floats) -> float:
@@ -147,28 +225,62 @@ def _resolution_k(degc: Floats) -> float:
     return next((step for step in _STEPS_K if abs(value / step - round(value / step)) < 1e-6), 0.0)
 
 
-def warming(
-    rotation: Matrix,
-    slopes: tuple[Floats, Floats],
-    variances: tuple[Floats, Floats],
-    warm_up: tuple[float, float],
-    batches: Sequence[Batch],
-) -> Warming:
-    """Of one window, turned into the vehicle's axes.
+class Lines(NamedTuple):
+    """Of gyro and accelerometer, (6,), sensor's axes; variances are infinite where the window tells nothing."""
 
-    Slopes and their variances are of gyro and accelerometer, (3,) each, in the sensor's axes; a variance is infinite
-    where the window tells nothing. `warm_up` is what `WARM_UP_K` does.
-    """
-    gyro, accel = (np.minimum(np.square(rotation) @ np.minimum(each, _NOTHING), _NOTHING) for each in variances)
+    hidden: Floats
+    """Slopes, zero of ramps that were seen."""
+    hidden_variance: Floats
+    ramp: Floats
+    variance: Floats
+    """Of the slopes, ramps too."""
+    level_variance: Floats
+
+
+def warming(rotation: Matrix, lines: Lines, warm_up: tuple[float, float], batches: Sequence[Batch]) -> Warming:
+    """Of one window, turned into the vehicle's axes; `warm_up` is what `WARM_UP_K` does."""
+    square = np.square(rotation)
+
+    def both(values: Floats, turn: Matrix, most: float = math.inf) -> list[Vector]:
+        return [vector(np.minimum(turn @ np.minimum(values[of], most), most)) for of in (slice(0, 3), slice(3, 6))]
+
+    gyro_slope, accel_slope = both(lines.hidden, rotation)
+    gyro_variance, accel_variance = both(lines.hidden_variance, square, _NOTHING)
+    gyro_line, accel_line = (
+        Line(slope=slope, slope_variance=variance, ramp=ramp, level_variance=level)
+        for slope, variance, ramp, level in zip(
+            both(lines.hidden + lines.ramp, rotation),
+            both(lines.variance, square, _NOTHING),
+            both(lines.ramp, rotation),
+            both(lines.level_variance, square),
+            strict=True,
+        )
+    )
     rate = temperature_rate(batches)
     return Warming(
-        gyro_slope=vector(rotation @ slopes[0]),
-        gyro_variance=vector(gyro),
-        accel_slope=vector(rotation @ slopes[1]),
-        accel_variance=vector(accel),
+        gyro_slope=gyro_slope,
+        gyro_variance=gyro_variance,
+        accel_slope=accel_slope,
+        accel_variance=accel_variance,
         gyro_warm_up=warm_up[0],
         accel_warm_up=warm_up[1],
         lever_s=(batches[-1].slot + 1.0 - batches[0].slot + NEXT_S) / 2.0,
         k_s=None if rate is None else rate[0],
         k_s_variance=0.0 if rate is None else rate[1],
+        gyro_line=gyro_line,
+        accel_line=accel_line,
+        path=temperature_path(batches),
     )
+
+
+def drifting(name: str, ramps: Floats, temperatures_degc: Sequence[float]) -> tuple[str, ...]:
+    """What is to be said of the drift of one IMU; `ramps` (6,): gyro rad/s^2, accelerometer m/s^3."""
+    found, size = [], np.abs(ramps)
+    span = max(temperatures_degc, default=0.0) - min(temperatures_degc, default=0.0)
+    if size[:3].any():
+        found.append(f"warm-up: gyro {name} drifts {size[:3].max() / DEG_H:.1f} deg/h per second")
+    if size[3:].any():
+        found.append(f"warm-up: accel {name} drifts {size[3:].max() / MG * 60.0:.2f} mg per minute")
+    if span > _TEMPERATURE_WARNING_K:
+        found.append(f"temperature of imu {name} moved by {span:.1f} K")
+    return tuple(found)

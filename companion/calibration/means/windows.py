@@ -18,7 +18,7 @@ from companion.calibration.means.integers import IntegerColumns, integer_columns
 from companion.calibration.means.losses import lost, refuse_broken
 from companion.calibration.means.pose import FieldWindow, HeadingWindow, TiltWindow
 from companion.calibration.means.quantised import EDGE_RMS
-from companion.calibration.means.warming import Warming, warming
+from companion.calibration.means.warming import Lines, Warming, drifting, warming
 from companion.calibration.noise.allan import (
     FLOOR_OF_FLICKER,
     NoiseProfile,
@@ -38,7 +38,6 @@ WHITE_SHARE: Final = 0.09
 """White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
 _ALLAN_SPANS: Final = 5
 _LOST_WARNING: Final = 0.01
-_TEMPERATURE_WARNING_K: Final = 3.0
 _ALLAN_SIGNIFICANT: Final = 3.0
 """ADEV^2 at T/5 over what white noise explains: the upper 5 % point with its about four degrees of freedom."""
 
@@ -100,6 +99,8 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     accel_sigma_use_m_s2: Vector
     temperature_degc: float | None
     warnings: tuple[str, ...]
+    drifting: tuple[str, ...] = ()
+    """What is to be said of its drift, unless it is known where that leads."""
     hidden: dict[Triad, Hidden] = {}
     """By triad, where the noise spreads the integers too little for a mean."""
     dithered: bool = False
@@ -155,6 +156,10 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     """Of those that are not significant; zero of the others."""
     slope_variance: Floats
     """Of `slope_per_s`; infinite where the window is too short for a line."""
+    line_variance: Floats
+    """The same, of ramps too."""
+    level_variance: Floats
+    """`use_variance` of the mean over the window, as if there were no ramp."""
     half_step: NDArray[np.bool_]
     """Fewer than 3 distinct readings; of a stream of integers, too few outside the two commonest."""
     undecided: NDArray[np.bool_]
@@ -207,9 +212,10 @@ def estimates(
     going_on = np.square(slope * horizon_s / 2.0) / 3.0
     stat = np.square(measured) * leverage + np.square(quantum)
     white_part = np.square(white) * leverage
-    use = white_part + floor_variance(flicker, walk, seconds, horizon_s) + np.square(quantum) + going_on
+    rest = floor_variance(flicker, walk, seconds, horizon_s) + np.square(quantum)
+    use = white_part + rest + going_on
     of_line = np.square(white) / max(float(np.square(slots - slots.mean()).sum()), 1.0) + wander
-    of_line = of_line + 3.0 * np.square(quantum / (end_s - slots[0]))
+    of_line = np.where(np.isnan(hidden), np.inf, of_line + 3.0 * np.square(quantum / (end_s - slots[0])))
 
     columns: dict[str, Any] = {
         "mean": mean,
@@ -221,7 +227,9 @@ def estimates(
         "walk": walk,
         "ramp_per_s": slope,
         "slope_per_s": np.nan_to_num(hidden),
-        "slope_variance": np.where(np.isnan(hidden), np.inf, np.where(slope != 0.0, 0.0, of_line)),
+        "slope_variance": np.where(slope != 0.0, 0.0, of_line),
+        "line_variance": of_line,
+        "level_variance": np.square(white) / seconds + rest,
         "half_step": half_step,
         "undecided": whole.unknown,
         "useless": whole.useless,
@@ -311,7 +319,12 @@ def _imu_estimate(
 ) -> ImuEstimate:
     temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
     rotation = np.asarray(imu.rotation, dtype=np.float64)
-    slopes, slope_variances = (gyro.slope_per_s, accel.slope_per_s), (gyro.slope_variance, accel.slope_variance)
+    lines = Lines(
+        *(
+            np.concatenate([getattr(gyro, each), getattr(accel, each)])
+            for each in ("slope_per_s", "slope_variance", "ramp_per_s", "line_variance", "level_variance")
+        )
+    )
     window = ImuWindow(
         name=imu.name,
         samples=sum(batch.n for batch in batches),
@@ -323,11 +336,12 @@ def _imu_estimate(
         gyro_sigma_use_rad_s=_turned(rotation, gyro.use_variance),
         accel_sigma_use_m_s2=_turned(rotation, accel.use_variance),
         temperature_degc=float(np.mean(temperatures)) if temperatures else None,
-        warnings=tuple(_warnings(imu, batches, gyro, accel, temperatures, rejected)),
+        warnings=tuple(_warnings(imu, batches, gyro, accel, rejected)),
         hidden=_hidden(imu, gyro, accel),
         named=imu.profile.is_named,
         mounting=(vector(rotation[0]), vector(rotation[1]), vector(rotation[2])),
-        warming=warming(rotation, slopes, slope_variances, imu.profile.warm_up, batches),
+        warming=warming(rotation, lines, imu.profile.warm_up, batches),
+        drifting=drifting(imu.name, lines.ramp, temperatures),
     )
     return ImuEstimate(gyro=gyro, accel=accel, window=window)
 
@@ -366,13 +380,8 @@ def _axes(which: NDArray[np.bool_]) -> str:
     return "".join(axis for axis, is_it in zip("xyz", which.tolist(), strict=True) if is_it)
 
 
-def _warnings(
-    imu: ImuInput, batches: Sequence[Batch], gyro: Estimate, accel: Estimate, temperatures: list[float], rejected: int
-) -> list[str]:
-    found = drifts(imu.name, gyro.ramp_per_s)
-    if accel.ramp_per_s.any():
-        rate = float(np.abs(accel.ramp_per_s).max()) / MG * 60.0
-        found.append(f"warm-up: accel {imu.name} drifts {rate:.2f} mg per minute")
+def _warnings(imu: ImuInput, batches: Sequence[Batch], gyro: Estimate, accel: Estimate, rejected: int) -> list[str]:
+    found: list[str] = []
     for part, triad, grid in (("gyro", gyro, imu.gyro_grid_rad_s), ("accel", accel, imu.accel_grid_m_s2)):
         if axes := _axes(triad.half_step & ~triad.undecided):
             found.append(f"{part} {imu.name} {axes}: fewer than 3 distinct readings, half a step may be hidden")
@@ -383,16 +392,4 @@ def _warnings(
         found.append(f"imu {imu.name} lost {share:.0%} of its samples")
     if rejected:
         found.append(f"{rejected} of {rejected + len(batches)} s were not still and are left out")
-    return found + warmed(imu.name, temperatures)
-
-
-def drifts(name: str, ramp_rad_s2: Floats) -> list[str]:
-    """What is to be said of the gyros' ramps, (3,), where there are any."""
-    rate = float(np.abs(ramp_rad_s2).max()) / DEG_H
-    return [f"warm-up: gyro {name} drifts {rate:.1f} deg/h per second"] if ramp_rad_s2.any() else []
-
-
-def warmed(name: str, temperatures_degc: Sequence[float]) -> list[str]:
-    """What is to be said of an IMU's temperatures, where they moved."""
-    span = max(temperatures_degc, default=0.0) - min(temperatures_degc, default=0.0)
-    return [f"temperature of imu {name} moved by {span:.1f} K"] if span > _TEMPERATURE_WARNING_K else []
+    return found

@@ -180,6 +180,17 @@ class Effective(msgspec.Struct, frozen=True, kw_only=True):
     """Sigma of the bias as the sensor's own, in its own axes, whatever its attitude."""
 
 
+class WhenWarm(msgspec.Struct, frozen=True, kw_only=True):
+    """What the whole biases will be once the board has warmed up, by the curve over temperature."""
+
+    degc: float
+    """Then, by how quickly the board has come to its end at earlier power-ups."""
+    gyro_bias_rad_s: Vector
+    gyro_sigma_rad_s: Vector
+    accel_bias_m_s2: Vector | None
+    accel_sigma_m_s2: Vector | None
+
+
 class CrossCovariance(msgspec.Struct, frozen=True, kw_only=True):
     """What two IMUs' errors have in common: tilt, heading, gravity, the Earth's rate."""
 
@@ -218,6 +229,8 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     gyro_sigma_warm_up_rad_s: Vector | None = None
     """The part of sigma_use for a warm-up too small to see, which only time takes away."""
     accel_sigma_warm_up_m_s2: Vector | None = None
+    when_warm: WhenWarm | None = None
+    """None: it was warm, or nobody knows where it leads."""
 
     def _of(self, triad: Triad) -> tuple[Vector | None, Vector | None, Vector | None]:
         """sigma_use, the residual and the part of sigma_use for a warm-up."""

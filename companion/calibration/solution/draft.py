@@ -112,10 +112,11 @@ class Draft:
             accel_sigma_warm_up_m_s2=_axes(np.sqrt(estimate.warm_up_variance[3:]) if has_accel else None),
             residual_gyro_rad_s=_axes(estimate.gyro_rad_s if owner_corrects else None),
             residual_accel_m_s2=_axes(estimate.accel_m_s2 if owner_corrects else None),
-            warnings=(*estimate.warnings, *self.imu_warnings.get(estimate.name, ())),
+            warnings=(*estimate.warnings, *estimate.drifting, *self.imu_warnings.get(estimate.name, ())),
             written=self.written.get(estimate.name, {}),
             prior=estimate.prior,
             effective=estimate.effective,
+            when_warm=estimate.when_warm,
             held_back=tuple(triad for name, triad in self.held_back if name == estimate.name),
             unchanged=tuple(sorted(triad for name, triad in self.unchanged if name == estimate.name)),
         )

@@ -26,6 +26,7 @@ import numpy as np
 
 from companion.calibration.records.history import Measured, Point, PowerUp
 from companion.calibration.records.record import AccelPrior, GyroPrior, Prior
+from companion.calibration.solution.at_end import TRIADS, Pair, ahead, at_end, foretold, rows_of
 from companion.calibration.solution.doubt import Doubt, Witness, doubts
 from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
@@ -34,10 +35,9 @@ from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG
 from companion.samples import Triad
 
-Whole = Mapping[str, tuple[Array | None, Array | None]]
+Whole = Mapping[str, Pair]
 """By IMU: whole gyro and accelerometer bias by the readings alone, (3,) each, vehicle FRD."""
 
-_TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 AGREES: Final = 11.34
 """Chi square of three axes that is passed by chance once in a hundred: beyond it nobody is warned yet, but what may
 well be of another sensor takes no part."""
@@ -74,18 +74,19 @@ class _Known:
 
     @property
     def rows(self) -> slice:
-        start = 6 * self.imu + _part(self.triad).start
+        start = 6 * self.imu + rows_of(self.triad).start
         return slice(start, start + 3)
 
 
 def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed:
     """Take in what was known from before: guard against it, and let it take part where it may."""
     expected = {each.name: each for each in expectation.imus}
+    solution, whole, followed = _at_end(solution, whole, expected)
     solution = dataclasses.replace(
         solution, imus=tuple(_with_effect(imu, expected.get(imu.name), solution.shared) for imu in solution.imus)
     )
     found = Weighed(solution, tuple(_doubts(solution, whole, expected)))
-    known = [one for triad in _TRIADS for one in _known(solution, whole, expected, triad, today=False)]
+    known = [one for triad in TRIADS for one in _known(solution, whole, expected, triad, today=False)]
     used = [
         one
         for one in known
@@ -97,16 +98,44 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
     for k, imu in enumerate(weighed.imus):
         own = [doubt.words for doubt in found.doubts if not doubt.of_all and imu.name in doubt.names]
         prior = _prior([one for one in known if one.imu == k], used)
+        if imu.name in whole:
+            imu = foretold(
+                imu, _shifted_by(whole[imu.name], solution.imus[k], imu), expected.get(imu.name), followed[k]
+            )
         imus.append(dataclasses.replace(imu, prior=prior, warnings=(*imu.warnings, *own)))
     common = [doubt.words for doubt in found.doubts if doubt.of_all]
     weighed = dataclasses.replace(weighed, imus=tuple(imus), warnings=(*solution.warnings, *common))
     return Weighed(weighed, found.doubts)
 
 
+def _at_end(
+    solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu]
+) -> tuple[Solution, Whole, list[tuple[Triad, ...]]]:
+    """Where the temperature changed: the same at the end of the window; and of which triads of each."""
+    imus, moved, followed = [], dict(whole), []
+    for imu in solution.imus:
+        of: tuple[Triad, ...] = ()
+        if imu.name in whole and imu.name in expected:
+            imu, moved[imu.name], of = at_end(imu, whole[imu.name], expected[imu.name], solution.shared)
+        imus.append(imu)
+        followed.append(of)
+    return dataclasses.replace(solution, imus=tuple(imus)), moved, followed
+
+
+def _shifted_by(whole: Pair, before: ImuSolution, after: ImuSolution) -> Pair:
+    """Whole biases with what an estimate has become."""
+    pairs = (before.gyro_rad_s, after.gyro_rad_s), (before.accel_m_s2, after.accel_m_s2)
+    gyro, accel = (
+        None if bias is None or one is None or other is None else bias + other - one
+        for bias, (one, other) in zip(whole, pairs, strict=True)
+    )
+    return gyro, accel
+
+
 def _doubts(solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu]) -> list[Doubt]:
     """What contradicts what was known."""
     found: list[Doubt] = []
-    for triad in _TRIADS:
+    for triad in TRIADS:
         # What was measured in this power-up says most; where it is content, nothing older has to be asked.
         for today in (True, False):
             witnesses = [one.witness for one in _known(solution, whole, expected, triad, today=today)]
@@ -168,12 +197,12 @@ def points(
     common[3:] = np.maximum(common[3:] - np.diag(by_zero @ by_zero.T), 0.0)
 
     def measured(imu: ImuSolution, triad: Triad) -> Measured | None:
-        bias = whole[imu.name][_TRIADS.index(triad)]
+        bias = whole[imu.name][TRIADS.index(triad)]
         if bias is None:
             return None
-        part = _part(triad)
+        part = rows_of(triad)
         return Measured(
-            bias=vector(bias),
+            bias=vector(bias - ahead(imu, triad)),
             sigma_stat=vector(imu.gyro_sigma_stat_rad_s if triad == "gyro" else imu.accel_sigma_stat_m_s2),
             sigma_use=vector(np.sqrt(_own_variance(imu, shared)[part])),
             sigma_shared=vector(np.sqrt(common[part])),
@@ -185,7 +214,7 @@ def points(
             started_at=started_at,
             unix_s=unix_s,
             power_up=power_ups[imu.name],
-            temperature_degc=imu.temperature_degc,
+            temperature_degc=imu.mean_degc,
             k_s=imu.k_s,
             up=vector(shared.up),
             zero=zero if whole[imu.name][1] is not None else None,
@@ -196,11 +225,6 @@ def points(
         for imu in solution.imus
         if imu.name in whole
     }
-
-
-def _part(triad: Triad) -> slice:
-    """Its rows of six."""
-    return slice(0, 3) if triad == "gyro" else slice(3, 6)
 
 
 def _with_effect(imu: ImuSolution, expected: ExpectedImu | None, shared: Shared) -> ImuSolution:
@@ -221,7 +245,7 @@ def _known(
 ) -> list[_Known]:
     found: list[_Known] = []
     for k, imu in enumerate(solution.imus):
-        measured = whole[imu.name][_TRIADS.index(triad)] if imu.name in whole else None
+        measured = whole[imu.name][TRIADS.index(triad)] if imu.name in whole else None
         known = expected[imu.name].of(triad, today=today) if imu.name in expected else None
         if measured is not None and known is not None:
             witness = _witness(imu, solution.shared, triad, known, measured)
@@ -244,7 +268,7 @@ def _by_reading(shared: Shared) -> Matrix:
 
 
 def _witness(imu: ImuSolution, shared: Shared, triad: Triad, expected: Expected, measured: Array) -> Witness:
-    part = _part(triad)
+    part = rows_of(triad)
     common = shared.covariance[part, part]
     if triad == "accel":
         by_reading = _by_reading(shared)
@@ -338,4 +362,4 @@ def _prior(known: Sequence[_Known], used: Sequence[_Known]) -> Prior | None:
         found[one.triad] = kind(
             used=one in used, power_ups=expected.power_ups, temperature_model=by_temperature, **figures
         )
-    return Prior(**{triad: found.get(triad) for triad in _TRIADS}) if found else None  # type: ignore[arg-type]
+    return Prior(**{triad: found.get(triad) for triad in TRIADS}) if found else None  # type: ignore[arg-type]

@@ -29,6 +29,7 @@ from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.calibration.records.align_record import Determined, ImuAlignmentRecord
 from companion.calibration.records.history import Measured, Point, PowerUp, believed
 from companion.calibration.records.record import Effective
+from companion.calibration.temperature.along import Along
 from companion.calibration.temperature.curve import Curve, Node, PowerUpNodes, fit
 from companion.physics.frames import Array, Floats, Matrix, skew, vector
 from companion.physics.units import DEG, DEG_H, MG, G
@@ -161,6 +162,13 @@ class ExpectedImu(msgspec.Struct, frozen=True, kw_only=True):
     accel_today: Expected | None = None
     effect: PoseEffect | None = None
     """How its accelerometers' bias moves with the attitude."""
+    gyro_along: Along | None = None
+    accel_along: Along | None = None
+    """What the curve says of a window in which the temperature changed."""
+
+    def along(self, triad: Triad) -> Along | None:
+        """One of these two."""
+        return self.gyro_along if triad == "gyro" else self.accel_along
 
     def of(self, triad: Triad, *, today: bool) -> Expected | None:
         """One of the four."""

@@ -31,8 +31,9 @@ import msgspec
 import numpy as np
 
 from companion.calibration.means.pose import CompassModel, GradienterModel
+from companion.calibration.means.warming import Warming
 from companion.calibration.means.windows import ImuWindow, Window
-from companion.calibration.records.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
+from companion.calibration.records.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site, WhenWarm
 from companion.calibration.request import What
 from companion.calibration.solution.believable import believable, untold, widened, without_heading
 from companion.calibration.solution.otherwise import NOTHING, Otherwise
@@ -60,15 +61,21 @@ class ImuSolution:
     name: str
     samples: int
     temperature_degc: float | None
+    """At the end of the window, where it is known to have changed."""
     gyro_rad_s: Array | None
     accel_m_s2: Array | None
     gyro_sigma_stat_rad_s: Array
     accel_sigma_stat_m_s2: Array
     covariance: Matrix
     warnings: tuple[str, ...]
+    drifting: tuple[str, ...] = ()
+    """What is to be said of its drift, or what it will be when warm."""
     warm_up_variance: Array = dataclasses.field(default_factory=lambda: np.zeros(6))
     k_s: float = 0.0
     """How fast its temperature rose."""
+    warming: Warming | None = None
+    """What its window tells of slopes; None: nothing."""
+    when_warm: WhenWarm | None = None
     dithered: bool = False
     """The telemetry was seen to follow this IMU's offsets step by step."""
     prior: Prior | None = None
@@ -85,6 +92,12 @@ class ImuSolution:
     def accel_sigma_use_m_s2(self) -> Array:
         """One sigma per axis, shape (3,)."""
         return np.sqrt(np.diag(self.use_covariance)[3:])
+
+    @property
+    def mean_degc(self) -> float | None:
+        """Over the window."""
+        path = None if self.warming is None else self.warming.path
+        return self.temperature_degc if path is None else path.mean_degc
 
     @property
     def use_covariance(self) -> Matrix:
@@ -279,11 +292,12 @@ def _estimate(
     if own is None:
         own = np.diag(np.square([*imu.gyro_sigma_use_rad_s, *imu.accel_sigma_use_m_s2]))
     covariance = shared.covariance + own
+    path = None if imu.warming is None or imu.dithered else imu.warming.path
     unseen = np.zeros(6) if imu.warming is None else imu.warming.unseen(powered_s)
     return ImuSolution(
         name=imu.name,
         samples=imu.samples,
-        temperature_degc=imu.temperature_degc,
+        temperature_degc=imu.temperature_degc if path is None else path.degc[2],
         gyro_rad_s=gyro,
         accel_m_s2=accel,
         gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
@@ -291,7 +305,10 @@ def _estimate(
         covariance=covariance,
         warm_up_variance=unseen,
         k_s=0.0 if imu.warming is None else imu.warming.rate_k_s,
-        warnings=(*imu.warnings, *untold(imu, asked), *widened(imu, asked, powered_s, np.diag(covariance))),
+        warnings=(*imu.warnings, *untold(imu, asked)),
+        drifting=(*imu.drifting, *widened(imu, asked, powered_s, np.diag(covariance))),
+        # A dither's means come after the window.
+        warming=None if imu.dithered else imu.warming,
         dithered=imu.dithered,
     )
 

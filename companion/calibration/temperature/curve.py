@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import msgspec
@@ -117,9 +117,15 @@ class Curve:
 
         Both are a temperature and how fast it rises, degC and K/s. Of a curve of order 1 and more.
         """
-        outside = (self.per_kelvin * abs(self.beyond_k(now[0]) - self.beyond_k(then[0]))) ** 2
-        x = self._row(*now) - self._row(*then)
-        variance = float(x @ self.covariance[1:, 1:] @ x) * self.widening + outside
+        return self.moves([(-1.0, then), (1.0, now)])
+
+    def moves(self, weighted: Iterable[tuple[float, tuple[float, float]]]) -> tuple[Array, Array]:
+        """The same of several states with weights whose sum is zero."""
+        x, outside_k = np.zeros(self.order), 0.0
+        for weight, (degc, k_s) in weighted:
+            side = 1.0 if degc > self.span_degc[1] else -1.0
+            x, outside_k = x + weight * self._row(degc, k_s), outside_k + weight * side * self.beyond_k(degc)
+        variance = float(x @ self.covariance[1:, 1:] @ x) * self.widening + (self.per_kelvin * outside_k) ** 2
         return x @ self.coefficients[1:], variance
 
     def _row(self, degc: float, k_s: float = 0.0) -> Array:

@@ -8,9 +8,11 @@ from typing import Final
 
 import numpy as np
 
+from companion.calibration.means.warming import Warming
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.history import Point, by_power_up
 from companion.calibration.solution.prior import curve_of
+from companion.calibration.temperature.along import Along, Settling, State, along, settling
 from companion.calibration.temperature.curve import Curve
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -31,6 +33,7 @@ class Curves:
         self._profiles, self._imus = core.profiles, imus
         self._names = {imu.name for imu in core.config.imu}
         self._of: dict[tuple[str, Triad], Curve | None] = {}
+        self._settling: dict[str, Settling | None] = {}
 
     def follow(self, known: Mapping[str, KnownImu]) -> None:
         """Work out the curves of what is known; blocking."""
@@ -40,6 +43,7 @@ class Curves:
             of[name, "gyro"] = curve_of(known[name].points, "gyro", profile.gyro)
             of[name, "accel"] = curve_of(known[name].points, "accel", profile.accel)
         self._of = of
+        self._settling = {name: settling(_states(known[name].points)) for name in known.keys() & self._names}
 
     def forget(self, name: str) -> None:
         """Of an IMU that is another one now."""
@@ -48,6 +52,13 @@ class Curves:
     def of(self, name: str, triad: Triad) -> Curve | None:
         """None: not known."""
         return self._of.get((name, triad))
+
+    def along(self, name: str, triad: Triad, warming: Warming | None) -> Along | None:
+        """What the curve says of a window; None: it is not known, or the temperature not to have changed."""
+        curve, path = self.of(name, triad), None if warming is None else warming.path
+        if curve is None or path is None:
+            return None
+        return along(curve, path.states, path.span_s, path.variance, self._settling.get(name))
 
     def drift(
         self, name: str, triad: Triad, degc: float | None, now_degc: float | None
@@ -95,6 +106,11 @@ def _by_temperature(name: str, points: Sequence[Point], curve: Curve | None) -> 
         ],
         "curve": rows,
     }
+
+
+def _states(points: Sequence[Point]) -> list[list[State]]:
+    groups = by_power_up([point for point in points if point.temperature_degc is not None])
+    return [[(point.temperature_degc or 0.0, point.k_s) for point in group] for group in groups]
 
 
 def _deg_h(axes: Iterable[float]) -> list[float]:

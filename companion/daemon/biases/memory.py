@@ -148,6 +148,8 @@ class BiasMemory:
             gyro_today=today("gyro", profile.gyro),
             accel_today=today("accel", profile.accel),
             effect=effect,
+            gyro_along=self.curves.along(name, "gyro", imu.warming),
+            accel_along=self.curves.along(name, "accel", imu.warming),
         )
 
     # --- and afterwards
@@ -202,14 +204,14 @@ class BiasMemory:
     def _tells_more(self, imu: ImuSolution, unix_s: float) -> bool:
         """Whether a window is the first at its temperature since the power came, or much better than that one."""
         known, power_up = self._known.get(imu.name), self.whose.power_up(imu.name, unix_s)
-        if imu.gyro_rad_s is None or imu.temperature_degc is None:
+        if imu.gyro_rad_s is None or imu.mean_degc is None:
             return False
         if known is None:
             return True
         same = [
             point.gyro
             for point in known.points
-            if point.gyro is not None and point.power_up.is_same(power_up) and _is_near(point, imu.temperature_degc)
+            if point.gyro is not None and point.power_up.is_same(power_up) and _is_near(point, imu.mean_degc)
         ]
         best = min((max(one.sigma_stat) for one in same), default=math.inf)
         return self._is_of_today(imu.name, known) and imu.gyro_sigma_stat_rad_s.max() < _MUCH_BETTER * best

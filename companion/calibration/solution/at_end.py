@@ -1,0 +1,135 @@
+"""Biases at the end of a window that warmed, by the curve over temperature, and what they will be when warm.
+
+The mean over a window is that of its mean temperature. The curve says how the bias has gone from there to the end, the
+readings' own slope says so too, and each by its variance has its share. Where they contradict each other the window
+alone counts: its mean, or the end of its ramp.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection
+from typing import Final
+
+import numpy as np
+
+from companion.calibration.means.warming import NEXT_S
+from companion.calibration.records.record import WhenWarm
+from companion.calibration.solution.prior import ExpectedImu
+from companion.calibration.solution.solve import ImuSolution, Shared
+from companion.calibration.temperature.along import Along
+from companion.physics.frames import Array, vector
+from companion.physics.units import DEG_H, MG
+from companion.samples import Triad
+
+TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
+_CONTRADICTS: Final = 4.0
+"""Sigmas between the slope of the readings and that of the curve."""
+_WORTH_SAYING: Final = 2.0
+"""Of sigma_use: by so much it will move."""
+_OF_END: Final = 0.25
+"""Variance of a mean over that of the end of a line through the same values (`robust.Line.end_leverage`)."""
+_WORDS: Final = {"gyro": (DEG_H, "deg/h", ".0f"), "accel": (MG, "mg", ".1f")}
+
+Pair = tuple[Array | None, Array | None]
+
+
+def rows_of(triad: Triad) -> slice:
+    """Its rows of six."""
+    return slice(0, 3) if triad == "gyro" else slice(3, 6)
+
+
+def at_end(
+    imu: ImuSolution, whole: Pair, expected: ExpectedImu, shared: Shared
+) -> tuple[ImuSolution, Pair, tuple[Triad, ...]]:
+    """The same at the end of the window, and of which triads; `whole` are its whole biases."""
+    found: list[Array | None] = [imu.gyro_rad_s, imu.accel_m_s2]
+    moved, covariance = list(whole), imu.covariance.copy()
+    warm_up = imu.warm_up_variance.copy()
+    stat = [imu.gyro_sigma_stat_rad_s, imu.accel_sigma_stat_m_s2]
+    followed: list[Triad] = []
+    for k, triad in enumerate(TRIADS):
+        along, bias = expected.along(triad), found[k]
+        end = None if along is None or bias is None else _end(imu, triad, along)
+        if end is None or bias is None:
+            continue
+        shift, variance, level_variance, slope_variance, ramps = end
+        at = np.arange(6)[rows_of(triad)]
+        found[k] = bias + shift
+        before = moved[k]
+        moved[k] = None if before is None else before + shift
+        covariance[at, at] = shared.covariance[at, at] + level_variance + variance
+        stat[k] = np.sqrt(np.square(stat[k]) * np.where(ramps, _OF_END, 1.0) + variance)
+        warm_up[at] = slope_variance * (NEXT_S / 2.0) ** 2
+        followed.append(triad)
+    same = dataclasses.replace(
+        imu,
+        gyro_rad_s=found[0],
+        accel_m_s2=found[1],
+        covariance=covariance,
+        gyro_sigma_stat_rad_s=stat[0],
+        accel_sigma_stat_m_s2=stat[1],
+        warm_up_variance=warm_up,
+    )
+    return same, (moved[0], moved[1]), tuple(followed)
+
+
+def _end(imu: ImuSolution, triad: Triad, along: Along) -> tuple[Array, Array, Array, Array, Array] | None:
+    """What is added to the bias, its variance, that of the mean, what the slope may yet do, and what was a ramp."""
+    line = None if imu.warming is None else imu.warming.line(triad)
+    if line is None or imu.warming is None:
+        return None
+    half_s, slope, ramp = imu.warming.half_s, np.array(along.slope), np.array(line.ramp)
+    of_line, of_slope = np.array(line.slope_variance), np.array(along.slope_variance)
+    more = np.array(line.slope) - slope
+    if (np.abs(more) > _CONTRADICTS * np.sqrt(of_line + of_slope)).any():
+        return None
+    share = of_slope / (of_line + of_slope)
+    shift = np.array(along.shift) + half_s * (share * more - ramp)
+    bend = np.maximum(np.array(along.shift_variance) - half_s**2 * of_slope, 0.0)
+    # It may go on, or end now.
+    goes_on = np.square(slope + share * more) / 3.0 + share * of_line
+    return shift, half_s**2 * share * of_line + bend, np.array(line.level_variance), goes_on, ramp != 0.0
+
+
+def ahead(imu: ImuSolution, triad: Triad) -> Array:
+    """By how much what was given is more than the mean over the window, where it is the end of a ramp."""
+    line = None if imu.warming is None else imu.warming.line(triad)
+    return np.zeros(3) if line is None or imu.warming is None else np.array(line.ramp) * imu.warming.half_s
+
+
+def foretold(imu: ImuSolution, whole: Pair, expected: ExpectedImu | None, followed: Collection[Triad]) -> ImuSolution:
+    """With what its biases, now `whole`, will be when it is warm, where that is known."""
+    warms = (
+        {}
+        if expected is None
+        else {triad: along.warm for triad in followed if (along := expected.along(triad)) and along.warm is not None}
+    )
+    figures: dict[Triad, tuple[Array, Array]] = {}
+    words, degc = [], 0.0
+    for triad, warm in warms.items():
+        k = TRIADS.index(triad)
+        now = whole[k]
+        if now is None:
+            continue
+        change, degc = np.array(warm.change), warm.degc
+        sigma = np.sqrt(np.diag(imu.covariance)[rows_of(triad)] + np.array(warm.variance))
+        figures[triad] = now + change, sigma
+        worst = int(np.abs(change).argmax())
+        if abs(change[worst]) > _WORTH_SAYING * np.sqrt(np.diag(imu.covariance)[rows_of(triad)])[worst]:
+            unit, name, form = _WORDS[triad]
+            then, of_then = (now + change)[worst] / unit, sigma[worst] / unit
+            words.append(
+                f"{triad} {imu.name} {'xyz'[worst]} now {now[worst] / unit:{form}} {name},"
+                f" at {degc:.0f} degC {then:{form}} +- {of_then:{form}}"
+            )
+    if "gyro" not in figures:
+        return imu
+    when = WhenWarm(
+        degc=round(degc, 1),
+        gyro_bias_rad_s=vector(figures["gyro"][0]),
+        gyro_sigma_rad_s=vector(figures["gyro"][1]),
+        accel_bias_m_s2=vector(figures["accel"][0]) if "accel" in figures else None,
+        accel_sigma_m_s2=vector(figures["accel"][1]) if "accel" in figures else None,
+    )
+    return dataclasses.replace(imu, when_warm=when, drifting=tuple(words))

@@ -1,0 +1,116 @@
+"""Along the curve: what a bias does while a window warms, and what it will be when warm.
+
+Where it will end says the present rate: a board that goes to its end as exp(-t / tau) has tau dT/dt to go, at whatever
+temperature of the air, and tau is what earlier power-ups have shown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.calibration.temperature.curve import Curve
+from companion.physics.frames import Array, vector
+from companion.samples import Vector
+
+State = tuple[float, float]
+"""A temperature and how fast it rises, degC and K/s."""
+
+_FEWEST: Final = 3
+"""Power-ups."""
+_SLOWED_K_S: Final = 0.25 / 60.0
+"""By less than that a warm-up that slows down tells nothing of where it ends."""
+_LEAST: Final = 0.15
+"""One sigma of tau, the least of it: boards have more than one."""
+_MAD_TO_SIGMA: Final = 1.4826
+_SIMPSON: Final = (1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0)
+
+
+class Warm(msgspec.Struct, frozen=True, kw_only=True):
+    """When it will be warm; vehicle FRD, rad/s or m/s^2."""
+
+    degc: float
+    change: Vector
+    """Of the bias, from the end of the window."""
+    variance: Vector
+
+
+class Along(msgspec.Struct, frozen=True, kw_only=True):
+    """What the curve of one triad says of a window; vehicle FRD, rad/s or m/s^2, and those a second."""
+
+    shift: Vector
+    """From the mean over it to its end."""
+    shift_variance: Vector
+    slope: Vector
+    slope_variance: Vector
+    warm: Warm | None = None
+    """None: nobody knows where it will end, or no power-up has been there."""
+
+
+class Settling(msgspec.Struct, frozen=True):
+    """How slowly a board goes to its end."""
+
+    tau_s: float
+    sigma_s: float
+
+
+def settling(power_ups: Iterable[Sequence[State]]) -> Settling | None:
+    """Out of the states of earlier power-ups, in their order; None of too few.
+
+    From where it rose fastest to the last one it has gained tau times by what it has slowed down.
+    """
+    found = []
+    for states in power_ups:
+        steepest, last = max(states, key=lambda state: state[1]), states[-1]
+        slowed = steepest[1] - last[1]
+        if slowed > _SLOWED_K_S and last[0] > steepest[0]:
+            found.append((last[0] - steepest[0]) / slowed)
+    if len(found) < _FEWEST:
+        return None
+    tau = _middle(found)
+    scatter = _MAD_TO_SIGMA * _middle([abs(each - tau) for each in found])
+    return Settling(tau, math.hypot(scatter, _LEAST * tau))
+
+
+def _middle(values: Sequence[float]) -> float:
+    return sorted(values)[len(values) // 2]
+
+
+def along(
+    curve: Curve, states: tuple[State, State, State], span_s: float, end_variance: float, settles: Settling | None
+) -> Along:
+    """Of a window whose temperature was in these `states` at its beginning, in its middle and at its end.
+
+    `end_variance`, K^2, is that of how far its end is from the mean.
+    """
+    start, _, end = states
+    weights = [-share for share in _SIMPSON]
+    weights[2] += 1.0
+    shift, of_shift = curve.moves(zip(weights, states, strict=True))
+    slope, of_slope = curve.change(start, end)
+    by_end = np.square(_per_k(curve, end[0])) * end_variance
+    return Along(
+        shift=vector(shift),
+        shift_variance=vector(of_shift + by_end),
+        slope=vector(slope / span_s),
+        # A line goes by half of its change from its middle to its end.
+        slope_variance=vector(of_slope / span_s**2 + by_end * (2.0 / span_s) ** 2),
+        warm=None if settles is None else _warm(curve, end, end_variance * (2.0 / span_s) ** 2, settles),
+    )
+
+
+def _warm(curve: Curve, end: State, k_s_variance: float, settles: Settling) -> Warm | None:
+    degc = end[0] + settles.tau_s * end[1]
+    if curve.beyond_k(degc) > 0.0:
+        return None
+    change, variance = curve.change(end, (degc, 0.0))
+    of_degc = (settles.sigma_s * end[1]) ** 2 + settles.tau_s**2 * k_s_variance
+    return Warm(degc=degc, change=vector(change), variance=vector(variance + np.square(_per_k(curve, degc)) * of_degc))
+
+
+def _per_k(curve: Curve, degc: float) -> Array:
+    return curve.change((degc - 0.5, 0.0), (degc + 0.5, 0.0))[0]
