@@ -26,6 +26,7 @@ SECTIONS: Final = (
     "turning",
     "by-hand",
     "power-up",
+    "mid-warm-up",
     "paper",
 )
 HELP: Final = "errors and sigmas of the estimator, beside the physical bound and what else is done"

@@ -31,6 +31,7 @@ from sim.earth import Array
 from sim.experiments.still import whereabouts
 from sim.imu_model import DEG_H, MG, ImuModel, ImuSpec
 from sim.scenario import site_at
+from sim.thermal import Curve
 
 BEGIN_S: Final = 0.5
 """The stream begins in the middle of a second, which is not counted; the windows begin at 1 s."""
@@ -138,6 +139,7 @@ def stand(
     gyro_bias_rad_s: Array | None = None,
     accel_bias_m_s2: Array | None = None,
     temperature_degc: float | Callable[[float], float] = STEADY_DEGC,
+    curve: Curve | None = None,
 ) -> Stand:
     """Put one up: its heading, its biases (unless given, in sensor axes) and its noise come from the seed."""
     random = np.random.default_rng([*seed, 21])
@@ -153,6 +155,7 @@ def stand(
         gyro_bias_rad_s=(gyro if gyro_bias_rad_s is None else gyro_bias_rad_s).tolist(),
         accel_bias_m_s2=(accel if accel_bias_m_s2 is None else accel_bias_m_s2).tolist(),
         mounting_deg=posture.mounting_deg,
+        curve=curve,
     )
     return Stand(posture, site, imu, random)
 

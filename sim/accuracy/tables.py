@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sim.accuracy import deck_tables, paper, temperature, turning, warmup_table
+from sim.accuracy import deck_tables, mid_warm_up, paper, temperature, turning, warmup_table
 from sim.accuracy.by_hand import table as by_hand_table
 from sim.accuracy.by_hand.stands import BY_HAND, by_hand
 from sim.accuracy.experiments import (
@@ -98,13 +98,27 @@ def report(
         progress(f"by hand: {each} aircraft of each of {len(BY_HAND)} parts")
         boards = [(part, seed, number) for part in BY_HAND for number in range(each)]
         found["by-hand"] = by_hand_table.section(many(by_hand, boards, jobs), each)
+    found |= _by_temperature(runs, seed, only, jobs, progress)
+    if "paper" in only:
+        found["paper"] = _paper(errata(seed, 400))
+    return found
+
+
+def _by_temperature(
+    runs: int, seed: int, only: tuple[str, ...], jobs: int, progress: Callable[[str], None]
+) -> dict[str, Section]:
+    found = {}
     if "power-up" in only:
         each = max(runs // 20, 1)
         progress(f"power-up: {each} aircraft of each of {len(temperature.TRIED)} parts")
         days = [(part, seed, number) for part in temperature.TRIED for number in range(each)]
         found["power-up"] = temperature.section(many(temperature.power_up, days, jobs), each)
-    if "paper" in only:
-        found["paper"] = _paper(errata(seed, 400))
+    if "mid-warm-up" in only:
+        each = max(runs // 20, 1)
+        progress(f"mid-warm-up: {each} aircraft of each of {len(temperature.TRIED)} parts and rates")
+        rates = mid_warm_up.RATES_K_MIN
+        wanted = [(part, rate, seed, k) for part in temperature.TRIED for rate in rates for k in range(each)]
+        found["mid-warm-up"] = mid_warm_up.section(many(mid_warm_up.mid_warm_up, wanted, jobs), each)
     return found
 
 

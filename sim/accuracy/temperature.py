@@ -48,7 +48,7 @@ class PowerUpRun:
 
 
 @dataclass(frozen=True, slots=True)
-class _Day:
+class Day:
     """A second is a row."""
 
     degc: Array
@@ -57,22 +57,25 @@ class _Day:
     still: Array
 
 
-class _Aircraft:
+class Aircraft:
+    """One piece of a part on one board."""
+
     def __init__(self, noise: AxisNoise, random: np.random.Generator) -> None:
         self._noise, self._random = noise, random
         self._flicker_sigma = noise.flicker * math.sqrt(math.log(3.0) / math.pi)
         offset = math.sqrt(noise.scatter**2 - len(_TAUS_S) * self._flicker_sigma**2)
         usual = random.normal(0.0, 1000.0 * DEG_H, 3)
-        self._piece = Piece.drawn(random, usual, np.full(3, offset), np.full(3, noise.per_kelvin))
-        self._board = Board.drawn(random)
+        self.piece = Piece.drawn(random, usual, np.full(3, offset), np.full(3, noise.per_kelvin))
+        self.board = Board.drawn(random)
 
-    def day(self) -> _Day:
+    def day(self) -> Day:
+        """The next one."""
         random, count = self._random, int(self._random.uniform(*SESSION_S))
-        turned_on = self._piece.turned_on(random)
+        turned_on = self.piece.turned_on(random)
         # Three times in ten it is switched on again while it is warm.
         cold = 1.0 if random.random() < 0.7 else random.uniform()
-        temperature = self._board.switched_on(random.uniform(*AMBIENT_DEGC), cold)
-        curve = self._piece.curve
+        temperature = self.board.switched_on(random.uniform(*AMBIENT_DEGC), cold)
+        curve = self.piece.curve
         degc, die = (np.array([temperature(second - late) for second in range(count)]) for late in (0.0, curve.lag_s))
         bias = turned_on + curve.at((die - PARTS[TRIED[0]].reference_degc)[:, None]) + self._flicker(count)
         still, second = np.zeros(count, dtype=bool), int(random.uniform(5.0, 60.0))
@@ -80,7 +83,7 @@ class _Aircraft:
             length = int(random.uniform(5.0, 120.0))
             still[second : second + length] = True
             second += length + int(random.uniform(5.0, 60.0))
-        return _Day(degc + random.normal(0.0, _THERMOMETER_K, count), np.gradient(degc), bias, still)
+        return Day(degc + random.normal(0.0, _THERMOMETER_K, count), np.gradient(degc), bias, still)
 
     def _flicker(self, count: int) -> Array:
         """Of many time constants: Gauss-Markov processes that add up to it."""
@@ -94,7 +97,7 @@ class _Aircraft:
             found[second] = state.sum(axis=0)
         return found
 
-    def seen(self, day: _Day, number: int) -> list[Point]:
+    def seen(self, day: Day, number: int) -> list[Point]:
         """What a daemon remembers of its still seconds, by kelvin."""
         points = []
         kelvin = np.floor(day.degc)
@@ -127,7 +130,7 @@ def power_up(part: str, seed: int, number: int) -> PowerUpRun:
     """One aircraft of a part: twenty days, and what is known when it is switched on again."""
     random = np.random.default_rng([seed, number])
     scatter = PARTS[part].gyro.scatter
-    aircraft = _Aircraft(PARTS[part].gyro, random)
+    aircraft = Aircraft(PARTS[part].gyro, random)
     known: tuple[Point, ...] = ()
     once: list[Point] = []
     for day in range(DAYS):

@@ -148,6 +148,11 @@ def unseen_turn(solution: Solution | None) -> tuple[str, ...]:
     return ()
 
 
+def when_warm(solution: Solution) -> list[str]:
+    """What the biases will be when it is warm, where that is known and worth saying."""
+    return [words for imu in solution.imus if imu.when_warm is not None for words in imu.drifting]
+
+
 def _known(imu: ImuSolution) -> list[bool]:
     return [imu.gyro_rad_s is not None] * 3 + [imu.accel_m_s2 is not None] * 3
 

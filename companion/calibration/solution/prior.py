@@ -25,11 +25,12 @@ import msgspec
 import numpy as np
 
 from companion.calibration.alignment.align_model import Priors
+from companion.calibration.means.warming import Path
 from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.calibration.records.align_record import Determined, ImuAlignmentRecord
 from companion.calibration.records.history import Measured, Point, PowerUp, believed
 from companion.calibration.records.record import Effective
-from companion.calibration.temperature.along import Along
+from companion.calibration.temperature.along import WARM_AFTER, Along, Settling, along
 from companion.calibration.temperature.curve import Curve, Node, PowerUpNodes, fit
 from companion.physics.frames import Array, Floats, Matrix, skew, vector
 from companion.physics.units import DEG, DEG_H, MG, G
@@ -274,6 +275,12 @@ def _along(first: Point, point: Point, triad: Triad) -> Node:
         _, sigma = pose_effect(None).change(G, np.array(point.up), np.array(first.up))
         variance += float(np.square(sigma).mean())
     return _node(point, np.array(found.bias), variance, told=True)
+
+
+def follow(curve: Curve, path: Path, settles: Settling | None, model: AllanModel) -> Along:
+    """What a curve says of a window, and of the time when it is warm."""
+    wander = 0.0 if settles is None else _in_run(model, max(WARM_AFTER * settles.tau_s, _SHORTEST_GAP_S))
+    return along(curve, path.states, path.span_s, path.variance, settles, wander)
 
 
 def _told(groups: Sequence[Sequence[Point]]) -> bool:

@@ -24,8 +24,10 @@ _FEWEST: Final = 3
 """Power-ups."""
 _SLOWED_K_S: Final = 0.25 / 60.0
 """By less than that a warm-up that slows down tells nothing of where it ends."""
-_LEAST: Final = 0.15
+_LEAST: Final = 0.05
 """One sigma of tau, the least of it: boards have more than one."""
+WARM_AFTER: Final = 5.0
+"""So many tau."""
 _MAD_TO_SIGMA: Final = 1.4826
 _SIMPSON: Final = (1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0)
 
@@ -81,11 +83,17 @@ def _middle(values: Sequence[float]) -> float:
 
 
 def along(
-    curve: Curve, states: tuple[State, State, State], span_s: float, end_variance: float, settles: Settling | None
+    curve: Curve,
+    states: tuple[State, State, State],
+    span_s: float,
+    end_variance: float,
+    settles: Settling | None,
+    wander: float = 0.0,
 ) -> Along:
     """Of a window whose temperature was in these `states` at its beginning, in its middle and at its end.
 
-    `end_variance`, K^2, is that of how far its end is from the mean.
+    `end_variance`, K^2, is that of how far its end is from the mean, `wander` that of what the bias does by itself
+    until it is warm.
     """
     start, _, end = states
     weights = [-share for share in _SIMPSON]
@@ -99,17 +107,19 @@ def along(
         slope=vector(slope / span_s),
         # A line goes by half of its change from its middle to its end.
         slope_variance=vector(of_slope / span_s**2 + by_end * (2.0 / span_s) ** 2),
-        warm=None if settles is None else _warm(curve, end, end_variance * (2.0 / span_s) ** 2, settles),
+        warm=None if settles is None else _warm(curve, end, end_variance * (2.0 / span_s) ** 2, settles, wander),
     )
 
 
-def _warm(curve: Curve, end: State, k_s_variance: float, settles: Settling) -> Warm | None:
+def _warm(curve: Curve, end: State, k_s_variance: float, settles: Settling, wander: float) -> Warm | None:
     degc = end[0] + settles.tau_s * end[1]
     if curve.beyond_k(degc) > 0.0:
         return None
     change, variance = curve.change(end, (degc, 0.0))
     of_degc = (settles.sigma_s * end[1]) ** 2 + settles.tau_s**2 * k_s_variance
-    return Warm(degc=degc, change=vector(change), variance=vector(variance + np.square(_per_k(curve, degc)) * of_degc))
+    return Warm(
+        degc=degc, change=vector(change), variance=vector(variance + wander + np.square(_per_k(curve, degc)) * of_degc)
+    )
 
 
 def _per_k(curve: Curve, degc: float) -> Array:

@@ -11,8 +11,8 @@ import numpy as np
 from companion.calibration.means.warming import Warming
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.history import Point, by_power_up
-from companion.calibration.solution.prior import curve_of
-from companion.calibration.temperature.along import Along, Settling, State, along, settling
+from companion.calibration.solution.prior import curve_of, follow
+from companion.calibration.temperature.along import Along, Settling, State, settling
 from companion.calibration.temperature.curve import Curve
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -58,7 +58,8 @@ class Curves:
         curve, path = self.of(name, triad), None if warming is None else warming.path
         if curve is None or path is None:
             return None
-        return along(curve, path.states, path.span_s, path.variance, self._settling.get(name))
+        profile = noise_profile(self._profiles.of(name))
+        return follow(curve, path, self._settling.get(name), profile.gyro if triad == "gyro" else profile.accel)
 
     def drift(
         self, name: str, triad: Triad, degc: float | None, now_degc: float | None

@@ -18,7 +18,7 @@ from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
 from companion.calibration.records.history import Point
 from companion.calibration.request import What
-from companion.calibration.solution.draft import Draft, unseen_turn
+from companion.calibration.solution.draft import Draft, unseen_turn, when_warm
 from companion.calibration.solution.joint import Weighed, weigh
 from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.solve import Solution
@@ -89,7 +89,7 @@ class Solving:
         for doubt in weighed.doubts:
             self._core.say(Severity.WARNING, doubt.words)
         if not job.automatic:
-            for words in unseen_turn(weighed.solution):
+            for words in (*unseen_turn(weighed.solution), *when_warm(weighed.solution)):
                 self._core.say(Severity.NOTICE, words)
         if draft.held_back:
             what = held_back.in_words(draft.held_back)
