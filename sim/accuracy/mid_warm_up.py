@@ -11,7 +11,7 @@ import numpy as np
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.history import by_power_up, kept
-from companion.calibration.solution.at_end import at_end, foretold
+from companion.calibration.solution.at_end import Pair, at_end, foretold
 from companion.calibration.solution.prior import ExpectedImu, curve_of, follow
 from companion.calibration.temperature.along import settling
 from sim.accuracy.figures import Claim, Section, covered, rms
@@ -71,7 +71,8 @@ def mid_warm_up(part: str, rate_k_min: float, seed: int, number: int) -> MidRun:
         solution = solved(standing, window, References.drawn(0.05, 0.5, random))
         plain = solution.imus[0]
         assert plain.gyro_rad_s is not None
-        end = plain_end = (plain.gyro_rad_s, None)
+        plain_end: Pair = (plain.gyro_rad_s, None)
+        end = plain_end
         path = None if plain.warming is None else plain.warming.path
         said, known = plain, ExpectedImu(name="imu")
         if curve is not None and path is not None:
