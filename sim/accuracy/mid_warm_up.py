@@ -100,8 +100,9 @@ def mid_warm_up(part: str, rate_k_min: float, seed: int, number: int) -> MidRun:
 def section(runs: list[MidRun], each: int) -> Section:
     """So many aircraft of every part and rate."""
     lines = [
-        "gyros, rms error in deg/h, sigma, 2 sigma cover: at the end of the window without and with the curve;",
-        "when warm, as foretold; what the calibration is off by then",
+        "gyros, rms error in deg/h, sigma, 2 sigma cover:",
+        "at the end of the window without and with the curve; when warm, as foretold;",
+        "what the calibration is off by then",
         "",
         f"{'':27}{'without':>16}{'with':>23}{'when warm':>23}{'off by':>8}",
     ]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -22,6 +23,7 @@ from companion.storage.learned import BiasStore
 from sim.devices import Gradienter
 from sim.imu_model import DEG_H, MG
 from sim.motions import SlowTurn
+from sim.thermal import warming
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -377,5 +379,62 @@ def test_the_gate_closes_by_what_the_temperature_does_to_this_imu(
             moved = [float(word.split()[3]) for word in accels if word.endswith(" mg off, 5 K warmer")]
             assert moved == ([pytest.approx(5.0 * 0.8, rel=0.1)] if closes else [])
             assert len(words) == (2 if closes else 0)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_a_calibration_in_mid_warm_up_says_what_the_bias_will_be_when_warm(
+    tmp_path: Path, firmware: Literal["ardupilot", "px4"]
+) -> None:
+    """Eight days before have shown it; 4 K a minute now."""
+
+    async def main() -> None:
+        board = warming(20.0, 40.0, 240.0)
+        rig = Rig(tmp_path, part="icm42688p", at_arm="off", up_s=60.0, firmware=firmware, temperature_degc=board, **FEW)
+        async with rig.running():
+            memory = rig.service.calibrating.memory
+            await rig.ready()
+            await calibrated(rig)
+            (first,) = memory._known["fc"].points[-1:]
+            assert first.gyro is not None
+            assert first.accel is not None
+            random, days = np.random.default_rng(3), []
+            for run in range(1, 9):
+                usual = random.normal(100.0, 30.0, 3)
+                for left in (20.0, 12.0, 6.0, 2.0):
+                    degc = 38.0 + random.uniform(0.0, 6.0) - left
+                    bias = usual + 18.0 * (degc - 25.0)
+                    days.append(
+                        msgspec.structs.replace(
+                            first,
+                            started_at="",
+                            power_up=since(run),
+                            temperature_degc=degc,
+                            k_s=left / 240.0,
+                            gyro=msgspec.structs.replace(first.gyro, bias=tuple((bias * DEG_H).tolist())),
+                            accel=msgspec.structs.replace(first.accel, bias=(0.15 * (degc - 25.0) * MG,) * 3),
+                        )
+                    )
+            memory._known["fc"] = msgspec.structs.replace(memory._known["fc"], points=(*days, first))
+            memory.curves.follow(memory._known)
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            (imu,) = record.imus
+            assert imu.when_warm is not None
+            assert imu.when_warm.degc == pytest.approx(40.0, abs=2.0)
+            now_s = rig.aircraft.time_at(rig.now_s)
+            now, warm = (rig.model.true_bias(t_s).gyro_rad_s for t_s in (now_s, now_s + 1800.0))
+            await asyncio.sleep(3.0)
+            assert np.abs(warm - now).min() > 100.0 * DEG_H
+            off = np.subtract(imu.when_warm.gyro_bias_rad_s, warm)
+            assert np.abs(off / imu.when_warm.gyro_sigma_rad_s).max() < 3.5
+            assert max(imu.when_warm.gyro_sigma_rad_s) < 0.3 * np.abs(warm - now).min()
+            words, accel = [words for words in imu.warnings if "degC" in words]
+            assert re.fullmatch(r"accel fc [xyz] now -?[\d.]+ mg, at (39|4\d) degC -?[\d.]+ \+- [\d.]+", accel), accel
+            assert re.fullmatch(r"gyro fc [xyz] now -?\d+ deg/h, at (39|4\d) degC -?\d+ \+- \d+", words), words
+            assert words[0].upper() + words[1:] in rig.ground.texts()
+            assert not any("sensor is another one" in text for text in rig.ground.texts())
+            assert not any("warm-up" in words or "temperature" in words for words in imu.warnings)
 
     run_virtual(main())

@@ -135,7 +135,7 @@ def test_a_ramp_is_followed_to_its_end() -> None:
     found = estimate(batches_of(exact))
     off = errors(found, 0.8 + GRAVITY_LSB)
     assert abs(off[0]) * LSB_DEG_H < 15.0
-    assert any("drifts" in line for line in found.window.warnings)
+    assert any("drifts" in line for line in found.window.drifting)
     assert not found.gyro.ramp_per_s[1:].any()
 
 

@@ -233,9 +233,9 @@ def test_three_kelvin_beyond_it_guards_wider_and_takes_no_part() -> None:
     assert near.weighs
     assert edge.weighs
     assert not far.weighs
-    # It ends at the edge, with the steeper of the fitted slope and the catalogue's as a sigma.
-    np.testing.assert_allclose(far.value, edge.value, rtol=1e-9)
-    assert np.sqrt(far.variance) == pytest.approx(54.0 * DEG_H * 20.0, rel=0.01)
+    # It goes straight on from the edge, with the steeper of the fitted slope and the catalogue's as a sigma.
+    np.testing.assert_allclose(far.value, slope * 53.0, rtol=0.02)
+    assert np.sqrt(far.variance) == pytest.approx(54.0 * DEG_H * 20.0, rel=0.1)
     unknown = found(points, now(None))
     assert not unknown.by_temperature
 

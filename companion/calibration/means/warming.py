@@ -107,6 +107,24 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
         """Of one triad; None where there is no such thing."""
         return self.gyro_line if triad == "gyro" else self.accel_line
 
+    def ahead(self, triad: Triad) -> Floats:
+        """By how much the mean that is given is more than that over the window, where it is the end of a ramp, (3,)."""
+        line = self.line(triad)
+        return np.zeros(3) if line is None else np.array(line.ramp) * self.half_s
+
+    def goes_on(self, triad: Triad) -> tuple[Floats, Floats]:
+        """The slope that will go on for some seconds and one sigma of it, (3,).
+
+        That of a ramp, or what the thermometer's rate leaves of another.
+        """
+        line, move = self.line(triad), self.gyro_warm_up if triad == "gyro" else self.accel_warm_up
+        if line is None:
+            return np.zeros(3), np.zeros(3)
+        slope, variance = np.array(line.slope), np.array(line.slope_variance)
+        prior = np.square(self.rate_k_s * move / WARM_UP_K)
+        share = np.where(np.array(line.ramp) != 0.0, 1.0, prior / np.maximum(prior + variance, np.finfo(float).tiny))
+        return share * slope, np.sqrt(share * variance)
+
     @property
     def rate_k_s(self) -> float:
         """How fast its temperature is known to rise; zero where that may be chance, or it has no thermometer."""

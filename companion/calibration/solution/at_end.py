@@ -92,12 +92,6 @@ def _end(imu: ImuSolution, triad: Triad, along: Along) -> tuple[Array, Array, Ar
     return shift, half_s**2 * share * of_line + bend, np.array(line.level_variance), goes_on, ramp != 0.0
 
 
-def ahead(imu: ImuSolution, triad: Triad) -> Array:
-    """By how much what was given is more than the mean over the window, where it is the end of a ramp."""
-    line = None if imu.warming is None else imu.warming.line(triad)
-    return np.zeros(3) if line is None or imu.warming is None else np.array(line.ramp) * imu.warming.half_s
-
-
 def foretold(imu: ImuSolution, whole: Pair, expected: ExpectedImu | None, followed: Collection[Triad]) -> ImuSolution:
     """With what its biases, now `whole`, will be when it is warm, where that is known."""
     warms = (

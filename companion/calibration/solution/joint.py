@@ -26,7 +26,7 @@ import numpy as np
 
 from companion.calibration.records.history import Measured, Point, PowerUp
 from companion.calibration.records.record import AccelPrior, GyroPrior, Prior
-from companion.calibration.solution.at_end import TRIADS, Pair, ahead, at_end, foretold, rows_of
+from companion.calibration.solution.at_end import TRIADS, Pair, at_end, foretold, rows_of
 from companion.calibration.solution.doubt import Doubt, Witness, doubts
 from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
@@ -202,7 +202,7 @@ def points(
             return None
         part = rows_of(triad)
         return Measured(
-            bias=vector(bias - ahead(imu, triad)),
+            bias=vector(bias if imu.warming is None else bias - imu.warming.ahead(triad)),
             sigma_stat=vector(imu.gyro_sigma_stat_rad_s if triad == "gyro" else imu.accel_sigma_stat_m_s2),
             sigma_use=vector(np.sqrt(_own_variance(imu, shared)[part])),
             sigma_shared=vector(np.sqrt(common[part])),

@@ -52,6 +52,14 @@ class Along(msgspec.Struct, frozen=True, kw_only=True):
     warm: Warm | None = None
     """None: nobody knows where it will end, or no power-up has been there."""
 
+    def less(self, shift: Array, slope: Array) -> Along:
+        """The same where somebody takes off so much by temperature: when warm, too, so that nothing is foretold."""
+        if not shift.any() and not slope.any():
+            return self
+        return msgspec.structs.replace(
+            self, shift=vector(self.shift - shift), slope=vector(self.slope - slope), warm=None
+        )
+
 
 class Settling(msgspec.Struct, frozen=True):
     """How slowly a board goes to its end."""

@@ -17,7 +17,7 @@ from companion.calibration.temperature.curve import Curve
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.formats import Object
-from companion.physics.frames import vector
+from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H
 from companion.samples import Triad, Vector
 from companion.storage.learned import KnownImu
@@ -59,7 +59,11 @@ class Curves:
         if curve is None or path is None:
             return None
         profile = noise_profile(self._profiles.of(name))
-        return follow(curve, path, self._settling.get(name), profile.gyro if triad == "gyro" else profile.accel)
+        found = follow(curve, path, self._settling.get(name), profile.gyro if triad == "gyro" else profile.accel)
+        start, _, end = path.degc
+        return found.less(
+            self.taken_off(name, triad, path.mean_degc, end), self.taken_off(name, triad, start, end) / path.span_s
+        )
 
     def drift(
         self, name: str, triad: Triad, degc: float | None, now_degc: float | None
@@ -69,10 +73,12 @@ class Curves:
         if curve is None or degc is None or now_degc is None:
             return None
         mean, variance = curve.change((degc, 0.0), (now_degc, 0.0))
+        return vector(mean - self.taken_off(name, triad, degc, now_degc)), vector(variance)
+
+    def taken_off(self, name: str, triad: Triad, degc: float, now_degc: float) -> Array:
+        """What the autopilot takes off by temperature itself, from one to another, (3,)."""
         calibration = self._imus[name].calibration if name in self._imus else None
-        if calibration is not None:  # which takes a part of it off by temperature itself
-            mean = mean - calibration.thermal_change(triad, degc, now_degc)
-        return vector(mean), vector(variance)
+        return np.zeros(3) if calibration is None else calibration.thermal_change(triad, degc, now_degc)
 
     def shown(self, known: Mapping[str, KnownImu]) -> list[Object]:
         """By IMU, for `companion temperature`: what still windows have shown, and the curve through them."""

@@ -158,9 +158,18 @@ class BiasMemory:
         self, solution: Solution, whole: Whole, doubts: Sequence[Doubt], started_at: str, unix_s: float
     ) -> dict[str, Point]:
         """What later calibrations may know of this one; `solution` by the readings alone."""
+        at_mean = dict(whole)
+        for imu in solution.imus:
+            degc, end_degc = imu.mean_degc, imu.temperature_degc
+            if degc is not None and end_degc is not None and degc != end_degc:
+                gyro, accel = (
+                    bias if bias is None else bias - self.curves.taken_off(imu.name, triad, degc, end_degc)
+                    for triad, bias in zip(_TRIADS, whole[imu.name], strict=True)
+                )
+                at_mean[imu.name] = gyro, accel
         return points(
             solution,
-            whole,
+            at_mean,
             doubts,
             started_at=started_at,
             unix_s=unix_s,

@@ -129,6 +129,7 @@ class EffectWatch:
             after=next(imu for imu in after.imus if imu.name == target.name),
             gyro_residual=target.solution.gyro_rad_s,
             accel_residual=target.solution.accel_m_s2,
+            apart_s=(after.start_s + after.end_s - before.start_s - before.end_s) / 2.0,
         )
         steps = step_from_far(target.calibration, target.changes, sides.before.accel_m_s2)
         on_the_way = OnTheWay(self._px4.seen_far(target.calibration), *steps)
@@ -154,6 +155,8 @@ class Sides:
     after: ImuWindow
     gyro_residual: Array | None
     accel_residual: Array | None
+    apart_s: float = 0.0
+    """Of their middles."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -214,13 +217,14 @@ def judge_vectors(
 def _judge_half(half: _Half, sides: Sides, calibration: ImuCalibration, on_the_way: OnTheWay | None) -> Verdict:
     (before, before_sigma, use), (after, after_sigma, _) = half.of(sides.before), half.of(sides.after)
     spans_s = (sides.before.duration_s, sides.after.duration_s)
+    before, after, warmed = _as_at_end(half.sensor, sides, before, after)
     observation = Observation(
         parameters=half.parameters,
         unit=half.unit,
         before=before,
         before_sigma=before_sigma,
         after=after,
-        after_sigma=vector(np.hypot(_no_calmer(after_sigma, before_sigma, spans_s), half.drift)),
+        after_sigma=vector(np.hypot(np.hypot(_no_calmer(after_sigma, before_sigma, spans_s), half.drift), warmed)),
         expected_step=half.step,
         truth=vector(np.subtract(before, half.residual)),
         tolerance=TOLERANCE_SIGMAS * max(use),
@@ -238,6 +242,21 @@ def _judge_half(half: _Half, sides: Sides, calibration: ImuCalibration, on_the_w
             expected_step=on_the_way.gyro_step if half.sensor == "gyro" else on_the_way.accel_step,
             resolution=half.resolution,
         )
+    )
+
+
+def _as_at_end(sensor: Sensor, sides: Sides, before: Vector, after: Vector) -> tuple[Vector, Vector, Array]:
+    """Both means as if the temperature had stayed as it was at the end of the first, and one sigma of that, (3,)."""
+    first, second = sides.before.warming, sides.after.warming
+    if first is None or sides.before.dithered:
+        return before, after, np.zeros(3)
+    slope, sigma = first.goes_on(sensor)
+    later = np.zeros(3) if second is None else second.ahead(sensor)
+    since_end_s = sides.apart_s - first.half_s
+    return (
+        vector(before - first.ahead(sensor) + slope * first.half_s),
+        vector(after - later - slope * since_end_s),
+        sigma * sides.apart_s,
     )
 
 
