@@ -30,8 +30,7 @@ from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.calibration.records.align_record import Determined, ImuAlignmentRecord
 from companion.calibration.records.history import Measured, Point, PowerUp, believed
 from companion.calibration.records.record import Effective
-from companion.calibration.temperature.along import WARM_AFTER, Along, Settling, along
-from companion.calibration.temperature.curve import Curve, Node, PowerUpNodes, fit
+from companion.calibration.temperature.curve import WARM_AFTER, Along, Curve, Node, PowerUpNodes, Settling, along, fit
 from companion.physics.frames import Array, Floats, Matrix, skew, vector
 from companion.physics.units import DEG, DEG_H, MG, G
 from companion.samples import Triad, Vector

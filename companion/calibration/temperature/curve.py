@@ -13,6 +13,9 @@ where it has seen nothing.
 
 Each power-up in turn is foretold by the others, at its first node: that decides the lag and how many terms there are,
 and tau is such that those errors are as large as is said.
+
+Where a warm-up will end says the present rate: a board that goes to its end as exp(-t / tau) has tau dT/dt to go, at
+whatever temperature of the air, and tau is what earlier power-ups have shown.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.physics.frames import Array, Floats, Matrix
+from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.samples import Vector
 
 REFERENCE_DEGC: Final = 35.0
@@ -45,6 +48,17 @@ _RANGE: Final = 18.0
 _HALVINGS: Final = 25
 _PRIOR_K: Final = np.array([UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
 """One sigma of each term's coefficient, in kelvin of what parts move."""
+State = tuple[float, float]
+"""A temperature and how fast it rises, degC and K/s."""
+
+_SLOWED_K_S: Final = 0.25 / 60.0
+"""By less than that a warm-up that slows down tells nothing of where it ends."""
+_LEAST: Final = 0.05
+"""One sigma of tau, the least of it: boards have more than one."""
+WARM_AFTER: Final = 5.0
+"""So many tau."""
+_MAD_TO_SIGMA: Final = 1.4826
+_SIMPSON: Final = (1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0)
 
 
 class Node(msgspec.Struct, frozen=True, array_like=True):
@@ -112,14 +126,14 @@ class Curve:
         outside = (steepest * self.beyond_k(degc)) ** 2
         return x @ self.coefficients, self.scatter + float(x @ self.covariance @ x) * self.widening + outside
 
-    def change(self, then: tuple[float, float], now: tuple[float, float]) -> tuple[Array, Array]:
+    def change(self, then: State, now: State) -> tuple[Array, Array]:
         """By how much the bias of one power-up is more now than then, and its variance, (3,) each.
 
         Both are a temperature and how fast it rises, degC and K/s. Of a curve of order 1 and more.
         """
         return self.moves([(-1.0, then), (1.0, now)])
 
-    def moves(self, weighted: Iterable[tuple[float, tuple[float, float]]]) -> tuple[Array, Array]:
+    def moves(self, weighted: Iterable[tuple[float, State]]) -> tuple[Array, Array]:
         """The same of several states with weights whose sum is zero."""
         x, outside_k = np.zeros(self.order), 0.0
         for weight, (degc, k_s) in weighted:
@@ -282,3 +296,105 @@ def _terms(degc: Floats) -> Floats:
 
 def _with_one(terms: Floats) -> Floats:
     return np.concatenate([np.ones((len(terms), 1)), terms], axis=1)
+
+
+class Warm(msgspec.Struct, frozen=True, kw_only=True):
+    """When it will be warm; vehicle FRD, rad/s or m/s^2."""
+
+    degc: float
+    change: Vector
+    """Of the bias, from the end of the window."""
+    variance: Vector
+
+
+class Along(msgspec.Struct, frozen=True, kw_only=True):
+    """What the curve of one triad says of a window; vehicle FRD, rad/s or m/s^2, and those a second."""
+
+    shift: Vector
+    """From the mean over it to its end."""
+    shift_variance: Vector
+    slope: Vector
+    slope_variance: Vector
+    warm: Warm | None = None
+    """None: nobody knows where it will end, or no power-up has been there."""
+
+    def less(self, shift: Array, slope: Array) -> Along:
+        """The same where somebody takes off so much by temperature: when warm, too, so that nothing is foretold."""
+        if not shift.any() and not slope.any():
+            return self
+        return msgspec.structs.replace(
+            self, shift=vector(self.shift - shift), slope=vector(self.slope - slope), warm=None
+        )
+
+
+class Settling(msgspec.Struct, frozen=True):
+    """How slowly a board goes to its end."""
+
+    tau_s: float
+    sigma_s: float
+
+
+def settling(power_ups: Iterable[Sequence[State]]) -> Settling | None:
+    """Out of the states of earlier power-ups, in their order; None of too few.
+
+    From where it rose fastest to the last one it has gained tau times by what it has slowed down.
+    """
+    found = []
+    for states in power_ups:
+        steepest, last = max(states, key=lambda state: state[1]), states[-1]
+        slowed = steepest[1] - last[1]
+        if slowed > _SLOWED_K_S and last[0] > steepest[0]:
+            found.append((last[0] - steepest[0]) / slowed)
+    if len(found) < FEWEST:
+        return None
+    tau = _middle(found)
+    scatter = _MAD_TO_SIGMA * _middle([abs(each - tau) for each in found])
+    return Settling(tau, math.hypot(scatter, _LEAST * tau))
+
+
+def _middle(values: Sequence[float]) -> float:
+    return sorted(values)[len(values) // 2]
+
+
+def along(
+    curve: Curve,
+    states: tuple[State, State, State],
+    span_s: float,
+    end_variance: float,
+    settles: Settling | None,
+    wander: float = 0.0,
+) -> Along:
+    """Of a window whose temperature was in these `states` at its beginning, in its middle and at its end.
+
+    `end_variance`, K^2, is that of how far its end is from the mean, `wander` that of what the bias does by itself
+    until it is warm.
+    """
+    start, _, end = states
+    weights = [-share for share in _SIMPSON]
+    weights[2] += 1.0
+    shift, of_shift = curve.moves(zip(weights, states, strict=True))
+    slope, of_slope = curve.change(start, end)
+    by_end = np.square(_per_k(curve, end[0])) * end_variance
+    return Along(
+        shift=vector(shift),
+        shift_variance=vector(of_shift + by_end),
+        slope=vector(slope / span_s),
+        # A line goes by half of its change from its middle to its end.
+        slope_variance=vector(of_slope / span_s**2 + by_end * (2.0 / span_s) ** 2),
+        warm=None if settles is None else _warm(curve, end, end_variance * (2.0 / span_s) ** 2, settles, wander),
+    )
+
+
+def _warm(curve: Curve, end: State, k_s_variance: float, settles: Settling, wander: float) -> Warm | None:
+    degc = end[0] + settles.tau_s * end[1]
+    if curve.beyond_k(degc) > 0.0:
+        return None
+    change, variance = curve.change(end, (degc, 0.0))
+    of_degc = (settles.sigma_s * end[1]) ** 2 + settles.tau_s**2 * k_s_variance
+    return Warm(
+        degc=degc, change=vector(change), variance=vector(variance + wander + np.square(_per_k(curve, degc)) * of_degc)
+    )
+
+
+def _per_k(curve: Curve, degc: float) -> Array:
+    return curve.change((degc - 0.5, 0.0), (degc + 0.5, 0.0))[0]

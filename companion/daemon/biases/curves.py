@@ -12,8 +12,7 @@ from companion.calibration.means.warming import Warming
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.history import Point, by_power_up
 from companion.calibration.solution.prior import curve_of, follow
-from companion.calibration.temperature.along import Along, Settling, State, settling
-from companion.calibration.temperature.curve import Curve
+from companion.calibration.temperature.curve import Along, Curve, Settling, State, settling
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.formats import Object
