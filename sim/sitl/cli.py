@@ -21,7 +21,7 @@ from sim.sea import motions_of
 from sim.serve import FIRMWARE_COMMANDS, add_world_options, address, configuration, describe, run_until_stopped, serve
 from sim.sitl.ardupilot import ArduPilotSitl
 from sim.sitl.process import BinaryError
-from sim.sitl.px4 import Px4Sitl
+from sim.sitl.px4 import Px4Sitl, flown_by
 from sim.sitl.vehicle import SitlVehicle
 
 SERVING = ("ardupilot", "px4")
@@ -86,6 +86,9 @@ def parser() -> argparse.ArgumentParser:
         "--found", type=int, default=0, metavar="RUNS",
         help="only what the companion finds beside the truth, writing nothing: so many starts, each with another seed",
     )  # fmt: skip
+    residuals.add_argument(
+        "--primary", type=int, choices=(1, 2), help="the IMU that PX4 flies by (default: the one that its EKFs choose)"
+    )
     only = residuals.add_mutually_exclusive_group()
     only.add_argument("--companion-only", action="store_true", help="leave the firmware's own calibrations out")
     only.add_argument("--own-only", action="store_true", help="leave the companion out")
@@ -150,7 +153,9 @@ def vehicle_of(arguments: argparse.Namespace, scenario: Scenario, folder: Path) 
     if firmware not in SERVING:
         firmware = arguments.firmware or ("px4" if arguments.binary.name.startswith("px4") else "ardupilot")
     if firmware == "px4":
-        return Px4Sitl(arguments.binary, scenario, folder, etc=arguments.etc)
+        primary = getattr(arguments, "primary", None)
+        parameters = flown_by(primary) if primary else None
+        return Px4Sitl(arguments.binary, scenario, folder, etc=arguments.etc, parameters=parameters)
     serving = arguments.command == "ardupilot"
     return ArduPilotSitl(
         arguments.binary,

@@ -35,6 +35,12 @@ MEASURING_PARAMETERS: dict[str, float] = {
 """Set at the first boot only; what is stored afterwards is the firmware's own business."""
 
 
+def flown_by(instance: int) -> dict[str, float]:
+    """Parameters that make one IMU (1, 2) the primary: one EKF, and the sensor of the highest priority."""
+    first = {f"CAL_{kind}{instance - 1}_PRIO": 75.0 for kind in ("ACC", "GYRO")}
+    return {"EKF2_MULTI_IMU": 0.0, "SENS_IMU_MODE": 1.0} | first
+
+
 def ports_of(instance: int) -> list[tuple[int, socket.SocketKind]]:
     """All ports an instance or its peers bind, except the ground station's 14550, which all instances share."""
     udp = (_UDP_COMPANION, _UDP_COMPANION_LOCAL, _UDP_GROUND_LOCAL, _UDP_PAYLOAD_LOCAL, _UDP_GIMBAL_LOCAL)
