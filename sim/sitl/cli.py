@@ -21,7 +21,7 @@ from sim.sea import motions_of
 from sim.serve import FIRMWARE_COMMANDS, add_world_options, address, configuration, describe, run_until_stopped, serve
 from sim.sitl.ardupilot import ArduPilotSitl
 from sim.sitl.process import BinaryError
-from sim.sitl.px4 import Px4Sitl, flown_by
+from sim.sitl.px4 import Px4Sitl
 from sim.sitl.vehicle import SitlVehicle
 
 SERVING = ("ardupilot", "px4")
@@ -87,7 +87,10 @@ def parser() -> argparse.ArgumentParser:
         help="only what the companion finds beside the truth, writing nothing: so many starts, each with another seed",
     )  # fmt: skip
     residuals.add_argument(
-        "--primary", type=int, choices=(1, 2), help="the IMU that PX4 flies by (default: the one that its EKFs choose)"
+        "--primary",
+        type=int,
+        choices=(1, 2),
+        help="with --found: the IMU that PX4 flies by (default: the one that its EKFs choose)",
     )
     only = residuals.add_mutually_exclusive_group()
     only.add_argument("--companion-only", action="store_true", help="leave the firmware's own calibrations out")
@@ -153,9 +156,7 @@ def vehicle_of(arguments: argparse.Namespace, scenario: Scenario, folder: Path) 
     if firmware not in SERVING:
         firmware = arguments.firmware or ("px4" if arguments.binary.name.startswith("px4") else "ardupilot")
     if firmware == "px4":
-        primary = getattr(arguments, "primary", None)
-        parameters = flown_by(primary) if primary else None
-        return Px4Sitl(arguments.binary, scenario, folder, etc=arguments.etc, parameters=parameters)
+        return Px4Sitl(arguments.binary, scenario, folder, etc=arguments.etc)
     serving = arguments.command == "ardupilot"
     return ArduPilotSitl(
         arguments.binary,
@@ -223,7 +224,7 @@ def _found(arguments: argparse.Namespace, folder: Path, more: str) -> int:
         one = folder / "firmware" / str(number)
         vehicle = vehicle_of(arguments, scenario_of(arguments), one / "firmware")
         one.mkdir(parents=True)
-        runs.append(asyncio.run(found(vehicle, one, more, listen_s=arguments.listen)))
+        runs.append(asyncio.run(found(vehicle, one, more, listen_s=arguments.listen, primary=arguments.primary)))
         arguments.seed += 1
     print(all_found(runs))
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import socket
 from collections.abc import Mapping
@@ -33,12 +34,6 @@ MEASURING_PARAMETERS: dict[str, float] = {
     "COM_ARM_WO_GPS": 1,
 }
 """Set at the first boot only; what is stored afterwards is the firmware's own business."""
-
-
-def flown_by(instance: int) -> dict[str, float]:
-    """Parameters that make one IMU (1, 2) the primary: one EKF, and the sensor of the highest priority."""
-    first = {f"CAL_{kind}{instance - 1}_PRIO": 75.0 for kind in ("ACC", "GYRO")}
-    return {"EKF2_MULTI_IMU": 0.0, "SENS_IMU_MODE": 1.0} | first
 
 
 def ports_of(instance: int) -> list[tuple[int, socket.SocketKind]]:
@@ -145,6 +140,17 @@ class Px4Sitl(SitlVehicle):
         return FirmwareProcess(
             [str(self._binary), "-d", "-i", str(self.instance), "-w", str(self.folder), str(self._etc)], self.folder
         )
+
+    async def fly_by(self, instance: int) -> None:
+        """Make one IMU (1, 2) the primary: that of the EKF that is asked for by hand.
+
+        Raises:
+            BinaryError: the firmware did not take it.
+        """
+        words = ("--instance", str(self.instance), "select_instance", str(instance - 1))
+        asked = await asyncio.create_subprocess_exec(self._binary.parent / "px4-ekf2", *words, cwd=self.folder)
+        if await asked.wait():
+            raise BinaryError(f"px4-ekf2 {' '.join(words)}: ended with {asked.returncode}")
 
     async def power_on(self) -> None:
         """Start the binary with what it has stored; when that is nothing, with our parameters."""

@@ -18,6 +18,7 @@ from sim.imu_model import DEG_H, MG
 from sim.sitl.daemon import companion_daemon, instances_of
 from sim.sitl.ground import GroundStation
 from sim.sitl.observe import residual
+from sim.sitl.px4 import Px4Sitl
 from sim.sitl.vehicle import SitlVehicle
 from sim.udp import open_udp
 
@@ -188,7 +189,9 @@ async def _companion(
     return 0
 
 
-async def found(vehicle: SitlVehicle, folder: Path, more: str, *, listen_s: float = 0.0) -> list[Found]:
+async def found(
+    vehicle: SitlVehicle, folder: Path, more: str, *, listen_s: float = 0.0, primary: int | None = None
+) -> list[Found]:
     """Start the firmware and let the companion find its IMUs' biases, which are written nowhere.
 
     Raises:
@@ -196,6 +199,8 @@ async def found(vehicle: SitlVehicle, folder: Path, more: str, *, listen_s: floa
     """
     async with vehicle:
         await asyncio.sleep(SETTLE_S)
+        if primary is not None and isinstance(vehicle, Px4Sitl):
+            await vehicle.fly_by(primary)
         async with companion_daemon(vehicle, folder, more=more + FIND) as daemon:
             await vehicle.sleep(listen_s)
             record = await daemon.calibrate(CALIBRATE_WITHIN_S)
