@@ -15,9 +15,8 @@ from companion.autopilot.firmware.firmwares import thermal_changes
 from companion.autopilot.firmware.imu_calibration import Thermal
 from companion.autopilot.parameters.wire import same_float32
 from companion.calibration.machine import Event
-from companion.calibration.means.windows import ImuWindow, Window
+from companion.calibration.means.windows import Window
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.solve import ImuSolution
 from companion.calibration.temperature.polynomial import of_curve
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.daemon.biases.memory import BiasMemory
@@ -25,7 +24,7 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import CurvesWritten, Job
 from companion.daemon.offsets.conclusion import Conclusion
-from companion.daemon.offsets.plan import Plan, Target
+from companion.daemon.offsets.plan import Plan, Target, left_in
 from companion.daemon.offsets.push import WATCHING
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.measuring import Measuring
@@ -130,7 +129,15 @@ class IntoAutopilot:
                 changes = await thermal_changes(self._core.parameters, calibration, polynomial, degc)
                 kind = imu.stream.own_kind
                 targets.append(
-                    Target(name, calibration, (), _as_before(means), kind, watched=True, unseen=tuple(changes))
+                    Target(
+                        name,
+                        calibration,
+                        (),
+                        left_in(means, np.zeros(3), np.zeros(3)),
+                        kind,
+                        watched=True,
+                        unseen=tuple(changes),
+                    )
                 )
                 low, high = curve.span_degc
                 words.append(f"{name}, {low:.0f} to {high:.0f} degC")
@@ -144,19 +151,3 @@ class IntoAutopilot:
                 ours |= {one.parameter: one.after for one in step.changes}
         found = [(ours[name], value) for name, value in thermal.values.items() if name in ours]
         return bool(found) and all(after is not None and same_float32(after, now) for after, now in found)
-
-
-def _as_before(means: ImuWindow) -> ImuSolution:
-    """What its output must go on to read."""
-    sigma = np.concatenate([means.gyro_sigma_use_rad_s, means.accel_sigma_use_m_s2])
-    return ImuSolution(
-        name=means.name,
-        samples=means.samples,
-        temperature_degc=means.temperature_degc,
-        gyro_rad_s=np.zeros(3),
-        accel_m_s2=np.zeros(3),
-        gyro_sigma_stat_rad_s=np.array(means.gyro_sigma_stat_rad_s),
-        accel_sigma_stat_m_s2=np.array(means.accel_sigma_stat_m_s2),
-        covariance=np.diag(sigma**2),
-        warnings=(),
-    )

@@ -16,6 +16,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes
 from companion.autopilot.firmware.px4 import SlotMemory, warnings_about
 from companion.autopilot.parameters.writer import Change
 from companion.autopilot.telemetry.imu_stream import StreamKind
+from companion.calibration.means.windows import ImuWindow
 from companion.calibration.records.record import Outcome, WrittenParameter
 from companion.calibration.records.validity import WORTH_SIGMAS
 from companion.calibration.solution.draft import Draft
@@ -203,6 +204,22 @@ def _less_noise(calibration: ImuCalibration, found: ImuSolution, draft: Draft) -
             draft.unchanged.add((found.name, triad))
             left[triad] = None
     return dataclasses.replace(found, gyro_rad_s=left["gyro"], accel_m_s2=left["accel"])
+
+
+def left_in(imu: ImuWindow, gyro_rad_s: Array | None, accel_m_s2: Array | None) -> ImuSolution:
+    """What is to be taken out of the output of an IMU that read so, where no calibration has worked it out."""
+    sigma = np.concatenate([imu.gyro_sigma_use_rad_s, imu.accel_sigma_use_m_s2])
+    return ImuSolution(
+        name=imu.name,
+        samples=imu.samples,
+        temperature_degc=imu.temperature_degc,
+        gyro_rad_s=gyro_rad_s,
+        accel_m_s2=accel_m_s2,
+        gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
+        accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
+        covariance=np.diag(sigma**2),
+        warnings=(),
+    )
 
 
 def _residual_of_consumer(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:

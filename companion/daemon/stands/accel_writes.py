@@ -11,13 +11,12 @@ from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.parameters.change import Change
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.solve import ImuSolution
 from companion.component.service import WRITTEN_PERCENT
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.daemon.offsets.conclusion import Conclusion
-from companion.daemon.offsets.plan import Plan, Target
+from companion.daemon.offsets.plan import Plan, Target, left_in
 from companion.daemon.offsets.push import WATCHING
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import CalibrationRefusedError
@@ -77,17 +76,6 @@ class AccelWrites:
     def _target(self, imu: ImuWindow, changes: Sequence[Change]) -> Target:
         calibration = self._imus[imu.name].in_force
         _, step = output_step(calibration, changes, imu.accel_m_s2)
-        sigma = np.concatenate([imu.gyro_sigma_use_rad_s, imu.accel_sigma_use_m_s2])
-        solution = ImuSolution(
-            name=imu.name,
-            samples=imu.samples,
-            temperature_degc=imu.temperature_degc,
-            gyro_rad_s=None,
-            accel_m_s2=-np.array(step),
-            gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
-            accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
-            covariance=np.diag(sigma**2),
-            warnings=(),
-        )
+        solution = left_in(imu, None, -np.array(step))
         kind = self._imus[imu.name].stream.kind
         return Target(imu.name, calibration, tuple(changes), solution, kind, watched=True, read_m_s2=imu.accel_m_s2)
