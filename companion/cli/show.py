@@ -127,6 +127,7 @@ def status_lines(status: Object) -> list[str]:
         lines.append(undo_line(status["undoable"]))
     if status["last"] is not None:
         lines += _magnetic_lines(status["last"].get("magnetic"))
+        lines += status["last"].get("when_warm", [])
     return lines
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from companion.calibration.records.history import KEEP_POINTS, PowerUp
 from companion.calibration.records.record import Record, Standing
-from companion.cli.show import temperature_lines
+from companion.cli.show import status_lines, temperature_lines
 from companion.daemon.job import Job
 from companion.daemon.offsets import firmware_calibration
 from companion.recording.walk import Recording
@@ -434,6 +434,9 @@ def test_a_calibration_in_mid_warm_up_says_what_the_bias_will_be_when_warm(
             assert re.fullmatch(r"accel fc [xyz] now -?[\d.]+ mg, at (39|4\d) degC -?[\d.]+ \+- [\d.]+", accel), accel
             assert re.fullmatch(r"gyro fc [xyz] now -?\d+ deg/h, at (39|4\d) degC -?\d+ \+- \d+", words), words
             assert words[0].upper() + words[1:] in rig.ground.texts()
+            async for reply in rig.service.faces.answer({"command": "status"}):
+                assert status_lines(reply["status"])[-2:] == [words, accel]
+                assert reply["status"]["calibration"]["imus"][0]["when_warm"] == [words, accel]
             assert not any("sensor is another one" in text for text in rig.ground.texts())
             assert not any("warm-up" in words or "temperature" in words for words in imu.warnings)
 

@@ -189,6 +189,8 @@ class WhenWarm(msgspec.Struct, frozen=True, kw_only=True):
     gyro_sigma_rad_s: Vector
     accel_bias_m_s2: Vector | None
     accel_sigma_m_s2: Vector | None
+    words: tuple[str, ...] = ()
+    """The same for people, of the axes that will move most; empty where that is not worth saying."""
 
 
 class CrossCovariance(msgspec.Struct, frozen=True, kw_only=True):

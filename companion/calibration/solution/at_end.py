@@ -125,5 +125,6 @@ def foretold(imu: ImuSolution, whole: Pair, expected: ExpectedImu | None, follow
         gyro_sigma_rad_s=vector(figures["gyro"][1]),
         accel_bias_m_s2=vector(figures["accel"][0]) if "accel" in figures else None,
         accel_sigma_m_s2=vector(figures["accel"][1]) if "accel" in figures else None,
+        words=tuple(words),
     )
     return dataclasses.replace(imu, when_warm=when, drifting=tuple(words))

@@ -150,7 +150,7 @@ def unseen_turn(solution: Solution | None) -> tuple[str, ...]:
 
 def when_warm(solution: Solution) -> list[str]:
     """What the biases will be when it is warm, where that is known and worth saying."""
-    return [words for imu in solution.imus if imu.when_warm is not None for words in imu.drifting]
+    return [words for imu in solution.imus if imu.when_warm is not None for words in imu.when_warm.words]
 
 
 def _known(imu: ImuSolution) -> list[bool]:

@@ -104,6 +104,7 @@ def _imu(imu: ImuRecord, now_degc: float | None) -> dict[str, object]:
     return {
         "name": imu.name,
         "temperature_degc": imu.temperature_degc,
+        "when_warm": [] if imu.when_warm is None else list(imu.when_warm.words),
         "temperature_now_degc": now_degc,
         "gyro_bias_deg_h": _scaled(imu.gyro_bias_rad_s, DEG_H, 2),
         "gyro_sigma_deg_h": _scaled(imu.gyro_sigma_use_rad_s, DEG_H, 2),

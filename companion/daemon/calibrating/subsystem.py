@@ -272,4 +272,5 @@ def _summary(record: Record | None) -> Object | None:
         "started_at": record.started_at,
         "reason": record.reason,
         "magnetic": msgspec.to_builtins(record.magnetic),
+        "when_warm": [words for imu in record.imus if imu.when_warm is not None for words in imu.when_warm.words],
     }

@@ -138,7 +138,7 @@ function calibration(found, arming) {
     const warm = [];
     if (imu.temperature_degc !== null) warm.push(`at ${imu.temperature_degc.toFixed(1)} °C`);
     if (imu.temperature_now_degc !== null) warm.push(`now ${imu.temperature_now_degc.toFixed(1)} °C`);
-    return [make("h3", `${imu.name}${warm.length ? ": " + warm.join(", ") : ""}`),
+    return [make("h3", `${imu.name}${warm.length ? ": " + warm.join(", ") : ""}`), ...imu.when_warm.map(words => make("p", words, "note")),
       ...axes(["x", "y", "z"], 1, imu.gyro_bias_deg_h, imu.gyro_sigma_deg_h, "°/h ± sigma", "gyro bias", imu.held_back.includes("gyro"),
         earlier(found, imu.name, "gyro")),
       ...axes(["x", "y", "z"], 2, imu.accel_bias_mg, imu.accel_sigma_mg, "mg ± sigma", "accelerometer bias", imu.held_back.includes("accel"),
