@@ -14,6 +14,7 @@ from sim.imu_model import Bias, ImuModel
 from sim.px4.defaults import EXTERNAL_IDS, SIMULATED_IDS, SLOTS, default_parameters
 from sim.px4.parameters import ParameterStore
 from sim.px4.port import NORMAL_RATES, ONBOARD_RATES, PX4Port
+from sim.px4.thermal import Module, ThermalCompensation
 from sim.px4.vehicle_imu import Sample, VehicleImu
 
 Version = Literal["1.18", "1.16"]
@@ -48,6 +49,7 @@ class Board(AutopilotDouble):
         up_s: how long it has been running when the simulation begins.
         has_position: whether it has a GNSS fix, and so a position and a date.
         clock_ppm: how much faster its clock runs.
+        thermal: whether there is a module for TC_*.
     """
 
     commander: Orders
@@ -70,6 +72,7 @@ class Board(AutopilotDouble):
         up_s: float = 30.0,
         has_position: bool = True,
         clock_ppm: float = 0.0,
+        thermal: Module = "idle",
         seed: int = 0,
     ) -> None:
         if not 1 <= len(imus) <= SLOTS:
@@ -103,11 +106,13 @@ class Board(AutopilotDouble):
         self.timesync_answers = 0
         """Answers to its own TIMESYNC requests."""
         ids = [EXTERNAL_IDS[n] if n in external else SIMULATED_IDS[n] for n in range(len(imus))]
-        self.parameters = self._new_store(parameters or {}, ids, slots or range(len(imus)))
+        table = default_parameters(thermal=thermal != "absent")
+        self.parameters = self._new_store(table, parameters or {}, ids, slots or range(len(imus)))
         self.vehicle_imus = [
             VehicleImu(model, n, ids[n], self.parameters, external=n in external, rate_hz=imu_rate_hz, seed=seed)
             for n, model in enumerate(imus)
         ]
+        self.thermal = ThermalCompensation(thermal, self.parameters, self.vehicle_imus)
         self.primary_imu = 0
         """Number of the IMU that flies, which HIGHRES_IMU shows."""
         self._frozen: dict[int, Sample] = {}
@@ -144,9 +149,12 @@ class Board(AutopilotDouble):
         """STATUSTEXT on every port with a ground station; elsewhere it waits for one, for 5 s."""
 
     def _new_store(
-        self, overrides: Mapping[str, float], ids: Sequence[int], slots: Sequence[int | None]
+        self,
+        table: dict[str, float],
+        overrides: Mapping[str, float],
+        ids: Sequence[int],
+        slots: Sequence[int | None],
     ) -> ParameterStore:
-        table = default_parameters()
         for device_id, slot in zip(ids, slots, strict=True):
             if slot is not None:
                 table |= {f"CAL_GYRO{slot}_ID": device_id, f"CAL_ACC{slot}_ID": device_id}

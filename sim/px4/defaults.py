@@ -12,8 +12,8 @@ EXTERNAL_IDS = (1311243, 1311499, 1311755, 1312011)
 """Device ids on a CAN bus: external sensors."""
 
 
-def default_parameters() -> dict[str, float]:
-    """Name to default: an int is an INT32, a float a REAL32."""
+def default_parameters(*, thermal: bool = True) -> dict[str, float]:
+    """Name to default: an int is an INT32, a float a REAL32. `thermal`: the module of TC_* is built."""
     table: dict[str, float] = {}
     for slot in range(SLOTS):
         for kind in ("GYRO", "ACC"):
@@ -26,7 +26,8 @@ def default_parameters() -> dict[str, float]:
             table |= {f"CAL_MAG{slot}_{axis}{word}": 0.0 for word in ("OFF", "ODIAG", "COMP")}
             table[f"CAL_MAG{slot}_{axis}SCALE"] = 1.0
         table |= {f"CAL_BARO{slot}_ID": 0, f"CAL_BARO{slot}_PRIO": -1, f"CAL_BARO{slot}_OFF": 0.0}
-        table |= _thermal(slot)
+        if thermal:
+            table |= _thermal(slot)
     table |= _sensors() | _commander() | _mavlink() | _estimator() | _actuators()
     return table
 

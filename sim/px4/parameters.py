@@ -15,7 +15,8 @@ from sim.firmware.numbers import float32
 INT32 = mavlink.MAV_PARAM_TYPE_INT32
 REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 SMALLEST_CHANGE = 1.1920929e-07
-"""A float that changes by no more than this is stored, but nobody is told and it is not saved for that."""
+"""A float that changes by no more than this is stored, but nobody is told and it is not saved for that; one that
+differs from its default by no more is not saved at all."""
 
 
 class ParameterStore:
@@ -61,9 +62,13 @@ class ParameterStore:
         return changed
 
     def save(self) -> None:
-        """Write everything to the storage."""
-        self.saved = dict(self.values)
+        """Write everything to the storage that is not, or almost, its default."""
+        self.saved = {name: self._stored(name, value) for name, value in self.values.items()}
         self.unsaved.clear()
+
+    def _stored(self, name: str, value: float) -> float:
+        default = self._defaults[name]
+        return default if abs(value - default) <= SMALLEST_CHANGE and not self.is_int(name) else value
 
     def load(self) -> None:
         """What a boot does: work with what has been saved."""

@@ -52,7 +52,11 @@ async def read_calibration(
     if firmware == "ardupilot":
         return await ardupilot.read_calibration(parameters, instance)
     if firmware == "px4":
-        return await px4.read_calibration(parameters, instance, memory or SlotMemory())
+        # Not before the autopilot is heard.
+        from companion.autopilot.firmware.px4_thermal import read_thermal
+
+        found = await px4.read_calibration(parameters, instance, memory or SlotMemory())
+        return dataclasses.replace(found, thermal=await read_thermal(parameters, found.gyro_id))
     raise AutopilotError("this autopilot is neither ArduPilot nor PX4; it is not supported")
 
 
@@ -72,7 +76,9 @@ async def thermal_changes(
     """
     if parameters.vehicle.firmware == "ardupilot":
         return await ardupilot_tcal.thermal_changes(parameters, calibration, gyro, degc)
-    raise AutopilotError("only ArduPilot's temperature calibration is written")
+    from companion.autopilot.firmware import px4_thermal
+
+    return await px4_thermal.thermal_changes(parameters, calibration, gyro, degc)
 
 
 def settle_s(firmware: Firmware | None) -> float:
@@ -115,6 +121,8 @@ _DEGC: Final = Range(-300.0, 200.0, unit="deg C")
 """-300: not known."""
 _TCAL: Final = Range(-1e6, 1e6)
 """Millionths of rad/s or m/s^2 a kelvin, square kelvin, cubic kelvin."""
+_TC: Final = Range(-10.0, 10.0)
+"""rad/s, and that a kelvin, square kelvin, cubic kelvin."""
 _DEVICE_ID: Final = Range(0.0, 2.0**24, whole=True)
 _TRIM: Final = Range(-math.radians(10.0), math.radians(10.0), unit="rad")
 """ArduPilot cuts it off there."""
@@ -144,7 +152,10 @@ def _ardupilot() -> dict[str, Range]:
 
 def _px4() -> dict[str, Range]:
     found = {name: one for slot in range(SLOTS) for name, one in _offsets(px4.parameters_of(slot, slot)).items()}
-    return found | dict.fromkeys(px4.LEVEL[:2], _LEVEL)
+    for sensor in range(SLOTS):
+        device_id, *rest = px4.thermal_names(sensor)
+        found |= {device_id: _DEVICE_ID, **dict.fromkeys(rest[:3], _DEGC), **dict.fromkeys(rest[3:], _TC)}
+    return found | dict.fromkeys(px4.LEVEL[:2], _LEVEL) | {px4.THERMAL_ENABLE: _SWITCH}
 
 
 CALIBRATION: Final[Mapping[Firmware, Ranges]] = {

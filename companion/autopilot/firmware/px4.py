@@ -3,8 +3,8 @@
     R = R(SENS_BOARD_X/Y/Z_OFF) R(SENS_BOARD_ROT)    of an internal sensor
     R = R(SENS_BOARD_X/Y/Z_OFF) R(CAL_*_ROT)         of an external one
 
-so the level adjustment, unlike ArduPilot's trim, does turn IMU data. A thermal calibration (TC_*) takes its part off
-before the offsets and may be on or off.
+so the level adjustment, unlike ArduPilot's trim, does turn IMU data. A thermal calibration (TC_*,
+`px4_thermal`) takes its part off before the offsets and may be on or off.
 
 The offsets of a sensor stand in the slot that holds its device id, CAL_GYROn_ID and CAL_ACCn_ID. SCALED_IMU, 2 and 3
 show the first, second and third pair of a gyro and an accelerometer, in the order in which their drivers started, and
@@ -40,6 +40,7 @@ from companion.samples import Vector
 Sensor = Literal["gyro", "accel"]
 
 SLOTS: Final = 4
+THERMAL_ENABLE: Final = "TC_G_ENABLE"
 LEVEL: Final = ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF", "SENS_BOARD_Z_OFF")
 NO_IMU: Final = 0
 PREFIX: Final[dict[Sensor, str]] = {"gyro": "CAL_GYRO", "accel": "CAL_ACC"}
@@ -166,6 +167,13 @@ def parameters_of(gyro_slot: int, accel_slot: int) -> ImuParameters:
         gyro_id=f"{gyro}_ID",
         accel_id=f"{accel}_ID",
     )
+
+
+def thermal_names(sensor: int) -> tuple[str, ...]:
+    """Of one gyro's thermal compensation: ID, TREF, TMIN, TMAX; then the coefficients, the constants first, by axis."""
+    own = f"TC_G{sensor}_"
+    head = (f"{own}ID", f"{own}TREF", f"{own}TMIN", f"{own}TMAX")
+    return (*head, *(f"{own}X{power}_{axis}" for power in range(4) for axis in range(3)))
 
 
 async def read_slots(parameters: ParameterClient, sensor: Sensor) -> tuple[Slot, ...]:

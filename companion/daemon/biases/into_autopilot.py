@@ -13,6 +13,7 @@ import numpy as np
 
 from companion.autopilot.firmware.firmwares import thermal_changes
 from companion.autopilot.firmware.imu_calibration import Thermal
+from companion.autopilot.firmware.px4 import THERMAL_ENABLE
 from companion.autopilot.parameters.wire import same_float32
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
@@ -106,10 +107,13 @@ class IntoAutopilot:
         await self._conclusion.conclude(job, plan, window, draft)
         warnings = (*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each))
         job.deliver(CurvesWritten(draft.written, warnings))
+        if any(change.parameter == THERMAL_ENABLE for change in plan.changes):
+            return f"{THERMAL_ENABLE} is on now: reboot PX4, then companion temperature --write once more"
         return f"written: {'; '.join(found.words)}"
 
     async def _find(self, window: Window, *, overwrite: bool) -> _Found:
-        targets, words, left = [], [], []
+        targets: list[Target] = []
+        words, left = [], []
         for means in window.imus:
             if means.name not in self._imus:
                 continue
@@ -127,6 +131,8 @@ class IntoAutopilot:
             else:
                 polynomial = of_curve(curve, calibration.orientation)
                 changes = await thermal_changes(self._core.parameters, calibration, polynomial, degc)
+                named = {change.parameter for target in targets for change in target.unseen}
+                changes = [change for change in changes if change.parameter not in named]
                 kind = imu.stream.own_kind
                 targets.append(
                     Target(

@@ -131,7 +131,7 @@ class EffectWatch:
             accel_residual=target.solution.accel_m_s2,
             apart_s=(after.start_s + after.end_s - before.start_s - before.end_s) / 2.0,
         )
-        steps = step_from_far(target.calibration, target.changes, sides.before.accel_m_s2)
+        steps = step_from_far(target.calibration, target.changes, sides.before.accel_m_s2, target.unseen)
         on_the_way = OnTheWay(self._px4.seen_far(target.calibration), *steps)
         profile = self._profiles.of(target.name)
         return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile, on_the_way)
