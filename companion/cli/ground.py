@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import operator
 import re
 import signal
+import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from companion.cli.terminal import Command, Parser, conclude, seconds, within
+from companion.cli.terminal import Parser, conclude, seconds, within
 from companion.errors import ConfigError, LinkError, NobodyHeardError
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
     )
     subcommands = ground.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    def add(name: str, command: Command, words: str) -> argparse.ArgumentParser:
+    def add(name: str, command: Callable[[argparse.Namespace], Awaitable[int]], words: str) -> argparse.ArgumentParser:
         sub = subcommands.add_parser(name, parents=[common, link], help=words, description=words)
         sub.set_defaults(command=command)
         return sub
@@ -62,9 +62,9 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
     calibrate.add_argument(
         "--reboot", action="store_true", help="restart the autopilot afterwards, where it needs that"
     )
-    add("status", _plain("status"), "what the companion is doing, its last result and its settings")
-    add("cancel", _plain("cancel"), "cancel what runs, whoever asked for it")
-    add("undo", _plain("undo"), "put the autopilot's values from before the last calibration back")
+    add("status", _status, "what the companion is doing, its last result and its settings")
+    add("cancel", _cancel, "cancel what runs, whoever asked for it")
+    add("undo", _undo, "put the autopilot's values from before the last calibration back")
     parameters = add("params", _parameters, "list the companion's own parameters, or set some until it restarts")
     parameters.add_argument("settings", nargs="*", type=_setting, metavar="NAME=VALUE", help="such as CMP_PUSH=0")
 
@@ -76,17 +76,20 @@ async def _calibrate(options: argparse.Namespace) -> int:
     return await _on_the_link(options, lambda one: one.calibrate(what, options.timeout, reboot=options.reboot))
 
 
+async def _status(options: argparse.Namespace) -> int:
+    return await _on_the_link(options, lambda one: one.status())
+
+
+async def _cancel(options: argparse.Namespace) -> int:
+    return await _on_the_link(options, lambda one: one.cancel())
+
+
+async def _undo(options: argparse.Namespace) -> int:
+    return await _on_the_link(options, lambda one: one.undo())
+
+
 async def _parameters(options: argparse.Namespace) -> int:
     return await _on_the_link(options, lambda one: one.parameters(dict(options.settings)))
-
-
-def _plain(method: str) -> Command:
-    """What takes no options."""
-
-    async def command(options: argparse.Namespace) -> int:
-        return await _on_the_link(options, operator.methodcaller(method))
-
-    return command
 
 
 async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Awaitable[Outcome]]) -> int:
@@ -99,7 +102,8 @@ async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Aw
     url, key_file = getattr(options, "url", DEFAULT_URL), getattr(options, "signing_key_file", None)
     key = None if key_file is None else _key(key_file)
     heard = Heard(getattr(options, "component", 191))
-    with contextlib.closing(Display()) as display:
+    # MAVSDK prints some of its own troubles on stdout, which is for the answer alone.
+    with contextlib.redirect_stdout(sys.stderr), Display() as display:
         async with open_link(url, heard, key) as link:
             station = Station(link, url, display)
             try:

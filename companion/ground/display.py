@@ -2,45 +2,53 @@
 
 from __future__ import annotations
 
-import os
-import sys
-from typing import Final
+from types import TracebackType
+from typing import Any, Self
 
+from companion.errors import ConfigError
+from companion.ground.link import INSTALL
 from companion.printable import printable
-
-_BAR: Final = 30
 
 
 class Display:
-    """Draws the bar anew in its line; what is said goes above it. `close` takes it off the terminal."""
+    """A context manager, since a bar must be taken off the terminal again."""
 
     def __init__(self) -> None:
-        self._redraws = sys.stderr.isatty() and os.environ.get("TERM", "dumb") != "dumb"
+        try:
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+        except ImportError as error:
+            raise ConfigError(f"companion ground needs rich: {error}; {INSTALL}") from None
+        # What the companion says is no markup: "[x]" stays what it is.
+        self._console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
+        self._bar: Any = Progress(
+            BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False),
+            console=self._console, transient=True,
+        )  # fmt: skip
+        self._task: Any = None
         self._shown = ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._task is not None:
+            self._bar.stop()
 
     def progress(self, percent: int, text: str) -> None:
         """How far it is."""
         text = printable(text)
-        if self._redraws:
-            self._shown = f"[{'#' * (percent * _BAR // 100):.<{_BAR}}] {percent:3d} % {text}"
-            self._write(self._shown)
+        if self._console.is_terminal:
+            if self._task is None:
+                self._task = self._bar.add_task(text, total=100)
+                self._bar.start()
+            self._bar.update(self._task, completed=percent, description=text)
         elif text != self._shown:
             self._shown = text
-            self._write(f"[{percent:3d} %] {text}\n")
+            self._console.print(f"[{percent:3d} %] {text}")
 
     def text(self, text: str, *, urgent: bool) -> None:
         """What the companion says."""
-        text = printable(text)
-        if not self._redraws:
-            self._write(f"{text}\n")
-        else:
-            self._write(f"\x1b[1m{text}\x1b[0m\n" if urgent else f"{text}\n")
-            self._write(self._shown)
-
-    def close(self) -> None:
-        """It has ended."""
-        self._write("")
-
-    def _write(self, text: str) -> None:
-        sys.stderr.write(f"\r\x1b[K{text}" if self._redraws else text)
-        sys.stderr.flush()
+        self._console.print(printable(text), style="bold yellow" if urgent else "")

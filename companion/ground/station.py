@@ -165,7 +165,7 @@ class Station:
 
     async def status(self) -> Outcome:
         """What the companion is doing, its settings and its last result."""
-        beat = self._heard.heartbeats[self._target].message
+        beat = self._heard.heartbeats[self._target]
         state: State = {
             mavlink.MAV_STATE_CALIBRATING: "busy",
             mavlink.MAV_STATE_STANDBY: "idle",
@@ -319,6 +319,9 @@ class Station:
         return heard.RESULTS.get(-1.0 if last is None else last)
 
     async def _own_parameters(self) -> dict[str, float]:
+        # MAVSDK's list waits over 10 s for its first answer, and tells nobody; one parameter is given up after 3 s.
+        if await self._link.get_parameter(self._target, "CMP_STATE") is None:
+            return {}
         found = await self._link.parameters(self._target)
         return {name: value for name, value in sorted(found.items()) if name.startswith("CMP_")}
 

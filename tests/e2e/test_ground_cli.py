@@ -1,4 +1,4 @@
-"""`companion ground ...` as a person types it: real processes, the real daemon, doubles of both firmwares.
+"""`companion ground ...` as a person types it: real processes, the real daemon, MAVSDK, doubles of both firmwares.
 
 Nearly all of the time is waiting, as a pilot would: what can go on side by side does.
 """
@@ -6,8 +6,10 @@ Nearly all of the time is waiting, as a pilot would: what can go on side by side
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import socket
+import sys
 from pathlib import Path
 from typing import cast
 
@@ -209,7 +211,7 @@ def test_a_port_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
     said = asyncio.run(_run("status", "--url", f"serial:{tmp_path}/radio:57600"))
     assert said.code == FAILED
     assert said.err.count("\n") == 1
-    assert f"{tmp_path}/radio: no such device" in said.err
+    assert "radio:57600 cannot be opened: No such file" in said.err
 
 
 def test_a_port_that_another_ground_station_has_is_named() -> None:
@@ -219,7 +221,26 @@ def test_a_port_that_another_ground_station_has_is_named() -> None:
         said = asyncio.run(_run("status", "--url", f"udpin:127.0.0.1:{port}"))
     assert said.code == FAILED
     assert said.err.count("\n") == 1
-    assert f"{port}: Address already in use; another ground station has it" in said.err
+    assert f"{port} cannot be opened: Address already in use; another ground station has it" in said.err
+
+
+@pytest.mark.parametrize("missing", ["mavsdk", "rich", "rich.progress"])
+def test_without_the_extra_one_line_says_how_to_get_it(missing: str) -> None:
+    code = f"import sys; sys.modules[{missing!r}] = None; from companion.cli import main; sys.exit(main(sys.argv[1:]))"
+
+    async def main() -> None:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", code, "ground", "status", "--url", "udpout:127.0.0.1:9",
+            stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": os.getcwd()},
+        )  # fmt: skip
+        said = await finish(process)
+        assert said.code == USAGE
+        assert said.out == ""
+        assert said.err.count("\n") == 1
+        assert "pip install '.[ground]'" in said.err
+
+    asyncio.run(main())
 
 
 async def _until_said(process: asyncio.subprocess.Process, words: str) -> None:
@@ -262,13 +283,13 @@ def test_texts_that_are_no_utf_8_spoil_nothing() -> None:
             transport.close()
         assert said.code == DONE, said
         assert set(said.json["texts"]) == {"?? ???? ?[31m"}
-        assert set(said.err.splitlines()) == {"?? ???? ?[31m"}, "what the companion says, and nothing else"
+        assert set(said.err.splitlines()) == {"?? ???? ?[31m"}, "what the companion says, and nothing of MAVSDK's"
 
     asyncio.run(main())
 
 
 def test_over_a_signed_link_with_the_key_and_with_another(tmp_path: Path) -> None:
-    """The autopilot judges our signatures by pymavlink's own code."""
+    """MAVSDK has no signing: what it says and hears goes through ours, which the autopilot judges by pymavlink's."""
     right, wrong = tmp_path / "right.key", tmp_path / "wrong.key"
     for path, words in ((right, "a passphrase for the field"), (wrong, "another one altogether")):
         path.write_text(f"{words}\n")

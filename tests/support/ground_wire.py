@@ -1,13 +1,12 @@
-"""What `companion.ground` needs of a link, on a wire in memory, with pymavlink's own parser."""
+"""A ground station without MAVSDK: what `companion.ground` needs of a link, on a wire in memory."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.ground.heard import Ack, Heard, Target, source_of
+from companion.ground.heard import Ack, Heard, Target
 from companion.links.system.listeners import Listeners
 from tests.support.component import Ground, command_message
 
@@ -17,15 +16,6 @@ COMPANION = Target(1, 191)
 def is_final(message: mavlink.MAVLink_message) -> bool:
     """Whether it is the one final answer to a command."""
     return isinstance(message, mavlink.MAVLink_command_ack_message) and message.result != mavlink.MAV_RESULT_IN_PROGRESS
-
-
-M = TypeVar("M", bound=mavlink.MAVLink_message)
-
-
-def sent_by(message: M, system_id: int, component_id: int) -> M:
-    """The message as it comes from there."""
-    message.pack(mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id))
-    return message
 
 
 class StationOnTheWire(Ground):
@@ -46,12 +36,9 @@ class StationOnTheWire(Ground):
         for _, message in self.received[known:]:
             if self.deaf_to(message):
                 continue
-            source = source_of(message)
-            if isinstance(message, mavlink.MAVLink_heartbeat_message):
-                self.heard.heartbeat(message, t_s)
-            elif isinstance(message, mavlink.MAVLink_statustext_message):
-                self.heard.statustext(message, t_s)
-            elif isinstance(message, mavlink.MAVLink_command_ack_message):
+            source = Target(message.get_srcSystem(), message.get_srcComponent())
+            self.heard.update(message.get_type(), source, message.to_dict(), t_s)
+            if isinstance(message, mavlink.MAVLink_command_ack_message):
                 ack = Ack(source, message.command, message.result, message.progress, message.result_param2)
                 self.on_ack.tell(ack)
 

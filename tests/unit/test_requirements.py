@@ -99,7 +99,7 @@ def test_the_boards_of_the_field_have_their_wheels() -> None:
                 "python_version": python, "python_full_version": f"{python}.2", "platform_machine": machine,
                 "sys_platform": "linux",
             }  # fmt: skip
-            for name in ("runtime", "mqtt", "recording"):
+            for name in ("runtime", "mqtt", "recording", "ground"):
                 for package, versions in pins(lock(name)).items():
                     chosen = [
                         version for version, one in versions if one.marker is None or one.marker.evaluate(environment)

@@ -27,10 +27,10 @@ from companion.cli.show import finding_lines
 from companion.daemon.process.check import Finding
 from companion.errors import LinkError
 from companion.ground.display import Display
-from companion.ground.heard import Heard
+from companion.ground.heard import Heard, Target
 from companion.links.serial.ports import Holder, SerialPort
 from companion.printable import printable
-from tests.support.ground_wire import StationOnTheWire, sent_by
+from tests.support.ground_wire import StationOnTheWire
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -246,12 +246,12 @@ def test_what_is_heard_on_the_ground(
 ) -> None:
     @contextlib.asynccontextmanager
     async def open_link(_url: str, heard: Heard, _key: bytes | None) -> AsyncIterator[StationOnTheWire]:
-        wire, now_s = StationOnTheWire(), asyncio.get_running_loop().time()
+        wire, beat = StationOnTheWire(), {"type": 18, "autopilot": 8, "base_mode": 0, "system_status": 3}
         wire.heard = heard
         wire.values = {"CMP_STATE": 1.0, f"CMP_{EVIL}": 1.0}
-        heard.heartbeat(sent_by(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3), 1, 191), now_s)
-        text = EVIL.encode("utf-8", "replace")
-        heard.statustext(sent_by(mavlink.MAVLink_statustext_message(2, text), 1, 191), now_s)
+        heard.update("HEARTBEAT", Target(1, 191), beat, asyncio.get_running_loop().time())
+        text = {"severity": mavlink.MAV_SEVERITY_CRITICAL, "text": EVIL, "id": 0, "chunk_seq": 0}
+        heard.update("STATUSTEXT", Target(1, 191), text, asyncio.get_running_loop().time())
         yield wire
 
     monkeypatch.setattr("companion.ground.link.open_link", open_link)
@@ -263,21 +263,10 @@ def test_what_is_heard_on_the_ground(
 
 def test_the_bar_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", to := io.StringIO())
-    with contextlib.closing(Display()) as display:
+    with Display() as display:
         display.text(EVIL, urgent=True)
         display.progress(20, EVIL)
     assert clean(to.getvalue()) == f"{SHOWN}\n[ 20 %] {SHOWN}\n"
-
-
-def test_the_bar_on_a_terminal_stays_below_what_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stderr", to := io.StringIO())
-    monkeypatch.setattr(to, "isatty", lambda: True)
-    monkeypatch.setenv("TERM", "xterm")
-    with contextlib.closing(Display()) as display:
-        display.progress(50, EVIL)
-        display.text(EVIL, urgent=False)
-    bar = f"[{'#' * 15}{'.' * 15}]  50 % {SHOWN}"
-    assert to.getvalue().split("\r\x1b[K") == ["", bar, f"{SHOWN}\n", bar, ""]
 
 
 @pytest.mark.parametrize(
