@@ -20,8 +20,8 @@ OFFSETS = [f"CAL_GYRO0_{axis}OFF" for axis in "XYZ"]
 
 
 class WarmPx4(Warm):
-    def __init__(self, folder: Path, thermal: str) -> None:
-        super().__init__(folder, firmware="px4", thermal=thermal, parameters=QUIET)
+    def __init__(self, folder: Path, thermal: str, **parameters: int) -> None:
+        super().__init__(folder, firmware="px4", thermal=thermal, parameters={**QUIET, **parameters})
 
     def values(self) -> dict[str, float]:
         return {name: self.px4.parameter(name) for name in (*NAMES, *OFFSETS)}
@@ -91,5 +91,20 @@ def test_without_the_module_it_is_refused_in_one_line(tmp_path: Path, thermal: s
             reply = await rig.ask(action="write")
             assert reply["state"] == "failed"
             assert reply["reason"].startswith(why), reply
+
+    run_virtual(main())
+
+
+def test_where_it_runs_without_this_gyro_it_is_asked_for_twice_without_a_boot(tmp_path: Path) -> None:
+    async def main() -> None:
+        rig = WarmPx4(tmp_path, "started", TC_G_ENABLE=1)
+        async with rig.running():
+            await rig.learn()
+            before = rig.values()
+            assert (await rig.ask(action="write"))["reason"].endswith("companion temperature --write once more")
+            assert (await rig.ask(action="write"))["reason"] == "written: fc, 13 to 34 degC"
+            for _ in range(2):
+                assert (await rig.ask(action="undo"))["state"] == "done"
+            assert rig.values() == before
 
     run_virtual(main())

@@ -107,7 +107,8 @@ class IntoAutopilot:
         await self._conclusion.conclude(job, plan, window, draft)
         warnings = (*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each))
         job.deliver(CurvesWritten(draft.written, warnings))
-        if any(change.parameter == THERMAL_ENABLE for change in plan.changes):
+        calibrations = [target.calibration for target in found.targets if target.all]
+        if any(one.far_step is not None and not one.thermal.gyro_constant for one in calibrations):
             return f"{THERMAL_ENABLE} is on now: reboot PX4, then companion temperature --write once more"
         return f"written: {'; '.join(found.words)}"
 
