@@ -120,7 +120,11 @@ def status_lines(status: Object) -> list[str]:
         + (f", {arming['words']}" if arming["verdict"] != "accept" else "")
     )
     lines.append(f"in force: {arming['in_force']}")
-    lines += [f"by hand, {_minute(one['measured_at'])} UTC: {by_hand_words(one)}" for one in status["by_hand"]]
+    lines += [
+        f"{'by itself' if one['state'] == 'predicted' else 'by hand'}, {_minute(one['measured_at'])} UTC:"
+        f" {by_hand_words(one)}"
+        for one in status["by_hand"]
+    ]
     lines += [f"profile {each['imu']}: {each['summary']}" for each in status["profiles"]]
     lines += end_lines(status)
     if status["undoable"]:
@@ -269,7 +273,7 @@ def history_lines(
         for number, record in zip(numbers, records, strict=True)
     ]
     if by_hand:
-        lines.append(f"{'':4} {'by hand (UTC)':20} what came of it")
+        lines.append(f"{'':4} {'beside these (UTC)':20} what came of it")
         lines += [f"{'':4} {one['measured_at'][:19]:20} {by_hand_words(one)}" for one in by_hand]
     if armings:
         lines.append(f"{'':4} {'armed (UTC)':20} in force")
@@ -282,10 +286,8 @@ def history_lines(
 
 
 def by_hand_words(done: Object) -> str:
-    """What came of an alignment, and whether that is in force."""
-    words = (
-        f"{done['what']}: {done['reason']}" if done["state"] == "done" else f"{done['what']} failed: {done['reason']}"
-    )
+    """What came of an alignment or a prediction, and whether that is in force."""
+    words = f"{done['what']}{' failed' if done['state'] == 'failed' else ''}: {done['reason']}"
     if not (number := len(done["written"])):
         return words
     if done["undone_at"]:

@@ -49,7 +49,19 @@ class CurvesWritten(msgspec.Struct, frozen=True):
     warnings: tuple[str, ...]
 
 
-Product = Record | AlignmentRecord | FacesRecord | TurnRecord | Undone | CurvesWritten
+class Predicted(msgspec.Struct, frozen=True, kw_only=True):
+    """Gyro offsets written because earlier power-ups foretell them."""
+
+    predicted_at: str
+    """UTC, ISO 8601; the host's clock."""
+    words: str
+    """What it is that is in force."""
+    sigmas_rad_s: dict[str, float]
+    """By IMU: of the worst axis."""
+    written: dict[str, WrittenParameter]
+
+
+Product = Record | AlignmentRecord | FacesRecord | TurnRecord | Predicted | Undone | CurvesWritten
 
 
 class JobCancelledError(Exception):

@@ -25,8 +25,11 @@ MOST_STEPS: Final = 10
 """Writes that can be undone one after the other; the oldest one makes room."""
 AUTOMATIC: Final = "auto calibration"
 BY_TEMPERATURE: Final = "temperature"
-BY_HAND: Final = ("faces", "turn", "level", BY_TEMPERATURE)
+PREDICTION: Final = "gyro prediction"
+"""Gyro offsets that earlier power-ups foretell."""
+BY_HAND: Final = ("faces", "turn", "level", BY_TEMPERATURE, PREDICTION)
 """What leaves no calibration's record."""
+_ONE_STEP: Final = {(AUTOMATIC, AUTOMATIC), (AUTOMATIC, PREDICTION), (PREDICTION, PREDICTION)}
 
 
 class Changed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -98,7 +101,9 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """This write and the one before it as one step: back to the values from before both."""
         were = {changed.parameter: changed for changed in older.changes}
         joined = [_joined(were.pop(changed.parameter, None), changed) for changed in self.changes]
-        origin = msgspec.structs.replace(self.origin, since=older.origin.first)
+        origin = self.origin
+        if older.origin.what == origin.what:
+            origin = msgspec.structs.replace(origin, since=older.origin.first)
         return ChangeSet(self.system_id, (*were.values(), *joined), origin)
 
     def without(self, latest: ChangeSet) -> ChangeSet:
@@ -137,10 +142,13 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
         return self.steps or ((ChangeSet(self.system_id, self.changes),) if self.changes else ())
 
     def and_then(self, latest: ChangeSet) -> Undoable:
-        """With another write; those that nobody has asked for are one step, as long as nothing else comes between."""
+        """With another write; those that nobody has asked for are one step, as long as nothing else comes between.
+
+        A prediction stays one by itself until a calibration has replaced it.
+        """
         steps = self.all
-        if steps and latest.origin.what == steps[0].origin.what == AUTOMATIC:
-            return Undoable(self.system_id, (latest.after(steps[0]), *steps[1:]))
+        while steps and (latest.origin.what, steps[0].origin.what) in _ONE_STEP:
+            latest, steps = latest.after(steps[0]), steps[1:]
         return Undoable(self.system_id, (latest, *steps)[:MOST_STEPS])
 
     def without(self, latest: ChangeSet) -> Undoable:

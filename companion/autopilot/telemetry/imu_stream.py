@@ -82,7 +82,8 @@ class ImuStream:
         self._link = link
         self._sources: list[Source] = []
         self._current: Source | None = None
-        self._temperature: tuple[float, float] | None = None
+        self.temperature: tuple[float, float] | None = None
+        """Of the IMU, degC, and when it was told; None: not since the restart."""
         self.pairing = Pairing()
         self._pairing: Pairing | None = None
         """Of PX4."""
@@ -138,7 +139,7 @@ class ImuStream:
         self._sources = [Source(message, self._rates_hz) for message in messages]
         self._pairing = self.pairing if self._vehicle.firmware == "px4" else None
         self.pairing.forget()
-        self._temperature = None
+        self.temperature = None
         while not self._restart.is_set():
             found = await self._find()
             if found is None:
@@ -263,7 +264,7 @@ class ImuStream:
             self._floats_again_s = now_s + (_BETTER_AGAIN_S if answered else SILENCE_S)
 
     def _temperature_is_old(self, now_s: float) -> bool:
-        return self._temperature is None or now_s - self._temperature[1] > _TEMPERATURE_AGE_S
+        return self.temperature is None or now_s - self.temperature[1] > _TEMPERATURE_AGE_S
 
     async def _pause(self, seconds: float) -> bool:
         """Wait, but not beyond the loss or restart of the autopilot; True when that came."""
@@ -307,7 +308,7 @@ class ImuStream:
         source.recent += 1
         self._arrived.set()
         if reading.temperature_degc is not None:
-            self._temperature = (reading.temperature_degc, t_s)
+            self.temperature = (reading.temperature_degc, t_s)
         if source is self._current:
             self._take(reading, source.message.kind, t_s)
 
@@ -333,7 +334,7 @@ class ImuStream:
     def _hand_on(self, reading: Reading, t_s: float, shared_variance: tuple[float, ...] | None = None) -> None:
         self.samples += 1
         self.problem = ""
-        known = self._temperature
+        known = self.temperature
         temperature = None if known is None or t_s - known[1] > _TEMPERATURE_AGE_S else known[0]
         self._on_sample(
             ImuSample(

@@ -40,6 +40,7 @@ class Why(enum.Enum):
 
     NEVER = "not calibrated yet"
     UNDONE = "calibration was undone"
+    PREDICTED = "predicted"
     REBOOTED = "autopilot restarted"
     REPLACED = "boot reset gyro offsets"
     ALIGNED = "gradienter aligned since then"
@@ -165,6 +166,12 @@ def worst_axis(held: Held, present: Present) -> float | None:
         if abs(residual - expected) > RESIDUAL_SIGMAS * math.hypot(then, now)
     ]
     return max(beyond, key=abs, default=None)
+
+
+def contradicts(present: Present, sigma: float) -> bool:
+    """Whether the output is off by more than what was known of it with this sigma lets expect."""
+    off = zip(present.residual, present.sigma, strict=True)
+    return any(abs(residual) > RESIDUAL_SIGMAS * math.hypot(sigma, now) for residual, now in off)
 
 
 def worth_writing(present: Present, held: Held | None, floor: float) -> bool:

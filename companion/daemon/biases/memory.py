@@ -11,16 +11,20 @@ import datetime
 import logging
 import math
 from collections.abc import Collection, Mapping, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
+import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import whole_of
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for, whole_bias, whole_of
+from companion.autopilot.parameters.change import Change
 from companion.calibration.noise.allan import AllanModel, noise_profile
 from companion.calibration.records.history import Point, kept
+from companion.calibration.records.validity import WORTH_SIGMAS
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import (
+    LEVEL,
     Expectation,
     Expected,
     ExpectedImu,
@@ -47,6 +51,8 @@ logger = logging.getLogger(__name__)
 LOOK_K: Final = 1.0
 WRITE_EVERY_S: Final = 300.0
 """What still windows tell is written so often at most: a power cut costs no more of it."""
+AT_POWER_UP_S: Final = 300.0
+"""Since its power came an IMU's offsets may not have been seen right by anybody else, such as a ground station."""
 _MUCH_BETTER: Final = 0.7
 _TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 
@@ -57,6 +63,19 @@ class _Reference(msgspec.Struct):
     session: str
     point: Point
     contradicted: int = 0
+
+
+class Foretold(NamedTuple):
+    """What earlier power-ups say that the gyro offsets of an IMU should be."""
+
+    calibration: ImuCalibration
+    """In force."""
+    changes: tuple[Change, ...]
+    off_rad_s: float
+    """By which the offsets in force seem to be off, on the worst axis."""
+    sigma_rad_s: float
+    """Of what is foretold, on the worst axis."""
+    power_ups: int
 
 
 class BiasMemory:
@@ -152,6 +171,39 @@ class BiasMemory:
             accel_along=self.curves.along(name, "accel", imu.warming),
         )
 
+    def foretold(self, name: str, degc: float) -> Foretold | None:
+        """Gyro offsets for an autopilot's IMU that nobody has seen still since its power came; blocking.
+
+        None where too little is known, or where those in force are not surely worse. Where the firmware has measured
+        them itself at this start, only what earlier power-ups contradict is.
+
+        Raises:
+            CalibrationRefusedError: what is foretold is no bias.
+        """
+        known, calibration = self._known.get(name), self._imus[name].calibration
+        if not self._config.calibration.prior or known is None or calibration is None or calibration.tcal_enable:
+            return None
+        unix_s = _unix_s()
+        power_up = self.whose.power_up(name, unix_s)
+        since_s = power_up.since_unix_s
+        if since_s is None or unix_s - since_s > AT_POWER_UP_S or not self._is_of_today(name, known):
+            return None
+        if any(point.power_up.is_same(power_up) for point in known.points):
+            return None
+        now = Now(
+            unix_s=unix_s, power_up=power_up, temperature_degc=degc, up=vector(LEVEL), gravity_m_s2=9.81, zero=None
+        )
+        expected = expect(known.points, "gyro", now, pose_effect(None), noise_profile(self._profiles.of(name)).gyro)
+        if expected is None or not expected.weighs:
+            return None
+        in_force, _ = whole_bias(calibration, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        off, sigma = np.subtract(expected.value, in_force), np.sqrt(expected.variance)
+        own = any(rival.acts == "at a start" for rival in calibration.rivals)
+        if (np.abs(off) <= (expected.limit if own else WORTH_SIGMAS) * sigma).all():
+            return None
+        changes = changes_for(calibration, vector(off), None)
+        return Foretold(calibration, tuple(changes), np.abs(off).max(), sigma.max(), expected.power_ups)
+
     # --- and afterwards
 
     def measured(
@@ -189,7 +241,7 @@ class BiasMemory:
 
     async def look(self, solution: Solution) -> None:
         """Remember what a still window tells that nobody calibrated from: of each kelvin of a power-up the best."""
-        unix_s = datetime.datetime.now(tz=datetime.UTC).timestamp()
+        unix_s = _unix_s()
         news = [imu.name for imu in solution.imus if self._tells_more(imu, unix_s)]
         if not news:
             return
@@ -273,6 +325,10 @@ class BiasMemory:
     def _reference(self, name: str, triad: Triad) -> Point | None:
         found = self._today.get((name, triad))
         return found.point if found is not None and found.session == self.whose.session(name) else None
+
+
+def _unix_s() -> float:
+    return datetime.datetime.now(tz=datetime.UTC).timestamp()
 
 
 def _is_near(point: Point, degc: float) -> bool:

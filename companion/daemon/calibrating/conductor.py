@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import datetime
 import logging
-from collections.abc import Awaitable, Callable, Collection, Coroutine
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
 from typing import Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -23,6 +23,7 @@ from companion.calibration.solution.draft import Draft, in_words
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.component.tunes import Tune
+from companion.daemon.biases.memory import Foretold
 from companion.daemon.calibrating.course import Course
 from companion.daemon.calibrating.results import Results
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
@@ -36,7 +37,7 @@ from companion.daemon.stands.facing import Facing
 from companion.daemon.stands.turning import TurnAsked, Turning
 from companion.errors import CompanionError
 from companion.links.system.listeners import Listeners
-from companion.storage.changes import AUTOMATIC, BY_HAND
+from companion.storage.changes import AUTOMATIC, PREDICTION, BY_HAND
 
 logger = logging.getLogger(__name__)
 
@@ -127,7 +128,7 @@ class Conductor:
         deadline_s = None if timeout_s is None else asyncio.get_running_loop().time() + timeout_s
         running = self._by_itself()
         whole = running is not None and not running.cancelled and not running.held_back
-        if running is not None and whole and running.what in (what, What.BOTH):
+        if running is not None and whole and running.kind == AUTOMATIC and running.what in (what, What.BOTH):
             running.adopt(requester, deadline_s, reboot=reboot)
             return running
         untold = what is What.ACCELEROMETERS and not self._has_gradienter
@@ -137,6 +138,13 @@ class Conductor:
         kind = AUTOMATIC if automatic else "calibration"
         job = Job(kind, what, requester, deadline_s, reboot=reboot, automatic=automatic)
         return self._start(job, Event.REQUEST, self._calibrate(job))
+
+    def start_prediction(self, foretold: Mapping[str, Foretold], requester: str) -> Job | Refusal:
+        """Start writing the gyro offsets that earlier power-ups foretell, by IMU, or say why not."""
+        if (refusal := self._refusal(requester, None)) is not None:
+            return refusal
+        job = Job(PREDICTION, What.GYROS, requester, None, automatic=True)
+        return self._start(job, Event.REQUEST, self._keep_by_hand(job, lambda job: self._course.predict(job, foretold)))
 
     def start_alignment(self, plan: Plan, requester: str, timeout_s: float) -> Job | Refusal:
         """Start measuring the gradienter's zero, or say why not."""
@@ -186,13 +194,13 @@ class Conductor:
             return refusal
         job = Job(kind, what, requester, asyncio.get_running_loop().time() + timeout_s)
 
-        async def work() -> None:
-            result = await _result(job, run(job))
-            await self._by_hand.keep(job, result)
-            self._collector.retarget(self._wanted.settings)
-            self._end(job, result)
+        return self._start(job, Event.REQUEST, self._keep_by_hand(job, run))
 
-        return self._start(job, Event.REQUEST, work())
+    async def _keep_by_hand(self, job: Job, run: Callable[[Job], Awaitable[str]]) -> None:
+        result = await _result(job, run(job))
+        await self._by_hand.keep(job, result)
+        self._collector.retarget(self._wanted.settings)
+        self._end(job, result)
 
     def start_undo(self, requester: str, *, force: bool = False) -> Job | Refusal:
         """Start putting back the values from before the last write, or say why not (see `Recovery.undo`)."""

@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequenc
 from typing import Final
 
 from companion.autopilot.firmware.gyro_calibration import GyroParameters
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
 from companion.autopilot.parameters.verify import Verdict
 from companion.autopilot.parameters.wire import same_float32
@@ -17,6 +18,7 @@ from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
+from companion.calibration.records.record import WrittenParameter
 from companion.calibration.solution.draft import Draft
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.daemon.core import Core
@@ -100,6 +102,30 @@ class Pusher:
             job.progress(WRITTEN_PERCENT, WATCHING)
             await self._verify(job, plan, before, draft, go_on)
         return plan
+
+    async def push_unseen(
+        self, job: Job, targets: Sequence[tuple[ImuCalibration, Sequence[Change]]], origin: Origin
+    ) -> dict[str, WrittenParameter]:
+        """Write and read back what the telemetry cannot show, because nothing is known to stand still.
+
+        Raises:
+            AutopilotError: as `push`.
+            StorageError: as `push`.
+        """
+        job.check_cancelled()
+        self._machine.on(Event.WRITE)
+        changes = [change for _, each in targets for change in each]
+        job.progress(MEASURED_PERCENT, f"writing {len(changes)} parameters")
+        await self._wait_disarmed()
+        kept = ChangeSet.of(self._vehicle.system_id, changes, origin=origin)
+        async with self._ledger.transaction(kept):
+            with changing(self._imus.values()):
+                async with self._px4.standing_by([(*target, (0.0, 0.0, 0.0)) for target in targets]):
+                    written = await self._writer.apply(changes)
+            await self._ledger.done(kept)
+        for event in (Event.WRITTEN, Event.VERIFIED, Event.CONCLUDED):
+            self._machine.on(event)
+        return written
 
     async def _write(self, job: Job, plan: Plan, firmware: GyroParameters | None, draft: Draft) -> Plan:
         if firmware is None:

@@ -260,7 +260,8 @@ class Px4Writes:
             raise
         # Only a write that came to its end comes here.
         for calibration, changes, _ in targets:
-            if calibration.far_step is not None:
+            written = {change.parameter for change in changes}
+            if calibration.far_step is not None and written.intersection(calibration.parameters.accel_offset):
                 after = _offsets(calibration, changes)
                 self._memory.brought_into_use(calibration.parameters.accel_offset, after, self._vehicle.boots)
 

@@ -1,4 +1,4 @@
-"""What stands have told and written, from the first to the last of them: for history and status."""
+"""What was written without a calibration: what stands have told, and the latest prediction; for history and status."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from companion.calibration.records.turn_record import TurnRecord
 from companion.component.service import JobResult
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.job import Job
+from companion.daemon.job import Job, Predicted
 from companion.errors import StorageError
 from companion.formats import Object
-from companion.storage.changes import ChangeSet
+from companion.storage.changes import PREDICTION, ChangeSet
 from companion.storage.state import BoundedList
 
 logger = logging.getLogger(__name__)
@@ -27,12 +27,12 @@ KEEP = 50
 
 
 class Done(msgspec.Struct, frozen=True, kw_only=True):
-    """One alignment that has come to an end of its own."""
+    """One alignment that has come to an end of its own, or a prediction."""
 
     what: str
-    """"zero", "tilts", "turn", "level" or "faces"."""
+    """"zero", "tilts", "turn", "level", "faces" or "gyro prediction"."""
     state: str
-    """"done" or "failed"."""
+    """"done", "failed" or "predicted"."""
     measured_at: str
     """UTC, ISO 8601; the host's clock."""
     reason: str
@@ -55,8 +55,12 @@ class ByHand:
         self._done = self._file.read()
 
     async def keep(self, job: Job, result: JobResult) -> None:
-        """Remember how a job with stands has ended, where it has come so far."""
+        """Remember how a job with stands, or a prediction, has ended, where it has come so far."""
         record = job.product
+        if isinstance(record, Predicted):
+            written = {name: one.after for name, one in record.written.items()}
+            await self._add(PREDICTION, "predicted", record.predicted_at, result.reason, written)
+            return
         if result.outcome == "cancelled" or not isinstance(record, AlignmentRecord | FacesRecord | TurnRecord):
             return
         board = record.board.written if isinstance(record, TurnRecord) and record.board is not None else {}
@@ -67,15 +71,20 @@ class ByHand:
             for name, one in part.items()
             if one.outcome in ("verified", "stored")
         }
+        await self._add("level" if board else record.kind, result.outcome, record.measured_at, result.reason, written)
+
+    async def _add(self, what: str, state: str, at: str, reason: str, written: dict[str, float]) -> None:
         done = Done(
-            what="level" if board else record.kind,
-            state=result.outcome,
-            measured_at=record.measured_at,
-            reason=result.reason,
+            what=what,
+            state=state,
+            measured_at=at,
+            reason=reason,
             system_id=self._vehicle.system_id,
             written=written,
         )
-        await self._write([*self._done, done][-KEEP:])
+        # Every power-up may bring another prediction: they must not push out what somebody has measured.
+        earlier = [each for each in self._done if each.what != what or what != PREDICTION]
+        await self._write([*earlier, done][-KEEP:])
 
     async def undone(self, step: ChangeSet) -> None:
         """What was written in this step is in force no more."""

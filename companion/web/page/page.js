@@ -149,7 +149,7 @@ function byHand(found) {
   $("by-hand").replaceChildren(...found.map(one => {
     const written = Object.keys(one.written).length;
     const end = one.undone_at ? `undone ${utc(one.undone_at)}` : one.in_force ? "in force" : one.in_force === false ? "not as written any more" : "";
-    return make("p", `${one.what}, ${utc(one.measured_at)}: ${one.state === "done" ? "" : "failed: "}${one.reason}` + (written && end ? `; ${end}` : ""), "note");
+    return make("p", `${one.what}, ${utc(one.measured_at)}: ${one.state === "failed" ? "failed: " : ""}${one.reason}` + (written && end ? `; ${end}` : ""), "note");
   }));
 }
 function link(good, name, words) {
