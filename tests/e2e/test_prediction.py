@@ -142,10 +142,11 @@ def test_it_is_written_while_the_aircraft_is_carried_then_seen_replaced_and_undo
             await calibrated_by_itself(rig, len(LEARNED_DEGC) + 1)
             await rig.until(lambda: in_force(rig).startswith("calibrated"), 10.0)
             assert not any("wrong" in text for text in rig.ground.texts())
-            # What nobody has asked for is one step: back to what the last power-up had left.
-            assert offsets(rig) != after
+            assert offsets(rig) not in (before, after)
+            # What nobody has asked for is one step: back to what was there before the first of the power-ups.
+            assert [step["what"] for step in rig.service.status()["undoable"]] == ["auto calibration"]
             assert (await undone(rig)).outcome == "done"
-            assert offsets(rig) == before
+            assert offsets(rig) == [0.0, 0.0, 0.0]
 
     run_virtual(main())
 
@@ -175,7 +176,7 @@ def says(degc: Callable[[float], float]) -> Callable[[Rig], None]:
     """Of the thermometer; MAVLink has 0 for none."""
 
     def before(rig: Rig) -> None:
-        rig.model.temperature_degc = degc  # type: ignore[method-assign]
+        rig.model.temperature_degc = degc  # type: ignore[assignment, method-assign]
 
     return before
 
@@ -220,10 +221,9 @@ def test_armed_nothing_is_written_and_disarmed_it_is(learned: tuple[Path, dict[s
             await nothing(rig)
             rig.double.disarm()
             await predicted(rig)
-            said = len(rig.ground.texts())
             rig.double.arm()
-            await rig.until(lambda: len(rig.ground.texts()) > said, 5.0)
-            assert rig.ground.texts()[said].startswith("Armed UNCALIBRATED: predicted from 6 power-ups")
+            said = "Armed UNCALIBRATED: predicted from 6 power-ups"
+            await rig.until(lambda: any(text.startswith(said) for text in rig.ground.texts()), 5.0)
 
     run_virtual(main())
 
@@ -289,7 +289,7 @@ def test_a_power_cut_in_the_middle_of_it_is_mended_by_the_next_start(
     run_virtual(main())
 
 
-def test_a_wrong_prediction_is_named_at_the_first_stillness_and_replaced(
+def test_a_wrong_prediction_is_named_at_the_first_stillness_and_is_never_ready(
     learned: tuple[Path, dict[str, float]], tmp_path: Path
 ) -> None:
     async def main() -> None:
@@ -297,21 +297,24 @@ def test_a_wrong_prediction_is_named_at_the_first_stillness_and_replaced(
             rig.model.turn_on(np.full(3, 2000.0 * DEG_H), np.zeros(3))
             await predicted(rig)
             await rig.until(lambda: any(text.startswith("Prediction wrong: fc") for text in rig.ground.texts()), 60.0)
-            print(in_force(rig), rig.service.status()["headline"])
-            await asyncio.sleep(30.0)
-            print(in_force(rig), rig.service.status()["headline"], rig.ground.texts())
+            # A calibration by itself does not believe it; nothing that was ever right is in force.
+            await rig.until(lambda: "held back: gyros of fc" in in_force(rig), 60.0)
+            assert in_force(rig).startswith("predicted from 6 power-ups: ")
+            assert rig.service.arming.readiness.state(rig.now_s)[0] == "uncalibrated"
+            result, _ = await calibrated(rig)
+            assert result.outcome == "done"
+            await rig.until(lambda: in_force(rig).startswith("calibrated"), 10.0)
+            assert off_deg_h(rig) < 400.0
 
     run_virtual(main())
 
 
-def test_px4(tmp_path: Path) -> None:
+def test_px4_takes_it_too(tmp_path: Path) -> None:
     """The same by way of far values, which PX4 takes small changes from."""
     options: dict[str, Any] = {"firmware": "px4", **QUICK, "imu_rate_hz": 50.0}
 
     async def main() -> None:
-        async with powered(
-            tmp_path, 0, 20.0, carried=False, at_arm="off", **{k: v for k, v in options.items() if k != "at_arm"}
-        ) as rig:
+        async with powered(tmp_path, 0, 20.0, carried=False, at_arm="off", **options) as rig:
             await calibrated(rig)
             true = rig.model.true_bias(rig.aircraft.time_at(rig.now_s))[0]
             parameters = {name: rig.autopilot.parameter(name) for name in PX4_GYROS}
@@ -336,7 +339,6 @@ def test_px4(tmp_path: Path) -> None:
             was_off = off_deg_h(rig)
             await predicted(rig)
             assert off_deg_h(rig) < was_off / 4.0
-            print(was_off, off_deg_h(rig), in_force(rig), rig.ground.texts())
             assert rig.service.calibrating.conductor.state is State.DONE
 
     run_virtual(main())

@@ -181,7 +181,7 @@ class BiasMemory:
             CalibrationRefusedError: what is foretold is no bias.
         """
         known, calibration = self._known.get(name), self._imus[name].calibration
-        if not self._config.calibration.prior or known is None or calibration is None or calibration.tcal_enable:
+        if not self._config.calibration.prior or known is None or calibration is None or calibration.thermal.enabled_by:
             return None
         unix_s = _unix_s()
         power_up = self.whose.power_up(name, unix_s)
@@ -196,7 +196,7 @@ class BiasMemory:
         expected = expect(known.points, "gyro", now, pose_effect(None), noise_profile(self._profiles.of(name)).gyro)
         if expected is None or not expected.weighs:
             return None
-        in_force, _ = whole_bias(calibration, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        in_force, _ = whole_bias(calibration, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), degc)
         off, sigma = np.subtract(expected.value, in_force), np.sqrt(expected.variance)
         own = any(rival.acts == "at a start" for rival in calibration.rivals)
         if (np.abs(off) <= (expected.limit if own else WORTH_SIGMAS) * sigma).all():

@@ -37,7 +37,7 @@ from companion.daemon.stands.facing import Facing
 from companion.daemon.stands.turning import TurnAsked, Turning
 from companion.errors import CompanionError
 from companion.links.system.listeners import Listeners
-from companion.storage.changes import AUTOMATIC, PREDICTION, BY_HAND
+from companion.storage.changes import AUTOMATIC, BY_HAND, PREDICTION
 
 logger = logging.getLogger(__name__)
 

@@ -85,7 +85,7 @@ class HeldBack:
         return True
 
     def left_of(self, key: Key, against: list[Finding]) -> list[Finding]:
-        """What speaks against a triad all the same: a person's choice, and what was written and had no effect."""
+        """What speaks against a triad all the same: a person's choice, and what was written and never seen right."""
         if key not in self._kept:
             return against
-        return [finding for finding in against if finding.why in _CHOSEN or finding.why is Why.UNSEEN]
+        return [finding for finding in against if finding.why in _CHOSEN or finding.why in (Why.UNSEEN, Why.PREDICTED)]
