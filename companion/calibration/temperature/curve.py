@@ -58,7 +58,8 @@ _LEAST: Final = 0.05
 WARM_AFTER: Final = 5.0
 """So many tau."""
 _MAD_TO_SIGMA: Final = 1.4826
-_SIMPSON: Final = (1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0)
+_TO_END: Final = (-1.0 / 6.0, -4.0 / 6.0, 5.0 / 6.0)
+"""The last less the mean by Simpson's rule."""
 
 
 class Node(msgspec.Struct, frozen=True, array_like=True):
@@ -370,9 +371,7 @@ def along(
     until it is warm.
     """
     start, _, end = states
-    weights = [-share for share in _SIMPSON]
-    weights[2] += 1.0
-    shift, of_shift = curve.moves(zip(weights, states, strict=True))
+    shift, of_shift = curve.moves(zip(_TO_END, states, strict=True))
     slope, of_slope = curve.change(start, end)
     by_end = np.square(_per_k(curve, end[0])) * end_variance
     return Along(
@@ -381,16 +380,17 @@ def along(
         slope=vector(slope / span_s),
         # A line goes by half of its change from its middle to its end.
         slope_variance=vector(of_slope / span_s**2 + by_end * (2.0 / span_s) ** 2),
-        warm=None if settles is None else _warm(curve, end, end_variance * (2.0 / span_s) ** 2, settles, wander),
+        warm=None if settles is None else _warm(curve, states, end_variance * (2.0 / span_s) ** 2, settles, wander),
     )
 
 
-def _warm(curve: Curve, end: State, k_s_variance: float, settles: Settling, wander: float) -> Warm | None:
-    degc = end[0] + settles.tau_s * end[1]
+def _warm(curve: Curve, states: Sequence[State], k_s_variance: float, settles: Settling, wander: float) -> Warm | None:
+    _, (middle_degc, k_s), end = states
+    degc = middle_degc + settles.tau_s * k_s
     if curve.beyond_k(degc) > 0.0:
         return None
     change, variance = curve.change(end, (degc, 0.0))
-    of_degc = (settles.sigma_s * end[1]) ** 2 + settles.tau_s**2 * k_s_variance
+    of_degc = (settles.sigma_s * k_s) ** 2 + settles.tau_s**2 * k_s_variance
     return Warm(
         degc=degc, change=vector(change), variance=vector(variance + wander + np.square(_per_k(curve, degc)) * of_degc)
     )
