@@ -18,6 +18,7 @@ from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.calibration.seconds.counting import Counted, TurnCounter
 from companion.calibration.stillness.gates import STILL, ImuGate, PoseGate, Verdict
 from companion.calibration.stillness.stretch import Lag, Settling
+from companion.calibration.temperature.thermometer import Thermometers
 from companion.calibration.turning.level import ImuKind
 from companion.calibration.turning.watch import Turn, TurnWatch
 from companion.physics.frames import Array
@@ -161,6 +162,7 @@ class Intake(ABC):
         """By IMU whose device tells: a time, and for how long it had been on by then."""
         self._field = None if field_by is None else FieldHeading(*field_by, keep)
         self._turns = TurnWatch(span)
+        self.thermometers = Thermometers()
         self._counters: dict[str, TurnCounter] = {}
         """By IMU, while turns on a spot are counted."""
 
@@ -250,6 +252,7 @@ class Intake(ABC):
             self._deck.set_imu(imu)
         if known is None:
             batches = BatchSource(LIMITS_IMU, self._keep, steps=integer_steps(imu))
+            batches.believed = functools.partial(self.thermometers.believed, imu.name)
             self._imus[imu.name] = source = Source("imu", imu.name, batches, gate)
             if self._deck is not None:
                 source.may_move, batches.on_second = True, functools.partial(self._deck.take_imu, imu.name)

@@ -240,6 +240,8 @@ class BatchSource:
         self.restarts = 0
         """How often the clock went back and everything was dropped."""
         self._limits, self._keep, self._circle, self.steps = np.asarray(limits), keep, circle, steps
+        self.believed: Callable[[int, float | None], float | None] = lambda slot, degc: degc
+        """What of the temperature of a second is believed."""
         self.on_second: Callable[[Batch, Floats, Floats], None] | None = None
         """Told of every second, its times (n,) and its rows (n, c), before those are dropped."""
         self._restart()
@@ -374,7 +376,7 @@ class BatchSource:
             times,
             rows,
             stamps,
-            sum(self._degc) / len(self._degc) if self._degc else None,
+            self.believed(slot, sum(self._degc) / len(self._degc) if self._degc else None),
             circle=self._circle,
             steps=self.steps,
         )

@@ -233,8 +233,10 @@ class BiasMemory:
         """Remember a calibration that has come to a good end; that it cannot be kept on disk is only logged."""
         for name, point in found.items():
             known = self._of(name)
-            # As many as the disk keeps: what is asked must not depend on when the daemon was started.
-            self._known[name] = msgspec.structs.replace(known, points=kept((*known.points, point)))
+            # Without a temperature, of an IMU whose curve is known, it would fit to none.
+            if point.temperature_degc is not None or all(one.temperature_degc is None for one in known.points):
+                # As many as the disk keeps: what is asked must not depend on when the daemon was started.
+                self._known[name] = msgspec.structs.replace(known, points=kept((*known.points, point)))
             for triad in _TRIADS:
                 self._refer(name, triad, point)
         await self._write()

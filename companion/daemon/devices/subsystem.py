@@ -69,9 +69,14 @@ class Devices(Subsystem):
             said = device.status() | counts.get(device.name, {})
             if (words := self._misplaced(device.name)) is not None:
                 said |= {"good": False, "summary": f"{said['summary']}; {words}"}
+            elif self._core.collector.thermometers.has_none(device.name):
+                said |= {"summary": f"{said['summary']}, without a temperature"}
             devices.append(said)
         return {
             "devices": devices,
+            "warnings": [
+                words for imu in self._core.config.imu if (words := self._core.collector.thermometers.trouble(imu.name))
+            ],
             "profiles": self._core.profiles.status(),
             "ground_stations": dict(zip(("good", "summary"), self.reach.text(), strict=True)),
         }

@@ -241,6 +241,8 @@ GYRO_LIMIT_RAD_S = 100.0
 ACCEL_LIMIT_M_S2 = 2000.0
 """204 g; the widest range of a part with a gyro in it is 200 g."""
 TEMPERATURE_LIMIT_DEGC = 200.0
+ANY_TEMPERATURE = 12000.0
+"""Of an IMU, in whichever unit it is sent: `calibration/temperature/thermometer.py` names what cannot be degC."""
 
 
 def numbers(fields: list[bytes]) -> list[float]:
@@ -275,7 +277,7 @@ def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | 
     if not (
         (-rate <= gx <= rate and -rate <= gy <= rate and -rate <= gz <= rate)
         and (-force <= ax <= force and -force <= ay <= force and -force <= az <= force)
-        and -TEMPERATURE_LIMIT_DEGC <= temperature <= TEMPERATURE_LIMIT_DEGC
+        and -ANY_TEMPERATURE <= temperature <= ANY_TEMPERATURE
     ):
         raise RejectedError(reasons.OUT_OF_RANGE)
 
