@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,7 +25,7 @@ profile = "icm42688p"
 """
 
 
-def learned(folder: Path, thermometer: Callable[[float], float], **options: object) -> tuple[list[str], str, int]:
+def learned(folder: Path, thermometer: Callable[[float], float], **options: Any) -> tuple[list[str], str, int]:
     """Warnings of the status, the IMU's summary, and how many points with a temperature are kept of it."""
 
     async def main() -> tuple[list[str], str, int]:

@@ -33,7 +33,6 @@ def shown(seconds: int, **by: Degc) -> tuple[Thermometers, dict[str, list[float 
     ("degc", "words"),
     [
         (lambda t_s: warm(t_s) + 273.15, r"shows 3\d\d\.\d\d, allowed -40 to 105 degC \(in kelvin or tenths\?\)"),
-        (lambda t_s: warm(t_s) * 100.0, r"shows 3\d\d\d\.\d\d, allowed -40 to 105 degC \(in hundredths\?\)"),
         (lambda t_s: warm(t_s) * 10.0, r"shows 3\d\d\.\d\d, allowed .* tenths\?\)"),
         (lambda t_s: 110.0 + warm(t_s) / 10.0, r"shows 113\.\d\d, allowed -40 to 105 degC \(in degF or tenths\?\)"),
         (lambda t_s: -300.0, r"shows -300.00, allowed -40 to 105 degC; nothing"),

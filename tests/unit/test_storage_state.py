@@ -286,7 +286,7 @@ def test_a_list_from_before_there_were_checksums_goes_on(tmp_path: Path) -> None
         (Changed("INS_ACCOFFS_X", before=9.5, after=0.0), "INS_ACCOFFS_X = 9.5; allowed: -4.9 to 4.9 m/s"),
         (Changed("CAL_ACC0_XOFF", before=0.0, after=0.0, via=9.5), "CAL_ACC0_XOFF = 9.5"),
         (Changed("CAL_GYRO3_ZOFF", before=0.0, after=0.0, also=(0.0, -1.0)), "CAL_GYRO3_ZOFF = -1"),
-        (Changed("INS_GYR1_CALTEMP", before=1e4, after=None), "INS_GYR1_CALTEMP = 10000; allowed: -300 to 200 deg C"),
+        (Changed("INS_GYR1_CALTEMP", before=1e4, after=None), "INS_GYR1_CALTEMP = 10000; allowed: -300 to 400 deg C"),
         (Changed("INS_GYR_ID", before=0.5, after=None), "INS_GYR_ID = 0.5; allowed: whole numbers 0 to"),
         (Changed("SENS_IMU_AUTOCAL", before=0.5, after=0.0), "SENS_IMU_AUTOCAL = 0.5"),
         (Changed("ARMING_CHECK", before=0.0, after=1.0), "'ARMING_CHECK': not a parameter that the companion writes"),

@@ -117,8 +117,8 @@ GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
 ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
 ACCEL_SCALE: Final = Range(0.5, 2.0)
 """With others nothing is calibrated."""
-_DEGC: Final = Range(-12000.0, 12000.0, unit="deg C")
-"""-300: not known. As wide as what a thermometer in hundredths shows: the autopilot notes what its own says."""
+_DEGC: Final = Range(-300.0, 400.0, unit="deg C")
+"""-300: not known. Up to what a thermometer in kelvin shows: the autopilot notes what its own says."""
 _TCAL: Final = Range(-1e6, 1e6)
 """Millionths of rad/s or m/s^2 a kelvin, square kelvin, cubic kelvin."""
 _TC: Final = Range(-10.0, 10.0)

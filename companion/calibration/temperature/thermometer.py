@@ -112,7 +112,6 @@ def _unit(shown: float) -> str:
         "kelvin": shown - 273.15,
         "degF": (shown - 32.0) / 1.8,
         "tenths": shown / 10.0,
-        "hundredths": shown / 100.0,
     }
     likely = [unit for unit, degc in units.items() if low <= degc <= high]
     return f" (in {' or '.join(likely)}?)" if likely else ""

@@ -241,8 +241,8 @@ GYRO_LIMIT_RAD_S = 100.0
 ACCEL_LIMIT_M_S2 = 2000.0
 """204 g; the widest range of a part with a gyro in it is 200 g."""
 TEMPERATURE_LIMIT_DEGC = 200.0
-ANY_TEMPERATURE = 12000.0
-"""Of an IMU, in whichever unit it is sent: `calibration/temperature/thermometer.py` names what cannot be degC."""
+ANY_TEMPERATURE = 800.0
+"""Of an IMU, in kelvin or tenths too: `calibration/temperature/thermometer.py` names what cannot be degC."""
 
 
 def numbers(fields: list[bytes]) -> list[float]:
