@@ -7,7 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
 
@@ -18,11 +18,13 @@ from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.calibration.seconds.counting import Counted, TurnCounter
 from companion.calibration.stillness.gates import STILL, ImuGate, PoseGate, Verdict
 from companion.calibration.stillness.stretch import Lag, Settling
-from companion.calibration.temperature.thermometer import Thermometers
 from companion.calibration.turning.level import ImuKind
 from companion.calibration.turning.watch import Turn, TurnWatch
 from companion.physics.frames import Array
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
+
+if TYPE_CHECKING:
+    from companion.calibration.temperature.thermometer import Thermometers
 
 Kind = Literal["imu", "gradienter", "compass"]
 
@@ -162,9 +164,15 @@ class Intake(ABC):
         """By IMU whose device tells: a time, and for how long it had been on by then."""
         self._field = None if field_by is None else FieldHeading(*field_by, keep)
         self._turns = TurnWatch(span)
-        self.thermometers = Thermometers()
         self._counters: dict[str, TurnCounter] = {}
         """By IMU, while turns on a spot are counted."""
+
+    @functools.cached_property
+    def thermometers(self) -> Thermometers:
+        """Of the IMUs; not wanted before the first second."""
+        from companion.calibration.temperature.thermometer import Thermometers
+
+        return Thermometers()
 
     @abstractmethod
     def _evaluate(self) -> None:
@@ -252,7 +260,8 @@ class Intake(ABC):
             self._deck.set_imu(imu)
         if known is None:
             batches = BatchSource(LIMITS_IMU, self._keep, steps=integer_steps(imu))
-            batches.believed = functools.partial(self.thermometers.believed, imu.name)
+            name = imu.name
+            batches.believed = lambda slot, degc: self.thermometers.believed(name, slot, degc)
             self._imus[imu.name] = source = Source("imu", imu.name, batches, gate)
             if self._deck is not None:
                 source.may_move, batches.on_second = True, functools.partial(self._deck.take_imu, imu.name)
