@@ -321,10 +321,11 @@ def _turn_rad_s(seconds: Sequence[ImuSecond], found: Found) -> Array:
 
 
 def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:
-    """(6,) variance of what integers hide that the swaying does not spread; vehicle axes."""
+    """(6,) variance of what integers hide that the swaying does not spread, and of what is off in all; vehicle axes."""
     steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
     means = np.array([one.mean for one in seconds])
     spread = np.sqrt(means.var(axis=0) + np.mean([one.variance for one in seconds], axis=0))
     hidden = np.where(spread < _DITHERED * steps, np.square(steps / 2.0), 0.0)
+    hidden = hidden + np.mean([np.broadcast_to(one.shared_variance, 6) for one in seconds], axis=0)
     turn = np.square(imu.rotation)
     return np.concatenate([turn @ hidden[:3], turn @ hidden[3:]])

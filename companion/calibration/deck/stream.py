@@ -47,6 +47,8 @@ class ImuSecond(msgspec.Struct, frozen=True):
     temperature_degc: float | None
     white2: float
     """N^2 of the gyros, from second differences of neighbouring samples; the mean of the axes."""
+    shared_variance: Floats | float = 0.0
+    """As in `Batch`; (6,), the sensor's axes."""
 
 
 class Stream:
@@ -99,6 +101,7 @@ class Stream:
                 variance=batch.variance,
                 temperature_degc=batch.temperature_degc,
                 white2=white2,
+                shared_variance=batch.shared_variance,
             )
         )
         while self.levels and next(iter(self.levels)) < self.seconds[0].slot:
