@@ -35,7 +35,7 @@ MAX_IMUS: Final = 4
 # No script, nothing fetched, nothing sent: what is not inline does not exist.
 _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
-_STYLE: Final = Path(__file__).with_name("page.css")
+_STYLES: Final = tuple(Path(__file__).with_name(name) for name in ("page.css", "plot.css"))
 
 
 def page(title: str, now: datetime.datetime, *body: Child, source: str = "from the records on this computer") -> str:
@@ -52,7 +52,7 @@ def page(title: str, now: datetime.datetime, *body: Child, source: str = "from t
         tag("meta", http_equiv="Content-Security-Policy", content=_POLICY),
         tag("meta", name="color-scheme", content="light dark"),
         tag("title", title),
-        tag("style", Markup(_STYLE.read_text(encoding="utf-8"))),
+        tag("style", Markup("".join(style.read_text(encoding="utf-8") for style in _STYLES))),
     )
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>{join(*body, foot)}</body></html>\n'
 

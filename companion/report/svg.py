@@ -85,7 +85,7 @@ class Plot:
     """One frame with axes, of that height, the whole 360 wide; what is drawn first lies below.
 
     Without an `x_label` no ticks are written either, for a plot with another one below it. `name` is what a screen
-    reader says, `left` the room for what is written at the vertical axis.
+    reader says, `told` what it shows, in words, `left` the room for what is written at the vertical axis.
     """
 
     def __init__(
@@ -94,13 +94,14 @@ class Plot:
         y: Axis,
         *,
         name: str,
+        told: str = "",
         height: float = 96.0,
         x_label: str | None = None,
         y_label: str = "",
         left: float = LEFT,
     ) -> None:
         self._left, self._top = left, _TOP + (_TITLE if y_label else 0.0)
-        self._x, self._y, self._name, self._height = x, y, name, height
+        self._x, self._y, self._name, self._told, self._height = x, y, name, told, height
         self._x_label, self._y_label = x_label, y_label
         self._below: list[Markup] = []
         self._parts: list[Markup] = []
@@ -120,14 +121,24 @@ class Plot:
         if len(points) > 1:
             self._below.append(_path("M" + "L".join(_xy(*self.at(*point)) for point in points), class_))
 
+    def area(self, ends: Sequence[tuple[float, float, float]], class_: str) -> None:
+        """Fill what lies between two lines, of (x, low, high)."""
+        if len(ends) > 1:
+            around = [*((x, low) for x, low, _ in ends), *((x, high) for x, _, high in reversed(ends))]
+            self._below.append(_path("M" + "L".join(_xy(*self.at(*point)) for point in around) + "z", class_))
+
+    def upright(self, x: float, class_: str) -> None:
+        """A line from below to above."""
+        self._below.append(_path(f"M{_xy(*self.at(x, self._y.low))}V{_n(self._top)}", class_))
+
     def points(self, points: Sequence[Pair], class_: str, spans: Sequence[Pair]) -> None:
-        """Markers: `sx` (circles), `sy` (squares) or `sz` (triangles), each with an upright bar over its span."""
+        """Markers: `sy` (squares), `sz` (triangles) or others (circles), each with an upright bar over its span."""
         bars: list[str] = []
         for (x, _), (low, high) in zip(points, spans, strict=True):
             across, bottom = self.at(x, low)
             bars.append(f"M{_n(across)} {_n(bottom)}V{_n(self.at(x, high)[1])}")
         self._parts.append(_path("".join(bars), f"bar {class_}"))
-        if class_ == "sx":
+        if class_ not in {"sy", "sz"}:
             # A round end of a line without length: a quarter of the characters that a circle takes.
             self._parts.append(_path("".join(f"M{_xy(*self.at(*point))}h.01" for point in points), f"dot {class_}"))
             return
@@ -158,10 +169,11 @@ class Plot:
             middle = (self._left + WIDTH - _RIGHT) / 2.0
             labels.append(tag("text", self._x_label, x=_n(middle), y=_n(bottom + 31.0), class_="mid label"))
         if self._y_label:
-            labels.append(tag("text", self._y_label, x=_n(self._left), y=_n(self._top - 6.0), class_="label"))
+            labels.append(tag("text", self._y_label, x="0", y=_n(self._top - 6.0), class_="label"))
         return tag(
             "svg",
             tag("title", self._name),
+            tag("desc", self._told) if self._told else None,
             *grid,
             frame,
             *self._below,
@@ -169,6 +181,7 @@ class Plot:
             *labels,
             viewBox=f"0 0 {_n(WIDTH)} {_n(whole)}",
             role="img",
+            class_="plot",
         )
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 PARTS: Final = Path(__file__).with_name("page")
-_STYLE: Final = re.compile(rb'<link rel="stylesheet" href="([\w.]+)">')
+_STYLE: Final = re.compile(rb'<link rel="stylesheet" href="([\w./]+)">')
 _SCRIPT: Final = re.compile(rb'<script src="([\w.]+)"></script>')
 
 

@@ -214,6 +214,8 @@ class Page:
         if request.path == "/records.json":
             found = await self._records()
             return _json(200, {"records": [{"file": file_name(record), "record": record} for record in found]})
+        if request.path == "/temperature.html":
+            return await self._temperature()
         if (match := _RECORD.fullmatch(request.path)) is not None:
             return await self._record(match[1])
         return _refusal(404, "nothing is here")
@@ -277,6 +279,10 @@ class Page:
                 return Response(200, body, headers=(("Content-Disposition", f'attachment; filename="{name}"'),))
         return _refusal(404, f"not among the last {RECORDS} records")
 
+    async def _temperature(self) -> Response:
+        reply = await self._result({"command": "temperature"})
+        return Response(200, await self._offload(_plots, reply.get("imus", [])), "text/html; charset=utf-8")
+
     # --- those who look
 
     async def _view(self, exchange: Exchange) -> None:
@@ -335,6 +341,13 @@ _RECORD: Final = re.compile(r"/records/([\w.-]{1,80})")
 def file_name(record: Object) -> str:
     """Under which a record is downloaded: its time, without what file systems dislike."""
     return f"companion-{re.sub(r'[^0-9T]+', '-', str(record.get('started_at')))}.json"
+
+
+def _plots(imus: object) -> bytes:
+    from companion.calibration.solution.by_temperature import ByTemperature
+    from companion.report.by_temperature import biases_by_temperature
+
+    return biases_by_temperature(msgspec.convert(imus, list[ByTemperature])).encode()
 
 
 def _event(value: Object, name: str | None = None) -> bytes:

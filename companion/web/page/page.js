@@ -1,6 +1,6 @@
 "use strict";
 const DEG_H = Math.PI / 180 / 3600, MG = 9.80665e-3;
-const HOLD_MS = 1500, GONE_MS = 3000, AGAIN_MS = 1000, SLIP_PX = 80;
+const HOLD_MS = 1500, GONE_MS = 3000, AGAIN_MS = 1000, SLIP_PX = 80, DRAWN_MS = 10000;
 const $ = id => document.getElementById(id);
 let token = null, handedOut = false, source = null, heardAt = 0, page = null, shownRecords = null, counted = {}, busy = false;
 
@@ -207,6 +207,18 @@ function figures(imu) {
   return `${imu.name}:` + part(imu.gyro_bias_rad_s, imu.gyro_sigma_use_rad_s, DEG_H, 1, ["gyro", "°/h"], "gyro")
     + part(imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, MG, 2, ["accelerometer", "mg"], "accel") + (written ? ` ${written} parameters written` : "");
 }
+// Plots are drawn by the daemon, as in its reports, and only for who looks.
+async function temperature() {
+  const it = $("temperature");
+  if (!it.open || document.hidden) return;
+  try {
+    const answer = await fetch("/temperature.html"), words = await answer.text();
+    if (answer.ok && words !== shownTemperature) it.lastElementChild.innerHTML = shownTemperature = words;
+  } catch { /* the headline says that nothing is heard */ }
+}
+let shownTemperature = null;
+$("temperature").addEventListener("toggle", temperature);
+setInterval(temperature, DRAWN_MS);
 
 // --- listening
 

@@ -1,0 +1,151 @@
+"""What is shown of one IMU's biases over temperature: in the terminal, on the page and in reports."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.calibration.records.history import Point, PowerUp, by_power_up
+from companion.calibration.solution.prior import WEIGHS_FROM
+from companion.calibration.temperature.curve import Curve
+from companion.physics.units import DEG_H, MG
+from companion.samples import Vector
+
+STEP_K: Final = 1.0
+"""Between the rows of a curve."""
+MOST_ROWS: Final = 60
+_DAY_S: Final = 86400.0
+
+
+class Seen(msgspec.Struct, frozen=True, kw_only=True):
+    """One still window; vehicle FRD."""
+
+    at_unix_s: float
+    started_at: str
+    """Of the calibration that was made of it; empty: none."""
+    power_up: int
+    """Which one, counted from 0."""
+    degc: float
+    gyro_deg_h: Vector
+    sigma_deg_h: Vector
+    accel_mg: Vector | None
+    """With the gradienter, or another that knew the tilt."""
+    accel_sigma_mg: Vector | None
+
+
+class Expected(msgspec.Struct, frozen=True, kw_only=True):
+    """What the gyros have at a temperature; one sigma."""
+
+    degc: float
+    gyro_deg_h: Vector
+    sigma_deg_h: Vector
+
+
+class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU."""
+
+    imu: str
+    power_ups: int
+    days: int
+    points: tuple[Seen, ...]
+    curve: tuple[Expected, ...]
+    """Of the next power-up; empty: not known yet."""
+    needs: str | None
+    """Why there is no curve, and what will make one."""
+    today: int | None
+    """Which power-up is this one; None: nothing is known of it yet."""
+    now: Expected | None
+    """The bias now: as last measured in this power-up, and moved along the curve since."""
+    at_power_up: Expected | None
+    """What the curve expects of a power-up at the temperature now."""
+
+
+def by_temperature(
+    name: str, points: Sequence[Point], curve: Curve | None, power_up: PowerUp | None, now_degc: float | None
+) -> ByTemperature:
+    """Put together what is shown.
+
+    Args:
+        name: of the IMU.
+        points: all that are kept of it.
+        curve: through them.
+        power_up: this one; None: not known.
+        now_degc: the temperature; None: not known, then it is that of the last window of this power-up.
+    """
+    told = [point for point in points if point.temperature_degc is not None and point.gyro is not None]
+    groups = by_power_up(told)
+    seen = [found for k, group in enumerate(groups) for point in group if (found := _seen(point, k)) is not None]
+    today = next(
+        (k for k, group in enumerate(groups) if power_up is not None and any(p.power_up.is_same(power_up) for p in group)),
+        None,
+    )
+    last = max((one for one in seen if one.power_up == today), key=lambda one: one.at_unix_s, default=None)
+    degc = now_degc if now_degc is not None or last is None else last.degc
+    return ByTemperature(
+        imu=name,
+        power_ups=len(groups),
+        days=len({math.floor(one.at_unix_s / _DAY_S) for one in seen}),
+        points=tuple(sorted(seen, key=lambda one: one.at_unix_s)),
+        curve=tuple(_expected(curve, step) for step in _steps(*curve.span_degc)) if curve is not None else (),
+        needs=None if curve is not None else _needs(len(points), len(groups), [one.degc for one in seen]),
+        today=today,
+        now=_moved(last, curve, degc) if last is not None and degc is not None else None,
+        at_power_up=_expected(curve, degc) if curve is not None and degc is not None else None,
+    )
+
+
+def _seen(point: Point, power_up: int) -> Seen | None:
+    if point.temperature_degc is None or point.gyro is None:
+        return None
+    return Seen(
+        at_unix_s=round(point.unix_s),
+        started_at=point.started_at,
+        power_up=power_up,
+        degc=point.temperature_degc,
+        gyro_deg_h=_in(DEG_H, point.gyro.bias),
+        sigma_deg_h=_in(DEG_H, point.gyro.sigma_use),
+        accel_mg=_in(MG, point.accel.bias) if point.accel is not None else None,
+        accel_sigma_mg=_in(MG, point.accel.sigma_use) if point.accel is not None else None,
+    )
+
+
+def _expected(curve: Curve, degc: float) -> Expected:
+    bias, variance = curve.at(degc)
+    return Expected(degc=round(degc, 2), gyro_deg_h=_in(DEG_H, bias), sigma_deg_h=_in(DEG_H, np.sqrt(variance)))
+
+
+def _moved(last: Seen, curve: Curve | None, degc: float) -> Expected:
+    """The bias that was measured last, as it is at another temperature; where no curve tells, it stays with its own."""
+    if curve is None:
+        return Expected(degc=last.degc, gyro_deg_h=last.gyro_deg_h, sigma_deg_h=last.sigma_deg_h)
+    change, variance = curve.change(last.degc, degc)
+    return Expected(
+        degc=round(degc, 2),
+        gyro_deg_h=_in(1.0, np.add(last.gyro_deg_h, change / DEG_H)),
+        sigma_deg_h=_in(1.0, np.sqrt(np.square(last.sigma_deg_h) + variance / DEG_H**2)),
+    )
+
+
+def _steps(low: float, high: float) -> Iterable[float]:
+    step = max(STEP_K, (high - low) / MOST_ROWS)
+    inner = (step * k for k in range(math.floor(low / step) + 1, math.ceil(high / step)))
+    return (low, *inner, high)
+
+
+def _needs(known: int, power_ups: int, degc: Sequence[float]) -> str:
+    if not degc:
+        if known:
+            return "its temperature is not known, so there is nothing to learn a curve from"
+        return "nothing seen yet: the first 10 s of standing still are remembered"
+    if power_ups < WEIGHS_FROM:
+        return f"{power_ups} of {WEIGHS_FROM} power-ups seen; still seconds at other temperatures will draw a curve"
+    return f"only {max(degc) - min(degc):.0f} K seen; still seconds where it is warmer or colder will draw a curve"
+
+
+def _in(unit: float, axes: Iterable[float]) -> Vector:
+    x, y, z = (round(float(value) / unit, 3) for value in axes)
+    return x, y, z

@@ -1,0 +1,149 @@
+"""Biases over temperature, as plots: for reports and for the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+
+from companion.calibration.solution.by_temperature import ByTemperature, Expected
+from companion.report import svg
+from companion.report.markup import Child, Markup, tag
+from companion.report.page import AXES, CLASSES, NAMES, TRIADS, UNITS
+from companion.samples import Triad, Vector
+
+_LEAST_K: Final = 4.0
+"""How wide an axis is at least, so that a tenth of a kelvin does not fill it."""
+
+
+class _Dot(msgspec.Struct, frozen=True):
+    """One still window, one triad."""
+
+    degc: float
+    bias: Vector
+    sigma: Vector
+
+
+def biases_by_temperature(imus: Sequence[ByTemperature]) -> Markup:
+    """Each IMU with its plots, or with what is needed for them."""
+    return tag("div", *(part for imu in imus for part in _imu(imu)))
+
+
+def _imu(imu: ByTemperature) -> list[Child]:
+    figures = [_figure(imu, triad) for triad in TRIADS]
+    return [
+        tag("h3", f"IMU {imu.imu}"),
+        tag("p", said) if (said := in_words(imu)) else None,
+        tag("p", f"{imu.needs}.") if imu.needs else None,
+        tag("div", *figures, class_="pairs") if imu.points else None,
+    ]
+
+
+def in_words(imu: ByTemperature) -> str:
+    """How much has been seen; empty: nothing."""
+    if not imu.points:
+        return ""
+    degc = [one.degc for one in imu.points]
+    days = f" on {imu.days} days" if imu.days > 1 else ""
+    return (
+        f"{_many(len(degc), 'still window')} of {_many(imu.power_ups, 'power-up')}{days},"
+        f" {min(degc):.0f} to {max(degc):.0f} degC."
+    )
+
+
+def _many(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _figure(imu: ByTemperature, triad: Triad) -> Markup | None:
+    power_ups: dict[int, list[_Dot]] = {}
+    for one in imu.points:
+        bias, sigma = (
+            (one.gyro_deg_h, one.sigma_deg_h) if triad == "gyro" else (one.accel_mg, one.accel_sigma_mg)
+        )
+        if bias is not None and sigma is not None:
+            power_ups.setdefault(one.power_up, []).append(_Dot(one.degc, bias, sigma))
+    if not power_ups:
+        return None
+    of_gyros = triad == "gyro"
+    now = imu.now if of_gyros else None
+    seen = [dot.degc for dots in power_ups.values() for dot in dots]
+    across = svg.linear([*seen, *([now.degc] if now else [])], least=_LEAST_K)
+    plots = []
+    for axis in range(3):
+        curve = [(row.degc, row.gyro_deg_h[axis], 2.0 * row.sigma_deg_h[axis]) for row in imu.curve if of_gyros]
+        dots = [(dot.degc, dot.bias[axis], dot.sigma[axis]) for each in power_ups.values() for dot in each]
+        ends = [value + sign * by for _, value, by in (*dots, *curve) for sign in (-1.0, 1.0)]
+        plot = svg.Plot(
+            across,
+            svg.linear([*ends, *([now.gyro_deg_h[axis]] if now else [])], ticks=3),
+            name=f"IMU {imu.imu}, {NAMES[triad].lower()} {AXES[axis]}: bias by temperature",
+            told=_told(imu, triad, axis, dots),
+            height=110.0,
+            x_label="temperature of the IMU, degC" if axis == 2 else None,
+            y_label=_label(imu, triad, axis),
+        )
+        class_ = CLASSES[axis]
+        plot.area([(degc, value - by, value + by) for degc, value, by in curve], f"area {class_}")
+        plot.line([(degc, value) for degc, value, _ in curve], f"curve {class_}")
+        for number, each in power_ups.items():
+            _power_up(plot, each, axis, class_ if number == imu.today else "past")
+        if now is not None:
+            _mark(plot, now.degc, now.gyro_deg_h[axis])
+        plots.append(plot.svg())
+    return tag("figure", tag("h4", NAMES[triad]), *plots, tag("figcaption", _caption(imu, triad)))
+
+
+def _power_up(plot: svg.Plot, dots: Sequence[_Dot], axis: int, class_: str) -> None:
+    points = [(dot.degc, dot.bias[axis]) for dot in dots]
+    plot.line(points, f"run {class_}")
+    plot.points(
+        points, class_, [(dot.bias[axis] - dot.sigma[axis], dot.bias[axis] + dot.sigma[axis]) for dot in dots]
+    )
+
+
+def _mark(plot: svg.Plot, degc: float, bias: float) -> None:
+    """The temperature now, and the bias."""
+    plot.upright(degc, "now")
+    x, y = plot.at(degc, bias)
+    plot.draw(tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=8, class_="ring"))
+
+
+def _label(imu: ByTemperature, triad: Triad, axis: int) -> str:
+    name = f"{AXES[axis]}, {UNITS[triad][1]}"
+    if triad == "accel":
+        return name
+    told = [("now", imu.now), ("at power-up", imu.at_power_up)]
+    said = [f"{words} {_value(found, axis)}" for words, found in told if found is not None]
+    return f"{name}: {', '.join(said)}" if said else name
+
+
+def _value(found: Expected, axis: int) -> str:
+    return f"{found.gyro_deg_h[axis]:+.0f} ± {found.sigma_deg_h[axis]:.0f}"
+
+
+def _told(imu: ByTemperature, triad: Triad, axis: int, dots: Sequence[tuple[float, float, float]]) -> str:
+    """For who cannot see it."""
+    unit, digits = UNITS[triad][1], 0 if triad == "gyro" else 2
+    words = [f"{len(dots)} points, {min(y for _, y, _ in dots):+.{digits}f} to {max(y for _, y, _ in dots):+.{digits}f} {unit}."]
+    if triad == "gyro" and imu.curve:
+        words += [
+            f"Expected at power-up: {_value(row, axis)} {unit} at {row.degc:.0f} degC."
+            for row in (imu.curve[0], imu.curve[-1])
+        ]
+    if triad == "gyro" and imu.now is not None:
+        words.append(f"Now {_value(imu.now, axis)} {unit} at {imu.now.degc:.1f} degC.")
+    return " ".join(words)
+
+
+def _caption(imu: ByTemperature, triad: Triad) -> str:
+    words = ["A dot is a still window, a line joins those of one power-up."]
+    if triad == "gyro":
+        if imu.curve:
+            words.append("Curve and band: the next power-up, with two sigma, as far as it was seen.")
+        if imu.now is not None:
+            words.append(f"Ring and dashes: now, {imu.now.degc:.1f} degC.")
+    elif len({one.started_at for one in imu.points}) > 1:
+        words.append("Each at the tilt that it stood at.")
+    return " ".join(words)
