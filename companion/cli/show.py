@@ -306,24 +306,37 @@ def _what_became(record: Object) -> str:
 
 
 def temperature_lines(imus: Sequence[Object]) -> list[str]:
-    """By IMU, the gyros' bias over temperature."""
-    lines = []
+    """By IMU, what was seen of its biases over temperature, and the gyros' now and at a power-up."""
+    lines: list[str] = []
     for imu in imus:
-        points, power_ups = imu["points"], imu["power_ups"]
-        degc = [point["degc"] for point in points]
-        span = f", {min(degc):.0f} to {max(degc):.0f} degC" if degc else ""
-        lines.append(f"{imu['imu']}: {len(points)} still windows of {power_ups} power-ups{span}")
-        if not imu["curve"]:
-            lines.append("    no curve yet: it takes five power-ups at different temperatures")
-            continue
-        lines.append(f"    {'degC':>6} {'x':>8} {'y':>8} {'z':>8}   sigma, deg/h")
-        lines += [
-            f"    {row['degc']:6.1f} "
-            + " ".join(f"{axis:8.0f}" for axis in row["gyro_deg_h"])
-            + f"   {max(row['sigma_deg_h']):.0f}"
-            for row in imu["curve"]
-        ]
-    return lines or ["nothing seen yet: still windows are remembered as soon as a thermometer is read"]
+        lines.append(f"{imu['imu']}: {imu['summary']}")
+        curve, now, at_power_up = imu["curve"], imu["now"], imu["at_power_up"]
+        columns = [] if now is None else [(f"now {now['degc']:.1f}", now)]
+        if at_power_up is not None:
+            columns.append((f"power-up at {at_power_up['degc']:.1f}", at_power_up))
+        picked = [curve[k * (len(curve) - 1) // 3] for k in range(4)] if len(curve) > 3 else curve
+        columns += [(f"{row['degc']:5.0f}", row) for row in picked]
+        if columns:
+            lines.append(_in_columns("gyro, deg/h", [head for head, _ in columns], columns) + " degC")
+            for k, axis in enumerate("xyz"):
+                lines.append(_in_columns(axis, [f"{one['gyro_deg_h'][k]:+.0f}" for _, one in columns], columns))
+            lines.append(_in_columns("1 sigma", [f"{max(one['sigma_deg_h']):.0f}" for _, one in columns], columns))
+        lines += [f"    {words}" for words in (_accelerometers(imu), imu["needs"]) if words]
+    return lines
+
+
+def _in_columns(first: str, cells: Sequence[str], columns: Sequence[tuple[str, Object]]) -> str:
+    padded = (f"{cell:>{len(head)}}" for cell, (head, _) in zip(cells, columns, strict=True))
+    return f"    {first:<11}  " + "  ".join(padded)
+
+
+def _accelerometers(imu: Object) -> str | None:
+    of_today = [one for one in imu["points"] if one["power_up"] == imu["today"] and one["accel_mg"] is not None]
+    if not of_today:
+        return None
+    last = of_today[-1]
+    found = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", last["accel_mg"], strict=True))
+    return f"accelerometers, mg, at {last['degc']:.1f} degC: {found}, 1 sigma {max(last['accel_sigma_mg']):.2f}"
 
 
 def curves_written_lines(written: Object | None) -> list[str]:

@@ -15,6 +15,7 @@ from companion.samples import Triad, Vector
 
 _LEAST_K: Final = 4.0
 """How wide an axis is at least, so that a tenth of a kelvin does not fill it."""
+_WHEN: Final = {"now": "now", "then": "this calibration"}
 
 
 class _Dot(msgspec.Struct, frozen=True):
@@ -25,43 +26,25 @@ class _Dot(msgspec.Struct, frozen=True):
     sigma: Vector
 
 
-def biases_by_temperature(imus: Sequence[ByTemperature]) -> Markup:
-    """Each IMU with its plots, or with what is needed for them."""
-    return tag("div", *(part for imu in imus for part in _imu(imu)))
+def biases_by_temperature(imus: Sequence[ByTemperature], *, looking_back: bool = False) -> Markup:
+    """Each IMU with its plots, or with what is needed for them; looking back, now is a calibration."""
+    return tag("div", *(part for imu in imus for part in _imu(imu, looking_back=looking_back)))
 
 
-def _imu(imu: ByTemperature) -> list[Child]:
-    figures = [_figure(imu, triad) for triad in TRIADS]
+def _imu(imu: ByTemperature, *, looking_back: bool) -> list[Child]:
+    figures = [_figure(imu, triad, "then" if looking_back else "now") for triad in TRIADS]
     return [
         tag("h3", f"IMU {imu.imu}"),
-        tag("p", said) if (said := in_words(imu)) else None,
+        tag("p", f"{imu.summary}."),
         tag("p", f"{imu.needs}.") if imu.needs else None,
         tag("div", *figures, class_="pairs") if imu.points else None,
     ]
 
 
-def in_words(imu: ByTemperature) -> str:
-    """How much has been seen; empty: nothing."""
-    if not imu.points:
-        return ""
-    degc = [one.degc for one in imu.points]
-    days = f" on {imu.days} days" if imu.days > 1 else ""
-    return (
-        f"{_many(len(degc), 'still window')} of {_many(imu.power_ups, 'power-up')}{days},"
-        f" {min(degc):.0f} to {max(degc):.0f} degC."
-    )
-
-
-def _many(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
-
-
-def _figure(imu: ByTemperature, triad: Triad) -> Markup | None:
+def _figure(imu: ByTemperature, triad: Triad, when: str) -> Markup | None:
     power_ups: dict[int, list[_Dot]] = {}
     for one in imu.points:
-        bias, sigma = (
-            (one.gyro_deg_h, one.sigma_deg_h) if triad == "gyro" else (one.accel_mg, one.accel_sigma_mg)
-        )
+        bias, sigma = (one.gyro_deg_h, one.sigma_deg_h) if triad == "gyro" else (one.accel_mg, one.accel_sigma_mg)
         if bias is not None and sigma is not None:
             power_ups.setdefault(one.power_up, []).append(_Dot(one.degc, bias, sigma))
     if not power_ups:
@@ -79,10 +62,10 @@ def _figure(imu: ByTemperature, triad: Triad) -> Markup | None:
             across,
             svg.linear([*ends, *([now.gyro_deg_h[axis]] if now else [])], ticks=3),
             name=f"IMU {imu.imu}, {NAMES[triad].lower()} {AXES[axis]}: bias by temperature",
-            told=_told(imu, triad, axis, dots),
+            told=_told(imu, triad, axis, dots, when),
             height=110.0,
-            x_label="temperature of the IMU, degC" if axis == 2 else None,
-            y_label=_label(imu, triad, axis),
+            x_label="temperature of the IMU, degC" if axis == 2 else "",
+            y_label=_label(imu, triad, axis, when),
         )
         class_ = CLASSES[axis]
         plot.area([(degc, value - by, value + by) for degc, value, by in curve], f"area {class_}")
@@ -92,15 +75,13 @@ def _figure(imu: ByTemperature, triad: Triad) -> Markup | None:
         if now is not None:
             _mark(plot, now.degc, now.gyro_deg_h[axis])
         plots.append(plot.svg())
-    return tag("figure", tag("h4", NAMES[triad]), *plots, tag("figcaption", _caption(imu, triad)))
+    return tag("figure", tag("h4", NAMES[triad]), *plots, tag("figcaption", _caption(imu, triad, when)))
 
 
 def _power_up(plot: svg.Plot, dots: Sequence[_Dot], axis: int, class_: str) -> None:
     points = [(dot.degc, dot.bias[axis]) for dot in dots]
     plot.line(points, f"run {class_}")
-    plot.points(
-        points, class_, [(dot.bias[axis] - dot.sigma[axis], dot.bias[axis] + dot.sigma[axis]) for dot in dots]
-    )
+    plot.points(points, class_, [(dot.bias[axis] - dot.sigma[axis], dot.bias[axis] + dot.sigma[axis]) for dot in dots])
 
 
 def _mark(plot: svg.Plot, degc: float, bias: float) -> None:
@@ -110,11 +91,11 @@ def _mark(plot: svg.Plot, degc: float, bias: float) -> None:
     plot.draw(tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=8, class_="ring"))
 
 
-def _label(imu: ByTemperature, triad: Triad, axis: int) -> str:
+def _label(imu: ByTemperature, triad: Triad, axis: int, when: str) -> str:
     name = f"{AXES[axis]}, {UNITS[triad][1]}"
     if triad == "accel":
         return name
-    told = [("now", imu.now), ("at power-up", imu.at_power_up)]
+    told = [(when, imu.now), ("at power-up", imu.at_power_up)]
     said = [f"{words} {_value(found, axis)}" for words, found in told if found is not None]
     return f"{name}: {', '.join(said)}" if said else name
 
@@ -123,27 +104,26 @@ def _value(found: Expected, axis: int) -> str:
     return f"{found.gyro_deg_h[axis]:+.0f} ± {found.sigma_deg_h[axis]:.0f}"
 
 
-def _told(imu: ByTemperature, triad: Triad, axis: int, dots: Sequence[tuple[float, float, float]]) -> str:
+def _told(imu: ByTemperature, triad: Triad, axis: int, dots: Sequence[tuple[float, float, float]], when: str) -> str:
     """For who cannot see it."""
     unit, digits = UNITS[triad][1], 0 if triad == "gyro" else 2
-    words = [f"{len(dots)} points, {min(y for _, y, _ in dots):+.{digits}f} to {max(y for _, y, _ in dots):+.{digits}f} {unit}."]
+    low, high = (f"{pick(value for _, value, _ in dots):+.{digits}f}" for pick in (min, max))
+    words = [f"{len(dots)} points, {low} to {high} {unit}."]
     if triad == "gyro" and imu.curve:
         words += [
             f"Expected at power-up: {_value(row, axis)} {unit} at {row.degc:.0f} degC."
             for row in (imu.curve[0], imu.curve[-1])
         ]
     if triad == "gyro" and imu.now is not None:
-        words.append(f"Now {_value(imu.now, axis)} {unit} at {imu.now.degc:.1f} degC.")
+        words.append(f"{when.capitalize()} {_value(imu.now, axis)} {unit} at {imu.now.degc:.1f} degC.")
     return " ".join(words)
 
 
-def _caption(imu: ByTemperature, triad: Triad) -> str:
+def _caption(imu: ByTemperature, triad: Triad, when: str) -> str:
     words = ["A dot is a still window, a line joins those of one power-up."]
     if triad == "gyro":
         if imu.curve:
             words.append("Curve and band: the next power-up, with two sigma, as far as it was seen.")
         if imu.now is not None:
-            words.append(f"Ring and dashes: now, {imu.now.degc:.1f} degC.")
-    elif len({one.started_at for one in imu.points}) > 1:
-        words.append("Each at the tilt that it stood at.")
+            words.append(f"Ring and dashes: {_WHEN[when]}, {imu.now.degc:.1f} degC.")
     return " ".join(words)

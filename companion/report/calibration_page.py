@@ -10,6 +10,8 @@ import msgspec
 
 from companion.calibration.collector.trace import Trace
 from companion.calibration.records.record import Arming, ImuRecord, Outcome, Record, outcome_word
+from companion.calibration.solution.by_temperature import ByTemperature
+from companion.report.by_temperature import biases_by_temperature
 from companion.report.markup import Child, Markup, cell, join, number, row, tag
 from companion.report.page import (
     AXES,
@@ -51,6 +53,8 @@ class Material(msgspec.Struct, frozen=True, kw_only=True):
     armings: Sequence[Arming]
     """While it was in force, oldest first."""
     damaged: Sequence[str]
+    by_temperature: Sequence[ByTemperature] = ()
+    """Of its IMUs, as known when the page is made."""
 
 
 def calibration_page(material: Material, now: datetime.datetime) -> str:
@@ -72,6 +76,7 @@ def calibration_page(material: Material, now: datetime.datetime) -> str:
         _pose(record),
         stillness(material.trace, material.no_trace),
         _drift(material),
+        _temperatures(material.by_temperature[:MAX_IMUS]),
     )
 
 
@@ -275,3 +280,11 @@ def _drift(material: Material) -> Markup:
     elif record.state == "done":
         parts.append(tag("p", "The ring is this calibration.", class_="soft"))
     return tag("section", *parts)
+
+
+def _temperatures(imus: Sequence[ByTemperature]) -> Markup | None:
+    return (
+        tag("section", tag("h2", "Biases by temperature"), biases_by_temperature(imus, looking_back=True))
+        if imus
+        else None
+    )

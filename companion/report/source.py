@@ -6,9 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from companion.calibration.noise.allan import PROFILES, NoiseProfile
 from companion.calibration.records.record import Arming, Record
+from companion.calibration.solution.by_temperature import ByTemperature, by_temperature
+from companion.calibration.solution.prior import curve_of
 from companion.errors import StorageError
 from companion.report.calibration_page import Material
+from companion.storage.learned import BiasStore
+from companion.storage.profiles import ProfileStore
 from companion.storage.records import Entry, RecordStore
 from companion.storage.state import BoundedList
 
@@ -48,6 +53,11 @@ def material(directory: Path, wanted: str | None) -> Material:
     except StorageError as error:
         why = f"{error}."
         damaged.append(str(error))
+    warmth: Sequence[ByTemperature] = ()
+    try:
+        warmth = _by_temperature(directory, record)
+    except StorageError as error:
+        damaged.append(str(error))
     earlier = [
         (one.number, one.record)
         for one in entries
@@ -59,9 +69,37 @@ def material(directory: Path, wanted: str | None) -> Material:
         trace=trace,
         no_trace="" if trace is not None else why,
         earlier=earlier[-MAX_EARLIER:],
+        by_temperature=warmth,
         armings=[arming for arming in armings if arming.calibration == record.started_at],
         damaged=damaged,
     )
+
+
+def _by_temperature(directory: Path, record: Record) -> list[ByTemperature]:
+    """What is known today of this calibration's IMUs, as far as it is the same vehicle's."""
+    found = []
+    for name, known in BiasStore(directory).all().items():
+        identity, points = known.identity, known.points
+        if name not in {imu.name for imu in record.imus} or identity.get("system", "") not in (
+            "",
+            str(record.system_id),
+        ):
+            continue
+        this = next((point for point in points if point.started_at == record.started_at), None)
+        found.append(
+            by_temperature(
+                name,
+                points,
+                curve_of(points, "gyro", _noise(directory, identity.get("profile", "unknown")).gyro),
+                power_up=this.power_up if this is not None else None,
+                started_at=record.started_at,
+            )
+        )
+    return found
+
+
+def _noise(directory: Path, name: str) -> NoiseProfile:
+    return PROFILES[name] if name in PROFILES else ProfileStore(directory).read(name).profile
 
 
 def _find(entries: Sequence[Entry], wanted: str | None) -> tuple[Entry, Record]:

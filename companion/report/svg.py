@@ -17,7 +17,7 @@ from companion.report.markup import Markup, tag
 
 WIDTH: Final = 360.0
 LEFT: Final = 58.0
-_RIGHT, _TOP, _TITLE = 12.0, 8.0, 18.0
+_RIGHT, _TOP, _TITLE = 12.0, 8.0, 20.0
 _TICKS_HEIGHT, _LABEL_HEIGHT = 20.0, 16.0
 _MARK: Final = 3.6
 _MOST: Final = 1e12
@@ -84,8 +84,9 @@ def _nice(step: float) -> float:
 class Plot:
     """One frame with axes, of that height, the whole 360 wide; what is drawn first lies below.
 
-    Without an `x_label` no ticks are written either, for a plot with another one below it. `name` is what a screen
-    reader says, `told` what it shows, in words, `left` the room for what is written at the vertical axis.
+    Without an `x_label` no ticks are written either, for a plot with another one below it; empty: only these. `name`
+    is what a screen reader says, `told` what it shows, in words, `left` the room for what is written at the vertical
+    axis.
     """
 
     def __init__(
@@ -152,7 +153,7 @@ class Plot:
     def svg(self) -> Markup:
         """The element."""
         bottom = self._top + self._height
-        whole = bottom + (_TICKS_HEIGHT + _LABEL_HEIGHT if self._x_label is not None else 6.0)
+        below = 6.0 if self._x_label is None else _TICKS_HEIGHT + _LABEL_HEIGHT * bool(self._x_label)
         grid: list[Markup] = []
         for place, label in self._x.ticks:
             across = self.at(place, self._y.low)[0]
@@ -169,7 +170,7 @@ class Plot:
             middle = (self._left + WIDTH - _RIGHT) / 2.0
             labels.append(tag("text", self._x_label, x=_n(middle), y=_n(bottom + 31.0), class_="mid label"))
         if self._y_label:
-            labels.append(tag("text", self._y_label, x="0", y=_n(self._top - 6.0), class_="label"))
+            labels.append(tag("text", self._y_label, x="0", y=_n(self._top - 8.0), class_="label"))
         return tag(
             "svg",
             tag("title", self._name),
@@ -179,7 +180,7 @@ class Plot:
             *self._below,
             *self._parts,
             *labels,
-            viewBox=f"0 0 {_n(WIDTH)} {_n(whole)}",
+            viewBox=f"0 0 {_n(WIDTH)} {_n(bottom + below)}",
             role="img",
             class_="plot",
         )

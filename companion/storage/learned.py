@@ -57,6 +57,15 @@ class BiasStore:
         found = self._file.load()
         return {} if found is None else found.imus
 
+    def all(self) -> dict[str, KnownImu]:
+        """The same, for who may not set aside anything.
+
+        Raises:
+            StorageError: it cannot be used.
+        """
+        found = self._file.read()
+        return {} if found is None else found.imus
+
     def write(self, imus: dict[str, KnownImu]) -> None:
         """Keep what is worth it of the latest IMUs.
 

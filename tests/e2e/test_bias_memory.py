@@ -367,8 +367,13 @@ def test_the_gate_closes_by_what_the_temperature_does_to_this_imu(
             rise = np.subtract(high["gyro_deg_h"], low["gyro_deg_h"]) / 21.0
             np.testing.assert_allclose(rise, slope_deg_h_k, atol=2.0)
             lines = temperature_lines(reply["imus"])
-            assert lines[0] == f"fc: {len(seen['points'])} still windows of 9 power-ups, 13 to 34 degC"
-            assert len(lines) == 2 + len(seen["curve"])
+            assert lines[0].startswith(f"fc: {len(seen['points'])} still windows, 9 power-ups on ")
+            assert lines[0].endswith(" 13 to 34 degC")
+            assert (seen["now"]["degc"], seen["today"]) == (20.0, 0)
+            true = rig.model.true_bias(rig.aircraft.time_at(rig.now_s)).gyro_rad_s
+            np.testing.assert_allclose(
+                seen["now"]["gyro_deg_h"], true / DEG_H, atol=4.0 * max(seen["now"]["sigma_deg_h"])
+            )
             # Nobody sees the output while somebody carries it about.
             in_force.temperatures_degc["fc"], in_force._present = 25.0, {}
             words = [finding.words for finding in in_force.findings(rig.now_s)]

@@ -17,10 +17,12 @@ import msgspec
 import pytest
 
 from companion.calibration.records.record import Record, from_json
+from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.records import RecordStore
 from tests.e2e.test_calibration import calibrated
 from tests.e2e.test_commands import DONE, FAILED, FlightLine, _end, _until_disarmed, companion, flight_line
 from tests.support.browser import DESKTOP, PHONE, Tab, chromium, find
+from tests.support.histories import windows_of_days
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -131,6 +133,30 @@ async def read_the_record(here: Scene, record: Record) -> None:
     await tab.value("scrollTo(0, 0)")
 
 
+async def read_the_temperatures(here: Scene) -> None:
+    """Plots of what earlier days have shown, for who opens them."""
+    tab = here.tab
+    await tab.value("document.querySelector('#temperature').open = true")
+    await tab.until("document.querySelector('#temperature svg')")
+    await tab.value("document.querySelector('#temperature').scrollIntoView()")
+    titles = await tab.value("[...document.querySelectorAll('#temperature title')].map(it => it.textContent)")
+    assert titles[:3] == [f"IMU fc, gyro {axis}: bias by temperature" for axis in "xyz"]
+    told = await tab.value("document.querySelector('#temperature').textContent")
+    assert "30 still windows, 10 power-ups on 10 days, 8 to 38 degC" in told
+    assert told.count("first point") == 1  # of the other IMU
+    words = "[...document.querySelectorAll('#temperature .plot text')]"
+    outside = "it => { const box = it.getBoundingClientRect(); return box.left < 0 || box.right > innerWidth; }"
+    assert await tab.value(f"{words}.filter({outside}).length") == 0
+    for scheme, ink in (("light", "rgb(0, 0, 0)"), ("dark", "rgb(242, 242, 242)")):
+        await tab.scheme(scheme)
+        await here.picture(f"phone_temperature_{scheme}")
+        assert await tab.value(f"getComputedStyle({words}[0]).fill") == ink
+    await tab.scheme("light")
+    assert await pixels_needed(tab) == 0
+    await tab.value("document.querySelector('#temperature').open = false")
+    await tab.value("scrollTo(0, 0)")
+
+
 def test_a_phone_on_the_field(tmp_path: Path) -> None:
     async def on_the_bench() -> Record:
         async with Rig(tmp_path / "bench", own_imu=True, max_s=12.0).running() as rig:
@@ -144,6 +170,7 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
     )
     record = msgspec.structs.replace(record, imus=(fc, own), reason=f"{record.reason}; accelerometers of fc held back")
     RecordStore(tmp_path / "state").save(record)
+    BiasStore(tmp_path / "state").write({"fc": KnownImu(identity={}, points=tuple(windows_of_days(10)))})
 
     async def main() -> None:
         async with scene(tmp_path, "127.0.0.1:0", PHONE) as here:
@@ -163,6 +190,7 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             await here.picture("phone_not_calibrated")
             await fits_every_phone(here)
             await read_the_record(here, record)
+            await read_the_temperatures(here)
 
             # A short tap is no order, and says why.
             await tab.touch("#calibrate")

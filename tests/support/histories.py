@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from companion.calibration.collector.trace import Trace, VerdictTrace
+from companion.calibration.records.history import Measured, Point, PowerUp
 from companion.calibration.records.record import (
     Arming,
     ImuRecord,
@@ -18,6 +19,7 @@ from companion.calibration.records.record import (
     Site,
     WrittenParameter,
 )
+from companion.physics.frames import Array
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
 from companion.storage.records import RecordStore
@@ -27,6 +29,9 @@ FIRST = datetime.datetime(2026, 5, 1, 6, 30, tzinfo=datetime.UTC)
 GYRO_DEG_H = (162.234, 169.563, -98.289)
 ACCEL_MG = (2.4125, -2.1596, 0.89809)
 PER_K_DEG_H = (1.5, -0.8, 0.3)
+SLOPES_DEG_H_K = (30.0, -12.0, 0.0)
+OFFSET_DEG_H = 5.0
+"""Of a power-up, one sigma."""
 
 
 def _axes(values: object) -> Vector:
@@ -179,3 +184,33 @@ def a_season(directory: Path, number: int = 30) -> list[Record]:
             armings.append(arming(made, good=made.state == "done"))
     write_atomically(directory / "armings.json", msgspec.json.encode(armings))
     return records
+
+
+def gyro_deg_h_at(degc: float) -> Array:
+    """What the gyros of `windows_of_days` have at a temperature, but for what each power-up adds, (3,)."""
+    return np.array([100.0, -50.0, 0.0]) + np.array(SLOPES_DEG_H_K) * (degc - 20.0)
+
+
+def windows_of_days(days: int, windows: int = 3, *, first_degc: float = 8.0, step_k: float = 3.0) -> list[Point]:
+    """One power-up a day, each somewhat warmer than that before, of a gyro that follows a line."""
+    random, found = np.random.default_rng(2), []
+    for day in range(days):
+        power_up = PowerUp(host=f"boot {day}", since_unix_s=1.78e9 + 86400.0 * day)
+        offset = random.normal(0.0, OFFSET_DEG_H, 3)
+        for k in range(windows):
+            degc = first_degc + step_k * day + 1.5 * k
+            gyro = _measured((gyro_deg_h_at(degc) + offset) * DEG_H, 2.0 * DEG_H)
+            found.append(
+                Point(
+                    started_at="", unix_s=1.78e9 + 86400.0 * day + 100.0 * (k + 1), power_up=power_up,
+                    temperature_degc=degc, up=(0.0, 0.0, -1.0), gyro=gyro,
+                    accel=_measured(np.array([2.0, -2.0, 0.01 * degc]) * MG, 0.1 * MG),
+                )
+            )  # fmt: skip
+    return found
+
+
+def _measured(bias: Array, sigma: float) -> Measured:
+    each = (sigma, sigma, sigma)
+    x, y, z = bias.tolist()
+    return Measured(bias=(x, y, z), sigma_stat=each, sigma_use=each, sigma_shared=(0.0, 0.0, 0.0))

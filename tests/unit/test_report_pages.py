@@ -459,11 +459,9 @@ def test_a_browser_shows_it_on_a_phone_without_scrolling_sideways(tmp_path: Path
 
 def test_light_and_dark_text_have_contrast_for_sunlight() -> None:
     """WCAG 2 contrast: 7:1 for text, 4.5:1 for what is drawn, on the page and on its cards."""
-    light, dark = re.findall(
-        r":root\{color-scheme:light dark;([^}]*)\}|:root\{(--bg:#0d[^}]*)\}", page._STYLE.read_text()
-    )
-    for held in (light[0], dark[1]):
-        colours = dict(re.findall(r"--(\w+):#([0-9a-f]+)", held.replace("\n", "")))
+    roots = [root for style in page._STYLES for root in re.findall(r":root\{([^}]*)\}", style.read_text())[:2]]
+    for scheme in (0, 1):
+        colours = dict(re.findall(r"--(\w+):#([0-9a-f]+)", "".join(roots[scheme::2])))
         for ground in ("bg", "card"):
             for ink, least in {"fg": 15.0, "soft": 7.0, "x": 4.5, "y": 4.0, "z": 4.5, "bad": 6.0, "good": 6.0}.items():
                 assert _contrast(colours[ink], colours[ground]) >= least, (ink, ground, colours)

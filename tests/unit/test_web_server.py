@@ -16,15 +16,21 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
 import zxingcpp
 
+from companion.calibration.noise.allan import PROFILES
+from companion.calibration.solution.by_temperature import by_temperature
+from companion.calibration.solution.prior import curve_of
 from companion.cli import main as companion
 from companion.errors import CalibrationRefusedError, StorageError
+from companion.report.by_temperature import biases_by_temperature
 from companion.web import access, exchange, server
 from companion.web.server import Page
+from tests.support.histories import windows_of_days
 
 Object = dict[str, Any]
 RECORD: Object = {"started_at": "2026-11-21T18:40:00.123+00:00", "state": "done", "reason": "sigma 4 deg/h"}
@@ -47,6 +53,7 @@ class Daemon:
         self.asked: list[tuple[Object, str]] = []
         self.status: Callable[[], Object] = lambda: {"state": "idle"}
         self.refuses: str | None = None
+        self.imus: list[Object] = []
 
     async def look(self) -> Object:
         return self.status()
@@ -57,6 +64,9 @@ class Daemon:
             raise CalibrationRefusedError(self.refuses)
         if request["command"] == "history":
             yield {"kind": "result", "records": [RECORD]}
+            return
+        if request["command"] == "temperature":
+            yield {"kind": "result", "imus": self.imus}
             return
         yield {"kind": "progress"}
         yield {"kind": "result", "state": "waiting", "reason": "calibration started"}
@@ -567,6 +577,20 @@ def test_the_last_records_and_a_download(tmp_path: Path) -> None:
         assert download.headers["content-disposition"] == f'attachment; filename="{file}"'
         assert re.fullmatch(r"[\w.-]+\.json", file)
         assert (await ask(served, "GET", "/records/companion-1970.json")).status == 404
+
+    run(tmp_path, visit)
+
+
+def test_the_plots_over_temperature_are_drawn_for_who_asks(tmp_path: Path) -> None:
+    points = windows_of_days(10)
+    imu = by_temperature("fc", points, curve_of(points, "gyro", PROFILES["icm42688p"].gyro), power_up=None)
+
+    async def visit(served: Page, daemon: Daemon) -> None:
+        daemon.imus = [msgspec.to_builtins(imu)]
+        said = await ask(served, "GET", "/temperature.html")
+        assert said.status == 200
+        assert said.headers["content-type"].startswith("text/html")
+        assert said.body.decode() == biases_by_temperature([imu])
 
     run(tmp_path, visit)
 

@@ -49,6 +49,8 @@ class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU."""
 
     imu: str
+    summary: str
+    """How much was seen."""
     power_ups: int
     days: int
     points: tuple[Seen, ...]
@@ -65,7 +67,13 @@ class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def by_temperature(
-    name: str, points: Sequence[Point], curve: Curve | None, power_up: PowerUp | None, now_degc: float | None
+    name: str,
+    points: Sequence[Point],
+    curve: Curve | None,
+    *,
+    power_up: PowerUp | None,
+    now_degc: float | None = None,
+    started_at: str = "",
 ) -> ByTemperature:
     """Put together what is shown.
 
@@ -75,20 +83,22 @@ def by_temperature(
         curve: through them.
         power_up: this one; None: not known.
         now_degc: the temperature; None: not known, then it is that of the last window of this power-up.
+        started_at: the calibration that is now, for who looks back; empty: the last window of this power-up.
     """
     told = [point for point in points if point.temperature_degc is not None and point.gyro is not None]
     groups = by_power_up(told)
     seen = [found for k, group in enumerate(groups) for point in group if (found := _seen(point, k)) is not None]
-    today = next(
-        (k for k, group in enumerate(groups) if power_up is not None and any(p.power_up.is_same(power_up) for p in group)),
-        None,
-    )
-    last = max((one for one in seen if one.power_up == today), key=lambda one: one.at_unix_s, default=None)
+    same = (k for k, group in enumerate(groups) for p in group if power_up is not None and p.power_up.is_same(power_up))
+    today = next(same, None)
+    of_today = [one for one in seen if one.power_up == today and started_at in ("", one.started_at)]
+    last = max(of_today, key=lambda one: one.at_unix_s, default=None)
     degc = now_degc if now_degc is not None or last is None else last.degc
+    days = len({math.floor(one.at_unix_s / _DAY_S) for one in seen})
     return ByTemperature(
         imu=name,
+        summary=_summary(seen, len(groups), days),
         power_ups=len(groups),
-        days=len({math.floor(one.at_unix_s / _DAY_S) for one in seen}),
+        days=days,
         points=tuple(sorted(seen, key=lambda one: one.at_unix_s)),
         curve=tuple(_expected(curve, step) for step in _steps(*curve.span_degc)) if curve is not None else (),
         needs=None if curve is not None else _needs(len(points), len(groups), [one.degc for one in seen]),
@@ -122,7 +132,7 @@ def _moved(last: Seen, curve: Curve | None, degc: float) -> Expected:
     """The bias that was measured last, as it is at another temperature; where no curve tells, it stays with its own."""
     if curve is None:
         return Expected(degc=last.degc, gyro_deg_h=last.gyro_deg_h, sigma_deg_h=last.sigma_deg_h)
-    change, variance = curve.change(last.degc, degc)
+    change, variance = curve.change((last.degc, 0.0), (degc, 0.0))
     return Expected(
         degc=round(degc, 2),
         gyro_deg_h=_in(1.0, np.add(last.gyro_deg_h, change / DEG_H)),
@@ -136,11 +146,23 @@ def _steps(low: float, high: float) -> Iterable[float]:
     return (low, *inner, high)
 
 
+def _summary(seen: Sequence[Seen], power_ups: int, days: int) -> str:
+    if not seen:
+        return "nothing seen yet"
+    degc = [one.degc for one in seen]
+    span = f"{min(degc):.0f} to {max(degc):.0f} degC"
+    return f"{_many(len(seen), 'still window')}, {_many(power_ups, 'power-up')} on {_many(days, 'day')}, {span}"
+
+
+def _many(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 def _needs(known: int, power_ups: int, degc: Sequence[float]) -> str:
     if not degc:
         if known:
-            return "its temperature is not known, so there is nothing to learn a curve from"
-        return "nothing seen yet: the first 10 s of standing still are remembered"
+            return "its temperature is not known: no curve without a thermometer"
+        return "ten still seconds at a known temperature are the first point"
     if power_ups < WEIGHS_FROM:
         return f"{power_ups} of {WEIGHS_FROM} power-ups seen; still seconds at other temperatures will draw a curve"
     return f"only {max(degc) - min(degc):.0f} K seen; still seconds where it is warmer or colder will draw a curve"

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Final
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -15,14 +13,9 @@ from companion.calibration.solution.prior import curve_of, follow
 from companion.calibration.temperature.curve import Along, Curve, Settling, State, settling
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.formats import Object
 from companion.physics.frames import Array, vector
-from companion.physics.units import DEG_H
 from companion.samples import Triad, Vector
 from companion.storage.learned import KnownImu
-
-STEP_K: Final = 5.0
-"""Between the rows of a curve that is shown."""
 
 
 class Curves:
@@ -79,45 +72,7 @@ class Curves:
         calibration = self._imus[name].calibration if name in self._imus else None
         return np.zeros(3) if calibration is None else calibration.thermal_change(triad, degc, now_degc)
 
-    def shown(self, known: Mapping[str, KnownImu]) -> list[Object]:
-        """By IMU, for `companion temperature`: what still windows have shown, and the curve through them."""
-        return [
-            _by_temperature(name, each.points, self.of(name, "gyro"))
-            for name, each in known.items()
-            if name in self._names
-        ]
-
-
-def _by_temperature(name: str, points: Sequence[Point], curve: Curve | None) -> Object:
-    told = [point for point in points if point.temperature_degc is not None and point.gyro is not None]
-    rows = []
-    if curve is not None:
-        low, high = curve.span_degc
-        steps = [low, *(STEP_K * k for k in range(math.ceil(low / STEP_K), math.ceil(high / STEP_K))), high]
-        for degc in dict.fromkeys(steps):
-            bias, variance = curve.at(degc)
-            rows.append({"degc": round(degc, 2), "gyro_deg_h": _deg_h(bias), "sigma_deg_h": _deg_h(np.sqrt(variance))})
-    return {
-        "imu": name,
-        "power_ups": len(by_power_up(told)),
-        "points": [
-            {
-                "at_unix_s": round(point.unix_s),
-                "degc": point.temperature_degc,
-                "gyro_deg_h": _deg_h(point.gyro.bias),
-                "sigma_deg_h": _deg_h(point.gyro.sigma_use),
-            }
-            for point in told
-            if point.gyro is not None
-        ],
-        "curve": rows,
-    }
-
 
 def _states(points: Sequence[Point]) -> list[list[State]]:
     groups = by_power_up([point for point in points if point.temperature_degc is not None])
     return [[(point.temperature_degc or 0.0, point.k_s) for point in group] for group in groups]
-
-
-def _deg_h(axes: Iterable[float]) -> list[float]:
-    return [round(value / DEG_H, 1) for value in axes]

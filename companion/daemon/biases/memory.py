@@ -21,6 +21,7 @@ from companion.autopilot.parameters.change import Change
 from companion.calibration.noise.allan import AllanModel, noise_profile
 from companion.calibration.records.history import Point, kept
 from companion.calibration.records.validity import WORTH_SIGMAS
+from companion.calibration.solution.by_temperature import by_temperature
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import (
@@ -91,6 +92,7 @@ class BiasMemory:
         self._store = BiasStore(core.config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], _Reference] = {}
+        self._now_degc: dict[str, float | None] = {}
         self._written_s = -math.inf
 
     def load(self) -> None:
@@ -244,6 +246,7 @@ class BiasMemory:
     async def look(self, solution: Solution) -> None:
         """Remember what a still window tells that nobody calibrated from: of each kelvin of a power-up the best."""
         unix_s = _unix_s()
+        self._now_degc |= {imu.name: imu.temperature_degc for imu in solution.imus}
         news = [imu.name for imu in solution.imus if self._tells_more(imu, unix_s)]
         if not news:
             return
@@ -322,7 +325,19 @@ class BiasMemory:
     def temperature(self) -> list[Object]:
         """For `companion temperature`; blocking."""
         self.curves.follow(dict(self._known))
-        return self.curves.shown(self._known)
+        unix_s = datetime.datetime.now(tz=datetime.UTC).timestamp()
+        return [
+            msgspec.to_builtins(
+                by_temperature(
+                    name,
+                    self._known[name].points if name in self._known else (),
+                    self.curves.of(name, "gyro"),
+                    power_up=self.whose.power_up(name, unix_s),
+                    now_degc=self._now_degc.get(name),
+                )
+            )
+            for name in self.whose.names
+        ]
 
     def _reference(self, name: str, triad: Triad) -> Point | None:
         found = self._today.get((name, triad))

@@ -213,7 +213,9 @@ async function temperature() {
   if (!it.open || document.hidden) return;
   try {
     const answer = await fetch("/temperature.html"), words = await answer.text();
-    if (answer.ok && words !== shownTemperature) it.lastElementChild.innerHTML = shownTemperature = words;
+    if (!answer.ok || words === shownTemperature) return;
+    it.lastElementChild.replaceChildren(new DOMParser().parseFromString(words, "text/html").body.firstChild);
+    shownTemperature = words;
   } catch { /* the headline says that nothing is heard */ }
 }
 let shownTemperature = null;
