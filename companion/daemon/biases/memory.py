@@ -21,7 +21,6 @@ from companion.autopilot.parameters.change import Change
 from companion.calibration.noise.allan import AllanModel, noise_profile
 from companion.calibration.records.history import Point, kept
 from companion.calibration.records.validity import WORTH_SIGMAS
-from companion.calibration.solution.by_temperature import by_temperature
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import (
@@ -324,6 +323,9 @@ class BiasMemory:
 
     def temperature(self) -> list[Object]:
         """For `companion temperature`; blocking."""
+        # What nobody asked for costs the start nothing.
+        from companion.calibration.solution.by_temperature import by_temperature
+
         self.curves.follow(dict(self._known))
         unix_s = datetime.datetime.now(tz=datetime.UTC).timestamp()
         return [
