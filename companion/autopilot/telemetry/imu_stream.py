@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.telemetry import imu_messages
 from companion.autopilot.telemetry.imu_messages import Reading, StreamKind
-from companion.autopilot.telemetry.pairing import UNLIKE, Pairing, floats_kind
+from companion.autopilot.telemetry.pairing import LEAST_HZ, UNLIKE, Pairing, floats_kind
 from companion.autopilot.telemetry.source import ABSENT_AFTER, Source
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink, Message
@@ -137,7 +137,8 @@ class ImuStream:
             await self._pause(60.0)
             return
         self._sources = [Source(message, self._rates_hz) for message in messages]
-        self._pairing = self.pairing if self._vehicle.firmware == "px4" else None
+        paired = self._vehicle.firmware == "px4" and self._rates_hz[0] >= LEAST_HZ
+        self._pairing = self.pairing if paired else None
         self.pairing.forget()
         self.temperature = None
         while not self._restart.is_set():

@@ -22,11 +22,13 @@ from companion.physics.units import MG
 UNLIKE: Final = 1.03
 """How much faster HIGHRES_IMU is asked for, so that at any two phases the same sample is due for both soon."""
 
+LEAST_HZ: Final = 50.0
+"""Below that too few samples meet to tell more than the integers: at 25 Hz one in ten."""
+
 BLOCK_S: Final = 0.5
 _PAIRS: Final = 2 * LEAST_PAIRS
 """In a block; it lasts until there are so many."""
-_LONGEST_BLOCK_S: Final = 25.0
-"""At 10 Hz one in twenty-five meets another."""
+_LONGEST_BLOCK_S: Final = 6.0
 _PUBLISHED_S: Final = 0.003
 """After a sample was taken, at most."""
 _WHOLE_MS: Final = 0.001
@@ -51,7 +53,6 @@ class Pairing:
         self._floats: list[tuple[float, ...]] = []
         self._integers: list[tuple[float, ...]] = []
         self._begun_s = self._paired_s = self._float_s = -math.inf
-        self._look_s = -math.inf
         self._calm_s = 0.0
         self._known = self._paused = False
         self._bias = np.zeros(6)
@@ -81,8 +82,7 @@ class Pairing:
             self.forget()
         self._float_s = t_s
         self._floats.append((t_s, *reading.gyro_rad_s, *reading.accel_m_s2))
-        if t_s >= self._look_s:
-            self._look_s = t_s + BLOCK_S
+        if t_s - self._begun_s >= BLOCK_S:
             self._pair(t_s)
 
     def add_integers(self, reading: Reading) -> None:
@@ -101,7 +101,7 @@ class Pairing:
     def forget(self) -> None:
         """Start anew."""
         self._floats, self._integers, self._known = [], [], False
-        self._float_s = self._begun_s = self._paired_s = self._look_s = -math.inf
+        self._float_s = self._begun_s = self._paired_s = -math.inf
         self._track.forget()
 
     def _pair(self, now_s: float) -> None:
