@@ -296,7 +296,9 @@ def test_a_wrong_prediction_is_named_at_the_first_stillness_and_is_never_ready(
         async with powered(degc=NOW_DEGC, **copied(learned, tmp_path)) as rig:
             rig.model.turn_on(np.full(3, 2000.0 * DEG_H), np.zeros(3))
             await predicted(rig)
-            await rig.until(lambda: any(text.startswith("Prediction wrong: fc") for text in rig.ground.texts()), 60.0)
+            await rig.until(
+                lambda: any(text == "Predicted bias of fc is wrong: hold still" for text in rig.ground.texts()), 60.0
+            )
             # A calibration by itself does not believe it; nothing that was ever right is in force.
             await rig.until(lambda: "held back: gyros of fc" in in_force(rig), 60.0)
             assert in_force(rig).startswith("predicted from 6 power-ups: ")

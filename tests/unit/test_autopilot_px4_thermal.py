@@ -18,7 +18,7 @@ from sim.px4.thermal import Module
 LINE, BEND, TURN = ((20.0, -12.0, 8.0), (0.5, 0.4, -0.3), (0.02, -0.015, 0.01))
 """deg/h a kelvin, square kelvin, cubic kelvin, about 25 degC."""
 AT_30 = (215.0, -51.875, 33.75)
-"""By hand, with a constant of 100, 0, 0 deg/h; a real PX4 took off 217, -52 (two looks), 34 within some deg/h."""
+"""By hand, with a constant of 100, 0, 0 deg/h; a real PX4 took off 217, -29, 49, in looks that scatter by 5 to 20."""
 
 
 def curve(cubes: tuple[float, float, float] = TURN) -> Polynomial:

@@ -363,7 +363,7 @@ class InForce:
             self._predicted += f"; seen: {off_deg_h:.0f} off"
             logger.info("imu %s: what is predicted is %.0f deg/h off", key[0], off_deg_h)
             if contradicts(present, sigma):
-                self._core.say(Severity.WARNING, f"Prediction wrong: {key[0]} is {off_deg_h:.0f} deg/h off")
+                self._core.say(Severity.WARNING, f"Predicted bias of {key[0]} is wrong: hold still")
         if isinstance(held, Why):
             right = key[0] in self._imus and not worth_writing(present, None, self._floors[key[1]])
             if right and held in _SETTLED_BY_MEASURING:
