@@ -1,4 +1,5 @@
--- companion_arming.lua: ArduPilot arms only while the companion computer says that a fresh calibration is in force.
+-- companion_arming.lua: ArduPilot arms only while the companion computer says that a fresh calibration is in force,
+-- and flies by its compass as soon as the companion's heading is not to be had.
 --
 -- Copyright the companion authors. SPDX-License-Identifier: Apache-2.0
 --
@@ -18,6 +19,7 @@ local MARK = "CMPA\1"
 local ACCEPT, NOT_GATING = 1, 3
 local SILENT_MS = 3000
 local PERIOD_MS = 200
+local GUARD_MS = 50
 local LONGEST = 41 -- what ArduPilot shows of a reason
 local TABLE_KEY = 191
 local WARNING, INFO = 4, 6
@@ -33,14 +35,36 @@ local verdict = nil
 local reason = ""
 local trouble = nil
 
+-- Heading: with EK3_SRC1_YAW = 6 the EKF has the companion's and no other. Source set 2 has the compass; it is taken
+-- when the companion's stream ends, or when in flight the heading turns while the gyros do not, and the set is put back
+-- when the stream has been there for 10 s: the companion sends only what agrees with the EKF. After a heading that turned
+-- by itself not before the aircraft is disarmed. A set that somebody else has chosen stays. CMPG_HEADING 0: no part in it.
+local FROM_OUTSIDE, FROM_COMPASS = 6, 1 -- EK3_SRCn_YAW
+local SET_1, SET_2 = 0, 1
+local LOST_MS = 300 -- besides the 300 ms after which visual_odom is not healthy
+local WELL_MS = 10000
+local STRAYS_RAD = math.rad(5)
+local STRAYS_WITHIN_S = 4
+local LONGEST_STEP_S = 0.2
+local STEEP_RAD = math.rad(60)
+
+local is_guarding = false
+local looked_ms = nil
+local silent_since_ms, well_since_ms = nil, nil
+local fell, is_latched = false, false
+local strayed_rad, last_yaw_rad, last_ms = 0, nil, nil
+local is_broken = false
+local gated_ms, gate_after_ms = nil, PERIOD_MS
+
 local function shorten(text)
     return string.sub(text, 1, LONGEST)
 end
 
 local function add_parameters()
-    if param:add_table(TABLE_KEY, "CMPG_", 2) then
+    if param:add_table(TABLE_KEY, "CMPG_", 3) then
         param:add_param(TABLE_KEY, 1, "ENABLE", 1)
         param:add_param(TABLE_KEY, 2, "COMPID", 191)
+        param:add_param(TABLE_KEY, 3, "HEADING", 1)
     else
         gcs:send_text(WARNING, "Companion gate: no parameters, defaults used")
     end
@@ -129,14 +153,84 @@ local function judge()
     end
 end
 
-local function step()
+local function since_ms(then_ms)
+    return (millis() - then_ms):toint()
+end
+
+-- Read once a second: looking a parameter up by its name takes its time.
+local function look()
+    if looked_ms ~= nil and since_ms(looked_ms) < 1000 then
+        return
+    end
+    looked_ms = millis()
+    is_guarding = visual_odom ~= nil and param:get("CMPG_HEADING") ~= 0
+        and param:get("EK3_SRC1_YAW") == FROM_OUTSIDE and param:get("EK3_SRC2_YAW") == FROM_COMPASS
+end
+
+local function angle_rad(name)
+    local ok, found = pcall(function() return ahrs[name .. "_rad"](ahrs) end)
+    return ok and found or ahrs[name](ahrs) -- before 4.7
+end
+
+-- Whether the heading turns and the gyros do not: what is off within the last seconds.
+local function strays()
+    local roll, pitch, yaw = angle_rad("get_roll"), angle_rad("get_pitch"), angle_rad("get_yaw")
+    local gyro, before, passed_s = ins:get_gyro(0), last_yaw_rad, last_ms ~= nil and since_ms(last_ms) / 1000 or 0
+    last_yaw_rad, last_ms = yaw, millis()
+    if before == nil or passed_s <= 0 or passed_s > LONGEST_STEP_S or math.abs(pitch) > STEEP_RAD
+        or not arming:is_armed() then
+        strayed_rad = 0
+        return false
+    end
+    local turned = (yaw - before + math.pi) % (2 * math.pi) - math.pi
+    local rate = (gyro:y() * math.sin(roll) + gyro:z() * math.cos(roll)) / math.cos(pitch)
+    strayed_rad = strayed_rad * (1 - passed_s / STRAYS_WITHIN_S) + turned - rate * passed_s
+    return math.abs(strayed_rad) > STRAYS_RAD
+end
+
+local function take_set(set, words)
+    ahrs:set_posvelyaw_source_set(set)
+    silent_since_ms, well_since_ms, last_yaw_rad, last_ms = nil, nil, nil, nil
+    gcs:send_text(WARNING, words)
+end
+
+local function guard()
+    look()
+    if not is_guarding then
+        return
+    end
+    local set, well = ahrs:get_posvelyaw_source_set(), visual_odom:healthy()
+    if well then
+        silent_since_ms, well_since_ms = nil, well_since_ms or millis()
+    else
+        silent_since_ms, well_since_ms = silent_since_ms or millis(), nil
+    end
+    if set == SET_1 then
+        if silent_since_ms ~= nil and since_ms(silent_since_ms) >= LOST_MS then
+            fell = true
+            take_set(SET_2, "Heading: compass, companion silent")
+        elseif strays() then
+            fell, is_latched = true, true
+            take_set(SET_2, "Heading: compass, companion's drifts")
+        end
+    elseif set == SET_2 and fell then
+        is_latched = is_latched and arming:is_armed()
+        if not is_latched and well_since_ms ~= nil and since_ms(well_since_ms) >= WELL_MS then
+            fell = false
+            take_set(SET_1, "Heading: companion")
+        end
+    else
+        fell = false -- somebody else's choice
+    end
+end
+
+local function gate()
     if auth_id == nil then
         auth_id = arming:get_aux_auth_id()
         if auth_id == nil then
             return
         end
         arming:set_aux_auth_failed(auth_id, "Companion silent: arming blocked")
-        add_parameters()
         listen()
         gcs:send_text(INFO, "Companion arming gate: active")
     end
@@ -158,15 +252,25 @@ end
 
 -- A script that stops on an error would leave its last word standing: so errors close the gate, and it goes on.
 local function update()
-    local ok, problem = pcall(step)
+    local ok, problem = pcall(guard)
+    if not ok and not is_broken then
+        is_broken = true
+        gcs:send_text(WARNING, shorten("Companion heading: " .. tostring(problem)))
+    end
+    if gated_ms ~= nil and since_ms(gated_ms) < gate_after_ms then
+        return update, GUARD_MS
+    end
+    gated_ms, gate_after_ms = millis(), PERIOD_MS
+    ok, problem = pcall(gate)
     if not ok then
         if auth_id ~= nil then
             arming:set_aux_auth_failed(auth_id, "Companion script error")
         end
         gcs:send_text(WARNING, shorten("Companion gate: " .. tostring(problem)))
-        return update, 5 * PERIOD_MS
+        gate_after_ms = 5 * PERIOD_MS
     end
-    return update, PERIOD_MS
+    return update, GUARD_MS
 end
 
+add_parameters()
 return update()

@@ -33,6 +33,9 @@ class YawSource(Protocol):
     def aligned(self) -> bool:
         """Whether the filter has taken a heading from it."""
 
+    def choose(self, source_set: int) -> None:
+        """Take another set of sources, 1 to 3."""
+
 
 class Board(AutopilotDouble):
     """An autopilot without its servers.

@@ -42,6 +42,7 @@ class CommandServer:
             mavlink.MAV_CMD_PREFLIGHT_STORAGE: self._storage,
             mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
             mavlink.MAV_CMD_RUN_PREARM_CHECKS: self._run_prearm_checks,
+            mavlink.MAV_CMD_SET_EKF_SOURCE_SET: self._set_source_set,
         }
 
     def handle(self, command: Command) -> None:
@@ -154,6 +155,12 @@ class CommandServer:
         if failures or double.calibrating:
             return FAILED
         double.arm()
+        return ACCEPTED
+
+    def _set_source_set(self, command: Command) -> int:
+        if command.params[0] not in (1.0, 2.0, 3.0):
+            return DENIED
+        self._double.external_nav.choose(int(command.params[0]))
         return ACCEPTED
 
     def _run_prearm_checks(self, command: Command) -> int:

@@ -1,8 +1,8 @@
 """What the double makes of an attitude from outside: VisOdom takes it in, EKF3 uses its yaw where it is told to.
 
 Facts: ArduPilot `GCS_Common.cpp`, `AP_VisualOdom_MAV.cpp`, `AP_NavEKF3_Measurements.cpp` (writeExtNavData),
-`AP_NavEKF3_MagFusion.cpp` (2026-03). VISO_TYPE and EK3_SRC1_YAW count as they were at the boot. Not modelled: position
-and velocity, which nobody here selects; other sets of sources; lanes.
+`AP_NavEKF3_MagFusion.cpp` (2026-03). VISO_TYPE and EK3_SRCn_YAW count as they were at the boot. Not modelled: position
+and velocity, which nobody here selects; lanes.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim.ardupilot.board import Board
 from sim.firmware.channel import Message
 
+COMPASS = 1
 EXTNAV = 6
 LEAST_SPACING_MS = 20
 HEALTHY_S = 0.3
@@ -45,10 +46,23 @@ class ExternalNav:
         """A boot."""
         values = self._double.parameters.values
         self.enabled = values["VISO_TYPE"] == 1
-        self.selected = values["EK3_SRC1_YAW"] == EXTNAV
-        self.aligned = False
+        self._sources = {number: values.get(f"EK3_SRC{number}_YAW", 0.0) for number in (1, 2, 3)}
+        self.source_set = 1
+        self.selected = self._sources[1] == EXTNAV
+        self.aligned = self._resets = False
         self._stamp_ms = -math.inf
         self._heard_s = self._fused_s = -math.inf
+
+    def choose(self, source_set: int) -> None:
+        """Take the sources of a set: the heading is reset to what the new one says, as soon as it says it."""
+        double = self._double
+        self.source_set = source_set
+        self.selected = self._sources[source_set] == EXTNAV
+        self._resets = self.selected
+        double.estimator.compass = self._sources[source_set] == COMPASS
+        if double.estimator.compass:
+            double.estimator.yaw_error_rad = 0.0
+            self.aligned = True
 
     def healthy(self, loop_s: float) -> bool:
         """What the check before arming asks."""
@@ -114,7 +128,10 @@ class ExternalNav:
         _, _, truth = double.aircraft.angles_rad(double.aircraft.time_at(loop_s))
         wrong = math.remainder(yaw_rad - truth, 2.0 * math.pi)
         estimator = double.estimator
-        if not self.aligned:
+        if self._resets:
+            self._resets = False
+            estimator.yaw_error_rad = wrong
+        elif not self.aligned:
             self.aligned = True
             estimator.yaw_error_rad = wrong
             double.say(mavlink.MAV_SEVERITY_INFO, "EKF3 IMU0 yaw aligned")

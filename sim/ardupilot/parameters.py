@@ -17,6 +17,9 @@ _LIMITS = {INT8: (-128, 127), INT16: (-32768, 32767), INT32: (-(2**31), 2**31 - 
 
 AXES = ("X", "Y", "Z")
 
+EKF_SOURCES = {"POSXY": 3, "VELXY": 3, "POSZ": 1, "VELZ": 3, "YAW": 1}
+"""EK3_SRC1_*: GNSS, barometer for the height, compass; the other sets are empty."""
+
 
 def offset_names(instance: int, kind: Literal["gyro", "accel", "scale"]) -> tuple[str, str, str]:
     """Parameter names of instance 1 to 5; the first one is irregular (there is no INS_ACC1OFFS_X), so are 4 and 5."""
@@ -147,7 +150,8 @@ def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) 
         "SERIAL3_PROTOCOL": (5, INT8),
         "EK3_ENABLE": (1, INT8),
         "EK3_IMU_MASK": (2 ** min(imus, 3) - 1, INT8),
-        "EK3_SRC1_YAW": (1, INT8),
+        **{f"EK3_SRC1_{what}": (value, INT8) for what, value in EKF_SOURCES.items()},
+        **{f"EK3_SRC2_{what}": (0, INT8) for what in EKF_SOURCES},
         "EK3_GBIAS_P_NSE": (0.001, REAL32),
         "EK3_ABIAS_P_NSE": (0.02, REAL32),
         "EK3_ACC_BIAS_LIM": (1.0, REAL32),

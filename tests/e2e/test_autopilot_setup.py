@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.cli.client import setup_lines
-from tests.e2e.test_attitude_push import flight
+from tests.e2e.test_attitude_push import Flight, flight
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -18,7 +19,15 @@ BEFORE: dict[Firmware, dict[str, float]] = {
     "px4": {"EKF2_EV_CTRL": 3.0, "EKF2_EV_NOISE_MD": 1.0, "EKF2_EVA_NOISE": 0.1234, "EKF2_EV_DELAY": 12.5},
 }
 AFTER: dict[Firmware, dict[str, float]] = {
-    "ardupilot": {"VISO_TYPE": 1.0, "EK3_SRC1_YAW": 6.0},
+    "ardupilot": {
+        "VISO_TYPE": 1.0,
+        "EK3_SRC1_YAW": 6.0,
+        "EK3_SRC2_YAW": 1.0,
+        "EK3_SRC2_POSXY": 3.0,
+        "EK3_SRC2_VELXY": 3.0,
+        "EK3_SRC2_POSZ": 1.0,
+        "EK3_SRC2_VELZ": 3.0,
+    },
     "px4": {"EKF2_EV_CTRL": 11.0, "EKF2_EV_NOISE_MD": 0.0, "EKF2_EVA_NOISE": 0.05, "EKF2_EV_DELAY": 0.0},
 }
 
@@ -96,8 +105,75 @@ def test_the_set_up_and_the_stream_together(tmp_path: Path) -> None:
             await flying.sleep(15.0)
             await flying.calibrate()
             await flying.pushing()
-            await flying.sleep(3.0)
+            await flying.sleep(13.0)
             assert rig.double.external_nav.in_use(rig.now_s)
             assert flying.theirs_deg() < 2.0
+
+    run_virtual(main())
+
+
+def test_without_a_compass_there_is_nothing_to_go_back_to(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight(tmp_path, calibrated=False, used=False) as flying:
+            rig = flying.rig
+            await follow(rig)
+            rig.autopilot.write_as_another_station("COMPASS_USE", 0)
+            shown = await ask(rig)
+            assert (shown["state"], shown["net"]["kind"]) == ("not applied", "none")
+            assert shown["reason"].startswith("this autopilot has no compass in use (COMPASS_USE): ")
+
+    run_virtual(main())
+
+
+async def set_up(flying: Flight) -> None:
+    """Both sets of sources, a restart, a calibration, and our heading in use."""
+    rig = flying.rig
+    await follow(rig)
+    rig.double.reboot()
+    await rig.until(lambda: rig.service.core.vehicle.boots == 1, 20.0)
+    await flying.sleep(20.0)
+    await flying.calibrate()
+    await flying.pushing()
+    await flying.sleep(12.0)
+
+
+def test_where_there_is_no_script_the_companion_asks_for_the_compass_and_for_its_own_heading_again(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        async with flight(tmp_path, calibrated=False, used=False) as flying:
+            rig = flying.rig
+            await set_up(flying)
+            assert flying.attitude.view()["safety_net"] == "command"
+            assert rig.double.external_nav.source_set == 1
+            rig.autopilot.arm()
+            rig.unplugged.add("own")
+            await flying.sleep(0.6)
+            assert rig.double.external_nav.source_set == 2
+            assert flying.theirs_deg() < 2.0
+            rig.unplugged.discard("own")
+            await flying.pushing(5.0)
+            await flying.sleep(9.0)
+            assert rig.double.external_nav.source_set == 2
+            await flying.sleep(2.0)
+            assert rig.double.external_nav.source_set == 1
+            texts = [text for text in rig.ground.texts() if text.startswith("Heading: ")]
+            assert texts[-2:] == ["Heading: compass, companion's is not pushed", "Heading: companion"]
+
+    run_virtual(main())
+
+
+def test_where_the_script_runs_the_companion_leaves_it_to_it(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight(tmp_path, calibrated=False, used=False) as flying:
+            rig = flying.rig
+            store = rig.double.parameters  # as the script makes it
+            store._types["CMPG_HEADING"], store.values["CMPG_HEADING"] = mavlink.MAV_PARAM_TYPE_REAL32, 1.0
+            store.names += ("CMPG_HEADING",)
+            await set_up(flying)
+            assert flying.attitude.view()["safety_net"] == "script"
+            rig.unplugged.add("own")
+            await flying.sleep(5.0)
+            assert rig.double.external_nav.source_set == 1
 
     run_virtual(main())

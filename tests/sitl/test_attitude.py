@@ -19,6 +19,7 @@ from typing import Any, Literal
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.lua import ARMING_SCRIPT
 from sim.companion_process import CompanionProcess
 from sim.motions import Turn
 from sim.serve import configuration
@@ -43,14 +44,14 @@ class Bench:
     def __init__(self, vehicle: SitlVehicle, ground: GroundStation, daemon: CompanionProcess) -> None:
         self.vehicle, self.ground, self.daemon = vehicle, ground, daemon
 
-    async def set_up(self) -> None:
-        """What `companion autopilot-setup` says, from a ground station."""
+    async def set_up(self, *, net: bool = True) -> dict[str, Any]:
+        """What `companion autopilot-setup` says, from a ground station; without `net` no second set of sources."""
         shown = await self.ask("autopilot-setup")
-        await self.ground.put_all(
-            {row["parameter"]: row["wanted"] for row in shown["parameters"] if row["wanted"] is not None}
-        )
+        wanted = {row["parameter"]: row["wanted"] for row in shown["parameters"] if row["wanted"] is not None}
+        await self.ground.put_all({name: value for name, value in wanted.items() if net or "SRC2" not in name})
         shown = await self.ask("autopilot-setup")
-        assert shown["state"] == "applied", shown
+        assert shown["state"] == ("applied" if net else "not applied"), shown
+        return shown
 
     async def ask(self, *words: str) -> dict[str, Any]:
         """A command of the companion with --json."""
@@ -150,7 +151,7 @@ def test_ekf3_takes_the_heading(tmp_path: Path) -> None:
     async def main() -> None:
         async with bench("ardupilot-sitl", tmp_path) as on:
             loop = asyncio.get_running_loop()
-            await on.set_up()
+            await on.set_up(net=False)
             assert (await on.ground.get("EK3_SRC1_YAW"), await on.ground.get("VISO_TYPE")) == (6.0, 1.0)
             await on.vehicle.sleep(3.0)
             booted_s = loop.time()
@@ -190,6 +191,41 @@ def test_ekf3_takes_the_heading(tmp_path: Path) -> None:
             await on.pushing()
             await on.vehicle.sleep(2.0)
             assert "VisOdom" not in await on.prearm_words()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("script", [True, False], ids=["script", "command"])
+def test_ekf3_goes_back_to_its_compass_when_our_heading_ends(tmp_path: Path, script: bool) -> None:
+    """By the script within a second even of a kill -9; without one, by the companion's own request."""
+
+    async def main() -> None:
+        if script:
+            scripts = tmp_path / "firmware" / "scripts"
+            scripts.mkdir(parents=True)
+            (scripts / ARMING_SCRIPT.name).write_bytes(ARMING_SCRIPT.read_bytes())
+        async with bench("ardupilot-sitl", tmp_path, parameters={"CMPG_ENABLE": 0} if script else {}) as on:
+            shown = await on.set_up()
+            print(shown["net"])
+            await on.vehicle.sleep(3.0)
+            await on.vehicle.power_cycle()
+            await on.vehicle.sleep(35.0)
+            assert (await on.ask("autopilot-setup"))["net"]["kind"] == ("script" if script else "command")
+            await on.stream(mavlink.MAVLINK_MSG_ID_ATTITUDE, 10.0)
+            await on.until_follows(0.0, 30.0)  # its compass, as long as there is no other
+            record = await on.daemon.calibrate(CALIBRATED_WITHIN_S)
+            assert record["state"] == "done", record["reason"]
+            await on.pushing()
+            found = await on.until_follows(LIE_DEG, 40.0)
+            print(f"EKF3's heading less the true one: {found:.2f} deg, ours {LIE_DEG} by its compass")
+            assert abs(found - LIE_DEG) < FOLLOWS_DEG
+            begun_s, physics_s = asyncio.get_running_loop().time(), on.vehicle.physics_s
+            on.daemon.signal(signal.SIGKILL if script else signal.SIGTERM)
+            words = "Heading: compass" if script else "EKF3 IMU0 yaw"
+            found = await on.until_follows(0.0, 30.0)
+            print(f"{found:.2f} deg, {on.vehicle.physics_s - physics_s:.1f} s after the end")
+            assert abs(found) < FOLLOWS_DEG
+            assert words in on.ground.texts_since(begun_s)
 
     asyncio.run(main())
 

@@ -19,14 +19,35 @@ gcs = { send_text = function(_, severity, words) said[#said + 1] = severity .. "
 local parameters = {}
 param = {
     get = function(_, name) return values[name] end,
-    add_table = function(_, key, prefix, count) parameters.prefix = prefix; return key > 0 and count == 2 end,
+    add_table = function(_, key, prefix, count) parameters.prefix = prefix; return key > 0 and count == 3 end,
     add_param = function(_, _, _, name, default)
         local full = parameters.prefix .. name
         if values[full] == nil then values[full] = default end
         return true
     end,
 }
+-- What the heading's guard sees: flight is as `fly` says, the rest as `set` does.
+local flight = { healthy = 1, set = 0, armed = 0, yaw = 0, rate = 0 }
+if kind ~= "4.4" then
+    visual_odom = { healthy = function(_) return flight.healthy ~= 0 end }
+end
+local function angle(name)
+    return function(_) return name == "yaw" and flight.yaw or 0 end
+end
+local suffix = kind == "4.5" and "" or "_rad"
+ahrs = {
+    get_posvelyaw_source_set = function(_) return flight.set end,
+    set_posvelyaw_source_set = function(_, set) flight.set = set end,
+}
+for _, name in ipairs({ "roll", "pitch", "yaw" }) do ahrs["get_" .. name .. suffix] = angle(name) end
+ins = {
+    get_gyro = function(_, _)
+        local rate = flight.rate
+        return { x = function() return 0 end, y = function() return 0 end, z = function() return rate end }
+    end,
+}
 arming = {
+    is_armed = function(_) return flight.armed ~= 0 end,
     get_aux_auth_id = function(_) return kind ~= "full" and 0 or nil end,
     set_aux_auth_passed = function(_, id) assert(id == 0); state, text = "passed", "" end,
     set_aux_auth_failed = function(_, id, words) assert(id == 0); state, text = "failed", words end,
@@ -78,6 +99,7 @@ for line in io.lines() do
         local till = now + tonumber(rest)
         while now + wait <= till do
             now = now + wait
+            flight.yaw = (flight.yaw + (flight.turns or 0) * wait / 1000 + math.pi) % (2 * math.pi) - math.pi
             update, wait = update()
         end
         now = till
@@ -86,6 +108,11 @@ for line in io.lines() do
     elseif word == "set" then
         local name, value = rest:match("(%S+) (%S+)")
         values[name] = tonumber(value)
+    elseif word == "fly" then -- healthy, set, armed; turns and rate in rad/s: of the heading, and by the gyro
+        local name, value = rest:match("(%S+) (%S+)")
+        flight[name] = tonumber(value)
+    elseif word == "source" then
+        said[#said + 1] = "set " .. flight.set + 1
     elseif word == "receive" then -- hexadecimal bytes of a message as ArduPilot hands it over
         queue[#queue + 1] = (rest:gsub("%x%x", function(two) return string.char(tonumber(two, 16)) end))
     elseif word == "break" then

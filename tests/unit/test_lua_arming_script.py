@@ -208,3 +208,91 @@ def test_with_no_authorisation_to_be_had_it_tries_on_and_breaks_nothing() -> Non
     script = Script("full")
     assert script("run 5000")[0] == "none"
     script.close()
+
+
+@pytest.fixture
+def flown(script: Script) -> Script:
+    """As `companion autopilot-setup` leaves it, with the stream there, armed."""
+    for each in ("set EK3_SRC1_YAW 6", "set EK3_SRC2_YAW 1", "fly healthy 1", "fly armed 1", "run 2000"):
+        script(each)
+    return script
+
+
+def source(script: Script) -> str:
+    return script("source")[2]
+
+
+def test_a_stream_that_ends_leaves_the_heading_to_the_compass_within_half_a_second(flown: Script) -> None:
+    flown("fly healthy 0")
+    assert flown("run 250")[2] == ""
+    assert flown("run 150")[2] == "4:Heading: compass, companion silent"
+    assert source(flown) == "set 2"
+
+
+def test_a_gap_of_a_moment_does_nothing(flown: Script) -> None:
+    for _ in range(20):
+        flown("fly healthy 0")
+        flown("run 200")
+        flown("fly healthy 1")
+        flown("run 50")
+    assert source(flown) == "set 1"
+
+
+def test_the_companions_heading_is_taken_again_after_ten_good_seconds_in_a_row(flown: Script) -> None:
+    flown("fly healthy 0")
+    flown("run 1000")
+    flown("fly healthy 1")
+    flown("run 9000")
+    flown("fly healthy 0")
+    flown("run 100")
+    flown("fly healthy 1")
+    assert flown("run 9900")[2] == ""
+    assert source(flown) == "set 2"
+    assert flown("run 200")[2] == "4:Heading: companion"
+    assert source(flown) == "set 1"
+
+
+def test_a_heading_that_turns_by_itself_is_left_until_the_aircraft_is_disarmed(flown: Script) -> None:
+    flown(f"fly turns {math.radians(3.0)}")
+    assert flown("run 1500")[2] == ""
+    assert flown("run 1500")[2] == "4:Heading: compass, companion's drifts"
+    flown("fly turns 0")
+    flown("run 60000")
+    assert source(flown) == "set 2"
+    flown("fly armed 0")
+    assert flown("run 200")[2] == "4:Heading: companion"
+
+
+def test_a_turn_that_the_gyros_see_is_none_of_the_headings(flown: Script) -> None:
+    for rate_deg_s in (3.0, 90.0, -200.0):
+        flown(f"fly turns {math.radians(rate_deg_s)}")
+        flown(f"fly rate {math.radians(rate_deg_s + 0.5)}")
+        assert flown("run 20000")[2] == ""
+    assert source(flown) == "set 1"
+
+
+def test_somebody_elses_choice_of_sources_stays(flown: Script) -> None:
+    flown("fly set 1")
+    flown("run 60000")
+    assert source(flown) == "set 2"
+    flown("fly set 2")
+    flown("run 60000")
+    assert source(flown) == "set 3"
+
+
+@pytest.mark.parametrize("otherwise", ["set EK3_SRC1_YAW 1", "set EK3_SRC2_YAW 6", "set CMPG_HEADING 0"])
+def test_where_the_sets_are_not_ours_nothing_is_switched(flown: Script, otherwise: str) -> None:
+    flown(otherwise)
+    flown("run 1000")
+    flown("fly healthy 0")
+    flown("run 60000")
+    assert source(flown) == "set 1"
+
+
+@pytest.mark.parametrize("kind", ["4.5", "colon", "taken", "full"])
+def test_the_heading_is_guarded_whatever_becomes_of_the_gate(kind: str) -> None:
+    script = Script(kind)
+    for each in ("set EK3_SRC1_YAW 6", "set EK3_SRC2_YAW 1", "fly armed 1", "run 2000", "fly healthy 0", "run 500"):
+        script(each)
+    assert source(script) == "set 2"
+    script.close()

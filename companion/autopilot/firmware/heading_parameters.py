@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, Literal
 
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.wire import same_float32
@@ -14,7 +14,12 @@ from companion.errors import AutopilotError
 EV_YAW: Final = 8
 """Bit 3 of EKF2_EV_CTRL."""
 EXTNAV: Final = 6
-"""EK3_SRCn_YAW: external navigation."""
+COMPASS: Final = 1
+"""EK3_SRCn_YAW: external navigation, and the autopilot's compass."""
+NO_COMPASS: Final = 5
+"""EKF2_MAG_TYPE: none."""
+Net = Literal["script", "command", "autopilot", "none"]
+"""Who sees to another heading when ours ends; "autopilot": it does so by itself."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -27,16 +32,27 @@ class Wanted:
     bits: bool = False
     """The value's bits are to be set, others stay as they are."""
     optional: bool = False
+    like: str = ""
+    """Another parameter, whose value it is to have; `value` where that is not there."""
 
-    def after(self, before: float) -> float:
-        """What it is to become."""
-        return float(int(before) | int(self.value)) if self.bits else self.value
+    def after(self, found: Mapping[str, float]) -> float:
+        """What it is to become, of parameters as they were read."""
+        value = found.get(self.like, self.value)
+        return float(int(found[self.parameter]) | int(value)) if self.bits else value
 
 
 _ARDUPILOT: Final = (
     Wanted("VISO_TYPE", 1.0, "listens to VISION_POSITION_ESTIMATE"),
-    Wanted("EK3_SRC1_YAW", float(EXTNAV), "EKF3 takes its heading from it, and from nothing else"),
+    Wanted("EK3_SRC1_YAW", float(EXTNAV), "EKF3 takes its heading from it (source set 1)"),
+    Wanted("EK3_SRC2_YAW", float(COMPASS), "where that ends, from its compass (source set 2)"),
+    *(
+        Wanted(f"EK3_SRC2_{what}", value, "and the rest as in set 1", like=f"EK3_SRC1_{what}")
+        for what, value in (("POSXY", 3.0), ("VELXY", 3.0), ("POSZ", 1.0), ("VELZ", 3.0))
+    ),
 )
+_COMPASSES: Final = ("COMPASS_ENABLE", *(f"COMPASS_{what}{n}" for n in ("", "2", "3") for what in ("USE", "DEV_ID")))
+SCRIPT: Final = "CMPG_HEADING"
+"""Of the script (companion/lua): it is there, and 1 where it sees to the heading."""
 _PX4: Final = (
     Wanted("EKF2_EV_CTRL", float(EV_YAW), "EKF2 takes its heading from external vision", bits=True),
     Wanted("EKF2_EV_NOISE_MD", 0.0, "with the sigma that we send"),
@@ -45,17 +61,41 @@ _PX4: Final = (
 )
 WANTED: Final[dict[Firmware, tuple[Wanted, ...]]] = {"ardupilot": _ARDUPILOT, "px4": _PX4}
 
-RISKS: Final[dict[Firmware, tuple[str, ...]]] = {
-    "ardupilot": (
-        "EK3_SRC1_YAW = 6 without the companion's stream is no heading at all: the compass is no fallback",
-        "it will not arm while the stream is away (VisOdom: not healthy)",
-        "if the stream stops in flight, modes that need a position go wrong within a minute: land by hand",
-    ),
-    "px4": (
-        "EKF2 believes the companion's heading beside its magnetometer, and resets to it where the two disagree",
-        "if the stream stops, the magnetometer goes on alone (not with EKF2_MAG_TYPE 5)",
-    ),
+NETS: Final[dict[Net, str]] = {
+    "script": "if our heading ends, the script takes the compass within a second",
+    "command": "if our heading ends, the companion asks for the compass; if its board dies nobody does (companion lua)",
+    "autopilot": "if our heading ends, the autopilot goes back to its magnetometer",
+    "none": "if our heading ends there is none: fly only where you can land by hand",
 }
+RISKS: Final[dict[Firmware, tuple[str, ...]]] = {
+    "ardupilot": ("it will not arm while the stream is away (VisOdom: not healthy)",),
+    "px4": ("EKF2 believes the companion's heading beside its magnetometer, and resets to it where the two disagree",),
+}
+
+
+def read_for(firmware: Firmware | None) -> list[str]:
+    """What `changes_for` and `net_of` look at.
+
+    Raises:
+        AutopilotError: as `wanted_for`.
+    """
+    wanted = [name for one in wanted_for(firmware) for name in (one.parameter, one.like) if name]
+    return [*wanted, *((*_COMPASSES, SCRIPT) if firmware == "ardupilot" else ("EKF2_MAG_TYPE",))]
+
+
+def net_of(firmware: Firmware, found: Mapping[str, float]) -> Net:
+    """What is there when our heading ends, of parameters as they were read."""
+    if firmware == "px4":
+        return "none" if found.get("EKF2_MAG_TYPE") == NO_COMPASS else "autopilot"
+    if without_compass(firmware, found) or found.get("EK3_SRC2_YAW") != COMPASS:
+        return "none"
+    return "script" if found.get(SCRIPT) == 1.0 else "command"
+
+
+def without_compass(firmware: Firmware, found: Mapping[str, float]) -> bool:
+    """Whether ArduPilot has no compass in use."""
+    used = [found.get(f"COMPASS_USE{n}") == 1.0 and found.get(f"COMPASS_DEV_ID{n}", 1.0) != 0.0 for n in ("", "2", "3")]
+    return firmware == "ardupilot" and (found.get("COMPASS_ENABLE") == 0.0 or not any(used))
 
 
 def wanted_for(firmware: Firmware | None) -> tuple[Wanted, ...]:
@@ -85,7 +125,7 @@ def changes_for(firmware: Firmware | None, found: Mapping[str, float]) -> list[C
             if wanted.optional:
                 continue
             raise AutopilotError(f"this autopilot has no {wanted.parameter}: it cannot take in a heading")
-        after = wanted.after(before)
+        after = wanted.after(found)
         if not same_float32(before, after):
             changes.append(Change(wanted.parameter, before, after))
     return changes

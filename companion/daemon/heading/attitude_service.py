@@ -24,6 +24,7 @@ from companion.daemon.arming.in_force import InForce
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.heading.carrier import SLOWEST_AIRSPEED_M_S, Carrier, carrying_imu, without_truncation
+from companion.daemon.heading.fallback import Fallback
 from companion.daemon.heading.health import Difference, Health
 from companion.daemon.stands.alignment import AlignmentInForce
 from companion.formats import Object
@@ -104,6 +105,7 @@ class AttitudeService:
         self.carrier = Carrier(core, carrying_imu(config), in_force, alignment)
         self.difference = Difference(vehicle, self.carrier.now, self.carrier.kept_at)
         self.health = Health(self.carrier, self.difference, vehicle)
+        self.fallback = Fallback(core)
         self.sender = Sender(link, models.attitude_rate_hz(config), full=config.push.attitude == "full")
         self.timesync = TimesyncResponder(link, vehicle)
         vehicle.hear(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
@@ -212,11 +214,17 @@ class AttitudeService:
             kind = self._autopilot_imu.stream.kind
             self.carrier.gyro_step_rad_s = kind.gyro_step_rad_s if kind is not None and kind.truncates else 0.0
         self.health.judge(now_s)
+        self.fallback.step(now_s, pushing=self.health.pushing)
         if now_s - self._looked_s >= LOOK_S:
             self._looked_s = now_s
             await self.carrier.update(now_s)
         self.sender.count(now_s)
         self._tell(now_s)
+
+    def close(self) -> None:
+        """Push no more; where nobody else sees to another heading, ask for one."""
+        self.health.stop("the companion ends")
+        self.fallback.step(asyncio.get_running_loop().time(), pushing=False)
 
     def _tell(self, now_s: float) -> None:
         if self.health.pushing != self._was_pushing:
@@ -276,6 +284,7 @@ class AttitudeService:
             "alignments": self.carrier.alignments,
             "reset_counter": self.carrier.reset_counter % 256,
             "timesync_answers": self.timesync.answered,
+            "safety_net": self.fallback.net,
             **_angles(attitude),
             "sigma_deg": None
             if attitude is None

@@ -7,7 +7,15 @@ import math
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
-from companion.autopilot.firmware.heading_parameters import RISKS, changes_for, wanted_for
+from companion.autopilot.firmware.heading_parameters import (
+    NETS,
+    RISKS,
+    changes_for,
+    net_of,
+    read_for,
+    wanted_for,
+    without_compass,
+)
 from companion.autopilot.firmware.imu_calibration import read_rivals
 from companion.autopilot.firmware.port_parameters import PortRow, baud_of, port_names, port_rows
 from companion.calibration.means.pose import up_in_vehicle, vehicle_heading_rad
@@ -52,10 +60,13 @@ class Heading(Subsystem):
     async def _answer_setup(self, _request: Object, _face: str) -> AsyncIterator[Object]:
         """What is set, what should be, and what to do: for our heading, the gate, the offsets, and the port."""
         firmware = self._core.vehicle.firmware
-        wanted = wanted_for(firmware)
-        found = await self._core.parameters.read_many([one.parameter for one in wanted], optional=True)
+        found = await self._core.parameters.read_many(read_for(firmware), optional=True)
         changes = changes_for(firmware, found)
-        if changes:
+        assert firmware is not None  # or it would have been refused
+        net = net_of(firmware, found)
+        if without_compass(firmware, found):
+            reason = f"this autopilot has no compass in use (COMPASS_USE): {NETS['none']}"
+        elif changes:
             todo = ", ".join(f"{change.parameter} {change.after:g}" for change in changes)
             reason = f"set {todo}; {REBOOT}"
         elif self._core.config.push.attitude == "off":
@@ -64,20 +75,21 @@ class Heading(Subsystem):
             reason = "the autopilot is set up"
         yield {
             "kind": "result",
-            "state": "not applied" if changes else "applied",
+            "state": "not applied" if changes or without_compass(firmware, found) else "applied",
             "reason": reason,
+            "net": {"kind": net, "words": NETS[net]},
             "firmware": firmware,
             "parameters": [
                 {
                     "parameter": one.parameter,
                     "now": now,
-                    "wanted": None if now is None else one.after(now),
+                    "wanted": None if now is None else one.after(found),
                     "why": one.why,
                 }
-                for one in wanted
+                for one in wanted_for(firmware)
                 for now in (found.get(one.parameter),)
             ],
-            "risks": list(RISKS.get(firmware or "other", ())),
+            "risks": list(RISKS.get(firmware, ())),
             "gate": {"at_arm": self._core.wanted.at_arm, "problem": await self._gate.find_missing(0.0)},
             "rivals": [rival.words for rival in await read_rivals(self._core.parameters)],
             "port": [row._asdict() for row in await self._port()],
@@ -98,8 +110,15 @@ class Heading(Subsystem):
             "devices": [] if attitude is None else [attitude.status()],
         }
 
+    def close(self) -> None:
+        """Push no more, and have the autopilot fly by something else."""
+        if self.attitude is not None:
+            self.attitude.close()
+
     def tasks(self) -> Sequence[Task]:  # noqa: D102
-        return [] if self.attitude is None else [("attitude", self.attitude.run)]
+        if self.attitude is None:
+            return []
+        return [("attitude", self.attitude.run), ("fallback", self.attitude.fallback.run)]
 
 
 class PoseNow:

@@ -253,7 +253,9 @@ def _gate(config: Config, setup: Object) -> Finding:
 
 async def _heading(config: Config) -> Finding:
     replies = [reply async for reply in ask(config.control.path, {"command": "autopilot-setup"})]
-    return Finding("heading", good=replies[-1].get("state") == "applied", words=replies[-1]["reason"])
+    reply = replies[-1]
+    words = f"{reply['reason']}; {reply['net']['words']}" if "net" in reply else reply["reason"]
+    return Finding("heading", good=reply.get("state") == "applied", words=words)
 
 
 def _storage(directory: Path) -> Finding:

@@ -90,7 +90,8 @@ class Service:
                         group.create_task(run(), name=name)
                     await asyncio.get_running_loop().create_future()
                 finally:
-                    # Before the links go: a write under way needs them to come to its end.
+                    # Before the links go: the heading needs another source, a write under way its end.
+                    self.heading.close()
                     await self.calibrating.conductor.close()
         finally:
             self.core.vehicle.close()

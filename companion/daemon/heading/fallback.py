@@ -1,0 +1,84 @@
+"""What ArduPilot flies by when our heading ends: the compass of source set 2 (autopilots 10.4).
+
+The script on the flight controller sees to it (companion/lua); where there is none, the companion asks. Nobody does
+then if its board dies. PX4 goes back to its magnetometer by itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from typing import Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.firmware.heading_parameters import EXTNAV, Net, net_of, read_for
+from companion.autopilot.vehicle.vehicle import VehicleEvent
+from companion.component.statustext import Severity, Weight
+from companion.daemon.core import Core
+from companion.errors import AutopilotError
+
+logger = logging.getLogger(__name__)
+
+SCRIPT_STARTS_S: Final = 15.0
+"""After the first heartbeat: before that nobody knows whether there is one."""
+WELL_S: Final = 10.0
+"""So long our heading must have been pushed before it is asked for again."""
+AGAIN_S: Final = 1.0
+_OURS, _COMPASS = 1, 2
+_WORDS: Final = {_OURS: "Heading: companion", _COMPASS: "Heading: compass, companion's is not pushed"}
+
+
+class Fallback:
+    """`run` finds out who sees to it; `step` asks, if that is us."""
+
+    def __init__(self, core: Core) -> None:
+        self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
+        self.net: Net | None = None
+        """None: not known yet."""
+        self._selected = False
+        self._stale = asyncio.Event()
+        self._pushed_since_s = math.inf
+        self._asked: int | None = None
+        self._tried_s = -math.inf
+        core.vehicle.on_event.add(self._on_event)
+
+    async def run(self) -> None:
+        """Look at every start of the autopilot, until cancelled."""
+        while True:
+            await self._vehicle.found.wait()
+            self._stale.clear()
+            firmware = self._vehicle.firmware
+            await asyncio.sleep(SCRIPT_STARTS_S)
+            try:
+                found = await self._parameters.read_many(read_for(firmware), optional=True)
+            except AutopilotError as error:
+                logger.info("what the autopilot flies by when our heading ends is not known: %s", error)
+                continue
+            assert firmware is not None  # or it would have been refused
+            self.net, self._selected = net_of(firmware, found), found.get("EK3_SRC1_YAW") == EXTNAV
+            await self._stale.wait()
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event in ("found", "rebooted"):
+            self.net = self._asked = None
+            self._stale.set()
+
+    def step(self, now_s: float, *, pushing: bool) -> None:
+        """Ask for the set that is right, if nobody else does."""
+        self._pushed_since_s = min(self._pushed_since_s, now_s) if pushing else math.inf
+        if self.net != "command" or not self._selected:
+            return
+        wanted = _OURS if now_s - self._pushed_since_s >= WELL_S else _COMPASS
+        # Until our heading has been well for long enough, what is in use stays.
+        if wanted == self._asked or (wanted == _COMPASS and pushing) or now_s - self._tried_s < AGAIN_S:
+            return
+        self._tried_s = now_s
+        answer = self._vehicle.commands.send(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, wanted)
+        answer.add_done_callback(lambda done: self._answered(wanted, done.result()))
+
+    def _answered(self, wanted: int, result: int | None) -> None:
+        if result == mavlink.MAV_RESULT_ACCEPTED and self._asked != wanted:
+            self._asked = wanted
+            self._say(Severity.WARNING if wanted == _COMPASS else Severity.NOTICE, _WORDS[wanted], Weight.NEWS)
