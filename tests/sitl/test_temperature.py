@@ -117,7 +117,8 @@ def _on_day(point: Point, day: int) -> Point:
     return msgspec.structs.replace(point, power_up=PowerUp(host=f"day {day}", since_unix_s=None))
 
 
-WHY_NOT_YET = "a ramp's bias is that of its window's end, its temperature the mean: slopes of warm-ups are 14 % low"
+BIN_K = 0.5
+"""Of the firmware's own learner: what it lacks of a span by less than that it has seen."""
 
 
 async def warm_up(vehicle: ArduPilotSitl, ground: GroundStation, start_degc: float, **more: float) -> None:
@@ -149,7 +150,6 @@ def rms_over_ten_k(left: dict[float, Array]) -> dict[float, float]:
 @pytest.mark.skipif(
     not extent(whole=True, a_slice=False), reason="five warm-ups in real time take half an hour; TESTS=long does them"
 )
-@pytest.mark.xfail(reason=WHY_NOT_YET, raises=AssertionError)
 def test_five_partial_warm_ups_leave_less_than_its_own_learner_does_after_one(tmp_path: Path) -> None:
     async def main() -> None:
         random = np.random.default_rng(17)
@@ -186,7 +186,8 @@ def test_five_partial_warm_ups_leave_less_than_its_own_learner_does_after_one(tm
                 assert answer["state"] == "done", (answer, daemon.log())
                 ours = rms_over_ten_k(await left_over(vehicle, ground, "ours"))
             print("own", own, "ours", ours, flush=True)
-            unseen = [low for low in ours if not low_degc <= low <= low + 10.0 <= high_degc]
+            unseen = [low for low in ours if not low_degc - BIN_K <= low <= low + 10.0 <= high_degc + BIN_K]
+            assert len(unseen) > 2
             assert all(ours[low] < own[low] / 3.0 for low in unseen), (unseen, own, ours)
 
     asyncio.run(main())
