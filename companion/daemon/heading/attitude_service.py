@@ -224,7 +224,7 @@ class AttitudeService:
     def close(self) -> None:
         """Push no more; where nobody else sees to another heading, ask for one."""
         self.health.stop("the companion ends")
-        self.fallback.step(asyncio.get_running_loop().time(), pushing=False)
+        self.fallback.close(asyncio.get_running_loop().time())
 
     def _tell(self, now_s: float) -> None:
         if self.health.pushing != self._was_pushing:

@@ -78,6 +78,11 @@ class Fallback:
         answer = self._vehicle.commands.send(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, wanted)
         answer.add_done_callback(lambda done: self._answered(wanted, done.result()))
 
+    def close(self, now_s: float) -> None:
+        """Our heading ends with the daemon."""
+        self._tried_s = -math.inf
+        self.step(now_s, pushing=False)
+
     def _answered(self, wanted: int, result: int | None) -> None:
         if result == mavlink.MAV_RESULT_ACCEPTED and self._asked != wanted:
             self._asked = wanted
