@@ -49,7 +49,7 @@ from companion.storage.learned import BiasStore, KnownImu
 logger = logging.getLogger(__name__)
 
 LOOK_K: Final = 1.0
-WRITE_EVERY_S: Final = 300.0
+WRITE_EVERY_S: Final = 60.0
 """What still windows tell is written so often at most: a power cut costs no more of it."""
 AT_POWER_UP_S: Final = 300.0
 """Since its power came an IMU's offsets may not have been seen right by anybody else, such as a ground station."""
