@@ -195,6 +195,28 @@ def test_another_profile_forgets_in_words(known: Path, tmp_path: Path) -> None:
     assert len(BiasStore(tmp_path).read()["own"].points) == 1
 
 
+def test_another_imu_in_its_place_has_no_curve_and_the_same_one_keeps_it(known: Path, tmp_path: Path) -> None:
+    """The sixth power-up of the one, the first of the other: told by the device id of its gyro."""
+    store = BiasStore(copied(known, tmp_path))
+    fc = store.read()["fc"]
+    spread = [msgspec.structs.replace(point, temperature_degc=5.0 + 8.0 * k) for k, point in enumerate(fc.points)]
+    store.write({"fc": msgspec.structs.replace(fc, points=tuple(spread))})
+
+    _, _, rig = power_up(tmp_path, 8, own_imu=False)
+    curves = rig.service.calibrating.memory.curves
+    assert curves.of("fc", "gyro") is not None
+
+    def exchanged(rig: Rig) -> None:
+        ids = rig.double.parameters
+        ids.values["INS_GYR_ID"] += 256.0
+
+    (record,), _, rig = power_up(tmp_path, 9, before=exchanged, own_imu=False)
+    assert record.imus[0].prior is None
+    assert "imu fc: gyro (device id) changed since then: its earlier biases are forgotten" in record.imus[0].warnings
+    assert rig.service.calibrating.memory.curves.of("fc", "gyro") is None
+    assert len(store.read()["fc"].points) == 1
+
+
 def test_switched_off_nothing_is_asked_but_all_is_remembered(known: Path, tmp_path: Path) -> None:
     def off(rig: Rig) -> None:
         quiet = msgspec.structs.replace(rig.config.calibration, prior=False)
