@@ -155,8 +155,8 @@ def test_where_there_is_no_script_the_companion_asks_for_the_compass_and_for_its
             await flying.pushing(5.0)
             await flying.sleep(9.0)
             assert rig.double.external_nav.source_set == 2
-            await flying.sleep(2.0)
-            assert rig.double.external_nav.source_set == 1
+            await rig.until(lambda: rig.double.external_nav.source_set == 1, 2.0)
+            await flying.sleep(0.1)
             texts = [text for text in rig.ground.texts() if text.startswith("Heading: ")]
             assert texts[-2:] == ["Heading: compass, companion's is not pushed", "Heading: companion"]
             flying.attitude.close()  # as the end of the daemon does, at once

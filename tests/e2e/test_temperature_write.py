@@ -201,3 +201,20 @@ def test_nothing_is_written_without_a_curve_or_while_armed(tmp_path: Path) -> No
             assert rig.parameters() == before
 
     run_virtual(main())
+
+
+def test_the_curve_of_an_imu_that_was_exchanged_is_not_written(tmp_path: Path) -> None:
+    async def main() -> None:
+        rig = Warm(tmp_path)
+        async with rig.running():
+            await rig.learn()
+            # As the disk has it of the IMU before: another device id of the gyro.
+            known = rig.service.calibrating.memory._known
+            known["fc"] = msgspec.structs.replace(known["fc"], identity={**known["fc"].identity, "gyro": "1"})
+            before = rig.parameters()
+            reply = await rig.ask(action="write")
+            assert reply["state"] != "done"
+            assert "imu fc: gyro (device id) changed since then: its earlier biases are forgotten" in reply["reason"]
+            assert rig.parameters() == before
+
+    run_virtual(main())

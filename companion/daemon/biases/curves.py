@@ -40,6 +40,7 @@ class Curves:
     def forget(self, name: str) -> None:
         """Of an IMU that is another one now."""
         self._of = {key: curve for key, curve in self._of.items() if key[0] != name}
+        self._settling.pop(name, None)
 
     def of(self, name: str, triad: Triad) -> Curve | None:
         """None: not known."""

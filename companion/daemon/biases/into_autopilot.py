@@ -85,7 +85,7 @@ class IntoAutopilot:
             JobCancelledError: cancelled; likewise.
         """
         draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._core.vehicle.system_id)
-        await self._core.offload(self._memory.temperature)
+        await self._core.offload(self._memory.follow)
         self._measuring.begin()
         window = await self._measuring.measure(job)
         if not await self._pusher.offsets_still_hold():
@@ -113,6 +113,8 @@ class IntoAutopilot:
         return f"written: {'; '.join(found.words)}"
 
     async def _find(self, window: Window, *, overwrite: bool) -> _Found:
+        # The curve of an IMU that is another one now must not be written.
+        exchanged = self._memory.forgotten()
         targets: list[Target] = []
         words, left = [], []
         for means in window.imus:
@@ -121,7 +123,7 @@ class IntoAutopilot:
             imu, curve = self._imus[means.name], self._memory.curves.of(means.name, "gyro")
             calibration, name, degc = imu.in_force, means.name, means.temperature_degc
             if curve is None:
-                left.append(f"imu {name}: no curve yet (companion temperature)")
+                left.append(exchanged.get(name) or f"imu {name}: no curve yet (companion temperature)")
             elif degc is None:
                 left.append(f"imu {name}: it tells no temperature now")
             elif calibration.thermal.enabled_by and not overwrite and not self._is_ours(calibration.thermal):

@@ -97,7 +97,11 @@ class BiasMemory:
     def load(self) -> None:
         """Read what was kept before this start; blocking."""
         self._known = {name: as_kept(known) for name, known in self._store.read().items()}
-        self.curves.follow(self._known)
+        self.follow()
+
+    def follow(self) -> None:
+        """Work out the curves of what is known by now; blocking."""
+        self.curves.follow(dict(self._known))
 
     # --- before a result is used
 
@@ -295,7 +299,7 @@ class BiasMemory:
         await self._write()
 
     async def _write(self) -> None:
-        await self._offload(self.curves.follow, dict(self._known))
+        await self._offload(self.follow)
         self._written_s = asyncio.get_running_loop().time()
         try:
             await self._offload(self._store.write, dict(self._known))
@@ -326,8 +330,8 @@ class BiasMemory:
         # What nobody asked for costs the start nothing.
         from companion.calibration.solution.by_temperature import by_temperature
 
-        self.curves.follow(dict(self._known))
-        unix_s = datetime.datetime.now(tz=datetime.UTC).timestamp()
+        self.follow()
+        unix_s = _unix_s()
         return [
             msgspec.to_builtins(
                 by_temperature(

@@ -13,7 +13,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.heading_parameters import EXTNAV, Net, net_of, read_for
+from companion.autopilot.firmware.heading_parameters import EXTNAV, WANTED, Net, net_of, read_for
 from companion.autopilot.vehicle.vehicle import VehicleEvent
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core
@@ -51,13 +51,13 @@ class Fallback:
             self._stale.clear()
             firmware = self._vehicle.firmware
             await asyncio.sleep(SCRIPT_STARTS_S)
-            try:
-                found = await self._parameters.read_many(read_for(firmware), optional=True)
-            except AutopilotError as error:
-                logger.info("what the autopilot flies by when our heading ends is not known: %s", error)
-                continue
-            assert firmware is not None  # or it would have been refused
-            self.net, self._selected = net_of(firmware, found), found.get("EK3_SRC1_YAW") == EXTNAV
+            if firmware in WANTED:
+                try:
+                    found = await self._parameters.read_many(read_for(firmware), optional=True)
+                except AutopilotError as error:
+                    logger.info("what the autopilot flies by when our heading ends is not known: %s", error)
+                    continue
+                self.net, self._selected = net_of(firmware, found), found.get("EK3_SRC1_YAW") == EXTNAV
             await self._stale.wait()
 
     def _on_event(self, event: VehicleEvent) -> None:
