@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import binascii
 import contextlib
+import json
 import struct
 import tempfile
 import time
@@ -32,6 +33,7 @@ from companion.protocols.registry import Kind
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.samples import ImuSample
+from companion.storage.learned import BiasStore, KnownImu
 from tests import bench_attitude, bench_daemon, bench_learning, bench_reading, bench_replay, bench_start
 from tests.bench_text import against_pynmeagps
 from tests.support.component import ScriptedGate
@@ -47,6 +49,7 @@ from tests.support.frames import (
     wit_imu,
     xsens_imu,
 )
+from tests.support.histories import two_years
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -194,6 +197,15 @@ def arm_request() -> Callable[[], object]:
     return work
 
 
+def _store(folder: Path) -> tuple[int, float, float]:
+    """Two years of daily sessions of three IMUs: their bytes, the time to read them, and that of json.loads alone."""
+    points, store = two_years(), BiasStore(folder)
+    store.write({name: KnownImu(identity={}, points=points) for name in ("one", "two", "three")})
+    (path,) = folder.iterdir()
+    data = path.read_bytes()
+    return len(data), seconds_a_call(store.all, 20), seconds_a_call(lambda: json.loads(data), 20)
+
+
 async def _answering() -> float:
     return seconds_a_call(arm_request())
 
@@ -221,6 +233,7 @@ def main() -> None:
         share = run_virtual(_one_calibration(Path(folder)))
         recording = run_virtual(_one_calibration(Path(folder) / "recorded", recordings_mb=64))
         speed = _replay_speed(Path(folder) / "recorded" / "recordings" / "000001.mcap")
+        size, read_s, loads_s = _store(Path(folder) / "store")
         longest_s = run_virtual(_longest_stalls(Path(folder) / "stalls"))
     print("\nlongest hold of the loop by one task, calibrating by itself (ms; x reference):")
     for name, held_s in sorted(longest_s.items(), key=lambda item: -item[1])[:6]:
@@ -228,6 +241,10 @@ def main() -> None:
     print(f"\na calibration with simulator and daemon in one process: {share:.1%} of a core (100 Hz FC, 200 Hz serial)")
     print(f"the same while it is recorded: {recording:.1%}")
     print(f"a recording of it is replayed {speed:.0f} times as fast as it was made")
+    print(
+        f"biases of two years of three IMUs ({size} bytes) are read in {1e3 * read_s:.2f} ms,"
+        f" {read_s / loads_s:.2f} x json.loads"
+    )
     bench_reading.main()
     bench_learning.table()
     bench_attitude.table()

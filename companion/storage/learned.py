@@ -30,7 +30,7 @@ class FacesStore(StateFile[faces_record.FacesRecord]):
         )
 
 
-FORMAT_VERSION: Final = 1
+FORMAT_VERSION: Final = 2
 KEEP_IMUS: Final = 8
 
 
@@ -50,7 +50,7 @@ class BiasStore:
     """`biases.json` in the storage directory."""
 
     def __init__(self, directory: Path) -> None:
-        self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, _check_biases, FORMAT_VERSION)
+        self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, newest=FORMAT_VERSION)
 
     def read(self) -> dict[str, KnownImu]:
         """By IMU, what is kept; what cannot be used is set aside and begun anew, since nothing hangs on it."""
@@ -78,12 +78,6 @@ class BiasStore:
             for name in latest[-KEEP_IMUS:]
         }
         self._file.write(_File(imus=kept))
-
-
-def _check_biases(found: _File) -> None:
-    for known in found.imus.values():
-        for point in known.points:
-            history.check(point)
 
 
 SIGNING_FILE: Final = "mavlink-signing-time.json"

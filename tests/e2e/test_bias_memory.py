@@ -12,14 +12,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.records.history import KEEP_POINTS, PowerUp
+from companion.calibration.records.history import KEEP_POINTS, KEEP_POWER_UPS, PowerUp
 from companion.calibration.records.record import Record, Standing
 from companion.cli.show import status_lines, temperature_lines
 from companion.daemon.job import Job
 from companion.daemon.offsets import firmware_calibration
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
-from companion.storage.learned import BiasStore
+from companion.storage.learned import KEEP_IMUS, BiasStore
+from companion.storage.state import MOST_BYTES
 from sim.devices import Gradienter
 from sim.imu_model import DEG_H, MG
 from sim.motions import SlowTurn
@@ -242,6 +243,9 @@ def test_no_more_is_held_in_memory_than_on_the_disk(tmp_path: Path) -> None:
                 await memory.keep({"fc": msgspec.structs.replace(point, started_at=str(k))})
             assert memory._known["fc"].points == BiasStore(tmp_path).read()["fc"].points
             assert len(memory._known["fc"].points) == KEEP_POINTS
+            # As many of as many IMUs as are kept can be read again.
+            bytes_each = (tmp_path / "biases.json").stat().st_size / KEEP_POINTS
+            assert bytes_each * KEEP_POINTS * KEEP_POWER_UPS * KEEP_IMUS < MOST_BYTES
 
     run_virtual(main())
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import datetime
+import math
+import random
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from companion.calibration.collector.trace import Trace, VerdictTrace
-from companion.calibration.records.history import Measured, Point, PowerUp
+from companion.calibration.records.history import Measured, Point, PowerUp, kept
 from companion.calibration.records.record import (
     Arming,
     ImuRecord,
@@ -214,3 +216,43 @@ def _measured(bias: Array, sigma: float) -> Measured:
     each = (sigma, sigma, sigma)
     x, y, z = bias.tolist()
     return Measured(bias=(x, y, z), sigma_stat=each, sigma_use=each, sigma_shared=(0.0, 0.0, 0.0))
+
+
+def _triad(dice: random.Random, scale: float) -> Measured:
+    """In all the digits that are kept."""
+
+    def axes(sigma: float) -> Vector:
+        x, y, z = (round(dice.uniform(0.1, 1.0) * sigma, 9) for _ in "xyz")
+        return x, y, z
+
+    return Measured(
+        bias=axes(-scale), sigma_stat=axes(scale / 100), sigma_use=axes(scale / 50), sigma_shared=axes(scale / 60)
+    )
+
+
+def _day(number: int, dice: random.Random) -> list[Point]:
+    """A warm-up of eight kelvin and more, colder in winter."""
+    return [
+        Point(
+            started_at="" if step else f"2026-11-23T10:{step:02}:00.123456+00:00",
+            unix_s=1.7e9 + 86400.0 * number + 30.123456 * step,
+            power_up=PowerUp(host=f"{dice.getrandbits(128):032x}", since_unix_s=1.7e9 + 86400.0 * number + 0.1),
+            temperature_degc=15.0 + 12.345678 * math.sin(number / 58.1) + 2.0 * step,
+            k_s=dice.random() / 50.0,
+            up=(0.087155743, -0.052335956, -0.994822123),
+            zero="inclinometer_xy axis 0 90 0 0.123456 -0.0987654 2026-11-23T10:34:56.123456+00:00",
+            zero_sigma_rad=dice.random() / 1000.0,
+            gyro=_triad(dice, 1e-2),
+            accel=_triad(dice, 1.0),
+        )
+        for step in range(8)
+    ]
+
+
+def two_years() -> tuple[Point, ...]:
+    """What is kept of one IMU after daily sessions."""
+    dice = random.Random(1)
+    points: tuple[Point, ...] = ()
+    for first in range(0, 730, 73):
+        points = kept((*points, *(point for number in range(first, first + 73) for point in _day(number, dice))))
+    return points

@@ -108,12 +108,6 @@ def test_several_calibrations_of_one_power_up_are_one_point() -> None:
     assert len(by_power_up([kept_on[0], point([0, 0, 0], "b", since=5e3)])) == 2
 
 
-def test_an_update_of_the_companion_is_no_power_up() -> None:
-    """Before it the boot id was kept with the kernel's dashes."""
-    kept = PowerUp(host="1b4e28ba-2fa1-11d2-883f-0016d3cca427", since_unix_s=None)
-    assert PowerUp(host="1b4e28ba2fa111d2883f0016d3cca427", since_unix_s=None).is_same(kept)
-
-
 def test_two_temperatures_of_one_power_up_tell_of_the_others() -> None:
     slope = np.array([18.0, -30.0, 5.0]) * DEG_H
     biases = some(5)

@@ -1,4 +1,4 @@
-"""Two years of daily sessions on the disk: bounded, and whole after a power cut in mid-write."""
+"""Two years of daily sessions on the disk: bounded, always readable, and whole after a power cut in mid-write."""
 
 from __future__ import annotations
 
@@ -6,37 +6,24 @@ import math
 import os
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from companion.calibration.records.history import Measured, Point, PowerUp, kept
+from companion.calibration.records.history import KEEP_POINTS, KEEP_POWER_UPS, Point
 from companion.errors import StorageError
-from companion.storage.learned import BiasStore, KnownImu
+from companion.storage.learned import KEEP_IMUS, BiasStore, KnownImu
+from tests.support.histories import two_years
 
 
-def day(number: int) -> list[Point]:
-    """A warm-up of eight kelvin and more, colder in winter."""
-    axes = (0.000123456789, -0.00098765432, 0.00055555555)
-    figures = Measured(bias=axes, sigma_stat=axes[:1] * 3, sigma_use=axes[:1] * 3, sigma_shared=axes[:1] * 3)
-    return [
-        Point(
-            started_at="",
-            unix_s=1.7e9 + 86400.0 * number + 30.0 * step,
-            power_up=PowerUp(host=f"{number:032x}", since_unix_s=1.7e9 + 86400.0 * number),
-            temperature_degc=15.0 + 12.345678 * math.sin(number / 58.1) + 2.0 * step,
-            up=(0.087155743, -0.052335956, -0.994822),
-            gyro=figures,
-            accel=figures,
-        )
-        for step in range(8)
-    ]
+@pytest.fixture(scope="module", name="two_years")
+def fixture_two_years() -> tuple[Point, ...]:
+    return two_years()
 
 
 def test_two_years_of_three_imus_are_small_and_a_power_cut_leaves_what_was_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    two_years: tuple[Point, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    points: tuple[Point, ...] = ()
-    for first in range(0, 730, 73):
-        points = kept((*points, *(point for number in range(first, first + 73) for point in day(number))))
+    points = two_years
     store = BiasStore(tmp_path)
     store.write({name: KnownImu(identity={"gyro": name}, points=points) for name in ("one", "two", "three")})
     (file,) = tmp_path.iterdir()
@@ -55,3 +42,23 @@ def test_two_years_of_three_imus_are_small_and_a_power_cut_leaves_what_was_there
         with pytest.raises(StorageError):
             store.write({})
     assert store.read() == known
+
+
+def test_the_most_that_is_kept_can_be_read_again(two_years: tuple[Point, ...], tmp_path: Path) -> None:
+    assert len(two_years) == KEEP_POWER_UPS * KEEP_POINTS
+    imus = {str(number): KnownImu(identity={}, points=two_years) for number in range(KEEP_IMUS)}
+    BiasStore(tmp_path).write(imus)
+    assert BiasStore(tmp_path).all() == imus
+
+
+@pytest.mark.parametrize("figure", [math.nan, math.inf, 200.0, -200.0])
+def test_what_could_not_be_read_again_is_not_written(
+    two_years: tuple[Point, ...], tmp_path: Path, figure: float
+) -> None:
+    store, point = BiasStore(tmp_path), two_years[0]
+    store.write(sound := {"fc": KnownImu(identity={}, points=(point,))})
+    assert point.gyro is not None
+    spoilt = msgspec.structs.replace(point, gyro=msgspec.structs.replace(point.gyro, bias=(0.0, figure, 0.0)))
+    with pytest.raises(StorageError, match="not written"):
+        store.write({"fc": KnownImu(identity={}, points=(spoilt,))})
+    assert store.all() == sound

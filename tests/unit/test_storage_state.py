@@ -21,7 +21,7 @@ from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, FacesStore, signing_time_in
 from companion.storage.profiles import ProfileStore, read_profile
 from companion.storage.records import RecordStore
-from companion.storage.state import MOST_ASIDE, BoundedList, StateFile, sealed, unsealed
+from companion.storage.state import MOST_ASIDE, MOST_BYTES, BoundedList, StateFile, sealed, unsealed
 from companion.web.access import kept_token
 
 
@@ -151,7 +151,7 @@ def test_no_more_is_read_than_may_be_there(tmp_path: Path) -> None:
     sparse(tmp_path / "journal.json")
     tracemalloc.start()
     try:
-        with pytest.raises(StorageError, match="more than 1000000 bytes"):
+        with pytest.raises(StorageError, match=f"more than {MOST_BYTES} bytes"):
             ChangeLog(tmp_path).journal.read()
         assert tracemalloc.get_traced_memory()[1] < 10_000_000
     finally:

@@ -3,6 +3,8 @@
 Kept are whole biases as they were *measured*, never what a prior has made of them: a prior that learns from itself
 believes itself more with every calibration. One power-up is one point, however often was calibrated in it: the bias
 that the sensor has started with is in all of them.
+
+Thousands of points are read at a start: so they are arrays on the disk, and nothing that the garbage collector follows.
 """
 
 from __future__ import annotations
@@ -11,15 +13,17 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 
 from companion.samples import Triad, Vector
 
-MOST_RAD_S: Final = 10.0
-MOST_M_S2: Final = 100.0
-"""Of a whole bias and of its sigmas: beyond what the worst IMU could have, one with a wrong scale included."""
+_MOST: Final = 100.0
+"""rad/s or m/s^2, of a whole bias and of its sigmas: beyond what the worst IMU could have, even with a wrong scale."""
+_Bias = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]
+_Sigma = Annotated[float, msgspec.Meta(ge=0.0, le=_MOST)]
+_Sigmas = tuple[_Sigma, _Sigma, _Sigma]
 NEW_AFTER: Final = 3
 """Power-ups in a row that contradict earlier ones and are no outliers any more: the sensor is another one now."""
 KEEP_POWER_UPS: Final = 48
@@ -33,7 +37,7 @@ SAME_START_S: Final = 60.0
 """Two power-ups whose beginnings differ by less are one: the wall clock is set in between, by a little."""
 
 
-class PowerUp(msgspec.Struct, frozen=True, kw_only=True):
+class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
     """Since when the sensor has been powered, as well as that can be told.
 
     Two are taken for one where either says so: too few points make a prior cautious, one counted twice makes it bold.
@@ -46,21 +50,20 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True):
 
     def is_same(self, other: PowerUp) -> bool:
         """Whether nothing says that the power was off in between."""
-        # Earlier versions kept the dashes of the kernel's boot id.
-        if self.host.replace("-", "") == other.host.replace("-", ""):
+        if self.host == other.host:
             return True
         mine, theirs = self.since_unix_s, other.since_unix_s
         return mine is not None and theirs is not None and abs(mine - theirs) < SAME_START_S
 
 
-class Measured(msgspec.Struct, frozen=True, kw_only=True):
+class Measured(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
     """One triad's whole bias, vehicle FRD, rad/s or m/s^2, as the readings alone gave it."""
 
-    bias: Vector
-    sigma_stat: Vector
-    sigma_use: Vector
+    bias: tuple[_Bias, _Bias, _Bias]
+    sigma_stat: _Sigmas
+    sigma_use: _Sigmas
     """Of the sensor alone, without what the pose adds."""
-    sigma_shared: Vector
+    sigma_shared: _Sigmas
     """What the place and the heading add; of an accelerometer without the gradienter's zero."""
     suspect: bool = False
     """It contradicted what was known."""
@@ -73,7 +76,7 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True):
         return self.suspect and not self.chosen
 
 
-class Point(msgspec.Struct, frozen=True, kw_only=True):
+class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
     """One calibration of one IMU, or one still window."""
 
     started_at: str
@@ -99,22 +102,6 @@ class Point(msgspec.Struct, frozen=True, kw_only=True):
         """The same, of a calibration that somebody has asked for and that is in force now; perhaps not of its gyros."""
         rates = _as_chosen(self.gyro) if gyro else self.gyro
         return msgspec.structs.replace(self, gyro=rates, accel=_as_chosen(self.accel))
-
-
-def check(point: Point) -> None:
-    """Whether a point can be one of an IMU.
-
-    Raises:
-        msgspec.ValidationError: figures that no IMU has.
-    """
-    for found, most in ((point.gyro, MOST_RAD_S), (point.accel, MOST_M_S2)):
-        if found is None:
-            continue
-        sigmas = (*found.sigma_stat, *found.sigma_use, *found.sigma_shared)
-        if not max(map(abs, (*found.bias, *sigmas))) <= most or min(sigmas) < 0.0:
-            raise msgspec.ValidationError(
-                f"found a bias of {found.bias} with sigmas of {sigmas}; allowed: up to {most:g}, none below 0"
-            )
 
 
 def _as_chosen(found: Measured | None) -> Measured | None:

@@ -33,7 +33,7 @@ from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.calibration.turning.watch import CHANCE_SIGMAS, Turn
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG
-from companion.samples import Triad
+from companion.samples import Triad, Vector
 
 Whole = Mapping[str, Pair]
 """By IMU: whole gyro and accelerometer bias by the readings alone, (3,) each, vehicle FRD."""
@@ -202,10 +202,10 @@ def points(
             return None
         part = rows_of(triad)
         return Measured(
-            bias=vector(bias if imu.warming is None else bias - imu.warming.ahead(triad)),
-            sigma_stat=vector(imu.gyro_sigma_stat_rad_s if triad == "gyro" else imu.accel_sigma_stat_m_s2),
-            sigma_use=vector(np.sqrt(_own_variance(imu, shared)[part])),
-            sigma_shared=vector(np.sqrt(common[part])),
+            bias=_short(bias if imu.warming is None else bias - imu.warming.ahead(triad)),
+            sigma_stat=_short(imu.gyro_sigma_stat_rad_s if triad == "gyro" else imu.accel_sigma_stat_m_s2),
+            sigma_use=_short(np.sqrt(_own_variance(imu, shared)[part])),
+            sigma_shared=_short(np.sqrt(common[part])),
             suspect=(triad, imu.name) in doubted,
         )
 
@@ -216,7 +216,7 @@ def points(
             power_up=power_ups[imu.name],
             temperature_degc=imu.mean_degc,
             k_s=imu.k_s,
-            up=vector(shared.up),
+            up=_short(shared.up),
             zero=zero if whole[imu.name][1] is not None else None,
             zero_sigma_rad=shared.zero_sigma_rad,
             gyro=measured(imu, "gyro"),
@@ -225,6 +225,11 @@ def points(
         for imu in solution.imus
         if imu.name in whole
     }
+
+
+def _short(values: Array) -> Vector:
+    """In as many digits as are worth keeping: 9 decimals are 2e-4 deg/h."""
+    return vector(np.round(values, 9))
 
 
 def _with_effect(imu: ImuSolution, expected: ExpectedImu | None, shared: Shared) -> ImuSolution:

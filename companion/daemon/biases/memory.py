@@ -35,7 +35,7 @@ from companion.calibration.solution.prior import (
 )
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.daemon.biases.curves import Curves
-from companion.daemon.biases.whose import Whose, as_kept, changed
+from companion.daemon.biases.whose import Whose, changed
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensors import SerialSensor
@@ -96,7 +96,7 @@ class BiasMemory:
 
     def load(self) -> None:
         """Read what was kept before this start; blocking."""
-        self._known = {name: as_kept(known) for name, known in self._store.read().items()}
+        self._known = self._store.read()
         self.follow()
 
     def follow(self) -> None:

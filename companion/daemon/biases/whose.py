@@ -6,7 +6,6 @@ import os
 from collections.abc import Collection, Mapping, Sequence
 from typing import Final
 
-import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
@@ -17,16 +16,13 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensors import SerialSensor
 from companion.daemon.stands.alignment import AlignmentInForce
-from companion.storage.learned import KnownImu, this_boot
+from companion.storage.learned import this_boot
 
-_TCAL: Final = "tcal"
-"""What earlier versions kept of the autopilot's temperature calibration: with one, their biases were not the whole."""
 _IN_WORDS: Final = {
     "system": "vehicle",
     "gyro": "gyro (device id)",
     "accel": "accelerometer (device id)",
     "scale": "accelerometer scale",
-    _TCAL: "temperature calibration",
 }
 """Of what is not said as it is called."""
 
@@ -105,12 +101,6 @@ def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """What is another one than before, in words."""
     keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
     return ", ".join(_IN_WORDS.get(key, key) for key in keys)
-
-
-def as_kept(known: KnownImu) -> KnownImu:
-    """With the identity that this version gives it; another one where its biases were not the whole."""
-    identity = {key: value for key, value in known.identity.items() if key != _TCAL or value not in ("0", "None")}
-    return msgspec.structs.replace(known, identity=identity)
 
 
 def _of_autopilot(calibration: ImuCalibration) -> dict[str, str]:
