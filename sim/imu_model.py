@@ -287,8 +287,8 @@ class ImuModel:
         return other
 
     def turn_on(self, gyro_bias_rad_s: Sequence[float] | Array, accel_bias_m_s2: Sequence[float] | Array) -> None:
-        """Another power-up: the bias begins elsewhere."""
-        self._turn_on = np.concatenate([gyro_bias_rad_s, accel_bias_m_s2]).astype(np.float64)
+        """Another power-up: the bias begins elsewhere, behind every converter."""
+        self._turn_on[:] = np.concatenate([gyro_bias_rad_s, accel_bias_m_s2])
 
     def forget_before(self, t_s: float) -> None:
         """Let go of the bias before a time: an hour of it is 1.7 MB."""
