@@ -204,12 +204,18 @@ def test_another_imu_in_its_place_has_no_curve_and_the_same_one_keeps_it(known: 
     store.write({"fc": msgspec.structs.replace(fc, points=tuple(spread))})
 
     _, _, rig = power_up(tmp_path, 8, own_imu=False)
-    curves = rig.service.calibrating.memory.curves
-    assert curves.of("fc", "gyro") is not None
+    memory = rig.service.calibrating.memory
+    assert memory.curves.of("fc", "gyro") is not None
+    assert memory.temperature()[0]["curve"]
 
     def exchanged(rig: Rig) -> None:
         ids = rig.double.parameters
         ids.values["INS_GYR_ID"] += 256.0
+
+    _, _, rig = power_up(tmp_path, 9, before=exchanged, own_imu=False, times=0)
+    (shown,) = rig.service.calibrating.memory.temperature()
+    assert (shown["points"], shown["curve"]) == ((), ())
+    assert shown["needs"] == "gyro (device id) changed since then: a calibration begins anew"
 
     (record,), _, rig = power_up(tmp_path, 9, before=exchanged, own_imu=False)
     assert record.imus[0].prior is None

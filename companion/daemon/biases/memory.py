@@ -122,11 +122,10 @@ class BiasMemory:
         """Forget what belongs to another sensor than there is now; by IMU, why, in one line."""
         found: dict[str, str] = {}
         for name in self.whose.names:
-            known = self._known.get(name)
-            if known is None or self._is_of_today(name, known):
+            what = self._changed(name)
+            if not what:
                 continue
-            what = changed(known.identity, self.whose.identity(name, known.identity))
-            del self._known[name]
+            known = self._known.pop(name)
             self.curves.forget(name)
             for triad in _TRIADS:
                 self._today.pop((name, triad), None)
@@ -191,7 +190,7 @@ class BiasMemory:
         unix_s = _unix_s()
         power_up = self.whose.power_up(name, unix_s)
         since_s = power_up.since_unix_s
-        if since_s is None or unix_s - since_s > AT_POWER_UP_S or not self._is_of_today(name, known):
+        if since_s is None or unix_s - since_s > AT_POWER_UP_S or self._changed(name):
             return None
         if any(point.power_up.is_same(power_up) for point in known.points):
             return None
@@ -283,7 +282,7 @@ class BiasMemory:
             if point.gyro is not None and point.power_up.is_same(power_up) and _is_near(point, imu.mean_degc)
         ]
         best = min((max(one.sigma_stat) for one in same), default=math.inf)
-        return self._is_of_today(imu.name, known) and imu.gyro_sigma_stat_rad_s.max() < _MUCH_BETTER * best
+        return not self._changed(imu.name) and imu.gyro_sigma_stat_rad_s.max() < _MUCH_BETTER * best
 
     async def forget(self, started: Collection[str]) -> None:
         """Forget calibrations that were undone, by when they had begun."""
@@ -322,8 +321,10 @@ class BiasMemory:
     def _of(self, name: str) -> KnownImu:
         return self._known.get(name) or KnownImu(identity=self.whose.identity(name, {}))
 
-    def _is_of_today(self, name: str, known: KnownImu) -> bool:
-        return known.identity == self.whose.identity(name, known.identity)
+    def _changed(self, name: str) -> str:
+        """What makes it another sensor than the one that is known, in words; empty: nothing."""
+        known = self._known.get(name)
+        return "" if known is None else changed(known.identity, self.whose.identity(name, known.identity))
 
     def temperature(self) -> list[Object]:
         """For `companion temperature`; blocking."""
@@ -332,18 +333,21 @@ class BiasMemory:
 
         self.follow()
         unix_s = _unix_s()
-        return [
-            msgspec.to_builtins(
-                by_temperature(
-                    name,
-                    self._known[name].points if name in self._known else (),
-                    self.curves.of(name, "gyro"),
-                    power_up=self.whose.power_up(name, unix_s),
-                    now_degc=self._now_degc.get(name),
-                )
+        found = []
+        for name in self.whose.names:
+            what = self._changed(name)
+            known = None if what else self._known.get(name)
+            shown = by_temperature(
+                name,
+                () if known is None else known.points,
+                None if known is None else self.curves.of(name, "gyro"),
+                power_up=self.whose.power_up(name, unix_s),
+                now_degc=self._now_degc.get(name),
             )
-            for name in self.whose.names
-        ]
+            if what:
+                shown = msgspec.structs.replace(shown, needs=f"{what} changed since then: a calibration begins anew")
+            found.append(msgspec.to_builtins(shown))
+        return found
 
     def _reference(self, name: str, triad: Triad) -> Point | None:
         found = self._today.get((name, triad))
