@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -78,8 +78,8 @@ class DeckRun:
     sigma: Array
 
 
-def sail(voyage: Voyage, spans_s: Sequence[int], seed: int) -> DeckRun:
-    """One aircraft with one IMU, calibrated after so many seconds each (ascending)."""
+def sail(voyage: Voyage, spans_s: Sequence[int], seed: int, made: Callable[[Surroundings], Deck] = Deck) -> DeckRun:
+    """One aircraft with one IMU, calibrated after so many seconds each (ascending) by the deck that is `made`."""
     random = np.random.default_rng([seed, 51])
     pitch, roll = random.normal(size=2) * 2.0
     pose = Pose(float(pitch), float(roll), float(random.uniform(0.0, 360.0)))
@@ -101,7 +101,7 @@ def sail(voyage: Voyage, spans_s: Sequence[int], seed: int) -> DeckRun:
         magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=voyage.compass_sigma_deg
     )
     around = Surroundings(gradienter=tilt, gradienter_lag_s=LAG_S, compass=compass, compass_lag_s=0.0)
-    deck = Deck(around)
+    deck = made(around)
     taken = ImuInput(
         name="imu", rotation=np.eye(3), profile=noise_profile(voyage.part if voyage.part in PROFILES else "icm42688p")
     )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -16,7 +18,7 @@ from companion.calibration.deck.waves import Wander, Waves, fit_waves, whitened
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import PROFILES
-from companion.calibration.seconds.batch import summary
+from companion.calibration.seconds.batch import Batch, summary
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import rotations, running_products
 from companion.physics.gradienter import Law, readings_from_up
@@ -237,3 +239,32 @@ def test_what_a_firmwares_own_calibration_leaves_on_a_boat_is_found_as_well_as_a
     np.testing.assert_allclose(large.error / UNITS, small.error / UNITS, atol=3.0)
     np.testing.assert_allclose(large.error[:, 3:] / MG, small.error[:, 3:] / MG, atol=0.15)
     np.testing.assert_allclose(large.sigma, small.sigma, rtol=0.2)
+
+
+class OfPairs(Deck):
+    """All readings of its IMU, which lies turned by 90 degrees, are off by the same, and say how far about."""
+
+    rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    sigma = np.array([100.0, 0.0, 30.0, 5.0, 0.0, 2.0]) * UNITS
+
+    def __init__(self, around: Surroundings, seed: int) -> None:
+        super().__init__(around)
+        self.off = self.sigma * np.random.default_rng([seed, 8]).standard_normal(6)
+
+    def set_imu(self, imu: ImuInput) -> None:
+        super().set_imu(msgspec.structs.replace(imu, rotation=self.rotation))
+
+    def take_imu(self, name: str, batch: Batch, times: Array, rows: Array) -> None:
+        rows = np.hstack([rows[:, :3] @ self.rotation, rows[:, 3:] @ self.rotation]) + self.off
+        found = msgspec.structs.replace(summary(batch.slot, times, rows), shared_variance=np.square(self.sigma))
+        super().take_imu(name, found, times, rows)
+
+
+def test_what_all_floats_have_wrong_in_common_is_in_sigma_as_large_as_it_is() -> None:
+    voyage = Voyage(waves=(), turn_deg_s=0.0)
+    runs = [sail(voyage, [30], seed, functools.partial(OfPairs, seed=seed)) for seed in range(16)]
+    sigma = np.mean([run.sigma[0] for run in runs], axis=0) / UNITS
+    ratio = np.sqrt(np.mean([np.square(run.error[0] / run.sigma[0]) for run in runs], axis=0))
+    assert sigma[3:] == pytest.approx([0.15, 5.0, 2.0], abs=0.05)  # ahead of the aircraft is the sensor's second axis
+    assert sigma[1] > 100.0 > 50.0 > sigma[0]
+    assert ratio[[1, 2, 4, 5]] == pytest.approx(1.0, abs=0.4)
