@@ -13,7 +13,7 @@ import pytest
 from companion.calibration.records.history import PowerUp
 from companion.daemon.calibrating.subsystem import RequestRefusedError
 from companion.storage.learned import BiasStore
-from sim.imu_model import DEG_H
+from sim.imu_model import DEG_H, MG
 from tests.support.rig import GYRO_BIAS_DEG_H, Rig
 from tests.support.virtual_time import run_virtual
 
@@ -21,6 +21,8 @@ FEW: dict[str, Any] = {"imus": 1, "min_still_s": 6.0, "max_s": 10.0, "part": "ic
 SLOPE = np.array([30.0, -20.0, 10.0])
 BEND = np.array([0.4, 0.6, -0.5])
 """deg/h a kelvin, and a square kelvin, about 25 degC; vehicle FRD."""
+ACCEL_SLOPE = np.array([0.2, -0.15, 0.25])
+"""mg a kelvin, likewise."""
 LOW_DEGC, HIGH_DEGC = 13.0, 34.0
 NAMES = [f"INS_TCAL1_{kind}{n}_{axis}" for kind in ("ACC", "GYR") for n in (1, 2, 3) for axis in "XYZ"]
 TCAL = [*NAMES, "INS_TCAL1_TMIN", "INS_TCAL1_TMAX", "INS_TCAL1_ENABLE", "INS_GYR1_CALTEMP", "INS_ACC1_CALTEMP"]
@@ -37,22 +39,26 @@ class Warm(Rig):
 
         def bias_at(t_s: float) -> Any:
             both = self.model._turn_on.copy()
-            both[:3] += self.model.mounting.T @ truth(self.model.temperature_degc(t_s)) * DEG_H
+            degc = self.model.temperature_degc(t_s)
+            both[:3] += self.model.mounting.T @ truth(degc) * DEG_H
+            both[3:] += self.model.mounting.T @ ACCEL_SLOPE * (degc - 25.0) * MG
             return both
 
         self.model._bias_at = bias_at  # type: ignore[method-assign]
 
-    async def learn(self) -> None:
-        """Eight power-ups at different temperatures."""
+    async def learn(self, *, accel: bool = True) -> None:
+        """Eight power-ups at different temperatures; `accel`: with a gradienter."""
         memory = self.service.calibrating.memory
         await self.ready()
         await self.rest()
         first = memory._known["fc"].points[-1]
         assert first.gyro is not None
+        assert first.accel is not None
         assert first.temperature_degc is not None
         at = truth(first.temperature_degc)
         for run, degc in enumerate(np.linspace(LOW_DEGC, HIGH_DEGC, 8)):
             bias = np.array(first.gyro.bias) + (truth(degc) - at) * DEG_H
+            forces = np.array(first.accel.bias) + ACCEL_SLOPE * (degc - first.temperature_degc) * MG
             await memory.keep({
                 "fc": msgspec.structs.replace(
                     first,
@@ -60,6 +66,7 @@ class Warm(Rig):
                     power_up=PowerUp(host=f"day {run}", since_unix_s=1e6 * run),
                     temperature_degc=float(degc),
                     gyro=msgspec.structs.replace(first.gyro, bias=tuple(bias.tolist())),
+                    accel=msgspec.structs.replace(first.accel, bias=tuple(forces.tolist())) if accel else None,
                 )
             })  # fmt: skip
 
@@ -76,6 +83,10 @@ class Warm(Rig):
         """In its output, vehicle FRD."""
         return self.double.residual(1, self.now_s).gyro_rad_s / DEG_H
 
+    def left_mg(self) -> Any:
+        """Likewise of the accelerometers."""
+        return self.double.residual(1, self.now_s).accel_m_s2 / MG
+
 
 def truth(degc: float) -> Any:
     d = degc - 25.0
@@ -85,17 +96,19 @@ def truth(degc: float) -> Any:
 TURNED = {"mounting_deg": (0.0, 0.0, 90.0), "parameters": {"INS_GYR_CAL": 0.0, "AHRS_ORIENTATION": 2.0}}
 
 
-@pytest.mark.parametrize("more", [{}, TURNED], ids=["straight", "turned"])
+@pytest.mark.parametrize(
+    ("more", "accel"), [({}, True), (TURNED, True), ({}, False)], ids=["straight", "turned", "without a gradienter"]
+)
 def test_a_curve_is_written_takes_the_warming_off_and_is_undone_to_the_bit(
-    tmp_path: Path, more: dict[str, Any]
+    tmp_path: Path, more: dict[str, Any], accel: bool
 ) -> None:
     async def main() -> None:
         rig = Warm(tmp_path, **more)
         for name in ("INS_TCAL1_ACC2_Y", "INS_TCAL1_GYR3_Z"):  # of somebody, and switched off
             rig.double.set_parameter(name, 12.345)
         async with rig.running():
-            await rig.learn()
-            before, left = rig.parameters(), rig.left_deg_h()
+            await rig.learn(accel=accel)
+            before, left, forces = rig.parameters(), rig.left_deg_h(), rig.left_mg()
             reply = await rig.ask(action="write")
             assert (reply["state"], reply["reason"]) == ("done", "written: fc, 13 to 34 degC"), reply
             now = rig.parameters()
@@ -107,7 +120,7 @@ def test_a_curve_is_written_takes_the_warming_off_and_is_undone_to_the_bit(
                 c1, c2, c3 = (now[f"INS_TCAL1_GYR{k}_{axis}"] for k in (1, 2, 3))
                 got = c1 * low + c2 * low**2 + c3 * low**3
                 np.testing.assert_allclose(got, slope[n] * low + bend[n] * low**2, atol=3.0 * DEG_H * 1e6)
-            assert not any(now[name] for name in NAMES if "ACC" in name)
+            assert any(now[name] for name in NAMES if "ACC" in name) == accel
             assert (now["INS_TCAL1_ENABLE"], now["INS_TCAL1_TMIN"], now["INS_TCAL1_TMAX"]) == (1.0, 13.0, 34.0)
             assert now["INS_GYR1_CALTEMP"] == pytest.approx(rig.model.temperature_degc(0.0), abs=0.01)
             assert {name: now[name] for name in OFFSETS} == {name: before[name] for name in OFFSETS}
@@ -115,6 +128,8 @@ def test_a_curve_is_written_takes_the_warming_off_and_is_undone_to_the_bit(
             for degc in (14.0, 28.0, 33.0):
                 rig.degc = degc
                 np.testing.assert_allclose(rig.left_deg_h(), left, atol=3.0)
+                moved = 0.0 if accel else ACCEL_SLOPE * (degc - 20.0)
+                np.testing.assert_allclose(rig.left_mg() - forces, moved, atol=0.05)
             rig.degc = 50.0  # beyond the span nothing is foretold
             edge = truth(rig.model.temperature_degc(0.0)) - truth(HIGH_DEGC)
             np.testing.assert_allclose(rig.left_deg_h() - left, edge, atol=5.0)

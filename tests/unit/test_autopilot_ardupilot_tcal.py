@@ -118,3 +118,6 @@ def test_a_curve_becomes_the_same_curve_in_the_sensors_axes(order: int) -> None:
     for degc in (8.0, 20.0, 35.0, 48.0):
         np.testing.assert_allclose(found.at(degc) - found.at(30.0), yaw_90.T @ (truth(degc) - truth(30.0)), atol=1.5e-5)
     np.testing.assert_allclose(found.at(90.0), found.at(48.0))
+    # Before a scale it is as much smaller.
+    scale = (2.0, 1.0, 0.5)
+    np.testing.assert_allclose(of_curve(curve, yaw_90, scale).at(20.0), found.at(20.0) / scale)

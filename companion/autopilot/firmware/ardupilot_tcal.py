@@ -112,17 +112,18 @@ def _polynomial(
 
 
 async def thermal_changes(
-    parameters: ParameterClient, calibration: ImuCalibration, gyro: Polynomial, degc: float
+    parameters: ParameterClient, calibration: ImuCalibration, gyro: Polynomial, accel: Polynomial | None, degc: float
 ) -> list[Change]:
-    """What to write so that a curve of the gyros is in force and the output at this temperature stays as it is.
+    """What to write so that curves are in force and the output at this temperature stays as it is.
 
-    The offsets belong to this temperature from then on. A curve of the accelerometers that is in force stays, held at
-    the ends of the new span; one that is not is cleared, for it would come into force with that of the gyros.
+    The offsets belong to this temperature from then on. Where none of the accelerometers is given, one that is in force
+    stays, held at the ends of the new span; one that is not is cleared, for it would come into force with the gyros'.
 
     Args:
         parameters: of the autopilot.
         calibration: in force.
         gyro: in the IMU's axes, about 35 degC.
+        accel: likewise, before its scale; None: not known.
         degc: of the IMU now.
 
     Raises:
@@ -134,11 +135,13 @@ async def thermal_changes(
         raise AutopilotError(
             f"{names.enable} does not exist: this firmware has no temperature calibration (boards of 1 MB have none)"
         )
-    caltemps = [names.gyro_caltemp, *([names.accel_caltemp] if any(map(any, thermal.accel.coefficients)) else [])]
+    acts = accel is not None or any(map(any, thermal.accel.coefficients))
+    caltemps = [names.gyro_caltemp, *([names.accel_caltemp] if acts else [])]
     before = await parameters.read_many((*names.deciding, *caltemps))
     wanted = {name: before[name] if thermal.enabled_by else 0.0 for each in names.accel for name in each}
-    for each, values in zip(names.gyro, gyro.coefficients[1:], strict=True):
-        wanted |= zip(each, (value / _UNIT for value in values), strict=True)
+    for of, curve in ((names.gyro, gyro), *(((names.accel, accel),) if accel is not None else ())):
+        for each, values in zip(of, curve.coefficients[1:], strict=True):
+            wanted |= zip(each, (value / _UNIT for value in values), strict=True)
     wanted |= {names.low: gyro.low_degc, names.high: gyro.high_degc, names.enable: float(_ON)}
     wanted |= dict.fromkeys(caltemps, degc)
     taken_gyro, taken_accel = thermal.taken_off(degc)

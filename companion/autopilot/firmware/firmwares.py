@@ -61,21 +61,22 @@ async def read_calibration(
 
 
 async def thermal_changes(
-    parameters: ParameterClient, calibration: ImuCalibration, gyro: Polynomial, degc: float
+    parameters: ParameterClient, calibration: ImuCalibration, gyro: Polynomial, accel: Polynomial | None, degc: float
 ) -> list[Change]:
-    """What to write so that a curve of the gyros is in force and the output at this temperature stays as it is.
+    """What to write so that curves are in force and the output at this temperature stays as it is.
 
     Args:
         parameters: of the autopilot.
         calibration: in force.
         gyro: in the IMU's axes, about 35 degC.
+        accel: likewise, before its scale; None: not known. PX4's is left as it is.
         degc: of the IMU now.
 
     Raises:
         AutopilotError: this firmware has no temperature calibration, or as `ParameterClient.read`.
     """
     if parameters.vehicle.firmware == "ardupilot":
-        return await ardupilot_tcal.thermal_changes(parameters, calibration, gyro, degc)
+        return await ardupilot_tcal.thermal_changes(parameters, calibration, gyro, accel, degc)
     from companion.autopilot.firmware import px4_thermal
 
     return await px4_thermal.thermal_changes(parameters, calibration, gyro, degc)

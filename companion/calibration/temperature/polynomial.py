@@ -42,7 +42,7 @@ class Polynomial(msgspec.Struct, frozen=True, kw_only=True):
 NOTHING: Final = Polynomial()
 
 
-def of_curve(curve: Curve, orientation: Matrix) -> Polynomial:
+def of_curve(curve: Curve, orientation: Matrix, scale: Vector = (1.0, 1.0, 1.0)) -> Polynomial:
     """How a bias changes over the span that was seen, nothing at the reference.
 
     The lag is left out: no firmware knows of one.
@@ -50,10 +50,11 @@ def of_curve(curve: Curve, orientation: Matrix) -> Polynomial:
     Args:
         curve: of the vehicle's axes.
         orientation: 3x3, the IMU's axes to the vehicle's.
+        scale: what the IMU's output is multiplied with after that.
     """
     low, high = curve.span_degc
     terms = np.zeros((4, 3))
     found = curve.coefficients[1:]
-    terms[1 : 1 + len(found)] = found @ orientation / UNIT_K ** np.arange(1.0, 1.0 + len(found))[:, None]
+    terms[1 : 1 + len(found)] = found @ orientation / scale / UNIT_K ** np.arange(1.0, 1.0 + len(found))[:, None]
     _, first, second, third = map(vector, terms)
     return Polynomial(coefficients=(ZERO, first, second, third), low_degc=low, high_degc=high)

@@ -1,4 +1,4 @@
-"""Curves of the gyros' biases over temperature into the autopilot's own temperature calibration, when asked to.
+"""Curves of the biases over temperature into the autopilot's own temperature calibration, when asked to.
 
 The output at the temperature of that moment stays as it is, and that is what is looked at before it may stay.
 """
@@ -18,9 +18,10 @@ from companion.autopilot.parameters.wire import same_float32
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
 from companion.calibration.solution.draft import Draft
-from companion.calibration.temperature.polynomial import of_curve
+from companion.calibration.temperature.curve import Curve
+from companion.calibration.temperature.polynomial import Polynomial, of_curve
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
-from companion.daemon.biases.memory import BiasMemory
+from companion.daemon.biases.memory import LOOK_K, BiasMemory
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import CurvesWritten, Job
@@ -132,8 +133,8 @@ class IntoAutopilot:
                     " (companion temperature --overwrite replaces it)"
                 )
             else:
-                polynomial = of_curve(curve, calibration.orientation)
-                changes = await thermal_changes(self._core.parameters, calibration, polynomial, degc)
+                gyro, accel = of_curve(curve, calibration.orientation), self._of_accelerometers(name, curve)
+                changes = await thermal_changes(self._core.parameters, calibration, gyro, accel, degc)
                 named = {change.parameter for target in targets for change in target.unseen}
                 changes = [change for change in changes if change.parameter not in named]
                 kind = imu.stream.own_kind
@@ -151,6 +152,13 @@ class IntoAutopilot:
                 low, high = curve.span_degc
                 words.append(f"{name}, {low:.0f} to {high:.0f} degC")
         return _Found(tuple(targets), tuple(words), tuple(left or ["no IMU of the autopilot was measured"]))
+
+    def _of_accelerometers(self, name: str, gyro: Curve) -> Polynomial | None:
+        """Their curve, where it has seen what that of the gyros has: an autopilot has one span for both."""
+        curve, calibration = self._memory.curves.of(name, "accel"), self._imus[name].in_force
+        if curve is None or not np.allclose(curve.span_degc, gyro.span_degc, rtol=0.0, atol=LOOK_K):
+            return None
+        return of_curve(curve, calibration.orientation, calibration.accel_scale)
 
     def _is_ours(self, thermal: Thermal) -> bool:
         """Whether it is as our writes have left it."""
