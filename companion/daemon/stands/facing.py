@@ -19,7 +19,7 @@ from companion.calibration.alignment.missing import Missing, missing, seen_befor
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.noise.robust import median
-from companion.calibration.records.faces_record import FaceRecord, FacesImuRecord, FacesRecord, faces_imu_record
+from companion.calibration.records.align_record import FaceRecord, FacesImuRecord, FacesRecord, faces_imu_record
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.component.statustext import Severity

@@ -15,9 +15,8 @@ from companion.calibration.alignment.align_model import Stand
 from companion.calibration.alignment.spot import Mounting, mounting, turned
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
-from companion.calibration.records.align_record import stand_record
+from companion.calibration.records.align_record import BoardRecord, TurnRecord, stand_record, turn_imu_record
 from companion.calibration.records.record import WrittenParameter
-from companion.calibration.records.turn_record import BoardRecord, TurnRecord, turn_imu_record
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.component.statustext import Severity
