@@ -220,25 +220,33 @@ class Rig:
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[Rig]:
         """Run everything; the daemon is stopped in order at the end."""
-        self.service = Service(self.config, link=self.link, offload=self.offload, imu_rate_hz=self.imu_rate_hz)
+        self._start()
         tasks = [
             asyncio.create_task(coroutine)
-            for coroutine in (
-                self.autopilot.run(),
-                self._feed(),
-                self._ground_heartbeat(),
-                self.service.serve(mavlink=False, ports=False),
-            )
+            for coroutine in (self.autopilot.run(), self._feed(), self._ground_heartbeat())
         ]
         await asyncio.sleep(0.01)
         try:
             yield self
         finally:
-            await self._stop(tasks[3])
-            for task in tasks[:3]:
+            await self._stop(self._serving)
+            for task in tasks:
                 await self._stop(task)
             self.wire.unplug()
             self.radio.unplug()
+
+    def _start(self) -> None:
+        self.service = Service(self.config, link=self.link, offload=self.offload, imu_rate_hz=self.imu_rate_hz)
+        self._serving = asyncio.create_task(self.service.serve(mavlink=False, ports=False))
+
+    async def restart(self) -> None:
+        """Kill the daemon and start it anew, from what is on disk, with `config`: what it would do at an orderly end
+        reaches nobody."""
+        self.wire.unplug()
+        await self._stop(self._serving)
+        self.link = MavlinkLink()
+        self.wire = Wire(self.link, self.autopilot, seed=1)
+        self._start()
 
     @staticmethod
     async def _stop(task: asyncio.Task[None]) -> None:
@@ -260,12 +268,12 @@ class Rig:
         return self
 
     async def _feed(self) -> None:
-        sensors = {sensor.name: sensor for sensor in self.service.devices.sensors}
         for device in self.devices.values():
             device.power_on(self.aircraft.time_at(self.now_s))
         while True:
             await asyncio.sleep(self.feed_s)
             t_s = self.aircraft.time_at(self.now_s)
+            sensors = {sensor.name: sensor for sensor in self.service.devices.sensors}
             for name, device in self.devices.items():
                 data = b"".join(frame.data for frame in device.frames_until(t_s))
                 if data and name not in self.unplugged:

@@ -34,6 +34,7 @@ class Armings:
         self._file = BoundedList(core.config.storage.path / "armings.json", Arming, KEEP)
         self._queue: asyncio.Queue[Arming] = asyncio.Queue(QUEUE)
         self.last: Arming | None = None
+        self._seen_disarmed = False
         core.vehicle.on_event.add(self._on_event)
 
     async def run(self) -> None:
@@ -53,8 +54,9 @@ class Armings:
             logger.warning("arming not kept: %s", error)
 
     def _on_event(self, event: VehicleEvent) -> None:
-        if event != "armed":
-            return
+        self._seen_disarmed |= event == "disarmed"
+        if event != "armed" or not self._seen_disarmed:
+            return  # a daemon that starts in flight sees no arming
         readiness, in_force = self._readiness, self._readiness.in_force
         now_s = asyncio.get_running_loop().time()
         state, words = readiness.state(now_s)

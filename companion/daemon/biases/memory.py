@@ -134,6 +134,20 @@ class BiasMemory:
                 logger.info("%s", found[name])
         return found
 
+    def why_not_now(self, name: str, started_at: str) -> str | None:
+        """Why what a calibration has found in an IMU may be its bias no more; None: as far as anybody knows, it is.
+
+        An autopilot outlives our board's power, and without a clock nobody knows since when it has been on.
+        """
+        known = self._known.get(name)
+        point = None if known is None else next((each for each in known.points if each.started_at == started_at), None)
+        if known is None or point is None:
+            return "its calibration is not known of"
+        if what := changed(known.identity, self.whose.identity(name, known.identity)):
+            return f"another IMU than was calibrated ({what})"
+        same = name in self._imus or point.power_up.is_same(self.whose.power_up(name, _unix_s()))
+        return None if same else "the IMU was without power since its calibration"
+
     def expectation(self, solution: Solution, unix_s: float) -> Expectation:
         """What earlier calibrations say of these IMUs today."""
         wanted = self._config.calibration.prior

@@ -6,7 +6,7 @@ Worked out here once, so that everybody who looks sees the same word.
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
 
@@ -24,6 +24,7 @@ from companion.daemon.offsets.effect import TELEMETRY
 if TYPE_CHECKING:
     from companion.daemon.heading.attitude_service import AttitudeService
 
+ARMED: Final = "ARMED"
 Tone = Literal["good", "wait", "busy", "bad"]
 """good: may fly. wait: the pilot's patience. busy: the companion works. bad: somebody has to do something."""
 
@@ -50,11 +51,14 @@ class Headlines:
     def now(self) -> Headline:
         """The headline of this moment."""
         headline = self._now()
-        concern = self._concern() if headline.tone == "good" else None
-        return headline if concern is None else Headline(headline.word, f"{concern}; {headline.reason}", "wait")
+        good = headline.tone == "good"
+        concern = self._concern() if good or headline.word == ARMED else None
+        if concern is None:
+            return headline
+        return Headline(headline.word, f"{concern}; {headline.reason}", "wait" if good else headline.tone)
 
     def _concern(self) -> str | None:
-        """What else the pilot should know of at once, where the rest is well."""
+        """What else the pilot should know of at once, where the rest is well or nothing can be done about it."""
         attitude = None if self._attitude is None else self._attitude.concern
         return self._devices.watch.implausible() or self._devices.signing.watch.warning or attitude
 
@@ -75,8 +79,8 @@ class Headlines:
         state, words = self._readiness.state(now_s)
         if rung is Rung.ARMED:
             if state == "uncalibrated":
-                return Headline("ARMED", f"not calibrated: {words}", "bad")
-            return Headline("ARMED", words, "good")
+                return Headline(ARMED, f"not calibrated: {words}", "bad")
+            return Headline(ARMED, words, "good")
         if self._readiness.at_arm == "gate":
             return self._gate()
         if state != "uncalibrated":

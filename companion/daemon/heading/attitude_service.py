@@ -17,16 +17,17 @@ from companion.autopilot.telemetry.attitude_messages import (
     microseconds,
     vision_position_estimate,
 )
-from companion.autopilot.vehicle.vehicle import Firmware
+from companion.autopilot.vehicle.vehicle import ArmState, Firmware
 from companion.component.statustext import Severity, Weight
 from companion.configured import models
 from companion.daemon.arming.in_force import InForce
+from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.heading.carrier import SLOWEST_AIRSPEED_M_S, Carrier, carrying_imu, without_truncation
 from companion.daemon.heading.fallback import Fallback
 from companion.daemon.heading.health import Difference, Health
-from companion.daemon.stands.alignment import AlignmentInForce
+from companion.daemon.heading.resume import Resume
 from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.physics.units import DEG
@@ -40,6 +41,8 @@ VFR_HUD_RATE_HZ: Final = 5.0
 AIRSPEED_OLD_S: Final = 1.0
 INTERNAL: Final = "internal error; the log has the details"
 SAID_AGAIN_S: Final = 30.0
+LATE_S: Final = 3.0
+"""So long after a start in flight it is said why nothing is pushed."""
 SHORTEST_S: Final = 0.02
 """The least time between two messages: ArduPilot drops what comes sooner (autopilots section 6)."""
 SHOWN_EVERY_S: Final = 0.2
@@ -97,13 +100,14 @@ def is_sane(attitude: Attitude) -> bool:
 class AttitudeService:
     """Carries, pushes and watches the attitude; `run` it."""
 
-    def __init__(self, core: Core, devices: Devices, in_force: InForce, alignment: AlignmentInForce) -> None:
+    def __init__(self, core: Core, devices: Devices, in_force: InForce, calibrating: Calibrating) -> None:
         config, link, vehicle = core.config, core.link, core.vehicle
         self.turns = 0
         """Of `run`, so that it is seen to go on."""
         self._config, self._vehicle, self._say = config, vehicle, core.say
-        self.carrier = Carrier(core, carrying_imu(config), in_force, alignment)
+        self.carrier = Carrier(core, carrying_imu(config), in_force, calibrating.alignment)
         self.difference = Difference(vehicle, self.carrier.now, self.carrier.kept_at)
+        self.resume = Resume(core, self.carrier, self.difference, calibrating, devices.imus)
         self.health = Health(self.carrier, self.difference, vehicle)
         self.fallback = Fallback(core)
         self.sender = Sender(link, models.attitude_rate_hz(config), full=config.push.attitude == "full")
@@ -116,6 +120,7 @@ class AttitudeService:
         self._said: tuple[str, float] = ("", -math.inf)
         self._warned: str | None = None
         self._running = False
+        self._started_s, self._late_told = math.inf, False
         self._autopilot_imu = devices.imus.get(self.carrier.imu.name)
         if self._autopilot_imu is not None:
             take = self._guarded(self._on_autopilot_samples)
@@ -191,7 +196,7 @@ class AttitudeService:
     async def run(self) -> None:
         """Look after everything that is not as urgent as a sample, until cancelled."""
         loop = asyncio.get_running_loop()
-        self._running = True
+        self._running, self._started_s = True, loop.time()
         try:
             while True:
                 self.turns += 1
@@ -213,6 +218,7 @@ class AttitudeService:
         if self._autopilot_imu is not None:
             kind = self._autopilot_imu.stream.kind
             self.carrier.gyro_step_rad_s = kind.gyro_step_rad_s if kind is not None and kind.truncates else 0.0
+        await self.resume.step(now_s)
         self.health.judge(now_s)
         self.fallback.step(now_s, pushing=self.health.pushing)
         if now_s - self._looked_s >= LOOK_S:
@@ -233,6 +239,9 @@ class AttitudeService:
                 self._say_once(Severity.NOTICE, "Attitude: heading pushed to the autopilot", now_s)
             else:
                 self._say_once(Severity.WARNING, f"Attitude push stopped: {self.health.why_not}", now_s)
+        elif self._restarted and not self._late_told and now_s - self._started_s >= LATE_S:
+            self._late_told = True
+            self._say_once(Severity.WARNING, f"Attitude not pushed: {self.health.why_not}", now_s)
         warning = self.health.warning
         if warning is not None and self._warned is None:
             logger.warning("%s", warning)
@@ -248,8 +257,15 @@ class AttitudeService:
     # --- what is known
 
     @property
+    def _restarted(self) -> bool:
+        """Whether it started in flight, and nothing has been pushed yet."""
+        return self.resume.pending and self._vehicle.arm_state is ArmState.ARMED
+
+    @property
     def concern(self) -> str | None:
         """What the pilot of an armed aircraft should know at once."""
+        if self._restarted:
+            return f"attitude not pushed: {self.health.why_not}"
         if self.carrier.phase == "flight" and not self.health.pushing and self.carrier.alignments:
             return f"attitude push stopped: {self.health.why_not}"
         return self.health.warning
@@ -257,7 +273,8 @@ class AttitudeService:
     def status(self) -> Object:
         """For `companion status` and `check`: one line among the devices."""
         # That nothing has been calibrated yet is no fault of a device.
-        good = not self._running or self.health.pushing or self.carrier.alignments == 0
+        calibrated = self.carrier.alignments > 0 or self._restarted
+        good = not self._running or self.health.pushing or not calibrated
         summary = self._summary() if self._running else "starts with companion run"
         return {"name": "attitude", "kind": "attitude", "good": good, "summary": summary}
 

@@ -167,6 +167,8 @@ class Carrier:
         """Of a stream of truncated integers; 0 of one of floats."""
         self.waiting_for = "waiting for a calibration"
         """What an alignment needs."""
+        self.doubt: str | None = None
+        """Why what began in flight is not to be pushed yet."""
         self._core = core
         self._config, self._vehicle, self._collector = core.config, core.vehicle, core.collector
         self._in_force, self._alignment, self._offload = in_force, alignment, core.offload
@@ -174,7 +176,7 @@ class Carrier:
         self._local: LocalEarth | None = None
         self._record: ImuRecord | None = None
         self._recent: deque[Sequence[ImuSample]] = deque()
-        """What came on the ground within `KEPT_S`, read by read."""
+        """What came within `KEPT_S` on the ground, or with nothing to take it, read by read."""
         self._wanted = False
         self._checked_s = -math.inf
         core.vehicle.on_event.add(self._on_event)
@@ -184,7 +186,7 @@ class Carrier:
     def add(self, samples: Sequence[ImuSample]) -> None:
         """Take the samples of one read."""
         self.heard_s = samples[-1].t_s
-        if self.phase == "ground":
+        if self.phase == "ground" or self.estimator is None:
             recent = self._recent
             recent.append(samples)
             while recent[0][-1].t_s < self.heard_s - KEPT_S:
@@ -213,7 +215,7 @@ class Carrier:
             estimator.add_heading(sample.t_s, heading, sigma_deg * DEG)
 
     def forget(self) -> None:
-        """Begin anew: on the ground, with the calibration in force."""
+        """Begin anew, with the calibration in force."""
         self.estimator = self._record = None
         self._recent.clear()
 
@@ -242,7 +244,6 @@ class Carrier:
         on_deck = self._config.vehicle.platform == "deck"
         self.still = disarmed and not on_deck and self._collector.glance(now_s).obstacle is None
         if not disarmed:
-            self._recent.clear()
             return
         await self._follow_calibration()
         if self.estimator is None or not self.still:
@@ -280,6 +281,11 @@ class Carrier:
             self.estimator.settle(settings)
             self._wanted = True
 
+    def resume(self, settings: AttitudeSettings, stand: Stand) -> None:
+        """Begin in flight."""
+        self.estimator, self._local = AttitudeEstimator(settings), stand.local
+        self._align(stand)
+
     async def _stand(self, now_s: float) -> Stand | None:
         try:
             window = await self._core.window(since_s=now_s - STOOD_S)
@@ -308,7 +314,7 @@ class Carrier:
         before = self.now()
         since = [sample for read in self._recent for sample in read if sample.t_s > stand.t_s]
         self.estimator.align(stand.t_s if since else None, stand.body_from_ned, stand.covariance)
-        self.estimator.update(since, phase="ground")
+        self.estimator.update(since, phase=self.phase)
         after = self.now()
         self._wanted = False
         if after is None:

@@ -9,7 +9,7 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.attitude.corrections import REFUSED_S
-from companion.attitude.estimator import Attitude
+from companion.attitude.estimator import Attitude, AttitudeEstimator
 from companion.attitude.quaternion import (
     Quaternion,
     Triple,
@@ -48,6 +48,7 @@ STEEP_RAD: Final = math.radians(60.0)
 """Pitch beyond which roll and heading can hardly be told apart."""
 FORGETS_PER_S: Final = 1e-4
 """The shortest delay that was seen is forgotten as two clocks may run apart."""
+HEADING_UNKNOWN: Final = "heading unknown: no compass reading fits"
 _DOWN: Final[Triple] = (0.0, 0.0, 1.0)
 
 
@@ -65,7 +66,12 @@ class Difference:
     ) -> None:
         self._now, self._kept_at = now, kept_at
         self._offset_s: float | None = None
-        self._heard_s = -math.inf
+        self.theirs: tuple[float, Quaternion] | None = None
+        """What the autopilot said last: the instant on our clock, and its turn from body to NED."""
+        self.latest: tuple[float, float] | None = None
+        """As `tilt_rad` and `heading_rad`, not smoothed; None where it is too steep to tell them apart."""
+        self.heard_s = -math.inf
+        """When the two were compared last."""
         self.forget()
         vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, ATTITUDE_RATE_HZ)
 
@@ -77,7 +83,7 @@ class Difference:
 
     def is_known(self, now_s: float) -> bool:
         """Whether the autopilot tells its attitude, and has for a while."""
-        return now_s - self._heard_s < OLD_S and now_s - self._since_s > SMOOTHED_S
+        return now_s - self.heard_s < OLD_S and now_s - self._since_s > SMOOTHED_S
 
     @property
     def tilt_rad(self) -> float:
@@ -94,17 +100,18 @@ class Difference:
         if not all(map(math.isfinite, angles)):
             return
         late_s = self._late_s(message.time_boot_ms * 1e-3, t_s)
+        self.theirs = t_s - late_s, from_roll_pitch_yaw(*angles)
         ours = self._now()
         if ours is None or abs(ours.t_s - t_s) > OLD_S:
             return
-        span_s = min(max(t_s - self._heard_s, 0.0), OLD_S)
-        self._heard_s = t_s
-        instant_s = t_s - late_s
+        span_s = min(max(t_s - self.heard_s, 0.0), OLD_S)
+        self.heard_s = t_s
+        instant_s, theirs = self.theirs
         kept_s, turn = self._kept_at(instant_s) or (ours.t_s, ours.quaternion)
         since_s = kept_s - instant_s
         rx, ry, rz = ours.rate_rad_s
         then = multiply(turn, from_rotation_vector((-rx * since_s, -ry * since_s, -rz * since_s)))
-        self._compare(then, from_roll_pitch_yaw(*angles), span_s, t_s)
+        self._compare(then, theirs, span_s, t_s)
 
     def _compare(self, ours: Quaternion, theirs: Quaternion, span_s: float, t_s: float) -> None:
         first = self._since_s == math.inf
@@ -112,11 +119,14 @@ class Difference:
             self._since_s = t_s
         gain = 1.0 if first else 1.0 - math.exp(-span_s / SMOOTHED_S)
         mine, other = rotate(conjugate(ours), _DOWN), rotate(conjugate(theirs), _DOWN)
-        x, y, z = (kept + gain * (b - a - kept) for kept, a, b in zip(self._down, mine, other, strict=True))
+        down = [b - a for a, b in zip(mine, other, strict=True)]
+        x, y, z = (kept + gain * (new - kept) for kept, new in zip(self._down, down, strict=True))
         self._down = (x, y, z)
+        self.latest = None
         _, pitch, yaw = roll_pitch_yaw(ours)
         _, their_pitch, their_yaw = roll_pitch_yaw(theirs)
         if max(abs(pitch), abs(their_pitch)) < STEEP_RAD:
+            self.latest = math.hypot(*down), math.remainder(their_yaw - yaw, 2.0 * math.pi)
             self._sine += gain * (math.sin(their_yaw - yaw) - self._sine)
             self._cosine += gain * (math.cos(their_yaw - yaw) - self._cosine)
 
@@ -126,9 +136,23 @@ class Difference:
         if self._offset_s is None or abs(offset_s - self._offset_s) > OLD_S:
             self._offset_s = offset_s
         else:
-            forgotten_s = FORGETS_PER_S * min(max(t_s - self._heard_s, 0.0), OLD_S)
+            forgotten_s = FORGETS_PER_S * min(max(t_s - self.heard_s, 0.0), OLD_S)
             self._offset_s = min(offset_s, self._offset_s + forgotten_s)
         return offset_s - self._offset_s
+
+
+def disagreements(attitude: Attitude, tilt_rad: float, heading_rad: float) -> tuple[str | None, str | None]:
+    """Whether tilt and heading differ by more than both may be off by, in words."""
+    roll, pitch, yaw = (sigma / DEG for sigma in attitude.sigma_rad)
+    words: list[str | None] = []
+    for name, found_rad, ours_deg, theirs_deg in (
+        ("tilt", tilt_rad, max(roll, pitch), THEIR_TILT_DEG),
+        ("heading", heading_rad, yaw, THEIR_HEADING_DEG),
+    ):
+        found_deg = abs(found_rad) / DEG
+        beyond = found_deg > DIFFERS_SIGMAS * math.hypot(ours_deg, theirs_deg)
+        words.append(f"{name} differs by {found_deg:.0f} deg from the autopilot's" if beyond else None)
+    return words[0], words[1]
 
 
 class Health:
@@ -183,18 +207,24 @@ class Health:
             return "this autopilot is neither ArduPilot nor PX4"
         if self._vehicle.conflict is not None:
             return self._vehicle.conflict
-        if carrier.estimator is None:
+        if carrier.estimator is None and carrier.doubt is None:
             return carrier.waiting_for
         silent_s = now_s - carrier.heard_s
         if silent_s > SILENT_S:
             return f"IMU {carrier.imu.name} sends nothing"
-        attitude = carrier.now()
-        if attitude is None:
+        if carrier.doubt is not None:
+            self._agreed = True  # before it is pushed
+            return carrier.doubt
+        return self._unsure(now_s, carrier.estimator)
+
+    def _unsure(self, now_s: float, estimator: AttitudeEstimator | None) -> str | None:
+        carrier, attitude = self._carrier, None if estimator is None else estimator.attitude()
+        if estimator is None or attitude is None:
             if carrier.alignments and carrier.phase == "flight":
                 return "attitude lost in flight: it is aligned again on the ground"
             return carrier.waiting_for
-        if not carrier.estimator.heading_known:
-            return "heading unknown: no compass reading fits"
+        if not estimator.heading_known:
+            return HEADING_UNKNOWN
         roll, pitch, heading = (sigma / DEG for sigma in attitude.sigma_rad)
         if heading > HEADING_SIGMA_DEG:
             return f"heading sigma {heading:.0f} deg > {HEADING_SIGMA_DEG:.0f}"
@@ -202,22 +232,17 @@ class Health:
             return f"tilt sigma {max(roll, pitch):.0f} deg > {TILT_SIGMA_DEG:.0f}"
         if carrier.compass_refused_s > REFUSED_S:
             return f"compass disagrees for {carrier.compass_refused_s:.0f} s"
-        return self._differs(now_s, max(roll, pitch), heading)
+        return self._differs(now_s, attitude)
 
-    def _differs(self, now_s: float, tilt_sigma_deg: float, heading_sigma_deg: float) -> str | None:
+    def _differs(self, now_s: float, attitude: Attitude) -> str | None:
         difference = self._difference
         if not difference.is_known(now_s):
             self._differs_since_s = None
             return None
-        tilt, heading = difference.tilt_rad / DEG, abs(difference.heading_rad) / DEG
-        heading_limit = DIFFERS_SIGMAS * math.hypot(heading_sigma_deg, THEIR_HEADING_DEG)
-        tilt_limit = DIFFERS_SIGMAS * math.hypot(tilt_sigma_deg, THEIR_TILT_DEG)
-        self._agreed |= heading < heading_limit / DIFFERS_SIGMAS
-        words = None
-        if tilt > tilt_limit:
-            words = f"tilt differs by {tilt:.0f} deg from the autopilot's"
-        elif self._agreed and heading > heading_limit:
-            words = f"heading differs by {heading:.0f} deg from the autopilot's"
+        tilt, heading = disagreements(attitude, difference.tilt_rad, difference.heading_rad)
+        own_deg = attitude.sigma_rad[2] / DEG
+        self._agreed |= abs(difference.heading_rad) / DEG < math.hypot(own_deg, THEIR_HEADING_DEG)
+        words = tilt or (heading if self._agreed else None)
         if words is None:
             self._differs_since_s = None
             return None

@@ -50,7 +50,7 @@ class Heading(Subsystem):
             # What nobody asked for costs the start nothing.
             from companion.daemon.heading.attitude_service import AttitudeService
 
-            self.attitude = AttitudeService(core, devices, arming.in_force, calibrating.alignment)
+            self.attitude = AttitudeService(core, devices, arming.in_force, calibrating)
         self.pose = PoseNow(core, calibrating.alignment, None if self.attitude is None else self.attitude.pose)
         devices.on_pose.add(self.pose.add)
 

@@ -1,0 +1,143 @@
+"""A daemon that starts in flight: the attitude begins again by what is on disk and what is measured, or not at all.
+
+Of the attitude itself nothing is kept: seconds later, in a turn, it would be worth nothing. Biases and place are those
+of the last calibration; roll and pitch are the autopilot's, and the heading is our compass'. Nothing is pushed before
+all that has gone along with the autopilot's own attitude for a while.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.attitude.quaternion import to_matrix
+from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_bias
+from companion.autopilot.vehicle.vehicle import ArmState
+from companion.calibration.records.record import ImuRecord, Record
+from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
+from companion.configured import models
+from companion.daemon.calibrating.subsystem import Calibrating
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.heading.carrier import Carrier, Stand, settings_of
+from companion.daemon.heading.health import HEADING_UNKNOWN, THEIR_TILT_DEG, Difference, disagreements
+from companion.physics.frames import vector
+from companion.physics.units import DEG
+from companion.samples import Vector
+
+AGREES_S: Final = 0.7
+"""So long the two must agree before the push; so long they may disagree before it begins anew."""
+FRESH_S: Final = 0.3
+LATEST: Final = 10
+"""How many records are looked through for one that is in force; the others were cancelled or have failed."""
+DECLINATION_SIGMA_DEG: Final = 1.0
+"""Of one that was kept: the model's is 0.3 to 0.5 deg where people live, and the aircraft has flown on."""
+_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
+
+
+class Resume:
+    """`step` several times a second; it has done its part once all agrees, or the aircraft is seen disarmed."""
+
+    def __init__(
+        self,
+        core: Core,
+        carrier: Carrier,
+        difference: Difference,
+        calibrating: Calibrating,
+        imus: Mapping[str, AutopilotImu],
+    ) -> None:
+        self._core, self._carrier, self._difference = core, carrier, difference
+        self._store, self._memory = calibrating.store, calibrating.memory
+        self._imu = imus.get(carrier.imu.name)
+        self.pending = True
+        """Whether nothing has agreed yet since the start, and nobody has seen the aircraft disarmed."""
+        self._record: Record | None = None
+        self._differs: str | None = None
+        self._agrees: bool | None = None
+        self._since_s = 0.0
+
+    async def step(self, now_s: float) -> None:
+        """Begin, compare, and begin anew where the two do not agree."""
+        carrier = self._carrier
+        if not self.pending or self._core.vehicle.firmware is None:
+            return
+        if self._core.vehicle.arm_state is ArmState.DISARMED:
+            self.pending, carrier.doubt = False, None
+            carrier.forget()
+            return
+        if carrier.estimator is None or not carrier.estimator.aligned:
+            self._agrees = None
+            carrier.doubt = await self._begin(now_s) or self._differs or "comparing with the autopilot's attitude"
+        elif carrier.estimator.heading_known:
+            self._compare(now_s)
+        else:
+            carrier.doubt = self._differs or HEADING_UNKNOWN
+
+    async def _begin(self, now_s: float) -> str | None:
+        """Begin from what is known; else say what is missing."""
+        name, theirs = self._carrier.imu.name, self._difference.theirs
+        if theirs is None or now_s - theirs[0] > FRESH_S:
+            return "waiting for the autopilot's attitude"
+        record = self._record = self._record or await self._core.offload(self._latest)
+        found = None if record is None else next((imu for imu in record.imus if imu.name == name), None)
+        if record is None or found is None or found.gyro_bias_rad_s is None:
+            return "no calibration is in force"
+        if self._imu is not None:
+            if self._imu.calibration is None:
+                return "reading the autopilot's offsets"
+            found = _left_by(self._imu.calibration, found)
+        if (why := self._memory.why_not_now(name, record.started_at)) is not None:
+            return why
+        local = await self._core.offload(_place, record, models.whereabouts(self._core.config, self._core.vehicle))
+        settings = settings_of(self._core.profiles.imu(name), found, local, self._carrier.gyro_step_rad_s)
+        if settings is None:
+            return "no calibration is in force"
+        covariance = np.diag([(THEIR_TILT_DEG * DEG) ** 2] * 2 + [HEADING_UNKNOWN_RAD**2])
+        stand = Stand(theirs[0], to_matrix(theirs[1]).T, covariance, heading_known=False, local=local)
+        self._carrier.resume(settings, stand)
+        return None
+
+    def _latest(self) -> Record | None:
+        done = (record for record in self._store.history(LATEST) if record.state == "done")
+        record = next(done, None)
+        return None if record is None or record.undone_at else record
+
+    def _compare(self, now_s: float) -> None:
+        attitude, latest = self._carrier.now(), self._difference.latest
+        if attitude is None or latest is None or now_s - self._difference.heard_s > FRESH_S:
+            self._agrees = None
+            return
+        words = next(filter(None, disagreements(attitude, *latest)), None)
+        if self._agrees is not (words is None):
+            self._agrees, self._since_s = words is None, now_s
+        if now_s - self._since_s < AGREES_S:
+            return
+        self._differs = self._carrier.doubt = words
+        if words is None:
+            self.pending = False
+        else:
+            self._carrier.forget()
+
+
+def _left_by(in_force: ImuCalibration, found: ImuRecord) -> ImuRecord:
+    """What the autopilot's present offsets leave of what was found in its IMU."""
+    whole = found.gyro_bias_rad_s, found.accel_bias_m_s2
+    taken_off = whole_bias(in_force, _ZERO, _ZERO, found.temperature_degc)
+    gyro, accel = (None if a is None else vector(np.subtract(a, b)) for a, b in zip(whole, taken_off, strict=True))
+    return msgspec.structs.replace(found, written={}, residual_gyro_rad_s=gyro, residual_accel_m_s2=accel)
+
+
+def _place(record: Record, where: Whereabouts) -> LocalEarth:
+    """Where the calibration was: the autopilot's position is believed too late. Blocking."""
+    site = record.site
+    if site is None or site.declination_deg is None:
+        return local_earth(where)
+    local = local_earth(Whereabouts(site.latitude_deg, None, site.height_m, site.source))
+    return dataclasses.replace(
+        local, site=site, declination_deg=site.declination_deg, declination_sigma_deg=DECLINATION_SIGMA_DEG
+    )
