@@ -35,6 +35,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         from sim.experiments.journeys import main as journeys
 
         return journeys(arguments)
+    if arguments[:1] == ["fly"]:
+        from sim.flying.cli import main as fly
+
+        return fly(arguments[1:])
     from sim.serve import FIRMWARE_COMMANDS
     from sim.serve import main as serve
 

@@ -82,6 +82,7 @@ def demo(
     devices: tuple[str, str, str] = DEMO_DEVICES,
     warms: tuple[float, float, float] | None = None,
     power_up: int = 0,
+    aircraft: VirtualAircraft | None = None,
 ) -> Scenario:
     """A small aircraft on uneven ground near Beijing, 40 N, 116 E, 50 m: pitch 5, roll -3, heading 40 degrees.
 
@@ -109,10 +110,11 @@ def demo(
         warms: the air's temperature in degC, by how many kelvin the aircraft gets warmer by itself, and with which time
             constant in s; then each IMU has a curve of its own over temperature, by the seed.
         power_up: the same aircraft on another day: each has then other biases, about those usual ones.
+        aircraft: another that the sensors are on; `pose`, `motions` and `warms` are then its own.
     """
     air_degc, rise_k, time_constant_s = warms or (25.0, 0.0, 1.0)
     temperature_degc = Board(rise_k, time_constant_s).switched_on(air_degc)
-    aircraft = VirtualAircraft(
+    aircraft = aircraft or VirtualAircraft(
         pose, site_at(40.0, 116.0, 50.0, unix_s), motions=motions, temperature_degc=temperature_degc, unix_s=unix_s
     )
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sim.aircraft import VirtualAircraft
 from sim.imu_model import Bias, ImuModel
 from sim.scenario import Scenario
 from sim.sitl.json_backend import JsonBackend
@@ -151,22 +152,39 @@ class ArduPilotSitl(SitlVehicle):
         return FirmwareProcess(self._command(ours), self.folder)
 
     def _command(self, ours: Path) -> list[str]:
-        site = self.aircraft.site
-        heading = self.aircraft.pose.heading_deg % 360.0
         return [
-            str(self._binary),
+            *common_arguments(
+                self._binary, self.aircraft, [*self._defaults, ours],
+                system_id=self.system_id, ground=self._ground, companion=self._companion,
+            ),
             "--model", f"JSON:{LOOPBACK}",
-            "--speedup", "1",
-            "--defaults", ",".join(map(str, [*self._defaults, ours])),
-            "--home", f"{site.latitude_deg:.7f},{site.longitude_deg:.7f},{site.height_m:.2f},{heading:.2f}",
-            "--start-time", str(int(self.aircraft.unix_s)),
-            "--sysid", str(self.system_id),
-            "--base-port", str(free_tcp_window(_TCP_PORTS)),
-            "--rc-in-port", str(free_udp_port()),
-            "--irlock-port", str(free_udp_port()),
             "--sim-address", LOOPBACK,
             "--sim-port-in", str(free_udp_port()),
             "--sim-port-out", str(self.backend.port),
-            "--serial0", f"udpclient:{self._ground[0]}:{self._ground[1]}",
-            "--serial1", f"udpclient:{self._companion[0]}:{self._companion[1]}",
         ]  # fmt: skip
+
+
+def common_arguments(
+    binary: Path,
+    aircraft: VirtualAircraft,
+    defaults: Sequence[Path],
+    *,
+    system_id: int,
+    ground: tuple[str, int],
+    companion: tuple[str, int],
+) -> list[str]:
+    """A SITL binary and what it is told whatever its physics: place, date, parameter files, free ports, two links."""
+    site, heading_deg = aircraft.site, aircraft.pose.heading_deg % 360.0
+    return [
+        str(binary),
+        "--speedup", "1",
+        "--defaults", ",".join(map(str, defaults)),
+        "--home", f"{site.latitude_deg:.7f},{site.longitude_deg:.7f},{site.height_m:.2f},{heading_deg:.2f}",
+        "--start-time", str(int(aircraft.unix_s)),
+        "--sysid", str(system_id),
+        "--base-port", str(free_tcp_window(_TCP_PORTS)),
+        "--rc-in-port", str(free_udp_port()),
+        "--irlock-port", str(free_udp_port()),
+        "--serial0", f"udpclient:{ground[0]}:{ground[1]}",
+        "--serial1", f"udpclient:{companion[0]}:{companion[1]}",
+    ]  # fmt: skip

@@ -18,9 +18,9 @@ from sim.imu_model import DEG_H, MG
 from sim.sitl.ardupilot import ArduPilotSitl
 from sim.sitl.daemon import companion_daemon
 from sim.sitl.ground import GroundStation
+from sim.sitl.lossy_link import LossyLink, Message
 from sim.sitl.residuals import ground_station
 from tests.sitl.craft import BINARIES, missing, world
-from tests.support.lossy_link import LossyLink, Message
 
 QUICK = '\n[calibration]\nmin_still_s = 8\nmax_s = 12\nat_arm = "off"\n'
 SETTLE_S = 25.0

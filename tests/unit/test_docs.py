@@ -130,12 +130,14 @@ def sim_parser(words: list[str]) -> argparse.ArgumentParser:
     """Of `python -m sim`, as sim/__main__.py chooses it."""
     from sim import serve
     from sim.experiments import rest
+    from sim.flying import cli as flying
     from sim.sitl import cli as firmware
 
-    if words[:1] == ["rest"]:
-        made = argparse.ArgumentParser()
-        made.add_subparsers().add_parser("rest", parents=[rest.parser()], add_help=False)
-        return made
+    for name, own in (("rest", rest.parser), ("fly", flying.parser)):
+        if words[:1] == [name]:
+            made = argparse.ArgumentParser()
+            made.add_subparsers().add_parser(name, parents=[own()], add_help=False)
+            return made
     return firmware.parser() if words[:1] and words[0] in serve.FIRMWARE_COMMANDS else serve.parser()
 
 

@@ -1,0 +1,271 @@
+"""ArduPilot's own multicopter and plane: its physics tells us the truth, its ground station flies it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import socket
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.flying.truth import FlyingAircraft, State
+from sim.flying.vehicle import FlyingVehicle
+from sim.scenario import Scenario
+from sim.sitl.ardupilot import AXES, common_arguments
+from sim.sitl.ground import GroundStation
+from sim.sitl.ports import LOOPBACK, free_udp_port, port_free
+from sim.sitl.process import BinaryError, FirmwareProcess, check_binary
+
+RIDER_PORT = 9012
+"""Where a SITL that is told of one slave waits for it (SIM_JSON_Master.cpp); it cannot be told another."""
+SERVO_MAGIC = 18458
+_SILENT_S = 0.1
+COPTER_MODES = {"guided": 4, "hold": 5}
+PLANE_MODES = {"guided": 15, "hold": 12, "takeoff": 13}
+STICKS_S = 0.2
+MIDDLE_US = 1500
+ARM_WITHIN_S = 60.0
+
+
+def state_of(line: bytes) -> State | None:
+    """What SITL tells a slave, one JSON object (SIM_JSON_Master.cpp: send); None if it is none."""
+    try:
+        told = json.loads(line)
+        imu = told["imu"]
+        return State(
+            float(told["timestamp"]), tuple(told["quaternion"]), tuple(imu["gyro"]), tuple(imu["accel_body"]),
+            tuple(told["position"]), tuple(told["velocity"]),
+        )  # fmt: skip
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+class Rider:
+    """A slave of SITL's physics that only listens: every step of it, in time. An async context manager."""
+
+    def __init__(self, aircraft: FlyingAircraft) -> None:
+        self._aircraft = aircraft
+        self.boots = 0
+        self._frame = 0
+        self._heard_s = 0.0
+        self._socket: socket.socket | None = None
+        self._knocking: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> Self:
+        loop = asyncio.get_running_loop()
+        self._aircraft.begin(loop.time())
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)  # noqa: FBT003
+        self._socket.bind((LOOPBACK, 0))
+        loop.add_reader(self._socket.fileno(), self._readable)
+        self._knocking = asyncio.create_task(self._knock(), name="rider")
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        assert self._socket is not None
+        assert self._knocking is not None
+        self._knocking.cancel()
+        await asyncio.gather(self._knocking, return_exceptions=True)
+        asyncio.get_running_loop().remove_reader(self._socket.fileno())
+        self._socket.close()
+
+    async def _knock(self) -> None:
+        """It waits for our word before its first step, and after a loss."""
+        loop = asyncio.get_running_loop()
+        while True:
+            if loop.time() - self._heard_s > _SILENT_S:
+                self._answer()
+            await asyncio.sleep(_SILENT_S)
+
+    def _answer(self) -> None:
+        assert self._socket is not None
+        self._frame += 1
+        packet = struct.pack("<HHI16H", SERVO_MAGIC, 1000, self._frame, *[0] * 16)
+        with contextlib.suppress(OSError):  # not there yet, or gone
+            self._socket.sendto(packet, (LOOPBACK, RIDER_PORT))
+
+    def _readable(self) -> None:
+        assert self._socket is not None
+        try:
+            data = self._socket.recv(4096)
+        except OSError:
+            return
+        self._answer()
+        state = state_of(data)
+        if state is None:
+            return
+        self._heard_s = asyncio.get_running_loop().time()
+        if not self._aircraft.has_state or state.own_s < self._aircraft.own_s - 1.0:
+            self.boots += 1
+            self._aircraft.restart()
+        self._aircraft.take(state, self._heard_s)
+
+
+def flying_parameters(scenario: Scenario, wind: tuple[float, float]) -> dict[str, float]:
+    """Defaults of a calibrated vehicle whose IMUs have the biases of the scenario's."""
+    table = {
+        "SIM_RATE_HZ": 1000.0,
+        "SIM_WIND_SPD": wind[0],
+        "SIM_WIND_DIR": wind[1],
+        "SIM_WIND_TURB": 1.0 if wind[0] else 0.0,
+        "SIM_WIND_T": 1.0,
+        "SIM_DRIFT_SPEED": 0.0,
+        "INS_GYR_CAL": 0.0,
+        "FRAME_CLASS": 1.0,
+        "FRAME_TYPE": 0.0,
+        "FS_THR_ENABLE": 0.0,
+        "FS_GCS_ENABLE": 0.0,
+        "DISARM_DELAY": 0.0,
+        "MOT_THST_HOVER": 0.39,
+        "ATC_RAT_YAW_P": 0.3,
+        "ATC_RAT_YAW_I": 0.02,
+        "SCR_ENABLE": 1.0,
+        "CMPG_ENABLE": 0.0,
+        "SERIAL0_PROTOCOL": 2.0,
+        "SERIAL1_PROTOCOL": 2.0,
+    }
+    for number in range(1, 9):
+        table |= {f"RC{number}_MIN": 1000.0, f"RC{number}_MAX": 2000.0, f"RC{number}_TRIM": float(MIDDLE_US)}
+    for compass in ("", "2", "3"):
+        table |= {f"COMPASS_OFS{compass}_X": 5.0, f"COMPASS_OFS{compass}_Y": 13.0, f"COMPASS_OFS{compass}_Z": -18.0}
+    for number, model in enumerate(scenario.flight_controller_imus[:2], 1):
+        bias, ins = model.true_bias(0.0), "" if number == 1 else "2"
+        for k, axis in enumerate(AXES):
+            table[f"SIM_GYR{number}_BIAS_{axis}"] = float(bias.gyro_rad_s[k])
+            table[f"SIM_ACC{number}_BIAS_{axis}"] = float(bias.accel_m_s2[k])
+            # All exactly zero would mean "never calibrated".
+            table[f"INS_ACC{ins}OFFS_{axis}"] = 1e-5
+            table[f"INS_ACC{ins}SCAL_{axis}"] = 1.0
+    return table
+
+
+class FlyingArduPilot(FlyingVehicle):
+    """An `arducopter` or `arduplane` with its own physics.
+
+    Args:
+        binary: the firmware; one whose name has "plane" in it is one.
+        scenario: whose aircraft is a `FlyingAircraft`.
+        folder: for the binary's files.
+        companion: where SERIAL1 sends to.
+        wind: speed in m/s and where from in degrees.
+        parameters: defaults that outrank all others.
+
+    Raises:
+        BinaryError: the binary is missing or not executable.
+    """
+
+    firmware = "ardupilot"
+
+    def __init__(
+        self,
+        binary: Path,
+        scenario: Scenario,
+        folder: Path,
+        *,
+        companion: tuple[str, int],
+        wind: tuple[float, float] = (0.0, 0.0),
+        parameters: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(scenario, folder)
+        self._binary = check_binary(binary)
+        self.is_plane = "plane" in self._binary.name
+        self._modes = PLANE_MODES if self.is_plane else COPTER_MODES
+        self._parameters = flying_parameters(scenario, wind) | dict(parameters or {})
+        self._companion, self._ground = companion, (LOOPBACK, free_udp_port())
+        self.system_id = 1
+        self.rider = Rider(self.truth)
+        self.sticks_us = [MIDDLE_US] * 4
+        """Roll, pitch, throttle, yaw; sent to it while it flies."""
+
+    @property
+    def url(self) -> str:
+        """The companion listens where SERIAL1 sends to."""
+        return f"udpin:{self._companion[0]}:{self._companion[1]}"
+
+    @property
+    def ground_target(self) -> tuple[str, int]:
+        """Where SERIAL0 sends to."""
+        return self._ground
+
+    @property
+    def backend_boots(self) -> int:
+        """Starts seen."""
+        return self.rider.boots
+
+    @property
+    def stored(self) -> tuple[str, ...]:
+        """The image of its EEPROM."""
+        return ("eeprom.bin",)
+
+    @property
+    def scripts(self) -> Path:
+        """Where Lua scripts go, before a start."""
+        return self.folder / "scripts"
+
+    async def _open(self, stack: contextlib.AsyncExitStack) -> FirmwareProcess:
+        if not port_free(RIDER_PORT, socket.SOCK_DGRAM):
+            raise BinaryError(f"UDP port {RIDER_PORT} is taken, by another flight? One at a time")
+        await stack.enter_async_context(self.rider)
+        self.scripts.mkdir(exist_ok=True)
+        ours = self.folder / "flying.parm"
+        ours.write_text("".join(f"{name} {value:.9g}\n" for name, value in self._parameters.items()), encoding="ascii")
+        arguments = common_arguments(
+            self._binary, self.aircraft, [ours],
+            system_id=self.system_id, ground=self._ground, companion=self._companion,
+        )  # fmt: skip
+        model = "plane" if self.is_plane else "quad"
+        return FirmwareProcess([*arguments, "--model", model, "--slave", "1"], self.folder)
+
+    async def ask_streams(self, ground: GroundStation) -> None:
+        """ATTITUDE and LOCAL_POSITION_NED at 25 Hz, for the record."""
+        for number in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED):
+            await ground.stream(number, 25.0)
+
+    async def take_off(self, ground: GroundStation, height_m: float) -> None:
+        """Armed as pilots do, with all its checks, and up.
+
+        Raises:
+            TimeoutError: it does not arm, or does not climb; with what it says.
+        """
+        loop = asyncio.get_running_loop()
+        since_s = loop.time()
+        await self.mode(ground, "guided")
+        try:
+            async with asyncio.timeout(ARM_WITHIN_S):
+                while await ground.arm(wait_s=2.0) != mavlink.MAV_RESULT_ACCEPTED:
+                    await asyncio.sleep(1.0)
+        except TimeoutError:
+            raise TimeoutError(f"it does not arm: {ground.texts_since(since_s)[-400:]}") from None
+        await ground.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height_m)
+        await ground.wait_for(lambda: self.height_m > 0.95 * height_m, 40.0, "take-off")
+
+    async def mode(self, ground: GroundStation, name: str) -> None:
+        """Change its mode, and wait until it says so.
+
+        Raises:
+            TimeoutError: it does not.
+        """
+        number = self._modes[name]
+        since_s = asyncio.get_running_loop().time()
+        await ground.command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, number)
+        await ground.wait_for(
+            lambda: any(beat.custom_mode == number for beat in ground.vehicle_heartbeats(since_s)), 5.0, f"mode {name}"
+        )
+
+    async def hold(self, ground: GroundStation) -> None:
+        """Loiter, sticks in the middle."""
+        await self.mode(ground, "hold")
+
+    async def steer(self, ground: GroundStation) -> None:
+        """Sends the sticks until cancelled."""
+        while True:
+            ground.send(mavlink.MAVLink_rc_channels_override_message(self.system_id, 1, *self.sticks_us, *[0] * 4))
+            await asyncio.sleep(STICKS_S)

@@ -1,0 +1,99 @@
+"""`python -m sim fly`: flights of a real firmware with our heading, and what a fault does to them."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import math
+import random
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from sim.flying.faults import FAULTS
+from sim.flying.flight import SET_UPS, WATCHED_S, Plan, flying
+from sim.flying.verdict import HEADER, Figures, Record, figures, row
+from sim.sitl.process import BinaryError
+
+HELP = "A real firmware flies with our heading, and something fails: the largest errors, as a table."
+
+
+def parser() -> argparse.ArgumentParser:
+    """Of `python -m sim fly`."""
+    command = argparse.ArgumentParser(prog="python -m sim fly", description=HELP)
+    command.add_argument("--binary", type=Path, required=True, help="the firmware: arducopter or arduplane")
+    command.add_argument(
+        "--fault", choices=tuple(FAULTS), action="append", default=[],
+        help="what happens (default: each of them); may be repeated: "
+        + "; ".join(f"{name}: {fault.words}" for name, fault in FAULTS.items()),
+    )  # fmt: skip
+    command.add_argument(
+        "--set-up", choices=tuple(SET_UPS), action="append", default=[],
+        help="how the autopilot is set up (default script); may be repeated: "
+        + "; ".join(f"{name}: {words}" for name, words in SET_UPS.items()),
+    )  # fmt: skip
+    command.add_argument(
+        "--wind", type=float, nargs=2, metavar=("M_S", "FROM_DEG"), help="default: 3 to 8 m/s, by the seed"
+    )
+    command.add_argument("--seed", type=int, default=0, help="of wind, heading and noise (default 0)")
+    command.add_argument(
+        "--watch", type=float, default=WATCHED_S, metavar="SECONDS",
+        help=f"how long it flies on after the fault (default {WATCHED_S:g})",
+    )  # fmt: skip
+    command.add_argument("--dir", type=Path, help="keep all files here (default: a new folder)")
+    command.add_argument("--words", action="store_true", help="show what the firmware said from the fault on")
+    return command
+
+
+def plans_of(arguments: argparse.Namespace) -> list[Plan]:
+    """What the options ask for; each flight has a wind of its own."""
+    plans = []
+    for number, fault in enumerate(arguments.fault or FAULTS):
+        dice = random.Random(arguments.seed + 1000 * number)
+        wind = (round(dice.uniform(3.0, 8.0), 1), round(dice.uniform(0.0, 360.0)))
+        heading_deg = float(round(dice.uniform(0.0, 360.0)))
+        for set_up in arguments.set_up or ["script"]:
+            plans.append(
+                Plan(
+                    arguments.binary, fault, set_up, tuple(arguments.wind or wind), heading_deg,
+                    arguments.seed, arguments.watch,
+                )
+            )  # fmt: skip
+    return plans
+
+
+async def fly(plan: Plan, folder: Path) -> tuple[Record, Figures]:
+    """One flight and its figures.
+
+    Raises:
+        BinaryError, RuntimeError, TimeoutError: it did not come about.
+    """
+    async with flying(plan, folder, time.time()) as flight:
+        await flight.set_up()
+        await flight.calibrate()
+        record = await flight.fly()
+    return record, figures(record)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Fly; 0 if every flight was good, 1 if one was not, 2 if one did not come about."""
+    arguments = parser().parse_args(argv)
+    folder = arguments.dir or Path(tempfile.mkdtemp(prefix="companion-flights-"))
+    worst = 0
+    print(HEADER, flush=True)
+    for plan in plans_of(arguments):
+        try:
+            record, found = asyncio.run(fly(plan, folder.absolute() / f"{plan.fault}-{plan.set_up}-{plan.seed}"))
+        except (BinaryError, RuntimeError, TimeoutError, OSError) as error:
+            print(f"{plan.fault:16}{plan.set_up:9}did not come about: {error}", file=sys.stderr, flush=True)
+            worst = 2
+            continue
+        print(row(record, found), flush=True)
+        worst = max(worst, bool(found.wrong))
+        if arguments.words:
+            for event in record.events:
+                if event.own_s > record.struck_s - 5.0 and math.isfinite(record.struck_s):
+                    print(f"  {event.own_s - record.struck_s:+6.1f} s  {event.kind}: {event.words}", flush=True)
+    return worst

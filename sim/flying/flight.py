@@ -1,0 +1,247 @@
+"""One flight: set up, calibrated, taken off, and then a fault while it holds its place in the wind."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import signal
+from collections.abc import AsyncIterator, Callable, Coroutine
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.companion_process import CompanionProcess
+from sim.devices import SerialDevice
+from sim.earth import Array
+from sim.flying.ardupilot import FlyingArduPilot
+from sim.flying.faults import FAULTS
+from sim.flying.truth import FlyingAircraft
+from sim.flying.vehicle import FlyingVehicle
+from sim.flying.verdict import Event, Record
+from sim.imu_model import ImuModel
+from sim.scenario import demo, site_at
+from sim.serve import configuration
+from sim.sitl.daemon import READY_WITHIN_S, devices
+from sim.sitl.ground import GroundStation
+from sim.sitl.lossy_link import LossyLink
+from sim.sitl.residuals import ground_station
+
+SetUp = Literal["script", "command", "today"]
+SET_UPS: dict[SetUp, str] = {
+    "script": "both source sets, and the script",
+    "command": "both source sets, no script",
+    "today": "our heading and no second source set, no script",
+}
+MORE = '\n[push]\nattitude = "yaw"\n[calibration]\nmin_still_s = 10\nmax_s = 15\nat_arm = "off"\n'
+CALIBRATED_WITHIN_S = 120.0
+PUSHED_WITHIN_S = 60.0
+FIRST_FIX_S = 20.0
+RESTARTED_S = 20.0
+HEIGHT_M = 10.0
+SETTLED_S = 10.0
+WATCHED_S = 45.0
+SCRIPT = Path(__file__).parents[2] / "companion" / "lua" / "companion_arming.lua"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be flown."""
+
+    binary: Path
+    fault: str
+    set_up: SetUp = "script"
+    wind: tuple[float, float] = (5.0, 0.0)
+    heading_deg: float = 40.0
+    seed: int = 0
+    watched_s: float = WATCHED_S
+
+
+class Flight:
+    """A vehicle, a daemon, and what happens to them; made by `flying`."""
+
+    def __init__(
+        self, plan: Plan, vehicle: FlyingVehicle, ground: GroundStation, link: LossyLink, folder: Path
+    ) -> None:
+        self.plan, self.vehicle, self.ground, self.link, self.folder = plan, vehicle, ground, link, folder
+        self.record = Record(plan.fault, plan.set_up, plan.wind)
+        self._since_s = 0.0
+        self._asked_modes = 0
+        self._background: list[asyncio.Task[None]] = []
+        self._stack = contextlib.AsyncExitStack()
+        self.daemon: CompanionProcess
+
+    @property
+    def compass(self) -> SerialDevice:
+        """The companion's."""
+        return self.vehicle.scenario.compass
+
+    @property
+    def serial_imu(self) -> ImuModel:
+        """The companion's."""
+        return self.vehicle.scenario.serial_imu
+
+    def signal(self, number: signal.Signals) -> None:
+        """To the daemon, if there is one."""
+        with contextlib.suppress(ProcessLookupError):
+            self.daemon.signal(number)
+
+    async def start_daemon(self) -> None:
+        """Start it, with what it has stored."""
+        log = self.folder / "daemon.log"
+        if log.exists():
+            log.rename(self.folder / "daemon-before.log")
+        self.daemon = await self._stack.enter_async_context(CompanionProcess(self.folder))
+
+    def in_background(self, work: Coroutine[Any, Any, None]) -> None:
+        """Goes on until the end of the flight."""
+        self._background.append(asyncio.create_task(work))
+
+    async def close(self) -> None:
+        """End what was begun."""
+        for task in self._background:
+            task.cancel()
+        await asyncio.gather(*self._background, return_exceptions=True)
+        self.signal(signal.SIGCONT)
+        await self._stack.aclose()
+
+    async def ask(self, *words: str) -> dict[str, Any]:
+        """A command of the companion with --json."""
+        process = await asyncio.create_subprocess_exec(
+            *self.daemon.command(*words, "--json"), stdout=asyncio.subprocess.PIPE
+        )
+        output, _ = await process.communicate()
+        answer: dict[str, Any] = json.loads(output)
+        return answer
+
+    async def set_up(self) -> None:
+        """As `companion autopilot-setup` says, from a ground station, and a restart of the autopilot.
+
+        Raises:
+            RuntimeError: the companion is not content.
+        """
+        shown = await self.ask("autopilot-setup")
+        wanted = {row["parameter"]: row["wanted"] for row in shown["parameters"] if row["wanted"] is not None}
+        only_one = self.plan.set_up == "today"
+        await self.ground.put_all({n: value for n, value in wanted.items() if not (only_one and "SRC2" in n)})
+        await self.vehicle.sleep(2.0)
+        await self.vehicle.power_cycle()
+        self._since_s = asyncio.get_running_loop().time()
+        await self.vehicle.sleep(RESTARTED_S)
+        shown = await self.ask("autopilot-setup")
+        if shown["state"] != ("not applied" if only_one else "applied"):
+            raise RuntimeError(f"autopilot-setup: {shown}")
+
+    async def calibrate(self) -> None:
+        """Calibrate, and wait until the heading is pushed.
+
+        Raises:
+            RuntimeError: it failed.
+            TimeoutError: nothing is pushed.
+        """
+        record = await self.daemon.calibrate(CALIBRATED_WITHIN_S)
+        if record["state"] != "done":
+            raise RuntimeError(f"calibration: {record['reason']}")
+        attitude: dict[str, Any] = {}
+        try:
+            async with asyncio.timeout(PUSHED_WITHIN_S):
+                while not attitude.get("pushing"):
+                    await asyncio.sleep(0.5)
+                    attitude = (await self.ask("status"))["attitude"]
+        except TimeoutError:
+            raise TimeoutError(f"no heading is pushed: {attitude}") from None
+
+    async def fly(self) -> Record:
+        """Take off, hold, let the fault happen, and watch; the record.
+
+        Raises:
+            TimeoutError: it does not take off.
+        """
+        vehicle, ground = self.vehicle, self.ground
+        await vehicle.ask_streams(ground)
+        self.in_background(vehicle.steer(ground))
+        await vehicle.take_off(ground, HEIGHT_M)
+        await vehicle.hold(ground)
+        await vehicle.sleep(SETTLED_S)
+        self.record.struck_s = vehicle.truth.own_s
+        await FAULTS[self.plan.fault].strike(self)
+        await vehicle.sleep(self.plan.watched_s)
+        self._take_down()
+        return self.record
+
+    def _take_down(self) -> None:
+        """What truth and ground station have seen, as a record."""
+        ground, record = self.ground, self.record
+        record.truth = np.array(self.vehicle.truth.recorded)
+        attitudes = [
+            (t_s, message)
+            for t_s, message in ground.timed(mavlink.MAVLink_attitude_message, since_s=self._since_s)
+            if message.get_srcComponent() == 1
+        ]
+        record.estimate = np.array([(m.time_boot_ms * 1e-3, m.yaw, 0.0) for _, m in attitudes])
+        places = ground.all(mavlink.MAVLink_local_position_ned_message, since_s=self._since_s)
+        record.place = np.array([(m.time_boot_ms * 1e-3, m.x, m.y, m.z) for m in places])
+        arrived = np.array([t_s for t_s, _ in attitudes])
+        record.events = list(events_of(ground, self._since_s, lambda t_s: _at(t_s, arrived, record.estimate[:, 0])))
+
+
+def _at(t_s: float, arrived: Array, own: Array) -> float:
+    return float(np.interp(t_s, arrived, own))
+
+
+def events_of(ground: GroundStation, since_s: float, own: Callable[[float], float]) -> list[Event]:
+    """Changes of mode, of arming and of the source set, and what was said; times by `own` from loop times."""
+    found, mode, armed = list[Event](), None, None
+    for t_s, message in ground.heard:
+        if t_s < since_s:
+            continue
+        if isinstance(message, mavlink.MAVLink_heartbeat_message) and message.get_srcComponent() == 1:
+            now = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+            if armed and not now:
+                found.append(Event(own(t_s), "disarmed", ""))
+            if mode is not None and message.custom_mode != mode:
+                found.append(Event(own(t_s), "mode", str(message.custom_mode)))
+            mode, armed = message.custom_mode, now
+        elif isinstance(message, mavlink.MAVLink_statustext_message):
+            found.append(Event(own(t_s), "text", message.text))
+            if message.text.startswith("Heading: compass"):
+                found.append(Event(own(t_s), "set", "2"))
+            elif message.text.startswith("Heading: companion"):
+                found.append(Event(own(t_s), "set", "1"))
+    return found
+
+
+@contextlib.asynccontextmanager
+async def flying(plan: Plan, folder: Path, unix_s: float) -> AsyncIterator[Flight]:
+    """Everything running on the ground: firmware, devices, daemon; nothing set up.
+
+    Raises:
+        BinaryError: the firmware cannot be run.
+        TimeoutError: something did not come up.
+    """
+    site = site_at(40.0, 116.0, 50.0, unix_s)
+    aircraft = FlyingAircraft(site, heading_deg=plan.heading_deg, unix_s=unix_s)
+    scenario = demo(seed=plan.seed, unix_s=unix_s, aircraft=aircraft)
+    here = folder / "daemon"
+    here.mkdir(parents=True)
+    async with LossyLink() as link:
+        vehicle = FlyingArduPilot(plan.binary, scenario, folder / "firmware", companion=link.near, wind=plan.wind)
+        if plan.set_up == "script":
+            vehicle.scripts.mkdir(parents=True)
+            (vehicle.scripts / SCRIPT.name).write_bytes(SCRIPT.read_bytes())
+        host, port = link.url.removeprefix("udpin:").rsplit(":", 1)
+        text = configuration(scenario, directory=here, udp=(host, int(port)))
+        (here / "companion.toml").write_text(text + MORE, encoding="utf-8")
+        async with vehicle, ground_station(vehicle) as ground, devices(scenario, here):
+            await ground.wait_for(lambda: bool(ground.vehicle_heartbeats()), 60.0, "a heartbeat")
+            flight = Flight(plan, vehicle, ground, link, here)
+            try:
+                await flight.start_daemon()
+                await vehicle.sleep(FIRST_FIX_S)
+                await flight.daemon.ready(READY_WITHIN_S)
+                yield flight
+            finally:
+                await flight.close()

@@ -1,0 +1,69 @@
+"""A firmware that flies by its own physics: what a flight needs of it."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from pathlib import Path
+
+from sim.flying.truth import FlyingAircraft
+from sim.imu_model import Bias, ImuModel
+from sim.scenario import Scenario
+from sim.sitl.ground import GroundStation
+from sim.sitl.samples import SampleBlocks
+from sim.sitl.vehicle import SitlVehicle
+
+
+class FlyingVehicle(SitlVehicle):
+    """A `SitlVehicle` whose aircraft follows the firmware, in the place of the other way round."""
+
+    sticks_us: list[int]
+    """Roll, pitch, throttle, yaw."""
+
+    def __init__(self, scenario: Scenario, folder: Path) -> None:
+        super().__init__(scenario, folder)
+        assert isinstance(scenario.aircraft, FlyingAircraft)
+        self.truth: FlyingAircraft = scenario.aircraft
+
+    @property
+    def physics_s(self) -> float:
+        """The firmware's clock."""
+        return self.truth.own_s
+
+    @property
+    def height_m(self) -> float:
+        """True height above the place of the start."""
+        return -self.truth.recorded[-1][6] if self.truth.recorded else 0.0
+
+    @property
+    def samples(self) -> SampleBlocks:
+        """There are none: it has physics of its own."""
+        raise NotImplementedError
+
+    @property
+    def imus(self) -> tuple[ImuModel, ...]:
+        """Whose biases its IMUs have."""
+        return self.scenario.flight_controller_imus
+
+    def true_bias(self, instance: int, t_s: float) -> Bias:
+        """What it was told at its start."""
+        return self.imus[instance - 1].true_bias(0.0)
+
+    @abstractmethod
+    async def ask_streams(self, ground: GroundStation) -> None:
+        """ATTITUDE and LOCAL_POSITION_NED at 20 Hz or more."""
+
+    @abstractmethod
+    async def take_off(self, ground: GroundStation, height_m: float) -> None:
+        """Arm, with all its checks, and climb.
+
+        Raises:
+            TimeoutError: it does not; with what it says.
+        """
+
+    @abstractmethod
+    async def hold(self, ground: GroundStation) -> None:
+        """Stay over the spot, or about it, until told otherwise."""
+
+    @abstractmethod
+    async def steer(self, ground: GroundStation) -> None:
+        """Send `sticks_us` until cancelled."""

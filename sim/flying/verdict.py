@@ -1,0 +1,153 @@
+"""What a flight was like: from the record of truth, estimate and events to figures, and whether they are good enough.
+
+Pure; times are on the firmware's clock, in seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from sim.earth import Array
+
+YAW_LIMIT_DEG = 10.0
+POSITION_LIMIT_M = 3.0
+TILT_LIMIT_DEG = 70.0
+"""Beyond it an aircraft that hovers is falling."""
+LOW_M = 1.0
+"""Below it the flight is over."""
+SETTLED_S = 1.0
+"""What the estimate is off by, in place, is taken over so long before the fault."""
+HEADER = f"{'fault':16}{'set-up':9}{'wind':>12}{'yaw':>7}{'set 2 after':>13}{'off truth':>11}{'off spot':>10}  verdict"
+
+
+class Event(NamedTuple):
+    """Something that the firmware said or did."""
+
+    own_s: float
+    kind: Literal["mode", "set", "disarmed", "text"]
+    words: str
+
+
+@dataclass
+class Record:
+    """One flight."""
+
+    fault: str
+    set_up: str
+    wind: tuple[float, float]
+    """Speed in m/s, and where from in degrees."""
+    truth: Array = field(default_factory=lambda: np.empty((0, 10)))
+    """Rows of `FlyingAircraft.recorded`."""
+    estimate: Array = field(default_factory=lambda: np.empty((0, 3)))
+    """own_s, yaw of the firmware's estimator in rad, 0."""
+    place: Array = field(default_factory=lambda: np.empty((0, 4)))
+    """own_s and where the firmware's estimator believes to be: north, east, down in m."""
+    events: list[Event] = field(default_factory=list)
+    struck_s: float = math.inf
+    """When the fault happened."""
+    hold: bool = True
+    """Whether it is to stay on its spot."""
+
+    def after(self, kind: str) -> list[Event]:
+        """Events of a kind after the fault."""
+        return [event for event in self.events if event.kind == kind and event.own_s >= self.struck_s]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of a flight from its fault on."""
+
+    yaw_deg: float
+    """Largest error of the estimator's yaw."""
+    yaw_before_deg: float
+    """The same in the last seconds before the fault."""
+    fallback_s: float
+    """Until the other source set was in use; inf: never."""
+    estimate_m: float
+    """Largest horizontal error of the estimated place, less what it was before."""
+    spot_m: float
+    """Largest horizontal distance from where the aircraft truly was at the fault; nan where it is not to stay."""
+    sets: int
+    """Changes of the source set."""
+    modes: int
+    """Changes of the flight mode that nobody has asked for."""
+    crashed: str
+    """How it ended badly, in words; empty if it did not."""
+
+    @property
+    def wrong(self) -> list[str]:
+        """What is not good enough."""
+        found = []
+        if not self.yaw_deg <= YAW_LIMIT_DEG:
+            found.append(f"yaw above {YAW_LIMIT_DEG:g} deg")
+        if not self.estimate_m <= POSITION_LIMIT_M or self.spot_m > POSITION_LIMIT_M:
+            found.append(f"place above {POSITION_LIMIT_M:g} m")
+        if self.sets > 2:
+            found.append(f"{self.sets} changes of the source set")
+        if self.modes:
+            found.append(f"{self.modes} changes of mode")
+        if self.crashed:
+            found.append(self.crashed)
+        return found
+
+
+def _yaw_errors_deg(record: Record) -> tuple[Array, Array]:
+    """Times and errors of the estimator's yaw."""
+    own_s = record.estimate[:, 0]
+    true = np.interp(own_s, record.truth[:, 0], record.truth[:, 3])
+    return own_s, np.degrees((record.estimate[:, 1] - true + math.pi) % (2.0 * math.pi) - math.pi)
+
+
+def figures(record: Record) -> Figures:
+    """The figures of a flight.
+
+    Raises:
+        ValueError: truth or estimate are missing before or after the fault.
+    """
+    own_s, errors = _yaw_errors_deg(record)
+    struck = record.struck_s
+    if not (own_s > struck).any() or not (own_s < struck).any() or not len(record.place):
+        raise ValueError("no estimates before or after the fault")
+    sets = record.after("set")
+    true = np.column_stack([np.interp(record.place[:, 0], record.truth[:, 0], record.truth[:, k]) for k in (4, 5)])
+    off = record.place[:, 1:3] - true
+    before = (record.place[:, 0] < struck) & (record.place[:, 0] >= struck - SETTLED_S)
+    since = record.place[:, 0] >= struck
+    off = off[since] - off[before].mean(axis=0)
+    flown = record.truth[record.truth[:, 0] >= struck]
+    spot = np.hypot(*(flown[:, 4:6] - flown[0, 4:6]).T)
+    return Figures(
+        yaw_deg=float(np.abs(errors[own_s >= struck]).max()),
+        yaw_before_deg=float(np.abs(errors[(own_s < struck) & (own_s > struck - 10.0)]).max()),
+        fallback_s=next((event.own_s - struck for event in sets if event.words == "2"), math.inf),
+        estimate_m=float(np.hypot(*off.T).max()),
+        spot_m=float(spot.max()) if record.hold else math.nan,
+        sets=len(sets),
+        modes=len(record.after("mode")),
+        crashed=_crashed(record, flown),
+    )
+
+
+def _crashed(record: Record, flown: Array) -> str:
+    if record.after("disarmed"):
+        return "disarmed in the air"
+    if (-flown[:, 6]).min() < LOW_M:
+        return "came down"
+    if np.degrees(np.abs(flown[:, 1:3]).max()) > TILT_LIMIT_DEG:
+        return "tipped over"
+    return ""
+
+
+def row(record: Record, found: Figures) -> str:
+    """One line of the table."""
+    fallback = f"{found.fallback_s:.1f} s" if math.isfinite(found.fallback_s) else "never"
+    spot = f"{found.spot_m:.1f} m" if math.isfinite(found.spot_m) else "-"
+    wind = f"{record.wind[0]:.0f} m/s {record.wind[1]:03.0f}"
+    return (
+        f"{record.fault:16}{record.set_up:9}{wind:>12}{found.yaw_deg:7.1f}{fallback:>13}"
+        f"{found.estimate_m:9.1f} m{spot:>10}  {'; '.join(found.wrong) or 'good'}"
+    )

@@ -1,0 +1,144 @@
+"""The flying bench's pure parts: what sensors see of a told truth, and what is made of a flight's record."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sim.flying.ardupilot import state_of
+from sim.flying.cli import parser, plans_of
+from sim.flying.truth import BEHIND_S, FlyingAircraft, State, angles_of_quaternion
+from sim.flying.verdict import Event, Record, figures, row
+from sim.imu_model import ImuModel
+from sim.scenario import site_at
+
+STEP_S = 0.001
+STRUCK_S = 20.0
+
+
+def yawed(yaw_rad: float) -> tuple[float, float, float, float]:
+    return (math.cos(yaw_rad / 2.0), 0.0, 0.0, math.sin(yaw_rad / 2.0))
+
+
+def turning(speed: float, rate_rad_s: float, seconds: float = 4.0) -> FlyingAircraft:
+    """An aircraft that turns, told by a firmware whose clock runs at `speed` times the wall's."""
+    aircraft = FlyingAircraft(site_at(40.0, 116.0, 50.0), heading_deg=30.0, unix_s=1_795_219_200.0)
+    aircraft.begin(100.0)
+    jitter = np.random.default_rng(3).uniform(0.0, 0.002, round(seconds / STEP_S))
+    for k, late_s in enumerate(jitter):
+        own_s = k * STEP_S
+        force = (0.0, 0.0, -9.80665)
+        state = State(own_s, yawed(rate_rad_s * own_s), (0.0, 0.0, rate_rad_s), force, (0.0,) * 3, (0.0,) * 3)
+        aircraft.take(state, 100.0 + own_s / speed + late_s)
+    return aircraft
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.9])
+def test_an_imu_integrates_to_the_attitude_however_slow_the_firmware_is(speed: float) -> None:
+    aircraft = turning(speed, 1.0)
+    times = 4.0 / speed + np.arange(-0.8, -0.05, 0.005)
+    readings = ImuModel(aircraft, "perfect").read(times, 0.005)
+    turned = (readings[:, 2] - aircraft.truth_at(0.0).rate_rad_s[2]).sum() * 0.005
+    seen = aircraft.angles_rad(times[-1])[2] - aircraft.angles_rad(times[0] - 0.005)[2]
+    assert turned == pytest.approx(seen, abs=2e-3)
+    assert seen == pytest.approx(0.75 * speed, abs=0.01)
+    assert readings[:, 5] == pytest.approx(-9.80665, abs=1e-3)
+
+
+def test_what_is_measured_is_a_little_old() -> None:
+    aircraft = turning(1.0, 1.0)
+    assert aircraft.angles_rad(3.0)[2] == pytest.approx(3.0 - BEHIND_S, abs=2e-3)
+    assert aircraft.late == 0
+    aircraft.angles_rad(5.0)
+    assert aircraft.late == 1
+
+
+def test_it_stands_as_it_was_put_down_until_it_is_told_otherwise() -> None:
+    aircraft = FlyingAircraft(site_at(40.0, 116.0, 50.0), heading_deg=30.0, unix_s=1_795_219_200.0)
+    assert np.degrees(aircraft.angles_rad(1.0)) == pytest.approx([0.0, 0.0, 30.0])
+    assert aircraft.truth_at(1.0).force_m_s2 == pytest.approx([0.0, 0.0, -aircraft.site.gravity_m_s2])
+
+
+def test_angles_of_a_quaternion() -> None:
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_euler("ZYX", [40.0, 10.0, -20.0], degrees=True).as_quat()
+    assert np.degrees(angles_of_quaternion((w, x, y, z))) == pytest.approx([-20.0, 10.0, 40.0])
+
+
+def test_what_ardupilot_tells_a_slave() -> None:
+    line = (
+        b'\n{"timestamp":1.500000,"imu":{"gyro":[0.1,0.2,0.3],"accel_body":[1.0,2.0,-9.8]},"position":[4.0,5.0,-6.0],'
+        b'"quaternion":[1.0,0.0,0.0,0.0],"velocity":[7.0,8.0,9.0],"no_time_sync":1}\n'
+    )
+    state = state_of(line)
+    assert state is not None
+    assert (state.own_s, list(state.rate_rad_s), list(state.position_m)) == (1.5, [0.1, 0.2, 0.3], [4.0, 5.0, -6.0])
+    assert state_of(b'{"timestamp": 1.0}') is None
+    assert state_of(b"noise") is None
+
+
+def hovered(**off: float) -> Record:
+    """A hover of 40 s at 10 m, struck at 20 s; `off` is reached linearly from then on."""
+    own_s = np.arange(0.0, 40.0, 0.02)
+    share = np.clip((own_s - STRUCK_S) / 20.0, 0.0, 1.0)
+    truth = np.zeros((len(own_s), 10))
+    truth[:, 0], truth[:, 3], truth[:, 6] = own_s, 3.0, -10.0 + off.get("falls_m", 0.0) * share
+    truth[:, 5] = off.get("drifts_m", 0.0) * share
+    truth[:, 1] = off.get("rolls_rad", 0.0) * share
+    record = Record("kill", "script", (5.0, 90.0), truth, struck_s=STRUCK_S)
+    yaw = 3.0 + 0.01 + math.radians(off.get("yaw_deg", 0.0)) * share
+    record.estimate = np.column_stack([own_s, (yaw + math.pi) % math.tau - math.pi, np.zeros(len(own_s))])
+    record.place = np.column_stack(
+        [own_s, 7.0 + truth[:, 4], truth[:, 5] + off.get("misled_m", 0.0) * share, truth[:, 6]]
+    )
+    return record
+
+
+def test_a_good_flight() -> None:
+    record = hovered(yaw_deg=4.0, drifts_m=1.0)
+    record.events = [Event(10.0, "mode", "5"), Event(20.7, "set", "2"), Event(33.0, "set", "1")]
+    found = figures(record)
+    assert found.yaw_deg == pytest.approx(4.0 + math.degrees(0.01), abs=0.05)
+    assert found.fallback_s == pytest.approx(0.7)
+    assert (found.estimate_m, found.spot_m) == pytest.approx((0.0, 1.0), abs=0.01)
+    assert not found.wrong
+    assert row(record, found).endswith("good")
+
+
+@pytest.mark.parametrize(
+    ("off", "words"),
+    [
+        ({"yaw_deg": 12.0}, "yaw above 10 deg"),
+        ({"drifts_m": 3.5}, "place above 3 m"),
+        ({"misled_m": 3.5}, "place above 3 m"),
+        ({"falls_m": 9.5}, "came down"),
+        ({"rolls_rad": 2.0}, "tipped over"),
+    ],
+)
+def test_a_flight_that_is_not_good(off: dict[str, float], words: str) -> None:
+    assert figures(hovered(**off)).wrong == [words]
+
+
+def test_changes_that_nobody_asked_for() -> None:
+    record = hovered()
+    record.events = [Event(21.0 + k, "set", str(1 + k % 2)) for k in range(3)]
+    record.events += [Event(30.0, "mode", "9"), Event(31.0, "disarmed", "")]
+    assert figures(record).wrong == ["3 changes of the source set", "1 changes of mode", "disarmed in the air"]
+
+
+def test_a_record_without_estimates_is_refused() -> None:
+    record = hovered()
+    record.estimate = record.estimate[record.estimate[:, 0] < STRUCK_S]
+    with pytest.raises(ValueError, match="no estimates"):
+        figures(record)
+
+
+def test_every_fault_has_a_wind_of_its_own_and_the_set_ups_share_it() -> None:
+    words = ["--binary", "arducopter", "--fault", "kill", "--fault", "stop", "--set-up", "script", "--set-up", "today"]
+    kill, kill_today, stop, _ = plans_of(parser().parse_args(words))
+    assert (kill.wind, kill.heading_deg) == (kill_today.wind, kill_today.heading_deg) != (stop.wind, stop.heading_deg)
+    assert all(3.0 <= plan.wind[0] <= 8.0 for plan in (kill, stop))
+    assert plans_of(parser().parse_args([*words, "--wind", "7", "90", "--seed", "3"]))[0].wind == (7.0, 90.0)
