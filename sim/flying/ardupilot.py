@@ -27,7 +27,7 @@ RIDER_PORT = 9012
 SERVO_MAGIC = 18458
 _SILENT_S = 0.1
 COPTER_MODES = {"guided": 4, "hold": 5}
-PLANE_MODES = {"guided": 15, "hold": 12, "takeoff": 13}
+PLANE_MODES = {"takeoff": 13, "hold": 12}
 STICKS_S = 0.2
 MIDDLE_US = 1500
 ARM_WITHIN_S = 60.0
@@ -109,6 +109,22 @@ class Rider:
         self._aircraft.take(state, self._heard_s)
 
 
+PLANE = {
+    "AIRSPEED_CRUISE": 22.0, "AIRSPEED_MAX": 30.0, "AIRSPEED_MIN": 10.0, "ARSPD_USE": 1.0, "TRIM_THROTTLE": 50.0,
+    "PTCH_LIM_MIN_DEG": -20.0, "PTCH_LIM_MAX_DEG": 25.0, "ROLL_LIMIT_DEG": 65.0, "KFF_RDDRMIX": 0.5,
+    "SERVO3_MIN": 1000.0, "SERVO3_MAX": 2000.0, "WP_LOITER_RAD": 80.0, "WP_RADIUS": 50.0, "NAVL1_PERIOD": 15.0,
+    "RLL2SRV_RMAX": 90.0, "RLL2SRV_TCONST": 0.25, "RLL_RATE_D": 0.01743, "RLL_RATE_FF": 0.237212, "RLL_RATE_I": 0.25,
+    "RLL_RATE_P": 0.3, "PTCH2SRV_RMAX_DN": 90.0, "PTCH2SRV_RMAX_UP": 90.0, "PTCH2SRV_TCONST": 0.25,
+    "PTCH_RATE_D": 0.007265, "PTCH_RATE_FF": 0.595723, "PTCH_RATE_I": 0.11, "PTCH_RATE_P": 0.15,
+    "TKOFF_ALT": 60.0, "THR_FAILSAFE": 0.0,
+}  # fmt: skip
+"""The tuning of SITL's plane (Tools/autotest/models/plane.parm)."""
+COPTER = {
+    "FRAME_CLASS": 1.0, "FRAME_TYPE": 0.0, "FS_THR_ENABLE": 0.0, "FS_GCS_ENABLE": 0.0, "MOT_THST_HOVER": 0.39,
+    "ATC_RAT_YAW_P": 0.3, "ATC_RAT_YAW_I": 0.02, "DISARM_DELAY": 0.0,
+}  # fmt: skip
+
+
 def flying_parameters(scenario: Scenario, wind: tuple[float, float]) -> dict[str, float]:
     """Defaults of a calibrated vehicle whose IMUs have the biases of the scenario's."""
     table = {
@@ -119,14 +135,6 @@ def flying_parameters(scenario: Scenario, wind: tuple[float, float]) -> dict[str
         "SIM_WIND_T": 1.0,
         "SIM_DRIFT_SPEED": 0.0,
         "INS_GYR_CAL": 0.0,
-        "FRAME_CLASS": 1.0,
-        "FRAME_TYPE": 0.0,
-        "FS_THR_ENABLE": 0.0,
-        "FS_GCS_ENABLE": 0.0,
-        "DISARM_DELAY": 0.0,
-        "MOT_THST_HOVER": 0.39,
-        "ATC_RAT_YAW_P": 0.3,
-        "ATC_RAT_YAW_I": 0.02,
         "SCR_ENABLE": 1.0,
         "CMPG_ENABLE": 0.0,
         "SERIAL0_PROTOCOL": 2.0,
@@ -134,8 +142,6 @@ def flying_parameters(scenario: Scenario, wind: tuple[float, float]) -> dict[str
     }
     for number in range(1, 9):
         table |= {f"RC{number}_MIN": 1000.0, f"RC{number}_MAX": 2000.0, f"RC{number}_TRIM": float(MIDDLE_US)}
-    for compass in ("", "2", "3"):
-        table |= {f"COMPASS_OFS{compass}_X": 5.0, f"COMPASS_OFS{compass}_Y": 13.0, f"COMPASS_OFS{compass}_Z": -18.0}
     for number, model in enumerate(scenario.flight_controller_imus[:2], 1):
         bias, ins = model.true_bias(0.0), "" if number == 1 else "2"
         for k, axis in enumerate(AXES):
@@ -178,7 +184,9 @@ class FlyingArduPilot(FlyingVehicle):
         self._binary = check_binary(binary)
         self.is_plane = "plane" in self._binary.name
         self._modes = PLANE_MODES if self.is_plane else COPTER_MODES
-        self._parameters = flying_parameters(scenario, wind) | dict(parameters or {})
+        self._parameters = (
+            flying_parameters(scenario, wind) | (PLANE if self.is_plane else COPTER) | dict(parameters or {})
+        )
         self._companion, self._ground = companion, (LOOPBACK, free_udp_port())
         self.system_id = 1
         self.rider = Rider(self.truth)
@@ -235,16 +243,16 @@ class FlyingArduPilot(FlyingVehicle):
         Raises:
             TimeoutError: it does not arm, or does not climb; with what it says.
         """
-        loop = asyncio.get_running_loop()
-        since_s = loop.time()
-        await self.mode(ground, "guided")
+        since_s = asyncio.get_running_loop().time()
+        await self.mode(ground, "takeoff" if self.is_plane else "guided")
         try:
             async with asyncio.timeout(ARM_WITHIN_S):
                 while await ground.arm(wait_s=2.0) != mavlink.MAV_RESULT_ACCEPTED:
                     await asyncio.sleep(1.0)
         except TimeoutError:
             raise TimeoutError(f"it does not arm: {ground.texts_since(since_s)[-400:]}") from None
-        await ground.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height_m)
+        if not self.is_plane:
+            await ground.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height_m)
         await ground.wait_for(lambda: self.height_m > 0.95 * height_m, 40.0, "take-off")
 
     async def mode(self, ground: GroundStation, name: str) -> None:
@@ -260,8 +268,13 @@ class FlyingArduPilot(FlyingVehicle):
             lambda: any(beat.custom_mode == number for beat in ground.vehicle_heartbeats(since_s)), 5.0, f"mode {name}"
         )
 
+    async def lie_with_own_compass(self, ground: GroundStation) -> float:
+        """All its compasses are turned by 45 deg, which is returned, as of now."""
+        await ground.put_all({f"SIM_MAG{number}_ORIENT": 1.0 for number in (1, 2, 3)})  # ROTATION_YAW_45
+        return 45.0
+
     async def hold(self, ground: GroundStation) -> None:
-        """Loiter, sticks in the middle."""
+        """Loiter, sticks in the middle: a plane circles."""
         await self.mode(ground, "hold")
 
     async def steer(self, ground: GroundStation) -> None:

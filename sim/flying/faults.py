@@ -92,6 +92,11 @@ async def _board_without_power(on: Aloft) -> None:
     on.in_background(comes_back())
 
 
+async def _own_compass_lies(on: Aloft) -> None:
+    await on.vehicle.lie_with_own_compass(on.ground)
+    on.signal(signal.SIGKILL)
+
+
 async def _nothing(on: Aloft) -> None:
     pass
 
@@ -112,5 +117,6 @@ FAULTS = {
     "gyro-drift": Fault(f"its gyro about z begins to read {DRIFT_DEG_S:g} deg/s too much", _gyro_drifts),
     "compass-drift": Fault(f"its compass turns by {DRIFT_DEG_S:g} deg/s", _compass_drifts),
     "compass-lies": Fault(f"its compass lies by {LIE_DEG:g} deg", _compass_lies),
+    "own-compass": Fault("the autopilot's own compass is turned by 45 deg, and then kill -9", _own_compass_lies),
     "board": Fault(f"its board has no power, and starts again after {POWERLESS_S:g} s", _board_without_power),
 }

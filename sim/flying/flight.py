@@ -42,6 +42,7 @@ PUSHED_WITHIN_S = 60.0
 FIRST_FIX_S = 20.0
 RESTARTED_S = 20.0
 HEIGHT_M = 10.0
+PLANE_HEIGHT_M = 50.0
 SETTLED_S = 10.0
 WATCHED_S = 45.0
 SCRIPT = Path(__file__).parents[2] / "companion" / "lua" / "companion_arming.lua"
@@ -67,7 +68,7 @@ class Flight:
         self, plan: Plan, vehicle: FlyingVehicle, ground: GroundStation, link: LossyLink, folder: Path
     ) -> None:
         self.plan, self.vehicle, self.ground, self.link, self.folder = plan, vehicle, ground, link, folder
-        self.record = Record(plan.fault, plan.set_up, plan.wind)
+        self.record = Record(plan.fault, plan.set_up, plan.wind, hold=not vehicle.is_plane)
         self._since_s = 0.0
         self._asked_modes = 0
         self._background: list[asyncio.Task[None]] = []
@@ -163,7 +164,7 @@ class Flight:
         vehicle, ground = self.vehicle, self.ground
         await vehicle.ask_streams(ground)
         self.in_background(vehicle.steer(ground))
-        await vehicle.take_off(ground, HEIGHT_M)
+        await vehicle.take_off(ground, PLANE_HEIGHT_M if vehicle.is_plane else HEIGHT_M)
         await vehicle.hold(ground)
         await vehicle.sleep(SETTLED_S)
         self.record.struck_s = vehicle.truth.own_s

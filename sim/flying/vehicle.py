@@ -18,6 +18,8 @@ class FlyingVehicle(SitlVehicle):
 
     sticks_us: list[int]
     """Roll, pitch, throttle, yaw."""
+    is_plane = False
+    """It circles where others stay."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         super().__init__(scenario, folder)
@@ -59,6 +61,10 @@ class FlyingVehicle(SitlVehicle):
         Raises:
             TimeoutError: it does not; with what it says.
         """
+
+    @abstractmethod
+    async def lie_with_own_compass(self, ground: GroundStation) -> float:
+        """Its own compasses are turned as of now, by so many degrees."""
 
     @abstractmethod
     async def hold(self, ground: GroundStation) -> None:
