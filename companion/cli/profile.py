@@ -156,8 +156,7 @@ def _learn(
     """
     from companion.calibration.noise.allan import noise_profile
     from companion.calibration.profiling.coverage import coverage
-    from companion.calibration.profiling.profile_fit import fit_profile, joined, rests
-    from companion.calibration.profiling.warm_up import learn_warm_up
+    from companion.calibration.profiling.profile_fit import fit_profile, joined, learn_warm_up, rests
 
     whole = [log for log in logs if not log.truncated]
     if not whole:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import struct
 from collections.abc import Sequence
 from typing import Final
 
@@ -11,7 +12,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.arm_authorisation import ArmAuthoriser, ArmingScript
 from companion.component.commands import CommandServer, Permission
-from companion.component.no_files import refuse_files
 from companion.component.own_parameters import OwnParameters, Parameter
 from companion.component.service import ArmGate, CalibrationService
 from companion.component.statustext import StatusText
@@ -128,3 +128,35 @@ def heartbeat(mav_state: int) -> mavlink.MAVLink_heartbeat_message:
     return mavlink.MAVLink_heartbeat_message(
         mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mav_state, 3
     )
+
+
+_HEADER: Final = struct.Struct("<HBBBBBBI")
+_PAYLOAD_BYTES: Final = 251
+_NAK: Final = 129
+_ANSWERS: Final = 128
+"""Opcodes from here on are answers."""
+_OPENS: Final = (4, 6, 11)
+"""To read, to create, to write."""
+_UNKNOWN_COMMAND, _FILE_NOT_FOUND = 7, 10
+
+
+def refuse_files(link: MavlinkLink) -> None:
+    """Answer requests for files that are addressed to us: MAVProxy would wait through two time-outs for our parameters.
+
+    MAVFTP (FILE_TRANSFER_PROTOCOL, 110), MAVLink developer guide: a request's payload is sequence, session, opcode,
+    size, opcode answered to, burst, a byte of padding, offset, data; an answer's sequence is the next one.
+    """
+
+    def answer(message: mavlink.MAVLink_file_transfer_protocol_message, _t_s: float) -> None:
+        sequence, session, opcode, *_ = _HEADER.unpack_from(bytes(message.payload))
+        if (message.target_system, message.target_component) != (link.system_id, link.component_id):
+            return
+        if opcode >= _ANSWERS:
+            return
+        why = _FILE_NOT_FOUND if opcode in _OPENS else _UNKNOWN_COMMAND
+        header = _HEADER.pack((sequence + 1) % 65536, session, _NAK, 1, opcode, 0, 0, 0)
+        payload = list((header + bytes([why])).ljust(_PAYLOAD_BYTES, b"\0"))
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        link.send(mavlink.MAVLink_file_transfer_protocol_message(0, *sender, payload))
+
+    link.subscribe(mavlink.MAVLink_file_transfer_protocol_message, answer)

@@ -8,10 +8,8 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.records.align_record import AlignmentRecord
-from companion.calibration.records.faces_record import FacesRecord
+from companion.calibration.records.align_record import AlignmentRecord, FacesRecord, TurnRecord
 from companion.calibration.records.record import Record, WrittenParameter
-from companion.calibration.records.turn_record import TurnRecord
 from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
 from companion.component.service import JobResult

@@ -8,7 +8,7 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.records import align_record, faces_record, history
+from companion.calibration.records import align_record, history
 from companion.storage.state import StateFile
 
 
@@ -21,12 +21,12 @@ class AlignmentStore(StateFile[align_record.AlignmentRecord]):
         )
 
 
-class FacesStore(StateFile[faces_record.FacesRecord]):
+class FacesStore(StateFile[align_record.FacesRecord]):
     """`faces.json` in the storage directory."""
 
     def __init__(self, directory: Path) -> None:
         super().__init__(
-            directory / "faces.json", faces_record.FacesRecord, faces_record.check, faces_record.FORMAT_VERSION
+            directory / "faces.json", align_record.FacesRecord, align_record.check_faces, align_record.FORMAT_VERSION
         )
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.calibration.records.faces_record import FacesRecord
-from companion.calibration.records.turn_record import TurnRecord
+from companion.calibration.records.align_record import FacesRecord, TurnRecord
 from companion.component.service import JobResult
 from companion.daemon.job import Job
 from sim.aircraft import Pose

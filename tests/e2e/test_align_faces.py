@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.records.faces_record import FacesRecord
+from companion.calibration.records.align_record import FacesRecord
 from companion.calibration.records.record import Record
 from companion.calibration.request import What
 from companion.cli.show import status_lines

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.records.turn_record import TurnRecord
+from companion.calibration.records.align_record import TurnRecord
 from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.daemon.stands.turning import TurnAsked

@@ -9,13 +9,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.parts import part_of
+from companion.autopilot.firmware.firmwares import part_of
 from companion.calibration.means.windows import Hidden, ImuWindow
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.record import ImuRecord
 from companion.calibration.request import What
-from companion.calibration.solution.believable import without_heading
 from companion.calibration.solution.site import IN_CONFIGURATION
+from companion.calibration.solution.solve import without_heading
 from companion.config import parse
 from companion.config.sections import Noise
 from companion.daemon.process.check import run_check

@@ -12,7 +12,7 @@ import pytest
 from companion.calibration.deck.deck import Deck
 from companion.calibration.deck.estimate import DeckFound
 from companion.calibration.deck.fluid import Fluid, Level, readings_deg
-from companion.calibration.deck.passage import passage
+from companion.calibration.deck.smoother import passage
 from companion.calibration.deck.stream import Surroundings
 from companion.calibration.deck.waves import Wander, Waves, fit_waves, whitened
 from companion.calibration.means.pose import CompassModel, GradienterModel

@@ -12,8 +12,7 @@ import pytest
 from companion.autopilot.firmware.ardupilot import parameters_of
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, whole_accelerometer
 from companion.calibration.alignment.faces import BIAS, SCALE
-from companion.calibration.records.align_record import Determined
-from companion.calibration.records.faces_record import FacesImuRecord, FacesRecord, Running
+from companion.calibration.records.align_record import Determined, FacesImuRecord, FacesRecord, Running
 from companion.cli.client import sides_lines
 from companion.config import parse
 from companion.daemon.core import Core

@@ -24,7 +24,7 @@ from companion.recording.past import Past
 from companion.replay.log_files import read_logs
 from companion.samples import ImuSample
 from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, check_name
-from companion.storage.state import sealed, unsealed
+from companion.storage.state import MOST_BYTES, sealed, unsealed
 from sim.__main__ import main as simulator
 from tests.support.made_noise import DEG_H, adis16405, write_csv
 
@@ -69,7 +69,7 @@ def changed(**changes: Any) -> Callable[[bytes], bytes]:
         (lambda _: b"\x00\xff" * 40, "not a readable profile"),
         (lambda _: b"[1, 2]", "not a readable profile"),
         (lambda data: data.replace(b'"mine"', b'"nine"'), "its checksum does not fit: damaged, or changed by hand"),
-        (lambda data: data + b" " * 1_000_000, "more than 1000000 bytes"),
+        (lambda data: data + b" " * MOST_BYTES, f"more than {MOST_BYTES} bytes"),
         (changed(format_version=2), "found format 2; allowed: up to 1 (a newer companion has saved it)"),
         (changed(name="other"), "it is of 'other'"),
         (changed(gyro={"white": -1.0, "flicker": 0.0, "walk": 0.0}), "allowed: N above 0"),

@@ -27,6 +27,7 @@ from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.calibration.records.record import Outcome, WrittenParameter
 from companion.calibration.temperature.polynomial import Polynomial
+from companion.config.sections import Profile
 from companion.errors import AutopilotError
 from companion.samples import Triad
 
@@ -171,3 +172,34 @@ def outcomes_of(triad: Triad, written: Mapping[str, WrittenParameter]) -> set[Ou
     offset = GYRO_OFFSET if triad == "gyro" else ACCEL_OFFSET
     offsets = {name for each in CALIBRATION.values() for name, one in each.items() if one is offset}
     return {one.outcome for name, one in written.items() if name in offsets}
+
+
+_TYPE_SHIFT: Final = 16
+_BYTE: Final = 0xFF
+
+_PARTS: Final[dict[Firmware, dict[tuple[int, int], Profile]]] = {
+    "ardupilot": {
+        (0x2B, 0x2B): "bmi088",
+        # ADIS16470, or the better ADIS16477 with the same driver.
+        (0x31, 0x31): "adis16470",
+        (0x34, 0x34): "icm42688p",
+    },
+    "px4": {
+        (0x26, 0x26): "icm42688p",
+        (0x58, 0x58): "adis16470",
+        (0x66, 0x6A): "bmi088",
+    },
+}
+"""By the types of gyro and accelerometer: those that are in the catalogue. The numbers are each firmware's own: 0x2B is
+a BMI088 to one and an IIM42652 to the other (ArduPilot's AP_InertialSensor_Backend.h, DevTypes; PX4's drv_sensor.h)."""
+
+
+def part_of(firmware: Firmware | None, gyro_id: int | None, accel_id: int | None) -> Profile | None:
+    """The catalogue's name of the part whose two halves have these device ids; None: it is not known.
+
+    Both firmwares make an id of bus, address and type (8 bits from bit 16 on).
+    """
+    if gyro_id is None or accel_id is None:
+        return None
+    types = (gyro_id >> _TYPE_SHIFT & _BYTE, accel_id >> _TYPE_SHIFT & _BYTE)
+    return _PARTS.get(firmware or "other", {}).get(types)

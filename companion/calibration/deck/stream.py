@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from companion.calibration.deck.fluid import Fluid, Level, level
-from companion.calibration.deck.passage import Passage, passage
+from companion.calibration.deck.smoother import Passage, passage
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.robust import median

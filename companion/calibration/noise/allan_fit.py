@@ -102,7 +102,8 @@ def fit_axis(curves: Sequence[Curve], column: int) -> AxisFit:
     theta = np.array([1.0, 0.05, 1e-4])
     for _ in range(_ROUNDS):
         before = theta
-        theta = _not_negative(*_normal_equations(parts, theta))
+        # White noise is in every sensor; and no figure at all would weigh everything infinitely.
+        theta = np.maximum(not_negative(*_normal_equations(parts, theta)), [1e-9, 0.0, 0.0])
         if bool(np.all(np.abs(theta - before) <= _CONVERGED * (np.abs(before) + 1e-9))):
             break
     information, _ = _normal_equations(parts, theta)
@@ -149,20 +150,20 @@ def _normal_equations(parts: Sequence[_Part], theta: Floats) -> tuple[Floats, Fl
     return information + np.diag(1e-12 * np.maximum(np.diag(information), 1.0)), right
 
 
-def _not_negative(information: Floats, right: Floats) -> Floats:
-    """The least squares solution among those without a negative figure: the best of the seven that may be it."""
-    best, least = np.zeros(3), math.inf
-    for size in (3, 2, 1):
-        for chosen in itertools.combinations(range(3), size):
+def not_negative(information: Floats, right: Floats) -> Floats:
+    """The least squares solution (n,) among those without a negative figure: the best of all that may be it."""
+    many = len(right)
+    best, least = np.zeros(many), 0.0
+    for size in range(many, 0, -1):
+        for chosen in itertools.combinations(range(many), size):
             index = list(chosen)
             some = np.linalg.solve(information[np.ix_(index, index)], right[index])
-            theta = np.zeros(3)
+            theta = np.zeros(many)
             theta[index] = some
             loss = float(theta @ information @ theta - 2.0 * right @ theta)
             if bool((some >= 0.0).all()) and loss < least:
                 best, least = theta, loss
-    # White noise is in every sensor; and no figure at all would weigh everything infinitely.
-    return np.asarray(np.maximum(best, [1e-9, 0.0, 0.0]))
+    return best
 
 
 def _upper(parts: Sequence[_Part], theta: Floats, which: int, sigma: float) -> float:

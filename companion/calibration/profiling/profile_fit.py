@@ -21,9 +21,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.noise.allan import FLOOR_OF_FLICKER, AllanModel, NoiseProfile
-from companion.calibration.noise.allan_fit import AxisFit, curve, fit_axis
-from companion.calibration.noise.horizon_fit import within_horizon
+from companion.calibration.noise.allan import FLOOR_OF_FLICKER, WARM_UP_K, AllanModel, NoiseProfile, floor_variance
+from companion.calibration.noise.allan_fit import AxisFit, curve, fit_axis, not_negative
 from companion.calibration.seconds.batch import Batch, summary
 from companion.calibration.stillness.gates import ImuGate
 from companion.calibration.stillness.own_noise import learned_of
@@ -275,3 +274,91 @@ def _slope_sigma(rest: Rest, figures: tuple[float, float, float]) -> float:
     covariance[np.diag_indices(_BLOCKS)] += white**2 / block
     variance = float(weights @ covariance @ weights)
     return math.sqrt(max(variance, white**2 * 12.0 / span_s**3))
+
+
+HORIZONS_S: Final = tuple(itertools.product((10, 30, 60), (60, 180)))
+"""T and H."""
+LEAST_WINDOWS: Final = 8.0
+"""Side by side; fewer say nothing against a model."""
+CAUTION_SIGMAS: Final = 1.0
+"""By so much of its standard error more than was measured counts, and the largest of three axes."""
+
+
+def within_horizon(model: AllanModel, stretches: Sequence[tuple[NDArray[np.int64], Floats]]) -> AllanModel:
+    """The model with the flicker and walk that hold for means of 10 to 60 s and the 60 to 180 s after them.
+
+    A random walk that is bounded, as the wander of most parts is after some minutes, looks like a walk at averages of
+    a minute; of what it does in the next three minutes the walk says too much. So what is measured is the mean square
+    of the difference of which `sigma_use` speaks; where it is less than the model's, flicker and walk are fitted to it.
+
+    `stretches`: slots (m,) and means (m, 3) of seconds at rest.
+    """
+    rows, targets = [], []
+    for mean_s, next_s in HORIZONS_S:
+        white = model.white**2 * (1.0 / mean_s + 1.0 / next_s)
+        target = float(floor_variance(model.flicker, model.walk, mean_s, next_s)) + white
+        seen, windows = _seen(stretches, mean_s, next_s)
+        if windows >= LEAST_WINDOWS:
+            target = min(target, seen * (1.0 + CAUTION_SIGMAS * math.sqrt(2.0 / windows)))
+        flicker, walk = float(floor_variance(1.0, 0.0, mean_s, next_s)), float(floor_variance(0.0, 1.0, mean_s, next_s))
+        rows.append([flicker / target, walk / target])
+        targets.append(max(target - white, 0.0) / target)
+    by = np.array(rows)
+    flicker2, walk2 = not_negative(by.T @ by, by.T @ np.array(targets)).tolist()
+    return AllanModel(model.white, math.sqrt(flicker2), math.sqrt(walk2))
+
+
+def _seen(stretches: Sequence[tuple[NDArray[np.int64], Floats]], mean_s: int, next_s: int) -> tuple[float, float]:
+    """Mean square of what the next seconds differed by, of the worst axis; and for how many windows there was room."""
+    total, many, windows = np.zeros(3), 0, 0.0
+    length = mean_s + next_s
+    for slots, means in stretches:
+        if len(slots) < length:
+            continue
+        sums = np.concatenate([np.zeros((1, 3)), np.cumsum(means - means.mean(axis=0), axis=0)])
+        past = (sums[mean_s : len(sums) - next_s] - sums[: len(sums) - length]) / mean_s
+        coming = (sums[length:] - sums[mean_s : len(sums) - next_s]) / next_s
+        whole = slots[length - 1 :] - slots[: len(slots) - length + 1] == length - 1
+        total += np.square(coming - past)[whole].sum(axis=0)
+        many += int(whole.sum())
+        windows += float(whole.sum()) / length
+    return (float(total.max()) / many if many else 0.0), windows
+
+
+LEAST_S: Final = 900
+"""Boards warm up within 20 min, most of it in the first ten."""
+_BLOCK_S: Final = 60
+_LEAST_IN_BLOCK: Final = 30
+_LEAST_K: Final = 3.0
+"""A thermometer that moves by less tells nothing of what a kelvin does."""
+
+
+def learn_warm_up(recordings: Sequence[Sequence[Rest]]) -> tuple[float, float]:
+    """What `WARM_UP_K` do to gyro and accelerometer: rad/s and m/s^2 of the axis that moves most.
+
+    The range of the minutes' means of each recording (its stretches at rest, in the order of time); where its
+    thermometer moved, in proportion to that, but not less than the range itself.
+
+    Raises:
+        CalibrationRefusedError: too little at rest.
+    """
+    found = np.zeros(2)
+    for rests in recordings:
+        minutes = np.array([row for rest in rests for row in _minutes(rest)])
+        seconds = sum(len(rest.slots) for rest in rests)
+        if seconds < LEAST_S or len(minutes) < 2:
+            raise CalibrationRefusedError(
+                f"--warm-up: {seconds} s at rest; to see a warm-up takes {LEAST_S} s from the switch-on"
+            )
+        moved = np.ptp(minutes, axis=0)
+        kelvin = float(moved[6])
+        share = max(WARM_UP_K / kelvin, 1.0) if kelvin >= _LEAST_K else 1.0
+        found = np.maximum(found, np.array([moved[:3].max(), moved[3:6].max()]) * share)
+    return float(found[0]), float(found[1])
+
+
+def _minutes(rest: Rest) -> list[Floats]:
+    """Means of six axes and the thermometer (NaN: none) over each minute that is mostly there."""
+    block = (rest.slots - rest.slots[0]) // _BLOCK_S
+    table = np.column_stack([rest.means, rest.temperature_degc])
+    return [table[block == k].mean(axis=0) for k in np.unique(block) if (block == k).sum() >= _LEAST_IN_BLOCK]

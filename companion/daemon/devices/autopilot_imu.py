@@ -14,9 +14,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.autopilot.firmware.firmwares import read_calibration
+from companion.autopilot.firmware.firmwares import part_of, read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, rivals_of
-from companion.autopilot.firmware.parts import part_of
 from companion.autopilot.firmware.px4 import SlotMemory
 from companion.autopilot.telemetry.imu_stream import ImuStream, StreamKind
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent

@@ -15,7 +15,7 @@ from companion.calibration.machine import Event
 from companion.calibration.means.pose import GradienterModel, up_in_vehicle, vehicle_heading_rad
 from companion.calibration.means.windows import Window
 from companion.calibration.records.align_record import AlignmentRecord, imu_record, stand_record
-from companion.calibration.solution.site import LocalEarth, local_earth
+from companion.calibration.solution.site import LocalEarth
 from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.job import Job
@@ -34,7 +34,7 @@ class Aligner:
     """Measures alignments; who may start one is the conductor's."""
 
     def __init__(self, core: Core, stands: Stands, alignment: AlignmentInForce) -> None:
-        self._config, self._vehicle, self._stands, self._alignment = core.config, core.vehicle, stands, alignment
+        self._config, self._stands, self._alignment = core.config, stands, alignment
         self._offload, self._machine = core.offload, core.machine
 
     async def run(self, job: Job, plan: Plan) -> str:
@@ -58,17 +58,13 @@ class Aligner:
         self._stands.begin(job)
         while len(taken) < plan.total:
             taken.append(await self._stands.take(job, plan, taken, see))
-            self._machine.on(Event.ENOUGH)
             if len(taken) >= min(3, plan.total):
                 # What does not fit is said at once, not after five more stands.
                 await self._stands.check_offsets()
-                where = models.whereabouts(self._config, self._vehicle)
-                local = await self._offload(local_earth, where)
+                local = await self._stands.local_earth()
                 result = await self._offload(self._solve, plan, model, taken, local)
                 if result.complaint is not None:
                     raise CalibrationRefusedError(in_words(result.complaint))
-            if len(taken) < plan.total:
-                self._machine.on(Event.MOVED)
         assert result is not None
         assert local is not None
         record = self._record(plan, result, taken, local)

@@ -9,9 +9,7 @@ from collections.abc import Mapping
 import msgspec
 
 from companion.autopilot.parameters.wire import same_float32
-from companion.calibration.records.align_record import AlignmentRecord
-from companion.calibration.records.faces_record import FacesRecord
-from companion.calibration.records.turn_record import TurnRecord
+from companion.calibration.records.align_record import AlignmentRecord, FacesRecord, TurnRecord
 from companion.component.service import JobResult
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu

@@ -11,7 +11,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.calibration.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Accelerometer
 from companion.calibration.means.windows import Window
 from companion.calibration.noise.allan import noise_profile
-from companion.calibration.records.faces_record import FacesImuRecord, FacesRecord, Running
+from companion.calibration.records.align_record import FacesImuRecord, FacesRecord, Running
 from companion.calibration.solution.otherwise import Sides, aged_m_s2
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu

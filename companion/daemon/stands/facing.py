@@ -19,11 +19,10 @@ from companion.calibration.alignment.missing import Missing, missing, seen_befor
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.noise.robust import median
-from companion.calibration.records.faces_record import FaceRecord, FacesImuRecord, FacesRecord, faces_imu_record
+from companion.calibration.records.align_record import FaceRecord, FacesImuRecord, FacesRecord, faces_imu_record
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.site import LocalEarth, local_earth
+from companion.calibration.solution.site import LocalEarth
 from companion.component.statustext import Severity
-from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
@@ -73,23 +72,15 @@ class Facing:
             CompanionError: it failed, and why; what was written is back, or it is said what is not.
             JobCancelledError: cancelled; likewise.
         """
-        with self._stands.imus_alone():
-            return await self._run(job, write=write)
-
-    async def _run(self, job: Job, *, write: bool) -> str:
         windows: list[Window] = []
         known = _Known({}, _FIRST)
         local: LocalEarth | None = None
         if write:
             await self._writes.prepare()
-        self._stands.begin(job)
+        self._stands.begin(job, imus_alone=True)
         while known.wish is not None and len(windows) < MOST:
-            if windows:
-                self._machine.on(Event.MOVED)
             windows.append(await self._next(job, known, len(windows) + 1))
-            self._machine.on(Event.ENOUGH)
-            where = models.whereabouts(self._core.config, self._core.vehicle)
-            local = await self._core.offload(local_earth, where)
+            local = await self._stands.local_earth()
             try:
                 before, known = known, await self._core.offload(self._solve, windows, local)
             except CalibrationRefusedError:

@@ -7,9 +7,8 @@ one person alone can do it with the ground station's voice or the page; the comm
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple, TypeVar
 
 import msgspec
@@ -17,10 +16,13 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.calibration.collector.outlook import Glance
+from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
+from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.component.service import JobResult
 from companion.component.statustext import LINE_BYTES, Severity
 from companion.component.tunes import Tune
+from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, same
 from companion.daemon.job import Job
@@ -119,15 +121,23 @@ class Stands:
         self.shown: StandsShown | None = None
         """None before the first alignment."""
 
-    def begin(self, job: Job) -> None:
-        """The next stand is the first, of this job."""
+    def begin(self, job: Job, *, imus_alone: bool = False) -> None:
+        """The next stand is the first, of this job.
+
+        `imus_alone`: until it ends nobody waits for a gradienter or a compass: turned over, either may fall silent.
+        """
         self._last, self._first = None, {}
         self._collector.count_turns(wanted=True)
+        if imus_alone:
+            self._collector.expect(gradienter=False, compass=False)
         self.shown = shown = StandsShown(job.kind, 1, 1, "", Hold(LEVEL))
 
         def ended(result: asyncio.Future[JobResult]) -> None:
             shown.outcome, shown.words, shown.share = result.result().outcome, result.result().reason, 0.0
             self._collector.count_turns(wanted=False)
+            if imus_alone:
+                config = self._core.config
+                self._collector.expect(gradienter=config.gradienter is not None, compass=config.compass is not None)
 
         job.finished.add_done_callback(ended)
 
@@ -147,6 +157,7 @@ class Stands:
         number, total, wish, *_ = asked
         shown = self._show(asked)
         if number > 1:
+            self._machine.on(Event.MOVED)
             self._core.tunes.play(Tune.NEXT)
         self._say(Severity.NOTICE, asked.words)
         # Whoever asks may yet put it down on a better spot: what was before that does not count.
@@ -186,6 +197,7 @@ class Stands:
                     self._last = window
                     self._first = self._first or self._offsets()
                     shown.done.append(_up(window))
+                    self._machine.on(Event.ENOUGH)
                     return found
                 else:
                     at.moved = False
@@ -277,15 +289,11 @@ class Stands:
             turn_deg, sigma_deg = counted.angle_rad / DEG, counted.sigma_rad / DEG
         return Taken(now, Seen(up, seen[-1].heading_deg + turn_deg), sigma_deg, counted=True)
 
-    @contextlib.contextmanager
-    def imus_alone(self) -> Iterator[None]:
-        """Meanwhile nobody waits for a gradienter or a compass: turned over, either may fall silent."""
-        config = self._core.config
-        self._collector.expect(gradienter=False, compass=False)
-        try:
-            yield
-        finally:
-            self._collector.expect(gradienter=config.gradienter is not None, compass=config.compass is not None)
+    async def local_earth(self) -> LocalEarth:
+        """Gravity and the Earth's rate where it stands, as known now."""
+        where = models.whereabouts(self._core.config, self._core.vehicle)
+        local: LocalEarth = await self._core.offload(local_earth, where)
+        return local
 
     async def check_offsets(self) -> None:
         """Read them afresh: somebody may have changed them without a word.

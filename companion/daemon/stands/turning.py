@@ -15,13 +15,11 @@ from companion.calibration.alignment.align_model import Stand
 from companion.calibration.alignment.spot import Mounting, mounting, turned
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
-from companion.calibration.records.align_record import stand_record
+from companion.calibration.records.align_record import BoardRecord, TurnRecord, stand_record, turn_imu_record
 from companion.calibration.records.record import WrittenParameter
-from companion.calibration.records.turn_record import BoardRecord, TurnRecord, turn_imu_record
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.site import LocalEarth, local_earth
+from companion.calibration.solution.site import LocalEarth
 from companion.component.statustext import Severity
-from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
@@ -81,10 +79,6 @@ class Turning:
             CompanionError: it failed, and why; what was written is back, or it is said what is not.
             JobCancelledError: cancelled; likewise.
         """
-        with self._stands.imus_alone():
-            return await self._run(job, asked)
-
-    async def _run(self, job: Job, asked: TurnAsked) -> str:
         plan = Plan("zero", asked.headings, back=True)
         taken: list[Taken] = []
 
@@ -92,15 +86,11 @@ class Turning:
             up = np.array(window.imus[0].accel_m_s2)
             return self._stands.turned(plan, taken, window, up / np.linalg.norm(up), 0.01)
 
-        self._stands.begin(job)
+        self._stands.begin(job, imus_alone=True)
         while len(taken) < plan.on_spot:
-            if taken:
-                self._machine.on(Event.MOVED)
             taken.append(await self._stands.take(job, plan, taken, see, if_armed=None))
-            self._machine.on(Event.ENOUGH)
         await self._stands.check_offsets()
-        where = models.whereabouts(self._core.config, self._core.vehicle)
-        local = await self._core.offload(local_earth, where)
+        local = await self._stands.local_earth()
         names = readable(taken, self._imus)
         stands = [one.as_stand(names) for one in taken]
         found: Alignment = await self._core.offload(turned, stands, ground(local, None))
