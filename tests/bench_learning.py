@@ -59,12 +59,12 @@ def table() -> None:
     )
     for words, took_s in (("reading the CSV file", floor_s), ("seconds and stillness", read_s), ("all of it", whole_s)):
         print(f"{words:44} {took_s:6.2f} s {took_s / floor_s:6.1f}")
-    print(f"at rest {found.still_s} of {found.seconds} s; the next minute within 2 sigma, strictly, naive:")
+    print(f"at rest {found.still_s} of {found.seconds} s; the next minute within 2 sigma:")
     for each in kept:
         use = each.sigma_use / (DEG_H if each.triad == "gyro" else 9.80665e-6)
         print(
             f"  {each.triad:6} T {each.mean_s:3} s  sigma_use {use:6.1f} {'deg/h' if each.triad == 'gyro' else 'ug':6}"
-            f" {each.share:6.1%} {each.share_strict:6.1%} {each.share_naive:6.1%}"
+            f" {each.share:6.1%}"
         )
 
 

@@ -276,8 +276,8 @@ def _lines(result: Result) -> list[str]:
             ]
             lines.append(f"{f'{triad}: {name}':24} {cells[0]:>16} {cells[1]:>16} {cells[2]:>16}")
     if result.kept:
-        heads = ("T, s", "sigma_use", "rms error", "over sigma", "2 sigma", "strictly", "naive")
-        widths = (5, 11, 11, 10, 8, 9, 7)
+        heads = ("T, s", "sigma_use", "rms error", "over sigma", "2 sigma")
+        widths = (5, 11, 11, 10, 8)
         lines.append(
             "the minute after windows of T s, learned from other recordings or the other half; within 2 sigma:"
         )
@@ -285,8 +285,8 @@ def _lines(result: Result) -> list[str]:
         for each in result.kept:
             unit, unit_name, digits = _UNITS[each.triad]
             sizes = [f"{value / unit:.{digits}f} {unit_name}" for value in (each.sigma_use, each.rms)]
-            shares = [f"{share:.1%}" for share in (each.share, each.share_strict, each.share_naive)]
-            lines.append(_row(each.triad, (f"{each.mean_s}", *sizes, f"{each.ratio:.2f}", *shares), widths))
+            line = (f"{each.mean_s}", *sizes, f"{each.ratio:.2f}", f"{each.share:.1%}")
+            lines.append(_row(each.triad, line, widths))
     lines += _used_lines(result)
     lines += [f"note: {note}" for note in result.notes]
     return lines + [f"DO NOT USE: {words}" for words in result.broken]

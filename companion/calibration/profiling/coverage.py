@@ -45,14 +45,9 @@ class Held(msgspec.Struct, frozen=True, kw_only=True):
             sigma_use=float(np.sqrt(median(np.ravel(use)))),
             rms=float(np.sqrt(np.square(miss).mean())),
             ratio=float(np.sqrt((np.square(miss) / (use + seen)).mean())),
-            share=within(miss, use + seen),
+            share=float((np.square(miss) <= SIGMAS**2 * (use + seen)).mean()),
             **rest,
         )
-
-
-def within(miss: Floats, variance: Floats) -> float:
-    """Share of misses within 2 sigma."""
-    return float((np.square(miss) <= SIGMAS**2 * variance).mean())
 
 
 class Kept(Held, frozen=True, kw_only=True):
@@ -63,10 +58,6 @@ class Kept(Held, frozen=True, kw_only=True):
     windows: int
     minutes: float
     """How many windows fit beside one another: what the share is worth."""
-    share_strict: float
-    """Within 2 sigma_use as it stands."""
-    share_naive: float
-    """Within 2 s / sqrt(n), of all samples of the window."""
 
 
 class _Misses(msgspec.Struct):
@@ -76,7 +67,6 @@ class _Misses(msgspec.Struct):
     use: list[Floats]
     seen: list[Floats]
     """Variance of what is seen of the next minute, about its bias."""
-    naive: list[Floats]
     minutes: float = 0.0
 
 
@@ -102,7 +92,7 @@ def keeps(
     next_s: int = NEXT_S,
 ) -> list[Kept]:
     """How often the seconds after a window came out as profiles say."""
-    found = {mean_s: _Misses([], [], [], []) for mean_s in means_s}
+    found = {mean_s: _Misses([], [], []) for mean_s in means_s}
     for rests, profile in tests:
         for mean_s, misses in found.items():
             _predict(rests, profile, (mean_s, next_s), misses)
@@ -155,7 +145,6 @@ def _predict(rests: Sequence[Rest], profile: NoiseProfile, lengths_s: tuple[int,
         misses.miss.append(mean - coming.mean(axis=0))
         misses.use.append(use)
         misses.seen.append(white / next_s)
-        misses.naive.append(np.array([_naive(window) for window in past]))
 
 
 def _estimated(windows: Sequence[Sequence[Batch]], profile: NoiseProfile, next_s: int) -> tuple[Floats, Floats]:
@@ -168,21 +157,7 @@ def _estimated(windows: Sequence[Sequence[Batch]], profile: NoiseProfile, next_s
     return np.array(mean), np.array(use)
 
 
-def _naive(window: Sequence[Batch]) -> Floats:
-    """Variance of a plain mean by the books, were all samples independent: s^2 / n."""
-    counts = np.array([batch.n for batch in window], dtype=np.float64)[:, None]
-    means = np.array([batch.mean for batch in window])
-    within = np.array([batch.variance for batch in window])
-    total = float(counts.sum())
-    middle = (counts * means).sum(axis=0) / total
-    squares = ((counts - 1.0) * within + counts * np.square(means - middle)).sum(axis=0)
-    return np.asarray(squares / (total - 1.0) / total)
-
-
 def _summary(triad: Triad, columns: slice, mean_s: int, misses: _Misses) -> Kept:
-    all_of = (misses.miss, misses.use, misses.seen, misses.naive)
-    miss, use, seen, naive = (np.concatenate(each)[:, columns] for each in all_of)
-    shares = {"share_strict": within(miss, use), "share_naive": within(miss, naive)}
-    return Kept.against(
-        miss, use, seen, triad=triad, mean_s=mean_s, windows=len(miss), minutes=misses.minutes, **shares
-    )
+    all_of = (misses.miss, misses.use, misses.seen)
+    miss, use, seen = (np.concatenate(each)[:, columns] for each in all_of)
+    return Kept.against(miss, use, seen, triad=triad, mean_s=mean_s, windows=len(miss), minutes=misses.minutes)
