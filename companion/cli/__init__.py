@@ -74,7 +74,7 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 
 
 def _parser() -> Parser:
-    from companion.cli import client, ground, local, monitor, profile, recordings
+    from companion.cli import client, flight, ground, local, monitor, profile, recordings
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -151,6 +151,7 @@ def _parser() -> Parser:
     add("monitor", monitor.monitor, "watch the daemon until Ctrl-C")
     add("web-token", local.web_token, "where the page is, and the token that its buttons need")
     recordings.add_commands(add)
+    flight.add_commands(add)
     profile.add_command(add)
     ground.add_commands(commands, common)
     return parser

@@ -7,9 +7,12 @@ in them is what is left, in the vehicle's axes.
 from __future__ import annotations
 
 import contextlib
+import io
+import mmap
 import os
+import struct
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
@@ -22,6 +25,8 @@ from companion.replay.log import LAST_S, StillLog
 
 _ULOG: Final = b"ULog\x01\x12\x35"
 _DATAFLASH: Final = b"\xa3\x95\x80"
+_FMT_COLUMNS: Final = "Type,Length,Name,Format,Columns"
+_TELL_BYTES: Final = 1 << 24
 _US: Final = 1e-6
 _LARGEST: Final = 1e6
 """What is larger is no reading, in SI units."""
@@ -34,6 +39,13 @@ _CORRECTED: Final = (
     "the autopilot's offsets are taken off in it: what is found is what they leave, in the vehicle's axes"
 )
 _RAW: Final = "readings without the autopilot's offsets"
+
+Progress = Callable[[float], None]
+"""Told how much of a file has been read, from 0 to 1."""
+
+
+def _nobody(_share: float) -> None:
+    """Nobody wants to know."""
 
 
 def reader_of(path: Path) -> Callable[[Path], list[StillLog]] | None:
@@ -55,6 +67,23 @@ def read_ulog(path: Path) -> list[StillLog]:
     Raises:
         StorageError: one line: it cannot be read, or pyulog is not there.
     """
+    with ulog(path, ["sensor_combined", "sensor_gyro", "sensor_accel"]) as found:
+        data = {(each.name, int(each.multi_id)): each.data for each in found.data_list}
+        dropouts = len(found.dropouts)
+        logs = [log for log in _ulog_imus(path, data) if log is not None]
+    if not logs:
+        raise StorageError(f"{path}: no samples of an IMU in it")
+    notes = (f"{dropouts} gaps in it, in which PX4 could not write",) if dropouts else ()
+    return [msgspec.structs.replace(log, notes=(*log.notes, *notes)) for log in logs]
+
+
+@contextlib.contextmanager
+def ulog(path: Path, topics: list[str], progress: Progress = _nobody) -> Iterator[Any]:
+    """A ULog with these topics read, as pyulog has it; what is wrong inside is one line, too.
+
+    Raises:
+        StorageError: one line: it cannot be read, or pyulog is not there.
+    """
     try:
         from pyulog import ULog
     except ImportError:
@@ -72,16 +101,8 @@ def read_ulog(path: Path) -> list[StillLog]:
                     raise _EndlessError
                 super()._parse_nested_type(prefix_str, type_name, message_formats)
 
-    topics = ["sensor_combined", "sensor_gyro", "sensor_accel"]
     with _quietly(path), path.open("rb") as file:
-        found = Bounded(_Finite(file), topics)
-        data = {(each.name, int(each.multi_id)): each.data for each in found.data_list}
-        dropouts = len(found.dropouts)
-        logs = [log for log in _ulog_imus(path, data) if log is not None]
-    if not logs:
-        raise StorageError(f"{path}: no samples of an IMU in it")
-    notes = (f"{dropouts} gaps in it, in which PX4 could not write",) if dropouts else ()
-    return [msgspec.structs.replace(log, notes=(*log.notes, *notes)) for log in logs]
+        yield Bounded(_Finite(file, progress), topics)
 
 
 def _ulog_imus(path: Path, data: dict[tuple[str, int], dict[str, Any]]) -> Iterator[StillLog | None]:
@@ -105,6 +126,8 @@ def _ulog_imus(path: Path, data: dict[tuple[str, int], dict[str, Any]]) -> Itera
 
 _KINDS: Final = {"IMU": 0, "IMU2": 1, "IMU3": 2}
 """Messages and their instances; newer firmware has one kind, with the instance in it."""
+_IMUS: Final = 5
+"""More no board has: another number is damage."""
 _HEAD: Final = 3
 _FIELDS: Final = ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ")
 
@@ -115,30 +138,13 @@ def read_dataflash(path: Path) -> list[StillLog]:
     Raises:
         StorageError: one line: it cannot be read.
     """
-    from pymavlink.DFReader import DFReader_binary
-
     tables: dict[int, array[float]] = {}
     with _quietly(path):
-        log: Any = DFReader_binary.__new__(DFReader_binary)
-
-        def index(progress_callback: Any = None) -> None:
-            # The fast one, in C, says what it skips on the terminal, which nobody can catch; it is some 3 s of a
-            # gigabyte.
-            log.formats = _Formats(log.formats)
-            log.init_arrays(progress_callback)
-
-        log.init_arrays_fast = index
-        try:
-            log.__init__(str(path))  # where this fails it leaves the file open
-            while (message := log.recv_match(type=list(_KINDS))) is not None:
-                fields = message.to_dict()
-                instance = int(fields.get("I", _KINDS[fields["mavpackettype"]]))
-                row = (fields["TimeUS"] * _US, *(fields[name] for name in _FIELDS), fields.get("T", float("nan")))
+        for kind, fields in dataflash(path, _KINDS):
+            instance = int(fields.get("I", _KINDS[kind]))
+            row = (fields["TimeUS"] * _US, *(fields[name] for name in _FIELDS), fields.get("T", float("nan")))
+            if instance < _IMUS:
                 tables.setdefault(instance, array("d")).extend(row)
-        finally:
-            for opened in ("data_map", "filehandle"):
-                if hasattr(log, opened):
-                    getattr(log, opened).close()
     found = []
     for instance in sorted(tables):
         table = np.frombuffer(tables[instance]).reshape(-1, 8)
@@ -147,6 +153,79 @@ def read_dataflash(path: Path) -> list[StillLog]:
     if not found:
         raise StorageError(f"{path}: no samples of an IMU in it")
     return found
+
+
+def dataflash(path: Path, kinds: Collection[str], progress: Progress = _nobody) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The messages of these kinds in an ArduPilot log, one by one, so that memory does not grow with it.
+
+    The formats are pymavlink's; its index of a whole log would be larger than the log of a board may be.
+
+    Raises:
+        StorageError: one line: it cannot be read.
+    """
+    formats: dict[int, _Layout] = {}
+    _learn(formats, {"Type": _DATAFLASH[2], "Name": "FMT", "Length": 89, "Format": "BBnNZ", "Columns": _FMT_COLUMNS})
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            at, told, size = 0, 0, len(data)
+            while (at := _next(data, at, formats)) >= 0:
+                layout = formats[data[at + 2]]
+                if at - told > _TELL_BYTES:
+                    told = at
+                    progress(at / size)
+                if layout.name == "FMT":
+                    _learn(formats, layout.read(data, at))
+                elif layout.name in kinds:
+                    yield layout.name, layout.read(data, at)
+                at += layout.length
+    except (OSError, ValueError) as error:
+        raise StorageError(f"{path}: cannot be read: {error}") from None
+
+
+def _next(data: mmap.mmap, at: int, formats: dict[int, _Layout]) -> int:
+    """Where the next whole message begins; -1: none does."""
+    while True:
+        layout = formats.get(data[at + 2]) if data[at : at + 2] == _DATAFLASH[:2] and at + 2 < len(data) else None
+        if layout is not None and at + layout.length <= len(data):
+            return at
+        at = data.find(_DATAFLASH[:2], at + 1)
+        if at < 0:
+            return -1
+
+
+def _learn(formats: dict[int, _Layout], fields: dict[str, Any]) -> None:
+    """One more kind of message, if that is what they say."""
+    from pymavlink.DFReader import DFFormat
+
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            kind = DFFormat(*(fields[key] for key in ("Type", "Name", "Length", "Format", "Columns")))  # type: ignore[no-untyped-call]
+    except Exception:  # noqa: BLE001  - whatever it makes of a damaged one
+        return
+    found = _Layout(kind)
+    if found.holds:
+        formats[fields["Type"]] = found
+
+
+class _Layout:
+    """How the messages of one kind lie."""
+
+    def __init__(self, kind: Any) -> None:
+        self.name, self.length = str(kind.name), int(kind.len)
+        layout = struct.Struct(kind.msg_struct)
+        self.holds = layout.size + _HEAD == self.length
+        self._unpack = layout.unpack_from
+        self._fields = list(zip(kind.columns, kind.msg_mults, strict=False))
+
+    def read(self, data: mmap.mmap, at: int) -> dict[str, Any]:
+        """By field, in its unit."""
+        found: dict[str, Any] = {}
+        for (name, factor), value in zip(self._fields, self._unpack(data, at + _HEAD), strict=False):
+            if isinstance(value, bytes):
+                found[name] = value.split(b"\0", 1)[0].decode("utf-8", "replace")
+            else:
+                found[name] = value if factor is None else value * factor
+        return found
 
 
 def _log(path: Path, imu: str, t_s: Floats, readings: Floats, degc: Floats, note: str) -> StillLog | None:
@@ -181,27 +260,22 @@ class _EndlessError(Exception):
 class _Finite:
     """A file that can be read some times over, but not for ever: at the end of a damaged one pyulog goes back."""
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._left = _READ_TIMES * os.fstat(file.fileno()).st_size + _READ_LEAST
-        self._file = file
+    def __init__(self, file: BinaryIO, progress: Progress) -> None:
+        self._size = os.fstat(file.fileno()).st_size
+        self._left = _READ_TIMES * self._size + _READ_LEAST
+        self._file, self._progress, self._told = file, progress, 0
         self.seek, self.tell, self.close = file.seek, file.tell, file.close
 
     def read(self, size: int) -> bytes:
         """As any file; an empty read counts, too."""
         data = self._file.read(size)
         self._left -= max(len(data), 1)
+        if abs((at := self._file.tell()) - self._told) > _TELL_BYTES:
+            self._told = at
+            self._progress(min(at / self._size, 1.0))
         if self._left < 0:
             raise _EndlessError
         return data
-
-
-class _Formats(dict[int, Any]):
-    """Formats by number; a message of no length would be read at the same place for ever."""
-
-    def __setitem__(self, number: int, found: Any) -> None:
-        if found.len < _HEAD:
-            raise _EndlessError
-        super().__setitem__(number, found)
 
 
 @contextlib.contextmanager

@@ -218,11 +218,20 @@ def without_length() -> bytes:
     return named(0x80, 89, b"FMT") + named(0x81, 0, b"IMU") + b"\xa3\x95\x81" + bytes(2000)
 
 
-@pytest.mark.parametrize("data", [circling(), nested(), without_length()], ids=["circling", "nested", "no length"])
+ENDLESS = "damaged, or not of its kind: reading it comes to no end"
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [(circling(), ENDLESS), (nested(), ENDLESS), (without_length(), "no samples of an IMU in it")],
+    ids=["circling", "nested", "no length"],
+)
 @pytest.mark.usefixtures("little_memory")
-def test_a_log_without_end_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], data: bytes) -> None:
+def test_a_log_without_end_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], data: bytes, words: str
+) -> None:
     path = tmp_path / "log"
     path.write_bytes(data)
     assert companion(["replay", str(path)]) == 1
     said = capsys.readouterr()
-    assert said.err == f"companion: {path}: damaged, or not of its kind: reading it comes to no end\n"
+    assert said.err == f"companion: {path}: {words}\n"

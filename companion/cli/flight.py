@@ -1,0 +1,191 @@
+"""`companion flight`: what a log of the autopilot says of a flight."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from companion.cli.terminal import AddCommand, conclude, storage_path
+from companion.errors import StorageError
+from companion.physics.units import DEG_H, MG
+
+if TYPE_CHECKING:
+    from companion.flight.flight import Flight, ImuFlight, Knowledge
+    from companion.flight.inertial import Drift
+    from companion.flight.split import Term
+
+_TOLD_BYTES: Final = 1 << 25
+_WORTH: Final = {"gyro": 30.0, "accel": 1.5}
+"""deg/h and mg: smaller findings are nobody's worry."""
+
+
+def add_commands(add: AddCommand) -> None:
+    """Add it to the parser of the command line."""
+    command = add("flight", flight, "what a log of the autopilot says of a flight")
+    command.add_argument("file", type=Path, metavar="LOG", help="ArduPilot's .bin or PX4's .ulg")
+    command.add_argument(
+        "--offsets",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="compare with the offsets of a parameter file, as ground stations save it (may be repeated)",
+    )
+
+
+async def flight(options: argparse.Namespace) -> int:
+    """`companion flight`."""
+    from companion.flight.flight import flights
+    from companion.flight.logs import read
+
+    boots = read(options.file, _Progress(options.file))
+    known = _knowledge(options)
+    found = [(number, each) for number, boot in enumerate(boots) for each in await flights(boot, known)]
+    if not found:
+        raise StorageError(f"{options.file}: no attitude and position of an EKF3 (ArduPilot) or EKF2 (PX4) in it")
+    lines: list[str] = []
+    if len(boots) > 1:
+        lines.append(f"{len(boots)} starts of the autopilot in it, each by its own clock")
+    for number, each in found:
+        lines += _flight_lines(number, each)
+    answer = {"state": "done", "reason": "", "flights": [msgspec.to_builtins(each) for _, each in found]}
+    return conclude(options, answer, lines, good=True)
+
+
+class _Progress:
+    """Of a large file, a line that counts."""
+
+    def __init__(self, path: Path) -> None:
+        self._shown, self._stream = -1, sys.stderr
+        self._large = path.is_file() and path.stat().st_size > _TOLD_BYTES
+
+    def __call__(self, share: float) -> None:
+        if self._large and (now := int(share * 20.0) * 5) != self._shown:
+            self._shown = now
+            self._stream.write(f"reading: {now} %\n")
+            self._stream.flush()
+
+
+def _knowledge(options: argparse.Namespace) -> Knowledge:
+    from companion.flight.flight import Knowledge
+    from companion.flight.in_force import parameter_file
+    from companion.storage.learned import BiasStore
+    from companion.storage.records import RecordStore
+
+    directory = storage_path(options)
+    return Knowledge(
+        records=RecordStore(directory).history(),
+        biases=BiasStore(directory).all(),
+        others={path.stem: parameter_file(path) for path in options.offsets},
+    )
+
+
+def _flight_lines(number: int, found: Flight) -> list[str]:
+    stages = found.stages
+    when = f"flight of {found.began_at}" if found.began_at else "flight at an unknown time"
+    start = f"{when}: armed {stages.armed_s:.0f} s after start {number + 1} of the autopilot"
+    told = [
+        f"{what} {at_s - stages.armed_s:.0f} s"
+        for what, at_s in (
+            ("motors", stages.motors_s), ("take-off", stages.take_off_s), ("landing", stages.landing_s),
+            ("disarmed", stages.disarmed_s),
+        )
+        if at_s is not None
+    ]  # fmt: skip
+    lines = [start, f"  after arming: {', '.join(told) or 'nothing more is logged'}"]
+    if found.reference == "truth":
+        lines.append("  measured from the simulator's truth, not from the EKF")
+    lines += [f"  note: {note}" for note in found.notes]
+    for imu in found.imus:
+        lines += _imu_lines(imu)
+    return [*lines, *([f"next flight: {_hint(found)}"] if any(imu.drift for imu in found.imus) else [])]
+
+
+def _imu_lines(imu: ImuFlight) -> list[str]:
+    whose = (
+        f"offsets of the calibration of {imu.calibration}"
+        if imu.calibration
+        else "offsets of no calibration known here"
+    )
+    lines = [f"IMU {imu.imu}, {imu.rate_hz:.0f} Hz: {whose}"]
+    lines += [f"  note: {note}" for note in imu.notes]
+    if any(axis.in_flight for axis in imu.axes):
+        lines += [f"  {words}" for words in _table(imu)]
+    if "flown" in imu.drift:
+        lines += [f"  {words}" for words in _drift_lines(imu.drift)]
+    return lines
+
+
+_HEADS: Final = ("in the air", "EKF", "motors off", "temperature", "motors", "per m/s^2", "a minute")
+
+
+def _table(imu: ImuFlight) -> list[str]:
+    """What is known of every axis; what is known of none is named once."""
+    rows = [
+        (
+            axis.in_flight,
+            imu.ekf.get(axis.axis),
+            axis.turn_on,
+            axis.temperature,
+            axis.motors,
+            axis.vibration,
+            axis.trend,
+        )
+        for axis in imu.axes
+    ]
+    shown = [k for k in range(len(_HEADS)) if any(row[k] for row in rows)]
+    lines = [f"{'left over':13}" + "".join(f"{_HEADS[k]:>13}" for k in shown)]
+    for axis, row in zip(imu.axes, rows, strict=True):
+        unit, name, digits = (DEG_H, "deg/h", 0) if axis.axis.startswith("gyro") else (MG, "mg", 1)
+        lines.append(
+            f"{', '.join((axis.axis, name)):13}" + "".join(f"{_term(row[k], unit, digits):>13}" for k in shown)
+        )
+    lacking = [head for k, head in enumerate(_HEADS) if k not in shown]
+    lines += [f"not known: {', '.join(lacking)}"] if lacking else []
+    return [*lines, "accel x, y: not counted, a hover does not tell them from tilt"]
+
+
+def _term(term: Term | None, unit: float, digits: int) -> str:
+    if term is None:
+        return "?"
+    return f"{term.value / unit:+.{digits}f} ± {term.sigma / unit:.{digits}f}"
+
+
+def _drift_lines(drift: dict[str, list[Drift]]) -> list[str]:
+    """The figure that counts first."""
+    lines = []
+    for flown in drift["flown"]:
+        others = [
+            f"with the offsets of {name} {each.median_m:.1f} m"
+            for name, rows in drift.items()
+            if name != "flown"
+            for each in rows
+            if each.seconds == flown.seconds
+        ]
+        own = f"{flown.median_m:.1f} m (95 %: {flown.worst_m:.1f} m, {flown.starts} starts)"
+        lines.append("; ".join([f"{flown.seconds:.0f} s without GNSS: {own}", *others]))
+    return lines
+
+
+def _hint(found: Flight) -> str:
+    """The largest thing that is surely there."""
+    worst: tuple[float, str] = (0.0, "nothing to do: what the offsets left is small or not surely there")
+    for imu in found.imus:
+        for axis in imu.axes:
+            half = axis.axis.split(" ")[0]
+            unit, name, digits = (DEG_H, "deg/h", 0) if half == "gyro" else (MG, "mg", 1)
+            for term, what, remedy in (
+                (axis.motors, "of rectification at hover throttle", "its damping"),
+                (axis.turn_on, "before the motors", "calibrate nearer to the take-off"),
+            ):
+                if term is None or abs(term.value) < 2.0 * term.sigma:
+                    continue
+                size = abs(term.value) / unit / _WORTH[half]
+                if size > max(worst[0], 1.0):
+                    words = f"IMU {imu.imu} {axis.axis}: {abs(term.value) / unit:.{digits}f} {name} {what}: {remedy}"
+                    worst = size, words
+    return worst[1]

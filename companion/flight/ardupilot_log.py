@@ -1,0 +1,244 @@
+"""ArduPilot's dataflash log of flights (LogStructure.h of AP_Logger, AP_InertialSensor, AP_NavEKF3 and AP_AHRS)."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from companion.flight.inertial import Navigation
+from companion.flight.log import Boot, Estimated, FlownImu, Place, Table, changes
+from companion.physics.frames import Floats
+from companion.physics.units import DEG
+from companion.replay.autopilot_logs import Progress, dataflash
+
+_US: Final = 1e-6
+_AXES: Final = "XYZ"
+_ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
+    "IMU": ("I", ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ", "T")),
+    "GYR": ("I", ("GyrX", "GyrY", "GyrZ")),
+    "ACC": ("I", ("AccX", "AccY", "AccZ")),
+    "VIBE": ("IMU", ("VibeX", "VibeY", "VibeZ")),
+    "XKF1": ("C", ("VN", "VE", "VD", "PN", "PE", "PD", "GX", "GY", "GZ")),
+    "XKF2": ("C", ("AX", "AY", "AZ")),
+    "XKQ": ("C", ("Q1", "Q2", "Q3", "Q4")),
+    "XKV1": ("C", ("V10", "V11")),
+    "XKV2": ("C", ("V12", "V13", "V14", "V15")),
+    "XKF4": ("C", ("PI",)),
+    "XKT": ("C", ("EKFMin", "EKFMax")),
+    "SIM": ("", ("Q1", "Q2", "Q3", "Q4")),
+    "SIM2": ("", ("VN", "VE", "VD", "PN", "PE", "PD")),
+    "GPS": ("I", ("Status", "GWk", "GMS", "Lat", "Alt")),
+    "ARM": ("", ("ArmState",)),
+    "EV": ("", ("Id",)),
+    "RCOU": ("", tuple(f"C{k}" for k in range(1, 15))),
+}
+"""By message, the field with its instance, and what is read of it."""
+_OLD: Final = {"IMU2": ("IMU", 1), "IMU3": ("IMU", 2)}
+"""Up to 4.0."""
+_IMUS: Final = 5
+_BACK_S: Final = 5.0
+"""By so much the clock goes back only at a start."""
+_GPS_UNIX_S: Final = 315964800.0
+_LEAP_S: Final = 18.0
+_GYRO_STEP_RAD_S: Final = 0.01 * DEG
+_ACCEL_STEP_M_S2: Final = 0.01
+"""XKF1 and XKF2 hold biases in whole hundredths, cut off toward zero: zero is anything within one of them."""
+_EVENTS: Final = {"armed": {10: True, 11: False}, "airborne": {28: True, 18: False}}
+_MOTOR_FUNCTIONS: Final = (*range(33, 41), *range(82, 86), 70)
+_TURNING_US: Final = 30.0
+
+
+class _Start:
+    """What one start of the autopilot has logged, message by message."""
+
+    def __init__(self) -> None:
+        self.tables: dict[tuple[str, int], Table] = defaultdict(Table)
+        self.parameters: list[tuple[float, str, float]] = []
+
+    def rows(self, kind: str, instance: int = 0) -> Floats:
+        """(n, 1 + fields), the time first."""
+        table = self.tables.get((kind, instance))
+        return np.zeros((0, 1 + len(_ROWS[kind][1]))) if table is None else table.rows()
+
+    def instances(self, kind: str) -> list[int]:
+        """That have logged it."""
+        return sorted(instance for name, instance in self.tables if name == kind)
+
+
+def read(path: Path, progress: Progress) -> list[Boot]:
+    """Each start of the autopilot in it.
+
+    Raises:
+        StorageError: one line: it cannot be read.
+    """
+    starts = [_Start()]
+    last_s = -math.inf
+    for kind, fields in dataflash(path, {*_ROWS, *_OLD, "PARM"}, progress):
+        try:
+            at_s = float(fields["TimeUS"]) * _US
+            if at_s < last_s - _BACK_S:
+                starts.append(_Start())
+            last_s = at_s
+            _take(starts[-1], kind, at_s, fields)
+        except (KeyError, TypeError, ValueError):
+            continue  # of another layout, or damaged
+    return [_boot(start) for start in starts]
+
+
+def _take(start: _Start, kind: str, at_s: float, fields: dict[str, Any]) -> None:
+    if kind == "PARM":
+        start.parameters.append((at_s, str(fields["Name"]), float(fields["Value"])))
+        return
+    name, instance = _OLD.get(kind, (kind, 0))
+    key, columns = _ROWS[name]
+    found = int(fields.get(key, instance)) if key else 0
+    if 0 <= found < _IMUS:
+        start.tables[name, found].add(at_s, *(float(fields.get(column, math.nan)) for column in columns))
+
+
+def _boot(start: _Start) -> Boot:
+    parameters = {name: value for _, name, value in start.parameters}
+    cores = _cores(parameters)
+    primary = _primary(start)
+    simulated = bool(start.instances("SIM"))
+    return Boot(
+        firmware="ardupilot",
+        imus=tuple(_imu(start, number, parameters, cores) for number in start.instances("IMU")),
+        solution=_navigation(start.rows("XKQ", primary), start.rows("XKF1", primary)[:, :7]),
+        truth=_navigation(start.rows("SIM"), start.rows("SIM2")),
+        armed=_events(start, "armed"),
+        motors=_motors(start.rows("RCOU"), parameters),
+        airborne=_events(start, "airborne"),
+        parameters=tuple(start.parameters),
+        unix_offset_s=_unix_offset(start.rows("GPS")),
+        place=_place(start.rows("GPS")),
+        # Its own physics know neither.
+        earth_turns=not simulated,
+        standard_gravity=simulated,
+        notes=("simulated: the Earth does not turn in it",) if simulated else (),
+    )
+
+
+def _cores(parameters: dict[str, float]) -> list[int]:
+    """By EKF core, its IMU from 0."""
+    mask = round(parameters.get("EK3_IMU_MASK", 3.0))
+    return [k for k in range(_IMUS) if mask >> k & 1]
+
+
+def _primary(start: _Start) -> int:
+    rows = [start.rows("XKF4", core) for core in start.instances("XKF4")]
+    told = np.concatenate([each[:, 1] for each in rows]) if rows else np.zeros(0)
+    told = told[(told >= 0) & (told < _IMUS)].astype(np.int64)
+    return int(np.bincount(told).argmax()) if len(told) else 0
+
+
+def _navigation(attitude: Floats, moving: Floats) -> Navigation | None:
+    """On the times of both: velocity and position in between."""
+    if len(attitude) < 2 or len(moving) < 2:
+        return None
+    both = attitude[(attitude[:, 0] >= moving[0, 0]) & (attitude[:, 0] <= moving[-1, 0])]
+    both = both[np.isfinite(both).all(axis=1) & (np.linalg.norm(both[:, 1:], axis=1) > 0.5)]
+    if len(both) < 2:
+        return None
+    states = np.column_stack([np.interp(both[:, 0], moving[:, 0], column) for column in moving[:, 1:7].T])
+    return Navigation(both[:, 0], both[:, 1:5], states[:, :3], states[:, 3:])
+
+
+def _imu(start: _Start, instance: int, parameters: dict[str, float], cores: list[int]) -> FlownImu:
+    rows = start.rows("IMU", instance)
+    raw = _raw(start.rows("GYR", instance), start.rows("ACC", instance))
+    used = raw if len(raw) > len(rows) else rows[:, :7]
+    used = used[np.isfinite(used).all(axis=1)]
+    vibration = start.rows("VIBE", instance)
+    number = instance + 1
+    prefix, suffix = (f"INS{number}_", "") if number > 3 else ("INS_", "" if number == 1 else str(number))
+    ids = [parameters.get(f"{prefix}{half}{suffix}_ID") for half in ("GYR", "ACC")]
+    gyro_id, accel_id = (None if each is None else round(each) for each in ids)
+    return FlownImu(
+        number=number, t_s=used[:, 0], readings=used[:, 1:7], means=start.tables["IMU", instance].each > 1,
+        gyro_id=gyro_id, accel_id=accel_id,
+        degc=rows[np.isfinite(rows[:, 7])][:, [0, 7]],
+        vibration=np.column_stack([vibration[:, 0], np.linalg.norm(vibration[:, 1:4], axis=1)]),
+        estimated=_estimated(start, cores.index(instance)) if instance in cores else None,
+    )  # fmt: skip
+
+
+def _raw(gyro: Floats, accel: Floats) -> Floats:
+    """GYR and ACC at the sensor's own rate, corrected too; forces at the gyro's times."""
+    if len(gyro) < 2 or len(accel) < 2:
+        return np.zeros((0, 7))
+    forces = [np.interp(gyro[:, 0], accel[:, 0], column) for column in accel[:, 1:4].T]
+    return np.column_stack([gyro, *forces])
+
+
+def _estimated(start: _Start, core: int) -> Estimated | None:
+    gyro, accel = start.rows("XKF1", core), start.rows("XKF2", core)
+    if not len(gyro) or not len(accel):
+        return None
+    t_s = gyro[:, 0]
+    steps = start.rows("XKT", core)
+    step_s = float(steps[:, 1:3].mean()) if len(steps) else 0.01
+    gyro_rad_s = gyro[:, 7:10] * DEG
+    accel_m_s2 = np.column_stack([np.interp(t_s, accel[:, 0], column) for column in accel[:, 1:4].T])
+    # It logs those of the core that it flies by; the others are tuned alike.
+    of = next((one for one in (core, *start.instances("XKV2")) if ("XKV2", one) in start.tables), core)
+    first, second = start.rows("XKV1", of), start.rows("XKV2", of)
+    known = len(first) and len(second) and step_s > 0.0
+    gyro_sigma, accel_sigma = np.full(gyro_rad_s.shape, np.nan), np.full(gyro_rad_s.shape, np.nan)
+    if known:
+        # Of increments of one step of the filter.
+        columns = [(first, 1), (first, 2), *((second, k) for k in range(1, 5))]
+        sigmas = [np.sqrt(np.maximum(np.interp(t_s, rows[:, 0], rows[:, k]), 0.0)) / step_s for rows, k in columns]
+        gyro_sigma, accel_sigma = np.column_stack(sigmas[:3]), np.column_stack(sigmas[3:])
+    return Estimated(
+        t_s,
+        _whole(gyro_rad_s, _GYRO_STEP_RAD_S),
+        np.hypot(gyro_sigma, _cut(gyro_rad_s, _GYRO_STEP_RAD_S)),
+        _whole(accel_m_s2, _ACCEL_STEP_M_S2),
+        np.hypot(accel_sigma, _cut(accel_m_s2, _ACCEL_STEP_M_S2)),
+    )
+
+
+def _whole(cut: Floats, step: float) -> Floats:
+    """The middle of what was cut off to this."""
+    return np.asarray(cut + 0.5 * step * np.sign(cut))
+
+
+def _cut(cut: Floats, step: float) -> Floats:
+    return np.where(np.abs(cut) < 0.5 * step, 2.0 * step, step) / math.sqrt(12.0)
+
+
+def _events(start: _Start, what: str) -> tuple[tuple[float, bool], ...]:
+    rows = start.rows("ARM") if what == "armed" else np.zeros((0, 2))
+    if len(rows):
+        return changes(rows[:, 0], rows[:, 1] > 0.5)
+    known = _EVENTS[what]
+    told = [(at_s, known[int(event)]) for at_s, event in start.rows("EV") if int(event) in known]
+    return changes([at_s for at_s, _ in told], [state for _, state in told])
+
+
+def _motors(outputs: Floats, parameters: dict[str, float]) -> tuple[tuple[float, bool], ...]:
+    """Whether any turns, by what is sent to them."""
+    used = [k for k in range(1, 15) if round(parameters.get(f"SERVO{k}_FUNCTION", 0.0)) in _MOTOR_FUNCTIONS]
+    if not len(outputs) or not used:
+        return ()
+    least = np.array([parameters.get(f"SERVO{k}_MIN", 1000.0) for k in used])
+    least = np.maximum(np.minimum(least, parameters.get("MOT_PWM_MIN", 3000.0) or 3000.0), 800.0)
+    return changes(outputs[:, 0], (outputs[:, used] > least + _TURNING_US).any(axis=1))
+
+
+def _unix_offset(gps: Floats) -> float | None:
+    fixed = gps[(gps[:, 1] >= 3) & (gps[:, 2] > 0)]
+    if not len(fixed):
+        return None
+    unix_s = _GPS_UNIX_S + fixed[:, 2] * 604800.0 + fixed[:, 3] * 1e-3 - _LEAP_S
+    return float(np.sort(unix_s - fixed[:, 0])[len(fixed) // 2])
+
+
+def _place(gps: Floats) -> Place | None:
+    fixed = gps[gps[:, 1] >= 3]
+    return Place(float(fixed[-1, 4]), float(fixed[-1, 5])) if len(fixed) else None

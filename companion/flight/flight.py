@@ -1,0 +1,300 @@
+"""One flight of a log: what was in force, what the biases did, how far free inertial navigation would have come."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.calibration.noise.allan import PROFILES, noise_profile
+from companion.calibration.noise.robust import median
+from companion.calibration.records.record import Record
+from companion.calibration.solution.prior import curve_of
+from companion.calibration.temperature.curve import Curve
+from companion.errors import AutopilotError
+from companion.flight import inertial
+from companion.flight.in_force import calibration_in, moment, with_others, written_in
+from companion.flight.inertial import Drift, Increments, Navigation, Window, World
+from companion.flight.log import Boot, FlownImu
+from companion.flight.split import LENGTH_S, SHORT_S, Split, Term, split
+from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
+from companion.physics.frames import Floats
+from companion.samples import Triad
+from companion.storage.learned import KnownImu
+
+SPANS_S: Final = (10.0, 30.0, 60.0)
+_STANDARD_M_S2: Final = 9.80665
+_SETTLED_S: Final = 3.0
+"""After the take-off, and before the landing."""
+_STOOD_S: Final = 30.0
+"""Before the motors, at most."""
+_STILL_RAD_S: Final = 0.005
+_OUTLIER: Final = 6.0
+_LIFTED_M: Final = 1.5
+_LEAST_AIR_S: Final = 15.0
+_SLOW_HZ: Final = 80.0
+
+
+class Stages(msgspec.Struct, frozen=True):
+    """Of a flight, in s of the autopilot's clock; None where the log does not tell."""
+
+    armed_s: float
+    motors_s: float | None
+    take_off_s: float | None
+    landing_s: float | None
+    disarmed_s: float | None
+
+
+class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU in one flight."""
+
+    imu: int
+    rate_hz: float
+    calibration: str | None
+    """`started_at` of the record whose offsets it flew with."""
+    set_gyro_rad_s: tuple[float, ...] | None
+    set_accel_m_s2: tuple[float, ...] | None
+    """The offsets in force, in the IMU's own axes."""
+    ekf: dict[str, Term | None]
+    """By axis, the bias that the EKF had in the air."""
+    axes: tuple[Split, ...]
+    drift: dict[str, list[Drift]]
+    """Without aid, by whose offsets: `flown`, `before`, those of files."""
+    notes: tuple[str, ...]
+
+
+class Flight(msgspec.Struct, frozen=True, kw_only=True):
+    """From an arming to the disarming after it."""
+
+    began_at: str | None
+    stages: Stages
+    reference: str
+    """What the drift is measured from: "ekf", or "truth" of a simulator."""
+    imus: tuple[ImuFlight, ...]
+    notes: tuple[str, ...]
+
+
+class Knowledge(msgspec.Struct, frozen=True, kw_only=True):
+    """What the companion has on disk."""
+
+    records: Sequence[Record] = ()
+    """The newest first."""
+    biases: Mapping[str, KnownImu] = {}
+    others: Mapping[str, Mapping[str, float]] = {}
+    """Sets of offsets to compare with, by name."""
+
+
+async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
+    """All flights of one start of the autopilot, in order."""
+    reference = boot.truth or boot.solution
+    if reference is None:
+        return []
+    world = _world(boot)
+    # Filters delay the readings; what is compared with the solution must be of the same moment.
+    late: dict[int, Increments] = {}
+    for imu in boot.imus:
+        if len(imu.t_s) > 2:
+            found = inertial.increments(imu.t_s, imu.readings, means=imu.means)
+            late[imu.number] = found._replace(t_s=found.t_s - inertial.lag_s(found, reference))
+    return [
+        Flight(
+            began_at=moment(None if boot.unix_offset_s is None else boot.unix_offset_s + stages.armed_s),
+            stages=stages,
+            reference="ekf" if boot.truth is None else "truth",
+            imus=tuple(
+                [
+                    await _imu(boot, imu, late[imu.number], stages, (reference, world), known)
+                    for imu in boot.imus
+                    if imu.number in late
+                ]
+            ),
+            notes=boot.notes,
+        )
+        for stages in _stages(boot, reference)
+    ]
+
+
+def _world(boot: Boot) -> World:
+    place, gravity = boot.place, _STANDARD_M_S2
+    if place is not None and not boot.standard_gravity:
+        gravity = gravity_m_s2(place.latitude_deg, place.height_m)
+    turns = boot.earth_turns and place is not None
+    return World(gravity, earth_rate_ned_rad_s(place.latitude_deg) if place is not None and turns else np.zeros(3))
+
+
+def _stages(boot: Boot, reference: Navigation) -> list[Stages]:
+    """One of each arming; where none is logged, the whole log is one."""
+    armed = [at_s for at_s, state in boot.armed if state] or [float(reference.t_s[0])]
+    found = []
+    for k, armed_s in enumerate(armed):
+        next_s = armed[k + 1] if k + 1 < len(armed) else math.inf
+        disarmed_s = next((at_s for at_s, state in boot.armed if not state and armed_s < at_s < next_s), None)
+        end_s = disarmed_s if disarmed_s is not None else min(next_s, float(reference.t_s[-1]))
+        motors_s = next((at_s for at_s, state in boot.motors if state and armed_s - 1.0 <= at_s < end_s), None)
+        air = [(at_s, state) for at_s, state in boot.airborne if armed_s <= at_s <= end_s + 1.0]
+        up_s = next((at_s for at_s, state in air if state), None)
+        down_s = next((at_s for at_s, state in reversed(air) if not state), None) if up_s is not None else None
+        if up_s is None:
+            up_s, down_s = _lifted(reference, armed_s, end_s)
+        found.append(Stages(armed_s, motors_s, up_s, down_s, disarmed_s))
+    return found
+
+
+def _lifted(reference: Navigation, armed_s: float, end_s: float) -> tuple[float | None, float | None]:
+    """By height: of aircraft that log no take-off."""
+    inside = (reference.t_s >= armed_s) & (reference.t_s <= end_s)
+    t_s, down = reference.t_s[inside], reference.position[inside, 2]
+    high = np.flatnonzero(down < down[0] - _LIFTED_M) if len(down) else np.zeros(0, dtype=np.int64)
+    return (float(t_s[high[0]]), float(t_s[high[-1]])) if len(high) else (None, None)
+
+
+async def _imu(
+    boot: Boot, imu: FlownImu, found: Increments, stages: Stages, seen: tuple[Navigation, World], known: Knowledge
+) -> ImuFlight:
+    notes: list[str] = []
+    reference, world = seen
+    calibration = None
+    try:
+        calibration = await calibration_in(boot.firmware, boot.parameters_at(stages.armed_s), imu)
+    except AutopilotError as error:
+        notes.append(str(error))
+    match = None if calibration is None else written_in(calibration, known.records)
+    up_s, down_s = stages.take_off_s, stages.landing_s or stages.disarmed_s or float(reference.t_s[-1])
+    in_air = None if up_s is None else (up_s + _SETTLED_S, down_s - _SETTLED_S)
+    if in_air is None or in_air[1] - in_air[0] < _LEAST_AIR_S:
+        in_air = None
+        notes.append("it did not fly, or too shortly to tell anything")
+    if imu.rate_hz < _SLOW_HZ:
+        notes.append(f"logged at {imu.rate_hz:.0f} Hz only: LOG_BITMASK with IMU_FAST would tell more")
+    ground = _stood(found, stages, reference, world)
+    flown = [] if in_air is None else _kept(inertial.windows(found, reference, world, in_air, LENGTH_S))
+    drift: dict[str, list[Drift]] = {}
+    if in_air is not None:
+        offsets = _others(calibration, match and match[1], known.others, found, in_air)
+        drift = inertial.drift(found, reference, world, in_air, SPANS_S, offsets)
+    return ImuFlight(
+        imu=imu.number,
+        rate_hz=imu.rate_hz,
+        calibration=None if match is None else match[0].started_at,
+        set_gyro_rad_s=None if calibration is None else calibration.gyro_offset_rad_s,
+        set_accel_m_s2=None if calibration is None else calibration.accel_offset_m_s2,
+        ekf=_ekf(imu, in_air),
+        axes=tuple(split(ground, flown, _levels(imu, flown), _warmth(imu, calibration, known, stages, in_air))),
+        drift=drift,
+        notes=tuple(notes),
+    )
+
+
+def _stood(found: Increments, stages: Stages, reference: Navigation, world: World) -> list[Window]:
+    """Before the motors it stood still, if it did: better than any solution knows."""
+    end_s = (stages.motors_s or stages.armed_s) - 0.5
+    start_s = max(end_s - _STOOD_S, float(reference.t_s[0]))
+    if end_s - start_s < 3 * SHORT_S:
+        return []
+    times = np.arange(start_s - 1.0, end_s + 1.0, 0.25)
+    attitude = reference.attitude[min(int(np.searchsorted(reference.t_s, end_s)), len(reference.t_s) - 1)]
+    still = Navigation(times, np.tile(attitude, (len(times), 1)), np.zeros((len(times), 3)), np.zeros((len(times), 3)))
+    rows = _kept(inertial.windows(found, still, world, (start_s, end_s), SHORT_S))
+    rates = np.array([one.gyro_rad_s for one in rows]).reshape(-1, 3)
+    return rows if len(rows) and rates.std(axis=0).max() < _STILL_RAD_S else []
+
+
+def _kept(rows: Sequence[Window]) -> list[Window]:
+    """Without those in which the solution has jumped: a heading was found anew, say."""
+    if len(rows) < 4:
+        return list(rows)
+    values = np.array([[*one.gyro_rad_s, one.down_m_s2] for one in rows])
+    off = np.abs(values - [median(column) for column in values.T])
+    usual = np.maximum([1.4826 * median(column) for column in off.T], 1e-9)
+    return [one for one, far in zip(rows, (off > _OUTLIER * usual).any(axis=1), strict=True) if not far]
+
+
+def _levels(imu: FlownImu, rows: Sequence[Window]) -> Floats | None:
+    """Vibration in each window."""
+    if len(imu.vibration) < 2:
+        return None
+    edges = [imu.vibration[:, 0].searchsorted([one.t_s - LENGTH_S / 2, one.t_s + LENGTH_S / 2]) for one in rows]
+    return np.array([imu.vibration[a : max(b, a + 1), 1].mean() for a, b in edges])
+
+
+def _ekf(imu: FlownImu, in_air: tuple[float, float] | None) -> dict[str, Term | None]:
+    """The latter half of the flight, when it has had time to find them; sigma is its own, and what the log cuts off."""
+    names = [f"{half} {axis}" for half in ("gyro", "accel") for axis in "xyz"]
+    found = imu.estimated
+    if found is None or in_air is None:
+        return dict.fromkeys(names)
+    late = (found.t_s >= 0.5 * (in_air[0] + in_air[1])) & (found.t_s <= in_air[1])
+    if not late.any():
+        return dict.fromkeys(names)
+    values = np.hstack([found.gyro_rad_s[late], found.accel_m_s2[late]])
+    sigmas = np.hstack([found.gyro_sigma_rad_s[late], found.accel_sigma_m_s2[late]])
+    return {
+        name: Term(float(values[:, k].mean()), float(math.hypot(values[:, k].std(), sigmas[:, k].mean())))
+        if np.isfinite(sigmas[:, k]).all()
+        else None
+        for k, name in enumerate(names)
+    }
+
+
+def _others(
+    calibration: ImuCalibration | None,
+    before: Mapping[str, float] | None,
+    others: Mapping[str, Mapping[str, float]],
+    found: Increments,
+    in_air: tuple[float, float],
+) -> dict[str, tuple[Floats, Floats]]:
+    nothing = np.zeros(3), np.zeros(3)
+    if calibration is None:
+        return {"flown": nothing}
+    inside = (found.t_s >= in_air[0]) & (found.t_s <= in_air[1])
+    accel = found.velocity[inside].sum(axis=0) / max(float(found.dt_s[inside].sum()), 1e-9)
+    sets = {**({"before": before} if before else {}), **others}
+    return {"flown": nothing, **{name: with_others(calibration, each, accel) for name, each in sets.items()}}
+
+
+def _warmth(
+    imu: FlownImu,
+    calibration: ImuCalibration | None,
+    known: Knowledge,
+    stages: Stages,
+    in_air: tuple[float, float] | None,
+) -> list[Term | None]:
+    """By axis, what the learnt curve says of the step from before the motors to the air."""
+    nothing: list[Term | None] = [None] * 4
+    if calibration is None or in_air is None or not len(imu.degc):
+        return nothing
+    own = next((one for one in known.biases.values() if _is_same(one.identity, imu, calibration)), None)
+    start_s = stages.motors_s or stages.armed_s
+    then, now = (
+        imu.degc[(imu.degc[:, 0] >= a) & (imu.degc[:, 0] <= b), 1] for a, b in ((start_s - _STOOD_S, start_s), in_air)
+    )
+    if own is None or not len(then) or not len(now):
+        return nothing
+    part = own.identity.get("profile", "")
+    profile = noise_profile(part if part in PROFILES else None)
+    found: list[Term | None] = []
+    for half, model, axes in (("gyro", profile.gyro, (0, 1, 2)), ("accel", profile.accel, (2,))):
+        curve: Curve | None = curve_of(own.points, half, model)  # type: ignore[arg-type]
+        found += _steps(curve, half, calibration, (float(then.mean()), float(now.mean())), axes)  # type: ignore[arg-type]
+    return found
+
+
+def _steps(
+    curve: Curve | None, half: Triad, calibration: ImuCalibration, degc: tuple[float, float], axes: tuple[int, ...]
+) -> list[Term | None]:
+    then, now = degc
+    if curve is None or not curve.order or max(map(curve.beyond_k, degc)) > 0.0:
+        return [None] * len(axes)
+    step, variance = curve.change((then, 0.0), (now, 0.0))
+    step = step - calibration.thermal_change(half, then, now)
+    return [Term(float(step[k]), math.sqrt(float(variance[k]))) for k in axes]
+
+
+def _is_same(identity: Mapping[str, str], imu: FlownImu, calibration: ImuCalibration) -> bool:
+    if identity.get("source") != "autopilot" or identity.get("instance") != str(imu.number):
+        return False
+    return identity.get("gyro", "") in ("", str(calibration.gyro_id))

@@ -1,0 +1,290 @@
+"""Free inertial navigation over pieces of a flight: what the firmware's corrected readings alone make of it.
+
+Between any two times the readings are integrated once, from the log's beginning; a start somewhere in the flight is
+then one turn and one shift of that, so that many starts cost no more than one (method section 3, "propagation").
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+import msgspec
+import numpy as np
+
+from companion.physics.frames import Floats, rotations, running_products
+
+STEP_S: Final = 0.02
+"""Increments are put together to this; coning and sculling within are kept."""
+GAP_S: Final = 0.25
+"""A longer hole in the readings is flown over by no start."""
+_LAG_SPAN_S: Final = 0.3
+_MOST_LAG_S: Final = 0.1
+
+
+class Navigation(NamedTuple):
+    """An estimator's solution, or the truth of a simulator."""
+
+    t_s: Floats
+    attitude: Floats
+    """(n, 4) quaternions, body FRD to NED."""
+    velocity: Floats
+    """(n, 3) m/s, NED."""
+    position: Floats
+    """(n, 3) m, NED."""
+
+    def at(self, t_s: Floats) -> tuple[Floats, Floats, Floats]:
+        """Rotation matrices (m, 3, 3) body to NED, velocities and positions (m, 3) in between."""
+        q = _between(t_s, self.t_s, _one_sign(self.attitude))
+        return matrices(q), _between(t_s, self.t_s, self.velocity), _between(t_s, self.t_s, self.position)
+
+
+class World(NamedTuple):
+    """Where it flies: a simulator may leave out that the Earth turns."""
+
+    gravity_m_s2: float
+    earth_rate_ned_rad_s: Floats
+
+
+class Increments(NamedTuple):
+    """What the sensors have added up, sample by sample."""
+
+    t_s: Floats
+    """(n,) the ends."""
+    dt_s: Floats
+    angle: Floats
+    """(n, 3) rad, body axes at the beginning of each."""
+    velocity: Floats
+    """(n, 3) m/s, likewise."""
+
+    def shifted(self, rate_rad_s: Floats, force_m_s2: Floats) -> Increments:
+        """With so much more in the output, (3,) or (n, 3)."""
+        dt = self.dt_s[:, None]
+        turned = rate_rad_s * dt
+        # What turns more has its force summed up in other axes.
+        velocity = self.velocity + force_m_s2 * dt + 0.5 * np.cross(turned, self.velocity)
+        return self._replace(angle=self.angle + turned, velocity=velocity)
+
+
+class Drift(msgspec.Struct, frozen=True):
+    """How far free inertial navigation is from the solution after a time."""
+
+    seconds: float
+    starts: int
+    median_m: float
+    worst_m: float
+    """In one start of twenty it is more."""
+
+
+def increments(t_s: Floats, readings: Floats, *, means: bool) -> Increments:
+    """Of readings (n, 6), rad/s and m/s^2: means since the one before, or instants between which they go straight."""
+    dt = np.diff(t_s)
+    rates = readings[1:] if means else 0.5 * (readings[1:] + readings[:-1])
+    grown = rates * dt[:, None]
+    bins = np.floor((t_s[1:] - t_s[0]) / STEP_S)
+    starts = np.flatnonzero(np.diff(bins, prepend=-1.0))
+    counts = np.diff(np.append(starts, len(bins)))
+
+    def before(values: Floats) -> Floats:
+        """What of a bin has come before each of its samples."""
+        sums = np.cumsum(values, axis=0) - values
+        return np.asarray(sums - np.repeat(sums[starts], counts, axis=0))
+
+    alpha, nu = grown[:, :3], grown[:, 3:]
+    turned = before(alpha)
+    coned = alpha + 0.5 * np.cross(turned, alpha)
+    sculled = nu + np.cross(turned + 0.5 * alpha, nu)
+    ends = starts + counts - 1
+    return Increments(
+        t_s[1:][ends],
+        np.add.reduceat(dt, starts),
+        np.add.reduceat(coned, starts, axis=0),
+        np.add.reduceat(sculled, starts, axis=0),
+    )
+
+
+def without_earth(found: Increments, solution: Navigation, world: World) -> Increments:
+    """Without what the Earth's turning adds: seen from the ground."""
+    rate = world.earth_rate_ned_rad_s
+    if not rate.any():
+        return found
+    turn, velocity, _ = solution.at(found.t_s - 0.5 * found.dt_s)
+    coriolis = np.cross(2.0 * rate, velocity)
+    return found.shifted(-np.einsum("nji,j->ni", turn, rate), np.einsum("nji,nj->ni", turn, coriolis))
+
+
+def lag_s(found: Increments, solution: Navigation) -> float:
+    """By how much the readings come behind the solution's attitude: filters delay them.
+
+    Over a short while readings that are late have turned by less than the solution has, by the rate at its end less
+    that at its beginning, times the delay.
+    """
+    if len(found.t_s) < 3:
+        return 0.0
+    span = max(round(_LAG_SPAN_S / float(np.mean(found.dt_s))), 1)
+    rate = found.angle / found.dt_s[:, None]
+    k = np.arange(1, len(found.t_s) - span, span)
+    turn, _, _ = solution.at(found.t_s)
+    carried = running_products(rotations(found.angle))
+    off = vectors(_transposed(turn[k + span]) @ turn[k] @ _transposed(carried[k]) @ carried[k + span])
+    change = 0.5 * (rate[k + span] + rate[k + span - 1] - rate[k] - rate[k - 1])
+    off, change = off - off.mean(axis=0), change - change.mean(axis=0)
+    power = float(np.square(change).sum())
+    found_s = -float((off * change).sum()) / power if power > 0.0 else 0.0
+    return found_s if abs(found_s) < _MOST_LAG_S else 0.0
+
+
+class _Carried(NamedTuple):
+    """Integrated from the log's beginning, in the axes in which the body lay then."""
+
+    turn: Floats
+    velocity: Floats
+    position: Floats
+
+
+def _carry(found: Increments) -> _Carried:
+    """(n + 1, ...) before the first increment and after each."""
+    turn = np.concatenate([np.eye(3)[None], running_products(rotations(found.angle))])
+    added = np.einsum("nij,nj->ni", turn[:-1], found.velocity)
+    velocity = np.concatenate([np.zeros((1, 3)), np.cumsum(added, axis=0)])
+    moved = (velocity[:-1] + 0.5 * added) * found.dt_s[:, None]
+    return _Carried(turn, velocity, np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)]))
+
+
+def drift(
+    found: Increments,
+    solution: Navigation,
+    world: World,
+    within_s: tuple[float, float],
+    spans_s: Sequence[float],
+    offsets: Mapping[str, tuple[Floats, Floats]],
+    *,
+    every_s: float = 1.0,
+) -> dict[str, list[Drift]]:
+    """Free inertial navigation from many starts within a time, by offsets.
+
+    Args:
+        found: readings, corrected by the firmware, on the solution's clock.
+        solution: where each start begins, and what its end is compared with.
+        world: gravity, and the Earth's rate.
+        within_s: first start and last end.
+        spans_s: how long each is without aid.
+        offsets: by name, what the output has more with those offsets, rad/s and m/s^2.
+        every_s: between two starts.
+
+    Returns:
+        By name, one of each span that fits in without a gap in the readings.
+    """
+    clean = without_earth(found, solution, world)
+    # A node is the beginning of an increment; the last one ends the last of them.
+    nodes = np.concatenate([found.t_s - found.dt_s, found.t_s[-1:]])
+    turn, velocity, position = solution.at(nodes)
+    holes = np.concatenate([[0], np.cumsum(found.dt_s > GAP_S)])
+    known = np.searchsorted(solution.t_s, nodes)
+    stale = np.diff(solution.t_s, prepend=-np.inf, append=np.inf)[known] > 2.0
+    first, last = max(within_s[0], float(nodes[0])), min(within_s[1], float(nodes[-1]))
+    results: dict[str, list[Drift]] = {}
+    for name, (gyro, accel) in offsets.items():
+        carried = _carry(clean.shifted(gyro, accel))
+        rows = []
+        for span_s in spans_s:
+            k = np.searchsorted(nodes, np.arange(first, last - span_s + 1e-9, every_s))
+            j = np.minimum(np.searchsorted(nodes, nodes[k] + span_s), len(nodes) - 1)
+            good = (holes[j] == holes[k]) & ~stale[k] & ~stale[j] & (j > k)
+            k, j = k[good], j[good]
+            if not len(k):
+                continue
+            t = (nodes[j] - nodes[k])[:, None]
+            back = turn[k] @ _transposed(carried.turn[k])
+            inertial = carried.position[j] - carried.position[k] - carried.velocity[k] * t
+            there = position[k] + velocity[k] * t + np.einsum("nij,nj->ni", back, inertial)
+            there += [0.0, 0.0, 0.5 * world.gravity_m_s2] * t**2
+            off = np.sort(np.linalg.norm(there - position[j], axis=1))
+            rows.append(Drift(span_s, len(off), float(_at(off, 0.5)), float(_at(off, 0.95))))
+        results[name] = rows
+    return results
+
+
+class Window(NamedTuple):
+    """What the readings of some seconds have too much, by the solution; axes of the body."""
+
+    t_s: float
+    """Its middle."""
+    gyro_rad_s: Floats
+    down_m_s2: float
+    """Along the vertical, counted along body z."""
+    tilt: Floats
+    """(2,) how much of x and of y lies along the vertical, for one of z."""
+
+
+def windows(
+    found: Increments, solution: Navigation, world: World, within_s: tuple[float, float], length_s: float
+) -> list[Window]:
+    """Side by side, without those that the readings or the solution have holes in."""
+    clean = without_earth(found, solution, world)
+    nodes = np.concatenate([found.t_s - found.dt_s, found.t_s[-1:]])
+    turn, velocity, _ = solution.at(nodes)
+    carried = _carry(clean)
+    # The solution's attitude turns specific force, so that what the gyros have wrong does not tilt it.
+    added = np.einsum("nj,nj->n", (0.5 * (turn[:-1] + turn[1:]))[:, 2], clean.velocity)
+    down = np.concatenate([[0.0], np.cumsum(added)])
+    along = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(carried.turn[:-1] * found.dt_s[:, None, None], axis=0)])
+    vertical = np.concatenate([np.zeros((1, 3)), np.cumsum(turn[:-1, 2] * found.dt_s[:, None], axis=0)])
+    holes = np.concatenate([[0], np.cumsum(found.dt_s > GAP_S)])
+    edges = np.arange(max(within_s[0], float(nodes[0])), min(within_s[1], float(nodes[-1])) + 1e-9, length_s)
+    at = np.searchsorted(nodes, edges)
+    at = at[at < len(nodes)]
+    rows = []
+    for k, j in itertools.pairwise(at):
+        inside = np.searchsorted(solution.t_s, nodes[[k, j]])
+        t = float(nodes[j] - nodes[k])
+        x, y, level = (vertical[j] - vertical[k]) / max(t, 1e-9)
+        if holes[j] != holes[k] or inside[1] - inside[0] < length_s or t <= 0.0 or abs(level) < 0.5:
+            continue
+        turned = carried.turn[k].T @ carried.turn[j]
+        off = vectors((turn[j].T @ turn[k] @ turned)[None])[0]
+        gyro = np.linalg.solve(carried.turn[j].T @ (along[j] - along[k]), off)
+        more = (down[j] - down[k] + world.gravity_m_s2 * t - (velocity[j] - velocity[k])[2]) / t
+        rows.append(Window(float(0.5 * (nodes[k] + nodes[j])), gyro, float(more / level), np.array([x, y]) / level))
+    return rows
+
+
+def matrices(q: Floats) -> Floats:
+    """(n, 3, 3) of quaternions (n, 4) of any length."""
+    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def vectors(turns: Floats) -> Floats:
+    """(n, 3) rotation vectors of matrices (n, 3, 3) that turn by less than half a circle."""
+    skew = 0.5 * (turns - _transposed(turns))
+    sine = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
+    size = np.linalg.norm(sine, axis=1)
+    angle = np.arctan2(size, 0.5 * (np.trace(turns, axis1=1, axis2=2) - 1.0))
+    return np.asarray(sine * np.where(size > 1e-9, angle / np.maximum(size, 1e-12), 1.0)[:, None])
+
+
+def _transposed(turns: Floats) -> Floats:
+    return np.swapaxes(turns, -1, -2)
+
+
+def _one_sign(q: Floats) -> Floats:
+    """Of q and -q, which are the same, the one next to the one before."""
+    if not len(q):
+        return q
+    flips = np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
+    return np.asarray(q * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
+
+
+def _between(t_s: Floats, known_s: Floats, values: Floats) -> Floats:
+    return np.column_stack([np.interp(t_s, known_s, column) for column in values.T])
+
+
+def _at(ascending: Floats, share: float) -> float:
+    return float(ascending[min(int(share * len(ascending)), len(ascending) - 1)])

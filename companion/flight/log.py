@@ -1,0 +1,137 @@
+"""A log of an autopilot as what a flight is judged by, whichever firmware wrote it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.autopilot.vehicle.vehicle import Firmware
+from companion.flight.inertial import Navigation
+from companion.physics.frames import Floats
+
+MOST_ROWS: Final = 1 << 20
+"""Of a message and instance: 40 minutes at 400 Hz; of a longer log each two, four ... are one mean."""
+_CHUNK: Final = 4096
+
+
+class Table:
+    """Rows of a message, the time in s first; its memory is bounded."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[float, ...]] = []
+        self._chunks: list[Floats] = []
+        self._count = 0
+        self.each = 1
+        """So many messages are one row."""
+
+    def add(self, *row: float) -> None:
+        """One more."""
+        self._rows.append(row)
+        if len(self._rows) < _CHUNK * self.each:
+            return
+        self._chunks.append(_means(np.array(self._rows), self.each))
+        self._rows = []
+        self._count += _CHUNK
+        if self._count >= MOST_ROWS:
+            self._chunks, self._count, self.each = (
+                [_means(np.concatenate(self._chunks), 2)],
+                self._count // 2,
+                2 * self.each,
+            )
+
+    def rows(self) -> Floats:
+        """(n, ...) whole numbers only, ascending in time."""
+        left = len(self._rows) - len(self._rows) % self.each
+        last = [_means(np.array(self._rows[:left]), self.each)] if left else []
+        if not self._chunks and not last:
+            return np.zeros((0, 1))
+        found = np.concatenate([*self._chunks, *last])
+        found = found[np.isfinite(found[:, 0])]
+        ahead = np.concatenate([[True], found[1:, 0] > np.maximum.accumulate(found[:, 0])[:-1]])
+        return np.asarray(found[ahead[: len(found)]])
+
+
+def _means(rows: Floats, each: int) -> Floats:
+    return np.asarray(rows.reshape(-1, each, rows.shape[1]).mean(axis=1))
+
+
+class Estimated(msgspec.Struct, frozen=True):
+    """Biases as an EKF has them: values and sigmas are (n, 3), NaN where it says nothing."""
+
+    t_s: Floats
+    gyro_rad_s: Floats
+    gyro_sigma_rad_s: Floats
+    accel_m_s2: Floats
+    accel_sigma_m_s2: Floats
+
+
+class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU in one log."""
+
+    number: int
+    """From 1, as in the configuration."""
+    t_s: Floats
+    readings: Floats
+    """(n, 6) rad/s and m/s^2, corrected by the firmware, vehicle FRD."""
+    means: bool
+    """Each is the mean since the one before, not an instant."""
+    gyro_id: int | None = None
+    accel_id: int | None = None
+    degc: Floats = np.zeros((0, 2))
+    """Time and temperature."""
+    vibration: Floats = np.zeros((0, 2))
+    """Time and level, m/s^2."""
+    estimated: Estimated | None = None
+
+    @property
+    def rate_hz(self) -> float:
+        """Of its readings."""
+        return (len(self.t_s) - 1) / float(self.t_s[-1] - self.t_s[0]) if len(self.t_s) > 1 else 0.0
+
+
+class Place(msgspec.Struct, frozen=True):
+    """Where it flew."""
+
+    latitude_deg: float
+    height_m: float
+
+
+class Boot(msgspec.Struct, frozen=True, kw_only=True):
+    """What one start of the autopilot has logged; times in s on its clock."""
+
+    firmware: Firmware
+    imus: tuple[FlownImu, ...]
+    solution: Navigation | None
+    truth: Navigation | None = None
+    """Of a simulator."""
+    armed: tuple[tuple[float, bool], ...] = ()
+    motors: tuple[tuple[float, bool], ...] = ()
+    airborne: tuple[tuple[float, bool], ...] = ()
+    parameters: tuple[tuple[float, str, float], ...] = ()
+    unix_offset_s: float | None = None
+    """UTC less its clock."""
+    place: Place | None = None
+    earth_turns: bool = True
+    standard_gravity: bool = False
+    notes: tuple[str, ...] = ()
+
+    def parameters_at(self, t_s: float) -> dict[str, float]:
+        """As they were then; of one that was told only later, its first value."""
+        found: dict[str, float] = {}
+        for told_s, name, value in self.parameters:
+            if told_s <= t_s or name not in found:
+                found[name] = value
+        return found
+
+
+def changes(t_s: Sequence[float] | Floats, states: Sequence[bool] | NDArray[Any]) -> tuple[tuple[float, bool], ...]:
+    """The first state and every other one after it."""
+    found: list[tuple[float, bool]] = []
+    for at_s, state in zip(t_s, states, strict=True):
+        if not found or found[-1][1] != bool(state):
+            found.append((float(at_s), bool(state)))
+    return tuple(found)

@@ -1,0 +1,155 @@
+"""What the biases did in flight, split into what was there before the motors, and what they and time have added.
+
+By least squares over windows side by side. What a window is off by comes from the solution's own errors at its two
+ends, which the next window has with the other sign: taken as independent they make sigma rather too large. What the
+solution can be wrong in for a whole flight without any window showing it stands below, and is in every sigma.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.calibration.noise.robust import median
+from companion.flight.inertial import Window
+from companion.physics.frames import Floats
+from companion.physics.units import DEG, MG
+
+LENGTH_S: Final = 10.0
+SHORT_S: Final = 2.0
+"""Before the motors, where there is little time and little noise."""
+_LEAST: Final = 3
+_ATTITUDE_RAD: Final = (0.3 * DEG, 0.3 * DEG, 2.0 * DEG)
+"""Of a solution with GNSS and a compass: tilt and heading may be off by this at one end of a stretch."""
+_VELOCITY_M_S: Final = 0.1
+_GRAVITY_M_S2: Final = 0.003
+"""Gravity where it flies against the normal one, and the accelerometer's scale at one g."""
+_AT_REST: Final = 0.02
+"""Of both, while it stands."""
+_LEVEL_M_S2: Final = 5.0 * MG
+"""What the other two accelerometers may be off by; where it tilts, that is in the vertical."""
+_LEAST_SPREAD: Final = 0.15
+"""Share of its mean by which vibration has to vary for a slope."""
+_LEAST_TREND_S: Final = 60.0
+
+
+class Term(msgspec.Struct, frozen=True):
+    """A part of a bias with one sigma; rad/s or m/s^2."""
+
+    value: float
+    sigma: float
+
+
+class Split(msgspec.Struct, frozen=True, kw_only=True):
+    """One axis of one IMU, over what the offsets in force left; None: the log does not carry it."""
+
+    axis: str
+    in_flight: Term | None
+    """Its mean in the air."""
+    turn_on: Term | None
+    """Before the motors."""
+    temperature: Term | None
+    """From there to the mean in the air, by the learnt curve."""
+    motors: Term | None
+    """The step at their start: vibration rectification, and temperature where no curve is known."""
+    vibration: Term | None
+    """For each m/s^2 of vibration level."""
+    trend: Term | None
+    """A minute of flight."""
+
+
+def split(
+    before: Sequence[Window],
+    flight: Sequence[Window],
+    levels: Floats | None,
+    warmth: Sequence[Term | None],
+) -> list[Split]:
+    """The gyro's three axes and the accelerometer's vertical one.
+
+    Args:
+        before: windows before the motors.
+        flight: windows in the air.
+        levels: (n,) vibration in each of those, m/s^2; None: not known.
+        warmth: by axis, what temperature explains of the step at the motors' start; None: not known.
+    """
+    found = []
+    for k, axis in enumerate(("gyro x", "gyro y", "gyro z", "accel z")):
+        ground, air = (np.array([_value(one, k) for one in each]) for each in (before, flight))
+        end = _ATTITUDE_RAD[k] if k < 3 else _VELOCITY_M_S
+        constant = 0.0 if k < 3 else _GRAVITY_M_S2
+        aside = 0.0 if k < 3 else _LEVEL_M_S2
+        turn_on = _mean(ground, _span(before, SHORT_S), _AT_REST * end, math.hypot(constant, aside * _tilt(before)))
+        in_flight = _mean(air, _span(flight, LENGTH_S), end, math.hypot(constant, aside * _tilt(flight)))
+        of_degc = warmth[k]
+        motors = None
+        if turn_on is not None and in_flight is not None:
+            by_degc = of_degc or Term(0.0, 0.0)
+            # Gravity and scale are the same before and after.
+            sigma = np.sqrt(max(turn_on.sigma**2 + in_flight.sigma**2 - 2.0 * constant**2, 0.0) + by_degc.sigma**2)
+            motors = Term(in_flight.value - turn_on.value - by_degc.value, float(sigma))
+        slope, trend = _slopes(air, flight, levels, end, aside)
+        found.append(
+            Split(
+                axis=axis, in_flight=in_flight, turn_on=turn_on, temperature=of_degc if motors else None,
+                motors=motors, vibration=slope, trend=trend,
+            )
+        )  # fmt: skip
+    return found
+
+
+def _value(window: Window, k: int) -> float:
+    return float(window.gyro_rad_s[k]) if k < 3 else window.down_m_s2
+
+
+def _tilt(windows: Sequence[Window]) -> float:
+    """Root mean square of how x and y lie along the vertical."""
+    return math.sqrt(float(np.mean([one.tilt @ one.tilt for one in windows]))) if windows else 0.0
+
+
+def _span(windows: Sequence[Window], length_s: float) -> float:
+    return len(windows) * length_s
+
+
+def _mean(values: Floats, span_s: float, end: float, constant: float) -> Term | None:
+    """Of windows; `end` is what the solution may be off by at either end of them all, `constant` what it always is."""
+    if len(values) < _LEAST:
+        return None
+    freedom = len(values) - 1
+    scatter = float(values.std(ddof=1)) / np.sqrt(len(values)) * _student(freedom)
+    sigma = np.sqrt(scatter**2 + 2.0 * (end / span_s) ** 2 + constant**2)
+    return Term(float(values.mean()), float(sigma))
+
+
+def _slopes(
+    values: Floats, windows: Sequence[Window], levels: Floats | None, end: float, aside: float
+) -> tuple[Term | None, Term | None]:
+    """Against vibration, and a minute; each only where the flight has enough of it."""
+    times = np.array([one.t_s for one in windows])
+    columns = {}
+    if len(times) > _LEAST and np.ptp(times) >= _LEAST_TREND_S:
+        columns["trend"] = (times - times.mean()) / 60.0
+    if levels is not None and len(levels) and levels.std() > _LEAST_SPREAD * abs(median(levels)):
+        columns["vibration"] = levels - levels.mean()
+    freedom = len(values) - 1 - len(columns)
+    if not columns or freedom < _LEAST:
+        return None, None
+    design = np.column_stack([np.ones(len(values)), *columns.values()])
+    fit, _, rank, _ = np.linalg.lstsq(design, values, rcond=None)
+    if rank < design.shape[1]:
+        return None, None
+    left = values - design @ fit
+    variance = float(left @ left) / freedom * _student(freedom) ** 2
+    # The solution's own wandering over minutes, by the same columns.
+    wander = math.hypot(end / LENGTH_S / math.sqrt(len(values)), aside * _tilt(windows))
+    sigmas = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * (variance + wander**2))
+    terms = {name: Term(float(fit[1 + k]), float(sigmas[1 + k])) for k, name in enumerate(columns)}
+    return terms.get("vibration"), terms.get("trend")
+
+
+def _student(freedom: int) -> float:
+    """By how much two sigma of few samples are wider than of many: 97.7 % of Student's distribution, approximated."""
+    return 1.0 + 1.4 / freedom + 2.2 / freedom**2

@@ -1,0 +1,190 @@
+"""`companion flight` on logs of ArduPilot and PX4, whole ones and others."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.calibration.records.record import ImuRecord, Record, WrittenParameter
+from companion.cli import main as companion
+from companion.physics.units import DEG_H, MG
+from companion.storage.records import RecordStore
+from tests.support.flown import Flown, dataflash, fly, messages, parameters
+
+GYRO_DEG_H, ACCEL_MG, STEP_MG = (300.0, -200.0, 100.0), (3.0, -2.0, 4.0), 5.0
+BEGAN = "2026-10-11T08:00:00+00:00"
+
+
+@pytest.fixture(scope="module")
+def flown() -> Flown:
+    return fly(
+        gyro_rad_s=[each * DEG_H for each in GYRO_DEG_H],
+        accel_m_s2=[each * MG for each in ACCEL_MG],
+        step_m_s2=STEP_MG * MG,
+        rate_hz=100.0,
+        white=(20.0 * DEG_H, 0.1 * MG),
+    )
+
+
+@pytest.fixture(scope="module")
+def log(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return dataflash(tmp_path_factory.mktemp("log") / "00000007.BIN", messages(flown, parameters()))
+
+
+def storage(folder: Path) -> list[str]:
+    """A configuration with a history of its own."""
+    path = folder / "companion.toml"
+    imu = '[[imu]]\nname = "fc"\nsource = "autopilot"\n'
+    path.write_text(f'[mavlink]\nurl = "udpin:127.0.0.1:14550"\n[storage]\ndirectory = "{folder}"\n{imu}')
+    return ["-c", str(path)]
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, dict[str, Any]]:
+    code = companion(["flight", "--json", *map(str, arguments)])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def record(values: dict[str, float], before: dict[str, float]) -> Record:
+    written = {
+        name: WrittenParameter(before=before[name], after=value, read_back=value, outcome="verified")
+        for name, value in values.items()
+    }
+    nothing = dict.fromkeys(
+        ("temperature_degc", "gyro_bias_rad_s", "gyro_sigma_stat_rad_s", "gyro_sigma_use_rad_s", "accel_bias_m_s2",
+         "accel_sigma_stat_m_s2", "accel_sigma_use_m_s2", "covariance", "residual_gyro_rad_s", "residual_accel_m_s2")
+    )  # fmt: skip
+    imu = ImuRecord(name="fc", samples=6000, written=written, **nothing)  # type: ignore[arg-type]
+    return Record(
+        state="done", reason="", warnings=(), started_at=BEGAN, duration_s=60.0, pose=None, site=None, imus=(imu,),
+        system_id=1,
+    )  # fmt: skip
+
+
+def test_a_flight_is_told_with_what_its_calibration_was_worth(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    offsets = {f"INS_GYROFFS_{axis}": 0.001 for axis in "XYZ"} | {f"INS_ACCOFFS_{axis}": 0.02 for axis in "XYZ"}
+    # Before, 1000 deg/h more and 20 mg less were taken off.
+    before = {
+        name: value + (1000.0 * DEG_H if "GYR" in name else -20.0 * MG if name.endswith("X") else 0.0)
+        for name, value in offsets.items()
+    }
+    RecordStore(tmp_path).save(record(offsets, before))
+    # A later one of other offsets is not the one.
+    RecordStore(tmp_path).save(record({"INS_GYROFFS_X": 0.5}, before))
+    right = tmp_path / "right.param"
+    values = {
+        f"INS_{name}OFFS_{axis}": offset + bias * unit
+        for name, offset, biases, unit in (("GYR", 0.001, GYRO_DEG_H, DEG_H), ("ACC", 0.02, ACCEL_MG, MG))
+        for axis, bias in zip("XYZ", biases, strict=True)
+    }
+    values["INS_ACCOFFS_Z"] += STEP_MG * MG
+    right.write_text("# saved by hand\n" + "".join(f"{name},{value:.9g}\n" for name, value in values.items()))
+    code, answer = said(capsys, log, "--offsets", right, *storage(tmp_path))
+    assert code == 0
+    (flight,) = answer["flights"]
+    assert flight["stages"] == {
+        "armed_s": 64.0, "motors_s": pytest.approx(65.0, abs=0.3), "take_off_s": 67.0, "landing_s": 240.0,
+        "disarmed_s": 242.0,
+    }  # fmt: skip
+    assert flight["began_at"] == "2026-10-11T00:00:46+00:00"
+    assert flight["reference"] == "ekf"
+    (imu,) = flight["imus"]
+    assert imu["calibration"] == BEGAN
+    found = {axis["axis"]: axis for axis in imu["axes"]}
+    for axis, bias in zip("xyz", GYRO_DEG_H, strict=True):
+        term = found[f"gyro {axis}"]["turn_on"]
+        assert abs(term["value"] / DEG_H - bias) < 2.0 * term["sigma"] / DEG_H < 30.0
+    motors = found["accel z"]["motors"]
+    assert abs(motors["value"] / MG - STEP_MG) < 2.0 * motors["sigma"] / MG < 2.0
+    assert set(imu["drift"]) == {"flown", "before", "right"}
+    at_30 = {name: next(row for row in rows if row["seconds"] == 30.0) for name, rows in imu["drift"].items()}
+    # 300 deg/h alone: g w t^3 / 6.
+    assert 60.0 < at_30["flown"]["median_m"] < 200.0
+    assert at_30["before"]["median_m"] > 2.0 * at_30["flown"]["median_m"]
+    # White noise of 20 deg/h/rtHz: some metres.
+    assert at_30["right"]["median_m"] < 8.0
+
+
+def test_people_read_the_figure_that_counts(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert companion(["flight", str(log), *storage(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "IMU 1, 100 Hz: offsets of no calibration known here\n" in out
+    assert "30 s without GNSS: " in out
+    assert "accel x, y: not counted, a hover does not tell them from tilt\n" in out
+    assert max(map(len, out.splitlines())) <= 100
+    assert out.splitlines()[-1].startswith("next flight: IMU 1 gyro x: ")
+
+
+def test_several_starts_in_one_file_are_each_by_their_own_clock(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = messages(flown, parameters())
+    code, answer = said(capsys, dataflash(tmp_path / "two.bin", [*one, *one]), *storage(tmp_path))
+    assert code == 0
+    assert len(answer["flights"]) == 2
+    assert answer["flights"][0]["imus"] == answer["flights"][1]["imus"]
+    assert companion(["flight", str(tmp_path / "two.bin"), *storage(tmp_path)]) == 0
+    assert capsys.readouterr().out.startswith("2 starts of the autopilot in it, each by its own clock\n")
+
+
+def test_a_log_that_begins_at_arming_does_not_know_what_was_before(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = dataflash(tmp_path / "armed.bin", messages(flown, parameters(), from_s=64.0))
+    code, answer = said(capsys, path, *storage(tmp_path))
+    assert code == 0
+    (imu,) = answer["flights"][0]["imus"]
+    assert all(axis["turn_on"] is None and axis["motors"] is None for axis in imu["axes"])
+    assert all(axis["in_flight"] is not None for axis in imu["axes"])
+
+
+@pytest.mark.parametrize(
+    ("left_out", "words"),
+    [
+        ({"XKQ"}, "no attitude and position of an EKF3 (ArduPilot) or EKF2 (PX4) in it"),
+        ({"IMU"}, "no samples of an IMU in it"),
+    ],
+)
+def test_a_log_without_what_it_takes_is_one_line(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], left_out: set[str], words: str
+) -> None:
+    kept = [each for each in messages(flown, parameters()) if each[0] not in left_out]
+    path = dataflash(tmp_path / "x.bin", kept)
+    assert companion(["flight", str(path), *storage(tmp_path)]) == 1
+    assert capsys.readouterr().err == f"companion: {path}: {words}\n"
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "no log of ArduPilot (.bin) or PX4 (.ulg)"),
+        (b"%PDF-1.4 and more", "no log of ArduPilot (.bin) or PX4 (.ulg)"),
+        (b"\xa3\x95\x80" + bytes(7), "no samples of an IMU in it"),
+        (b"ULogEnc\x01" + bytes(100), "encrypted by PX4: decrypt it first (Tools/log_encryption of PX4)"),
+    ],
+    ids=["empty", "foreign", "beginning", "encrypted"],
+)
+def test_another_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], data: bytes, words: str) -> None:
+    path = tmp_path / "log"
+    path.write_bytes(data)
+    assert companion(["flight", str(path), *storage(tmp_path)]) == 1
+    assert capsys.readouterr().err == f"companion: {path}: {words}\n"
+
+
+def test_a_truncated_and_damaged_log_is_read_as_far_as_it_goes(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = bytearray(log.read_bytes()[: log.stat().st_size * 2 // 3])
+    data[len(data) // 2 : len(data) // 2 + 3000] = bytes(3000)
+    path = tmp_path / "cut.bin"
+    path.write_bytes(bytes(data))
+    code, answer = said(capsys, path, *storage(tmp_path))
+    assert code == 0
+    (flight,) = answer["flights"]
+    assert flight["stages"]["landing_s"] is None
+    assert flight["stages"]["disarmed_s"] is None
+    assert flight["imus"][0]["drift"]["flown"]
