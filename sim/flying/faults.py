@@ -20,6 +20,8 @@ DRIFT_DEG_S = 3.0
 LIE_DEG = 40.0
 STEP_S = 0.05
 POWERLESS_S = 20.0
+RESTARTED_S = 1.0
+"""What a service manager waits before it starts it anew."""
 
 
 class Aloft(Protocol):
@@ -82,14 +84,17 @@ def _turn_compass(on: Aloft, degrees: float) -> None:
     device.heading_error_deg += degrees
 
 
-async def _board_without_power(on: Aloft) -> None:
-    on.signal(signal.SIGKILL)
+def _killed_for(seconds: float) -> Callable[[Aloft], Awaitable[None]]:
+    async def strike(on: Aloft) -> None:
+        on.signal(signal.SIGKILL)
 
-    async def comes_back() -> None:
-        await asyncio.sleep(POWERLESS_S)
-        await on.start_daemon()
+        async def comes_back() -> None:
+            await asyncio.sleep(seconds)
+            await on.start_daemon()
 
-    on.in_background(comes_back())
+        on.in_background(comes_back())
+
+    return strike
 
 
 async def _own_compass_lies(on: Aloft) -> None:
@@ -118,5 +123,6 @@ FAULTS = {
     "compass-drift": Fault(f"its compass turns by {DRIFT_DEG_S:g} deg/s", _compass_drifts),
     "compass-lies": Fault(f"its compass lies by {LIE_DEG:g} deg", _compass_lies),
     "own-compass": Fault("the autopilot's own compass is turned by 45 deg, and then kill -9", _own_compass_lies),
-    "board": Fault(f"its board has no power, and starts again after {POWERLESS_S:g} s", _board_without_power),
+    "restart": Fault(f"kill -9 of the daemon, started anew after {RESTARTED_S:g} s", _killed_for(RESTARTED_S)),
+    "board": Fault(f"its board has no power, and starts again after {POWERLESS_S:g} s", _killed_for(POWERLESS_S)),
 }

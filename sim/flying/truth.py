@@ -129,10 +129,12 @@ class FlyingAircraft(VirtualAircraft):
     def _moving(self, t_s: Array) -> Truth:
         angles, _ = self._euler(t_s)
         earth = np.array([body_from_ned(*row) @ self._earth_rate_ned for row in angles])
+        at_rest = np.array([-(body_from_ned(*row) @ self._gravity_ned) for row in angles])
         if self._count < 2:
-            return Truth(earth, np.array([-(body_from_ned(*row) @ self._gravity_ned) for row in angles]))
+            return Truth(earth, at_rest)
         both = self._columns(np.concatenate([t_s - MEAN_S, t_s]), slice(_OWN, _PUSHED.stop))
         passed = both[len(t_s) :] - both[: len(t_s)]
         # In the wall's time for rates, in the firmware's own for forces: gravity does not change with its speed.
-        own_s = np.maximum(passed[:, :1], 1e-6)
-        return Truth(earth + passed[:, 4:7] / MEAN_S, passed[:, 7:10] / own_s)
+        # Before the first state after a start nothing has passed.
+        forces = np.where(passed[:, :1] > 1e-6, passed[:, 7:10] / np.maximum(passed[:, :1], 1e-6), at_rest)
+        return Truth(earth + passed[:, 4:7] / MEAN_S, forces)

@@ -61,6 +61,12 @@ def test_it_stands_as_it_was_put_down_until_it_is_told_otherwise() -> None:
     assert aircraft.truth_at(1.0).force_m_s2 == pytest.approx([0.0, 0.0, -aircraft.site.gravity_m_s2])
 
 
+def test_what_is_asked_for_before_its_first_state_is_at_rest() -> None:
+    """A device that is a little behind, right after a restart of the firmware."""
+    aircraft = turning(1.0, 1.0)
+    assert aircraft.truth_at(-0.5).force_m_s2 == pytest.approx([0.0, 0.0, -aircraft.site.gravity_m_s2])
+
+
 def test_angles_of_a_quaternion() -> None:
     from scipy.spatial.transform import Rotation
 
