@@ -18,7 +18,6 @@ from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.calibration.seconds.counting import Counted, TurnCounter
 from companion.calibration.stillness.gates import STILL, ImuGate, PoseGate, Verdict
 from companion.calibration.stillness.stretch import Lag, Settling
-from companion.calibration.turning.level import ImuKind
 from companion.calibration.turning.watch import Turn, TurnWatch
 from companion.physics.frames import Array
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
@@ -245,16 +244,7 @@ class Intake(ABC):
         self._inputs[imu.name] = imu
         steps = (imu.gyro_step_rad_s, imu.accel_step_m_s2)
         gate = ImuGate(imu.name, imu.profile, steps, sways=self._deck is not None)
-        self._turns.set_imu(
-            ImuKind(
-                name=imu.name,
-                rotation=imu.rotation,
-                gyro=imu.profile.gyro,
-                accel=imu.profile.accel,
-                gyro_step_rad_s=imu.gyro_step_rad_s,
-                accel_step_m_s2=imu.accel_step_m_s2,
-            )
-        )
+        self._turns.set_imu(imu.name, imu.rotation, imu.profile, steps)
         known = self._imus.get(imu.name)
         if self._deck is not None:
             self._deck.set_imu(imu)

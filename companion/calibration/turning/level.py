@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from companion.calibration.noise.allan import AllanModel, floor_variance
+from companion.calibration.noise.allan import AllanModel, NoiseProfile, floor_variance
 from companion.calibration.noise.slope import FEWEST, Slope, fit_slope, hidden_by_steps
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.seconds.recent import Recent
@@ -44,18 +44,6 @@ HINT_SIGMAS: Final = 2.0
 ACROSS_SIGMAS: Final = 4.0
 ACROSS_SHARE: Final = 0.25
 """A turn about the vertical shows across it by the error of the vertical only, some degrees."""
-
-
-class ImuKind(msgspec.Struct, frozen=True, kw_only=True):
-    """What must be known of an IMU to judge its level."""
-
-    name: str
-    rotation: Matrix
-    """Sensor to vehicle FRD."""
-    gyro: AllanModel
-    accel: AllanModel
-    gyro_step_rad_s: float = 0.0
-    accel_step_m_s2: float = 0.0
 
 
 class Change(msgspec.Struct, frozen=True, kw_only=True):
@@ -138,13 +126,16 @@ class _Level(msgspec.Struct):
 
 
 class ImuLevel:
-    """One IMU: its seconds of the stretch under way, and its level at rest from before them."""
+    """One IMU: its seconds of the stretch under way, and its level at rest from before them.
 
-    def __init__(self, kind: ImuKind, span: int) -> None:
-        self._kind = kind
+    `rotation`: sensor to vehicle FRD; `steps`: those of its stream, rad/s and m/s^2, 0 for floats.
+    """
+
+    def __init__(self, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float], span: int) -> None:
+        self._gyro, self._steps = profile.gyro, steps
         self._memory = _REMEMBERED * span
-        self._turned = np.asarray(kind.rotation, dtype=np.float64)
-        self._least = np.repeat([[m.white, m.flicker, m.walk] for m in (kind.gyro, kind.accel)], 3, axis=0).T
+        self._turned = np.asarray(rotation, dtype=np.float64)
+        self._least = np.repeat([[m.white, m.flicker, m.walk] for m in (profile.gyro, profile.accel)], 3, axis=0).T
         """N, B and K of its six channels."""
         self._white = 0.0
         self._spread = np.zeros(6)
@@ -221,14 +212,13 @@ class ImuLevel:
         """Against its level, if there is one, and against gravity, over the seconds of this stretch."""
         if self._measured < FEWEST:
             return None
-        kind, seconds = self._kind, self._seconds.rows
+        seconds = self._seconds.rows
         latest = seconds[-self._measured :]
         slots, rows = latest[:, _SLOT].astype(np.int64), latest[:, _READINGS]
         # The vertical by its accelerometers, (3,) vehicle FRD; good to some degrees, and enough here.
         force = rows[:, 3:].mean(axis=0)
         down = np.asarray(-force / _length(force))
-        steps = (kind.gyro_step_rad_s, kind.accel_step_m_s2)
-        hidden = [hidden_by_steps(steps[k // 3], float(self._spread[k])) for k in range(6)]
+        hidden = [hidden_by_steps(self._steps[k // 3], float(self._spread[k])) for k in range(6)]
         own = len(slots) >= TELLS_NOISE_S
         slope = fit_slope(
             slots,
@@ -243,20 +233,20 @@ class ImuLevel:
             self._white = float(slope.white[:3].max())
         white = float(np.sqrt(np.square(down) @ np.square(slope.white[:3])))
         step = None
-        if kind.gyro_step_rad_s == 0.0 and len(seconds) >= RESTED_S + LEVEL_S:
-            step = _step(seconds[:, _SLOT], seconds[:, _RATES] @ down, white, kind.gyro, len(slots))
+        if self._steps[0] == 0.0 and len(seconds) >= RESTED_S + LEVEL_S:
+            step = _step(seconds[:, _SLOT], seconds[:, _RATES] @ down, white, self._gyro, len(slots))
         return Look(change=change, tilting=_tilting(force, slope), step=step, white=white)
 
     def _change(self, latest: Floats, slope: Slope, down: Array) -> Change | None:
         level, white = self._level, slope.white[:3]
         if level is None or level.weight < LEVEL_S:
             return None
-        kind, count = self._kind, len(latest)
+        count = len(latest)
         off = latest[:, _RATES].mean(axis=0) - level.rows[:3]
         middle = float(latest[:, _SLOT].mean()) - level.slot
         gap_s = max(middle - (count + level.weight) / 2.0, 0.0)
         variance = np.square(white) * (1.0 / count + 1.0 / level.weight)
-        variance = variance + floor_variance(kind.gyro.flicker, kind.gyro.walk, level.weight, count + 2.0 * gap_s)
+        variance = variance + floor_variance(self._gyro.flicker, self._gyro.walk, level.weight, count + 2.0 * gap_s)
         unseen = level.turn_variance or 0.0
         noise = float(np.square(down) @ variance) + unseen
         # Warming up: as fast as the readings show, or as the thermometer says.
@@ -270,7 +260,7 @@ class ImuLevel:
         else:
             warmed = min(_WARMING_RAD_S2 * max(middle - _WARMING_S, 0.0), _WARMED_RAD_S)
         # Integers of the stream hide up to half a step each time.
-        hidden = 0.5 * kind.gyro_step_rad_s
+        hidden = 0.5 * self._steps[0]
         was = level.rows[3:] / _length(level.rows[3:])
         leaned = _length(down + was)
         felt = (PER_G_RAD_S + EARTH_RAD_S) * leaned

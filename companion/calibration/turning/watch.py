@@ -19,11 +19,12 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
+from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.noise.slope import FEWEST, fit_slope, hidden_by_steps, plain_slope
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.seconds.recent import Recent
 from companion.calibration.seconds.resolution import few_distinct, step
-from companion.calibration.turning.level import Change, Common, ImuKind, ImuLevel, Look, Step, common_change
+from companion.calibration.turning.level import Change, Common, ImuLevel, Look, Step, common_change
 from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.physics.units import DEG
 from companion.samples import Vector
@@ -186,9 +187,9 @@ class TurnWatch:
         self.words = ""
         """What is in the way, for a pilot; empty while nothing is."""
 
-    def set_imu(self, kind: ImuKind) -> None:
-        """Add an IMU, or say that its stream is another kind now."""
-        self._levels[kind.name] = ImuLevel(kind, self._span)
+    def set_imu(self, name: str, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float]) -> None:
+        """Add an IMU, or say that its stream is another kind now; as for `ImuLevel`."""
+        self._levels[name] = ImuLevel(rotation, profile, steps, self._span)
 
     def forget(self, imu: str | None) -> None:
         """Readings of one IMU, or of all, are not comparable with earlier ones."""
