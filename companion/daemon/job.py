@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final
 
 import msgspec
@@ -27,6 +27,8 @@ TEMPERATURE: Final = "temperature curve"
 """The kind of job that writes what still windows have shown over temperature."""
 NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, TEMPERATURE)
 """Those that are not calibrations."""
+
+GoOn = Callable[[str], None]
 
 
 class Undone(msgspec.Struct, frozen=True):
@@ -185,6 +187,15 @@ class Job:
         """
         if self._cancelled_by is not None:
             raise JobCancelledError(f"cancelled by {self._cancelled_by}")
+
+    def going_on(self, percent: float, otherwise: str = "") -> GoOn:
+        """What to call now and then with words, or none, for what goes on; raises JobCancelledError."""
+
+        def go_on(words: str) -> None:
+            self.check_cancelled()
+            self.progress(percent, words or otherwise)
+
+        return go_on
 
     def check_time(self) -> None:
         """The end of its patience.

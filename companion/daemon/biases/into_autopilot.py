@@ -20,14 +20,13 @@ from companion.calibration.means.windows import Window
 from companion.calibration.solution.draft import Draft
 from companion.calibration.temperature.curve import Curve
 from companion.calibration.temperature.polynomial import Polynomial, of_curve
-from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
+from companion.component.service import MEASURED_PERCENT
 from companion.daemon.biases.memory import LOOK_K, BiasMemory
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import CurvesWritten, Job
 from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.plan import Plan, Target, left_in
-from companion.daemon.offsets.push import WATCHING
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.measuring import Measuring
 from companion.errors import CalibrationRefusedError
@@ -99,12 +98,7 @@ class IntoAutopilot:
         if not any(target.all for target in found.targets):
             self._core.machine.on(Event.NOTHING_TO_WRITE)
             return "already in force"
-
-        def go_on(words: str) -> None:
-            job.check_cancelled()
-            job.progress(WRITTEN_PERCENT, words or WATCHING)
-
-        plan = await self._pusher.push(job, Plan(found.targets, self._core.vehicle.boots), window, draft, go_on)
+        plan = await self._pusher.push(job, Plan(found.targets, self._core.vehicle.boots), window, draft)
         await self._conclusion.conclude(job, plan, window, draft)
         warnings = (*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each))
         job.deliver(CurvesWritten(draft.written, warnings))

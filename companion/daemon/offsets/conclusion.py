@@ -19,11 +19,11 @@ from companion.calibration.means.windows import Window
 from companion.calibration.solution.draft import Draft
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core
-from companion.daemon.job import Job, JobCancelledError
+from companion.daemon.job import GoOn, Job, JobCancelledError
 from companion.daemon.offsets.effect import EffectWatch, in_short
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration, settles_within_s
 from companion.daemon.offsets.plan import Plan
-from companion.daemon.offsets.push import POLL_S, GoOn, heartbeat, not_as_written
+from companion.daemon.offsets.push import POLL_S, heartbeat, not_as_written
 from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.errors import AutopilotError, AutopilotRebootedError, ParameterTimeoutError
 
@@ -35,14 +35,6 @@ ANSWER_S: Final = 3.0
 BACK_WITHIN_S: Final = 60.0
 CONCLUDING_PERCENT: Final = 95.0
 READ_ATTEMPTS: Final = 3
-
-
-def _going_on(job: Job, otherwise: str = "") -> GoOn:
-    def go_on(words: str) -> None:
-        job.check_cancelled()
-        job.progress(CONCLUDING_PERCENT, words or otherwise)
-
-    return go_on
 
 
 class NotRebootedError(AutopilotError):
@@ -91,7 +83,7 @@ class Conclusion:
 
     async def _restart(self, job: Job, plan: Plan, before: Window, draft: Draft) -> str:
         """Restart it; why that was not done or not seen to its end, or empty."""
-        go_on = _going_on(job, "watching the telemetry after the reboot")
+        go_on = job.going_on(CONCLUDING_PERCENT, "watching the telemetry after the reboot")
         self._machine.on(Event.REBOOT)
         try:
             draft.notes.append(await self._after(plan, before, draft.warnings.append, go_on))
@@ -103,10 +95,9 @@ class Conclusion:
 
     async def _settle(self, job: Job, plan: Plan, draft: Draft) -> None:
         """The write is done and stays; a cancel ends only the waiting for the autopilot's EKF."""
-        go_on = _going_on(job)
         job.lasts(settles_within_s(plan.firmware))
         try:
-            words = await self._firmware.settle(plan.gyros, plan.firmware, go_on)
+            words = await self._firmware.settle(plan.gyros, plan.firmware, job.going_on(CONCLUDING_PERCENT))
         except JobCancelledError as cancelled:
             words = f"wait 2 min before take-off: {cancelled} while the EKF took in the new offsets, which stay"
         if words is not None:

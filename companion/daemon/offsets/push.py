@@ -23,7 +23,7 @@ from companion.calibration.solution.draft import Draft
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
-from companion.daemon.job import Job, JobCancelledError
+from companion.daemon.job import GoOn, Job, JobCancelledError
 from companion.daemon.offsets.effect import EffectWatch, in_short
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration
 from companion.daemon.offsets.ledger import Ledger
@@ -41,7 +41,6 @@ logger = logging.getLogger(__name__)
 
 DISARMED_WITHIN_S: Final = 10.0
 """How long a heartbeat lost just before the write is waited for."""
-GoOn = Callable[[str], None]
 WATCHING: Final = "watching the telemetry take the new offsets"
 POLL_S: Final = 0.2
 
@@ -76,10 +75,11 @@ class Pusher:
             held &= await imu.refresh()
         return held and not (self._wanted.push and await self._px4.make_sure(list(self._imus.values())))
 
-    async def push(self, job: Job, plan: Plan, before: Window, draft: Draft, go_on: GoOn) -> Plan:
+    async def push(self, job: Job, plan: Plan, before: Window, draft: Draft, go_on: GoOn | None = None) -> Plan:
         """Write, read back, and watch the telemetry take the step that it must; on failure put the old values back.
 
-        `go_on(words)` is called now and then while it watches. The plan, and what the firmware has changed besides.
+        `go_on(words)` is called now and then while it watches; else the job tells of it. The plan, and what the
+        firmware has changed besides.
 
         Raises:
             AutopilotError: what went wrong, and which parameters could not be put back, if any.
@@ -100,7 +100,7 @@ class Pusher:
                     raise
             self._machine.on(Event.WRITTEN)
             job.progress(WRITTEN_PERCENT, WATCHING)
-            await self._verify(job, plan, before, draft, go_on)
+            await self._verify(job, plan, before, draft, go_on or job.going_on(WRITTEN_PERCENT, WATCHING))
         return plan
 
     async def push_unseen(

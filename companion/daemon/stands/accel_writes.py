@@ -11,13 +11,11 @@ from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.parameters.change import Change
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.solution.draft import Draft
-from companion.component.service import WRITTEN_PERCENT
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.plan import Plan, Target, left_in
-from companion.daemon.offsets.push import WATCHING
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import CalibrationRefusedError
 
@@ -59,12 +57,7 @@ class AccelWrites:
         for target in targets:
             draft.warn(target.name, *warnings_about(target.calibration, target.changes))
         plan = Plan(targets, self._core.vehicle.boots)
-
-        def go_on(words: str) -> None:
-            job.check_cancelled()
-            job.progress(WRITTEN_PERCENT, words or WATCHING)
-
-        plan = await self._pusher.push(job, plan, last, draft, go_on)
+        plan = await self._pusher.push(job, plan, last, draft)
         for target in targets:
             kept = draft.written.get(target.name, {})
             seen = {kept[name].outcome for name in target.calibration.parameters.accel_offset if name in kept}
