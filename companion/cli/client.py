@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import math
+import sys
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -15,10 +16,13 @@ from companion.daemon.faces.control import ask
 Object = dict[str, Any]
 
 
-async def request(options: argparse.Namespace, wanted: Object, at_interrupt: Object | None = None) -> Object:
+async def request(
+    options: argparse.Namespace, wanted: Object, at_interrupt: Object | None = None, *, in_place: bool = False
+) -> Object:
     """Send a request, show its progress on stderr, return its last reply.
 
     At Ctrl-C, where it has begun, `at_interrupt` is asked, and its reply is the last; None: it is only left.
+    `in_place`: progress that only counts, on one line.
     """
     reply: Object = {}
     shown = ""
@@ -26,11 +30,18 @@ async def request(options: argparse.Namespace, wanted: Object, at_interrupt: Obj
         async for reply in ask(load_config(options).control.path, wanted):
             if reply["kind"] == "progress" and reply["text"] != shown:
                 shown = reply["text"]
+                if in_place:
+                    sys.stderr.write("\r")
+                    print_lines(shown, end="", error=True)
+                    continue
                 print_lines(f"[{reply['percent']:3d} %] {reply.get('word', reply['state'])}: {shown}", error=True)
     except asyncio.CancelledError:
         if at_interrupt is None or not reply:
             raise
         return await request(options, at_interrupt)
+    finally:
+        if in_place and shown:
+            print_lines("", error=True)
     return reply
 
 

@@ -24,8 +24,9 @@ from companion.cli.terminal import (
     print_address,
     print_json,
     print_lines,
+    storage_path,
 )
-from companion.errors import CompanionError, ConfigError, StorageError
+from companion.errors import CompanionError, StorageError
 
 if TYPE_CHECKING:
     from companion.installation.install import Step, Target
@@ -259,14 +260,7 @@ async def report(options: argparse.Namespace) -> int:
     if options.output == "-" and options.json:
         print_lines("companion report: -o - and --json both want stdout", error=True)
         return USAGE
-    directory = _storage(options)
-    try:
-        path, damaged = _make(options, directory)
-    except CompanionError as error:
-        print_lines(f"companion: {error}", error=True)
-        if options.json:
-            print_json({"state": "failed", "reason": str(error), "file": None})
-        return FAILED
+    path, damaged = _make(options, options.storage or storage_path(options))
     skipped = f"skipped: {'; '.join(damaged)}" if damaged else ""
     if skipped:
         print_lines(f"companion: {skipped}", error=True)
@@ -275,21 +269,6 @@ async def report(options: argparse.Namespace) -> int:
     elif path is not None:
         print_lines(path)
     return DONE
-
-
-def _storage(options: argparse.Namespace) -> Path:
-    """The storage folder; one that was copied to another computer needs no configuration there.
-
-    Raises:
-        ConfigError: there is no configuration to say where, and no --storage.
-    """
-    if options.storage is not None:
-        named: Path = options.storage
-        return named
-    try:
-        return load_config(options).storage.path
-    except ConfigError as error:
-        raise ConfigError(f"{error} (or name the folder with the records: --storage DIR)") from error
 
 
 def _make(options: argparse.Namespace, directory: Path) -> tuple[Path | None, list[str]]:

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
-import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from companion.cli import replay_log, show
-from companion.cli.client import finish
-from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds
-from companion.daemon.faces.control import ask
+from companion.cli.client import finish, request
+from companion.cli.terminal import AddCommand, conclude, print_lines, seconds
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
     from companion.replay.engine import Result
 
-Object = dict[str, Any]
 MOST_LINES = 20
 """Of differences, for people; --json has them all."""
 
@@ -38,28 +34,10 @@ def add_commands(add: AddCommand) -> None:
 
 async def record(options: argparse.Namespace) -> int:
     """`companion record`."""
-    path = load_config(options).control.path
-    if options.stop:
-        return await _end(options, {})
     file = None if options.file is None else str(options.file.absolute())
-    reply: Object = {}
-    try:
-        async for reply in ask(path, {"command": "record", "file": file, "seconds": options.seconds}):
-            if reply["kind"] == "progress":
-                sys.stderr.write("\r")
-                print_lines(reply["text"], end="", error=True)
-    except asyncio.CancelledError:  # Ctrl-C
-        print_lines("", error=True)
-        return await _end(options, {})
-    print_lines("", error=True)
-    return await _end(options, reply)
-
-
-async def _end(options: argparse.Namespace, reply: Object) -> int:
-    """Say how a recording ended; without a reply of its own, end it."""
-    if not reply:
-        async for answer in ask(load_config(options).control.path, {"command": "record", "stop": True}):
-            reply = answer
+    stop = {"command": "record", "stop": True}
+    begin = {"command": "record", "file": file, "seconds": options.seconds}
+    reply = await request(options, stop if options.stop else begin, stop, in_place=True)
     answer = {key: item for key, item in reply.items() if key != "kind"}
     lines: list[str] = []
     if "file" in answer:

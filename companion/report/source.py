@@ -31,7 +31,7 @@ def material(directory: Path, wanted: str | None) -> Material:
         # Else a folder that only root may enter looks like one that is not there.
         next(iter(records.iterdir()), None)
     except FileNotFoundError:
-        raise StorageError(f"no calibration yet: there is no {records}") from None
+        raise StorageError(f"no calibration yet: there is no {records} (--storage DIR names another folder)") from None
     except OSError as error:
         hint = "; run it with sudo" if isinstance(error, PermissionError) else ""
         raise StorageError(f"{records}: cannot be read: {error.strerror}{hint}") from error
