@@ -31,9 +31,7 @@ from sim.px4.messages import BUILDERS
 from sim.px4.parameter_server import ParameterServer
 from sim.px4.port import PX4Port
 from sim.px4.rivals import SAMPLE_S, BackgroundGyroCalibration, LearnedOffsets
-from sim.px4.routing import forward, is_for_us
 from sim.px4.thermal import POLL_S
-from sim.px4.voice import Voice
 
 __all__ = ["Applied", "Faults", "PX4Double", "Write"]
 
@@ -277,3 +275,66 @@ class PX4Double(Board):
             self.system_id, message, broadcast=False
         ):
             server.list_all(port)
+
+
+COMPONENT = 1
+
+
+def forward(system_id: int, ports: Sequence[PX4Port], came_by: PX4Port, message: Message, *, heartbeats: bool) -> None:
+    """Pass a packet on to the other ports that it concerns.
+
+    Autopilots 5.4: both ports need MAV_n_FORWARD = 1, and the target must have been heard there.
+    """
+    system = int(getattr(message, "target_system", 0))
+    component = int(getattr(message, "target_component", 0))
+    if not came_by.forwards or (system, component) == (system_id, COMPONENT):
+        return
+    if message.get_type() == "HEARTBEAT" and not heartbeats:
+        return
+    for port in ports:
+        if port is not came_by and port.forwards and port.has_seen(system, component):
+            port.forward(bytes(message.get_msgbuf()))
+
+
+def is_for_us(system_id: int, message: Message, *, broadcast: bool) -> bool:
+    """Whether the target is this autopilot, which obeys nothing else; `broadcast`: or every system."""
+    system, component = int(getattr(message, "target_system", 0)), int(getattr(message, "target_component", 0))
+    return (system == system_id or (broadcast and system == 0)) and component in (0, COMPONENT)
+
+
+TEXT_PERIOD_S = 0.05
+STALE_S = 5.0
+_CHUNK = 50
+
+
+class Voice:
+    """Says texts on all ports, one at a time, where a ground station's HEARTBEAT is heard (autopilots 9.3.2).
+
+    Elsewhere they wait, and are dropped when they are 5 s old.
+    """
+
+    def __init__(self, double: Board) -> None:
+        self._double = double
+
+    def say(self, severity: int, text: str) -> None:
+        """Queue on every port; of more than eight that wait the oldest is lost."""
+        now_s = self._double.now_s()
+        for port in self._double.ports:
+            port.texts.append((now_s, severity, text))
+            self.go_on(port)
+
+    def go_on(self, port: PX4Port) -> None:
+        """Send the next text if its time has come: 20 a second."""
+        now_s = self._double.now_s()
+        while port.texts and now_s - port.texts[0][0] >= STALE_S:
+            port.texts.popleft()
+        if not port.texts or port.text_next_s > now_s or not port.has_ground_station(now_s):
+            return
+        _, severity, text = port.texts.popleft()
+        data = text.encode()
+        for number, start in enumerate(range(0, len(data), _CHUNK)):
+            chunk = data[start : start + _CHUNK]
+            self._double.answer(port, mavlink.MAVLink_statustext_message(severity, chunk, port.text_number, number))
+        port.text_number = (port.text_number + 1) % 65536
+        port.text_next_s = now_s + TEXT_PERIOD_S
+        self._double.later(TEXT_PERIOD_S, lambda: self.go_on(port))
