@@ -70,7 +70,6 @@ class Permission:
 
     def __init__(self, senders: Senders) -> None:
         self.senders = senders
-        """Who may."""
         self.refused: Counter[tuple[int, int]] = Counter()
         """By sender: the first 32."""
 

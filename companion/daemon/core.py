@@ -69,7 +69,6 @@ class Core:
 
     config: Config
     offload: Offload
-    """Runs a blocking call elsewhere."""
     link: MavlinkLink
     vehicle: Vehicle
     parameters: ParameterClient
@@ -78,7 +77,6 @@ class Core:
     texts: StatusText
     tunes: Tunes
     machine: Machine
-    """Where the calibration stands."""
     wanted: Wanted
     only_listening: str | None
     """Why nothing may be started although requests arrive: a check listens and must change nothing."""

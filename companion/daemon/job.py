@@ -18,15 +18,10 @@ from companion.samples import Triad
 from companion.storage.changes import BY_TEMPERATURE, ChangeSet
 
 ALIGNMENT: Final = "gradienter alignment"
-"""The kind of job that calibrates nothing."""
 FACES: Final = "measurement on all sides"
-"""The kind of job that measures accelerometers in any orientation."""
 TURN: Final = "turn on the spot"
-"""The kind of job that finds the level by that alone."""
 TEMPERATURE: Final = "temperature curve"
-"""The kind of job that writes what still windows have shown over temperature."""
 NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, TEMPERATURE)
-"""Those that are not calibrations."""
 
 GoOn = Callable[[str], None]
 
@@ -53,9 +48,7 @@ class Predicted(msgspec.Struct, frozen=True, kw_only=True):
     """Gyro offsets written because earlier power-ups foretell them."""
 
     predicted_at: str
-    """UTC, ISO 8601; the host's clock."""
     words: str
-    """What it is that is in force."""
     sigmas_rad_s: dict[str, float]
     """By IMU: of the worst axis."""
     written: dict[str, WrittenParameter]

@@ -43,7 +43,6 @@ class Question:
     put: Callable[[str], None]
     """Take an answer; raises ConfigError, in one line, where it is none."""
     choices: Sequence[str]
-    """Usual answers."""
 
 
 @dataclass

@@ -29,7 +29,6 @@ class Request:
     headers: Mapping[str, str]
     body: bytes = b""
     peer: str = ""
-    """The address that it came from."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -69,7 +69,6 @@ class AxisVerdict:
     made: float
     sigma: float
     words: str
-    """What is wrong with it, for people."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -19,7 +19,6 @@ class Obstacle(msgspec.Struct, frozen=True):
     """What is in the way of a measurement."""
 
     words: str
-    """One line, as a pilot reads it."""
     moving: bool = False
     """Nothing but a movement, which a hand can end; no fault."""
     hold_still_s: int | None = None
@@ -55,7 +54,6 @@ class Glance(msgspec.Struct, frozen=True, kw_only=True):
     obstacle: Obstacle | None
     """What is in the way at this moment, however long it has been still: it moves, or a source is silent or stuck."""
     still_s: float
-    """As in `Status`."""
     steady_s: float
     """Good seconds without a bad one until now."""
 

@@ -265,10 +265,8 @@ class Arming(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     armed_at: str
-    """UTC, ISO 8601; the host's clock."""
     state: Literal["calibrated", "checked", "uncalibrated"]
     reason: str
-    """As it was said to the ground station."""
     at_arm: Literal["gate", "warn", "off"]
     calibration: str | None
     """`started_at` of the record that was in force, wholly or in part."""
@@ -284,7 +282,6 @@ class AlignmentUsed(msgspec.Struct, frozen=True, kw_only=True):
     """The alignment of the gradienter that was in force: its zero on top of the configured one, and its sigma."""
 
     measured_at: str
-    """UTC, ISO 8601."""
     offset_deg: tuple[float, float]
     sigma_deg: float
 

@@ -32,7 +32,6 @@ class Done(msgspec.Struct, frozen=True, kw_only=True):
     state: str
     """"done", "failed" or "predicted"."""
     measured_at: str
-    """UTC, ISO 8601; the host's clock."""
     reason: str
     system_id: int | None
     written: dict[str, float]

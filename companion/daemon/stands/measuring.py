@@ -38,7 +38,6 @@ class Stand(NamedTuple):
 
     status: Status
     waiting_for: str | None
-    """What is in the way of measuring."""
     hold_still_s: int | None
     """For how long to hold still, where nothing else is."""
 

@@ -61,7 +61,6 @@ class Asked(NamedTuple):
     total: int
     """How many there will be, about."""
     wish: str
-    """How to stand it."""
     hold: Hold
     """The same as a picture."""
     unknown: tuple[str, ...] = ()
@@ -83,7 +82,6 @@ class StandsShown(msgspec.Struct):
     hold: Hold
     unknown: tuple[str, ...] = ()
     words: str = ""
-    """What is going on."""
     objection: str | None = None
     """Why what stood there last was not what was asked for."""
     share: float = 0.0
