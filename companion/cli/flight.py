@@ -39,20 +39,22 @@ def add_commands(add: AddCommand) -> None:
 
 async def flight(options: argparse.Namespace) -> int:
     """`companion flight`."""
-    from companion.flight.flight import flights
-    from companion.flight.logs import read
+    from companion.flight.flight import flights, read
 
-    boots = read(options.file, _Progress(options.file))
     known = _knowledge(options)
-    found = [(number, each) for number, boot in enumerate(boots) for each in await flights(boot, known)]
+    starts, imus, lines, found = 0, 0, [], []
+    for boot in read(options.file, _Progress(options.file)):
+        starts, imus = starts + 1, imus + len(boot.imus)
+        for each in await flights(boot, known):
+            found.append(each)
+            lines += _flight_lines(starts, each)
+    if not imus:
+        raise StorageError(f"{options.file}: no samples of an IMU in it")
     if not found:
         raise StorageError(f"{options.file}: no attitude and position of an EKF3 (ArduPilot) or EKF2 (PX4) in it")
-    lines: list[str] = []
-    if len(boots) > 1:
-        lines.append(f"{len(boots)} starts of the autopilot in it, each by its own clock")
-    for number, each in found:
-        lines += _flight_lines(number, each)
-    answer = {"state": "done", "reason": "", "flights": [msgspec.to_builtins(each) for _, each in found]}
+    if starts > 1:
+        lines.insert(0, f"{starts} starts of the autopilot in it, each by its own clock")
+    answer = {"state": "done", "reason": "", "flights": msgspec.to_builtins(found)}
     return conclude(options, answer, lines, good=True)
 
 
@@ -87,7 +89,7 @@ def _knowledge(options: argparse.Namespace) -> Knowledge:
 def _flight_lines(number: int, found: Flight) -> list[str]:
     stages = found.stages
     when = f"flight of {found.began_at}" if found.began_at else "flight at an unknown time"
-    start = f"{when}: armed {stages.armed_s:.0f} s after start {number + 1} of the autopilot"
+    start = f"{when}: armed {stages.armed_s:.0f} s after start {number} of the autopilot"
     told = [
         f"{what} {at_s - stages.armed_s:.0f} s"
         for what, at_s in (

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from companion.flight.inertial import Navigation
+from companion.flight.inertial import joined
 from companion.flight.log import Boot, Estimated, FlownImu, Place, Table, changes
 from companion.physics.frames import Floats
 from companion.physics.units import DEG
@@ -42,6 +43,7 @@ _OLD: Final = {"IMU2": ("IMU", 1), "IMU3": ("IMU", 2)}
 _IMUS: Final = 5
 _BACK_S: Final = 5.0
 """By so much the clock goes back only at a start."""
+_DAY_S: Final = 86400.0
 _GPS_UNIX_S: Final = 315964800.0
 _LEAP_S: Final = 18.0
 _GYRO_STEP_RAD_S: Final = 0.01 * DEG
@@ -69,35 +71,43 @@ class _Start:
         return sorted(instance for name, instance in self.tables if name == kind)
 
 
-def read(path: Path, progress: Progress) -> list[Boot]:
-    """Each start of the autopilot in it.
+def read(path: Path, progress: Progress) -> Iterator[Boot]:
+    """Each start of the autopilot in it, one after another: memory is that of one.
 
     Raises:
         StorageError: one line: it cannot be read.
     """
-    starts = [_Start()]
-    last_s = -math.inf
+    start, last_s = _Start(), math.nan
+    jumped: tuple[str, float, dict[str, Any]] | None = None
     for kind, fields in dataflash(path, {*_ROWS, *_OLD, "PARM"}, progress):
-        try:
-            at_s = float(fields["TimeUS"]) * _US
-            if at_s < last_s - _BACK_S:
-                starts.append(_Start())
-            last_s = at_s
-            _take(starts[-1], kind, at_s, fields)
-        except (KeyError, TypeError, ValueError):
-            continue  # of another layout, or damaged
-    return [_boot(start) for start in starts]
+        at_s = float(fields.get("TimeUS", math.nan)) * _US
+        if not math.isfinite(at_s):
+            continue
+        if jumped is None and not -_BACK_S < at_s - last_s < _DAY_S and last_s >= 0.0:
+            # A lone time from elsewhere is damage; where the next one agrees, it is a new start.
+            jumped = kind, at_s, fields
+            continue
+        if jumped is not None and abs(at_s - jumped[1]) < _BACK_S:
+            yield _boot(start)
+            start = _Start()
+            _take(start, *jumped)
+        jumped, last_s = None, at_s
+        _take(start, kind, at_s, fields)
+    yield _boot(start)
 
 
 def _take(start: _Start, kind: str, at_s: float, fields: dict[str, Any]) -> None:
-    if kind == "PARM":
-        start.parameters.append((at_s, str(fields["Name"]), float(fields["Value"])))
-        return
-    name, instance = _OLD.get(kind, (kind, 0))
-    key, columns = _ROWS[name]
-    found = int(fields.get(key, instance)) if key else 0
-    if 0 <= found < _IMUS:
-        start.tables[name, found].add(at_s, *(float(fields.get(column, math.nan)) for column in columns))
+    try:
+        if kind == "PARM":
+            start.parameters.append((at_s, str(fields["Name"]), float(fields["Value"])))
+            return
+        name, instance = _OLD.get(kind, (kind, 0))
+        key, columns = _ROWS[name]
+        found = int(fields.get(key, instance)) if key else 0
+        if 0 <= found < _IMUS:
+            start.tables[name, found].add(at_s, *(float(fields.get(column, math.nan)) for column in columns))
+    except (KeyError, TypeError, ValueError):
+        return  # of another layout, or damaged
 
 
 def _boot(start: _Start) -> Boot:
@@ -108,8 +118,8 @@ def _boot(start: _Start) -> Boot:
     return Boot(
         firmware="ardupilot",
         imus=tuple(_imu(start, number, parameters, cores) for number in start.instances("IMU")),
-        solution=_navigation(start.rows("XKQ", primary), start.rows("XKF1", primary)[:, :7]),
-        truth=_navigation(start.rows("SIM"), start.rows("SIM2")),
+        solution=joined(start.rows("XKQ", primary), start.rows("XKF1", primary)),
+        truth=joined(start.rows("SIM"), start.rows("SIM2")),
         armed=_events(start, "armed"),
         motors=_motors(start.rows("RCOU"), parameters),
         airborne=_events(start, "airborne"),
@@ -134,18 +144,6 @@ def _primary(start: _Start) -> int:
     told = np.concatenate([each[:, 1] for each in rows]) if rows else np.zeros(0)
     told = told[(told >= 0) & (told < _IMUS)].astype(np.int64)
     return int(np.bincount(told).argmax()) if len(told) else 0
-
-
-def _navigation(attitude: Floats, moving: Floats) -> Navigation | None:
-    """On the times of both: velocity and position in between."""
-    if len(attitude) < 2 or len(moving) < 2:
-        return None
-    both = attitude[(attitude[:, 0] >= moving[0, 0]) & (attitude[:, 0] <= moving[-1, 0])]
-    both = both[np.isfinite(both).all(axis=1) & (np.linalg.norm(both[:, 1:], axis=1) > 0.5)]
-    if len(both) < 2:
-        return None
-    states = np.column_stack([np.interp(both[:, 0], moving[:, 0], column) for column in moving[:, 1:7].T])
-    return Navigation(both[:, 0], both[:, 1:5], states[:, :3], states[:, 3:])
 
 
 def _imu(start: _Start, instance: int, parameters: dict[str, float], cores: list[int]) -> FlownImu:

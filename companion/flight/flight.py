@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -15,14 +16,15 @@ from companion.calibration.noise.robust import median
 from companion.calibration.records.record import Record
 from companion.calibration.solution.prior import curve_of
 from companion.calibration.temperature.curve import Curve
-from companion.errors import AutopilotError
-from companion.flight import inertial
+from companion.errors import AutopilotError, StorageError
+from companion.flight import ardupilot_log, inertial, px4_log
 from companion.flight.in_force import calibration_in, moment, with_others, written_in
 from companion.flight.inertial import Drift, Increments, Navigation, Window, World
 from companion.flight.log import Boot, FlownImu
 from companion.flight.split import LENGTH_S, SHORT_S, Split, Term, split
 from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
 from companion.physics.frames import Floats
+from companion.replay.autopilot_logs import Progress, read_ulog, reader_of
 from companion.samples import Triad
 from companion.storage.learned import KnownImu
 
@@ -37,6 +39,9 @@ _OUTLIER: Final = 6.0
 _LIFTED_M: Final = 1.5
 _LEAST_AIR_S: Final = 15.0
 _SLOW_HZ: Final = 80.0
+
+
+_ENCRYPTED: Final = b"ULogEnc"
 
 
 class Stages(msgspec.Struct, frozen=True):
@@ -86,6 +91,24 @@ class Knowledge(msgspec.Struct, frozen=True, kw_only=True):
     biases: Mapping[str, KnownImu] = {}
     others: Mapping[str, Mapping[str, float]] = {}
     """Sets of offsets to compare with, by name."""
+
+
+def read(path: Path, progress: Progress) -> Iterator[Boot]:
+    """Each start of the autopilot in it.
+
+    Raises:
+        StorageError: one line: it cannot be read, or is another file.
+    """
+    try:
+        reader = reader_of(path)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if reader is None:
+        with path.open("rb") as file:
+            if file.read(len(_ENCRYPTED)) == _ENCRYPTED:
+                raise StorageError(f"{path}: encrypted by PX4: decrypt it first (Tools/log_encryption of PX4)")
+        raise StorageError(f"{path}: no log of ArduPilot (.bin) or PX4 (.ulg)")
+    return px4_log.read(path, progress) if reader is read_ulog else ardupilot_log.read(path, progress)
 
 
 async def flights(boot: Boot, known: Knowledge) -> list[Flight]:

@@ -40,6 +40,16 @@ class Navigation(NamedTuple):
         return matrices(q), _between(t_s, self.t_s, self.velocity), _between(t_s, self.t_s, self.position)
 
 
+def joined(attitude: Floats, moving: Floats) -> Navigation | None:
+    """Of quaternions (n, 1 + 4) and velocities and positions (m, 1 + 6) by time; None of too few."""
+    if len(attitude) < 2 or len(moving) < 2:
+        return None
+    q = attitude[(attitude[:, 0] >= moving[0, 0]) & (attitude[:, 0] <= moving[-1, 0])]
+    q = q[np.linalg.norm(q[:, 1:5], axis=1) > 0.5]
+    states = _between(q[:, 0], moving[:, 0], moving[:, 1:7])
+    return Navigation(q[:, 0], q[:, 1:5], states[:, :3], states[:, 3:]) if len(q) > 1 else None
+
+
 class World(NamedTuple):
     """Where it flies: a simulator may leave out that the Earth turns."""
 

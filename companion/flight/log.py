@@ -49,10 +49,15 @@ class Table:
         last = [_means(np.array(self._rows[:left]), self.each)] if left else []
         if not self._chunks and not last:
             return np.zeros((0, 1))
-        found = np.concatenate([*self._chunks, *last])
-        found = found[np.isfinite(found[:, 0])]
-        ahead = np.concatenate([[True], found[1:, 0] > np.maximum.accumulate(found[:, 0])[:-1]])
-        return np.asarray(found[ahead[: len(found)]])
+        return ascending(np.concatenate([*self._chunks, *last]))
+
+
+def ascending(rows: Floats) -> Floats:
+    """Of rows that begin with a time, those in order."""
+    rows = rows[np.isfinite(rows[:, 0])]
+    if not len(rows):
+        return rows
+    return np.asarray(rows[np.concatenate([[True], rows[1:, 0] > np.maximum.accumulate(rows[:, 0])[:-1]])])
 
 
 def _means(rows: Floats, each: int) -> Floats:

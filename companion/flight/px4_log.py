@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from companion.flight.inertial import Navigation
-from companion.flight.log import Boot, Estimated, FlownImu, Place, changes
+from companion.flight.inertial import Navigation, joined
+from companion.flight.log import Boot, Estimated, FlownImu, Place, ascending, changes
 from companion.physics.frames import Floats
 from companion.replay.autopilot_logs import Progress, ulog
 
@@ -27,7 +26,7 @@ _TURNING: Final = 0.02
 _Data = Mapping[tuple[str, int], dict[str, Any]]
 
 
-def read(path: Path, progress: Progress) -> list[Boot]:
+def read(path: Path, progress: Progress) -> Iterator[Boot]:
     """A ULog is of one start.
 
     Raises:
@@ -39,7 +38,8 @@ def read(path: Path, progress: Progress) -> list[Boot]:
         told = [(start_s, str(name), float(value)) for name, value in found.initial_parameters.items()]
         told += [(at * _US, str(name), float(value)) for at, name, value in found.changed_parameters]
         gaps = len(found.dropouts)
-        return [_boot(data, told, gaps)]
+        boot = _boot(data, told, gaps)
+    yield boot
 
 
 def _boot(data: _Data, parameters: list[tuple[float, str, float]], gaps: int) -> Boot:
@@ -50,9 +50,11 @@ def _boot(data: _Data, parameters: list[tuple[float, str, float]], gaps: int) ->
         imus=_imus(data),
         solution=_navigation(data, ""),
         truth=_navigation(data, "_groundtruth"),
-        armed=() if armed is None else changes(_times(armed), armed["armed"]),
+        armed=() if armed is None else changes(np.asarray(armed["timestamp"]) * _US, armed["armed"]),
         motors=_motors(data.get(("actuator_motors", 0))),
-        airborne=() if landed is None else changes(_times(landed), np.asarray(landed["landed"]) == 0),
+        airborne=()
+        if landed is None
+        else changes(np.asarray(landed["timestamp"]) * _US, np.asarray(landed["landed"]) == 0),
         parameters=tuple(parameters),
         unix_offset_s=_unix_offset(data),
         place=_place(data),
@@ -60,22 +62,15 @@ def _boot(data: _Data, parameters: list[tuple[float, str, float]], gaps: int) ->
     )
 
 
-def _times(data: dict[str, Any], key: str = "timestamp") -> Floats:
-    return np.asarray(data[key if key in data else "timestamp"], dtype=np.float64) * _US
+def _table(data: dict[str, Any], names: Sequence[str], when: str = "timestamp") -> Floats:
+    """The time and these fields, what is whole of it, in order; times of older versions are of the message."""
+    times = np.asarray(data[when if when in data else "timestamp"], dtype=np.float64) * _US
+    rows = np.column_stack([times, *(np.asarray(data[name], dtype=np.float64) for name in names)])
+    return ascending(rows[np.isfinite(rows).all(axis=1)])
 
 
-def _vectors(data: dict[str, Any], name: str, axes: int = 3) -> Floats:
-    return np.column_stack([np.asarray(data[f"{name}[{k}]"], dtype=np.float64) for k in range(axes)])
-
-
-def _ascending(t_s: Floats, rows: Floats) -> tuple[Floats, Floats]:
-    """Of what is whole, in order of time."""
-    good = np.isfinite(rows).all(axis=1) & np.isfinite(t_s)
-    t_s, rows = t_s[good], rows[good]
-    if not len(t_s):
-        return t_s, rows
-    ahead = np.concatenate([[True], t_s[1:] > np.maximum.accumulate(t_s)[:-1]])
-    return t_s[ahead], rows[ahead]
+def _xyz(name: str, axes: int = 3) -> list[str]:
+    return [f"{name}[{k}]" for k in range(axes)]
 
 
 def _navigation(data: _Data, suffix: str) -> Navigation | None:
@@ -83,20 +78,8 @@ def _navigation(data: _Data, suffix: str) -> Navigation | None:
     local = data.get((f"vehicle_local_position{suffix}", 0))
     if attitude is None or local is None:
         return None
-    names = ("vx", "vy", "vz", "x", "y", "z")
-    at, q = _ascending(_times(attitude, "timestamp_sample"), _vectors(attitude, "q", 4))
-    moved, states = _ascending(
-        _times(local, "timestamp_sample"),
-        np.column_stack([np.asarray(local[name], dtype=np.float64) for name in names]),
-    )
-    if len(moved) < 2:
-        return None
-    inside = (at >= moved[0]) & (at <= moved[-1]) & (np.linalg.norm(q, axis=1) > 0.5)
-    at, q = at[inside], q[inside]
-    if len(at) < 2:
-        return None
-    states = np.column_stack([np.interp(at, moved, column) for column in states.T])
-    return Navigation(at, q, states[:, :3], states[:, 3:])
+    moving = _table(local, ("vx", "vy", "vz", "x", "y", "z"), "timestamp_sample")
+    return joined(_table(attitude, _xyz("q", 4), "timestamp_sample"), moving)
 
 
 def _imus(data: _Data) -> tuple[FlownImu, ...]:
@@ -106,80 +89,66 @@ def _imus(data: _Data) -> tuple[FlownImu, ...]:
     ids = {int(each["gyro_device_id"][-1]): k for k, each in status.items() if len(each["gyro_device_id"])}
     combined, selection = data.get(("sensor_combined", 0)), data.get(("sensor_selection", 0))
     if combined is not None:
-        chosen = int(selection["gyro_device_id"][-1]) if selection and "gyro_device_id" in selection else None
-        rows = np.hstack([_vectors(combined, "gyro_rad"), _vectors(combined, "accelerometer_m_s2")])
-        number = ids.get(chosen or -1, 0)
-        found[number] = _imu(data, number, *_ascending(_times(combined), rows))
+        chosen = int(selection["gyro_device_id"][-1]) if selection and "gyro_device_id" in selection else -1
+        number = ids.get(chosen, 0)
+        found[number] = _imu(data, number, _table(combined, [*_xyz("gyro_rad"), *_xyz("accelerometer_m_s2")]))
     for (name, k), each in data.items():
         if name != "vehicle_imu" or k in found:
             continue
-        # The middle of both times of integration.
-        rows = np.hstack(
-            [
-                _vectors(each, f"delta_{what}")
-                / (np.asarray(each[f"delta_{what}_dt"], dtype=np.float64)[:, None] * _US)
-                for what in ("angle", "velocity")
-            ]
-        )
-        imu = _imu(data, k, *_ascending(_times(each, "timestamp_sample"), rows))
+        what = [*_xyz("delta_angle"), *_xyz("delta_velocity"), "delta_angle_dt", "delta_velocity_dt"]
+        rows = _table(each, what, "timestamp_sample")
+        rows = rows[(rows[:, 7:] > 0.0).all(axis=1)]
+        imu = _imu(data, k, np.hstack([rows[:, :1], rows[:, 1:7] / (np.repeat(rows[:, 7:], 3, axis=1) * _US)]))
         if imu.rate_hz >= _FAST_HZ:
             found[k] = imu
     return tuple(found[k] for k in sorted(found))
 
 
-def _imu(data: _Data, k: int, t_s: Floats, readings: Floats) -> FlownImu:
+def _imu(data: _Data, k: int, rows: Floats) -> FlownImu:
     status = data.get(("vehicle_imu_status", k))
     degc = vibration = np.zeros((0, 2))
     gyro_id = accel_id = None
-    if status is not None and len(status["timestamp"]):
+    if status is not None and "gyro_device_id" in status:
         gyro_id, accel_id = int(status["gyro_device_id"][-1]), int(status["accel_device_id"][-1])
-        at = _times(status)
-        degc = np.column_stack(_ascending(at, np.asarray(status["temperature_gyro"], dtype=np.float64)[:, None]))
-        level = np.asarray(status["accel_vibration_metric"], dtype=np.float64)[:, None]
-        vibration = np.column_stack(_ascending(at, level))
+        degc, vibration = _table(status, ["temperature_gyro"]), _table(status, ["accel_vibration_metric"])
     return FlownImu(
-        number=k + 1, t_s=t_s, readings=readings, means=True, gyro_id=gyro_id, accel_id=accel_id, degc=degc,
+        number=k + 1, t_s=rows[:, 0], readings=rows[:, 1:7], means=True, gyro_id=gyro_id, accel_id=accel_id, degc=degc,
         vibration=vibration, estimated=_estimated(data, gyro_id),
     )  # fmt: skip
 
 
 def _estimated(data: _Data, gyro_id: int | None) -> Estimated | None:
     for (name, _), each in sorted(data.items(), key=lambda item: item[0]):
-        if name != "estimator_sensor_bias" or not len(each["timestamp"]):
+        if name != "estimator_sensor_bias" or (gyro_id is not None and int(each["gyro_device_id"][-1]) != gyro_id):
             continue
-        if gyro_id is not None and int(each["gyro_device_id"][-1]) not in (gyro_id, 0):
-            continue
-        columns = [_vectors(each, key) for key in ("gyro_bias", "accel_bias")]
-        sigmas = [np.sqrt(np.maximum(_vectors(each, f"{key}_bias_variance"), 0.0)) for key in ("gyro", "accel")]
-        return Estimated(_times(each), columns[0], sigmas[0], columns[1], sigmas[1])
+        rows = _table(each, [name for half in ("gyro", "accel") for name in _xyz(f"{half}_bias")])
+        sigmas = _table(each, [name for half in ("gyro", "accel") for name in _xyz(f"{half}_bias_variance")])
+        sigmas = np.sqrt(np.maximum(sigmas, 0.0))
+        if len(rows) == len(sigmas):
+            return Estimated(rows[:, 0], rows[:, 1:4], sigmas[:, 1:4], rows[:, 4:7], sigmas[:, 4:7])
     return None
 
 
 def _motors(data: dict[str, Any] | None) -> tuple[tuple[float, bool], ...]:
     if data is None:
         return ()
-    outputs = np.nan_to_num(_vectors(data, "control", 12))
-    return changes(_times(data), np.max(outputs, axis=1) > _TURNING)
+    outputs = np.column_stack([data[name] for name in _xyz("control", 12) if name in data])
+    return changes(np.asarray(data["timestamp"]) * _US, np.nan_to_num(outputs).max(axis=1) > _TURNING)
 
 
 def _unix_offset(data: _Data) -> float | None:
     gps = data.get(("vehicle_gps_position", 0))
-    if gps is None:
-        return None
-    utc = np.asarray(gps["time_utc_usec"], dtype=np.float64) * _US
-    known = np.sort((utc - _times(gps))[utc > 1e9])
+    rows = np.zeros((0, 2)) if gps is None else _table(gps, ["time_utc_usec"])
+    known = np.sort((rows[:, 1] * _US - rows[:, 0])[rows[:, 1] > 1e15])
     return float(known[len(known) // 2]) if len(known) else None
 
 
 def _place(data: _Data) -> Place | None:
     local = data.get(("vehicle_local_position", 0))
-    if local is None:
+    rows = np.zeros((0, 3)) if local is None else _table(local, ["ref_lat", "ref_alt"])
+    rows = rows[rows[:, 1] != 0.0]
+    if not len(rows):
         return None
-    latitude, height = (np.asarray(local[key], dtype=np.float64) for key in ("ref_lat", "ref_alt"))
-    known = np.flatnonzero(np.isfinite(latitude) & (latitude != 0.0))
-    if not len(known):
-        return None
-    at = known[-1]
     # The simulator's gravity is that of the ellipsoid.
     simulated = ("vehicle_attitude_groundtruth", 0) in data
-    return Place(float(latitude[at]), float(height[at]) if math.isfinite(height[at]) and not simulated else 0.0)
+    return Place(float(rows[-1, 1]), 0.0 if simulated else float(rows[-1, 2]))

@@ -173,6 +173,7 @@ def dataflash(path: Path, kinds: Collection[str], progress: Progress = _nobody) 
                 if at - told > _TELL_BYTES:
                     told = at
                     progress(at / size)
+                    data.madvise(mmap.MADV_DONTNEED, 0, at - at % mmap.PAGESIZE)
                 if layout.name == "FMT":
                     _learn(formats, layout.read(data, at))
                 elif layout.name in kinds:
