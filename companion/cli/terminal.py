@@ -16,8 +16,7 @@ from typing import Any, Final, NoReturn
 from urllib.parse import quote
 
 from companion import config
-from companion.config import SavedProfiles
-from companion.config.sections import Config, Storage
+from companion.config.sections import Config, Noise, Storage
 from companion.errors import ConfigError
 from companion.printable import printable
 
@@ -75,10 +74,10 @@ def load_config(options: argparse.Namespace, *, profiles: bool = False, forgivin
     Who only asks the daemon may not be allowed to read those. `forgiving`: a damaged one is no reason to refuse.
     """
 
-    def saved(directory: Path) -> SavedProfiles | None:
-        from companion.storage.profiles import ProfileStore
+    def saved(directory: Path, name: str) -> Noise | str:
+        from companion.storage.profiles import saved_profile
 
-        return ProfileStore(directory, forgiving=forgiving) if profiles else None
+        return saved_profile(directory, name, forgiving=forgiving) if profiles else name
 
     return config.load(config_path(options), saved)
 

@@ -11,7 +11,7 @@ import tomllib
 import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 import msgspec
 
@@ -28,28 +28,26 @@ MOST_LINE: Final = 4096
 CATALOGUE: Final[tuple[str, ...]] = typing.get_args(Profile)
 
 
-class SavedProfiles(Protocol):
-    """Profiles that are kept somewhere."""
+Saved = Callable[[Path, str], Noise | str]
+"""What a profile of that name is which a storage directory has; a name stays one where nobody looks there.
 
-    def names(self) -> Sequence[str]:
-        """Of all of them."""
-
-    def noise(self, name: str) -> Noise:
-        """One of them.
-
-        Raises:
-            StorageError: it cannot be read, in one line.
-        """
-
-    def instead(self, name: str, error: StorageError) -> Noise | None:
-        """What to take where one cannot be read; None: the configuration that names it is refused."""
+Raises:
+    ConfigError, StorageError: there is none, or it cannot be read; in words that follow "found".
+"""
 
 
-Saved = Callable[[Path], SavedProfiles | None]
-"""The saved profiles of a storage directory; None: they are not to be looked for, and a name stays a name."""
+def no_profile(wanted: str, names: Sequence[str] = ()) -> ConfigError:
+    """That neither the catalogue nor what was saved has it."""
+    near = difflib.get_close_matches(wanted, [*CATALOGUE, *names], n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return ConfigError(f"{shown(wanted)}; allowed: {_allowed(names)}{hint}")
 
 
-def load(path: Path, saved: Saved | None = None) -> Config:
+def _none(_directory: Path, wanted: str) -> Noise:
+    raise no_profile(wanted)
+
+
+def load(path: Path, saved: Saved = _none) -> Config:
     """Read and check a configuration file; `saved` says where saved noise profiles are.
 
     Raises:
@@ -65,7 +63,7 @@ def load(path: Path, saved: Saved | None = None) -> Config:
     return parse(text, str(path), saved)
 
 
-def parse(text: str, name: str, saved: Saved | None = None) -> Config:
+def parse(text: str, name: str, saved: Saved = _none) -> Config:
     """Check the text of a configuration file; `name` stands for the file in messages, `saved` as for `load`.
 
     Raises:
@@ -91,7 +89,7 @@ def parse(text: str, name: str, saved: Saved | None = None) -> Config:
     return _with_saved_profiles(config, name, saved)
 
 
-def _with_saved_profiles(config: Config, name: str, saved: Saved | None) -> Config:
+def _with_saved_profiles(config: Config, name: str, saved: Saved) -> Config:
     """The configuration with the figures of saved profiles in the place of their names."""
     imus = []
     for index, imu in enumerate(config.imu):
@@ -99,30 +97,12 @@ def _with_saved_profiles(config: Config, name: str, saved: Saved | None) -> Conf
         if isinstance(imu.profile, Noise):
             raise ConfigError(f"{key} a table; allowed: {_allowed(())}")
         if imu.profile is not None and imu.profile not in CATALOGUE:
-            if saved is None:
-                raise _unknown(imu.profile, (), key)
-            if (store := saved(config.storage.path)) is not None:
-                imu = msgspec.structs.replace(imu, profile=_found(store, imu.profile, key))
+            try:
+                imu = msgspec.structs.replace(imu, profile=saved(config.storage.path, imu.profile))
+            except (ConfigError, StorageError) as error:
+                raise ConfigError(f"{key} {error}") from None
         imus.append(imu)
     return msgspec.structs.replace(config, imu=imus)
-
-
-def _found(store: SavedProfiles, wanted: str, key: str) -> Noise:
-    try:
-        names = store.names()
-        if wanted in names:
-            return store.noise(wanted)
-    except StorageError as error:
-        if (instead := store.instead(wanted, error)) is not None:
-            return instead
-        raise ConfigError(f"{key} {wanted!r}, a saved profile: {error}") from None
-    raise _unknown(wanted, names, key)
-
-
-def _unknown(wanted: str, names: Sequence[str], key: str) -> ConfigError:
-    near = difflib.get_close_matches(wanted, [*CATALOGUE, *names], n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    return ConfigError(f"{key} {shown(wanted)}; allowed: {_allowed(names)}{hint}")
 
 
 def _allowed(names: Sequence[str]) -> str:

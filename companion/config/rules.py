@@ -256,15 +256,11 @@ def _mqtt(mqtt: Mqtt) -> Iterator[str]:
             yield f"'mqtt.{other}' is missing; allowed: a path (needed by {key})"
 
 
+_TOPIC = re.compile(r"(?!\$)[^+# /]+(/[^+# /]+)*")
+
+
 def _topic(topic: str) -> Iterator[str]:
-    good = (
-        len(topic.encode()) <= MAX_TOPIC_BYTES
-        and not any(character in topic for character in "+# ")
-        and not topic.startswith(("/", "$"))
-        and not topic.endswith("/")
-        and "//" not in topic
-    )
-    if not good:
+    if len(topic.encode()) > MAX_TOPIC_BYTES or not _TOPIC.fullmatch(topic):
         yield (
             f"'mqtt.base_topic': found {topic!r}; allowed: words with / between them, such as"
             f' "field/heron", without + # or blanks, at most {MAX_TOPIC_BYTES} bytes'

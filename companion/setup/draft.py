@@ -73,7 +73,7 @@ class Draft:
             ConfigError: in one line, what is wrong.
         """
         # Names of saved profiles are for the daemon to look up.
-        return config.parse(self.result(), "answer", lambda _: None)
+        return config.parse(self.result(), "answer", lambda _, name: name)
 
     @property
     def url(self) -> str | None:

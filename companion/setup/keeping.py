@@ -33,7 +33,7 @@ def begin(path: Path) -> Draft:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     if text == sample():
         return Draft(text, is_new=True)
-    config.parse(text, str(path), lambda _: None)
+    config.parse(text, str(path), lambda _, name: name)
     return Draft(text, is_new=False)
 
 

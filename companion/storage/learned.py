@@ -12,22 +12,16 @@ from companion.calibration.records import align_record, history
 from companion.storage.state import StateFile
 
 
-class AlignmentStore(StateFile[align_record.AlignmentRecord]):
-    """`alignment.json` in the storage directory."""
-
-    def __init__(self, directory: Path) -> None:
-        super().__init__(
-            directory / "alignment.json", align_record.AlignmentRecord, align_record.check, align_record.FORMAT_VERSION
-        )
+def alignment_in(directory: Path) -> StateFile[align_record.AlignmentRecord]:
+    """`alignment.json` in a storage directory."""
+    kind, newest = align_record.AlignmentRecord, align_record.FORMAT_VERSION
+    return StateFile(directory / "alignment.json", kind, align_record.check, newest)
 
 
-class FacesStore(StateFile[align_record.FacesRecord]):
-    """`faces.json` in the storage directory."""
-
-    def __init__(self, directory: Path) -> None:
-        super().__init__(
-            directory / "faces.json", align_record.FacesRecord, align_record.check_faces, align_record.FORMAT_VERSION
-        )
+def faces_in(directory: Path) -> StateFile[align_record.FacesRecord]:
+    """`faces.json`, likewise."""
+    kind, newest = align_record.FacesRecord, align_record.FORMAT_VERSION
+    return StateFile(directory / "faces.json", kind, align_record.check_faces, newest)
 
 
 FORMAT_VERSION: Final = 2

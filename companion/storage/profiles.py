@@ -14,7 +14,7 @@ import msgspec
 
 from companion import formats
 from companion.calibration.noise.allan import PROFILES, AllanModel, NoiseProfile, noise_profile
-from companion.config import CATALOGUE
+from companion.config import CATALOGUE, no_profile
 from companion.config.sections import Noise
 from companion.errors import ConfigError, StorageError
 from companion.storage.state import UNREADABLE, read_regular, sealed, unsealed, write_atomically
@@ -96,13 +96,10 @@ def check_name(name: str) -> None:
 
 
 class ProfileStore:
-    """The folder `profiles` of a storage directory.
+    """The folder `profiles` of a storage directory."""
 
-    `forgiving`: for the daemon, which no damaged file may end: the figures of the worst common parts, and a word.
-    """
-
-    def __init__(self, directory: Path, *, forgiving: bool = False) -> None:
-        self._folder, self._forgiving = directory / "profiles", forgiving
+    def __init__(self, directory: Path) -> None:
+        self._folder = directory / "profiles"
 
     def path(self, name: str) -> Path:
         """The file of a profile."""
@@ -134,23 +131,6 @@ class ProfileStore:
             raise StorageError(f"{path}: not a readable profile: it is of {found.name!r}")
         return found
 
-    def noise(self, name: str) -> Noise:
-        """One profile as the configuration carries it.
-
-        Raises:
-            StorageError: as `read`.
-        """
-        return self.read(name).noise
-
-    def instead(self, name: str, error: StorageError) -> Noise | None:
-        """The figures of the worst common parts, said once, where the daemon starts; else None."""
-        if not self._forgiving:
-            return None
-        logger.warning("%s; its sigmas are those of the worst common parts", error)
-        worst = PROFILES["unknown"]
-        origin = "which cannot be used: sigmas are those of the worst common parts"
-        return _noise(name, worst.gyro, worst.accel, origin)
-
     def write(self, profile: SavedProfile) -> Path:
         """Keep a profile, in the place of one of that name; returns its file.
 
@@ -179,6 +159,31 @@ def read_profile(path: Path) -> SavedProfile:
         raise StorageError(f"{path}: not a readable profile: {error}") from error
 
 
+def saved_profile(directory: Path, wanted: str, *, forgiving: bool = False) -> Noise:
+    """One profile as the configuration carries it.
+
+    `forgiving`: for the daemon, which no damaged file may end: the figures of the worst common parts, and a word.
+
+    Raises:
+        ConfigError: there is none of that name; says what is allowed.
+        StorageError: it cannot be read.
+    """
+    store = ProfileStore(directory)
+    try:
+        names = store.names()
+        if wanted in names:
+            return store.read(wanted).noise
+    except StorageError as error:
+        if not forgiving:
+            raise StorageError(f"{wanted!r}, a saved profile: {error}") from None
+        logger.warning("%s; its sigmas are those of the worst common parts", error)
+        worst = PROFILES["unknown"]
+        return _noise(
+            wanted, worst.gyro, worst.accel, "which cannot be used: sigmas are those of the worst common parts"
+        )
+    raise no_profile(wanted, names)
+
+
 def given_profile(wanted: str, directory: Callable[[], Path]) -> str | Noise:
     """What somebody has named: a part of the catalogue, a saved profile, or the file of one (a slash in it, or .json).
 
@@ -196,7 +201,7 @@ def given_profile(wanted: str, directory: Callable[[], Path]) -> str | Noise:
     store = ProfileStore(directory())
     names = store.names()
     if wanted in names:
-        return store.noise(wanted)
+        return store.read(wanted).noise
     near = difflib.get_close_matches(plain, [*CATALOGUE, *names], n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise ConfigError(

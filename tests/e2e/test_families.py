@@ -26,7 +26,7 @@ from companion.configured import models
 from companion.daemon.job import Job
 from companion.daemon.process.service import Service
 from companion.protocols.registry import PROTOCOLS
-from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source
+from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, saved_profile
 from sim.aircraft import Pose, VirtualAircraft
 from sim.ardupilot.double import ArduPilotDouble
 from sim.devices import SerialDevice
@@ -179,7 +179,7 @@ async def carry_out(run: Run, folder: Path, number: int) -> Outcome:
         host, port = link.local
         ProfileStore(folder / "state").write(calm())
         config = parse(
-            CONFIG.format(host=host, port=port, folder=folder) + "\n".join(parts), "families.toml", ProfileStore
+            CONFIG.format(host=host, port=port, folder=folder) + "\n".join(parts), "families.toml", saved_profile
         )
         service = Service(config)
         tasks = [asyncio.create_task(autopilot.run()), asyncio.create_task(service.run())]

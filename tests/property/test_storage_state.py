@@ -15,7 +15,7 @@ from companion.calibration.records.record import Arming
 from companion.daemon.offsets.reboot_owed import owed_in
 from companion.daemon.stands.by_hand import Done
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
-from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, FacesStore, signing_time_in
+from companion.storage.learned import SIGNING_FILE, BiasStore, alignment_in, faces_in, signing_time_in
 from companion.storage.records import RecordStore
 from companion.storage.state import BoundedList, sealed
 
@@ -66,8 +66,8 @@ def test_any_bytes_in_any_file(data: bytes) -> None:
         log = ChangeLog(folder)
         log.journal.load()
         log.undo_of(1).load()
-        AlignmentStore(folder).load()
-        FacesStore(folder).load()
+        alignment_in(folder).load()
+        faces_in(folder).load()
         owed_in(folder).load()
         BoundedList(folder / "by-hand.json", Done, 5).read()
         BiasStore(folder).read()

@@ -16,7 +16,7 @@ from companion import cli, config
 from companion.calibration.records.align_record import AlignmentRecord, GradienterSettings
 from companion.cli.client import stands_lines
 from companion.errors import StorageError
-from companion.storage.learned import AlignmentStore
+from companion.storage.learned import alignment_in
 from companion.storage.state import unsealed
 
 CONFIG = '[mavlink]\nurl = "tcp:h:1"\n[[imu]]\nname = "a"\nsource = "autopilot"\n[control]\nsocket = "{}"\n'
@@ -71,7 +71,7 @@ def test_the_lines_for_the_configuration_hold_the_whole_offset() -> None:
 
 
 def test_a_record_comes_back_as_it_was_and_nonsense_does_not(tmp_path: Path) -> None:
-    store = AlignmentStore(tmp_path / "state")
+    store = alignment_in(tmp_path / "state")
     assert store.read() is None
     store.write(RECORD)
     assert store.read() == RECORD
@@ -98,8 +98,8 @@ KILLED = """
 import sys
 from pathlib import Path
 import msgspec
-from companion.storage.learned import AlignmentStore
-store = AlignmentStore(Path(sys.argv[1]))
+from companion.storage.learned import alignment_in
+store = alignment_in(Path(sys.argv[1]))
 record = store.read()
 print("begun", flush=True)
 while True:
@@ -108,7 +108,7 @@ while True:
 
 
 def test_kill_in_the_middle_of_writing_leaves_a_whole_record(tmp_path: Path) -> None:
-    store = AlignmentStore(tmp_path)
+    store = alignment_in(tmp_path)
     store.write(RECORD)
     for _ in range(5):
         writer = subprocess.Popen(

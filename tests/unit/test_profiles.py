@@ -23,7 +23,7 @@ from companion.recording.journal import Entry
 from companion.recording.past import Past
 from companion.replay.log_files import read_logs
 from companion.samples import ImuSample
-from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, check_name
+from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, check_name, saved_profile
 from companion.storage.state import MOST_BYTES, sealed, unsealed
 from sim.__main__ import main as simulator
 from tests.support.made_noise import DEG_H, adis16405, write_csv
@@ -91,11 +91,11 @@ def test_a_damaged_or_newer_one_is_refused_in_one_line(
     assert "\n" not in str(caught.value)
     # The configuration that names it is refused, in one line that says where.
     with pytest.raises(ConfigError) as refused:
-        parse(SMALLEST.format("mine"), "x.toml", lambda _: store)
+        parse(SMALLEST.format("mine"), "x.toml", lambda _, name: saved_profile(tmp_path, name))
     assert str(refused.value).startswith("x.toml: 'imu[0].profile': found 'mine', a saved profile: ")
     assert words in str(refused.value)
     # All but the daemon's own start, which no file may prevent: then with the figures of the worst parts, and a word.
-    config = parse(SMALLEST.format("mine"), "x.toml", lambda folder: ProfileStore(tmp_path, forgiving=True))
+    config = parse(SMALLEST.format("mine"), "x.toml", lambda _, name: saved_profile(tmp_path, name, forgiving=True))
     assert str(Profiles(config).status()[0]["summary"]).startswith("mine, which cannot be used")
     instead, worst = noise_profile(config.imu[0].profile), noise_profile(None)
     assert (instead.gyro, instead.accel) == (worst.gyro, worst.accel)
@@ -123,7 +123,7 @@ def test_names_that_are_not(tmp_path: Path, name: str) -> None:
 def test_a_saved_name_brings_its_figures_along(tmp_path: Path) -> None:
     store = ProfileStore(tmp_path)
     store.write(saved())
-    config = parse(SMALLEST.format("mine"), "x.toml", lambda _: store)
+    config = parse(SMALLEST.format("mine"), "x.toml", lambda _, name: saved_profile(tmp_path, name))
     profile = config.imu[0].profile
     assert isinstance(profile, Noise)
     noise = noise_profile(profile)
@@ -135,7 +135,7 @@ def test_a_saved_name_brings_its_figures_along(tmp_path: Path) -> None:
 
 
 def test_the_catalogue_wins_and_is_not_looked_up() -> None:
-    def never(_: Path) -> None:
+    def never(_: Path, name: str) -> str:
         raise AssertionError("looked for saved profiles")
 
     for name in PROFILES:
@@ -147,7 +147,7 @@ def test_an_unknown_name_is_refused_with_the_nearest_of_both(tmp_path: Path, nam
     store = ProfileStore(tmp_path)
     store.write(saved())
     with pytest.raises(ConfigError) as caught:
-        parse(SMALLEST.format(name), "x.toml", lambda _: store)
+        parse(SMALLEST.format(name), "x.toml", lambda _, name: saved_profile(tmp_path, name))
     text = str(caught.value)
     assert text.startswith(f"x.toml: 'imu[0].profile': found {name!r}; allowed: \"icm42688p\", ")
     assert text.endswith(f"did you mean {near!r}?")
@@ -155,7 +155,7 @@ def test_an_unknown_name_is_refused_with_the_nearest_of_both(tmp_path: Path, nam
 
 
 def test_who_only_asks_the_daemon_does_not_look() -> None:
-    assert parse(SMALLEST.format("mine"), "x.toml", lambda _: None).imu[0].profile == "mine"
+    assert parse(SMALLEST.format("mine"), "x.toml", lambda _, name: name).imu[0].profile == "mine"
 
 
 def test_figures_are_not_written_into_the_file() -> None:
@@ -194,7 +194,7 @@ def test_learned_saved_and_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert (profile.sources[0].file, profile.imu) == ("half_hour.csv", "imu")
     toml = tmp_path / "x.toml"
     toml.write_text(SMALLEST.format("mine") + f'[storage]\ndirectory = "{tmp_path}"\n', encoding="utf-8")
-    config = parse(toml.read_text(encoding="utf-8"), "x.toml", ProfileStore)
+    config = parse(toml.read_text(encoding="utf-8"), "x.toml", saved_profile)
     assert noise_profile(config.imu[0].profile).gyro == profile.gyro
     # Whose figures they are, for `companion status`.
     (shown,) = Profiles(config).status()

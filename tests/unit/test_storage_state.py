@@ -18,7 +18,7 @@ import pytest
 from companion.calibration.records.record import Arming
 from companion.errors import StorageError
 from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
-from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, FacesStore, signing_time_in
+from companion.storage.learned import SIGNING_FILE, BiasStore, alignment_in, faces_in, signing_time_in
 from companion.storage.profiles import ProfileStore, read_profile
 from companion.storage.records import RecordStore
 from companion.storage.state import MOST_ASIDE, MOST_BYTES, BoundedList, StateFile, sealed, unsealed
@@ -64,8 +64,8 @@ HOSTILE: dict[str, Callable[[Path], Any]] = {
 FILES: dict[str, Callable[[Path], Any]] = {
     "journal.json": lambda folder: ChangeLog(folder).journal.load(),
     "undo-1.json": lambda folder: ChangeLog(folder).undos()[0].load(),
-    "alignment.json": lambda folder: AlignmentStore(folder).load(),
-    "faces.json": lambda folder: FacesStore(folder).load(),
+    "alignment.json": lambda folder: alignment_in(folder).load(),
+    "faces.json": lambda folder: faces_in(folder).load(),
     "biases.json": lambda folder: BiasStore(folder).read() or None,
     "armings.json": lambda folder: BoundedList(folder / "armings.json", Arming, 200).read() or None,
     SIGNING_FILE: lambda folder: signing_time_in(folder).load(),

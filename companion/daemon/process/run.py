@@ -25,7 +25,7 @@ from companion.daemon.process.service import Service
 from companion.daemon.process.supervisor import Supervisor
 from companion.errors import CompanionError, ConfigError
 from companion.links.system.service_manager import ServiceManager
-from companion.storage.profiles import ProfileStore
+from companion.storage.profiles import saved_profile
 
 logger = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ class Reloader:
     async def reload(self) -> str:
         """Apply what the file says now; what came of it in one line, empty when all of it is in force."""
         try:
-            new = flat(await self._offload(load, self._path, ProfileStore))
+            new = flat(await self._offload(load, self._path, saved_profile))
         except ConfigError as error:
             logger.error("reload refused, the old configuration stays in force: %s", error)  # noqa: TRY400 - one line
             return f"reload refused: {error}"

@@ -13,7 +13,7 @@ from companion.config.sections import Config
 from companion.configured import models
 from companion.daemon.core import Offload
 from companion.links.system.listeners import Listeners
-from companion.storage.learned import AlignmentStore
+from companion.storage.learned import alignment_in
 
 logger = logging.getLogger(__name__)
 
@@ -23,7 +23,7 @@ class AlignmentInForce:
 
     def __init__(self, config: Config, offload: Offload) -> None:
         self._gradienter, self._offload = config.gradienter, offload
-        self._store = AlignmentStore(config.storage.path)
+        self._store = alignment_in(config.storage.path)
         self.record: AlignmentRecord | None = None
         """What is kept, whether or not it is used."""
         self.unused: str | None = None

@@ -18,14 +18,14 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.formats import Object
 from companion.physics.frames import Array, Matrix
 from companion.physics.units import MG
-from companion.storage.learned import FacesStore, this_boot
+from companion.storage.learned import faces_in, this_boot
 
 
 class FacesInForce:
     """The latest measurement, on disk and in memory."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
-        self._store, self._offload = FacesStore(core.config.storage.path), core.offload
+        self._store, self._offload = faces_in(core.config.storage.path), core.offload
         self._collector, self._profiles, self._imus = core.collector, core.profiles, imus
         self._host = this_boot()
         self.record: FacesRecord | None = None
