@@ -7,6 +7,7 @@ still seconds, drawn directly.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -60,8 +61,12 @@ class Day:
 class Aircraft:
     """One piece of a part on one board."""
 
-    def __init__(self, noise: AxisNoise, random: np.random.Generator) -> None:
+    def __init__(
+        self, noise: AxisNoise, random: np.random.Generator, shown: Callable[[Array, float], Array] | None = None
+    ) -> None:
+        """`shown` makes of the board's temperature each second, and that of the air, what a thermometer shows."""
         self._noise, self._random = noise, random
+        self._shown = shown or (lambda board_degc, air_degc: board_degc)
         self._flicker_sigma = noise.flicker * math.sqrt(math.log(3.0) / math.pi)
         offset = math.sqrt(noise.scatter**2 - len(_TAUS_S) * self._flicker_sigma**2)
         usual = random.normal(0.0, 1000.0 * DEG_H, 3)
@@ -74,7 +79,8 @@ class Aircraft:
         turned_on = self.piece.turned_on(random)
         # Three times in ten it is switched on again while it is warm.
         cold = 1.0 if random.random() < 0.7 else random.uniform()
-        temperature = self.board.switched_on(random.uniform(*AMBIENT_DEGC), cold)
+        air_degc = random.uniform(*AMBIENT_DEGC)
+        temperature = self.board.switched_on(air_degc, cold)
         curve = self.piece.curve
         degc, die = (np.array([temperature(second - late) for second in range(count)]) for late in (0.0, curve.lag_s))
         bias = turned_on + curve.at((die - PARTS[TRIED[0]].reference_degc)[:, None]) + self._flicker(count)
@@ -83,6 +89,7 @@ class Aircraft:
             length = int(random.uniform(5.0, 120.0))
             still[second : second + length] = True
             second += length + int(random.uniform(5.0, 60.0))
+        degc = self._shown(degc, air_degc)
         return Day(degc + random.normal(0.0, _THERMOMETER_K, count), np.gradient(degc), bias, still)
 
     def _flicker(self, count: int) -> Array:
@@ -126,11 +133,11 @@ class Aircraft:
         return points
 
 
-def power_up(part: str, seed: int, number: int) -> PowerUpRun:
+def power_up(part: str, seed: int, number: int, shown: Callable[[Array, float], Array] | None = None) -> PowerUpRun:
     """One aircraft of a part: twenty days, and what is known when it is switched on again."""
     random = np.random.default_rng([seed, number])
     scatter = PARTS[part].gyro.scatter
-    aircraft = Aircraft(PARTS[part].gyro, random)
+    aircraft = Aircraft(PARTS[part].gyro, random, shown)
     known: tuple[Point, ...] = ()
     once: list[Point] = []
     for day in range(DAYS):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from companion.calibration.means.warming import temperature_path
-from companion.calibration.temperature.curve import Along, Curve, Settling, Warm, along, fit, settling
+from companion.calibration.temperature.along import Along, Settling, Warm, along, settling
+from companion.calibration.temperature.curve import Curve, fit
 from sim.accuracy.mid_warm_up import RATES_K_MIN, SPANS_S, mid_warm_up
 from sim.imu_model import DEG_H
 from tests.unit.test_calibration_temperature import PER_K, power_up

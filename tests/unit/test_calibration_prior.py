@@ -44,11 +44,12 @@ def point(
     since: float | None = None,
     up: Sequence[float] | Array = LEVEL,
     zero: str = "zero",
+    sigma: float = 0.0,
 ) -> Point:
     x, y, z = (float(value) for value in bias)
     one = Measured(
         bias=(x, y, z),
-        sigma_stat=(0.0, 0.0, 0.0),
+        sigma_stat=(sigma, sigma, sigma),
         sigma_use=(1e-5, 1e-5, 1e-5),
         sigma_shared=(0.0, 0.0, 0.0),
         suspect=suspect,
@@ -354,7 +355,7 @@ def test_accelerometers_have_a_curve_too_unless_they_never_stood_alike() -> None
     for day in range(8):
         for k, degc in enumerate(15.0 + day + np.arange(0.0, 16.0, 4.0)):
             bias = (0.3 * degc + random.normal(0.0, 0.02, 3)) * MG
-            still.append(point(bias.tolist(), f"day {day}", triad="accel", temperature=float(degc)))
+            still.append(point(bias.tolist(), f"day {day}", triad="accel", temperature=float(degc), sigma=0.02 * MG))
             roll = 0.5 * k
             tilted.append(msgspec.structs.replace(still[-1], up=(0.0, float(np.sin(roll)), float(-np.cos(roll)))))
     curve = curve_of(still, "accel", accel)

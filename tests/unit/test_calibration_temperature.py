@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.temperature.curve import Node, PowerUpNodes, fit
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.records.history import kept
+from companion.calibration.solution.prior import curve_of
+from companion.calibration.temperature.curve import Curve, Node, PowerUpNodes, fit
+from sim.accuracy.temperature import Aircraft
+from sim.accuracy.temperature import power_up as simulated
+from sim.imu_model import PARTS
 
 Array = NDArray[np.float64]
 PER_K = 54.0
@@ -116,3 +122,69 @@ def test_beyond_what_was_seen_it_goes_straight_on_and_says_so() -> None:
 def test_two_power_ups_tell_nothing_of_a_third() -> None:
     nodes, _ = part(np.random.default_rng(2), 10.0, (20.0,), 2)
     assert fit(nodes, 1.0, PER_K) is None
+
+
+def of_the_air(board_degc: Array, air_degc: float) -> Array:
+    """A draught."""
+    return np.asarray(air_degc + 2.0 * np.sin(np.arange(len(board_degc)) / 150.0 + air_degc))
+
+
+def of_a_processor(board_degc: Array, air_degc: float) -> Array:
+    """Warmer by 35 K in no time."""
+    return air_degc + 35.0 * (1.0 - np.exp(-np.arange(len(board_degc)) / 60.0))
+
+
+def of_a_heater(board_degc: Array, air_degc: float) -> Array:
+    """It switches itself on and off."""
+    return np.asarray(25.0 + 5.0 * np.sin(np.arange(len(board_degc)) / 100.0 + air_degc))
+
+
+def in_degf(board_degc: Array, air_degc: float) -> Array:
+    return 1.8 * board_degc + 32.0
+
+
+@pytest.mark.parametrize("shown", [of_the_air, of_a_processor, of_a_heater, in_degf])
+def test_no_thermometer_makes_a_power_up_worse_than_what_is_in_force(shown: Callable[[Array, float], Array]) -> None:
+    """The last calibration's value is, until what is foretold differs by two sigma, as the daemon has it."""
+    runs = [simulated("bmi088", 8, number, shown) for number in range(8)]
+    last, foretold, sigma = (np.array([getattr(run, name) for run in runs]) for name in ("last", "error", "sigma"))
+    written = (np.abs(foretold - last) > 2.0 * sigma).any(axis=1, keepdims=True)
+    left = np.where(written, foretold, last)
+    assert np.square(left).mean() <= np.square(last).mean()
+    if shown is in_degf:
+        assert np.square(left).mean() < 0.5 * np.square(last).mean()
+
+
+@pytest.mark.parametrize("shown", [of_the_air, of_a_processor, of_a_heater])
+@pytest.mark.parametrize("part", ["bmi088", "icm42688p"])
+def test_a_foreign_thermometer_tells_of_no_change(part: str, shown: Callable[[Array, float], Array]) -> None:
+    assert sum(learned(part, number, shown)[1] is not None for number in range(6)) <= 1
+
+
+@pytest.mark.parametrize("shown", [None, in_degf])
+@pytest.mark.parametrize("part", ["bmi088", "icm42688p"])
+def test_its_own_tells_of_changes_as_well_as_it_says(part: str, shown: Callable[[Array, float], Array] | None) -> None:
+    inside, left, moved = [], [], []
+    for number in range(6):
+        aircraft, curve = learned(part, number, shown)
+        assert curve is not None
+        first, *_, last = aircraft.seen(aircraft.day(), 99)
+        assert first.gyro is not None
+        assert first.temperature_degc is not None
+        assert last.gyro is not None
+        assert last.temperature_degc is not None
+        said, variance = curve.change((first.temperature_degc, first.k_s), (last.temperature_degc, last.k_s))
+        noise = 2.0 * PARTS[part].gyro.flicker ** 2 + first.gyro.sigma_stat[0] ** 2 + last.gyro.sigma_stat[0] ** 2
+        change = np.subtract(last.gyro.bias, first.gyro.bias)
+        moved.append(change)
+        left.append(change - said)
+        inside.append(np.abs(change - said) < 2.0 * np.sqrt(variance + noise))
+    assert np.mean(inside) > 0.8
+    assert np.square(left).mean() < 0.05 * np.square(moved).mean()
+
+
+def learned(part: str, number: int, shown: Callable[[Array, float], Array] | None) -> tuple[Aircraft, Curve | None]:
+    """An aircraft after ten days, and its curve."""
+    aircraft = Aircraft(PARTS[part].gyro, np.random.default_rng([9, number]), shown)
+    known = [point for day in range(10) for point in aircraft.seen(aircraft.day(), day)]
+    return aircraft, curve_of(kept(known), "gyro", noise_profile(part).gyro)

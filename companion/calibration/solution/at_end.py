@@ -17,7 +17,7 @@ from companion.calibration.means.warming import NEXT_S
 from companion.calibration.records.record import WhenWarm
 from companion.calibration.solution.prior import ExpectedImu
 from companion.calibration.solution.solve import ImuSolution, Shared
-from companion.calibration.temperature.curve import Along
+from companion.calibration.temperature.along import Along
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad

@@ -18,6 +18,7 @@ from companion.samples import Vector
 STEP_K: Final = 1.0
 """Between the rows of a curve."""
 MOST_ROWS: Final = 60
+_ENOUGH_K: Final = 5.0
 _DAY_S: Final = 86400.0
 
 
@@ -165,6 +166,8 @@ def _needs(known: int, power_ups: int, degc: Sequence[float]) -> str:
         return "ten still seconds at a known temperature are the first point"
     if power_ups < WEIGHS_FROM:
         return f"{power_ups} of {WEIGHS_FROM} power-ups seen; still seconds at other temperatures will draw a curve"
+    if max(degc) - min(degc) >= _ENOUGH_K:
+        return "no curve: its bias does not follow the temperature that it tells; another sensor's?"
     return f"only {max(degc) - min(degc):.0f} K seen; still seconds where it is warmer or colder will draw a curve"
 
 

@@ -30,7 +30,8 @@ from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.calibration.records.align_record import Determined, ImuAlignmentRecord
 from companion.calibration.records.history import Measured, Point, PowerUp, believed
 from companion.calibration.records.record import Effective
-from companion.calibration.temperature.curve import WARM_AFTER, Along, Curve, Node, PowerUpNodes, Settling, along, fit
+from companion.calibration.temperature.along import WARM_AFTER, Along, Settling, along
+from companion.calibration.temperature.curve import Curve, Node, PowerUpNodes, fit
 from companion.physics.frames import Array, Floats, Matrix, skew, vector
 from companion.physics.units import DEG, DEG_H, MG, G
 from companion.samples import Triad, Vector
@@ -130,6 +131,9 @@ CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2
 """BMI088, the worse one of method section 2.1."""
 _KNOWN: Final = 0.5
 """Of the catalogue's: a curve that is known worse is not worth following."""
+_UNEXPLAINED: Final = 0.1
+"""Of the changes within power-ups: with a thermometer of its own 0.05 and less, but for one simulated aircraft in some
+hundreds; with that of the air, of a heater or of a processor 0.1 to 1 and more."""
 _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0
 
@@ -263,7 +267,8 @@ def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve 
     assert curve is not None
     low, high = curve.span_degc
     _, variance = curve.change((low, 0.0), (low + 1.0, 0.0))
-    return curve if high > low and variance.max() < (_KNOWN * CATALOGUE_PER_K[triad]) ** 2 else None
+    known = high > low and variance.max() < (_KNOWN * CATALOGUE_PER_K[triad]) ** 2
+    return curve if known and curve.unexplained < _UNEXPLAINED else None
 
 
 def _along(first: Point, point: Point, triad: Triad) -> Node:

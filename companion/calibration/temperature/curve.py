@@ -12,10 +12,8 @@ The coefficients have a prior as wide as the catalogue's parts move, so that a c
 where it has seen nothing.
 
 Each power-up in turn is foretold by the others, at its first node: that decides the lag and how many terms there are,
-and tau is such that those errors are as large as is said.
-
-Where a warm-up will end says the present rate: a board that goes to its end as exp(-t / tau) has tau dT/dt to go, at
-whatever temperature of the air, and tau is what earlier power-ups have shown.
+and tau is such that those errors are as large as is said. Likewise its change from there to its last node: what is said
+of changes is as uncertain as that shows, and a thermometer that is none of this IMU explains little of them.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.physics.frames import Array, Floats, Matrix, vector
+from companion.physics.frames import Array, Floats, Matrix
 from companion.samples import Vector
 
 REFERENCE_DEGC: Final = 35.0
@@ -46,20 +44,13 @@ _AT_LEAST: Final = 0.5
 _RANGE: Final = 18.0
 """Of the logarithm of the scatter's variance, about that of a kelvin."""
 _HALVINGS: Final = 25
+_SURELY: Final = 2.0
+"""Sigmas."""
+_LITTLE: Final = 1e-6
 _PRIOR_K: Final = np.array([UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
 """One sigma of each term's coefficient, in kelvin of what parts move."""
 State = tuple[float, float]
 """A temperature and how fast it rises, degC and K/s."""
-
-_SLOWED_K_S: Final = 0.25 / 60.0
-"""By less than that a warm-up that slows down tells nothing of where it ends."""
-_LEAST: Final = 0.05
-"""One sigma of tau, the least of it: boards have more than one."""
-WARM_AFTER: Final = 5.0
-"""So many tau."""
-_MAD_TO_SIGMA: Final = 1.4826
-_TO_END: Final = (-1.0 / 6.0, -4.0 / 6.0, 5.0 / 6.0)
-"""The last less the mean by Simpson's rule."""
 
 
 class Node(msgspec.Struct, frozen=True, array_like=True):
@@ -92,6 +83,9 @@ class Curve:
         coefficients: mean and those of the terms, (1 + terms, 3).
         covariance: of these, for an axis that scatters as usual.
         widening: of each axis, (3,).
+        of_changes: likewise, for changes within a power-up.
+        unexplained: share of these, in squares, by which power-ups left out differ from what was foretold and is not
+            chance.
         scatter: variance of one more power-up about the curve, its wandering included, (3,).
         foretold: mean square error of what was foretold of power-ups left out, (rad/s)^2 or (m/s^2)^2.
         shares: of every power-up in the mean, (n,).
@@ -105,6 +99,8 @@ class Curve:
     coefficients: Matrix
     covariance: Matrix
     widening: Array
+    of_changes: Array
+    unexplained: float
     scatter: Array
     foretold: float
     shares: Array
@@ -140,7 +136,7 @@ class Curve:
         for weight, (degc, k_s) in weighted:
             side = 1.0 if degc > self.span_degc[1] else -1.0
             x, outside_k = x + weight * self._row(degc, k_s), outside_k + weight * side * self.beyond_k(degc)
-        variance = float(x @ self.covariance[1:, 1:] @ x) * self.widening + (self.per_kelvin * outside_k) ** 2
+        variance = float(x @ self.covariance[1:, 1:] @ x) * self.of_changes + (self.per_kelvin * outside_k) ** 2
         return x @ self.coefficients[1:], variance
 
     def _row(self, degc: float, k_s: float = 0.0) -> Array:
@@ -201,6 +197,10 @@ class _Sums:
     """Terms of the first node, (n, 3)."""
     first_bias: Floats
     first_variance: Floats
+    change: Floats
+    """From the first node to the last."""
+    change_bias: Floats
+    change_variance: Floats
 
     @classmethod
     def of(cls, power_ups: Sequence[PowerUpNodes], lag_s: float, in_run_variance: float) -> _Sums:
@@ -216,6 +216,7 @@ class _Sums:
             rows.append((
                 1.0 / total, one.common_variance, mean, mean_bias,
                 about.T @ (terms - mean), about.T @ (bias - mean_bias), terms[0], bias[0], variance[0],
+                terms[-1] - terms[0], bias[-1] - bias[0], variance[-1] + variance[0],
             ))  # fmt: skip
         return cls(lag_s, *(np.array(each) for each in zip(*rows, strict=True)))
 
@@ -227,6 +228,7 @@ class _Fit:
         some = slice(order)
         self._sums, self._order, self._in_run, self._per_kelvin = sums, order, in_run_variance, per_kelvin
         self._first, between = _with_one(sums.first[:, some]), _with_one(sums.mean[:, some])
+        self._change = np.concatenate([np.zeros((len(sums.change), 1)), sums.change[:, some]], axis=1)
         self._squares = between[:, :, None] * between[:, None, :]
         self._products = between[:, :, None] * sums.bias[:, None, :]
         self._within, self._within_right = np.zeros_like(self._squares), np.zeros_like(self._products)
@@ -243,13 +245,22 @@ class _Fit:
         squares = np.mean(np.square(error), axis=0)
         # Three axes know the scatter better than one, but one may scatter more than the others.
         freedom = 3.0 * max(len(shares) - 1.0 - (self._order > 0), 1.0)
-        widening = np.maximum(np.mean(np.square(error) / variance[:, None], axis=0), 1.0) * freedom / (freedom - 2.0)
+        student = freedom / (freedom - 2.0)
+        widening = np.maximum(np.mean(np.square(error) / variance[:, None], axis=0), 1.0) * student
+        said, of_changes = self._by_others(scatter, self._change)
+        missed, noise = np.square(self._sums.change_bias - said), self._sums.change_variance[:, None]
+        surely = float((missed - np.square(_SURELY) * (of_changes[:, None] + noise)).sum())
+        changed = float(np.square(self._sums.change_bias).sum()) + float(noise.sum())
+        by_chance = (1.0 + _SURELY * math.sqrt(2.0 / len(noise))) * noise
+        more = (missed - by_chance).sum(axis=0) / max(float(of_changes.sum()), _LITTLE * float(noise.sum()))
         return Curve(
             order=self._order,
             lag_s=self._sums.lag_s,
             coefficients=covariance @ right.sum(axis=0),
             covariance=covariance,
             widening=widening,
+            of_changes=np.maximum(more, 1.0) * student,
+            unexplained=max(surely, 0.0) / changed,
             scatter=np.maximum((scatter + self._in_run) * widening, _AT_LEAST * np.maximum(squares, squares.mean())),
             foretold=float(squares.mean()),
             shares=shares / shares.sum(),
@@ -282,11 +293,15 @@ class _Fit:
 
     def _foretold(self, scatter: float) -> tuple[Floats, Floats]:
         """By how much each power-up's first node is off what the others say, (n, 3), and the variance of it, (n,)."""
+        said, variance = self._by_others(scatter, self._first)
+        return self._sums.first_bias - said, variance + self._sums.first_variance + scatter
+
+    def _by_others(self, scatter: float, rows: Floats) -> tuple[Floats, Floats]:
+        """What the others say of each power-up's row of terms, (n, 3), and how sure that is, (n,)."""
         _, normal, right = self._equations(scatter)
-        others = np.concatenate([self._first[:, :, None], right.sum(axis=0) - right], axis=2)
-        solved = self._first[:, None, :] @ np.linalg.solve(self._base + normal.sum(axis=0) - normal, others)
-        said, variance = solved[:, 0, 1:], solved[:, 0, 0] + self._sums.first_variance + scatter
-        return self._sums.first_bias - said, variance
+        others = np.concatenate([rows[:, :, None], right.sum(axis=0) - right], axis=2)
+        solved = rows[:, None, :] @ np.linalg.solve(self._base + normal.sum(axis=0) - normal, others)
+        return solved[:, 0, 1:], solved[:, 0, 0]
 
 
 def _terms(degc: Floats) -> Floats:
@@ -297,104 +312,3 @@ def _terms(degc: Floats) -> Floats:
 
 def _with_one(terms: Floats) -> Floats:
     return np.concatenate([np.ones((len(terms), 1)), terms], axis=1)
-
-
-class Warm(msgspec.Struct, frozen=True, kw_only=True):
-    """When it will be warm; vehicle FRD, rad/s or m/s^2."""
-
-    degc: float
-    change: Vector
-    """Of the bias, from the end of the window."""
-    variance: Vector
-
-
-class Along(msgspec.Struct, frozen=True, kw_only=True):
-    """What the curve of one triad says of a window; vehicle FRD, rad/s or m/s^2, and those a second."""
-
-    shift: Vector
-    """From the mean over it to its end."""
-    shift_variance: Vector
-    slope: Vector
-    slope_variance: Vector
-    warm: Warm | None = None
-    """None: nobody knows where it will end, or no power-up has been there."""
-
-    def less(self, shift: Array, slope: Array) -> Along:
-        """The same where somebody takes off so much by temperature: when warm, too, so that nothing is foretold."""
-        if not shift.any() and not slope.any():
-            return self
-        return msgspec.structs.replace(
-            self, shift=vector(self.shift - shift), slope=vector(self.slope - slope), warm=None
-        )
-
-
-class Settling(msgspec.Struct, frozen=True):
-    """How slowly a board goes to its end."""
-
-    tau_s: float
-    sigma_s: float
-
-
-def settling(power_ups: Iterable[Sequence[State]]) -> Settling | None:
-    """Out of the states of earlier power-ups, in their order; None of too few.
-
-    From where it rose fastest to the last one it has gained tau times by what it has slowed down.
-    """
-    found = []
-    for states in power_ups:
-        steepest, last = max(states, key=lambda state: state[1]), states[-1]
-        slowed = steepest[1] - last[1]
-        if slowed > _SLOWED_K_S and last[0] > steepest[0]:
-            found.append((last[0] - steepest[0]) / slowed)
-    if len(found) < FEWEST:
-        return None
-    tau = _middle(found)
-    scatter = _MAD_TO_SIGMA * _middle([abs(each - tau) for each in found])
-    return Settling(tau, math.hypot(scatter, _LEAST * tau))
-
-
-def _middle(values: Sequence[float]) -> float:
-    return sorted(values)[len(values) // 2]
-
-
-def along(
-    curve: Curve,
-    states: tuple[State, State, State],
-    span_s: float,
-    end_variance: float,
-    settles: Settling | None,
-    wander: float = 0.0,
-) -> Along:
-    """Of a window whose temperature was in these `states` at its beginning, in its middle and at its end.
-
-    `end_variance`, K^2, is that of how far its end is from the mean, `wander` that of what the bias does by itself
-    until it is warm.
-    """
-    start, _, end = states
-    shift, of_shift = curve.moves(zip(_TO_END, states, strict=True))
-    slope, of_slope = curve.change(start, end)
-    by_end = np.square(_per_k(curve, end[0])) * end_variance
-    return Along(
-        shift=vector(shift),
-        shift_variance=vector(of_shift + by_end),
-        slope=vector(slope / span_s),
-        # A line goes by half of its change from its middle to its end.
-        slope_variance=vector(of_slope / span_s**2 + by_end * (2.0 / span_s) ** 2),
-        warm=None if settles is None else _warm(curve, states, end_variance * (2.0 / span_s) ** 2, settles, wander),
-    )
-
-
-def _warm(curve: Curve, states: Sequence[State], k_s_variance: float, settles: Settling, wander: float) -> Warm | None:
-    _, (middle_degc, k_s), end = states
-    degc = middle_degc + settles.tau_s * k_s
-    if curve.beyond_k(degc) > 0.0:
-        return None
-    change, variance = curve.change(end, (degc, 0.0))
-    of_degc = (settles.sigma_s * k_s) ** 2 + settles.tau_s**2 * k_s_variance
-    return Warm(
-        degc=degc, change=vector(change), variance=vector(variance + wander + np.square(_per_k(curve, degc)) * of_degc)
-    )
-
-
-def _per_k(curve: Curve, degc: float) -> Array:
-    return curve.change((degc - 0.5, 0.0), (degc + 0.5, 0.0))[0]

@@ -10,7 +10,8 @@ from companion.calibration.means.warming import Warming
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.history import Point, by_power_up
 from companion.calibration.solution.prior import curve_of, follow
-from companion.calibration.temperature.curve import Along, Curve, Settling, State, settling
+from companion.calibration.temperature.along import Along, Settling, settling
+from companion.calibration.temperature.curve import Curve, State
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.physics.frames import Array, vector
