@@ -29,7 +29,7 @@ _SILENT_S = 0.1
 COPTER_MODES = {"guided": 4, "hold": 5}
 PLANE_MODES = {"takeoff": 13, "hold": 12}
 STICKS_S = 0.2
-MIDDLE_US = 1500
+LOWEST_US, MIDDLE_US = 1000, 1500
 ARM_WITHIN_S = 60.0
 
 
@@ -136,7 +136,6 @@ def flying_parameters(scenario: Scenario, wind: tuple[float, float]) -> dict[str
         "SIM_DRIFT_SPEED": 0.0,
         "INS_GYR_CAL": 0.0,
         "SCR_ENABLE": 1.0,
-        "CMPG_ENABLE": 0.0,
         "SERIAL0_PROTOCOL": 2.0,
         "SERIAL1_PROTOCOL": 2.0,
     }
@@ -190,7 +189,7 @@ class FlyingArduPilot(FlyingVehicle):
         self._companion, self._ground = companion, (LOOPBACK, free_udp_port())
         self.system_id = 1
         self.rider = Rider(self.truth)
-        self.sticks_us = [MIDDLE_US] * 4
+        self.sticks_us = [MIDDLE_US, MIDDLE_US, LOWEST_US, MIDDLE_US]
         """Roll, pitch, throttle, yaw; sent to it while it flies."""
 
     @property
@@ -275,6 +274,8 @@ class FlyingArduPilot(FlyingVehicle):
 
     async def hold(self, ground: GroundStation) -> None:
         """Loiter, sticks in the middle: a plane circles."""
+        self.sticks_us[2] = MIDDLE_US
+        await asyncio.sleep(2.0 * STICKS_S)
         await self.mode(ground, "hold")
 
     async def steer(self, ground: GroundStation) -> None:

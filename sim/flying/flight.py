@@ -39,12 +39,12 @@ SET_UPS: dict[SetUp, str] = {
 MORE = '\n[push]\nattitude = "yaw"\n[calibration]\nmin_still_s = 10\nmax_s = 15\nat_arm = "off"\n'
 CALIBRATED_WITHIN_S = 120.0
 PUSHED_WITHIN_S = 60.0
-FIRST_FIX_S = 20.0
-RESTARTED_S = 20.0
+STARTED_S = 2.0
+RESTARTED_S = 6.0
 HEIGHT_M = 10.0
 PLANE_HEIGHT_M = 50.0
-SETTLED_S = 10.0
-WATCHED_S = 45.0
+SETTLED_S = 6.0
+WATCHED_S = 35.0
 SCRIPT = Path(__file__).parents[2] / "companion" / "lua" / "companion_arming.lua"
 
 
@@ -135,6 +135,8 @@ class Flight:
         shown = await self.ask("autopilot-setup")
         if shown["state"] != ("not applied" if only_one else "applied"):
             raise RuntimeError(f"autopilot-setup: {shown}")
+        if self.plan.set_up == "script":
+            await self.ground.put("CMPG_ENABLE", 0.0)  # its other half, the gate, is not what flies here
 
     async def calibrate(self) -> None:
         """Calibrate, and wait until the heading is pushed.
@@ -241,7 +243,7 @@ async def flying(plan: Plan, folder: Path, unix_s: float) -> AsyncIterator[Fligh
             flight = Flight(plan, vehicle, ground, link, here)
             try:
                 await flight.start_daemon()
-                await vehicle.sleep(FIRST_FIX_S)
+                await vehicle.sleep(STARTED_S)
                 await flight.daemon.ready(READY_WITHIN_S)
                 yield flight
             finally:

@@ -55,6 +55,17 @@ def test_what_is_measured_is_a_little_old() -> None:
     assert aircraft.late == 1
 
 
+def test_while_the_firmware_restarts_it_stands() -> None:
+    aircraft = turning(1.0, 1.0)
+    assert aircraft.truth(np.array([6.0])).force_m_s2[0] == pytest.approx([0.0, 0.0, -aircraft.site.gravity_m_s2])
+    aircraft.restart()
+    for k in range(3):
+        aircraft.take(
+            State(k * STEP_S, yawed(0.0), (0.0,) * 3, (0.0, 0.0, -9.8), (0.0,) * 3, (0.0,) * 3), 107.0 + k * STEP_S
+        )
+    assert aircraft.truth(np.array([6.5])).force_m_s2[0] == pytest.approx([0.0, 0.0, -aircraft.site.gravity_m_s2])
+
+
 def test_it_stands_as_it_was_put_down_until_it_is_told_otherwise() -> None:
     aircraft = FlyingAircraft(site_at(40.0, 116.0, 50.0), heading_deg=30.0, unix_s=1_795_219_200.0)
     assert np.degrees(aircraft.angles_rad(1.0)) == pytest.approx([0.0, 0.0, 30.0])
