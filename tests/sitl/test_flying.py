@@ -26,5 +26,7 @@ def test_it_stays_where_it_is(tmp_path: Path, fault: str) -> None:
     print(found, [event for event in record.events if event.own_s > record.struck_s])
     assert not found.wrong
     assert found.yaw_before_deg < 5.0
-    if fault == "kill":  # a heading that drifts is not believed by EKF3 itself, sooner than anybody asks for the compass
+    if (
+        fault == "kill"
+    ):  # a heading that drifts is not believed by EKF3 itself, sooner than anybody asks for the compass
         assert found.fallback_s < 1.0
