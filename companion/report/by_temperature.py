@@ -19,7 +19,7 @@ _WHEN: Final = {"now": "now", "then": "this calibration"}
 
 
 class _Dot(msgspec.Struct, frozen=True):
-    """One still window, one triad."""
+    """One still window, or what is expected at a temperature, of one triad."""
 
     degc: float
     bias: Vector
@@ -49,13 +49,12 @@ def _figure(imu: ByTemperature, triad: Triad, when: str) -> Markup | None:
             power_ups.setdefault(one.power_up, []).append(_Dot(one.degc, bias, sigma))
     if not power_ups:
         return None
-    of_gyros = triad == "gyro"
-    now = imu.now if of_gyros else None
+    now, rows = (imu.now if triad == "gyro" else None), _curve(imu, triad)
     seen = [dot.degc for dots in power_ups.values() for dot in dots]
     across = svg.linear([*seen, *([now.degc] if now else [])], least=_LEAST_K)
     plots = []
     for axis in range(3):
-        curve = [(row.degc, row.gyro_deg_h[axis], 2.0 * row.sigma_deg_h[axis]) for row in imu.curve if of_gyros]
+        curve = [(row.degc, row.bias[axis], 2.0 * row.sigma[axis]) for row in rows]
         dots = [(dot.degc, dot.bias[axis], dot.sigma[axis]) for each in power_ups.values() for dot in each]
         ends = [value + sign * by for _, value, by in (*dots, *curve) for sign in (-1.0, 1.0)]
         plot = svg.Plot(
@@ -76,6 +75,12 @@ def _figure(imu: ByTemperature, triad: Triad, when: str) -> Markup | None:
             _mark(plot, now.degc, now.gyro_deg_h[axis])
         plots.append(plot.svg())
     return tag("figure", tag("h4", NAMES[triad]), *plots, tag("figcaption", _caption(imu, triad, when)))
+
+
+def _curve(imu: ByTemperature, triad: Triad) -> list[_Dot]:
+    if triad == "gyro":
+        return [_Dot(row.degc, row.gyro_deg_h, row.sigma_deg_h) for row in imu.curve]
+    return [_Dot(row.degc, row.accel_mg, row.sigma_mg) for row in imu.accel_curve]
 
 
 def _power_up(plot: svg.Plot, dots: Sequence[_Dot], axis: int, class_: str) -> None:
@@ -121,9 +126,8 @@ def _told(imu: ByTemperature, triad: Triad, axis: int, dots: Sequence[tuple[floa
 
 def _caption(imu: ByTemperature, triad: Triad, when: str) -> str:
     words = ["A dot is a still window, a line joins those of one power-up."]
-    if triad == "gyro":
-        if imu.curve:
-            words.append("Curve and band: the next power-up, with two sigma, as far as it was seen.")
-        if imu.now is not None:
-            words.append(f"Ring and dashes: {_WHEN[when]}, {imu.now.degc:.1f} degC.")
+    if _curve(imu, triad):
+        words.append("Curve and band: the next power-up, with two sigma, as far as it was seen.")
+    if triad == "gyro" and imu.now is not None:
+        words.append(f"Ring and dashes: {_WHEN[when]}, {imu.now.degc:.1f} degC.")
     return " ".join(words)

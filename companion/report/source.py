@@ -86,11 +86,13 @@ def _by_temperature(directory: Path, record: Record) -> list[ByTemperature]:
         ):
             continue
         this = next((point for point in points if point.started_at == record.started_at), None)
+        noise = _noise(directory, identity.get("profile", "unknown"))
         found.append(
             by_temperature(
                 name,
                 points,
-                curve_of(points, "gyro", _noise(directory, identity.get("profile", "unknown")).gyro),
+                curve_of(points, "gyro", noise.gyro),
+                curve_of(points, "accel", noise.accel),
                 power_up=this.power_up if this is not None else None,
                 started_at=record.started_at,
             )

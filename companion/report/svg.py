@@ -45,6 +45,8 @@ def linear(values: Sequence[float], *, ticks: int = 4, least: float = 0.0) -> Ax
     middle = (low + high) / 2.0
     low, high = middle - 0.56 * width, middle + 0.56 * width
     step = _nice((high - low) / ticks)
+    if step > (high - low) / 2.0:  # there might be one tick only, from which nobody reads a scale
+        step = _nice(step / 2.6)
     digits = max(0, -math.floor(math.log10(step) + 1e-9))
     first = math.ceil(low / step - 1e-9)
     places = [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]

@@ -17,7 +17,7 @@ from companion.calibration.records.history import Point
 from companion.calibration.solution.by_temperature import ByTemperature, by_temperature
 from companion.calibration.solution.prior import curve_of
 from companion.cli.show import temperature_lines
-from companion.physics.units import DEG_H
+from companion.physics.units import DEG_H, MG
 from companion.report.by_temperature import biases_by_temperature
 from companion.report.calibration_page import calibration_page
 from companion.report.source import material
@@ -26,12 +26,13 @@ from companion.storage.records import RecordStore
 from tests.support.histories import OFFSET_DEG_H, gyro_deg_h_at, imu_record, record, windows_of_days
 
 NOW = datetime.datetime(2026, 6, 1, 12, 0, tzinfo=datetime.UTC)
-MODEL = PROFILES["icm42688p"].gyro
+MODEL, ACCEL_MODEL = PROFILES["icm42688p"].gyro, PROFILES["icm42688p"].accel
 
 
 def learned(points: Sequence[Point], now_degc: float | None = None) -> ByTemperature:
     return by_temperature(
-        "fc", points, curve_of(points, "gyro", MODEL), power_up=points[-1].power_up, now_degc=now_degc
+        "fc", points, curve_of(points, "gyro", MODEL), curve_of(points, "accel", ACCEL_MODEL),
+        power_up=points[-1].power_up, now_degc=now_degc,
     )  # fmt: skip
 
 
@@ -110,6 +111,23 @@ def test_points_curve_band_and_now_lie_where_their_values_are() -> None:
         assert dashes[0][0] == pytest.approx(30.0, abs=0.1)
 
 
+def test_the_accelerometers_curve_is_drawn_where_it_was_shown() -> None:
+    slope_mg = np.array([0.3, -0.2, 0.1])
+
+    def warmer(point: Point) -> Point:
+        assert point.accel is not None
+        assert point.temperature_degc is not None
+        bias = np.array(point.accel.bias) + slope_mg * (point.temperature_degc - 25.0) * MG
+        return msgspec.structs.replace(point, accel=msgspec.structs.replace(point.accel, bias=tuple(bias.tolist())))
+
+    _, forces = plots(learned([warmer(point) for point in windows_of_days(10)]))
+    for axis, drawn in enumerate(forces):
+        (curve,), (_,) = drawn.paths("curve"), drawn.paths("area")
+        (low, first), *_, (high, last) = curve
+        assert (low, high) == pytest.approx((8.0, 38.0), abs=0.1)
+        assert (last - first) / (high - low) == pytest.approx(slope_mg[axis], abs=0.02)
+
+
 def test_what_is_now_is_the_last_window_moved_along_the_curve() -> None:
     points = windows_of_days(10)
     imu = learned(points, now_degc=30.0)
@@ -131,8 +149,6 @@ def test_windows_of_one_power_up_are_joined_and_this_one_stands_out() -> None:
     for drawn in (*gyros, *accelerometers):
         assert [len(run) for run in drawn.paths("run")] == [4] * 6
         assert len(drawn.paths("run past")) == 5
-    for drawn in accelerometers:
-        assert drawn.paths("curve") == []
 
 
 def test_each_plot_says_in_words_what_it_shows() -> None:

@@ -142,6 +142,12 @@ def test_how_good_the_compass_heading_can_be_is_one_line(tmp_path: Path) -> None
     assert bare.in_words() == "heading error bound unknown"
 
 
+def test_an_axis_of_a_small_plot_has_two_ticks_at_least() -> None:
+    for width in (1.0, 1.7, 2.9, 3.4, 3.8, 6.1, 9.9):
+        for middle in (0.0, 0.3, 1.7, -40.3):
+            assert len(svg.linear([middle - width / 2.0, middle + width / 2.0], ticks=3).ticks) >= 2
+
+
 def test_the_points_of_a_plot_lie_where_their_values_are() -> None:
     across, up = svg.linear([0.0, 10.0]), svg.linear([1.0, 100.0])
     plot = svg.Plot(across, up, name="test", height=100.0, x_label="x")

@@ -170,3 +170,10 @@ def test_power_ups_scatter_about_what_is_usual_for_a_piece_and_its_curve_stays()
     assert first.temperature_degc(0.0) == 5.0
     assert np.array_equal(first.curve.powers, second.curve.powers)
     assert (first.true_bias(0.0).gyro_rad_s != second.true_bias(0.0).gyro_rad_s).all()
+
+
+def test_another_power_up_is_seen_behind_another_converter_too() -> None:
+    imu = ImuModel(VirtualAircraft(), "perfect", gyro_bias_rad_s=[1.0, 2.0, 3.0])
+    other = imu.in_steps(0.25, 0.25)
+    imu.turn_on([4.0, 5.0, 6.0], [7.0, 8.0, 9.0])
+    np.testing.assert_array_equal(np.concatenate(other.true_bias(0.0)), [4.0, 5.0, 6.0, 7.0, 8.0, 9.0])

@@ -46,6 +46,14 @@ class Expected(msgspec.Struct, frozen=True, kw_only=True):
     sigma_deg_h: Vector
 
 
+class ExpectedForces(msgspec.Struct, frozen=True, kw_only=True):
+    """Likewise the accelerometers."""
+
+    degc: float
+    accel_mg: Vector
+    sigma_mg: Vector
+
+
 class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU."""
 
@@ -57,6 +65,8 @@ class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
     points: tuple[Seen, ...]
     curve: tuple[Expected, ...]
     """Of the next power-up; empty: not known yet."""
+    accel_curve: tuple[ExpectedForces, ...] = ()
+    """Likewise, where a gradienter has shown it."""
     needs: str | None
     """Why there is no curve, and what will make one."""
     today: int | None
@@ -71,6 +81,7 @@ def by_temperature(
     name: str,
     points: Sequence[Point],
     curve: Curve | None,
+    accel: Curve | None = None,
     *,
     power_up: PowerUp | None,
     now_degc: float | None = None,
@@ -81,7 +92,8 @@ def by_temperature(
     Args:
         name: of the IMU.
         points: all that are kept of it.
-        curve: through them.
+        curve: through them, of the gyros.
+        accel: likewise of the accelerometers.
         power_up: this one; None: not known.
         now_degc: the temperature; None: not known, then it is that of the last window of this power-up.
         started_at: the calibration that is now, for who looks back; empty: the last window of this power-up.
@@ -102,6 +114,7 @@ def by_temperature(
         days=days,
         points=tuple(sorted(seen, key=lambda one: one.at_unix_s)),
         curve=tuple(_expected(curve, step) for step in _steps(*curve.span_degc)) if curve is not None else (),
+        accel_curve=tuple(_forces(accel, step) for step in _steps(*accel.span_degc)) if accel is not None else (),
         needs=None if curve is not None else _needs(len(points), len(groups), [one.degc for one in seen]),
         today=today,
         now=_moved(last, curve, degc) if last is not None and degc is not None else None,
@@ -127,6 +140,11 @@ def _seen(point: Point, power_up: int) -> Seen | None:
 def _expected(curve: Curve, degc: float) -> Expected:
     bias, variance = curve.at(degc)
     return Expected(degc=round(degc, 2), gyro_deg_h=_in(DEG_H, bias), sigma_deg_h=_in(DEG_H, np.sqrt(variance)))
+
+
+def _forces(curve: Curve, degc: float) -> ExpectedForces:
+    bias, variance = curve.at(degc)
+    return ExpectedForces(degc=round(degc, 2), accel_mg=_in(MG, bias), sigma_mg=_in(MG, np.sqrt(variance)))
 
 
 def _moved(last: Seen, curve: Curve | None, degc: float) -> Expected:

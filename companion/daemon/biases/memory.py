@@ -354,7 +354,7 @@ class BiasMemory:
             shown = by_temperature(
                 name,
                 () if known is None else known.points,
-                None if known is None else self.curves.of(name, "gyro"),
+                *(None if known is None else self.curves.of(name, triad) for triad in _TRIADS),
                 power_up=self.whose.power_up(name, unix_s),
                 now_degc=self._now_degc.get(name),
             )
