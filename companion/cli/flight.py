@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from companion.flight.split import Term
 
 _TOLD_BYTES: Final = 1 << 25
-_WORTH: Final = {"gyro": 30.0, "accel": 1.5}
-"""deg/h and mg: smaller findings are nobody's worry."""
+_WORTH: Final = {"deg/h": 30.0, "mg": 1.5}
+"""Smaller findings are nobody's worry."""
 
 
 def add_commands(add: AddCommand) -> None:
@@ -122,33 +122,27 @@ def _imu_lines(imu: ImuFlight) -> list[str]:
     return lines
 
 
-_HEADS: Final = ("in the air", "EKF", "motors off", "temperature", "motors", "per m/s^2", "a minute")
+_HEADS: Final = {
+    "in_flight": "in the air", "ekf": "EKF", "turn_on": "motors off", "temperature": "temperature", "motors": "motors",
+    "vibration": "per m/s^2", "trend": "a minute",
+}  # fmt: skip
 
 
 def _table(imu: ImuFlight) -> list[str]:
     """What is known of every axis; what is known of none is named once."""
-    rows = [
-        (
-            axis.in_flight,
-            imu.ekf.get(axis.axis),
-            axis.turn_on,
-            axis.temperature,
-            axis.motors,
-            axis.vibration,
-            axis.trend,
-        )
-        for axis in imu.axes
-    ]
-    shown = [k for k in range(len(_HEADS)) if any(row[k] for row in rows)]
-    lines = [f"{'left over':13}" + "".join(f"{_HEADS[k]:>13}" for k in shown)]
-    for axis, row in zip(imu.axes, rows, strict=True):
-        unit, name, digits = (DEG_H, "deg/h", 0) if axis.axis.startswith("gyro") else (MG, "mg", 1)
-        lines.append(
-            f"{', '.join((axis.axis, name)):13}" + "".join(f"{_term(row[k], unit, digits):>13}" for k in shown)
-        )
-    lacking = [head for k, head in enumerate(_HEADS) if k not in shown]
-    lines += [f"not known: {', '.join(lacking)}"] if lacking else []
+    shown = [term for term in _HEADS if any(getattr(axis, term) for axis in imu.axes)]
+    lines = [f"{'left over':13}" + "".join(f"{_HEADS[term]:>13}" for term in shown)]
+    for axis in imu.axes:
+        unit, name, digits = _unit(axis.axis)
+        terms = [_term(getattr(axis, term), unit, digits) for term in shown]
+        lines.append(f"{', '.join((axis.axis, name)):13}" + "".join(f"{each:>13}" for each in terms))
+    if lacking := [head for term, head in _HEADS.items() if term not in shown]:
+        lines.append(f"not known: {', '.join(lacking)}")
     return [*lines, "accel x, y: not counted, a hover does not tell them from tilt"]
+
+
+def _unit(axis: str) -> tuple[float, str, int]:
+    return (DEG_H, "deg/h", 0) if axis.startswith("gyro") else (MG, "mg", 1)
 
 
 def _term(term: Term | None, unit: float, digits: int) -> str:
@@ -178,15 +172,14 @@ def _hint(found: Flight) -> str:
     worst: tuple[float, str] = (0.0, "nothing to do: what the offsets left is small or not surely there")
     for imu in found.imus:
         for axis in imu.axes:
-            half = axis.axis.split(" ")[0]
-            unit, name, digits = (DEG_H, "deg/h", 0) if half == "gyro" else (MG, "mg", 1)
+            unit, name, digits = _unit(axis.axis)
             for term, what, remedy in (
                 (axis.motors, "of rectification at hover throttle", "its damping"),
                 (axis.turn_on, "before the motors", "calibrate nearer to the take-off"),
             ):
                 if term is None or abs(term.value) < 2.0 * term.sigma:
                     continue
-                size = abs(term.value) / unit / _WORTH[half]
+                size = abs(term.value) / unit / _WORTH[name]
                 if size > max(worst[0], 1.0):
                     words = f"IMU {imu.imu} {axis.axis}: {abs(term.value) / unit:.{digits}f} {name} {what}: {remedy}"
                     worst = size, words

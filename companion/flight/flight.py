@@ -15,7 +15,6 @@ from companion.calibration.noise.allan import PROFILES, noise_profile
 from companion.calibration.noise.robust import median
 from companion.calibration.records.record import Record
 from companion.calibration.solution.prior import curve_of
-from companion.calibration.temperature.curve import Curve
 from companion.errors import AutopilotError, StorageError
 from companion.flight import ardupilot_log, inertial, px4_log
 from companion.flight.in_force import calibration_in, moment, with_others, written_in
@@ -25,7 +24,6 @@ from companion.flight.split import LENGTH_S, SHORT_S, Split, Term, split
 from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
 from companion.physics.frames import Floats
 from companion.replay.autopilot_logs import Progress, read_ulog, reader_of
-from companion.samples import Triad
 from companion.storage.learned import KnownImu
 
 SPANS_S: Final = (10.0, 30.0, 60.0)
@@ -64,8 +62,6 @@ class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
     set_gyro_rad_s: tuple[float, ...] | None
     set_accel_m_s2: tuple[float, ...] | None
     """The offsets in force, in the IMU's own axes."""
-    ekf: dict[str, Term | None]
-    """By axis, the bias that the EKF had in the air."""
     axes: tuple[Split, ...]
     drift: dict[str, list[Drift]]
     """Without aid, by whose offsets: `flown`, `before`, those of files."""
@@ -130,7 +126,7 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
             reference="ekf" if boot.truth is None else "truth",
             imus=tuple(
                 [
-                    await _imu(boot, imu, late[imu.number], stages, (reference, world), known)
+                    await _imu(boot, imu, _during(late[imu.number], stages), stages, (reference, world), known)
                     for imu in boot.imus
                     if imu.number in late
                 ]
@@ -139,6 +135,13 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
         )
         for stages in _stages(boot, reference)
     ]
+
+
+def _during(found: Increments, stages: Stages) -> Increments:
+    """What of a log is of this flight."""
+    start_s, end_s = stages.armed_s - _STOOD_S, stages.disarmed_s or math.inf
+    inside = (found.t_s > start_s) & (found.t_s < end_s)
+    return Increments(*(each[inside] for each in found))
 
 
 def _world(boot: Boot) -> World:
@@ -193,20 +196,24 @@ async def _imu(
         notes.append("it did not fly, or too shortly to tell anything")
     if imu.rate_hz < _SLOW_HZ:
         notes.append(f"logged at {imu.rate_hz:.0f} Hz only: LOG_BITMASK with IMU_FAST would tell more")
-    ground = _stood(found, stages, reference, world)
+    if len(found.t_s) < 2:
+        in_air = None
+    ground = [] if in_air is None else _stood(found, stages, reference, world)
     flown = [] if in_air is None else _kept(inertial.windows(found, reference, world, in_air, LENGTH_S))
     drift: dict[str, list[Drift]] = {}
     if in_air is not None:
         offsets = _others(calibration, match and match[1], known.others, found, in_air)
         drift = inertial.drift(found, reference, world, in_air, SPANS_S, offsets)
+    warmth: Sequence[Term | None] = [None] * 4
+    if calibration is not None and in_air is not None:
+        warmth = _warmth(imu, calibration, known, stages, in_air)
     return ImuFlight(
         imu=imu.number,
         rate_hz=imu.rate_hz,
         calibration=None if match is None else match[0].started_at,
         set_gyro_rad_s=None if calibration is None else calibration.gyro_offset_rad_s,
         set_accel_m_s2=None if calibration is None else calibration.accel_offset_m_s2,
-        ekf=_ekf(imu, in_air),
-        axes=tuple(split(ground, flown, _levels(imu, flown), _warmth(imu, calibration, known, stages, in_air))),
+        axes=tuple(split(ground, flown, _levels(imu, flown), warmth, _ekf(imu, in_air))),
         drift=drift,
         notes=tuple(notes),
     )
@@ -244,23 +251,18 @@ def _levels(imu: FlownImu, rows: Sequence[Window]) -> Floats | None:
     return np.array([imu.vibration[a : max(b, a + 1), 1].mean() for a, b in edges])
 
 
-def _ekf(imu: FlownImu, in_air: tuple[float, float] | None) -> dict[str, Term | None]:
+def _ekf(imu: FlownImu, in_air: tuple[float, float] | None) -> list[Term | None]:
     """The latter half of the flight, when it has had time to find them; sigma is its own, and what the log cuts off."""
-    names = [f"{half} {axis}" for half in ("gyro", "accel") for axis in "xyz"]
-    found = imu.estimated
+    found, nothing = imu.estimated, [None] * 4
     if found is None or in_air is None:
-        return dict.fromkeys(names)
+        return [*nothing]
     late = (found.t_s >= 0.5 * (in_air[0] + in_air[1])) & (found.t_s <= in_air[1])
-    if not late.any():
-        return dict.fromkeys(names)
-    values = np.hstack([found.gyro_rad_s[late], found.accel_m_s2[late]])
-    sigmas = np.hstack([found.gyro_sigma_rad_s[late], found.accel_sigma_m_s2[late]])
-    return {
-        name: Term(float(values[:, k].mean()), float(math.hypot(values[:, k].std(), sigmas[:, k].mean())))
-        if np.isfinite(sigmas[:, k]).all()
-        else None
-        for k, name in enumerate(names)
-    }
+    values = np.column_stack([found.gyro_rad_s[late], found.accel_m_s2[late, 2]])
+    sigmas = np.column_stack([found.gyro_sigma_rad_s[late], found.accel_sigma_m_s2[late, 2]])
+    if not late.any() or not np.isfinite(sigmas).all():
+        return [*nothing]
+    sigma = np.hypot(values.std(axis=0), sigmas.mean(axis=0))
+    return [Term(*each) for each in zip(values.mean(axis=0).tolist(), sigma.tolist(), strict=True)]
 
 
 def _others(
@@ -280,41 +282,25 @@ def _others(
 
 
 def _warmth(
-    imu: FlownImu,
-    calibration: ImuCalibration | None,
-    known: Knowledge,
-    stages: Stages,
-    in_air: tuple[float, float] | None,
+    imu: FlownImu, calibration: ImuCalibration, known: Knowledge, stages: Stages, in_air: tuple[float, float]
 ) -> list[Term | None]:
-    """By axis, what the learnt curve says of the step from before the motors to the air."""
+    """Of the gyros, what the learnt curve says of the step from before the motors to the air."""
     nothing: list[Term | None] = [None] * 4
-    if calibration is None or in_air is None or not len(imu.degc):
-        return nothing
     own = next((one for one in known.biases.values() if _is_same(one.identity, imu, calibration)), None)
     start_s = stages.motors_s or stages.armed_s
-    then, now = (
+    seen = [
         imu.degc[(imu.degc[:, 0] >= a) & (imu.degc[:, 0] <= b), 1] for a, b in ((start_s - _STOOD_S, start_s), in_air)
-    )
-    if own is None or not len(then) or not len(now):
+    ]
+    if own is None or not all(map(len, seen)):
         return nothing
     part = own.identity.get("profile", "")
-    profile = noise_profile(part if part in PROFILES else None)
-    found: list[Term | None] = []
-    for half, model, axes in (("gyro", profile.gyro, (0, 1, 2)), ("accel", profile.accel, (2,))):
-        curve: Curve | None = curve_of(own.points, half, model)  # type: ignore[arg-type]
-        found += _steps(curve, half, calibration, (float(then.mean()), float(now.mean())), axes)  # type: ignore[arg-type]
-    return found
-
-
-def _steps(
-    curve: Curve | None, half: Triad, calibration: ImuCalibration, degc: tuple[float, float], axes: tuple[int, ...]
-) -> list[Term | None]:
-    then, now = degc
-    if curve is None or not curve.order or max(map(curve.beyond_k, degc)) > 0.0:
-        return [None] * len(axes)
+    curve = curve_of(own.points, "gyro", noise_profile(part if part in PROFILES else None).gyro)
+    then, now = (float(degc.mean()) for degc in seen)
+    if curve is None or not curve.order or max(curve.beyond_k(then), curve.beyond_k(now)) > 0.0:
+        return nothing
     step, variance = curve.change((then, 0.0), (now, 0.0))
-    step = step - calibration.thermal_change(half, then, now)
-    return [Term(float(step[k]), math.sqrt(float(variance[k]))) for k in axes]
+    step = step - calibration.thermal_change("gyro", then, now)
+    return [*(Term(*each) for each in zip(step.tolist(), np.sqrt(variance).tolist(), strict=True)), None]
 
 
 def _is_same(identity: Mapping[str, str], imu: FlownImu, calibration: ImuCalibration) -> bool:

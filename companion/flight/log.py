@@ -13,8 +13,8 @@ from companion.autopilot.vehicle.vehicle import Firmware
 from companion.flight.inertial import Navigation
 from companion.physics.frames import Floats
 
-MOST_ROWS: Final = 1 << 20
-"""Of a message and instance: 40 minutes at 400 Hz; of a longer log each two, four ... are one mean."""
+MOST_ROWS: Final = 1 << 19
+"""Of a message and instance: 20 minutes at 400 Hz; of a longer log each two, four ... are one mean."""
 _CHUNK: Final = 4096
 
 

@@ -50,6 +50,8 @@ class Split(msgspec.Struct, frozen=True, kw_only=True):
     axis: str
     in_flight: Term | None
     """Its mean in the air."""
+    ekf: Term | None
+    """As the EKF had it in the latter half of that."""
     turn_on: Term | None
     """Before the motors."""
     temperature: Term | None
@@ -67,6 +69,7 @@ def split(
     flight: Sequence[Window],
     levels: Floats | None,
     warmth: Sequence[Term | None],
+    ekf: Sequence[Term | None],
 ) -> list[Split]:
     """The gyro's three axes and the accelerometer's vertical one.
 
@@ -75,6 +78,7 @@ def split(
         flight: windows in the air.
         levels: (n,) vibration in each of those, m/s^2; None: not known.
         warmth: by axis, what temperature explains of the step at the motors' start; None: not known.
+        ekf: by axis.
     """
     found = []
     for k, axis in enumerate(("gyro x", "gyro y", "gyro z", "accel z")):
@@ -82,8 +86,8 @@ def split(
         end = _ATTITUDE_RAD[k] if k < 3 else _VELOCITY_M_S
         constant = 0.0 if k < 3 else _GRAVITY_M_S2
         aside = 0.0 if k < 3 else _LEVEL_M_S2
-        turn_on = _mean(ground, _span(before, SHORT_S), _AT_REST * end, math.hypot(constant, aside * _tilt(before)))
-        in_flight = _mean(air, _span(flight, LENGTH_S), end, math.hypot(constant, aside * _tilt(flight)))
+        turn_on = _mean(ground, len(before) * SHORT_S, _AT_REST * end, math.hypot(constant, aside * _tilt(before)))
+        in_flight = _mean(air, len(flight) * LENGTH_S, end, math.hypot(constant, aside * _tilt(flight)))
         of_degc = warmth[k]
         motors = None
         if turn_on is not None and in_flight is not None:
@@ -94,7 +98,7 @@ def split(
         slope, trend = _slopes(air, flight, levels, end, aside)
         found.append(
             Split(
-                axis=axis, in_flight=in_flight, turn_on=turn_on, temperature=of_degc if motors else None,
+                axis=axis, in_flight=in_flight, ekf=ekf[k], turn_on=turn_on, temperature=of_degc if motors else None,
                 motors=motors, vibration=slope, trend=trend,
             )
         )  # fmt: skip
@@ -108,10 +112,6 @@ def _value(window: Window, k: int) -> float:
 def _tilt(windows: Sequence[Window]) -> float:
     """Root mean square of how x and y lie along the vertical."""
     return math.sqrt(float(np.mean([one.tilt @ one.tilt for one in windows]))) if windows else 0.0
-
-
-def _span(windows: Sequence[Window], length_s: float) -> float:
-    return len(windows) * length_s
 
 
 def _mean(values: Floats, span_s: float, end: float, constant: float) -> Term | None:

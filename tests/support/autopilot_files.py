@@ -44,6 +44,14 @@ _TOPICS = {
     "sensor_combined": "uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;",
     "sensor_gyro": "uint64_t timestamp;float x;float y;float z;float temperature;",
     "sensor_accel": "uint64_t timestamp;float x;float y;float z;",
+    "vehicle_attitude": "uint64_t timestamp;float[4] q;",
+    "vehicle_local_position": "uint64_t timestamp;float vx;float vy;float vz;float x;float y;float z;"
+    "float ref_lat;float ref_alt;",
+    "actuator_armed": "uint64_t timestamp;float armed;",
+    "vehicle_land_detected": "uint64_t timestamp;float landed;",
+    "actuator_motors": "uint64_t timestamp;float[12] control;",
+    "estimator_sensor_bias": "uint64_t timestamp;float gyro_device_id;float[3] gyro_bias;float[3] gyro_bias_variance;"
+    "float[3] accel_bias;float[3] accel_bias_variance;",
 }
 
 

@@ -13,6 +13,7 @@ from tests.support.made_noise import Floats
 
 WORLD = World(gravity(), earth_rate())
 AIR = (70.0, 235.0)
+NOTHING_KNOWN = [None] * 4
 NOTHING = (np.zeros(3), np.zeros(3))
 GYRO, ACCEL = np.array([300.0, -200.0, 100.0]) * DEG_H, np.array([3.0, -2.0, 4.0]) * MG
 
@@ -106,7 +107,7 @@ def test_what_motors_add_is_found_with_an_honest_sigma() -> None:
     before = windows(found, still, WORLD, (35.0, 64.0), SHORT_S)
     for seed in range(12):
         air = windows(found, navigation(flown, seed), WORLD, AIR, LENGTH_S)
-        for k, axis in enumerate(split(before, air, levels(len(air)), [None] * 4)):
+        for k, axis in enumerate(split(before, air, levels(len(air)), NOTHING_KNOWN, NOTHING_KNOWN)):
             assert axis.in_flight is not None
             assert axis.turn_on is not None
             assert axis.motors is not None
@@ -125,9 +126,11 @@ def test_what_motors_add_is_found_with_an_honest_sigma() -> None:
 
 
 def test_what_the_data_do_not_carry_is_not_known(perfect: Flown) -> None:
-    assert all(axis.in_flight is None and axis.motors is None for axis in split([], [], None, [None] * 4))
+    assert all(
+        axis.in_flight is None and axis.motors is None for axis in split([], [], None, NOTHING_KNOWN, NOTHING_KNOWN)
+    )
     air = windows(of(perfect), navigation(perfect), WORLD, (70.0, 115.0), LENGTH_S)
-    for axis in split([], air, None, [None] * 4):
+    for axis in split([], air, None, NOTHING_KNOWN, NOTHING_KNOWN):
         assert axis.in_flight is not None
         assert axis.turn_on is None
         assert axis.motors is None

@@ -6,13 +6,16 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from companion.calibration.records.record import ImuRecord, Record, WrittenParameter
 from companion.cli import main as companion
 from companion.physics.units import DEG_H, MG
 from companion.storage.records import RecordStore
-from tests.support.flown import Flown, dataflash, fly, messages, parameters
+from tests.support.autopilot_files import write_ulog
+from tests.support.flown import HEIGHT_M, LATITUDE_DEG, Flown, dataflash, fly, messages, parameters
+from tests.support.made_noise import Floats
 
 GYRO_DEG_H, ACCEL_MG, STEP_MG = (300.0, -200.0, 100.0), (3.0, -2.0, 4.0), 5.0
 BEGAN = "2026-10-11T08:00:00+00:00"
@@ -117,6 +120,43 @@ def test_people_read_the_figure_that_counts(log: Path, tmp_path: Path, capsys: p
     assert "accel x, y: not counted, a hover does not tell them from tilt\n" in out
     assert max(map(len, out.splitlines())) <= 100
     assert out.splitlines()[-1].startswith("next flight: IMU 1 gyro x: ")
+
+
+def column(states: Any) -> Floats:
+    return np.asarray(states, dtype=np.float64)[:, None]
+
+
+def test_a_flight_of_px4_is_told_alike(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    at, slow = flown.at_s, flown.at_s[::25]
+    place = np.tile([LATITUDE_DEG, HEIGHT_M], (len(at), 1))
+    spun = ((slow >= flown.motors_s) & (slow < flown.disarmed_s))[:, None]
+    bias = [*(each * DEG_H for each in GYRO_DEG_H), *[1e-10] * 3, *(each * MG for each in ACCEL_MG), *[1e-6] * 3]
+    path = write_ulog(
+        tmp_path / "log.ulg",
+        {
+            ("sensor_combined", 0): (flown.t_s, flown.readings),
+            ("vehicle_attitude", 0): (at, flown.quaternions),
+            ("vehicle_local_position", 0): (at, np.hstack([flown.velocity, flown.position, place])),
+            ("actuator_armed", 0): (slow, column((slow >= 64.0) & (slow < 242.0))),
+            ("vehicle_land_detected", 0): (slow, column((slow < 67.0) | (slow >= 240.0))),
+            ("actuator_motors", 0): (slow, 0.5 * np.hstack([np.tile(spun, (1, 4)), np.full((len(slow), 8), np.nan)])),
+            ("estimator_sensor_bias", 0): (slow, np.tile([0.0, *bias], (len(slow), 1))),
+        },
+    )
+    code, answer = said(capsys, path, *storage(tmp_path))
+    assert code == 0
+    (flight,) = answer["flights"]
+    assert flight["stages"]["motors_s"] == pytest.approx(65.0, abs=1.0)
+    assert flight["stages"]["take_off_s"] == pytest.approx(67.0, abs=1.0)
+    (imu,) = flight["imus"]
+    # No parameters are in this log.
+    assert imu["notes"][0].startswith("PX4 has no accelerometer in CAL_ACC0_ID")
+    for axis, bias_now, unit in zip(
+        imu["axes"], (*GYRO_DEG_H, ACCEL_MG[2] + STEP_MG), (DEG_H, DEG_H, DEG_H, MG), strict=True
+    ):
+        assert abs(axis["in_flight"]["value"] / unit - bias_now) < 2.0 * axis["in_flight"]["sigma"] / unit
+    assert imu["axes"][0]["ekf"]["value"] / DEG_H == pytest.approx(GYRO_DEG_H[0])
+    assert 60.0 < imu["drift"]["flown"][1]["median_m"] < 200.0
 
 
 def test_several_starts_in_one_file_are_each_by_their_own_clock(
