@@ -139,6 +139,7 @@ def _estimator() -> dict[str, float]:
         "EKF2_EV_NOISE_MD": 0,
         "EKF2_GPS_CTRL": 7,
         "EKF2_MAG_TYPE": 0,
+        "EKF2_SENS_EN": 8191,
     }
     floats = {
         "EKF2_ABL_LIM": 0.4, "EKF2_ABL_TAU": 0.5, "EKF2_ABL_ACCLIM": 25.0, "EKF2_ABL_GYRLIM": 3.0,

@@ -9,7 +9,7 @@ import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import pytest
@@ -410,6 +410,65 @@ def test_a_compass_that_disagrees_for_long_stops_the_push(tmp_path: Path) -> Non
             assert math.degrees(abs(flying.witness.of(Vision)[-1].yaw - flying.true_yaw_rad)) < 3.0
             compass.heading_error_deg = 0.0
             await flying.pushing(20.0)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(("firmware", "device"), [("ardupilot", "gyro"), ("px4", "gyro"), ("px4", "compass")])
+def test_a_heading_that_drifts_is_not_believed_until_it_is_aligned_again(
+    tmp_path: Path, firmware: Firmware, device: str
+) -> None:
+    """3 deg/s: of a gyro that no compass holds, and of a compass. The autopilot's gyros say nothing of the kind."""
+
+    async def main() -> None:
+        async with flight(tmp_path, firmware=firmware) as flying:
+            rig, compass = flying.rig, cast("Any", flying.rig.devices["compass"])
+            rig.autopilot.arm()
+            flying.turn(heading_deg=110.0, roll_deg=20.0, pitch_deg=-10.0)
+            await flying.sleep(6.0)
+            assert flying.attitude.health.pushing
+            gyro, accel = rig.own_model.true_bias(0.0)
+            if device == "gyro":
+                rig.unplugged.add("compass")
+                rig.own_model.turn_on(gyro + np.radians([0.0, 0.0, 3.0]), accel)
+            for _ in range(100):
+                compass.heading_error_deg += 0.15
+                await flying.sleep(0.05)
+                if not flying.attitude.health.pushing:
+                    break
+            assert compass.heading_error_deg < 11.0  # seconds: a third of it
+            assert "deg off the autopilot's gyros" in flying.attitude.health.why_not
+            assert math.degrees(abs(flying.witness.of(Vision)[-1].yaw - flying.true_yaw_rad)) < 9.0
+            assert flying.theirs_deg() < 8.0
+            rig.own_model.turn_on(gyro, accel)
+            rig.unplugged.discard("compass")
+            compass.heading_error_deg = 0.0
+            stopped_s = rig.now_s
+            await flying.sleep(15.0)
+            assert not flying.witness.of(Vision, stopped_s + 0.1)
+            rig.autopilot.disarm()
+            await flying.pushing(40.0)
+            await flying.sleep(3.0)
+            assert math.degrees(abs(flying.witness.of(Vision)[-1].yaw - flying.true_yaw_rad)) < 2.0
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_two_compasses_that_differ_are_not_settled_by_pushing(tmp_path: Path, firmware: Firmware) -> None:
+    """EKF2 takes 40 deg without a word, and arms; ours is pushed once that compass is out of use."""
+
+    async def main() -> None:
+        async with flight(tmp_path, firmware=firmware, used=firmware == "px4", calibrated=False) as flying:
+            compass: Any = flying.rig.devices["compass"]
+            flying.rig.autopilot.has_compass = True
+            compass.heading_error_deg = 40.0
+            await flying.calibrate()
+            await flying.sleep(10.0)
+            assert not flying.witness.of(Vision)
+            assert "40 deg from the autopilot's compass: one of the two is wrong" in flying.attitude.health.why_not
+            flying.rig.autopilot.has_compass = False
+            await flying.pushing(10.0)
 
     run_virtual(main())
 

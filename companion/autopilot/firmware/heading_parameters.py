@@ -16,8 +16,8 @@ EV_YAW: Final = 8
 EXTNAV: Final = 6
 COMPASS: Final = 1
 """EK3_SRCn_YAW: external navigation, and the autopilot's compass."""
-NO_COMPASS: Final = 5
-"""EKF2_MAG_TYPE: none."""
+MAGNETOMETER: Final = 1 << 10
+"""Bit 10 of EKF2_SENS_EN."""
 Net = Literal["script", "command", "autopilot", "none"]
 """Who sees to another heading when ours ends; "autopilot": it does so by itself."""
 
@@ -51,6 +51,7 @@ _ARDUPILOT: Final = (
     ),
 )
 _COMPASSES: Final = ("COMPASS_ENABLE", *(f"COMPASS_{what}{n}" for n in ("", "2", "3") for what in ("USE", "DEV_ID")))
+_MAGNETOMETERS: Final = ("EKF2_MAG_TYPE", "SYS_HAS_MAG", "EKF2_SENS_EN")
 SCRIPT: Final = "CMPG_HEADING"
 """Of the script (companion/lua): it is there, and 1 where it sees to the heading."""
 _PX4: Final = (
@@ -80,22 +81,30 @@ def read_for(firmware: Firmware | None) -> list[str]:
         AutopilotError: as `wanted_for`.
     """
     wanted = [name for one in wanted_for(firmware) for name in (one.parameter, one.like) if name]
-    return [*wanted, *((*_COMPASSES, SCRIPT) if firmware == "ardupilot" else ("EKF2_MAG_TYPE",))]
+    return [*wanted, *((*_COMPASSES, SCRIPT) if firmware == "ardupilot" else _MAGNETOMETERS)]
 
 
 def net_of(firmware: Firmware, found: Mapping[str, float]) -> Net:
     """What is there when our heading ends, of parameters as they were read."""
+    if without_compass(firmware, found):
+        return "none"
     if firmware == "px4":
-        return "none" if found.get("EKF2_MAG_TYPE") == NO_COMPASS else "autopilot"
-    if without_compass(firmware, found) or found.get("EK3_SRC2_YAW") != COMPASS:
+        return "autopilot"
+    if found.get("EK3_SRC2_YAW") != COMPASS:
         return "none"
     return "script" if found.get(SCRIPT) == 1.0 else "command"
 
 
-def without_compass(firmware: Firmware, found: Mapping[str, float]) -> bool:
-    """Whether ArduPilot has no compass in use."""
+def without_compass(firmware: Firmware, found: Mapping[str, float]) -> str | None:
+    """The parameter that leaves it without a compass in flight; None if it has one."""
+    if firmware == "px4":
+        if found.get("SYS_HAS_MAG") == 0.0:
+            return "SYS_HAS_MAG = 0"
+        if (kind := found.get("EKF2_MAG_TYPE", 0.0)) not in (0.0, 1.0):
+            return f"EKF2_MAG_TYPE = {kind:g}"
+        return None if int(found.get("EKF2_SENS_EN", MAGNETOMETER)) & MAGNETOMETER else "bit 10 of EKF2_SENS_EN"
     used = [found.get(f"COMPASS_USE{n}") == 1.0 and found.get(f"COMPASS_DEV_ID{n}", 1.0) != 0.0 for n in ("", "2", "3")]
-    return firmware == "ardupilot" and (found.get("COMPASS_ENABLE") == 0.0 or not any(used))
+    return "COMPASS_USE" if found.get("COMPASS_ENABLE") == 0.0 or not any(used) else None
 
 
 def wanted_for(firmware: Firmware | None) -> tuple[Wanted, ...]:

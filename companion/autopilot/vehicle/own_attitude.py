@@ -46,24 +46,55 @@ class Angles(NamedTuple):
     yaw: float
 
 
+class OwnCompass:
+    """Whether its magnetometer is well and agrees with its yaw; `wanted`: asks for what tells it, all the time."""
+
+    def __init__(self, vehicle: Vehicle, *, wanted: bool) -> None:
+        self._has_compass_s = self._agrees_s = -math.inf
+        rate_hz = RATE_HZ if wanted else None
+        vehicle.hear(mavlink.MAVLink_sys_status_message, self._on_status, rate_hz)
+        vehicle.hear(mavlink.MAVLink_ekf_status_report_message, self._on_ardupilot, rate_hz, "ardupilot")
+        vehicle.hear(mavlink.MAVLink_estimator_status_message, self._on_px4, rate_hz, "px4")
+
+    def agrees(self, now_s: float) -> bool:
+        """Whether both have been said lately."""
+        return min(self._has_compass_s, self._agrees_s) >= now_s - OLD_S
+
+    def _on_status(self, message: mavlink.MAVLink_sys_status_message, t_s: float) -> None:
+        fit = (
+            message.onboard_control_sensors_present
+            & message.onboard_control_sensors_enabled
+            & message.onboard_control_sensors_health
+            & _MAGNETOMETER
+        )
+        self._has_compass_s = t_s if fit else -math.inf
+
+    def _on_ardupilot(self, message: mavlink.MAVLink_ekf_status_report_message, t_s: float) -> None:
+        fit = message.flags & mavlink.EKF_ATTITUDE and not message.flags & mavlink.EKF_UNINITIALIZED
+        self._agrees(message.compass_variance, t_s, fit=bool(fit))
+
+    def _on_px4(self, message: mavlink.MAVLink_estimator_status_message, t_s: float) -> None:
+        self._agrees(message.mag_ratio, t_s, fit=bool(message.flags & mavlink.ESTIMATOR_ATTITUDE))
+
+    def _agrees(self, ratio: float, t_s: float, *, fit: bool) -> None:
+        """`ratio`: of the innovation to what is allowed; exactly 0 where nothing is compared."""
+        self._agrees_s = t_s if fit and 0.0 < ratio < 1.0 else -math.inf
+
+
 class OwnAttitude:
     """Listens to the latched autopilot; `wanted`: asks for what the heading needs, all the time."""
 
     def __init__(self, vehicle: Vehicle, *, wanted: bool) -> None:
         self._vehicle, self._wanted = vehicle, wanted
         self._seen: deque[Angles] = deque(maxlen=256)
-        self._has_compass_s = self._agrees_s = -math.inf
-        rate_hz = RATE_HZ if wanted else None
-        vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, rate_hz)
-        vehicle.hear(mavlink.MAVLink_sys_status_message, self._on_status, rate_hz)
-        vehicle.hear(mavlink.MAVLink_ekf_status_report_message, self._on_ardupilot, rate_hz, "ardupilot")
-        vehicle.hear(mavlink.MAVLink_estimator_status_message, self._on_px4, rate_hz, "px4")
+        self._compass = OwnCompass(vehicle, wanted=wanted)
+        vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, RATE_HZ if wanted else None)
 
     def heading(self) -> OwnHeading | None:
         """Its yaw from true north; None while it has none that can be believed."""
         now_s = asyncio.get_running_loop().time()
         seen = self._since(now_s - KEPT_S)
-        if len(seen) < 2 or min(self._has_compass_s, self._agrees_s) < now_s - OLD_S:
+        if len(seen) < 2 or not self._compass.agrees(now_s):
             return None
         last = seen[-1].yaw
         turned = [(one.yaw - last + math.pi) % (2.0 * math.pi) - math.pi for one in seen]
@@ -108,23 +139,3 @@ class OwnAttitude:
         angles = (message.roll, message.pitch, message.yaw)
         if all(map(math.isfinite, angles)):
             self._seen.append(Angles(t_s, *angles))
-
-    def _on_status(self, message: mavlink.MAVLink_sys_status_message, t_s: float) -> None:
-        fit = (
-            message.onboard_control_sensors_present
-            & message.onboard_control_sensors_enabled
-            & message.onboard_control_sensors_health
-            & _MAGNETOMETER
-        )
-        self._has_compass_s = t_s if fit else -math.inf
-
-    def _on_ardupilot(self, message: mavlink.MAVLink_ekf_status_report_message, t_s: float) -> None:
-        fit = message.flags & mavlink.EKF_ATTITUDE and not message.flags & mavlink.EKF_UNINITIALIZED
-        self._agrees(message.compass_variance, t_s, fit=bool(fit))
-
-    def _on_px4(self, message: mavlink.MAVLink_estimator_status_message, t_s: float) -> None:
-        self._agrees(message.mag_ratio, t_s, fit=bool(message.flags & mavlink.ESTIMATOR_ATTITUDE))
-
-    def _agrees(self, ratio: float, t_s: float, *, fit: bool) -> None:
-        """`ratio`: of the innovation to what is allowed; exactly 0 where nothing is compared."""
-        self._agrees_s = t_s if fit and 0.0 < ratio < 1.0 else -math.inf

@@ -17,6 +17,7 @@ from companion.autopilot.telemetry.attitude_messages import (
     microseconds,
     vision_position_estimate,
 )
+from companion.autopilot.vehicle.own_attitude import OwnCompass
 from companion.autopilot.vehicle.vehicle import ArmState, Firmware
 from companion.component.statustext import Severity, Weight
 from companion.configured import models
@@ -108,7 +109,7 @@ class AttitudeService:
         self.carrier = Carrier(core, carrying_imu(config), in_force, calibrating.alignment)
         self.difference = Difference(vehicle, self.carrier.now, self.carrier.kept_at)
         self.resume = Resume(core, self.carrier, self.difference, calibrating, devices.imus)
-        self.health = Health(self.carrier, self.difference, vehicle)
+        self.health = Health(self.carrier, self.difference, vehicle, OwnCompass(vehicle, wanted=True))
         self.fallback = Fallback(core)
         self.sender = Sender(link, models.attitude_rate_hz(config), full=config.push.attitude == "full")
         self.timesync = TimesyncResponder(link, vehicle)

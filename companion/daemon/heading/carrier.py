@@ -219,6 +219,10 @@ class Carrier:
         self.estimator = self._record = None
         self._recent.clear()
 
+    def align_anew(self) -> None:
+        """As soon as it stands still on the ground."""
+        self._wanted = True
+
     def now(self) -> Attitude | None:
         """The attitude at the last sample; None while there is none."""
         return None if self.estimator is None else self.estimator.attitude()
@@ -313,7 +317,9 @@ class Carrier:
         assert self.estimator is not None
         before = self.now()
         since = [sample for read in self._recent for sample in read if sample.t_s > stand.t_s]
-        self.estimator.align(stand.t_s if since else None, stand.body_from_ned, stand.covariance)
+        # Just landed nothing is kept: then it stood so at the last sample, and is known at once.
+        begun_s = stand.t_s if since else self.heard_s if math.isfinite(self.heard_s) else None
+        self.estimator.align(begun_s, stand.body_from_ned, stand.covariance)
         self.estimator.update(since, phase=self.phase)
         after = self.now()
         self._wanted = False

@@ -20,7 +20,9 @@ from companion.attitude.quaternion import (
     roll_pitch_yaw,
     rotate,
 )
-from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.attitude.straying import Straying
+from companion.autopilot.vehicle.own_attitude import OwnCompass
+from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.daemon.heading.carrier import Carrier
 from companion.physics.units import DEG
 
@@ -80,10 +82,16 @@ class Difference:
         self._sine = self._cosine = 0.0
         self._down: Triple = (0.0, 0.0, 0.0)
         self._since_s = math.inf
+        self.straying = Straying()
+        """Of our heading against the autopilot's gyros."""
+
+    def is_heard(self, now_s: float) -> bool:
+        """Whether the autopilot tells its attitude."""
+        return now_s - self.heard_s < OLD_S
 
     def is_known(self, now_s: float) -> bool:
-        """Whether the autopilot tells its attitude, and has for a while."""
-        return now_s - self.heard_s < OLD_S and now_s - self._since_s > SMOOTHED_S
+        """Whether it has for a while."""
+        return self.is_heard(now_s) and now_s - self._since_s > SMOOTHED_S
 
     @property
     def tilt_rad(self) -> float:
@@ -112,6 +120,11 @@ class Difference:
         rx, ry, rz = ours.rate_rad_s
         then = multiply(turn, from_rotation_vector((-rx * since_s, -ry * since_s, -rz * since_s)))
         self._compare(then, theirs, span_s, t_s)
+        pitch_rate, yaw_rate = message.pitchspeed, message.yawspeed
+        if abs(message.pitch) < STEEP_RAD and math.isfinite(pitch_rate) and math.isfinite(yaw_rate):
+            across = pitch_rate * math.sin(message.roll) + yaw_rate * math.cos(message.roll)
+            rate = across / math.cos(message.pitch)
+            self.straying.add(message.time_boot_ms * 1e-3, roll_pitch_yaw(then)[2], ours.sigma_rad[2], rate)
 
     def _compare(self, ours: Quaternion, theirs: Quaternion, span_s: float, t_s: float) -> None:
         first = self._since_s == math.inf
@@ -158,12 +171,13 @@ def disagreements(attitude: Attitude, tilt_rad: float, heading_rad: float) -> tu
 class Health:
     """Judges; `judge` several times a second.
 
-    A heading that differs stops the push only if the two have agreed since the last alignment: before that the
-    autopilot has no heading, or one of its own that is to be replaced by ours.
+    A heading that differs stops the push if the two have agreed since the last alignment, or if the autopilot's is its
+    compass' and not ours: then one of the two compasses lies. Else it has none, or one that is to be replaced by ours.
+    What turns in flight while the autopilot's gyros do not is not pushed again before it is aligned on the ground.
     """
 
-    def __init__(self, carrier: Carrier, difference: Difference, vehicle: Vehicle) -> None:
-        self._carrier, self._difference, self._vehicle = carrier, difference, vehicle
+    def __init__(self, carrier: Carrier, difference: Difference, vehicle: Vehicle, own: OwnCompass) -> None:
+        self._carrier, self._difference, self._vehicle, self._own = carrier, difference, vehicle, own
         self.pushing = False
         self.why_not = carrier.waiting_for
         """Why nothing is pushed; empty while it is."""
@@ -174,12 +188,19 @@ class Health:
         self._differs_since_s: float | None = None
         self._agreed = False
         self._alignments = 0
+        self._strayed: str | None = None
+        self._has_ours = False
+        """Whether the autopilot has had our heading since its start."""
+        vehicle.on_event.add(self._on_event)
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        self._has_ours &= event != "rebooted"
 
     def judge(self, now_s: float) -> None:
         """Look at everything; `pushing` and the words follow."""
         if self._alignments != self._carrier.alignments:
             self._alignments = self._carrier.alignments
-            self._agreed, self._differs_since_s = False, None
+            self._agreed, self._differs_since_s, self._strayed = False, None, None
             self._difference.forget()
         wrong = self._wrong(now_s)
         self._compare(now_s)
@@ -190,7 +211,7 @@ class Health:
             self._good_since_s = now_s
         wait_s = GOOD_S if self._stopped else 0.0
         if now_s - self._good_since_s >= wait_s:
-            self.pushing, self.why_not, self._stopped = True, "", False
+            self.pushing, self.why_not, self._stopped, self._has_ours = True, "", False, True
         else:
             self.why_not = f"well again, pushed after {GOOD_S:.0f} s of it"
 
@@ -215,6 +236,12 @@ class Health:
         if carrier.doubt is not None:
             self._agreed = True  # before it is pushed
             return carrier.doubt
+        straying = self._difference.straying
+        if self._strayed is None and straying.is_too_far and carrier.phase == "flight":
+            self._strayed = f"heading drifts: {abs(straying.strayed_rad) / DEG:.0f} deg off the autopilot's gyros"
+            carrier.align_anew()
+        if self._strayed is not None:
+            return self._strayed
         return self._unsure(now_s, carrier.estimator)
 
     def _unsure(self, now_s: float, estimator: AttitudeEstimator | None) -> str | None:
@@ -236,13 +263,16 @@ class Health:
 
     def _differs(self, now_s: float, attitude: Attitude) -> str | None:
         difference = self._difference
+        has_own = not self._has_ours and not self._agreed and self._own.agrees(now_s)
         if not difference.is_known(now_s):
             self._differs_since_s = None
-            return None
+            return "comparing with the autopilot's heading" if has_own and difference.is_heard(now_s) else None
         tilt, heading = disagreements(attitude, difference.tilt_rad, difference.heading_rad)
         own_deg = attitude.sigma_rad[2] / DEG
         self._agreed |= abs(difference.heading_rad) / DEG < math.hypot(own_deg, THEIR_HEADING_DEG)
         words = tilt or (heading if self._agreed else None)
+        if words is None and heading is not None and has_own:
+            words = f"{heading} compass: one of the two is wrong"
         if words is None:
             self._differs_since_s = None
             return None

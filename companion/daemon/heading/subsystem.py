@@ -64,8 +64,9 @@ class Heading(Subsystem):
         changes = changes_for(firmware, found)
         assert firmware is not None  # or it would have been refused
         net = net_of(firmware, found)
-        if without_compass(firmware, found):
-            reason = f"this autopilot has no compass in use (COMPASS_USE): {NETS['none']}"
+        missing = without_compass(firmware, found)
+        if missing is not None:
+            reason = f"this autopilot has no compass in use ({missing}): {NETS['none']}"
         elif changes:
             todo = ", ".join(f"{change.parameter} {change.after:g}" for change in changes)
             reason = f"set {todo}; {REBOOT}"
@@ -75,7 +76,7 @@ class Heading(Subsystem):
             reason = "the autopilot is set up"
         yield {
             "kind": "result",
-            "state": "not applied" if changes or without_compass(firmware, found) else "applied",
+            "state": "not applied" if changes or missing is not None else "applied",
             "reason": reason,
             "net": {"kind": net, "words": NETS[net]},
             "firmware": firmware,

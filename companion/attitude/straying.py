@@ -1,0 +1,45 @@
+"""Whether a heading turns by what other gyros do not: the same rule as that of the script on the flight controller."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+STRAYS_RAD: Final = math.radians(5.0)
+WITHIN_S: Final = 4.0
+"""What is older counts less and less: 1.25 deg/s go unnoticed, and are what the compass holds."""
+SIGMAS: Final = 3.0
+"""A heading that was not well known may be set right by its compass."""
+SCALES: Final = 0.01
+"""Share of a turn by which two gyros may differ."""
+LATE_S: Final = 0.03
+"""By so much the times of the two may lie apart while they turn."""
+LONGEST_STEP_S: Final = 0.5
+
+
+class Straying:
+    """Adds up heading less gyros; `add` at every instant of which both are known."""
+
+    def __init__(self) -> None:
+        self.strayed_rad = 0.0
+        """By how much the heading has turned and the gyros have not, lately."""
+        self.is_too_far = False
+        self._last: tuple[float, float, float] | None = None
+        self._turned_rad = self._sigma_rad = 0.0
+
+    def add(self, t_s: float, heading_rad: float, sigma_rad: float, rate_rad_s: float) -> None:
+        """Heading with its sigma, and how fast the other gyros turn about the vertical; the first after a gap begins."""
+        before, self._last = self._last, (t_s, heading_rad, rate_rad_s)
+        passed_s = 0.0 if before is None else t_s - before[0]
+        if before is None or not 0.0 < passed_s <= LONGEST_STEP_S:
+            self.strayed_rad = self._turned_rad = 0.0
+            self._sigma_rad, self.is_too_far = sigma_rad, False
+            return
+        kept = 1.0 - passed_s / WITHIN_S
+        by_gyros = 0.5 * (rate_rad_s + before[2]) * passed_s
+        heading = math.remainder(heading_rad - before[1], 2.0 * math.pi)
+        self.strayed_rad = self.strayed_rad * kept + heading - by_gyros
+        self._turned_rad = self._turned_rad * kept + abs(by_gyros)
+        self._sigma_rad = max(self._sigma_rad * kept, sigma_rad)
+        allowed = max(STRAYS_RAD, SIGMAS * self._sigma_rad) + SCALES * self._turned_rad + LATE_S * abs(rate_rad_s)
+        self.is_too_far = abs(self.strayed_rad) > allowed
