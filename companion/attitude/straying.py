@@ -28,7 +28,7 @@ class Straying:
         self._turned_rad = self._sigma_rad = 0.0
 
     def add(self, t_s: float, heading_rad: float, sigma_rad: float, rate_rad_s: float) -> None:
-        """Heading with its sigma, and how fast the other gyros turn about the vertical; the first after a gap begins."""
+        """Heading with its sigma, and how fast the other gyros turn about the vertical; after a gap it begins anew."""
         before, self._last = self._last, (t_s, heading_rad, rate_rad_s)
         passed_s = 0.0 if before is None else t_s - before[0]
         if before is None or not 0.0 < passed_s <= LONGEST_STEP_S:

@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.cli.client import setup_lines
-from tests.e2e.test_attitude_push import Firmware, Flight, flight
+from tests.e2e.test_attitude_push import Flight, flight
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 

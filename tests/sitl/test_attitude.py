@@ -1,7 +1,7 @@
 """Real firmware takes our heading: EKF3 with EK3_SRC1_YAW = 6, EKF2 with EV yaw, by what they say of themselves.
 
-The compass of the companion is told to lie by 12 degrees, fewer than would be refused, and the autopilot's own does not: a heading that follows the
-lie is ours and no other.
+The compass of the companion is told to lie by 12 degrees, fewer than would be refused, and the autopilot's own does
+not: a heading that follows the lie is ours and no other.
 """
 
 from __future__ import annotations
