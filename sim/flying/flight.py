@@ -45,6 +45,8 @@ HEIGHT_M = 10.0
 PLANE_HEIGHT_M = 50.0
 SETTLED_S = 6.0
 WATCHED_S = 35.0
+TURNS_AFTER_S, TURN_DEG = 12.0, 120.0
+"""The pilot turns it about, with the fault in force."""
 SCRIPT = Path(__file__).parents[2] / "companion" / "lua" / "companion_arming.lua"
 
 
@@ -163,17 +165,20 @@ class Flight:
         Raises:
             TimeoutError: it does not take off.
         """
-        vehicle, ground = self.vehicle, self.ground
+        vehicle, ground, record = self.vehicle, self.ground, self.record
         await vehicle.ask_streams(ground)
         self.in_background(vehicle.steer(ground))
         await vehicle.take_off(ground, PLANE_HEIGHT_M if vehicle.is_plane else HEIGHT_M)
         await vehicle.hold(ground)
         await vehicle.sleep(SETTLED_S)
-        self.record.struck_s = vehicle.truth.own_s
+        record.struck_s = vehicle.truth.own_s
         await FAULTS[self.plan.fault].strike(self)
-        await vehicle.sleep(self.plan.watched_s)
+        await vehicle.sleep(TURNS_AFTER_S)
+        await vehicle.turn(TURN_DEG)
+        await vehicle.sleep(self.plan.watched_s - TURNS_AFTER_S)
         self._take_down()
-        return self.record
+        np.savez(self.folder / "record.npz", truth=record.truth, estimate=record.estimate, place=record.place)
+        return record
 
     def _take_down(self) -> None:
         """What truth and ground station have seen, as a record."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import math
 from abc import abstractmethod
 from pathlib import Path
 
@@ -11,6 +14,9 @@ from sim.scenario import Scenario
 from sim.sitl.ground import GroundStation
 from sim.sitl.samples import SampleBlocks
 from sim.sitl.vehicle import SitlVehicle
+
+YAW_STICK_US = 250
+TURNED_WITHIN_S = 8.0
 
 
 class FlyingVehicle(SitlVehicle):
@@ -69,6 +75,18 @@ class FlyingVehicle(SitlVehicle):
     @abstractmethod
     async def hold(self, ground: GroundStation) -> None:
         """Stay over the spot, or about it, until told otherwise."""
+
+    async def turn(self, degrees: float) -> None:
+        """Turned clockwise by the yaw stick, by the truth; a plane turns anyway."""
+        if self.is_plane:
+            return
+        middle, begun_rad = self.sticks_us[3], self.truth.recorded[-1][3]
+        self.sticks_us[3] = middle + YAW_STICK_US
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(TURNED_WITHIN_S):
+                while self.truth.recorded[-1][3] - begun_rad < math.radians(degrees):
+                    await asyncio.sleep(0.02)
+        self.sticks_us[3] = middle
 
     @abstractmethod
     async def steer(self, ground: GroundStation) -> None:
