@@ -128,14 +128,16 @@ class CompanionProcess:
         answer: Record = json.loads(output)
         return answer
 
-    async def calibrate(self, within_s: float) -> Record:
-        """`companion calibrate --wait --json`, its progress on our stderr; the record.
+    async def calibrate(self, within_s: float, *, progress: int | None = None) -> Record:
+        """`companion calibrate --wait --json`, its progress on our stderr, or where `progress` says; the record.
 
         Raises:
             RuntimeError: it printed none.
         """
         words = ("calibrate", "--wait", "--timeout", str(within_s), "--json")
-        process = await asyncio.create_subprocess_exec(*self.command(*words), stdout=asyncio.subprocess.PIPE)
+        process = await asyncio.create_subprocess_exec(
+            *self.command(*words), stdout=asyncio.subprocess.PIPE, stderr=progress
+        )
         output, _ = await process.communicate()
         if not output.strip():
             raise RuntimeError(f"companion calibrate printed no record (exit code {process.returncode}):\n{self.log()}")

@@ -86,7 +86,7 @@ def main(argv: Sequence[str]) -> int:
     for plan in plans_of(arguments):
         try:
             record, found = asyncio.run(fly(plan, folder.absolute() / f"{plan.fault}-{plan.set_up}-{plan.seed}"))
-        except (BinaryError, RuntimeError, TimeoutError, OSError) as error:
+        except (BinaryError, RuntimeError, TimeoutError, OSError, KeyError, ValueError) as error:
             print(f"{plan.fault:16}{plan.set_up:9}did not come about: {error}", file=sys.stderr, flush=True)
             worst = 2
             continue
@@ -96,4 +96,5 @@ def main(argv: Sequence[str]) -> int:
             for event in record.events:
                 if event.own_s > record.struck_s - 5.0 and math.isfinite(record.struck_s):
                     print(f"  {event.own_s - record.struck_s:+6.1f} s  {event.kind}: {event.words}", flush=True)
+    print(f"Records, logs and the firmware's files: {folder}", file=sys.stderr)
     return worst

@@ -147,7 +147,7 @@ class Flight:
             RuntimeError: it failed.
             TimeoutError: nothing is pushed.
         """
-        record = await self.daemon.calibrate(CALIBRATED_WITHIN_S)
+        record = await self.daemon.calibrate(CALIBRATED_WITHIN_S, progress=asyncio.subprocess.DEVNULL)
         if record["state"] != "done":
             raise RuntimeError(f"calibration: {record['reason']}")
         attitude: dict[str, Any] = {}
