@@ -88,12 +88,13 @@ def read(path: Path, progress: Progress) -> Iterator[Boot]:
             jumped = kind, at_s, fields
             continue
         if jumped is not None and abs(at_s - jumped[1]) < _BACK_S:
-            yield _boot(start)
-            start = _Start()
+            whole, start = _boot(start), _Start()
+            yield whole
             _take(start, *jumped)
         jumped, last_s = None, at_s
         _take(start, kind, at_s, fields)
-    yield _boot(start)
+    whole, start = _boot(start), _Start()
+    yield whole
 
 
 def _take(start: _Start, kind: str, at_s: float, fields: dict[str, Any]) -> None:

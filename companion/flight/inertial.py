@@ -121,7 +121,7 @@ def without_earth(found: Increments, solution: Navigation, world: World) -> Incr
         return found
     turn, velocity, _ = solution.at(found.t_s - 0.5 * found.dt_s)
     coriolis = np.cross(2.0 * rate, velocity)
-    return found.shifted(-np.einsum("nji,j->ni", turn, rate), np.einsum("nji,nj->ni", turn, coriolis))
+    return found.shifted(-np.einsum("nji,j->ni", turn, rate), -np.einsum("nji,nj->ni", turn, coriolis))
 
 
 def lag_s(found: Increments, solution: Navigation) -> float:

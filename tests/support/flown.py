@@ -133,13 +133,16 @@ def parameters(**others: float) -> dict[str, float]:
     return found | {"SERVO1_FUNCTION": 33.0, "SERVO1_MIN": 1000.0} | others
 
 
-def messages(flown: Flown, values: Mapping[str, float], *, from_s: float = 0.0) -> list[tuple[str, tuple[Any, ...]]]:
+def messages(
+    flown: Flown, values: Mapping[str, float], *, from_s: float = 0.0, degc: Floats | None = None
+) -> list[tuple[str, tuple[Any, ...]]]:
     """A log of ArduPilot, in order; GPS week 2440 began on 2026-10-11."""
     found: list[tuple[float, str, tuple[Any, ...]]] = []
     for name, value in values.items():
         found.append((from_s, "PARM", (name.encode(), value, 0.0)))
-    for t_s, row in zip(flown.t_s.tolist(), flown.readings.tolist(), strict=True):
-        found.append((t_s, "IMU", (0, *row, 0, 0, 40.0, 1, 1, 1000, 1000)))
+    warm = np.full(len(flown.t_s), 40.0) if degc is None else degc
+    for t_s, row, now_degc in zip(flown.t_s.tolist(), flown.readings.tolist(), warm.tolist(), strict=True):
+        found.append((t_s, "IMU", (0, *row, 0, 0, now_degc, 1, 1, 1000, 1000)))
     states = zip(
         flown.at_s.tolist(), flown.quaternions.tolist(), flown.velocity.tolist(), flown.position.tolist(), strict=True
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,11 @@ import pytest
 from companion.calibration.records.record import ImuRecord, Record, WrittenParameter
 from companion.cli import main as companion
 from companion.physics.units import DEG_H, MG
+from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.records import RecordStore
 from tests.support.autopilot_files import write_ulog
 from tests.support.flown import HEIGHT_M, LATITUDE_DEG, Flown, dataflash, fly, messages, parameters
+from tests.support.histories import SLOPES_DEG_H_K, windows_of_days
 from tests.support.made_noise import Floats
 
 GYRO_DEG_H, ACCEL_MG, STEP_MG = (300.0, -200.0, 100.0), (3.0, -2.0, 4.0), 5.0
@@ -120,6 +123,31 @@ def test_people_read_the_figure_that_counts(log: Path, tmp_path: Path, capsys: p
     assert "accel x, y: not counted, a hover does not tell them from tilt\n" in out
     assert max(map(len, out.splitlines())) <= 100
     assert out.splitlines()[-1].startswith("next flight: IMU 1 gyro x: ")
+
+
+def test_what_the_curve_knows_of_temperature_is_not_put_down_to_the_motors(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slopes = np.array(SLOPES_DEG_H_K)
+    warmer_k = np.clip((flown.t_s - 66.0) / 20.0, 0.0, 1.0) * 8.0
+    readings = flown.readings + np.hstack([np.outer(warmer_k, slopes * DEG_H), np.zeros((len(warmer_k), 3))])
+    warmed = dataclasses.replace(flown, readings=readings)
+    path = dataflash(tmp_path / "warm.bin", messages(warmed, parameters(), degc=14.0 + warmer_k))
+    identity = {"source": "autopilot", "instance": "1", "gyro": "2752772"}
+    BiasStore(tmp_path).write({"fc": KnownImu(identity=identity, points=tuple(windows_of_days(8)))})
+    _, answer = said(capsys, path, *storage(tmp_path))
+    step_k = warmer_k[(flown.t_s > 70.0) & (flown.t_s < 237.0)].mean()
+    for k, axis in enumerate(answer["flights"][0]["imus"][0]["axes"][:3]):
+        temperature, motors = axis["temperature"], axis["motors"]
+        assert abs(temperature["value"] / DEG_H - slopes[k] * step_k) < 2.0 * temperature["sigma"] / DEG_H < 40.0
+        assert abs(motors["value"]) < 2.0 * motors["sigma"]
+    # Of another sensor's curve nothing is known here.
+    BiasStore(tmp_path).write({"fc": KnownImu(identity=identity | {"gyro": "1"}, points=tuple(windows_of_days(8)))})
+    _, answer = said(capsys, path, *storage(tmp_path))
+    axes = answer["flights"][0]["imus"][0]["axes"]
+    assert all(axis["temperature"] is None for axis in axes)
+    worst = int(np.argmax(np.abs(slopes)))
+    assert axes[worst]["motors"]["value"] / DEG_H == pytest.approx(slopes[worst] * step_k, rel=0.3)
 
 
 def column(states: Any) -> Floats:
