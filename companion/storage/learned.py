@@ -61,17 +61,13 @@ class BiasStore:
         return {} if found is None else found.imus
 
     def write(self, imus: dict[str, KnownImu]) -> None:
-        """Keep what is worth it of the latest IMUs.
+        """Keep the latest IMUs.
 
         Raises:
             StorageError: it could not be written; what was there before still is.
         """
         latest = sorted(imus, key=lambda name: max((point.unix_s for point in imus[name].points), default=0.0))
-        kept = {
-            name: msgspec.structs.replace(imus[name], points=history.kept(imus[name].points))
-            for name in latest[-KEEP_IMUS:]
-        }
-        self._file.write(_File(imus=kept))
+        self._file.write(_File(imus={name: imus[name] for name in latest[-KEEP_IMUS:]}))
 
 
 SIGNING_FILE: Final = "mavlink-signing-time.json"

@@ -215,7 +215,7 @@ def test_another_imu_in_its_place_has_no_curve_and_the_same_one_keeps_it(known: 
     _, _, rig = power_up(tmp_path, 9, before=exchanged, own_imu=False, times=0)
     (shown,) = rig.service.calibrating.memory.temperature()
     assert (shown["points"], shown["curve"]) == ((), ())
-    assert shown["needs"] == "gyro (device id) changed since then: a calibration begins anew"
+    assert shown["needs"] == "gyro (device id) changed: earlier biases count no more, a calibration begins anew"
 
     (record,), _, rig = power_up(tmp_path, 9, before=exchanged, own_imu=False)
     assert record.imus[0].prior is None

@@ -53,7 +53,7 @@ State = tuple[float, float]
 """A temperature and how fast it rises, degC and K/s."""
 
 
-class Node(msgspec.Struct, frozen=True, array_like=True):
+class Node(msgspec.Struct, frozen=True):
     """Still seconds of one power-up at about one temperature; vehicle FRD, rad/s or m/s^2."""
 
     degc: float

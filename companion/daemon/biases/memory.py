@@ -359,7 +359,9 @@ class BiasMemory:
                 now_degc=self._now_degc.get(name),
             )
             if what:
-                shown = msgspec.structs.replace(shown, needs=f"{what} changed since then: a calibration begins anew")
+                shown = msgspec.structs.replace(
+                    shown, needs=f"{what} changed: earlier biases count no more, a calibration begins anew"
+                )
             found.append(msgspec.to_builtins(shown))
         return found
 
