@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.records.history import PowerUp
+from companion.calibration.records.record import Record
 from companion.config import parse
 from companion.storage.learned import BiasStore
 from companion.storage.records import RecordStore
@@ -195,16 +197,26 @@ def undone(flying: Flight) -> None:
     ],
 )
 def test_biases_that_are_not_this_imus_now_are_not_used(
-    tmp_path: Path, own_imu: bool, happens: Callable[[Flight], None], why: str
+    tmp_path: Path, own_imu: bool, happens: Callable[[Flight], None], why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Nothing is pushed, it is said once, and the disk is not asked again and again."""
+
     async def main() -> None:
         async with flight(tmp_path, own_imu=own_imu, imu_rate_hz=50.0) as flying:
             in_air(flying)
             await flying.sleep(3.0)
             happens(flying)
             killed_s = flying.rig.now_s
+            looks, history = Counter[str](), RecordStore.history
+
+            def counted(store: RecordStore, limit: int | None = None) -> list[Record]:
+                looks["history"] += 1
+                return history(store, limit)
+
+            monkeypatch.setattr(RecordStore, "history", counted)
             await flying.rig.restart()
             await flying.sleep(5.0)
+            assert looks["history"] == 2  # at the start, and here
             assert not flying.witness.of(Vision, killed_s)
             assert flying.attitude.view()["why_not"] == why
             texts = [text for text in flying.rig.ground.texts() if "not pushed" in text]

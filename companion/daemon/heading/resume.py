@@ -32,7 +32,8 @@ from companion.samples import Vector
 
 AGREES_S: Final = 0.7
 """So long the two must agree before the push; so long they may disagree before it begins anew."""
-FRESH_S: Final = 0.3
+FRESH_S: Final = 1.0
+"""How old the autopilot's attitude may be: what has turned since is known from the gyros."""
 LATEST: Final = 10
 """How many records are looked through for one that is in force; the others were cancelled or have failed."""
 DECLINATION_SIGMA_DEG: Final = 1.0
@@ -57,9 +58,12 @@ class Resume:
         self.pending = True
         """Whether nothing has agreed yet since the start, and nobody has seen the aircraft disarmed."""
         self._record: Record | None = None
+        self._looked = False
+        """For a record: disks are not asked again and again in flight."""
         self._differs: str | None = None
         self._agrees: bool | None = None
-        self._since_s = 0.0
+        self._since_s = self._unknown_s = 0.0
+        """Since when it is so, and until when our heading was not known."""
 
     async def step(self, now_s: float) -> None:
         """Begin, compare, and begin anew where the two do not agree."""
@@ -70,10 +74,12 @@ class Resume:
             self.pending, carrier.doubt = False, None
             carrier.forget()
             return
+        known = carrier.estimator is not None and carrier.estimator.heading_known
+        self._unknown_s = self._unknown_s if known else now_s
         if carrier.estimator is None or not carrier.estimator.aligned:
             self._agrees = None
             carrier.doubt = await self._begin(now_s) or self._differs or "comparing with the autopilot's attitude"
-        elif carrier.estimator.heading_known:
+        elif known:
             self._compare(now_s)
         else:
             carrier.doubt = self._differs or HEADING_UNKNOWN
@@ -83,7 +89,9 @@ class Resume:
         name, theirs = self._carrier.imu.name, self._difference.theirs
         if theirs is None or now_s - theirs[0] > FRESH_S:
             return "waiting for the autopilot's attitude"
-        record = self._record = self._record or await self._core.offload(self._latest)
+        if not self._looked:
+            self._record, self._looked = await self._core.offload(self._latest), True
+        record = self._record
         found = None if record is None else next((imu for imu in record.imus if imu.name == name), None)
         if record is None or found is None or found.gyro_bias_rad_s is None:
             return "no calibration is in force"
@@ -109,7 +117,8 @@ class Resume:
 
     def _compare(self, now_s: float) -> None:
         attitude, latest = self._carrier.now(), self._difference.latest
-        if attitude is None or latest is None or now_s - self._difference.heard_s > FRESH_S:
+        heard_s = self._difference.heard_s
+        if attitude is None or latest is None or heard_s <= self._unknown_s or now_s - heard_s > FRESH_S:
             self._agrees = None
             return
         words = next(filter(None, disagreements(attitude, *latest)), None)
