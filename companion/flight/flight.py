@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -116,8 +117,9 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
     # Filters delay the readings; what is compared with the solution must be of the same moment.
     late: dict[int, Increments] = {}
     for imu in boot.imus:
-        if len(imu.t_s) > 2:
-            found = inertial.increments(imu.t_s, imu.readings, means=imu.means)
+        rows = inertial.whole(np.column_stack([imu.t_s, imu.readings]))
+        if len(rows) > 2:
+            found = inertial.increments(rows[:, 0], rows[:, 1:], means=imu.means)
             late[imu.number] = found._replace(t_s=found.t_s - inertial.lag_s(found, reference))
     return [
         Flight(
@@ -189,6 +191,11 @@ async def _imu(
     except AutopilotError as error:
         notes.append(str(error))
     match = None if calibration is None else written_in(calibration, known.records)
+    if match is not None and boot.unix_offset_s is not None:
+        began_s = datetime.datetime.fromisoformat(match[0].started_at).timestamp()
+        after_s = began_s - boot.unix_offset_s - stages.armed_s
+        if after_s > 0.0:
+            notes.append(f"clocks differ: by them its calibration began {after_s / 3600.0:.1f} h after this arming")
     up_s, down_s = stages.take_off_s, stages.landing_s or stages.disarmed_s or float(reference.t_s[-1])
     in_air = None if up_s is None else (up_s + _SETTLED_S, down_s - _SETTLED_S)
     if in_air is None or in_air[1] - in_air[0] < _LEAST_AIR_S:

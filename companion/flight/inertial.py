@@ -13,14 +13,17 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
+from companion.calibration.noise.robust import median
 from companion.physics.frames import Floats, rotations, running_products
 
 STEP_S: Final = 0.02
 """Increments are put together to this; coning and sculling within are kept."""
 GAP_S: Final = 0.25
 """A longer hole in the readings is flown over by no start."""
+_LARGEST: Final = 1e6
 _LAG_SPAN_S: Final = 0.3
 _MOST_LAG_S: Final = 0.1
+_OUTLIER: Final = 10.0
 
 
 class Navigation(NamedTuple):
@@ -40,8 +43,14 @@ class Navigation(NamedTuple):
         return matrices(q), _between(t_s, self.t_s, self.velocity), _between(t_s, self.t_s, self.position)
 
 
+def whole(rows: Floats) -> Floats:
+    """Without those that hold what no aircraft can mean."""
+    return np.asarray(rows[(np.abs(rows) < _LARGEST).all(axis=1)])
+
+
 def joined(attitude: Floats, moving: Floats) -> Navigation | None:
     """Of quaternions (n, 1 + 4) and velocities and positions (m, 1 + 6) by time; None of too few."""
+    attitude, moving = whole(attitude), whole(moving)
     if len(attitude) < 2 or len(moving) < 2:
         return None
     q = attitude[(attitude[:, 0] >= moving[0, 0]) & (attitude[:, 0] <= moving[-1, 0])]
@@ -130,16 +139,21 @@ def lag_s(found: Increments, solution: Navigation) -> float:
     Over a short while readings that are late have turned by less than the solution has, by the rate at its end less
     that at its beginning, times the delay.
     """
-    if len(found.t_s) < 3:
-        return 0.0
-    span = max(round(_LAG_SPAN_S / float(np.mean(found.dt_s))), 1)
+    span = max(round(_LAG_SPAN_S / float(median(found.dt_s))), 1)
     rate = found.angle / found.dt_s[:, None]
+    holes = np.cumsum(found.dt_s > GAP_S)
     k = np.arange(1, len(found.t_s) - span, span)
+    k = k[holes[k + span] == holes[k]]
+    if len(k) < 2:
+        return 0.0
     turn, _, _ = solution.at(found.t_s)
     carried = running_products(rotations(found.angle))
     off = vectors(_transposed(turn[k + span]) @ turn[k] @ _transposed(carried[k]) @ carried[k + span])
     change = 0.5 * (rate[k + span] + rate[k + span - 1] - rate[k] - rate[k - 1])
-    off, change = off - off.mean(axis=0), change - change.mean(axis=0)
+    # Where the solution found its heading anew, no filter is to blame.
+    size = np.linalg.norm(off, axis=1)
+    usual = size <= _OUTLIER * median(size)
+    off, change = off[usual] - off[usual].mean(axis=0), change[usual] - change[usual].mean(axis=0)
     power = float(np.square(change).sum())
     found_s = -float((off * change).sum()) / power if power > 0.0 else 0.0
     return found_s if abs(found_s) < _MOST_LAG_S else 0.0

@@ -100,6 +100,7 @@ def test_a_flight_is_told_with_what_its_calibration_was_worth(
     assert flight["reference"] == "ekf"
     (imu,) = flight["imus"]
     assert imu["calibration"] == BEGAN
+    assert imu["notes"] == ["clocks differ: by them its calibration began 8.0 h after this arming"]
     found = {axis["axis"]: axis for axis in imu["axes"]}
     for axis, bias in zip("xyz", GYRO_DEG_H, strict=True):
         term = found[f"gyro {axis}"]["turn_on"]
@@ -256,3 +257,25 @@ def test_a_truncated_and_damaged_log_is_read_as_far_as_it_goes(
     assert flight["stages"]["landing_s"] is None
     assert flight["stages"]["disarmed_s"] is None
     assert flight["imus"][0]["drift"]["flown"]
+
+
+def test_whatever_is_damaged_nothing_is_raised(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slow = dataclasses.replace(flown, t_s=flown.t_s[::4], readings=flown.readings[::4])
+    some = [each for each in messages(slow, parameters()) if each[0] == "PARM" or 60e6 < each[1][0] < 110e6]
+    path = dataflash(tmp_path / "some.bin", some)
+    data = path.read_bytes()
+    rng = np.random.default_rng(5)
+    for _ in range(12):
+        damaged = bytearray(data)
+        for at in rng.integers(7, len(data), size=int(rng.integers(0, 200))):
+            damaged[int(at)] = int(rng.integers(0, 256))
+        at = int(rng.integers(0, len(data)))
+        del damaged[at : at + int(rng.integers(1, 5000))]
+        path.write_bytes(bytes(damaged))
+        code = companion(["flight", str(path), *storage(tmp_path)])
+        said_now = capsys.readouterr()
+        assert code in {0, 1}
+        assert said_now.err.count("\n") == code
+        assert bool(said_now.out) == (code == 0)
