@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sim.flying.faults import FAULTS
-from sim.flying.flight import SET_UPS, WATCHED_S, Plan, flying
+from sim.flying.flight import SET_UPS, WATCHED_S, Plan, SetUp, flying
 from sim.flying.verdict import HEADER, Figures, Record, figures, row
 from sim.sitl.process import BinaryError
 
@@ -23,7 +23,7 @@ HELP = "A real firmware flies with our heading, and something fails: the largest
 def parser() -> argparse.ArgumentParser:
     """Of `python -m sim fly`."""
     command = argparse.ArgumentParser(prog="python -m sim fly", description=HELP)
-    command.add_argument("--binary", type=Path, required=True, help="the firmware: arducopter or arduplane")
+    command.add_argument("--binary", type=Path, required=True, help="the firmware: arducopter, arduplane or px4")
     command.add_argument(
         "--fault", choices=tuple(FAULTS), action="append", default=[],
         help="what happens (default: each of them); may be repeated: "
@@ -50,11 +50,14 @@ def parser() -> argparse.ArgumentParser:
 def plans_of(arguments: argparse.Namespace) -> list[Plan]:
     """What the options ask for; each flight has a wind of its own."""
     plans = []
-    for number, fault in enumerate(arguments.fault or FAULTS):
+    px4 = "px4" in arguments.binary.name
+    able = [fault for fault in FAULTS if not px4 or fault != "own-compass"]  # SIH's cannot be turned
+    for number, fault in enumerate(arguments.fault or able):
         dice = random.Random(arguments.seed + 1000 * number)
         wind = (round(dice.uniform(3.0, 8.0), 1), round(dice.uniform(0.0, 360.0)))
         heading_deg = float(round(dice.uniform(0.0, 360.0)))
-        for set_up in arguments.set_up or ["script"]:
+        set_ups: list[SetUp] = ["px4"] if px4 else arguments.set_up or ["script"]
+        for set_up in set_ups:
             plans.append(
                 Plan(
                     arguments.binary, fault, set_up, tuple(arguments.wind or wind), heading_deg,

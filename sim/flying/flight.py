@@ -19,6 +19,7 @@ from sim.devices import SerialDevice
 from sim.earth import Array
 from sim.flying.ardupilot import FlyingArduPilot
 from sim.flying.faults import FAULTS
+from sim.flying.px4 import FlyingPx4
 from sim.flying.truth import FlyingAircraft
 from sim.flying.vehicle import FlyingVehicle
 from sim.flying.verdict import Event, Record
@@ -30,16 +31,19 @@ from sim.sitl.ground import GroundStation
 from sim.sitl.lossy_link import LossyLink
 from sim.sitl.residuals import ground_station
 
-SetUp = Literal["script", "command", "today"]
+SetUp = Literal["script", "command", "today", "px4"]
 SET_UPS: dict[SetUp, str] = {
     "script": "both source sets, and the script",
     "command": "both source sets, no script",
     "today": "our heading and no second source set, no script",
+    "px4": "of PX4, which sees to another heading by itself",
 }
 MORE = '\n[push]\nattitude = "yaw"\n[calibration]\nmin_still_s = 10\nmax_s = 15\nat_arm = "off"\n'
 CALIBRATED_WITHIN_S = 120.0
 PUSHED_WITHIN_S = 60.0
 STARTED_S = 2.0
+STORED_S = 3.0
+"""By then PX4 has stored what was written."""
 RESTARTED_S = 6.0
 HEIGHT_M = 10.0
 PLANE_HEIGHT_M = 50.0
@@ -130,7 +134,7 @@ class Flight:
         wanted = {row["parameter"]: row["wanted"] for row in shown["parameters"] if row["wanted"] is not None}
         only_one = self.plan.set_up == "today"
         await self.ground.put_all({n: value for n, value in wanted.items() if not (only_one and "SRC2" in n)})
-        await self.vehicle.sleep(2.0)
+        await self.vehicle.sleep(STORED_S)
         await self.vehicle.power_cycle()
         self._since_s = asyncio.get_running_loop().time()
         await self.vehicle.sleep(RESTARTED_S)
@@ -235,14 +239,22 @@ async def flying(plan: Plan, folder: Path, unix_s: float) -> AsyncIterator[Fligh
     scenario = demo(seed=plan.seed, unix_s=unix_s, aircraft=aircraft)
     here = folder / "daemon"
     here.mkdir(parents=True)
-    async with LossyLink() as link:
-        vehicle = FlyingArduPilot(plan.binary, scenario, folder / "firmware", companion=link.near, wind=plan.wind)
+    firmware, near_port, more = folder / "firmware", None, MORE
+    px4 = None
+    if plan.set_up == "px4":
+        px4 = FlyingPx4(plan.binary, scenario, firmware, wind=plan.wind, seed=plan.seed)
+        near_port, more = px4.companion_port, MORE.replace("[push]", "[push]\nparameters = false")
+    async with LossyLink(near_port=near_port) as link:
+        vehicle: FlyingVehicle = px4 or FlyingArduPilot(
+            plan.binary, scenario, firmware, companion=link.near, wind=plan.wind
+        )
         if plan.set_up == "script":
-            vehicle.scripts.mkdir(parents=True)
-            (vehicle.scripts / SCRIPT.name).write_bytes(SCRIPT.read_bytes())
+            scripts = firmware / "scripts"
+            scripts.mkdir(parents=True)
+            (scripts / SCRIPT.name).write_bytes(SCRIPT.read_bytes())
         host, port = link.url.removeprefix("udpin:").rsplit(":", 1)
         text = configuration(scenario, directory=here, udp=(host, int(port)))
-        (here / "companion.toml").write_text(text + MORE, encoding="utf-8")
+        (here / "companion.toml").write_text(text + more, encoding="utf-8")
         async with vehicle, ground_station(vehicle) as ground, devices(scenario, here):
             await ground.wait_for(lambda: bool(ground.vehicle_heartbeats()), 60.0, "a heartbeat")
             flight = Flight(plan, vehicle, ground, link, here)

@@ -20,8 +20,8 @@ MODEL = "none_iris"
 INSTANCES = 10
 """Beyond ten, the firmware gives several vehicles the same companion port."""
 _TCP_SIMULATOR = 4560
-_UDP_COMPANION, _UDP_COMPANION_LOCAL = 14540, 14580
-_UDP_GROUND_LOCAL = 18570
+UDP_COMPANION, _UDP_COMPANION_LOCAL = 14540, 14580
+UDP_GROUND_LOCAL = 18570
 _UDP_PAYLOAD_LOCAL, _UDP_GIMBAL_LOCAL = 14280, 13030
 
 MEASURING_PARAMETERS: dict[str, float] = {
@@ -38,7 +38,7 @@ MEASURING_PARAMETERS: dict[str, float] = {
 
 def ports_of(instance: int) -> list[tuple[int, socket.SocketKind]]:
     """All ports an instance or its peers bind, except the ground station's 14550, which all instances share."""
-    udp = (_UDP_COMPANION, _UDP_COMPANION_LOCAL, _UDP_GROUND_LOCAL, _UDP_PAYLOAD_LOCAL, _UDP_GIMBAL_LOCAL)
+    udp = (UDP_COMPANION, _UDP_COMPANION_LOCAL, UDP_GROUND_LOCAL, _UDP_PAYLOAD_LOCAL, _UDP_GIMBAL_LOCAL)
     return [(_TCP_SIMULATOR + instance, socket.SOCK_STREAM)] + [(p + instance, socket.SOCK_DGRAM) for p in udp]
 
 
@@ -99,12 +99,12 @@ class Px4Sitl(SitlVehicle):
     @property
     def url(self) -> str:
         """The companion listens where the onboard link sends to."""
-        return f"udpin:{LOOPBACK}:{_UDP_COMPANION + self.instance}"
+        return f"udpin:{LOOPBACK}:{UDP_COMPANION + self.instance}"
 
     @property
     def ground_target(self) -> tuple[str, int]:
         """Where the firmware's ground link listens; it answers whoever speaks to it first."""
-        return LOOPBACK, _UDP_GROUND_LOCAL + self.instance
+        return LOOPBACK, UDP_GROUND_LOCAL + self.instance
 
     @property
     def physics_s(self) -> float:

@@ -1,0 +1,234 @@
+"""PX4's own quadrotor (SIH, `sihsim_quadx`): its ground truth tells us the truth, it takes off and holds by itself."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import random
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from scipy.spatial.transform import Rotation
+
+from sim.earth import STANDARD_GRAVITY_M_S2
+from sim.flying.truth import FlyingAircraft, State
+from sim.flying.vehicle import FlyingVehicle
+from sim.imu_model import Bias
+from sim.scenario import Scenario
+from sim.sitl.ground import GroundStation
+from sim.sitl.ports import LOOPBACK
+from sim.sitl.process import FirmwareProcess, check_binary
+from sim.sitl.px4 import MEASURING_PARAMETERS, UDP_COMPANION, UDP_GROUND_LOCAL, free_instance
+from sim.udp import open_udp
+
+MODEL = "sihsim_quadx"
+HOLD = 4, 3
+"""Main and sub mode: AUTO, LOITER."""
+_UDP_TRUTH = 19410
+TRUTH_HZ = 250.0
+ASKED_EVERY_S = 1.0
+ARM_WITHIN_S = 60.0
+GUST_EVERY_S = 5.0
+"""Not oftener: a parameter that changes while PX4 stores another brings its simulated time to a stop."""
+GUST_SHARE = 0.3
+FORCE_OVER = 25
+"""Steps over which velocities, told in whole cm/s, are compared."""
+_EARTH_M_PER_DEG = 111_320.0
+
+
+class Truth:
+    """Takes HIL_STATE_QUATERNION of SIH for an aircraft: rates from attitudes, forces from velocities."""
+
+    def __init__(self, aircraft: FlyingAircraft, system_id: int) -> None:
+        self.boots = 0
+        self._aircraft, self._system_id = aircraft, system_id
+        self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=mavlink.MAV_COMP_ID_USER2)
+        self._codec.robust_parsing = True
+        self._transmit: Callable[[bytes], None] | None = None
+        self._asked_s = -math.inf
+        self._before: tuple[float, Rotation] | None = None
+        self._velocities: deque[tuple[float, float, float, float]] = deque(maxlen=FORCE_OVER)
+        self._start: tuple[float, float, float] | None = None
+
+    def attach(self, transmit: Callable[[bytes], None] | None) -> None:
+        """Where it sends."""
+        self._transmit = transmit
+
+    def receive(self, data: bytes, t_s: float) -> None:
+        """What came; it is asked for oftener, now and then."""
+        for message in self._codec.parse_buffer(data) or ():
+            if isinstance(message, mavlink.MAVLink_hil_state_quaternion_message):
+                state = self.state(message)
+                if state is not None:
+                    self._aircraft.take(state, t_s)
+        if self._transmit is not None and t_s - self._asked_s > ASKED_EVERY_S:
+            self._asked_s = t_s
+            number, rate = mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION, 1e6 / TRUTH_HZ
+            command = mavlink.MAVLink_command_long_message(
+                self._system_id, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, rate, *[0.0] * 5
+            )
+            self._transmit(command.pack(self._codec))
+
+    def state(self, told: mavlink.MAVLink_hil_state_quaternion_message) -> State | None:
+        """The next one; None for the first after a start, and for what is out of order."""
+        w, x, y, z = told.attitude_quaternion
+        own_s, turn = told.time_usec * 1e-6, Rotation.from_quat((x, y, z, w))
+        before = self._before
+        if before is not None and before[0] - 1.0 < own_s <= before[0]:
+            return None
+        self._before = own_s, turn
+        if before is None or own_s < before[0]:
+            self._velocities.clear()
+            self._aircraft.restart()
+            self.boots += 1
+            return None
+        rate = (before[1].inv() * turn).as_rotvec() / (own_s - before[0])
+        velocity = (told.vx * 1e-2, told.vy * 1e-2, told.vz * 1e-2)
+        self._velocities.append((own_s, *velocity))
+        first, last = np.array(self._velocities[0]), np.array(self._velocities[-1])
+        pushed = (last - first)[1:] / max(last[0] - first[0], 1e-3) - (0.0, 0.0, STANDARD_GRAVITY_M_S2)
+        here = told.lat * 1e-7, told.lon * 1e-7, told.alt * 1e-3
+        self._start = start = self._start or here
+        north = (here[0] - start[0]) * _EARTH_M_PER_DEG
+        east = (here[1] - start[1]) * _EARTH_M_PER_DEG * math.cos(math.radians(start[0]))
+        return State(
+            own_s, (w, x, y, z), tuple(rate), tuple(turn.inv().apply(pushed)),
+            (north, east, start[2] - here[2]), velocity,
+        )  # fmt: skip
+
+
+class FlyingPx4(FlyingVehicle):
+    """A `px4` of SITL that simulates itself, in wind with gusts.
+
+    Args:
+        binary: the firmware; its `etc` lies beside its folder.
+        scenario: whose aircraft is a `FlyingAircraft`.
+        folder: for the binary's files.
+        wind: speed in m/s and where from in degrees.
+        seed: of the gusts.
+
+    Raises:
+        BinaryError: binary or folder is missing, or no instance is free.
+    """
+
+    firmware = "px4"
+
+    def __init__(
+        self, binary: Path, scenario: Scenario, folder: Path, *, wind: tuple[float, float] = (0.0, 0.0), seed: int = 0
+    ) -> None:
+        super().__init__(scenario, folder)
+        self._binary = check_binary(binary)
+        self.instance = free_instance()
+        self.system_id = self.instance + 1
+        from_rad = math.radians(wind[1])
+        self._wind = {"SIH_WIND_N": -wind[0] * math.cos(from_rad), "SIH_WIND_E": -wind[0] * math.sin(from_rad)}
+        self._gust_m_s, self._dice = GUST_SHARE * wind[0], random.Random(seed)
+        self._told = Truth(self.truth, self.system_id)
+        self.sticks_us = []
+
+    @property
+    def companion_port(self) -> int:
+        """Where it sends to."""
+        return UDP_COMPANION + self.instance
+
+    @property
+    def url(self) -> str:
+        """The companion listens where the onboard link sends to."""
+        return f"udpin:{LOOPBACK}:{self.companion_port}"
+
+    @property
+    def ground_target(self) -> tuple[str, int]:
+        """Where its ground link listens."""
+        return LOOPBACK, UDP_GROUND_LOCAL + self.instance
+
+    @property
+    def backend_boots(self) -> int:
+        """Starts seen."""
+        return self._told.boots
+
+    @property
+    def stored(self) -> tuple[str, ...]:
+        """Parameters and their backup."""
+        return "parameters.bson", "parameters_backup.bson"
+
+    def true_bias(self, instance: int, t_s: float) -> Bias:
+        """SIH's IMU has noise, and no bias."""
+        return Bias(np.zeros(3), np.zeros(3))
+
+    async def _open(self, stack: contextlib.AsyncExitStack) -> FirmwareProcess:
+        self.truth.begin(asyncio.get_running_loop().time())
+        end = await open_udp(self._told, listen=(LOOPBACK, _UDP_TRUTH + self.instance))
+        stack.callback(end.close)
+        etc = self._binary.parent.parent / "etc"
+        return FirmwareProcess(
+            [str(self._binary), "-d", "-i", str(self.instance), "-w", str(self.folder), str(etc)], self.folder
+        )
+
+    async def power_on(self) -> None:
+        """Start it with what it has stored; when that is nothing, with our parameters."""
+        site = self.aircraft.site
+        environment = {
+            "PX4_SIM_MODEL": MODEL,
+            "PX4_HOME_LAT": f"{site.latitude_deg}",
+            "PX4_HOME_LON": f"{site.longitude_deg}",
+            "PX4_HOME_ALT": f"{site.height_m}",
+            "PX4_HOME_YAW": f"{math.degrees(self.aircraft.angles_rad(0.0)[2]):.1f}",
+        }
+        if not (self.folder / self.stored[0]).exists():
+            values = MEASURING_PARAMETERS | self._wind | {"SDLOG_BACKEND": 0.0, "COM_LOW_BAT_ACT": 0.0}
+            environment |= {f"PX4_PARAM_{name}": f"{value:g}" for name, value in values.items()}
+        self.process.environment = environment
+        await super().power_on()
+
+    async def ask_streams(self, ground: GroundStation) -> None:
+        """It sends ATTITUDE and LOCAL_POSITION_NED at 50 Hz by itself: less, for the record."""
+        for number in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED):
+            await ground.stream(number, 25.0)
+
+    async def take_off(self, ground: GroundStation, height_m: float) -> None:
+        """Armed with all its checks, and up to MIS_TAKEOFF_ALT.
+
+        Raises:
+            TimeoutError: it does not arm, or does not climb; with what it says.
+        """
+        since_s = asyncio.get_running_loop().time()
+        await ground.put("MIS_TAKEOFF_ALT", height_m)
+        await ground.command(mavlink.MAV_CMD_NAV_TAKEOFF, *[0.0] * 3, *[math.nan] * 4)
+        try:
+            async with asyncio.timeout(ARM_WITHIN_S):
+                while await ground.arm(wait_s=2.0) != mavlink.MAV_RESULT_ACCEPTED:
+                    await asyncio.sleep(1.0)
+        except TimeoutError:
+            raise TimeoutError(f"it does not arm: {ground.texts_since(since_s)[-400:]}") from None
+        await ground.wait_for(lambda: self.height_m > 0.9 * height_m, 60.0, "take-off")
+
+    async def hold(self, ground: GroundStation) -> None:
+        """It holds by itself once it is up.
+
+        Raises:
+            TimeoutError: it does not.
+        """
+        since_s = asyncio.get_running_loop().time()
+        wanted = HOLD[1] << 24 | HOLD[0] << 16
+        await ground.wait_for(
+            lambda: any(beat.custom_mode == wanted for beat in ground.vehicle_heartbeats(since_s)), 30.0, "Hold"
+        )
+
+    async def steer(self, ground: GroundStation) -> None:
+        """Gusts, until cancelled."""
+        while True:
+            for name, mean in self._wind.items():
+                ground.send_put(name, mean + self._dice.gauss(0.0, self._gust_m_s), mavlink.MAV_PARAM_TYPE_REAL32)
+            await asyncio.sleep(GUST_EVERY_S)
+
+    async def lie_with_own_compass(self, ground: GroundStation) -> float:
+        """SIH's cannot be turned.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError
