@@ -34,7 +34,8 @@ ASKED_EVERY_S = 1.0
 ARM_WITHIN_S = 60.0
 GUST_EVERY_S = 5.0
 """Not oftener: a parameter that changes while PX4 stores another brings its simulated time to a stop."""
-GUST_SHARE = 0.3
+GUST_SHARE = 0.2
+TURNED_S = 4.0
 FORCE_OVER = 25
 """Steps over which velocities, told in whole cm/s, are compared."""
 _EARTH_M_PER_DEG = 111_320.0
@@ -128,6 +129,7 @@ class FlyingPx4(FlyingVehicle):
         self._wind = {"SIH_WIND_N": -wind[0] * math.cos(from_rad), "SIH_WIND_E": -wind[0] * math.sin(from_rad)}
         self._gust_m_s, self._dice = GUST_SHARE * wind[0], random.Random(seed)
         self._told = Truth(self.truth, self.system_id)
+        self._ground: GroundStation | None = None
         self.sticks_us = []
 
     @property
@@ -218,8 +220,16 @@ class FlyingPx4(FlyingVehicle):
             lambda: any(beat.custom_mode == wanted for beat in ground.vehicle_heartbeats(since_s)), 30.0, "Hold"
         )
 
+    async def turn(self, degrees: float) -> None:
+        """Told to turn clockwise on its spot."""
+        assert self._ground is not None
+        yaw_rad = math.remainder(self.truth.recorded[-1][3] + math.radians(degrees), math.tau)
+        await self._ground.command(mavlink.MAV_CMD_DO_REPOSITION, -1.0, 0.0, 0.0, yaw_rad, *[math.nan] * 3)
+        await self.sleep(TURNED_S)
+
     async def steer(self, ground: GroundStation) -> None:
-        """Gusts, until cancelled."""
+        """Gusts, until cancelled: no sticks."""
+        self._ground = ground
         while True:
             for name, mean in self._wind.items():
                 ground.send_put(name, mean + self._dice.gauss(0.0, self._gust_m_s), mavlink.MAV_PARAM_TYPE_REAL32)

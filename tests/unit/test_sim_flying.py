@@ -6,9 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.flying.ardupilot import state_of
 from sim.flying.cli import parser, plans_of
+from sim.flying.px4 import Truth
 from sim.flying.truth import BEHIND_S, FlyingAircraft, State, angles_of_quaternion
 from sim.flying.verdict import Event, Record, figures, row
 from sim.imu_model import ImuModel
@@ -159,3 +161,30 @@ def test_every_fault_has_a_wind_of_its_own_and_the_set_ups_share_it() -> None:
     assert (kill.wind, kill.heading_deg) == (kill_today.wind, kill_today.heading_deg) != (stop.wind, stop.heading_deg)
     assert all(3.0 <= plan.wind[0] <= 8.0 for plan in (kill, stop))
     assert plans_of(parser().parse_args([*words, "--wind", "7", "90", "--seed", "3"]))[0].wind == (7.0, 90.0)
+
+
+def test_what_px4_tells_of_its_truth_is_an_aircraft_that_turns_and_speeds_up() -> None:
+    """Attitudes to rates, whole cm/s to forces; a clock that begins again is a boot."""
+    aircraft = FlyingAircraft(site_at(40.0, 116.0, 50.0), heading_deg=30.0, unix_s=1_795_219_200.0)
+    aircraft.begin(100.0)
+    truth, codec = Truth(aircraft, 1), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    truth.attach(None)
+    for k in range(1000):
+        t_s = 0.004 * k
+        told = mavlink.MAVLink_hil_state_quaternion_message(
+            int(t_s * 1e6), [math.cos(0.5 * t_s), 0.0, 0.0, math.sin(0.5 * t_s)], 0.0, 0.0, 0.0,
+            400_000_000 + round(1e7 * t_s**2 / 111_320.0), 1_160_000_000, 50_000 + round(1e3 * t_s),
+            round(200.0 * t_s), 0, -100, 0, 0, 0, 0, 0,
+        )  # fmt: skip
+        truth.receive(told.pack(codec), 100.0 + t_s)
+    rate, force = aircraft.truth(np.arange(2.0, 3.5, 0.01))
+    assert (rate[:, 2] - aircraft.truth_at(-1.0).rate_rad_s[2]) == pytest.approx(1.0, abs=2e-3)
+    ahead = np.hypot(force[:, 0], force[:, 1])
+    assert ahead.mean() == pytest.approx(2.0, abs=0.02)
+    assert force[:, 2] == pytest.approx(-9.80665, abs=1e-3)
+    own_s, _, _, yaw, north, _, down, *_ = aircraft.recorded[-1]
+    assert (yaw, north, down) == pytest.approx((own_s, own_s**2, -own_s), abs=0.06)
+    assert truth.boots == 1
+    truth.receive(mavlink.MAVLink_hil_state_quaternion_message(0, [1.0, 0, 0, 0], *[0] * 14).pack(codec), 110.0)
+    assert truth.boots == 2
+    assert not aircraft.has_state
