@@ -144,7 +144,9 @@ def _crashed(record: Record, flown: Array) -> str:
 
 def row(record: Record, found: Figures) -> str:
     """One line of the table."""
-    fallback = f"{found.fallback_s:.1f} s" if math.isfinite(found.fallback_s) else "never"
+    fallback = (
+        f"{found.fallback_s:.1f} s" if math.isfinite(found.fallback_s) else "-" if record.set_up == "px4" else "never"
+    )
     spot = f"{found.spot_m:.1f} m" if math.isfinite(found.spot_m) else "-"
     wind = f"{record.wind[0]:.0f} m/s {record.wind[1]:03.0f}"
     return (
