@@ -96,7 +96,7 @@ def mavlink_imu() -> Callable[[], object]:
 def collector_sample() -> Callable[[], object]:
     wanted = Settings(min_still_s=10, max_s=60, target_gyro_sigma_rad_s=1e-5, target_accel_sigma_m_s2=1e-3)
     imu = ImuInput(name="fc", rotation=np.eye(3), profile=noise_profile(None))
-    collector = RollingCollector(wanted, [imu], gradienter=False, compass=False)
+    collector = RollingCollector(wanted, [imu])
     noise = np.random.default_rng(1).standard_normal((CALLS, 6)) * 1e-3
     rows = [((r[0], r[1], r[2]), (r[3], r[4], r[5] - 9.8)) for r in noise.tolist()]
     count = 0

@@ -10,6 +10,7 @@ from typing import Final, Literal
 from companion.autopilot.firmware.port_parameters import baud_of
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.deck.deck import KEPT_S, Deck
@@ -164,10 +165,14 @@ def lag(kind: Literal["gradienter", "compass"], device: Gradienter | Compass | N
     return Lag(lag_s, model.sigma_deg)
 
 
-def field_by(config: Config) -> tuple[CompassModel, GradienterModel | None] | None:
-    """How a heading comes of the compass' field vector, if there is a compass."""
+def pose_sources(config: Config) -> PoseSources:
+    """How tilt and heading come."""
     compass = compass_model(config.compass)
-    return None if compass is None else (compass, gradienter_model(config.gradienter))
+    return PoseSources(
+        gradienter=None if config.gradienter is None else lag("gradienter", config.gradienter),
+        compass=None if config.compass is None else lag("compass", config.compass),
+        field_by=None if compass is None else (compass, gradienter_model(config.gradienter)),
+    )
 
 
 def deck(config: Config) -> Deck | None:

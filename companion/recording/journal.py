@@ -272,12 +272,8 @@ class RecordedCollector(RollingCollector):
         super().__init__(
             models.settings(config),
             [models.imu_input(imu, None) for imu in config.imu],
-            gradienter=config.gradienter is not None,
-            compass=config.compass is not None,
-            gradienter_lag=models.lag("gradienter", config.gradienter),
-            compass_lag=models.lag("compass", config.compass),
-            field_by=models.field_by(config),
-            deck=models.deck(config),
+            models.pose_sources(config),
+            models.deck(config),
         )
 
     def number_of(self, window: Window) -> int | None:

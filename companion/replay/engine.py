@@ -227,12 +227,8 @@ class Replay:
         self._collector = RollingCollector(
             models.settings(config),
             (),
-            gradienter=config.gradienter is not None,
-            compass=config.compass is not None,
-            gradienter_lag=models.lag("gradienter", config.gradienter),
-            compass_lag=models.lag("compass", config.compass),
-            field_by=models.field_by(config),
-            deck=models.deck(config),
+            models.pose_sources(config),
+            models.deck(config),
         )
         self._decoders = {
             device.name: device.info.decoder(device.settings.seconds_per_byte) for device in self._devices

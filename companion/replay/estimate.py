@@ -11,6 +11,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.measurement import Measurement
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
@@ -25,7 +26,7 @@ from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.site import Remedies, Whereabouts, local_earth
 from companion.calibration.solution.solve import solve
-from companion.calibration.stillness.stretch import Lag
+from companion.calibration.stillness.stretch import AT_ONCE, Lag
 from companion.config.sections import Mounting, Noise, Platform
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats, Matrix, rotation_matrix
@@ -173,15 +174,12 @@ class _Streams:
     def collector(self, settings: Settings, imu: ImuInput) -> RollingCollector:
         """One that expects what comes."""
         field_by = None if self.field is None or self.compass is None else (self.compass, self.gradienter)
-        return RollingCollector(
-            settings,
-            [imu],
-            gradienter=self.tilt is not None,
-            compass=self.heading is not None or self.field is not None,
-            gradienter_lag=self._lag,
+        sources = PoseSources(
+            gradienter=None if self.tilt is None else self._lag,
+            compass=None if self.heading is None and self.field is None else AT_ONCE,
             field_by=field_by,
-            deck=self._deck,
         )
+        return RollingCollector(settings, [imu], sources, self._deck)
 
     def feed(self, collector: RollingCollector, at: int, now_s: float) -> None:
         """What stands in line `at` of the log."""

@@ -16,6 +16,7 @@ from typing import Final
 
 import numpy as np
 
+from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.pose import CompassModel, GradienterModel
@@ -23,6 +24,7 @@ from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.request import What
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.calibration.solution.solve import ImuSolution, Solution, solve
+from companion.calibration.stillness.stretch import AT_ONCE
 from companion.physics.gradienter import Law
 from companion.samples import CompassSample, ImuSample, TiltSample
 from sim.aircraft import Pose, Site, VirtualAircraft
@@ -190,7 +192,7 @@ def collected(
         target_accel_sigma_m_s2=0.0,
         horizon_s=horizon_s,
     )
-    collector = RollingCollector(wanted, [taken], gradienter=True, compass=True)
+    collector = RollingCollector(wanted, [taken], PoseSources(gradienter=AT_ONCE, compass=AT_ONCE))
     tilts, headings = _tilts(standing, float(times[-1])), _headings(standing, float(times[-1]))
     found: list[Window] = []
     spans = list(spans_s)

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.pose import CompassModel, GradienterModel
@@ -16,6 +17,7 @@ from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.calibration.solution.solve import ImuSolution, Solution, solve
+from companion.calibration.stillness.stretch import AT_ONCE
 from companion.physics.gradienter import Law
 from companion.protocols.decoding.base import Decoder
 from companion.protocols.registry import PROTOCOLS, Kind
@@ -80,7 +82,7 @@ def calibrate(
         min_still_s=seconds, max_s=seconds, target_gyro_sigma_rad_s=0.0, target_accel_sigma_m_s2=0.0, horizon_s=180.0
     )
     taken = ImuInput(name="own", rotation=np.eye(3), profile=noise_profile(profile))
-    collector = RollingCollector(wanted, [taken], gradienter=True, compass=True)
+    collector = RollingCollector(wanted, [taken], PoseSources(gradienter=AT_ONCE, compass=AT_ONCE))
     now_s = 0.0
     while now_s < seconds + 2.0:
         now_s += 0.5

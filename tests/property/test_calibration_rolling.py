@@ -9,10 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.outlook import Status
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.noise.robust import huber_line, huber_mean
 from companion.calibration.seconds.batch import BatchSource
+from companion.calibration.stillness.stretch import AT_ONCE
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import rotation_matrix
 from companion.rotations import ROTATION_NAMES
@@ -37,7 +39,9 @@ EVENTS = st.one_of(
 @settings(max_examples=150)
 @given(st.lists(EVENTS, max_size=25))
 def test_nothing_that_arrives_raises(events: list[object]) -> None:
-    collector = RollingCollector(still.settings(max_s=20.0), [still.imu()], gradienter=True, compass=True)
+    collector = RollingCollector(
+        still.settings(max_s=20.0), [still.imu()], PoseSources(gradienter=AT_ONCE, compass=AT_ONCE)
+    )
     feed = still.Feeder(collector, rate_hz=8)
     feed.tilt = lambda _t: (1.0, -1.0)
     feed.heading = lambda _t: 0.1
@@ -151,7 +155,7 @@ def test_the_mounting_turns_the_means_and_keeps_the_total_variance(name: str) ->
 
 
 def run(shift: still.Floats, **more: object):  # type: ignore[no-untyped-def]
-    collector = RollingCollector(still.settings(), [still.imu(**more)], gradienter=False, compass=False)  # type: ignore[arg-type]
+    collector = RollingCollector(still.settings(), [still.imu(**more)])  # type: ignore[arg-type]
     feed = still.Feeder(collector, seed=4)
     feed.change = lambda _name, _t, rows: rows + shift
     feed.run(14.0)

@@ -11,7 +11,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
+from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.stillness.stretch import AT_ONCE
 from companion.configured.models import Role, SerialDevice
 from companion.daemon.devices.sensor_watch import SensorWatch
 from companion.daemon.devices.sensors import SerialSensor
@@ -156,4 +158,4 @@ async def listening(kind: Any, protocol: str, url: str | Path, **line: Any) -> A
 
 
 def still_collector() -> RollingCollector:
-    return RollingCollector(settings(), [imu("fc")], gradienter=True, compass=True)
+    return RollingCollector(settings(), [imu("fc")], PoseSources(gradienter=AT_ONCE, compass=AT_ONCE))

@@ -40,9 +40,7 @@ class Fed:
 
     def __init__(self) -> None:
         self.decoder = ImuLineDecoder()
-        self.collector = RollingCollector(
-            settings(min_still_s=5.0, max_s=30.0), [imu("own")], gradienter=False, compass=False
-        )
+        self.collector = RollingCollector(settings(min_still_s=5.0, max_s=30.0), [imu("own")])
         self.now_s = 0.0
         self.waits: list[str] = []
 

@@ -140,7 +140,7 @@ def test_rocking_that_is_taken_for_still_is_in_sigma(white: tuple[float, float],
     readings += rocking(t_s, rms_deg_s, hz)
     readings[:, 0] += EARTH_RAD_S  # on the equator, heading north
     profile = noise_profile("icm42688p") if white is ICM42688P else UNKNOWN
-    feeder = Feeder(RollingCollector(settings(), [imu(profile=profile)], gradienter=False, compass=False))
+    feeder = Feeder(RollingCollector(settings(), [imu(profile=profile)]))
     feeder.change = lambda _name, _t, rows: readings[: len(rows)]
     earth = local_earth(Whereabouts(0.0, 0.0, 0.0, "test", datetime.date(2026, 1, 1)))
     bias = np.array([0.3, -0.2, 0.1]) * DEG

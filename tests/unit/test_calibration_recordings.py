@@ -25,9 +25,7 @@ class Played:
     def __init__(self, recording: Recording, **asked: float) -> None:
         from companion.calibration.noise.allan import noise_profile
 
-        self.collector = RollingCollector(
-            settings(**asked), [imu("fc", noise_profile(None))], gradienter=False, compass=False
-        )
+        self.collector = RollingCollector(settings(**asked), [imu("fc", noise_profile(None))])
         self.still_s: dict[int, float] = {}
         self.words: dict[int, str] = {}
         stretches: dict[int, int] = {}

@@ -9,9 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.calibration.collector import measurement
+from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.noise.allan import AllanModel, NoiseProfile
+from companion.calibration.stillness.stretch import AT_ONCE
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import ImuSample, TiltSample
@@ -35,7 +37,9 @@ SILENT = settings(target_gyro_sigma_rad_s=1e-9, target_accel_sigma_m_s2=1e-9)
 def feeder(asked: Settings | None = None, *names: str, gradienter: bool = False, compass: bool = False) -> Feeder:
     names = names or ("fc",)
     collector = RollingCollector(
-        asked or settings(), [imu(name) for name in names], gradienter=gradienter, compass=compass
+        asked or settings(),
+        [imu(name) for name in names],
+        PoseSources(gradienter=AT_ONCE if gradienter else None, compass=AT_ONCE if compass else None),
     )
     made = Feeder(collector, names)
     if gradienter:
@@ -292,7 +296,7 @@ def test_a_slow_gradienter_need_not_speak_every_second() -> None:
 
 
 def test_no_imu_at_all_still_gives_the_pose() -> None:
-    collector = RollingCollector(settings(), [], gradienter=True, compass=False)
+    collector = RollingCollector(settings(), [], PoseSources(gradienter=AT_ONCE))
     for tick in range(150):
         collector.add_tilt(TiltSample(10.05 + 0.1 * tick, 1.0, 2.0))
     assert collector.status(25.0).enough
@@ -304,7 +308,7 @@ def test_no_imu_at_all_still_gives_the_pose() -> None:
 
 def test_two_imus_of_one_name_are_a_mistake() -> None:
     with pytest.raises(ValueError, match="two IMUs have one name"):
-        RollingCollector(settings(), [imu(), imu()], gradienter=False, compass=False)
+        RollingCollector(settings(), [imu(), imu()])
 
 
 def test_an_imu_that_pauses_breaks_the_stretch_and_is_named() -> None:
@@ -372,7 +376,7 @@ def test_a_long_sleep_is_a_new_stretch() -> None:
 
 
 def test_lost_samples_are_said() -> None:
-    collector = RollingCollector(settings(), [imu()], gradienter=False, compass=False)
+    collector = RollingCollector(settings(), [imu()])
     rng = np.random.default_rng(3)
     for index in range(50 * 15):
         if index % 20 != 7:

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import noise_profile
@@ -68,7 +69,7 @@ def fly(motions: list[Motion], *, device_lag_s: float, known: Lag, until_s: floa
     }
     asked = settings(min_still_s=10.0, max_s=10.0)
     own = ImuInput(name="own", rotation=np.eye(3), profile=noise_profile("icm42688p"))
-    collector = RollingCollector(asked, [own], gradienter=True, compass=False, gradienter_lag=known)
+    collector = RollingCollector(asked, [own], PoseSources(gradienter=known))
     seen = Seen()
     for device, _ in devices.values():
         device.power_on(0.0)
@@ -153,10 +154,7 @@ def turned(known: Lag, gradienter: bool = False) -> tuple[float, float]:
     collector = RollingCollector(
         settings(),
         [imu()],
-        gradienter=gradienter,
-        compass=not gradienter,
-        gradienter_lag=known if gradienter else AT_ONCE,
-        compass_lag=AT_ONCE if gradienter else known,
+        PoseSources(gradienter=known if gradienter else None, compass=None if gradienter else known),
     )
     feed = Feeder(collector)
     size, end_s = 2.0 if gradienter else 20.0, 1006.0

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from companion.calibration.collector import trace as traces
+from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.collector.trace import MAX_SECONDS, Trace
+from companion.calibration.stillness.stretch import AT_ONCE
 from tests.support.still_aircraft import BIAS, GYRO_NOISE, RATE_HZ, Feeder, imu, settings
 
 YAW_90 = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -18,7 +20,7 @@ YAW_90 = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 def _feeder() -> Feeder:
     inputs = [imu("fc"), imu("own", rotation=YAW_90)]
-    feed = Feeder(RollingCollector(settings(), inputs, gradienter=True, compass=True), ("fc", "own"))
+    feed = Feeder(RollingCollector(settings(), inputs, PoseSources(gradienter=AT_ONCE, compass=AT_ONCE)), ("fc", "own"))
     feed.tilt = lambda _t: (1.25, -0.5)
     feed.heading = lambda _t: 12.0
     return feed
@@ -100,7 +102,7 @@ def test_a_silent_second_says_so() -> None:
 
 
 def test_it_is_bounded_and_says_what_it_lost() -> None:
-    collector = RollingCollector(settings(), [imu("fc")], gradienter=False, compass=False)
+    collector = RollingCollector(settings(), [imu("fc")])
     feed = Feeder(collector, rate_hz=5)
     feed.run(MAX_SECONDS + 50.0)
     trace = _trace(feed, 1000.5, None)

@@ -124,7 +124,7 @@ def test_how_long_a_part_has_been_on_says_its_device_else_its_stream(
     clock_s: float | None,
     age_s: float,
 ) -> None:
-    collector = RollingCollector(settings(), [imu("fc", clock_from_start=says)], gradienter=False, compass=False)
+    collector = RollingCollector(settings(), [imu("fc", clock_from_start=says)])
     rows = noise(np.random.default_rng(1), 1000)
     for k, row in enumerate(rows):
         sample = imu_sample(100.0 + k / 50.0, row)

@@ -13,16 +13,15 @@ from typing import Any, Final
 import msgspec
 
 from companion.calibration.collector.afloat import Afloat
-from companion.calibration.collector.intake import Intake, Source
+from companion.calibration.collector.intake import NO_POSE_SOURCES, Intake, PoseSources, Source
 from companion.calibration.collector.measurement import Estimates, Found, Measurement, PoseSeconds, Work
 from companion.calibration.collector.outlook import Glance, Obstacle, Settings, Status, expected_s, is_enough
 from companion.calibration.collector.swell import Swell
 from companion.calibration.collector.trace import Snapshot, TraceLog
 from companion.calibration.deck.deck import Deck
 from companion.calibration.deck.estimate import DeckWork
-from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput, Window
-from companion.calibration.stillness.stretch import AT_ONCE, HeadingWatch, Lag, Stretch
+from companion.calibration.stillness.stretch import HeadingWatch, Stretch
 from companion.errors import CalibrationRefusedError
 
 MIN_BATCHES: Final = 5
@@ -48,12 +47,7 @@ class RollingCollector(Intake):
         self,
         settings: Settings,
         imus: Sequence[ImuInput],
-        *,
-        gradienter: bool,
-        compass: bool,
-        gradienter_lag: Lag = AT_ONCE,
-        compass_lag: Lag = AT_ONCE,
-        field_by: tuple[CompassModel, GradienterModel | None] | None = None,
+        poses: PoseSources = NO_POSE_SOURCES,
         deck: Deck | None = None,
     ) -> None:
         if len({imu.name for imu in imus}) != len(imus):
@@ -61,15 +55,7 @@ class RollingCollector(Intake):
         self._settings = settings
         self._min_good, self._max_slots = settings.min_slots, settings.max_slots
         self._least = min(MIN_BATCHES, self._min_good)
-        super().__init__(
-            self._max_slots + _MARGIN,
-            gradienter=gradienter,
-            compass=compass,
-            lags=(gradienter_lag, compass_lag),
-            field_by=field_by,
-            deck=deck,
-            span=self._max_slots,
-        )
+        super().__init__(self._max_slots + _MARGIN, poses, deck, span=self._max_slots)
         self._afloat = None if deck is None else Afloat(deck, settings.horizon_s)
         self._watch = HeadingWatch()
         self._stretch = Stretch(self._min_good, self._max_slots)

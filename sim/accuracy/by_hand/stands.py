@@ -173,7 +173,7 @@ class _Aircraft:
             target_accel_sigma_m_s2=0.0,
             horizon_s=NEXT_S,
         )
-        collector = RollingCollector(wanted, [self.taken], gradienter=False, compass=False)
+        collector = RollingCollector(wanted, [self.taken])
         for t_s, (p, q, r, x, y, z) in zip(times.tolist(), rows.tolist(), strict=True):
             collector.add_imu("imu", ImuSample(t_s, (p, q, r), (x, y, z), None))
         self.t_s = begin_s + STAND_S + 1.3
