@@ -7,14 +7,14 @@ import contextlib
 from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Final, Self
 
 from companion.cli.asking import Asking
 from companion.cli.terminal import print_address
 from companion.errors import CalibrationRefusedError, CompanionError
+from companion.formats import Object
 from companion.web.server import Page
 
-Object = dict[str, Any]
 OPEN_WITHIN_S: Final = 5.0
 SHOWN_S: Final = 1.0
 """Within which a page that looks has the last state."""

@@ -7,13 +7,12 @@ import asyncio
 import math
 import sys
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 from companion.cli import show
 from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds
 from companion.daemon.faces.control import ask
-
-Object = dict[str, Any]
+from companion.formats import Object
 
 
 async def request(

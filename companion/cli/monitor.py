@@ -14,15 +14,14 @@ import shutil
 import sys
 import textwrap
 import time
-from typing import Any, Final
+from typing import Final
 
 from companion.cli import show
 from companion.cli.terminal import DONE, load_config, print_json, print_lines
 from companion.daemon.faces.control import ask
 from companion.errors import DaemonUnreachableError
+from companion.formats import Object
 from companion.printable import printable
-
-Object = dict[str, Any]
 
 SILENT_S: Final = 5.0
 """A daemon that says nothing for so long stands still."""

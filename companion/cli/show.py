@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from companion.calibration.records.record import Magnetic, outcome_word
+from companion.formats import Object
 from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
     from companion.daemon.process.check import Finding
     from companion.links.serial.ports import SerialPort
 
-Object = dict[str, Any]
 
 _BAR = 40
 _HEARTBEAT_S = 2.0

@@ -20,7 +20,7 @@ import msgspec
 
 from companion import __version__
 from companion.errors import CompanionError
-from companion.formats import parse_request
+from companion.formats import Object, parse_request
 from companion.links.system.connection import Backoff, Reconnection
 from companion.web.access import (
     TOKEN_HEADER,
@@ -36,7 +36,6 @@ from companion.web.exchange import BadRequestError, Exchange, Request, Response
 
 logger = logging.getLogger(__name__)
 
-Object = dict[str, Any]
 Answer = Callable[[Object, str], AsyncIterator[Object]]
 """A request as on the control socket, and which face it came by: its replies."""
 Offload = Callable[..., Awaitable[Any]]
