@@ -5,13 +5,14 @@ Read from /sys, /proc, /etc and /run below a `root` that a test may replace. Wha
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from companion.links.serial.ports import ROOT, Holder, SerialPort, list_ports, resolve
+from companion.links.serial.ports import ROOT, Holder, SerialPort, entries, list_ports, read_attribute, resolve
 
 SLOW_TIMER_MS: Final = 1
 _GETTY: Final = re.compile(r"a?getty|login|mgetty|getty")
@@ -151,21 +152,12 @@ def _name(port: str, found: SerialPort) -> Iterator[PortFault]:
 
 
 def _processes(root: Path) -> Iterator[tuple[int, str, tuple[str, ...]]]:
-    try:
-        entries = sorted((root / "proc").iterdir())
-    except OSError:
-        return
-    for entry in entries:
-        if not entry.name.isdigit():
+    for entry in entries(root / "proc"):
+        if not entry.name.isdigit() or (comm := read_attribute(entry / "comm")) is None:
             continue
-        try:
-            comm = (entry / "comm").read_text(errors="replace").strip()
-        except OSError:
-            continue
-        try:
+        words: list[str] = []
+        with contextlib.suppress(OSError):
             words = (entry / "cmdline").read_bytes()[:4096].decode(errors="replace").split("\0")
-        except OSError:
-            words = []
         yield int(entry.name), comm, tuple(word.removeprefix("/dev/") for word in words)
 
 

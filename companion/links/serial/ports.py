@@ -61,7 +61,7 @@ def list_ports(root: Path = ROOT) -> list[SerialPort]:
     consoles = _consoles(root)
     return [
         _describe(root, entry, links.get(device, []), tuple(holders.get(device, ())), is_console=device in consoles)
-        for entry in _entries(root / "sys/class/tty")
+        for entry in entries(root / "sys/class/tty")
         if _has_hardware(entry)
         for device in [f"/dev/{entry.name}"]
     ]
@@ -82,7 +82,7 @@ def lasting_name(device: str) -> str | None:
     root = Path(device[: match.start()] or "/")
     links = _links_by_device(root).get(resolve(root, match[0]), [])
     usb = _node_with(root, _hardware(root, match[0]), "idVendor")
-    names = _best_first(_under(_BY_ID, links), _under(_BY_PATH, links), _read(usb / "serial") if usb else None)
+    names = _best_first(_under(_BY_ID, links), _under(_BY_PATH, links), read_attribute(usb / "serial") if usb else None)
     return str(root / names[0].lstrip("/")) if names else None
 
 
@@ -104,7 +104,7 @@ def _describe(
 ) -> SerialPort:
     hardware = (entry / "device").resolve()
     usb = _node_with(root, hardware, "idVendor")
-    serial_number = _read(usb / "serial") if usb else None
+    serial_number = read_attribute(usb / "serial") if usb else None
     by_id, by_path = _under(_BY_ID, links), _under(_BY_PATH, links)
     names = _best_first(by_id, by_path, serial_number)
     driver = _driver(hardware)
@@ -150,7 +150,7 @@ def _node_with(root: Path, hardware: Path, attribute: str) -> Path | None:
 
 
 def _usb_description(usb: Path) -> str:
-    words = [_read(usb / "manufacturer"), _read(usb / "product")]
+    words = [read_attribute(usb / "manufacturer"), read_attribute(usb / "product")]
     found = " ".join(word for word in words if word)
     return found or "USB device"
 
@@ -159,7 +159,7 @@ def _links_by_device(root: Path) -> dict[str, list[str]]:
     """Symbolic links in /dev, /dev/serial/by-id and /dev/serial/by-path, by the device that they lead to."""
     found: dict[str, list[str]] = {}
     for folder in ("dev/serial/by-id", "dev/serial/by-path", "dev"):
-        for entry in _entries(root / folder):
+        for entry in entries(root / folder):
             if entry.is_symlink():
                 name = f"/{folder}/{entry.name}"
                 found.setdefault(resolve(root, name), []).append(name)
@@ -180,18 +180,18 @@ def resolve(root: Path, name: str) -> str:
 
 def _holders_by_device(root: Path) -> dict[str, list[Holder]]:
     found: dict[str, list[Holder]] = {}
-    for process in _entries(root / "proc"):
+    for process in entries(root / "proc"):
         if not process.name.isdigit():
             continue
         seen = set()
-        for descriptor in _entries(process / "fd"):  # another user's is unreadable, hence empty
+        for descriptor in entries(process / "fd"):  # another user's is unreadable, hence empty
             try:
                 target = os.readlink(descriptor)
             except OSError:
                 continue
             if target.startswith("/dev/") and target not in seen and not _is_namesake(descriptor, target):
                 seen.add(target)
-                holder = Holder(int(process.name), _read(process / "comm") or "?")
+                holder = Holder(int(process.name), read_attribute(process / "comm") or "?")
                 found.setdefault(target, []).append(holder)
     return found
 
@@ -207,19 +207,20 @@ def _is_namesake(descriptor: Path, target: str) -> bool:
 
 
 def _consoles(root: Path) -> set[str]:
-    words = (_read(root / "proc/cmdline", limit=4096) or "").split()
+    words = (read_attribute(root / "proc/cmdline", limit=4096) or "").split()
     names = [word.removeprefix("console=").split(",")[0] for word in words if word.startswith("console=")]
     return {resolve(root, f"/dev/{name}") for name in names}
 
 
-def _entries(folder: Path) -> Iterator[Path]:
+def entries(folder: Path) -> Iterator[Path]:
+    """What is in a folder, by name; nothing where it cannot be looked into."""
     try:
         yield from sorted(folder.iterdir())
     except OSError:
         return
 
 
-def _read(path: Path, limit: int = _TEXT_LIMIT) -> str | None:
+def read_attribute(path: Path, limit: int = _TEXT_LIMIT) -> str | None:
     """A one-line attribute; what a device says of itself is cut and cleaned before anyone prints it."""
     try:
         raw = path.read_bytes()[:limit]
@@ -230,6 +231,6 @@ def _read(path: Path, limit: int = _TEXT_LIMIT) -> str | None:
 
 def _number(path: Path, base: int) -> int | None:
     try:
-        return int(_read(path) or "", base)
+        return int(read_attribute(path) or "", base)
     except ValueError:
         return None
