@@ -83,15 +83,8 @@ class AlignmentInForce:
         """For `companion status`; None where nothing is kept."""
         if self.record is None and self.unused is None:
             return None
-        record = self.record
-        return {
-            "in_force": self.used is not None,
-            "unused_because": self.unused,
-            "kind": record.kind if record is not None else None,
-            "measured_at": record.measured_at if record is not None else None,
-            "offset_deg": record.offset_deg if record is not None else None,
-            "sigma_deg": record.sigma_deg if record is not None else None,
-        }
+        kept = {key: getattr(self.record, key, None) for key in ("kind", "measured_at", "offset_deg", "sigma_deg")}
+        return {"in_force": self.used is not None, "unused_because": self.unused, **kept}
 
     def _take(self, record: AlignmentRecord | None) -> None:
         self.record, self.unused = record, None
