@@ -14,6 +14,7 @@ from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
+from companion.links.system.waiting import comes
 from companion.samples import Triad
 from companion.storage.changes import BY_TEMPERATURE, ChangeSet
 
@@ -207,12 +208,8 @@ class Job:
         """
         self.check_cancelled()
         self._nudge.clear()
-        try:
-            async with asyncio.timeout(seconds):
-                await self._nudge.wait()
-        except TimeoutError:
-            return
-        self.check_cancelled()
+        if await comes(self._nudge, seconds):
+            self.check_cancelled()
 
     def finish(self, result: JobResult) -> None:
         """Tell everybody who waits."""

@@ -7,7 +7,6 @@ not to notice that anybody looks at it.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import hashlib
 import logging
 import re
@@ -22,6 +21,7 @@ from companion import __version__
 from companion.errors import CompanionError
 from companion.formats import Object, parse_request
 from companion.links.system.connection import Backoff, Reconnection
+from companion.links.system.waiting import comes
 from companion.web.access import (
     TOKEN_HEADER,
     Access,
@@ -311,9 +311,7 @@ class Page:
                 for viewer in tuple(self._viewers):
                     self._send(viewer, event)
             await asyncio.sleep(LEAST_S)
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(EVERY_S - LEAST_S):
-                    await self._wake.wait()
+            await comes(self._wake, EVERY_S - LEAST_S)
 
     def _send(self, viewer: Exchange, event: bytes) -> None:
         transport = viewer.writer.transport
