@@ -288,7 +288,7 @@ def _others(
     inside = (found.t_s >= in_air[0]) & (found.t_s <= in_air[1])
     accel = found.velocity[inside].sum(axis=0) / max(float(found.dt_s[inside].sum()), 1e-9)
     sets = {**({"before": before} if before else {}), **others}
-    return {"flown": nothing, **{name: with_others(calibration, each, accel) for name, each in sets.items()}}
+    return {**{name: with_others(calibration, each, accel) for name, each in sets.items()}, "flown": nothing}
 
 
 def _warmth(
