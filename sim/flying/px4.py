@@ -34,7 +34,8 @@ ASKED_EVERY_S = 1.0
 ARM_WITHIN_S = 60.0
 GUST_EVERY_S = 5.0
 """Not oftener: a parameter that changes while PX4 stores another brings its simulated time to a stop."""
-GUST_SHARE = 0.2
+GUST_SHARE = 0.1
+"""Of the mean wind: this aircraft has a drag of 1 N for 1 m/s at 1 kg, ten times that of others."""
 TURNED_S = 4.0
 FORCE_OVER = 25
 """Steps over which velocities, told in whole cm/s, are compared."""

@@ -22,6 +22,8 @@ MEAN_S = 0.005
 _FOLLOWS = 0.02
 """Share of the lateness of a state by which the smoothed clock follows."""
 _JUMP_S = 0.5
+LATE_S = 0.1
+_SLOPE_ROWS = 4
 _ROWS = 4096
 _KEPT = 1024
 _T, _OWN, _ROLL, _PITCH, _YAW, _TURNED, _PUSHED = 0, 1, 2, 3, 4, slice(5, 8), slice(8, 11)
@@ -112,12 +114,19 @@ class FlyingAircraft(VirtualAircraft):
         return None
 
     def _columns(self, t_s: Array, columns: slice) -> Array:
-        """Interpolated at aircraft times, `BEHIND_S` before them; (n, columns)."""
+        """Interpolated at aircraft times, `BEHIND_S` before them; (n, columns).
+
+        What has not arrived yet goes on as it was: else a turn would lose whatever comes late.
+        """
         rows = self._rows[:, max(0, self._count - _KEPT) : self._count]
-        asked = t_s - BEHIND_S
-        if asked[-1] > rows[_T, -1]:
+        asked, last = t_s - BEHIND_S, rows[:, -1]
+        found = np.column_stack([np.interp(asked, rows[_T], row) for row in rows[columns]])
+        late_s = np.clip(asked - last[_T], 0.0, LATE_S)
+        if late_s[-1] > 0.0:
             self.late += 1
-        return np.column_stack([np.interp(asked, rows[_T], row) for row in rows[columns]])
+            before = rows[:, -min(_SLOPE_ROWS, rows.shape[1])]
+            found += np.outer(late_s, (last - before)[columns] / max(last[_T] - before[_T], 1e-3))
+        return found
 
     def _euler(self, t_s: Array) -> tuple[Array, Array]:
         if not self._count:

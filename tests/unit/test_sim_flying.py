@@ -57,6 +57,21 @@ def test_what_is_measured_is_a_little_old() -> None:
     assert aircraft.late == 1
 
 
+def test_what_arrives_late_is_not_lost_to_an_imu() -> None:
+    """States in bursts of 40 ms: the gyro turns by as much as the aircraft."""
+    aircraft = FlyingAircraft(site_at(40.0, 116.0, 50.0), heading_deg=30.0, unix_s=1_795_219_200.0)
+    aircraft.begin(100.0)
+    model, turned = ImuModel(aircraft, "perfect"), []
+    for burst in range(100):
+        for k in range(10 * burst, 10 * burst + 10):
+            own_s = 0.004 * k
+            state = State(own_s, yawed(own_s), (0.0, 0.0, 1.0), (0.0, 0.0, -9.80665), (0.0,) * 3, (0.0,) * 3)
+            aircraft.take(state, 100.0 + own_s)
+        turned += model.read(0.04 * burst + np.arange(0.0, 0.04, 0.005) + 0.04, 0.005)[:, 2].tolist()
+    earth = aircraft.truth_at(-1.0).rate_rad_s[2]
+    assert (np.array(turned[80:]) - earth).sum() * 0.005 == pytest.approx(3.6, abs=0.02)
+
+
 def test_while_the_firmware_restarts_it_stands() -> None:
     aircraft = turning(1.0, 1.0)
     assert aircraft.truth(np.array([6.0])).force_m_s2[0] == pytest.approx([0.0, 0.0, -aircraft.site.gravity_m_s2])
