@@ -86,6 +86,10 @@ TAU_S: Final = 9.0
 GATE_SIGMAS: Final = 4.0
 GATE_LEAST_RAD: Final = math.radians(10.0)
 STEEP_RAD: Final = math.radians(60.0)
+FIRST_S: Final = 0.1
+"""What the first reading stands for."""
+BADLY: Final = 1.5
+"""A heading is known badly from so many sigmas of the compass on."""
 REFUSED_S: Final = 20.0
 """A compass that has been outside the gate for so long is worth a word to the pilot."""
 
@@ -104,10 +108,12 @@ class HeadingAid:
             if self._refused_since_s is None:
                 self._refused_since_s = t_s
             return 0.0
-        since_s = 0.0 if self._last_s is None else max(0.0, t_s - self._last_s)
+        since_s = FIRST_S if self._last_s is None else max(0.0, t_s - self._last_s)
         self._last_s, self._refused_since_s = t_s, None
-        # What is known badly is told by the first reading at once; after that the time constant rules.
-        trust = sigma_rad**2 / (sigma_rad**2 + compass_sigma_rad**2) if sigma_rad > compass_sigma_rad else 0.0
+        # What is known badly is told by the first reading at once; after that the time constant rules. A heading that
+        # the compass holds is as uncertain as it is, and what the gyros add in that time: that is not known badly.
+        badly_rad = BADLY * compass_sigma_rad
+        trust = 1.0 - (badly_rad / sigma_rad) ** 2 if sigma_rad > badly_rad else 0.0
         return max(trust, min(1.0, since_s / TAU_S))
 
     def refused_for_s(self, t_s: float) -> float:

@@ -278,6 +278,21 @@ def test_a_heading_from_a_wild_compass_is_refused_and_named() -> None:
     assert compass.refused_for_s(30.0) == 0.0
 
 
+def test_a_compass_that_turns_is_not_followed() -> None:
+    """At 3 deg/s, within the gate: in 3 s a correction over 9 s has turned by 3 t - 27 (1 - exp(-t / 9)) = 1.3 deg."""
+    aircraft = VirtualAircraft(Pose(0.0, 0.0, 350.0), NORTH)
+    estimator = AttitudeEstimator(settings(gyro_covariance=np.eye(3) * (80.0 * DEG_H) ** 2))
+    estimator.align(0.0, aircraft.body_from_ned(0.0), np.diag([0.05, 0.05, 2.0]) ** 2 * DEG**2)
+    for number, batch in enumerate(samples(ImuModel(aircraft, "perfect"), 33.0)):
+        estimator.update(batch, phase="flight")
+        lies_deg = 3.0 * max(0.0, number * 0.25 - 30.0)
+        assert estimator.add_heading(number * 0.25, (350.0 + lies_deg) * DEG, 2.0 * DEG) == (number > 0)
+    found = estimator.attitude()
+    assert found is not None
+    assert error_deg(found, aircraft)[1] < 2.0
+    assert 1.8 * DEG < found.sigma_rad[2] < 2.6 * DEG
+
+
 def test_a_pendulum_compass_is_not_read_in_a_turn() -> None:
     aircraft = MovingAircraft(BankedCircles(start_s=0.0), Pose(), NORTH)
     estimator = AttitudeEstimator(settings())
