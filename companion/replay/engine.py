@@ -18,7 +18,6 @@ import msgspec
 
 from companion.autopilot.telemetry import imu_messages
 from companion.autopilot.telemetry.imu_messages import ImuMessage, Reading
-from companion.autopilot.telemetry.pairing import floats_kind
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.records.record import Record, from_json
 from companion.calibration.solution.draft import Draft
@@ -49,8 +48,6 @@ class Telemetry:
         self._pending: dict[str, deque[tuple[float, Reading]]] = {}
         for each in {*sum(imu_messages.ARDUPILOT.values(), ()), *sum(imu_messages.PX4.values(), ())}:
             self._listen(each)
-        paired = [message for messages in imu_messages.PX4.values() for message in messages]
-        self._paired = {floats_kind(each.kind).message for each in paired}
 
     def _listen(self, kind: ImuMessage) -> None:
         pending = self._pending[kind.kind.message] = deque(maxlen=PENDING)
@@ -85,8 +82,8 @@ class Telemetry:
             entry.t_s, entry.gyro_rad_s, entry.accel_m_s2, entry.temperature_degc, None, entry.t_device_s,
             shared_variance=entry.shared_variance,
         )  # fmt: skip
-        # What was made of two messages is in no single one.
-        return sample, None if entry.message in self._paired else _NOT_THERE
+        # What PX4's bias was put back into is in no message.
+        return sample, None if (entry.message or "").startswith("HIGHRES_IMU+") else _NOT_THERE
 
 
 _UNUSABLE: Final = (

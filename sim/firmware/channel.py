@@ -50,6 +50,11 @@ class Channel(abc.ABC):
         """Whether anything is plugged in."""
         return self._transmit is not None
 
+    def has_room(self, size: int) -> bool:
+        """Whether so many bytes could be sent now, where what carries them can tell (`has_room` of it)."""
+        room: Callable[[int], bool] | None = getattr(self._transmit, "has_room", None)
+        return room is None or room(size)
+
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes; never raises, whatever they are."""
         try:

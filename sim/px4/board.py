@@ -50,6 +50,7 @@ class Board(AutopilotDouble):
         has_position: whether it has a GNSS fix, and so a position and a date.
         clock_ppm: how much faster its clock runs.
         thermal: whether there is a module for TC_*.
+        console: whether `listener` is built, which some small boards leave out.
     """
 
     commander: Orders
@@ -73,6 +74,7 @@ class Board(AutopilotDouble):
         has_position: bool = True,
         clock_ppm: float = 0.0,
         thermal: Module = "idle",
+        console: bool = True,
         seed: int = 0,
     ) -> None:
         if not 1 <= len(imus) <= SLOTS:
@@ -102,7 +104,7 @@ class Board(AutopilotDouble):
             tunes_go_on=True,
         )
         self.system_id, self.version, self.vehicle = system_id, version, vehicle
-        self.flash_storage = flash_storage
+        self.flash_storage, self.console = flash_storage, console
         self.timesync_answers = 0
         """Answers to its own TIMESYNC requests."""
         ids = [EXTERNAL_IDS[n] if n in external else SIMULATED_IDS[n] for n in range(len(imus))]

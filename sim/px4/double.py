@@ -31,6 +31,7 @@ from sim.px4.messages import BUILDERS
 from sim.px4.parameter_server import ParameterServer
 from sim.px4.port import PX4Port
 from sim.px4.rivals import SAMPLE_S, BackgroundGyroCalibration, LearnedOffsets
+from sim.px4.shell import Shell
 from sim.px4.thermal import POLL_S
 
 __all__ = ["Applied", "Faults", "PX4Double", "Write"]
@@ -74,6 +75,7 @@ class PX4Double(Board):
         self.commander: Commander = Commander(self, self.checks, self.calibrations, self.vision, self.authorization)
         self._parameter_server = ParameterServer(self)
         self._voice = Voice(self)
+        self.shell = Shell(self)
         self._consumers = (
             Consumer(self, 1.0 / imu_rate_hz, self._update_imus),
             Consumer(self, SAMPLE_S, self._update_gyro_rival),
@@ -175,7 +177,14 @@ class PX4Double(Board):
         self._frozen.clear()
         for imu in self.vehicle_imus:
             imu.restart()
-        for part in (self._parameter_server, self.calibrations, self.authorization, self.commander, self.vision):
+        for part in (
+            self._parameter_server,
+            self.calibrations,
+            self.authorization,
+            self.commander,
+            self.vision,
+            self.shell,
+        ):
             part.restart()
         for consumer in self._consumers:
             consumer.restart()
@@ -253,6 +262,8 @@ class PX4Double(Board):
         elif isinstance(message, mavlink.MAVLink_play_tune_message):
             if is_for_us(self.system_id, message, broadcast=True):
                 self.buzzer.take(message, loop_s, armed=self.armed)
+        elif isinstance(message, mavlink.MAVLink_serial_control_message):
+            self.shell.take(channel, message, loop_s)
         elif isinstance(message, mavlink.MAVLink_timesync_message):
             if message.tc1 == 0:
                 now_ns = self.boot_us(loop_s) * 1000

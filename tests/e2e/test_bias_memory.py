@@ -428,7 +428,16 @@ def test_a_calibration_in_mid_warm_up_says_what_the_bias_will_be_when_warm(
 
     async def main() -> None:
         board = warming(20.0, 40.0, 240.0)
-        rig = Rig(tmp_path, part="icm42688p", at_arm="off", up_s=60.0, firmware=firmware, temperature_degc=board, **FEW)
+        rig = Rig(
+            tmp_path,
+            part="icm42688p",
+            at_arm="off",
+            up_s=60.0,
+            firmware=firmware,
+            temperature_degc=board,
+            imu_rate_hz=100.0,
+            **FEW,
+        )
         async with rig.running():
             memory = rig.service.calibrating.memory
             await rig.ready()

@@ -55,8 +55,8 @@ class Wire:
         self._random = random.Random(seed)
         self._last_due_s: dict[int, float] = {}
         self._ends = (one, other)
-        one.attach(lambda data: self._carry(data, other))
-        other.attach(lambda data: self._carry(data, one))
+        one.attach(_Way(self, other))
+        other.attach(_Way(self, one))
 
     def unplug(self) -> None:
         """Take both ends off the wire."""
@@ -66,6 +66,11 @@ class Wire:
     def carry_from_other(self, data: bytes) -> None:
         """Put a packet on the wire towards the companion's end, beside what the autopilot itself sends."""
         self._carry(data, self._ends[0])
+
+    def has_room(self, size: int, to: End) -> bool:
+        """Whether so many bytes find room in the buffer of the sender's UART."""
+        loop = asyncio.get_running_loop()
+        return self._free_s.get(id(to), 0.0) - loop.time() + size / self.bytes_per_s <= BUFFER_BYTES / self.bytes_per_s
 
     def _carry(self, data: bytes, to: End) -> None:
         if self.cut or self._random.random() < self.loss:
@@ -87,3 +92,16 @@ class Wire:
     def _deliver(self, data: bytes, to: End) -> None:
         if not self.cut:
             to.receive(data, asyncio.get_running_loop().time())
+
+
+class _Way:
+    """One direction, as it is given to the sender."""
+
+    def __init__(self, wire: Wire, to: End) -> None:
+        self._wire, self._to = wire, to
+
+    def __call__(self, data: bytes) -> None:
+        self._wire._carry(data, self._to)
+
+    def has_room(self, size: int) -> bool:
+        return self._wire.has_room(size, self._to)

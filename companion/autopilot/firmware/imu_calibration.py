@@ -231,17 +231,6 @@ class ImuCalibration:
         """By parameter: everything that acts on this IMU's output, as far as single parameters tell."""
         return {**self.offsets, **dict(zip(self.parameters.accel_scale, self.accel_scale, strict=True))}
 
-    def lines(self) -> tuple[Array, Array]:
-        """Steps of the sensor as its output has them, (6,), 0 where they do not matter; and where one of them lies."""
-        turn = np.rint(self.orientation)
-        gyro, accel = self.gyro_grid_rad_s, 0.0 if self.accel_offset_may_be_unused else self.accel_grid_m_s2
-        if not np.allclose(turn, self.orientation, atol=1e-6):
-            gyro = accel = 0.0  # an output is of several sensors' axes
-        scale = self.in_use()
-        steps = np.concatenate((np.full(3, gyro), np.abs(turn) @ scale * accel))
-        offset = np.concatenate((turn @ self.gyro_offset_rad_s, turn @ (scale * self.accel_offset_m_s2)))
-        return steps, -offset
-
     def in_use(self, accel_scale: Vector | None = None) -> Array:
         """Of these scales, or of those that were read, what the firmware works with, (3,)."""
         scale = np.asarray(self.accel_scale if accel_scale is None else accel_scale, dtype=np.float64)

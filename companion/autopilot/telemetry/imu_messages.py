@@ -107,4 +107,6 @@ RAW: Final = ImuMessage(_integer_kind("RAW_IMU"), mavlink.MAVLink_raw_imu_messag
 ARDUPILOT: Final = {1: (HIGHRES, SCALED, RAW), 2: (SCALED2,), 3: (SCALED3,)}
 
 PX4: Final = {1: (SCALED,), 2: (SCALED2,), 3: (SCALED3,)}
-"""Never HIGHRES_IMU: PX4 takes EKF2's own estimate of the bias off it, so at rest it tells nothing."""
+"""Never HIGHRES_IMU as it comes: PX4 takes EKF2's own estimate of the bias off it, so at rest it tells nothing."""
+PX4_FLOATS: Final = dataclasses.replace(HIGHRES, kind=dataclasses.replace(HIGHRES.kind, message="HIGHRES_IMU+bias"))
+"""That of the IMU that PX4 flies by, once the estimate is known and put back (`telemetry.ekf_bias`)."""

@@ -16,8 +16,8 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.telemetry import imu_messages
+from companion.autopilot.telemetry.ekf_bias import EkfBias
 from companion.autopilot.telemetry.imu_messages import Reading, StreamKind
-from companion.autopilot.telemetry.pairing import LEAST_HZ, UNLIKE, Pairing, floats_kind
 from companion.autopilot.telemetry.source import ABSENT_AFTER, Source
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink, Message
@@ -45,7 +45,11 @@ _TURN_S: Final = 1.0
 BEAT_WITHIN_S: Final = 20.0
 """A request may wait behind fifteen others, each of which goes unanswered (`autopilot.commands`)."""
 _REFUSED: Final = -1
+_BESIDE_CONSOLE: Final = 0.85
+"""What the bias' answers leave of the rate on a slow line."""
 _TEMPERATURE_RATE_HZ: Final = 2.0
+_SEEN_BY_RATE_HZ: Final = 4.0
+"""Of PX4's integers beside its floats: a write looks who is there for 0.4 s (`daemon.offsets.px4_writes`)."""
 _TEMPERATURE_AGE_S: Final = 5.0
 
 
@@ -64,6 +68,7 @@ class ImuStream:
         on_sample: Callable[[ImuSample], None],
         *,
         rate_hz: float = 100.0,
+        ekf_bias: EkfBias | None = None,
         on_kind_change: Callable[[StreamKind | None], None] | None = None,
     ) -> None:
         if instance not in imu_messages.ARDUPILOT:
@@ -84,17 +89,15 @@ class ImuStream:
         self._current: Source | None = None
         self.temperature: tuple[float, float] | None = None
         """Of the IMU, degC, and when it was told; None: not since the restart."""
-        self.pairing = Pairing()
-        self._pairing: Pairing | None = None
-        """Of PX4."""
-        self._floats_again_s = -math.inf
+        self._ekf_bias = ekf_bias
         self._restart = asyncio.Event()
         self._arrived = asyncio.Event()
 
     @property
     def own_kind(self) -> StreamKind | None:
-        """That of the one message by which the IMU is known, which offsets just written are seen by."""
-        return None if self._current is None else self._current.message.kind
+        """That of the message which offsets just written are seen by: of PX4 always the integers."""
+        seen_by = self._current if self._vehicle.firmware != "px4" or not self._sources else self._sources[-1]
+        return None if self._current is None or seen_by is None else seen_by.message.kind
 
     @property
     def rate_hz(self) -> float | None:
@@ -103,9 +106,8 @@ class ImuStream:
 
     async def run(self) -> None:
         """Keep the samples coming until cancelled; raises nothing else."""
-        messages = {*imu_messages.ARDUPILOT[self._instance], *imu_messages.PX4[self._instance]}
-        subscriptions = [self._link.subscribe(each.message, self._on_message) for each in messages]
-        subscriptions.append(self._link.subscribe(imu_messages.HIGHRES.message, self._on_floats))
+        both = (*imu_messages.ARDUPILOT[self._instance], *imu_messages.PX4[self._instance], imu_messages.PX4_FLOATS)
+        subscriptions = [self._link.subscribe(kind, self._on_message) for kind in {each.message for each in both}]
         subscriptions.append(self._vehicle.on_event.add(self._on_event))
         try:
             while True:
@@ -131,15 +133,18 @@ class ImuStream:
         if self._vehicle.firmware == "ardupilot":
             messages = imu_messages.ARDUPILOT[self._instance]
         elif self._vehicle.firmware == "px4":
-            messages = imu_messages.PX4[self._instance]
+            floats = () if self._ekf_bias is None else (imu_messages.PX4_FLOATS,)
+            messages = (*floats, *imu_messages.PX4[self._instance])
+            if self._ekf_bias is not None and self._ekf_bias.may_look:
+                # Floats that begin late would begin a measurement anew.
+                await comes(self._ekf_bias.settled, BEAT_WITHIN_S / 2.0)
         else:
             self._lose("this autopilot is neither ArduPilot nor PX4: what its IMU messages carry is not known")
             await self._pause(60.0)
             return
         self._sources = [Source(message, self._rates_hz) for message in messages]
-        paired = self._vehicle.firmware == "px4" and self._rates_hz[0] >= LEAST_HZ
-        self._pairing = self.pairing if paired else None
-        self.pairing.forget()
+        if messages[0] is imu_messages.PX4_FLOATS and self._rates_hz[0] < SLOWER_RATES_HZ[0]:
+            self._sources[0].rates_hz = [_BESIDE_CONSOLE * self._rates_hz[0], *self._rates_hz[1:]]
         self.temperature = None
         while not self._restart.is_set():
             found = await self._find()
@@ -153,7 +158,7 @@ class ImuStream:
 
     async def _find(self) -> Source | None:
         """The first source, best first, that sends."""
-        for source in self._sources:
+        for source in filter(self._usable, self._sources):
             for _ in range(_ASKS):
                 if self._restart.is_set() or source.refused:
                     break
@@ -202,26 +207,25 @@ class ImuStream:
         silent_asks = 0
         asked_s = temperature_s = better_s = loop.time()
         await self._ask_for_temperature(source)
-        self._floats_again_s = -math.inf  # PX4 may send them by itself, at another rate
-        await self._ask_for_floats(source, asked_s)
         for each in self._sources:
             each.recent = 0
         while not await self._pause(_LOOK_S):
             now_s = loop.time()
-            await self._ask_for_floats(source, now_s)
+            if not self._usable(source):
+                self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, source.message.message.id, 0.0)
+                return
             better = self._better_than(source)
             if better is not None:
                 self._switch(better)
                 source = better
+                await self._ask(source)  # it may send by itself, at another rate
                 await self._ask_for_temperature(source)
             if now_s - source.last_s < SILENCE_S:
                 silent_asks = 0
                 if self._temperature_is_old(now_s) and now_s - temperature_s > _TEMPERATURE_AGE_S:
                     temperature_s = now_s
                     await self._ask_for_temperature(source)
-                if now_s - better_s > _BETTER_AGAIN_S:
-                    better_s = now_s
-                    await self._ask_for_better(source)
+                better_s = await self._ask_for_better(source, better_s)
             elif source.absent:
                 return
             elif now_s - asked_s >= SILENCE_S:
@@ -242,27 +246,31 @@ class ImuStream:
             each.recent = 0
         return found
 
-    async def _ask_for_better(self, source: Source) -> None:
+    async def _ask_for_better(self, source: Source, asked_s: float) -> float:
+        """Now and then, and as soon as all can be used; when that was."""
+        if not all(map(self._usable, self._sources)):
+            return -math.inf
+        now_s = asyncio.get_running_loop().time()
+        if now_s - asked_s <= _BETTER_AGAIN_S:
+            return asked_s
         for each in self._sources[: self._sources.index(source)]:
             if not each.refused and not each.reason:
                 await self._ask(each)
+        return now_s
 
     async def _ask_for_temperature(self, source: Source) -> None:
         """HIGHRES_IMU carries the barometer's; the IMU's comes with the integer messages."""
-        if source.message is imu_messages.HIGHRES:
+        if source.message.message is imu_messages.HIGHRES.message:
+            rate_hz = _TEMPERATURE_RATE_HZ if source.message is imu_messages.HIGHRES else _SEEN_BY_RATE_HZ
             for each in self._sources[1:]:
-                message_id = each.message.message.id
-                result = await self._vehicle.commands.request_message_interval(message_id, _TEMPERATURE_RATE_HZ)
+                result = await self._vehicle.commands.request_message_interval(each.message.message.id, rate_hz)
                 if result in (mavlink.MAV_RESULT_ACCEPTED, None):
                     return
 
-    async def _ask_for_floats(self, source: Source, now_s: float) -> None:
-        """PX4's floats, to be paired with its integers; by itself it may send them at a rate that never pairs."""
-        if self._pairing is not None and not self._pairing.known and now_s >= self._floats_again_s:
-            rate_hz = source.rates_hz[source.rate] * UNLIKE
-            result = await self._vehicle.commands.request_message_interval(imu_messages.HIGHRES.message.id, rate_hz)
-            answered = result == mavlink.MAV_RESULT_ACCEPTED
-            self._floats_again_s = now_s + (_BETTER_AGAIN_S if answered else SILENCE_S)
+    def _usable(self, source: Source) -> bool:
+        """Not while it wants a bias that is not known, or is of another IMU."""
+        known = self._ekf_bias is not None and self._ekf_bias.known_of(self._instance)
+        return known or source.message is not imu_messages.PX4_FLOATS
 
     def _temperature_is_old(self, now_s: float) -> bool:
         return self.temperature is None or now_s - self.temperature[1] > _TEMPERATURE_AGE_S
@@ -290,7 +298,7 @@ class ImuStream:
         if not self._vehicle.sent(message):
             return
         source = next((each for each in self._sources if each.message.message is type(message)), None)
-        if source is None:
+        if source is None or not self._usable(source):
             return
         reading = source.message.decode(message)
         if isinstance(reading, str):
@@ -311,28 +319,12 @@ class ImuStream:
         if reading.temperature_degc is not None:
             self.temperature = (reading.temperature_degc, t_s)
         if source is self._current:
-            self._take(reading, source.message.kind, t_s)
+            if source.message is imu_messages.PX4_FLOATS and self._ekf_bias is not None:
+                self._hand_on(*self._ekf_bias.restored(reading), t_s)
+            else:
+                self._hand_on(reading, None, t_s)
 
-    def _take(self, reading: Reading, kind: StreamKind, t_s: float) -> None:
-        if self._pairing is not None:
-            self._pairing.add_integers(reading)
-            self._set_kind(floats_kind(kind) if self._pairing.known else kind)
-        if self.kind is kind:
-            self._hand_on(reading, t_s)
-
-    def _on_floats(self, message: Message, t_s: float) -> None:
-        """PX4's HIGHRES_IMU, whichever IMU it shows."""
-        if self._pairing is None or not self._vehicle.sent(message):
-            return
-        reading = imu_messages.HIGHRES.decode(message)
-        if isinstance(reading, str):
-            return
-        self._pairing.add_floats(reading)
-        if self._pairing.known and self.kind is not None and not self.kind.truncates:
-            corrected, variance = self._pairing.corrected(reading)
-            self._hand_on(corrected, t_s, variance)
-
-    def _hand_on(self, reading: Reading, t_s: float, shared_variance: tuple[float, ...] | None = None) -> None:
+    def _hand_on(self, reading: Reading, shared_variance: tuple[float, ...] | None, t_s: float) -> None:
         self.samples += 1
         self.problem = ""
         known = self.temperature
@@ -369,9 +361,10 @@ class ImuStream:
 
     def _why_none(self) -> str:
         ordinal = {1: "first", 2: "second", 3: "third"}[self._instance]
-        if all(source.absent for source in self._sources if not source.refused and not source.reason):
-            zero = [source.name for source in self._sources if source.absent]
+        sources = list(filter(self._usable, self._sources))
+        if all(source.absent for source in sources if not source.refused and not source.reason):
+            zero = [source.name for source in sources if source.absent]
             if zero:
                 return f"{zero[0]} is all zero: there is no {ordinal} IMU"
-        words = [f"{source.name} {source.reason or 'does not come'}" for source in self._sources]
+        words = [f"{source.name} {source.reason or 'does not come'}" for source in sources]
         return f"no samples of IMU {self._instance}: {', '.join(words)}"

@@ -17,6 +17,7 @@ import numpy as np
 from companion.autopilot.firmware.firmwares import part_of, read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, rivals_of
 from companion.autopilot.firmware.px4 import SlotMemory
+from companion.autopilot.telemetry.ekf_bias import EkfBias
 from companion.autopilot.telemetry.imu_stream import ImuStream, StreamKind
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.config.sections import Imu
@@ -46,7 +47,7 @@ class _Announced(NamedTuple):
 class AutopilotImu:
     """Gives the collector the samples of one autopilot IMU while the offsets behind them are known."""
 
-    def __init__(self, core: Core, imu: Imu, slots: SlotMemory, rate_hz: float) -> None:
+    def __init__(self, core: Core, imu: Imu, slots: SlotMemory, ekf_bias: EkfBias, rate_hz: float) -> None:
         self.name, self.instance = imu.name, imu.instance or 1
         self.calibration: ImuCalibration | None = None
         """What the autopilot subtracts, as read; None while that is not known."""
@@ -64,7 +65,7 @@ class AutopilotImu:
         """Told of every sample that counts, before the collector: for what must not wait."""
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
         """Told of every reading: what was read before, unless we have written since, and what is in force now."""
-        self._slots, self._profiles = slots, core.profiles
+        self._slots, self._ekf_bias, self._profiles = slots, ekf_bias, core.profiles
         self._vehicle, self._parameters, self._collector = core.vehicle, core.parameters, core.collector
         self._known: ImuCalibration | None = None
         """What was read last, unless we have written since."""
@@ -81,6 +82,7 @@ class AutopilotImu:
             self.instance,
             self._on_sample,
             rate_hz=rate_hz,
+            ekf_bias=ekf_bias,
             on_kind_change=self._kind_changed,
         )
         core.parameters.on_value.add(self._on_parameter)
@@ -97,12 +99,11 @@ class AutopilotImu:
         """While we write its offsets ourselves: no samples count, and nobody reads in between."""
         self._ours += 1
         self.calibration = self._known = None
-        self.stream.pairing.pause(paused=True)
         try:
-            yield
+            with self._ekf_bias.held():
+                yield
         finally:
             self._ours -= 1
-            self.stream.pairing.pause(paused=self._ours > 0)
             self._invalidate("offsets written")
 
     @property
@@ -144,7 +145,6 @@ class AutopilotImu:
         if is_other_part or self._grid != (fresh.gyro_grid_rad_s, fresh.accel_grid_m_s2):
             self._grid = (fresh.gyro_grid_rad_s, fresh.accel_grid_m_s2)
             self._kind_changed(self.stream.kind)
-        self.stream.pairing.set_lines(*fresh.lines())
         self.on_read.tell(known, fresh)
         now_s = asyncio.get_running_loop().time()
         holds = assumed is not None and same(assumed, fresh)
@@ -157,6 +157,7 @@ class AutopilotImu:
         if not holds:
             if assumed is not None:
                 self.upsets, self.upset = self.upsets + 1, why
+                self._ekf_bias.step()
             self._collector.reset(why, self.name)
         return holds
 

@@ -1,0 +1,225 @@
+"""The bias that PX4's EKF takes off HIGHRES_IMU, read at PX4's console.
+
+HIGHRES_IMU is the reading of one IMU in floats less this bias, which no message tells. The console does, as a ground
+station's "MAVLink console" (SERIAL_CONTROL): `listener` prints what is published, in five decimals: 2 deg/h,
+1 micro-g. Nothing else is typed there, and nothing while the autopilot is not known to be disarmed. Each of PX4's
+MAVLink ports has a console of its own (autopilots 10.3).
+
+The bias is published once a second, or as soon as it has moved by 0.001 rad/s or m/s^2, and wanders slowly between.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import re
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.telemetry.imu_messages import Reading
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
+from companion.links.mavlink.link import MavlinkLink
+from companion.links.system.waiting import comes
+
+logger = logging.getLogger(__name__)
+
+LOOK_EVERY_S: Final = 5.0
+"""In turn at the bias and at which EKF flies: 1300 bytes each, 4.5 % of a line of 57600 baud."""
+_AT_FIRST_S: Final = 1.0
+_ANSWER_S: Final = 4.0
+MISSES: Final = 10
+_AGAIN_S: Final = 60.0
+"""After so many answers that did not come or were not understood."""
+_TURN_S: Final = 0.5
+_OLD_S: Final = 45.0
+_CALM_S: Final = 60.0
+"""New offsets set the estimate to nothing, and it is some seconds until it is back. On a deck they are watched for 40 s
+by the integers, and floats that came back earlier would begin that anew."""
+_BYTES: Final = 70
+_SHELL: Final = mavlink.SERIAL_CONTROL_DEV_SHELL
+_ASKING: Final = mavlink.SERIAL_CONTROL_FLAG_RESPOND | mavlink.SERIAL_CONTROL_FLAG_EXCLUSIVE
+_UNITS: Final = np.repeat([1e-3, 1e-2], 3)
+_JUMP: Final = 0.5 * _UNITS
+"""From one look to the next: 100 deg/h, 0.5 mg."""
+_STEADY: Final = 0.02 * _UNITS
+"""Within a second, before it is used: 4 deg/h, 0.02 mg."""
+_WALK: Final = np.repeat([2.4e-6, 3e-5], 3)
+"""In a second, at rest: 0.5 deg/h, 3 micro-g (seen on the real one: 0.2 to 0.5 deg/h)."""
+
+_LONGEST: Final = 8192
+_PROMPT: Final = re.compile("(nsh|pxh)> ")
+_ID: Final = r"(\d+)[^\n]*\n\s*"
+_VECTOR: Final = r"\[(-?\d+\.\d+), (-?\d+\.\d+), (-?\d+\.\d+)\]\s*"
+# Seventy bytes that are lost leave no other match: each value has its neighbours beside it.
+_PRIMARY: Final = re.compile(r"primary_instance: (\d+)\s|estimator_selector_status[^>]*never published")
+_BIAS: Final = re.compile(
+    rf"gyro_device_id: {_ID}gyro_bias: {_VECTOR}gyro_bias_limit.*"
+    rf"accel_device_id: {_ID}accel_bias: {_VECTOR}accel_bias_limit",
+    re.DOTALL,
+)
+_IMU: Final = re.compile(
+    r"(?:Instance (\d+):|TOPIC: vehicle_imu)\s+vehicle_imu\s+timestamp: [^\n]*\n\s*timestamp_sample: [^\n]*\n\s*"
+    rf"accel_device_id: {_ID}gyro_device_id: {_ID}"
+)
+
+
+class EkfBias:
+    """Reads the bias again and again; `run` it."""
+
+    def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
+        self.instance: int | None = None
+        """The IMU (1..) that HIGHRES_IMU shows; None while its bias is not known."""
+        self.settled = asyncio.Event()
+        """Set once the bias is known, or the first answer did not tell it."""
+        self._link, self._vehicle = link, vehicle
+        self._held, self._misses = 0, 0
+        self._text, self._asked, self._number = "", "", -1
+        self._answered, self._woken = asyncio.Event(), asyncio.Event()
+        self._from_s = -math.inf
+        self._imus: dict[tuple[int, int], int] = {}
+        """IMUs (1..) by the device ids of accelerometer and gyro."""
+        self._primary: int | None = None
+        self._at_bias = False
+        self._bias, self._variance, self._read_s = np.full(6, np.nan), np.zeros(6), -math.inf
+
+    def known_of(self, instance: int) -> bool:
+        """Whether HIGHRES_IMU shows this IMU (1..) and `restored` gives its readings."""
+        return self.instance == instance and not self._age_s > _OLD_S
+
+    def restored(self, reading: Reading) -> tuple[Reading, tuple[float, ...]]:
+        """A HIGHRES_IMU as it was before the bias was taken off, and the variances of that bias (6), SI units."""
+        values = (np.array(reading.gyro_rad_s + reading.accel_m_s2) + self._bias).tolist()
+        row = [float(f"{value:.9g}") for value in values]  # as a recording keeps them
+        variance = self._variance + np.square(_WALK) * self._age_s
+        gyro, accel = (row[0], row[1], row[2]), (row[3], row[4], row[5])
+        return Reading(reading.t_device_s, gyro, accel, None), tuple(variance.tolist())
+
+    def forget(self) -> None:
+        """Start anew."""
+        self.instance = self._primary = None
+        self._bias = np.full(6, np.nan)
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """While offsets are written the bias does nothing but step, and for some time after."""
+        self._held += 1
+        self.forget()
+        try:
+            yield
+        finally:
+            self._held -= 1
+            self.step()
+
+    def step(self) -> None:
+        """Other offsets have come into force."""
+        self.forget()
+        self._from_s = asyncio.get_running_loop().time() + _CALM_S
+
+    async def run(self) -> None:
+        """Read until cancelled."""
+        unsubscribe = self._link.subscribe(mavlink.MAVLink_serial_control_message, self._on_text)
+        ignore = self._vehicle.on_event.add(self._on_event)
+        try:
+            while True:
+                self._woken.clear()
+                await comes(self._woken, await self._look() if self.may_look else _TURN_S)
+        finally:
+            unsubscribe()
+            ignore()
+
+    @property
+    def may_look(self) -> bool:
+        """Whether something may be typed now."""
+        disarmed = self._vehicle.firmware == "px4" and self._vehicle.arm_state is ArmState.DISARMED
+        return disarmed and not self._held and asyncio.get_running_loop().time() >= self._from_s
+
+    @property
+    def _age_s(self) -> float:
+        return asyncio.get_running_loop().time() - self._read_s
+
+    async def _look(self) -> float:
+        """Read once; seconds to the next look."""
+        if not await self._read():
+            self._misses += 1
+            self.settled.set()
+            if self._misses < MISSES:
+                return _AT_FIRST_S
+            if self._misses == MISSES:
+                logger.info("PX4's console does not tell the EKF's bias; its IMUs are read in whole thousandths")
+            return _AGAIN_S
+        self._misses = 0
+        if self.instance is not None:
+            self.settled.set()
+            return LOOK_EVERY_S
+        return _AT_FIRST_S if self._at_bias else 0.0
+
+    async def _read(self) -> bool:
+        """Whether the console told what was wanted of it: which EKF flies, or the bias of that one."""
+        self._at_bias = self._primary is not None and (self.instance is None or not self._at_bias)
+        if not self._at_bias:
+            found = await self._print("estimator_selector_status", _PRIMARY)
+            if found is None:
+                return False
+            primary = int(found[1] or 0)  # a single EKF has no selector
+            if primary != self._primary:
+                self.forget()
+                self._primary = primary
+            return True
+        found = await self._print("estimator_sensor_bias", _BIAS, "-i", str(self._primary))
+        if found is None:
+            return False
+        key = int(found[5]), int(found[1])
+        if key not in self._imus:
+            if await self._print("vehicle_imu", _IMU) is None:
+                return False
+            imus = _IMU.findall(self._text)
+            self._imus = {(int(accel), int(gyro)): int(number or 0) + 1 for number, accel, gyro in imus}
+            return key in self._imus
+        self._take(found, self._imus[key])
+        return True
+
+    def _take(self, found: re.Match[str], instance: int) -> None:
+        texts = found.groups()[1:4] + found.groups()[5:8]
+        steps = np.array([10.0 ** -len(text.partition(".")[2]) for text in texts])
+        bias = np.array([float(text) for text in texts])
+        moved = np.abs(bias - self._bias)
+        most = _STEADY if self.instance is None else _JUMP
+        steady = bool((moved <= np.maximum(most, 1.5 * steps)).all())
+        self._bias, self._read_s = bias, asyncio.get_running_loop().time()
+        self._variance = np.square(steps) / 12.0 + np.square(moved) / 4.0
+        self.instance = instance if steady and not self._held else None
+
+    async def _print(self, topic: str, pattern: re.Pattern[str], *which: str) -> re.Match[str] | None:
+        """Have the console print what is published; None: it did not in time, or something else."""
+        self._text, self._asked = "", topic
+        self._answered.clear()
+        line = " ".join(("listener", topic, *which, "\n")).encode()
+        self._link.send(
+            mavlink.MAVLink_serial_control_message(_SHELL, _ASKING, 0, 0, len(line), [*line.ljust(_BYTES, b"\0")])
+        )
+        await comes(self._answered, _ANSWER_S)
+        self._asked = ""
+        return pattern.search(self._text)
+
+    def _on_text(self, message: mavlink.MAVLink_serial_control_message, _t_s: float) -> None:
+        number, before = message.get_seq(), self._number
+        if self._asked and message.device == _SHELL and self._vehicle.sent(message) and number != before:
+            self._number = number  # the same again is a copy
+            text = bytes(message.data[: message.count]).decode("ascii", "replace")
+            self._text = (self._text + text)[-_LONGEST:]
+            if _PROMPT.search(self._text, max(self._text.find(self._asked), 0)) and self._asked in self._text:
+                self._answered.set()
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event in ("rebooted", "found"):
+            self._misses = 0
+            self._woken.set()
+        if event == "rebooted":
+            self.forget()
+            self._imus.clear()
+            self.settled.clear()
