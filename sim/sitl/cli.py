@@ -92,6 +92,7 @@ def parser() -> argparse.ArgumentParser:
         choices=(1, 2),
         help="with --found: the IMU that PX4 flies by (default: the one that its EKFs choose)",
     )
+    residuals.add_argument("--baud", type=int, help="with --found: of a serial line to PX4 (default: by UDP)")
     only = residuals.add_mutually_exclusive_group()
     only.add_argument("--companion-only", action="store_true", help="leave the firmware's own calibrations out")
     only.add_argument("--own-only", action="store_true", help="leave the companion out")
@@ -224,7 +225,8 @@ def _found(arguments: argparse.Namespace, folder: Path, more: str) -> int:
         one = folder / "firmware" / str(number)
         vehicle = vehicle_of(arguments, scenario_of(arguments), one / "firmware")
         one.mkdir(parents=True)
-        runs.append(asyncio.run(found(vehicle, one, more, listen_s=arguments.listen, primary=arguments.primary)))
+        how = {"listen_s": arguments.listen, "primary": arguments.primary, "baud": arguments.baud}
+        runs.append(asyncio.run(found(vehicle, one, more, **how)))
         arguments.seed += 1
     print(all_found(runs))
     return 0

@@ -24,8 +24,9 @@ def instances_of(vehicle: SitlVehicle) -> tuple[int, ...]:
 
 def daemon_configuration(vehicle: SitlVehicle, folder: Path, more: str = "", url: str | None = None) -> str:
     """A companion.toml for the vehicle's IMUs with the ports in the folder; `more` is added at the end."""
-    host, port = (url or vehicle.url).removeprefix("udpin:").rsplit(":", 1)
+    host, port = vehicle.url.removeprefix("udpin:").rsplit(":", 1)
     text = configuration(vehicle.scenario, directory=folder, udp=(host, int(port)))
+    text = text.replace(vehicle.url, url or vehicle.url)
     # The autopilot's IMUs only: the serial one has nothing to do with the firmware.
     head, _, tail = text.partition("[[imu]]")
     imus = "".join(_IMU.format(instance) for instance in instances_of(vehicle))

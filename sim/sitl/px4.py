@@ -147,10 +147,21 @@ class Px4Sitl(SitlVehicle):
         Raises:
             BinaryError: the firmware did not take it.
         """
-        words = ("--instance", str(self.instance), "select_instance", str(instance - 1))
-        asked = await asyncio.create_subprocess_exec(self._binary.parent / "px4-ekf2", *words, cwd=self.folder)
+        await self._type("ekf2", "select_instance", str(instance - 1))
+
+    async def speak_on(self, port: Path, baud: int) -> None:
+        """Start MAVLink on a serial port too, as on TELEM1.
+
+        Raises:
+            BinaryError: the firmware did not take it.
+        """
+        await self._type("mavlink", "start", "-d", str(port), "-b", str(baud))
+
+    async def _type(self, module: str, *words: str) -> None:
+        program = self._binary.parent / f"px4-{module}"
+        asked = await asyncio.create_subprocess_exec(program, "--instance", str(self.instance), *words, cwd=self.folder)
         if await asked.wait():
-            raise BinaryError(f"px4-ekf2 {' '.join(words)}: ended with {asked.returncode}")
+            raise BinaryError(f"px4-{module} {' '.join(words)}: ended with {asked.returncode}")
 
     async def power_on(self) -> None:
         """Start the binary with what it has stored; when that is nothing, with our parameters."""

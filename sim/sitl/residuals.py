@@ -19,6 +19,7 @@ from sim.sitl.daemon import companion_daemon, instances_of
 from sim.sitl.ground import GroundStation
 from sim.sitl.observe import residual
 from sim.sitl.px4 import Px4Sitl
+from sim.sitl.serial_line import serial_line
 from sim.sitl.vehicle import SitlVehicle
 from sim.udp import open_udp
 
@@ -190,18 +191,38 @@ async def _companion(
 
 
 async def found(
-    vehicle: SitlVehicle, folder: Path, more: str, *, listen_s: float = 0.0, primary: int | None = None
+    vehicle: SitlVehicle,
+    folder: Path,
+    more: str,
+    *,
+    listen_s: float = 0.0,
+    primary: int | None = None,
+    baud: int | None = None,
 ) -> list[Found]:
     """Start the firmware and let the companion find its IMUs' biases, which are written nowhere.
+
+    Args:
+        vehicle: not running yet.
+        folder: for the companion's files; exists.
+        more: further lines of the companion's configuration.
+        listen_s: how long the companion hears the sensors before it is asked.
+        primary: the IMU that PX4 flies by; None: the one that its EKFs choose.
+        baud: of a serial line to PX4; None: by UDP.
 
     Raises:
         RuntimeError, TimeoutError: the companion failed.
     """
-    async with vehicle:
+    async with contextlib.AsyncExitStack() as stack:
+        await stack.enter_async_context(vehicle)
         await asyncio.sleep(SETTLE_S)
+        url = None
         if primary is not None and isinstance(vehicle, Px4Sitl):
             await vehicle.fly_by(primary)
-        async with companion_daemon(vehicle, folder, more=more + FIND) as daemon:
+        if baud is not None and isinstance(vehicle, Px4Sitl):
+            theirs, ours = await stack.enter_async_context(serial_line(baud, folder))
+            await vehicle.speak_on(theirs, baud)
+            url = f"serial:{ours}:{baud}"
+        async with companion_daemon(vehicle, folder, more=more + FIND, url=url) as daemon:
             await vehicle.sleep(listen_s)
             record = await daemon.calibrate(CALIBRATE_WITHIN_S)
             status = await daemon.status() or {}
