@@ -14,7 +14,8 @@ SCALES: Final = 0.01
 """Share of a turn by which two gyros may differ."""
 LATE_S: Final = 0.03
 """By so much the times of the two may lie apart while they turn."""
-LONGEST_STEP_S: Final = 0.5
+LONGEST_STEP_S: Final = 0.25
+"""What turns to and fro between two of them is not seen; on a line that brings fewer nothing is compared."""
 
 
 class Straying:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from companion.cli.terminal import AddCommand, conclude, storage_path
+from companion.cli.terminal import AddCommand, conclude, print_lines, storage_path
 from companion.errors import StorageError
 from companion.physics.units import DEG_H, MG
 
@@ -78,12 +78,13 @@ def _knowledge(options: argparse.Namespace) -> Knowledge:
     from companion.storage.learned import BiasStore
     from companion.storage.records import RecordStore
 
+    others = {path.stem: parameter_file(path) for path in options.offsets}
     directory = storage_path(options)
-    return Knowledge(
-        records=RecordStore(directory).history(),
-        biases=BiasStore(directory).all(),
-        others={path.stem: parameter_file(path) for path in options.offsets},
-    )
+    try:
+        return Knowledge(records=RecordStore(directory).history(), biases=BiasStore(directory).all(), others=others)
+    except StorageError as error:
+        print_lines(f"note: {error}: looked at without the companion's history; sudo may help", error=True)
+        return Knowledge(others=others)
 
 
 def _flight_lines(number: int, found: Flight) -> list[str]:
@@ -115,10 +116,9 @@ def _imu_lines(imu: ImuFlight) -> list[str]:
     )
     lines = [f"IMU {imu.imu}, {imu.rate_hz:.0f} Hz: {whose}"]
     lines += [f"  note: {note}" for note in imu.notes]
+    lines += [f"  {words}" for words in _drift_lines(imu.drift)]
     if any(axis.in_flight for axis in imu.axes):
         lines += [f"  {words}" for words in _table(imu)]
-    if "flown" in imu.drift:
-        lines += [f"  {words}" for words in _drift_lines(imu.drift)]
     return lines
 
 
@@ -154,7 +154,7 @@ def _term(term: Term | None, unit: float, digits: int) -> str:
 def _drift_lines(drift: dict[str, list[Drift]]) -> list[str]:
     """The figure that counts first."""
     lines = []
-    for flown in drift["flown"]:
+    for flown in drift.get("flown", ()):
         others = [
             f"with the offsets of {name} {each.median_m:.1f} m"
             for name, rows in drift.items()

@@ -24,6 +24,7 @@ from companion.flight.log import Boot, FlownImu
 from companion.flight.split import LENGTH_S, SHORT_S, Split, Term, split
 from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
 from companion.physics.frames import Floats
+from companion.physics.units import DEG_H, MG
 from companion.replay.autopilot_logs import Progress, read_ulog, reader_of
 from companion.storage.learned import KnownImu
 
@@ -35,6 +36,8 @@ _STOOD_S: Final = 30.0
 """Before the motors, at most."""
 _STILL_RAD_S: Final = 0.005
 _OUTLIER: Final = 6.0
+_USUAL: Final = np.array([30.0 * DEG_H] * 3 + [1.0 * MG])
+"""Of so much windows may differ at any time."""
 _LIFTED_M: Final = 1.5
 _LEAST_AIR_S: Final = 15.0
 _SLOW_HZ: Final = 80.0
@@ -246,7 +249,7 @@ def _kept(rows: Sequence[Window]) -> list[Window]:
         return list(rows)
     values = np.array([[*one.gyro_rad_s, one.down_m_s2] for one in rows])
     off = np.abs(values - [median(column) for column in values.T])
-    usual = np.maximum([1.4826 * median(column) for column in off.T], 1e-9)
+    usual = np.maximum([1.4826 * median(column) for column in off.T], _USUAL)
     return [one for one, far in zip(rows, (off > _OUTLIER * usual).any(axis=1), strict=True) if not far]
 
 
@@ -285,7 +288,7 @@ def _others(
     inside = (found.t_s >= in_air[0]) & (found.t_s <= in_air[1])
     accel = found.velocity[inside].sum(axis=0) / max(float(found.dt_s[inside].sum()), 1e-9)
     sets = {**({"before": before} if before else {}), **others}
-    return {"flown": nothing, **{name: with_others(calibration, each, accel) for name, each in sets.items()}}
+    return {**{name: with_others(calibration, each, accel) for name, each in sets.items()}, "flown": nothing}
 
 
 def _warmth(

@@ -23,7 +23,7 @@ GAP_S: Final = 0.25
 _LARGEST: Final = 1e6
 _LAG_SPAN_S: Final = 0.3
 _MOST_LAG_S: Final = 0.1
-_OUTLIER: Final = 10.0
+_OUTLIER: Final = 50.0
 
 
 class Navigation(NamedTuple):
@@ -150,12 +150,14 @@ def lag_s(found: Increments, solution: Navigation) -> float:
     carried = running_products(rotations(found.angle))
     off = vectors(_transposed(turn[k + span]) @ turn[k] @ _transposed(carried[k]) @ carried[k + span])
     change = 0.5 * (rate[k + span] + rate[k + span - 1] - rate[k] - rate[k - 1])
-    # Where the solution found its heading anew, no filter is to blame.
-    size = np.linalg.norm(off, axis=1)
-    usual = size <= _OUTLIER * median(size)
-    off, change = off[usual] - off[usual].mean(axis=0), change[usual] - change[usual].mean(axis=0)
-    power = float(np.square(change).sum())
-    found_s = -float((off * change).sum()) / power if power > 0.0 else 0.0
+    found_s, usual = 0.0, np.ones(len(k), dtype=bool)
+    for _ in range(2):
+        by_off, by_change = off[usual] - off[usual].mean(axis=0), change[usual] - change[usual].mean(axis=0)
+        power = float(np.square(by_change).sum())
+        found_s = -float((by_off * by_change).sum()) / power if power > 0.0 else 0.0
+        # Where the solution found its heading anew, no filter is to blame.
+        size = np.linalg.norm(off + found_s * change, axis=1)
+        usual = size <= _OUTLIER * max(float(median(size)), 1e-9)
     return found_s if abs(found_s) < _MOST_LAG_S else 0.0
 
 

@@ -45,17 +45,17 @@ def mid_warm_up(part: str, rate_k_min: float, seed: int, number: int) -> MidRun:
     """One aircraft, its earlier days, and a stand in whose middle its temperature rises so fast."""
     random = np.random.default_rng([seed, 77, number, round(10.0 * rate_k_min)])
     rate_k_s = rate_k_min / 60.0
-    while True:
+    on_s = -1.0
+    while on_s < 0.0:  # where it stands before the power came, it does not warm
         aircraft = Aircraft(PARTS[part].gyro, random)
         board, bends = aircraft.board, aircraft.piece.curve
-        if board.rise_k > 1.1 * rate_k_s * board.time_constant_s:
-            break
+        steepest = board.rise_k / board.time_constant_s
+        on_s = board.time_constant_s * math.log(steepest / rate_k_s) - SPANS_S[-1] / 2.0
     points = kept([point for day in range(DAYS) for point in aircraft.seen(aircraft.day(), day)])
     profile = noise_profile(part)
     curve = curve_of(points, "gyro", profile.gyro)
     settles = settling([[(point.temperature_degc or 0.0, point.k_s) for point in one] for one in by_power_up(points)])
     switched_on = board.switched_on(random.uniform(*AMBIENT_DEGC))
-    on_s = board.time_constant_s * math.log(board.rise_k / (rate_k_s * board.time_constant_s)) - SPANS_S[-1] / 2.0
     standing = stand(
         part,
         POSTURES[0],

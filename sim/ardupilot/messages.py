@@ -97,7 +97,10 @@ def ahrs(double: Board, loop_s: float) -> Message:
 
 
 def ekf_status_report(double: Board, loop_s: float) -> Message:
-    """EKF_STATUS_REPORT: without a heading EKF3 does not use GNSS; what it compares with no compass has no ratio."""
+    """EKF_STATUS_REPORT: without a heading EKF3 does not use GNSS.
+
+    The ratio is of any yaw: a compass', ours, or the one it holds while it stands (seen on the real one).
+    """
     flags = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
     external = double.external_nav
     if external.selected and not external.aligned:
@@ -105,9 +108,7 @@ def ekf_status_report(double: Board, loop_s: float) -> Message:
     elif double.has_position:
         flags |= mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_PRED_POS_HORIZ_ABS
         flags |= mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_PRED_POS_HORIZ_REL
-    return mavlink.MAVLink_ekf_status_report_message(
-        flags, 0.05, 0.05, 0.05, 0.0 if external.selected else 0.02, 0.0, 0.0
-    )
+    return mavlink.MAVLink_ekf_status_report_message(flags, 0.05, 0.05, 0.05, 0.02, 0.0, 0.0)
 
 
 def vfr_hud(double: Board, loop_s: float) -> Message:

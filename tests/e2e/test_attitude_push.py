@@ -468,6 +468,20 @@ def test_two_compasses_that_differ_are_not_settled_by_pushing(tmp_path: Path, fi
     run_virtual(main())
 
 
+def test_a_yaw_that_is_nobodys_does_not_stand_against_ours(tmp_path: Path) -> None:
+    """An ArduPilot with our heading and no second source set has none without us, though its compass is well."""
+
+    async def main() -> None:
+        async with flight(tmp_path, calibrated=False) as flying:
+            flying.rig.autopilot.has_compass = True
+            compass: Any = flying.rig.devices["compass"]
+            compass.heading_error_deg = 40.0
+            await flying.calibrate()
+            await flying.pushing(30.0)
+
+    run_virtual(main())
+
+
 @pytest.mark.parametrize("vehicle", ["plane", "copter"])
 def test_circles_without_end_tilt_nothing(tmp_path: Path, vehicle: str) -> None:
     """35 degrees of bank for half a minute; the field with a fixed wing's airspeed is used on a fixed wing only."""

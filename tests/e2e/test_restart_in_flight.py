@@ -78,6 +78,9 @@ def test_it_goes_on_within_three_seconds_in_a_turn(tmp_path: Path, firmware: Fir
             await flying.sleep(5.0)
             assert flying.attitude.health.pushing
             assert worst_deg(flying, killed_s) < 2.0
+            headline = flying.rig.service.status()["headline"]
+            assert headline["word"] == "ARMED"
+            assert headline["reason"].startswith("companion started in flight: ")
             assert begun(flying, killed_s) == []
             assert flying.rig.service.calibrating.conductor.job is None
             texts = flying.rig.ground.texts()[said:]

@@ -102,7 +102,12 @@ def test_no_start_flies_over_a_hole(perfect: Flown) -> None:
 
 def test_the_delay_of_filters_is_found(perfect: Flown) -> None:
     late = of(perfect)._replace(t_s=of(perfect).t_s + 0.012)
-    assert lag_s(late, navigation(perfect)) == pytest.approx(0.012, abs=0.001)
+    assert lag_s(late, navigation(perfect)) == pytest.approx(0.012, abs=0.0002)
+    # A heading that is found anew, by 30 degrees, is no delay.
+    anew = navigation(perfect)
+    turned = Rotation.from_euler("z", np.where(anew.t_s > 150.0, 30.0, 0.0)[:, None], degrees=True)
+    q = (turned * Rotation.from_quat(anew.attitude[:, [1, 2, 3, 0]])).as_quat()[:, [3, 0, 1, 2]]
+    assert lag_s(late, anew._replace(attitude=q)) == pytest.approx(0.012, abs=0.0002)
 
 
 def levels(count: int) -> Floats:

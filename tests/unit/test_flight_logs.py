@@ -279,3 +279,16 @@ def test_whatever_is_damaged_nothing_is_raised(
         assert code in {0, 1}
         assert said_now.err.count("\n") == code
         assert bool(said_now.out) == (code == 0)
+
+
+def test_a_history_that_cannot_be_read_is_said_and_the_flight_told(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "records").write_text("in the place of a folder")
+    assert companion(["flight", "--json", str(log), *storage(tmp_path)]) == 0
+    heard = capsys.readouterr()
+    assert heard.err == (
+        f"note: {tmp_path}/records: cannot be listed: Not a directory: looked at without the companion's history;"
+        " sudo may help\n"
+    )
+    assert json.loads(heard.out)["flights"][0]["imus"][0]["drift"]["flown"]

@@ -34,7 +34,8 @@ class Armings:
         self._file = BoundedList(core.config.storage.path / "armings.json", Arming, KEEP)
         self._queue: asyncio.Queue[Arming] = asyncio.Queue(QUEUE)
         self.last: Arming | None = None
-        self._seen_disarmed = False
+        self.seen_disarmed = False
+        """Else it may have started in flight."""
         core.vehicle.on_event.add(self._on_event)
 
     async def run(self) -> None:
@@ -54,8 +55,8 @@ class Armings:
             logger.warning("arming not kept: %s", error)
 
     def _on_event(self, event: VehicleEvent) -> None:
-        self._seen_disarmed |= event == "disarmed"
-        if event != "armed" or not self._seen_disarmed:
+        self.seen_disarmed |= event == "disarmed"
+        if event != "armed" or not self.seen_disarmed:
             return  # a daemon that starts in flight sees no arming
         readiness, in_force = self._readiness, self._readiness.in_force
         now_s = asyncio.get_running_loop().time()

@@ -44,7 +44,7 @@ class Headlines:
         self, core: Core, devices: Devices, conductor: Conductor, arming: Arming, attitude: AttitudeService | None
     ) -> None:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
-        self._readiness, self._automatic = arming.readiness, arming.automatic
+        self._readiness, self._automatic, self._armings = arming.readiness, arming.automatic, arming.armings
         self._devices, self._attitude = devices, attitude
         self._on_deck = core.config.vehicle.platform == "deck"
 
@@ -79,6 +79,8 @@ class Headlines:
         state, words = self._readiness.state(now_s)
         if rung is Rung.ARMED:
             if state == "uncalibrated":
+                if not self._armings.seen_disarmed and self._readiness.in_force.earlier is not None:
+                    return Headline(ARMED, f"companion started in flight: {words}", "wait")
                 return Headline(ARMED, f"not calibrated: {words}", "bad")
             return Headline(ARMED, words, "good")
         if self._readiness.at_arm == "gate":

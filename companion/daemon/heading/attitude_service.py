@@ -109,8 +109,10 @@ class AttitudeService:
         self.carrier = Carrier(core, carrying_imu(config), in_force, calibrating.alignment)
         self.difference = Difference(vehicle, self.carrier.now, self.carrier.kept_at)
         self.resume = Resume(core, self.carrier, self.difference, calibrating, devices.imus)
-        self.health = Health(self.carrier, self.difference, vehicle, OwnCompass(vehicle, wanted=True))
-        self.fallback = Fallback(core)
+        self.fallback, own = Fallback(core), OwnCompass(vehicle, wanted=True)
+        self.health = Health(
+            self.carrier, self.difference, vehicle, lambda now_s: own.agrees(now_s) and not self.fallback.is_all
+        )
         self.sender = Sender(link, models.attitude_rate_hz(config), full=config.push.attitude == "full")
         self.timesync = TimesyncResponder(link, vehicle)
         vehicle.hear(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)

@@ -44,6 +44,11 @@ class Fallback:
         self._tried_s = -math.inf
         core.vehicle.on_event.add(self._on_event)
 
+    @property
+    def is_all(self) -> bool:
+        """Whether the autopilot is known to have no heading but ours: what its yaw is without it means nothing."""
+        return self._selected and self.net == "none"
+
     async def run(self) -> None:
         """Look at every start of the autopilot, until cancelled."""
         while True:

@@ -21,7 +21,6 @@ from companion.attitude.quaternion import (
     rotate,
 )
 from companion.attitude.straying import Straying
-from companion.autopilot.vehicle.own_attitude import OwnCompass
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.daemon.heading.carrier import Carrier
 from companion.physics.units import DEG
@@ -174,10 +173,13 @@ class Health:
     A heading that differs stops the push if the two have agreed since the last alignment, or if the autopilot's is its
     compass' and not ours: then one of the two compasses lies. Else it has none, or one that is to be replaced by ours.
     What turns in flight while the autopilot's gyros do not is not pushed again before it is aligned on the ground.
+    `own_agrees`: whether the autopilot's compass is well and agrees with its yaw at a time.
     """
 
-    def __init__(self, carrier: Carrier, difference: Difference, vehicle: Vehicle, own: OwnCompass) -> None:
-        self._carrier, self._difference, self._vehicle, self._own = carrier, difference, vehicle, own
+    def __init__(
+        self, carrier: Carrier, difference: Difference, vehicle: Vehicle, own_agrees: Callable[[float], bool]
+    ) -> None:
+        self._carrier, self._difference, self._vehicle, self._own_agrees = carrier, difference, vehicle, own_agrees
         self.pushing = False
         self.why_not = carrier.waiting_for
         """Why nothing is pushed; empty while it is."""
@@ -263,7 +265,7 @@ class Health:
 
     def _differs(self, now_s: float, attitude: Attitude) -> str | None:
         difference = self._difference
-        has_own = not self._has_ours and not self._agreed and self._own.agrees(now_s)
+        has_own = not self._has_ours and not self._agreed and self._own_agrees(now_s)
         if not difference.is_known(now_s):
             self._differs_since_s = None
             return "comparing with the autopilot's heading" if has_own and difference.is_heard(now_s) else None
