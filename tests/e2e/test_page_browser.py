@@ -17,7 +17,7 @@ import msgspec
 import pytest
 
 from companion.calibration.records.record import Record, from_json
-from companion.storage.learned import BiasStore, KnownImu
+from companion.storage.learned import BiasStore
 from companion.storage.records import RecordStore
 from tests.e2e.test_calibration import calibrated
 from tests.e2e.test_commands import DONE, FAILED, FlightLine, _end, _until_disarmed, companion, flight_line
@@ -143,7 +143,8 @@ async def read_the_temperatures(here: Scene) -> None:
     assert titles[:3] == [f"IMU fc, gyro {axis}: bias by temperature" for axis in "xyz"]
     told = await tab.value("document.querySelector('#temperature').textContent")
     assert "30 still windows, 10 power-ups on 10 days, 8 to 38 degC" in told
-    assert told.count("first point") == 1  # of the other IMU
+    # Of the other IMU nothing, or what it has seen meanwhile.
+    assert ("first point" in told) != ("1 of 5 power-ups seen" in told)
     words = "[...document.querySelectorAll('#temperature .plot text')]"
     outside = "it => { const box = it.getBoundingClientRect(); return box.left < 0 || box.right > innerWidth; }"
     assert await tab.value(f"{words}.filter({outside}).length") == 0
@@ -170,7 +171,9 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
     )
     record = msgspec.structs.replace(record, imus=(fc, own), reason=f"{record.reason}; accelerometers of fc held back")
     RecordStore(tmp_path / "state").save(record)
-    BiasStore(tmp_path / "state").write({"fc": KnownImu(identity={}, points=tuple(windows_of_days(10)))})
+    known = BiasStore(tmp_path / "bench").read()["fc"]  # the same IMU
+    earlier = msgspec.structs.replace(known, points=tuple(windows_of_days(10)))
+    BiasStore(tmp_path / "state").write({"fc": earlier})
 
     async def main() -> None:
         async with scene(tmp_path, "127.0.0.1:0", PHONE) as here:
@@ -226,7 +229,8 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             assert (await here.status())["last"]["state"] == "cancelled"
             await here.picture("phone_cancelled")
             spoken = await tab.value("heard.slice(1)")
-            assert [words.split()[:2] for words in spoken] == [
+            # It may also be said that the days before, which were made up, contradict what is measured.
+            assert [words.split()[:2] for words in spoken if not words.startswith("Gyro fc")] == [
                 ["Calibration", "started:"],
                 ["Calibration", "cancelled"],
             ]
