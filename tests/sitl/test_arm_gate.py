@@ -8,8 +8,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -58,11 +59,18 @@ async def arm(ground: GroundStation, vehicle: SitlVehicle, force: float = 0.0) -
 
 async def until_ready(daemon: CompanionProcess, within_s: float = 240.0) -> None:
     """Wait until the companion would let it arm."""
+    await until_arming(daemon, lambda arming: arming["verdict"] == "accept", within_s)
+
+
+async def until_arming(
+    daemon: CompanionProcess, wanted: Callable[[dict[str, Any]], bool], within_s: float = 60.0
+) -> None:
+    """Wait for what its status says of arming."""
     loop = asyncio.get_running_loop()
     deadline_s = loop.time() + within_s
     while True:
         status = await daemon.status()
-        if status is not None and status["arming"]["verdict"] == "accept":
+        if status is not None and wanted(status["arming"]):
             return
         assert loop.time() < deadline_s, (status, daemon.log())
         await asyncio.sleep(1.0)
@@ -112,6 +120,7 @@ def test_px4_arms_only_with_a_fresh_calibration_and_a_living_companion(tmp_path:
             await vehicle.sleep(40.0)
             assert "No response" in (await arm(ground, vehicle))[1]
             async with companion_daemon(vehicle, folder, more=GATE) as daemon:
+                await until_arming(daemon, lambda arming: "hold still" in arming["words"])
                 armed, words = await arm(ground, vehicle)
                 assert not armed
                 assert "Temporarily rejected" in words
