@@ -1,4 +1,4 @@
-"""A real PX4 whose gyros follow the temperature: what is learned of them and foretold.
+"""A real PX4 whose gyros follow the temperature: what is learned of them, foretold, and written into TC_*.
 
 Its thermal compensation is built for SITL, though only a board's start script starts it: an airframe's second script
 does so here. HIL_SENSOR tells the temperature.
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG
@@ -26,8 +27,9 @@ from sim.sitl.px4 import MODEL, Px4Sitl
 from sim.sitl.residuals import ground_station
 from sim.thermal import Curve
 from tests.sitl.craft import BINARIES, missing
-from tests.sitl.px4_bench import SAVED_S
-from tests.sitl.test_temperature import another_day, predicted
+from tests.sitl.px4_bench import SAVED_S, changed
+from tests.sitl.test_temperature import another_day, predicted, typed
+from tests.support.extent import extent
 
 USUAL_DEG_H = np.array([[500.0, -700.0, 1000.0], [-90.0, -60.0, 40.0]])
 """At 25 degC, of the two IMUs."""
@@ -40,11 +42,19 @@ SCATTER_DEG_H = 15.0
 """From one power-up to the next."""
 LEARNED_DEGC = (16.0, 36.0, 26.0, 31.0, 21.0)
 FORETOLD_DEGC = 33.5
+LOOKS_DEGC = (18.0, 23.0, 34.0)
+LOOK_S, WITHIN_DEG_H = 60.0, 5.0
+"""Noise leaves 1.4 deg/h of it."""
 ACCEL_MG = (1.0, -2.0, 3.0)
 QUIET = {"IMU_GYRO_CAL_EN": 0.0, "SENS_IMU_AUTOCAL": 0.0}
 QUICK = '\n[calibration]\nmin_still_s = 10\nmax_s = 15\nat_arm = "{}"\n'
 ONLY_LOOKS = "[push]\nparameters = false\n"
 CARRIED_S = 60.0
+SETTLE_S = 10.0
+TC = ["TC_G_ENABLE"]
+for sensor in range(4):
+    TC += [f"TC_G{sensor}_{name}" for name in ("ID", "TREF", "TMIN", "TMAX")]
+    TC += [f"TC_G{sensor}_X{power}_{axis}" for power in range(4) for axis in range(3)]
 
 
 class Warm(Px4Sitl):
@@ -155,3 +165,67 @@ def test_offsets_are_foretold_at_another_temperature_before_it_has_stood_still(l
 async def held_deg_h(ground: GroundStation) -> Array:
     """The offsets of the first IMU."""
     return np.array([await ground.get(f"CAL_GYRO0_{axis}OFF") for axis in "XYZ"]) / DEG_H
+
+
+async def left_deg_h(vehicle: Warm, ground: GroundStation) -> Array:
+    """In the telemetry of the first IMU, in floats: with EKF2_IMU_CTRL so, HIGHRES_IMU is without the EKF's bias."""
+    assert await ground.get("EKF2_IMU_CTRL") == 6.0
+    await vehicle.fly_by(1)  # it is of the primary IMU, which may be another one by now
+    await vehicle.sleep(1.0)
+    begun_s = vehicle.now_s
+    rows = await ground.imu(mavlink.MAVLink_highres_imu_message, LOOK_S, rate_hz=250.0)
+    truth = np.concatenate(vehicle.aircraft.truth(np.linspace(begun_s, vehicle.now_s, 301)), axis=1).mean(axis=0)
+    return np.asarray((rows.mean(axis=0) - truth)[:3] / DEG_H)
+
+
+async def taken_off_deg_h(ground: GroundStation, degc: float) -> Array:
+    """Of the first IMU, by PX4's formula and its parameters as they are."""
+    values = {name: await ground.get(name) for name in TC if name.startswith("TC_G0_")}
+    d = min(max(degc, values["TC_G0_TMIN"]), values["TC_G0_TMAX"]) - values["TC_G0_TREF"]
+    curve = sum(np.array([values[f"TC_G0_X{power}_{axis}"] for axis in range(3)]) * d**power for power in range(4))
+    return np.asarray(curve / DEG_H) + await held_deg_h(ground)
+
+
+async def all_parameters(ground: GroundStation) -> dict[str, float]:
+    """What PX4 lists, and those of its compensation, which it does not while that is off."""
+    return await ground.whole_list() | {name: await ground.get(name) for name in TC}
+
+
+@pytest.mark.sitl
+def test_what_is_written_acts_as_predicted_and_undo_leaves_no_bit_of_it(learned: Path, tmp_path: Path) -> None:
+    if missing("px4-sitl") is None and not extent(whole=True, a_slice=False):
+        pytest.skip("with looks of a minute it takes five; TESTS=long does them")
+
+    async def main() -> None:
+        folder = copied(learned, tmp_path)
+        async with flying(folder, len(LEARNED_DEGC), 26.0) as (vehicle, ground):
+            await vehicle.sleep(SETTLE_S)
+            before = await all_parameters(ground)
+            async with companion_daemon(vehicle, folder / "daemon", more=QUICK.format("off")) as daemon:
+                first = await typed(daemon, "--write")
+                assert str(first["reason"]).startswith("TC_G_ENABLE is on now: reboot PX4"), (first, daemon.log())
+                await vehicle.another(len(LEARNED_DEGC), 26.0)
+                await vehicle.sleep(SETTLE_S)
+                second = await typed(daemon, "--write")
+                assert str(second["reason"]).startswith("written: fc1, 16 to 36 degC"), (second, daemon.log())
+                await ground.put("EKF2_IMU_CTRL", 6.0)
+                off = {}
+                for degc in LOOKS_DEGC:
+                    vehicle.degc = degc
+                    await vehicle.sleep(3.0)
+                    foretold = vehicle.bias_deg_h() - await taken_off_deg_h(ground, degc)
+                    left = await left_deg_h(vehicle, ground)
+                    print(degc, "left", np.round(left, 1), "foretold", np.round(foretold, 1), flush=True)
+                    off[degc] = np.abs(left - foretold).max()
+                await ground.put("EKF2_IMU_CTRL", before["EKF2_IMU_CTRL"])
+                vehicle.degc = 26.0
+                for _ in range(2):
+                    undone = await typed(daemon, "--undo")
+                    assert undone["state"] == "done", (undone, daemon.log())
+                assert not changed(before, await all_parameters(ground))
+            await vehicle.another(len(LEARNED_DEGC), 26.0)
+            await vehicle.sleep(SETTLE_S)
+            assert not changed(before, await all_parameters(ground))
+            assert max(off.values()) < WITHIN_DEG_H, off
+
+    asyncio.run(main())
