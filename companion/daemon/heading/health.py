@@ -48,7 +48,7 @@ OLD_S: Final = 2.0
 STEEP_RAD: Final = math.radians(60.0)
 """Pitch beyond which roll and heading can hardly be told apart."""
 FORGETS_PER_S: Final = 0.02
-"""The shortest delay that was seen is forgotten as two clocks may run apart: a simulated one by 1 % on a busy machine."""
+"""The shortest delay that was seen is forgotten as two clocks may run apart, a simulated one by 1 %."""
 HEADING_UNKNOWN: Final = "heading unknown: no compass reading fits"
 _DOWN: Final[Triple] = (0.0, 0.0, 1.0)
 
