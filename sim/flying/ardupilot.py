@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim.flying.truth import FlyingAircraft, State
 from sim.flying.vehicle import FlyingVehicle
 from sim.scenario import Scenario
-from sim.sitl.ardupilot import AXES, common_arguments
+from sim.sitl.ardupilot import AXES, ArduPilotLinks, common_arguments
 from sim.sitl.ground import GroundStation
 from sim.sitl.ports import LOOPBACK, free_udp_port, port_free
 from sim.sitl.process import BinaryError, FirmwareProcess, check_binary
@@ -30,7 +30,6 @@ COPTER_MODES = {"guided": 4, "hold": 5}
 PLANE_MODES = {"takeoff": 13, "hold": 12}
 STICKS_S = 0.2
 LOWEST_US, MIDDLE_US = 1000, 1500
-ARM_WITHIN_S = 60.0
 
 
 def state_of(line: bytes) -> State | None:
@@ -152,7 +151,7 @@ def flying_parameters(scenario: Scenario, wind: tuple[float, float]) -> dict[str
     return table
 
 
-class FlyingArduPilot(FlyingVehicle):
+class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
     """An `arducopter` or `arduplane` with its own physics.
 
     Args:
@@ -193,29 +192,9 @@ class FlyingArduPilot(FlyingVehicle):
         """Roll, pitch, throttle, yaw; sent to it while it flies."""
 
     @property
-    def url(self) -> str:
-        """The companion listens where SERIAL1 sends to."""
-        return f"udpin:{self._companion[0]}:{self._companion[1]}"
-
-    @property
-    def ground_target(self) -> tuple[str, int]:
-        """Where SERIAL0 sends to."""
-        return self._ground
-
-    @property
     def backend_boots(self) -> int:
         """Starts seen."""
         return self.rider.boots
-
-    @property
-    def stored(self) -> tuple[str, ...]:
-        """The image of its EEPROM."""
-        return ("eeprom.bin",)
-
-    @property
-    def scripts(self) -> Path:
-        """Where Lua scripts go, before a start."""
-        return self.folder / "scripts"
 
     async def _open(self, stack: contextlib.AsyncExitStack) -> FirmwareProcess:
         if not port_free(RIDER_PORT, socket.SOCK_DGRAM):
@@ -231,25 +210,14 @@ class FlyingArduPilot(FlyingVehicle):
         model = "plane" if self.is_plane else "quad"
         return FirmwareProcess([*arguments, "--model", model, "--slave", "1"], self.folder)
 
-    async def ask_streams(self, ground: GroundStation) -> None:
-        """ATTITUDE and LOCAL_POSITION_NED at 25 Hz, for the record."""
-        for number in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED):
-            await ground.stream(number, 25.0)
-
     async def take_off(self, ground: GroundStation, height_m: float) -> None:
         """Armed as pilots do, with all its checks, and up.
 
         Raises:
             TimeoutError: it does not arm, or does not climb; with what it says.
         """
-        since_s = asyncio.get_running_loop().time()
         await self.mode(ground, "takeoff" if self.is_plane else "guided")
-        try:
-            async with asyncio.timeout(ARM_WITHIN_S):
-                while await ground.arm(wait_s=2.0) != mavlink.MAV_RESULT_ACCEPTED:
-                    await asyncio.sleep(1.0)
-        except TimeoutError:
-            raise TimeoutError(f"it does not arm: {ground.texts_since(since_s)[-400:]}") from None
+        await self.arm(ground)
         if not self.is_plane:
             await ground.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height_m)
         await ground.wait_for(lambda: self.height_m > 0.95 * height_m, 40.0, "take-off")

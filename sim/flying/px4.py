@@ -31,7 +31,6 @@ HOLD = 4, 3
 _UDP_TRUTH = 19410
 TRUTH_HZ = 250.0
 ASKED_EVERY_S = 1.0
-ARM_WITHIN_S = 60.0
 GUST_EVERY_S = 5.0
 """Not oftener: a parameter that changes while PX4 stores another brings its simulated time to a stop."""
 GUST_SHARE = 0.1
@@ -187,26 +186,15 @@ class FlyingPx4(FlyingVehicle):
         self.process.environment = environment
         await super().power_on()
 
-    async def ask_streams(self, ground: GroundStation) -> None:
-        """It sends ATTITUDE and LOCAL_POSITION_NED at 50 Hz by itself: less, for the record."""
-        for number in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED):
-            await ground.stream(number, 25.0)
-
     async def take_off(self, ground: GroundStation, height_m: float) -> None:
         """Armed with all its checks, and up to MIS_TAKEOFF_ALT.
 
         Raises:
             TimeoutError: it does not arm, or does not climb; with what it says.
         """
-        since_s = asyncio.get_running_loop().time()
         await ground.put("MIS_TAKEOFF_ALT", height_m)
         await ground.command(mavlink.MAV_CMD_NAV_TAKEOFF, *[0.0] * 3, *[math.nan] * 4)
-        try:
-            async with asyncio.timeout(ARM_WITHIN_S):
-                while await ground.arm(wait_s=2.0) != mavlink.MAV_RESULT_ACCEPTED:
-                    await asyncio.sleep(1.0)
-        except TimeoutError:
-            raise TimeoutError(f"it does not arm: {ground.texts_since(since_s)[-400:]}") from None
+        await self.arm(ground)
         await ground.wait_for(lambda: self.height_m > 0.9 * height_m, 60.0, "take-off")
 
     async def hold(self, ground: GroundStation) -> None:

@@ -8,6 +8,8 @@ import math
 from abc import abstractmethod
 from pathlib import Path
 
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
 from sim.flying.truth import FlyingAircraft
 from sim.imu_model import Bias, ImuModel
 from sim.scenario import Scenario
@@ -15,6 +17,7 @@ from sim.sitl.ground import GroundStation
 from sim.sitl.samples import SampleBlocks
 from sim.sitl.vehicle import SitlVehicle
 
+ARM_WITHIN_S = 60.0
 YAW_STICK_US = 250
 TURNED_WITHIN_S = 8.0
 
@@ -56,9 +59,24 @@ class FlyingVehicle(SitlVehicle):
         """What it was told at its start."""
         return self.imus[instance - 1].true_bias(0.0)
 
-    @abstractmethod
     async def ask_streams(self, ground: GroundStation) -> None:
-        """ATTITUDE and LOCAL_POSITION_NED at 20 Hz or more."""
+        """ATTITUDE and LOCAL_POSITION_NED at 25 Hz, for the record."""
+        for number in (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED):
+            await ground.stream(number, 25.0)
+
+    async def arm(self, ground: GroundStation) -> None:
+        """Ask until it arms, with all its checks.
+
+        Raises:
+            TimeoutError: it does not; with what it says.
+        """
+        since_s = asyncio.get_running_loop().time()
+        try:
+            async with asyncio.timeout(ARM_WITHIN_S):
+                while await ground.arm(wait_s=2.0) != mavlink.MAV_RESULT_ACCEPTED:
+                    await asyncio.sleep(1.0)
+        except TimeoutError:
+            raise TimeoutError(f"it does not arm: {ground.texts_since(since_s)[-400:]}") from None
 
     @abstractmethod
     async def take_off(self, ground: GroundStation, height_m: float) -> None:

@@ -52,10 +52,38 @@ def measuring_parameters(scenario: Scenario, *, gyr_cal: bool) -> dict[str, floa
     return table
 
 
-class ArduPilotSitl(SitlVehicle):
+class ArduPilotLinks:
+    """Its two links and its files. SERIAL0 goes to the ground station, SERIAL1 to the companion, both UDP."""
+
+    folder: Path
+    _companion: tuple[str, int]
+    _ground: tuple[str, int]
+
+    @property
+    def url(self) -> str:
+        """The companion listens where SERIAL1 sends to."""
+        return f"udpin:{self._companion[0]}:{self._companion[1]}"
+
+    @property
+    def ground_target(self) -> tuple[str, int]:
+        """Where SERIAL0 sends to."""
+        return self._ground
+
+    @property
+    def scripts(self) -> Path:
+        """Where Lua scripts go, before a start; scripting is on."""
+        return self.folder / "scripts"
+
+    @property
+    def stored(self) -> tuple[str, ...]:
+        """The image of its EEPROM."""
+        return ("eeprom.bin",)
+
+
+class ArduPilotSitl(ArduPilotLinks, SitlVehicle):
     """An `arducopter` (or `arduplane`) of SITL on a scenario's aircraft.
 
-    Links: SERIAL0 goes to the ground station, SERIAL1 to the companion, both UDP; the firmware speaks first.
+    The firmware speaks first.
 
     Args:
         binary: the firmware.
@@ -96,16 +124,6 @@ class ArduPilotSitl(SitlVehicle):
         self.backend = JsonBackend(scenario.aircraft, scenario.flight_controller_imus[0])
 
     @property
-    def url(self) -> str:
-        """The companion listens where SERIAL1 sends to."""
-        return f"udpin:{self._companion[0]}:{self._companion[1]}"
-
-    @property
-    def ground_target(self) -> tuple[str, int]:
-        """Where SERIAL0 sends to."""
-        return self._ground
-
-    @property
     def physics_s(self) -> float:
         """The firmware's simulated time since its boot."""
         return self.backend.physics_s
@@ -114,16 +132,6 @@ class ArduPilotSitl(SitlVehicle):
     def backend_boots(self) -> int:
         """Starts seen."""
         return self.backend.boots
-
-    @property
-    def scripts(self) -> Path:
-        """Where Lua scripts go, before a start; scripting is on."""
-        return self.folder / "scripts"
-
-    @property
-    def stored(self) -> tuple[str, ...]:
-        """The image of its EEPROM."""
-        return ("eeprom.bin",)
 
     @property
     def samples(self) -> SampleBlocks:
