@@ -235,10 +235,9 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
             lambda: any(beat.custom_mode == number for beat in ground.vehicle_heartbeats(since_s)), 5.0, f"mode {name}"
         )
 
-    async def lie_with_own_compass(self, ground: GroundStation) -> float:
-        """All its compasses are turned by 45 deg, which is returned, as of now."""
+    async def lie_with_own_compass(self, ground: GroundStation) -> None:
+        """All its compasses are turned by 45 deg, as of now."""
         await ground.put_all({f"SIM_MAG{number}_ORIENT": 1.0 for number in (1, 2, 3)})  # ROTATION_YAW_45
-        return 45.0
 
     async def hold(self, ground: GroundStation) -> None:
         """Loiter, sticks in the middle: a plane circles."""

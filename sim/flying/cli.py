@@ -48,10 +48,18 @@ def parser() -> argparse.ArgumentParser:
 
 
 def plans_of(arguments: argparse.Namespace) -> list[Plan]:
-    """What the options ask for; each flight has a wind of its own."""
+    """What the options ask for; each flight has a wind of its own.
+
+    Raises:
+        BinaryError: that firmware cannot do it.
+    """
     plans = []
     px4 = "px4" in arguments.binary.name
-    able = [fault for fault in FAULTS if not px4 or fault != "own-compass"]  # SIH's cannot be turned
+    if any((set_up == "px4") is not px4 for set_up in arguments.set_up):
+        raise BinaryError(f"--set-up: {', '.join(arguments.set_up)}: px4 is that of PX4, the others are ArduPilot's")
+    if px4 and "own-compass" in arguments.fault:
+        raise BinaryError("--fault own-compass: the compass of PX4's simulation cannot be turned; ArduPilot's can")
+    able = [fault for fault in FAULTS if not px4 or fault != "own-compass"]
     for number, fault in enumerate(arguments.fault or able):
         dice = random.Random(arguments.seed + 1000 * number)
         wind = (round(dice.uniform(3.0, 8.0), 1), round(dice.uniform(0.0, 360.0)))
@@ -82,11 +90,16 @@ async def fly(plan: Plan, folder: Path) -> tuple[Record, Figures]:
 
 def main(argv: Sequence[str]) -> int:
     """Fly; 0 if every flight was good, 1 if one was not, 2 if one did not come about."""
-    arguments = parser().parse_args(argv)
+    command = parser()
+    arguments = command.parse_args(argv)
+    try:
+        plans = plans_of(arguments)
+    except BinaryError as error:
+        command.error(str(error))
     folder = arguments.dir or Path(tempfile.mkdtemp(prefix="companion-flights-"))
     worst = 0
     print(HEADER, flush=True)
-    for plan in plans_of(arguments):
+    for plan in plans:
         try:
             record, found = asyncio.run(fly(plan, folder.absolute() / f"{plan.fault}-{plan.set_up}-{plan.seed}"))
         except (BinaryError, RuntimeError, TimeoutError, OSError, KeyError, ValueError) as error:

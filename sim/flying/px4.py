@@ -21,7 +21,7 @@ from sim.imu_model import Bias
 from sim.scenario import Scenario
 from sim.sitl.ground import GroundStation
 from sim.sitl.ports import LOOPBACK
-from sim.sitl.process import FirmwareProcess, check_binary
+from sim.sitl.process import BinaryError, FirmwareProcess, check_binary
 from sim.sitl.px4 import MEASURING_PARAMETERS, UDP_COMPANION, UDP_GROUND_LOCAL, free_instance
 from sim.udp import open_udp
 
@@ -224,10 +224,10 @@ class FlyingPx4(FlyingVehicle):
                 ground.send_put(name, mean + self._dice.gauss(0.0, self._gust_m_s), mavlink.MAV_PARAM_TYPE_REAL32)
             await asyncio.sleep(GUST_EVERY_S)
 
-    async def lie_with_own_compass(self, ground: GroundStation) -> float:
+    async def lie_with_own_compass(self, ground: GroundStation) -> None:
         """SIH's cannot be turned.
 
         Raises:
-            NotImplementedError: always.
+            BinaryError: always.
         """
-        raise NotImplementedError
+        raise BinaryError("the compass of PX4's simulation cannot be turned")

@@ -87,8 +87,12 @@ class FlyingVehicle(SitlVehicle):
         """
 
     @abstractmethod
-    async def lie_with_own_compass(self, ground: GroundStation) -> float:
-        """Its own compasses are turned as of now, by so many degrees."""
+    async def lie_with_own_compass(self, ground: GroundStation) -> None:
+        """Its own compasses are turned by 45 deg as of now.
+
+        Raises:
+            BinaryError: they cannot be.
+        """
 
     @abstractmethod
     async def hold(self, ground: GroundStation) -> None:

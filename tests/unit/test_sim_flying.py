@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.flying.ardupilot import state_of
-from sim.flying.cli import parser, plans_of
+from sim.flying.cli import main, parser, plans_of
 from sim.flying.px4 import Truth
 from sim.flying.truth import BEHIND_S, FlyingAircraft, State, angles_of_quaternion
 from sim.flying.verdict import Event, Record, figures, row
@@ -203,3 +203,17 @@ def test_what_px4_tells_of_its_truth_is_an_aircraft_that_turns_and_speeds_up() -
     truth.receive(mavlink.MAVLink_hil_state_quaternion_message(0, [1.0, 0, 0, 0], *[0] * 14).pack(codec), 110.0)
     assert truth.boots == 2
     assert not aircraft.has_state
+
+
+@pytest.mark.parametrize(("words", "why"), [
+    (["--binary", "px4", "--fault", "own-compass"], "cannot be turned"),
+    (["--binary", "px4", "--set-up", "today"], "the others are ArduPilot's"),
+    (["--binary", "arducopter", "--set-up", "px4"], "px4 is that of PX4"),
+])  # fmt: skip
+def test_what_a_firmware_cannot_do_is_said_before_it_is_started(
+    words: list[str], why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert why in capsys.readouterr().err
