@@ -41,8 +41,6 @@ _USUAL: Final = np.array([30.0 * DEG_H] * 3 + [1.0 * MG])
 _LIFTED_M: Final = 1.5
 _LEAST_AIR_S: Final = 15.0
 _SLOW_HZ: Final = 80.0
-
-
 _ENCRYPTED: Final = b"ULogEnc"
 
 
@@ -204,7 +202,7 @@ async def _imu(
     if in_air is None or in_air[1] - in_air[0] < _LEAST_AIR_S:
         in_air = None
         notes.append("it did not fly, or too shortly to tell anything")
-    if imu.rate_hz < _SLOW_HZ:
+    if imu.rate_hz < _SLOW_HZ and boot.firmware == "ardupilot" and not imu.means:
         notes.append(f"logged at {imu.rate_hz:.0f} Hz only: LOG_BITMASK with IMU_FAST would tell more")
     if len(found.t_s) < 2:
         in_air = None

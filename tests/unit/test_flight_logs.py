@@ -126,6 +126,16 @@ def test_people_read_the_figure_that_counts(log: Path, tmp_path: Path, capsys: p
     assert out.splitlines()[-1].startswith("next flight: IMU 1 gyro x: ")
 
 
+def test_a_log_too_long_for_memory_is_thinned_and_nobody_is_told_to_log_more(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.flight.log.MOST_ROWS", 4096)
+    _, answer = said(capsys, log, *storage(tmp_path))
+    imu = answer["flights"][0]["imus"][0]
+    assert imu["rate_hz"] < 60.0
+    assert not [note for note in imu["notes"] if "LOG_BITMASK" in note]
+
+
 def test_what_the_curve_knows_of_temperature_is_not_put_down_to_the_motors(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
