@@ -5,16 +5,14 @@ from __future__ import annotations
 import datetime
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
+from typing import Final
 
 import numpy as np
 
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
-from companion.autopilot.firmware.px4 import SlotMemory
+from companion.autopilot.firmware.px4 import Sensor, SlotMemory
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.calibration.records.record import Record
@@ -28,10 +26,14 @@ class _Logged:
 
     def __init__(self, firmware: Firmware, values: Mapping[str, float]) -> None:
         self._values = values
-        self.vehicle = SimpleNamespace(firmware=firmware, boots=1, name="log", hear_boot_time=self._known)
+        self.vehicle = self
+        self.name: Final = "log"
+        self.firmware: Final[Firmware] = firmware
+        self.boots: Final = 1
 
-    async def _known(self) -> None:
+    async def hear_boot_time(self) -> bool:
         """A log is of one start."""
+        return True
 
     async def read(self, name: str) -> float:
         if name not in self._values:
@@ -52,11 +54,11 @@ async def calibration_in(firmware: Firmware, values: Mapping[str, float], imu: F
         AutopilotError: they do not say.
     """
     memory = SlotMemory()
-    for sensor, device_id in (("gyro", imu.gyro_id), ("accel", imu.accel_id)):
+    ids: dict[Sensor, int | None] = {"gyro": imu.gyro_id, "accel": imu.accel_id}
+    for sensor, device_id in ids.items():
         if device_id is not None:
-            memory.learn(sensor, device_id, imu.number)  # type: ignore[arg-type]
-    client = cast("ParameterClient", _Logged(firmware, values))
-    return await read_calibration(client, imu.number, memory)
+            memory.learn(sensor, device_id, imu.number)
+    return await read_calibration(_Logged(firmware, values), imu.number, memory)
 
 
 def written_in(calibration: ImuCalibration, records: Sequence[Record]) -> tuple[Record, dict[str, float]] | None:

@@ -12,7 +12,7 @@ from typing import Final
 
 from companion.autopilot.firmware.ardupilot_tcal import TcalParameters, names_of, read_thermal
 from companion.autopilot.firmware.imu_calibration import ACCEL_SCALE_RANGE, ImuCalibration, ImuParameters, read_rivals
-from companion.autopilot.parameters.client import ParameterClient, read_integer, read_offsets, read_scales
+from companion.autopilot.parameters.reading import Parameters, read_integer, read_offsets, read_scales
 from companion.errors import AutopilotError, AutopilotRebootedError
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.rotations import ROTATION_NAMES
@@ -53,7 +53,7 @@ def parameters_of(instance: int) -> ArduPilotParameters:
     )
 
 
-async def read_calibration(parameters: ParameterClient, instance: int) -> ImuCalibration:
+async def read_calibration(parameters: Parameters, instance: int) -> ImuCalibration:
     """Read afresh what ArduPilot corrects one of its IMUs with.
 
     Raises:
@@ -123,12 +123,12 @@ _CUSTOM_NAMES: Final = {
 }
 
 
-async def read_board_rotation(parameters: ParameterClient) -> Matrix:
+async def read_board_rotation(parameters: Parameters) -> Matrix:
     """The 3x3 matrix from the board's axes to the vehicle's FRD.
 
     Raises:
         AutopilotError: an orientation that is not known, or a custom one that is not in force; or as
-            `ParameterClient.read`.
+            `Parameters.read`.
     """
     value = await parameters.read("AHRS_ORIENTATION")
     number = round(value) if math.isfinite(value) else -1

@@ -18,7 +18,7 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, Thermal, vector_changes
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.client import ParameterClient, read_integer
+from companion.autopilot.parameters.reading import Parameters, read_integer
 from companion.calibration.temperature.polynomial import ZERO, Polynomial
 from companion.errors import AutopilotError
 from companion.physics.frames import vector
@@ -73,11 +73,11 @@ def names_of(instance: int) -> TcalParameters:
     )
 
 
-async def read_thermal(parameters: ParameterClient, instance: int) -> Thermal:
+async def read_thermal(parameters: Parameters, instance: int) -> Thermal:
     """Read afresh what it takes off; nothing where it is switched off, or not in the firmware.
 
     Raises:
-        AutopilotError: it is learning, or as `ParameterClient.read`.
+        AutopilotError: it is learning, or as `Parameters.read`.
     """
     names = names_of(instance)
     enable = await read_integer(parameters, names.enable)
@@ -112,7 +112,7 @@ def _polynomial(
 
 
 async def thermal_changes(
-    parameters: ParameterClient, calibration: ImuCalibration, gyro: Polynomial, accel: Polynomial | None, degc: float
+    parameters: Parameters, calibration: ImuCalibration, gyro: Polynomial, accel: Polynomial | None, degc: float
 ) -> list[Change]:
     """What to write so that curves are in force and the output at this temperature stays as it is.
 
@@ -127,7 +127,7 @@ async def thermal_changes(
         degc: of the IMU now.
 
     Raises:
-        AutopilotError: this firmware has none, or as `ParameterClient.read`.
+        AutopilotError: this firmware has none, or as `Parameters.read`.
     """
     assert gyro.reference_degc == REFERENCE_DEGC
     names, thermal, own = names_of(calibration.instance), calibration.thermal, calibration.parameters

@@ -23,7 +23,7 @@ from companion.autopilot.firmware.imu_calibration import (
 )
 from companion.autopilot.firmware.px4 import SLOTS, SlotMemory
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.reading import Parameters
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.calibration.records.record import Outcome, WrittenParameter
 from companion.calibration.temperature.polynomial import Polynomial
@@ -39,9 +39,7 @@ _SETTLE_S: Final[dict[Firmware, float]] = {
 }
 
 
-async def read_calibration(
-    parameters: ParameterClient, instance: int, memory: SlotMemory | None = None
-) -> ImuCalibration:
+async def read_calibration(parameters: Parameters, instance: int, memory: SlotMemory | None = None) -> ImuCalibration:
     """Read afresh what the autopilot corrects one of its IMUs (1 to 3) with.
 
     `memory`: what earlier writes have shown about PX4's slots.
@@ -62,7 +60,7 @@ async def read_calibration(
 
 
 async def thermal_changes(
-    parameters: ParameterClient, calibration: ImuCalibration, gyro: Polynomial, accel: Polynomial | None, degc: float
+    parameters: Parameters, calibration: ImuCalibration, gyro: Polynomial, accel: Polynomial | None, degc: float
 ) -> list[Change]:
     """What to write so that curves are in force and the output at this temperature stays as it is.
 
@@ -74,7 +72,7 @@ async def thermal_changes(
         degc: of the IMU now.
 
     Raises:
-        AutopilotError: this firmware has no temperature calibration, or as `ParameterClient.read`.
+        AutopilotError: this firmware has no temperature calibration, or as `Parameters.read`.
     """
     if parameters.vehicle.firmware == "ardupilot":
         return await ardupilot_tcal.thermal_changes(parameters, calibration, gyro, accel, degc)

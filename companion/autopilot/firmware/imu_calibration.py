@@ -21,7 +21,7 @@ from typing import Final, Literal
 import numpy as np
 
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.client import ParameterClient, read_integer
+from companion.autopilot.parameters.reading import Parameters, read_integer
 from companion.autopilot.parameters.wire import float32, same_float32
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.calibration.solution.solve import ImuSolution
@@ -91,13 +91,13 @@ def rivals_of(firmware: Firmware | None) -> tuple[str, ...]:
     return tuple(_RIVALS.get(firmware or "other", {}))
 
 
-async def read_rivals(parameters: ParameterClient, seen: dict[str, int] | None = None) -> tuple[Rival, ...]:
+async def read_rivals(parameters: Parameters, seen: dict[str, int] | None = None) -> tuple[Rival, ...]:
     """Those that are switched on, and those that were and act until the next boot.
 
     `seen` is kept here from one call to the next: by parameter, the boot (as counted) since which it was seen to be on.
 
     Raises:
-        AutopilotError: as `ParameterClient.read_optional`.
+        AutopilotError: as `Parameters.read_optional`.
     """
     found: list[Rival] = []
     seen = {} if seen is None else seen

@@ -30,7 +30,7 @@ from companion.autopilot.firmware.imu_calibration import (
     read_rivals,
 )
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.client import ParameterClient, read_integer, read_offsets, read_scales
+from companion.autopilot.parameters.reading import Parameters, read_integer, read_offsets, read_scales
 from companion.errors import AutopilotError, AutopilotRebootedError
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.physics.units import MG
@@ -176,11 +176,11 @@ def thermal_names(sensor: int) -> tuple[str, ...]:
     return (*head, *(f"{own}X{power}_{axis}" for power in range(4) for axis in range(3)))
 
 
-async def read_slots(parameters: ParameterClient, sensor: Sensor) -> tuple[Slot, ...]:
+async def read_slots(parameters: Parameters, sensor: Sensor) -> tuple[Slot, ...]:
     """All slots that hold a device id, in order.
 
     Raises:
-        AutopilotError: as `ParameterClient.read_optional`.
+        AutopilotError: as `Parameters.read_optional`.
     """
     found: list[Slot] = []
     for number in range(SLOTS):
@@ -191,7 +191,7 @@ async def read_slots(parameters: ParameterClient, sensor: Sensor) -> tuple[Slot,
     return tuple(found)
 
 
-async def read_calibration(parameters: ParameterClient, instance: int, memory: SlotMemory) -> ImuCalibration:
+async def read_calibration(parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
     """Read afresh what PX4 corrects one of its IMUs with.
 
     Raises:
@@ -260,7 +260,7 @@ def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tu
     return (f"{size}: below 1 mg (0.01 m/s^2) PX4 starts without them; calibrate again after a restart",)
 
 
-async def _read_rotation(parameters: ParameterClient, gyro: Slot, accel: Slot) -> Matrix:
+async def _read_rotation(parameters: Parameters, gyro: Slot, accel: Slot) -> Matrix:
     level = rotation_matrix(await read_level(parameters))
     gyro_mounting = await _read_mounting(parameters, "gyro", gyro)
     accel_mounting = await _read_mounting(parameters, "accel", accel)
@@ -277,24 +277,24 @@ def _bus(slot: Slot) -> int:
     return slot.device_id & 0b111
 
 
-async def read_level(parameters: ParameterClient) -> Vector:
+async def read_level(parameters: Parameters) -> Vector:
     """The level adjustment: degrees of roll, pitch, yaw.
 
     Raises:
-        AutopilotError: as `ParameterClient.read`, or no angles.
+        AutopilotError: as `Parameters.read`, or no angles.
     """
     x, y, z = LEVEL
     return await _read_angle(parameters, x), await _read_angle(parameters, y), await _read_angle(parameters, z)
 
 
-async def _read_angle(parameters: ParameterClient, name: str) -> float:
+async def _read_angle(parameters: Parameters, name: str) -> float:
     angle_deg = await parameters.read(name)
     if not math.isfinite(angle_deg):
         raise AutopilotError(f"{name} is {angle_deg}; an angle was expected")
     return angle_deg
 
 
-async def _read_mounting(parameters: ParameterClient, sensor: Sensor, slot: Slot) -> Matrix:
+async def _read_mounting(parameters: Parameters, sensor: Sensor, slot: Slot) -> Matrix:
     """How a sensor is mounted on the vehicle, level adjustment apart."""
     own = await read_integer(parameters, f"{PREFIX[sensor]}{slot.number}_ROT")
     bus = _bus(slot)

@@ -17,7 +17,7 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, Thermal, vector_changes
 from companion.autopilot.firmware.px4 import SLOTS, THERMAL_ENABLE, thermal_names
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.client import ParameterClient, read_integer
+from companion.autopilot.parameters.reading import Parameters, read_integer
 from companion.autopilot.parameters.wire import float32, same_float32
 from companion.calibration.temperature.polynomial import NOTHING, Polynomial
 from companion.errors import AutopilotError
@@ -28,13 +28,13 @@ NOT_STORED: Final = 2.0**-23
 _LEAST: Final = float(np.nextafter(np.float32(NOT_STORED), np.float32(1.0)))
 
 
-async def read_thermal(parameters: ParameterClient, gyro_id: int | None) -> Thermal:
+async def read_thermal(parameters: Parameters, gyro_id: int | None) -> Thermal:
     """Read afresh what is taken off one gyro; nothing where it is switched off, or not in the firmware.
 
     Whether the module runs cannot be read: it is taken to where it is switched on, as the start script has it.
 
     Raises:
-        AutopilotError: a value that cannot be worked with, or as `ParameterClient.read`.
+        AutopilotError: a value that cannot be worked with, or as `Parameters.read`.
     """
     enable = await read_integer(parameters, THERMAL_ENABLE)
     if enable is None:
@@ -61,7 +61,7 @@ async def read_thermal(parameters: ParameterClient, gyro_id: int | None) -> Ther
 
 
 async def thermal_changes(
-    parameters: ParameterClient, calibration: ImuCalibration, gyro: Polynomial, degc: float
+    parameters: Parameters, calibration: ImuCalibration, gyro: Polynomial, degc: float
 ) -> list[Change]:
     """What to write so that a curve of the gyros is in force and the output at this temperature stays as it is.
 
@@ -75,7 +75,7 @@ async def thermal_changes(
         degc: of the IMU now.
 
     Raises:
-        AutopilotError: this PX4 has none, or as `ParameterClient.read`.
+        AutopilotError: this PX4 has none, or as `Parameters.read`.
     """
     thermal, far = calibration.thermal, calibration.far_step
     if not thermal.values:
@@ -100,7 +100,7 @@ async def thermal_changes(
     ]
 
 
-async def _switching_on(parameters: ParameterClient, slot: str, gyro_id: int) -> list[Change]:
+async def _switching_on(parameters: Parameters, slot: str, gyro_id: int) -> list[Change]:
     sensor = int(slot.removeprefix("CAL_GYRO").removesuffix("_ID"))
     before = await parameters.read_many((*thermal_names(sensor), THERMAL_ENABLE))
     if before[THERMAL_ENABLE] != 1.0:

@@ -30,7 +30,6 @@ from companion.autopilot.parameters.wire import (
 )
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.errors import (
-    AutopilotError,
     AutopilotRebootedError,
     NotDisarmedError,
     ParameterMismatchError,
@@ -39,7 +38,6 @@ from companion.errors import (
 )
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners
-from companion.samples import Vector
 
 _NO_ERROR: Final = 0
 _DOES_NOT_EXIST: Final = 1
@@ -329,43 +327,3 @@ def _wire_name(name: str) -> bytes:
     if len(data) > 16:  # the codec would cut it, and the rest may be another parameter's name
         raise ValueError(f"{name!r} is longer than the 16 characters of a MAVLink parameter name")
     return data
-
-
-async def read_offsets(parameters: ParameterClient, names: tuple[str, str, str]) -> Vector:
-    """Three offsets; any finite ones will do, for they are only added to.
-
-    Raises:
-        AutopilotError: one is not a number; or as `ParameterClient.read`.
-    """
-    return await _read_vector(parameters, names, -math.inf, math.inf)
-
-
-async def read_scales(parameters: ParameterClient, names: tuple[str, str, str]) -> Vector:
-    """Three scales, which will be divided by.
-
-    Raises:
-        AutopilotError: one is far from 1; or as `ParameterClient.read`.
-    """
-    return await _read_vector(parameters, names, 0.5, 2.0)
-
-
-async def read_integer(parameters: ParameterClient, name: str) -> int | None:
-    """A whole number, or None where the firmware has no such parameter.
-
-    Raises:
-        AutopilotError: not a number; or as `ParameterClient.read_optional`.
-    """
-    value = await parameters.read_optional(name)
-    if value is None:
-        return None
-    if not math.isfinite(value):
-        raise AutopilotError(f"{name} is {value}; a whole number was expected")
-    return round(value)
-
-
-async def _read_vector(parameters: ParameterClient, names: tuple[str, str, str], low: float, high: float) -> Vector:
-    x, y, z = [await parameters.read(name) for name in names]
-    for name, value in zip(names, (x, y, z), strict=True):
-        if not math.isfinite(value) or not low <= value <= high:
-            raise AutopilotError(f"{name} is {value:.9g}; this cannot be right, calibrate the accelerometers first")
-    return x, y, z

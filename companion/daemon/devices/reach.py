@@ -16,7 +16,8 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.port_parameters import baud_of, port_needs
-from companion.autopilot.parameters.client import ParameterClient, read_integer
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.reading import read_integer
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.errors import AutopilotError
 from companion.links.mavlink.link import MavlinkLink

@@ -1,0 +1,87 @@
+"""What is asked of parameters, whoever has them: an autopilot that answers, or a log in which they stand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Protocol
+
+from companion.autopilot.vehicle.vehicle import Firmware
+from companion.errors import AutopilotError
+from companion.samples import Vector
+
+
+class Owner(Protocol):
+    """Whose they are."""
+
+    @property
+    def name(self) -> str:
+        """For people."""
+
+    @property
+    def firmware(self) -> Firmware | None:
+        """None: not known yet."""
+
+    @property
+    def boots(self) -> int:
+        """Starts that have been seen."""
+
+    async def hear_boot_time(self) -> bool:
+        """Make sure that `boots` counts every start until now."""
+
+
+class Parameters(Protocol):
+    """Read by name; `ParameterClient` has what they raise."""
+
+    @property
+    def vehicle(self) -> Owner:
+        """Whose they are."""
+
+    async def read(self, name: str) -> float:
+        """One that must be there."""
+
+    async def read_optional(self, name: str) -> float | None:
+        """None: there is no such parameter."""
+
+    async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
+        """Several; where `optional`, what does not exist is left out."""
+
+
+async def read_offsets(parameters: Parameters, names: tuple[str, str, str]) -> Vector:
+    """Three offsets; any finite ones will do, for they are only added to.
+
+    Raises:
+        AutopilotError: one is not a number; or as `Parameters.read`.
+    """
+    return await _read_vector(parameters, names, -math.inf, math.inf)
+
+
+async def read_scales(parameters: Parameters, names: tuple[str, str, str]) -> Vector:
+    """Three scales, which will be divided by.
+
+    Raises:
+        AutopilotError: one is far from 1; or as `Parameters.read`.
+    """
+    return await _read_vector(parameters, names, 0.5, 2.0)
+
+
+async def read_integer(parameters: Parameters, name: str) -> int | None:
+    """A whole number, or None where the firmware has no such parameter.
+
+    Raises:
+        AutopilotError: not a number; or as `Parameters.read_optional`.
+    """
+    value = await parameters.read_optional(name)
+    if value is None:
+        return None
+    if not math.isfinite(value):
+        raise AutopilotError(f"{name} is {value}; a whole number was expected")
+    return round(value)
+
+
+async def _read_vector(parameters: Parameters, names: tuple[str, str, str], low: float, high: float) -> Vector:
+    x, y, z = [await parameters.read(name) for name in names]
+    for name, value in zip(names, (x, y, z), strict=True):
+        if not math.isfinite(value) or not low <= value <= high:
+            raise AutopilotError(f"{name} is {value:.9g}; this cannot be right, calibrate the accelerometers first")
+    return x, y, z
