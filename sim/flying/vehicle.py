@@ -11,19 +11,18 @@ from pathlib import Path
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.flying.truth import FlyingAircraft
-from sim.imu_model import Bias, ImuModel
+from sim.imu_model import Bias
 from sim.scenario import Scenario
 from sim.sitl.ground import GroundStation
-from sim.sitl.samples import SampleBlocks
-from sim.sitl.vehicle import SitlVehicle
+from sim.sitl.vehicle import FirmwareVehicle
 
 ARM_WITHIN_S = 60.0
 YAW_STICK_US = 250
 TURNED_WITHIN_S = 8.0
 
 
-class FlyingVehicle(SitlVehicle):
-    """A `SitlVehicle` whose aircraft follows the firmware, in the place of the other way round."""
+class FlyingVehicle(FirmwareVehicle):
+    """A firmware with physics of its own, which the scenario's aircraft follows."""
 
     sticks_us: list[int]
     """Roll, pitch, throttle, yaw."""
@@ -45,19 +44,9 @@ class FlyingVehicle(SitlVehicle):
         """True height above the place of the start."""
         return -self.truth.recorded[-1][6] if self.truth.recorded else 0.0
 
-    @property
-    def samples(self) -> SampleBlocks:
-        """There are none: it has physics of its own."""
-        raise NotImplementedError
-
-    @property
-    def imus(self) -> tuple[ImuModel, ...]:
-        """Whose biases its IMUs have."""
-        return self.scenario.flight_controller_imus
-
     def true_bias(self, instance: int, t_s: float) -> Bias:
         """What it was told at its start."""
-        return self.imus[instance - 1].true_bias(0.0)
+        return self.scenario.flight_controller_imus[instance - 1].true_bias(0.0)
 
     async def ask_streams(self, ground: GroundStation) -> None:
         """ATTITUDE and LOCAL_POSITION_NED at 25 Hz, for the record."""

@@ -87,8 +87,8 @@ class ArduPilotSitl(ArduPilotLinks, SitlVehicle):
 
     Args:
         binary: the firmware.
-        scenario: see `SitlVehicle`.
-        folder: see `SitlVehicle`; `scripts/` in it is where Lua scripts go.
+        scenario: see `FirmwareVehicle`.
+        folder: see `FirmwareVehicle`; `scripts/` in it is where Lua scripts go.
         defaults: parameter files of the firmware's own format, read before ours.
         parameters: defaults that outrank all others.
         gyr_cal: INS_GYR_CAL, whether it calibrates its gyros at every boot; JSON's own default is not.

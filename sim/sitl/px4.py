@@ -63,8 +63,8 @@ class Px4Sitl(SitlVehicle):
     Args:
         binary: the firmware.
         etc: its `etc` folder of start scripts; None: `../etc` of the binary.
-        scenario: see `SitlVehicle`.
-        folder: see `SitlVehicle`.
+        scenario: see `FirmwareVehicle`.
+        folder: see `FirmwareVehicle`.
         parameters: set at the first boot, besides `MEASURING_PARAMETERS`.
         instance: of the firmware; None: the first that is free.
 

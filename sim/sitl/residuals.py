@@ -20,7 +20,7 @@ from sim.sitl.ground import GroundStation
 from sim.sitl.observe import residual
 from sim.sitl.px4 import Px4Sitl
 from sim.sitl.serial_line import serial_line
-from sim.sitl.vehicle import SitlVehicle
+from sim.sitl.vehicle import FirmwareVehicle, SitlVehicle
 from sim.udp import open_udp
 
 SETTLE_S = 40.0
@@ -95,7 +95,7 @@ class Found:
 
 
 @contextlib.asynccontextmanager
-async def ground_station(vehicle: SitlVehicle) -> AsyncIterator[GroundStation]:
+async def ground_station(vehicle: FirmwareVehicle) -> AsyncIterator[GroundStation]:
     """A ground station on the vehicle's ground link, with a heartbeat."""
     station = GroundStation(vehicle.firmware, vehicle=vehicle.system_id)
     if vehicle.firmware == "px4":

@@ -24,8 +24,8 @@ SLOWEST = 10.0
 """Seconds of the wall for one of the firmware's, at most."""
 
 
-class SitlVehicle(ABC):
-    """A firmware binary that lives on a scenario's aircraft. An async context manager on a real event loop.
+class FirmwareVehicle(ABC):
+    """A firmware binary and a scenario's aircraft, whosever the physics. An async context manager on a real event loop.
 
     Args:
         scenario: the aircraft and its sensors; its double is not used.
@@ -57,16 +57,6 @@ class SitlVehicle(ABC):
     def physics_s(self) -> float:
         """The firmware's simulated time since its boot."""
 
-    @property
-    @abstractmethod
-    def samples(self) -> SampleBlocks:
-        """What the back end sends."""
-
-    @property
-    @abstractmethod
-    def imus(self) -> tuple[ImuModel, ...]:
-        """The models behind the back end."""
-
     @abstractmethod
     def true_bias(self, instance: int, t_s: float) -> Bias:
         """What IMU `instance` (1..) of the firmware reads too much at an aircraft time."""
@@ -76,7 +66,7 @@ class SitlVehicle(ABC):
         """Open the back end and make the process, not started."""
 
     async def __aenter__(self) -> Self:
-        """Start back end and binary, and wait until the binary takes our physics.
+        """Start back end and binary, and wait until its simulated time passes.
 
         Raises:
             BinaryError: it cannot be run, or died, or does not ask for physics.
@@ -149,12 +139,26 @@ class SitlVehicle(ABC):
             while self.backend_boots == starts and self.physics_s - begun_s < seconds:
                 await asyncio.sleep(0.05)
 
-    def move(self, motions: Sequence[Motion]) -> None:
-        """Let something happen to the aircraft; start at least 0.1 s from now (aircraft time, see `now_s`)."""
-        for motion in motions:
-            self.aircraft.add(motion)
-
     @property
     def now_s(self) -> float:
         """Aircraft time."""
         return self.aircraft.time_at(asyncio.get_running_loop().time())
+
+
+class SitlVehicle(FirmwareVehicle):
+    """A firmware on our physics: it lives on the scenario's aircraft, and its IMUs read what ours read."""
+
+    @property
+    @abstractmethod
+    def samples(self) -> SampleBlocks:
+        """What the back end sends."""
+
+    @property
+    @abstractmethod
+    def imus(self) -> tuple[ImuModel, ...]:
+        """The models behind the back end."""
+
+    def move(self, motions: Sequence[Motion]) -> None:
+        """Let something happen to the aircraft; start at least 0.1 s from now (aircraft time, see `now_s`)."""
+        for motion in motions:
+            self.aircraft.add(motion)
