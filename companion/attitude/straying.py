@@ -26,14 +26,17 @@ class Straying:
         """By how much the heading has turned and the gyros have not, lately."""
         self.is_too_far = False
         self._last: tuple[float, float, float] | None = None
-        self._turned_rad = self._sigma_rad = 0.0
+        self._turned_rad = self._sigma_rad = self._apart_rad = 0.0
 
-    def add(self, t_s: float, heading_rad: float, sigma_rad: float, rate_rad_s: float) -> None:
-        """Heading with its sigma, and how fast the other gyros turn about the vertical; after a gap it begins anew."""
+    def add(self, t_s: float, heading_rad: float, sigma_rad: float, rate_rad_s: float, late_s: float = 0.0) -> None:
+        """Heading with its sigma, and how fast the other gyros turn about the vertical; after a gap it begins anew.
+
+        `late_s`: by how much more than usual the times of the two may lie apart.
+        """
         before, self._last = self._last, (t_s, heading_rad, rate_rad_s)
         passed_s = 0.0 if before is None else t_s - before[0]
         if before is None or not 0.0 < passed_s <= LONGEST_STEP_S:
-            self.strayed_rad = self._turned_rad = 0.0
+            self.strayed_rad = self._turned_rad = self._apart_rad = 0.0
             self._sigma_rad, self.is_too_far = sigma_rad, False
             return
         kept = 1.0 - passed_s / WITHIN_S
@@ -42,5 +45,7 @@ class Straying:
         self.strayed_rad = self.strayed_rad * kept + heading - by_gyros
         self._turned_rad = self._turned_rad * kept + abs(by_gyros)
         self._sigma_rad = max(self._sigma_rad * kept, sigma_rad)
-        allowed = max(STRAYS_RAD, SIGMAS * self._sigma_rad) + SCALES * self._turned_rad + LATE_S * abs(rate_rad_s)
+        self._apart_rad = max(self._apart_rad * kept, late_s * max(abs(rate_rad_s), abs(heading / passed_s)))
+        apart = LATE_S * abs(rate_rad_s) + self._apart_rad
+        allowed = max(STRAYS_RAD, SIGMAS * self._sigma_rad) + SCALES * self._turned_rad + apart
         self.is_too_far = abs(self.strayed_rad) > allowed

@@ -14,40 +14,62 @@ from companion.attitude.estimator import Attitude
 from companion.attitude.quaternion import Quaternion, from_roll_pitch_yaw
 from companion.daemon.heading.health import ATTITUDE_RATE_HZ, Difference
 
-RATE_RAD_S = math.radians(40.0)
 TURNS_AT_S = 60.0
 
 
-def yaw_at(t_s: float) -> float:
-    """It stands for a minute, then turns."""
-    return RATE_RAD_S * max(0.0, t_s - TURNS_AT_S)
+def compare(rate_rad_s: float, clock: float, late_s: Callable[[int], float], drift_rad_s: float = 0.0) -> Difference:
+    """An aircraft that stands for a minute, then turns for 8 s, as the autopilot tells it `late_s` later.
+
+    `clock`: how fast the autopilot's runs; our heading drifts from the start of the turn on. Ends where it strays.
+    """
+    heard: list[Callable[[Any, float], None]] = []
+    vehicle: Any = SimpleNamespace(hear=lambda _message, handler, _rate: heard.append(handler))
+    now_s = 0.0
+
+    def ours(t_s: float) -> float:
+        return (rate_rad_s + drift_rad_s) * max(0.0, t_s - TURNS_AT_S)
+
+    def attitude(t_s: float) -> Quaternion:
+        return from_roll_pitch_yaw(0.0, 0.0, ours(t_s))
+
+    def now() -> Attitude:
+        rate = rate_rad_s + drift_rad_s if now_s > TURNS_AT_S else 0.0
+        sigma = math.radians(1.0)
+        return Attitude(now_s, attitude(now_s), 0.0, 0.0, ours(now_s), (0.0, 0.0, rate), (sigma, sigma, sigma))
+
+    difference = Difference(vehicle, now, lambda t_s: (t_s, attitude(t_s)))
+    for k in range(int((TURNS_AT_S + 8.0) * ATTITUDE_RATE_HZ)):
+        said_s = 1.0 + k / ATTITUDE_RATE_HZ
+        rate = rate_rad_s if said_s > TURNS_AT_S else 0.0
+        boot_ms = round(1e3 * (100.0 + clock * said_s))
+        theirs = math.remainder(rate_rad_s * max(0.0, said_s - TURNS_AT_S), math.tau)
+        message = mavlink.MAVLink_attitude_message(boot_ms, 0.0, 0.0, theirs, 0.0, 0.0, rate)
+        now_s = max(now_s, said_s + late_s(k))
+        heard[0](message, now_s)
+        if difference.straying.is_too_far:
+            break
+    return difference
 
 
 @pytest.mark.parametrize("clock", [1.0, 0.989, 1.011], ids=["as ours", "slower", "faster"])
 @pytest.mark.parametrize("late_s", [lambda _k: 0.0, lambda k: 0.06 * (k % 3)], ids=["at once", "late at times"])
 def test_a_turn_is_the_same_to_both_whatever_the_autopilots_clock(clock: float, late_s: Callable[[int], float]) -> None:
     """Who pairs what was said at 12:00:00 with a heading of 12:00:01 sees a heading that strays in every turn."""
-    heard: list[Callable[[Any, float], None]] = []
-    vehicle: Any = SimpleNamespace(hear=lambda _message, handler, _rate: heard.append(handler))
-    now_s = 0.0
-
-    def attitude(t_s: float) -> Quaternion:
-        return from_roll_pitch_yaw(0.0, 0.0, yaw_at(t_s))
-
-    def now() -> Attitude:
-        rate = RATE_RAD_S if now_s > TURNS_AT_S else 0.0
-        sigma = math.radians(1.0)
-        return Attitude(now_s, attitude(now_s), 0.0, 0.0, yaw_at(now_s), (0.0, 0.0, rate), (sigma, sigma, sigma))
-
-    difference = Difference(vehicle, now, lambda t_s: (t_s, attitude(t_s)))
-    for k in range(int((TURNS_AT_S + 8.0) * ATTITUDE_RATE_HZ)):
-        said_s = 1.0 + k / ATTITUDE_RATE_HZ
-        rate = RATE_RAD_S if said_s > TURNS_AT_S else 0.0
-        boot_ms = round(1e3 * (100.0 + clock * said_s))
-        message = mavlink.MAVLink_attitude_message(
-            boot_ms, 0.0, 0.0, math.remainder(yaw_at(said_s), math.tau), 0.0, 0.0, rate
-        )
-        now_s = said_s + late_s(k)
-        heard[0](message, now_s)
-        assert not difference.straying.is_too_far, said_s
+    difference = compare(math.radians(40.0), clock, late_s)
+    assert not difference.straying.is_too_far
     assert abs(difference.heading_rad) < math.radians(3.0)
+
+
+@pytest.mark.parametrize("rate_deg_s", [45.0, 90.0, -180.0])
+@pytest.mark.parametrize("recovers_s", [0.5, 2.0, 6.0])
+def test_a_line_that_is_late_for_a_while_makes_no_turn_a_drift(rate_deg_s: float, recovers_s: float) -> None:
+    """Late by 0.3 s for 10 s, and on time again so long after the turn has begun."""
+    last = round((TURNS_AT_S + recovers_s - 1.0) * ATTITUDE_RATE_HZ)
+    difference = compare(math.radians(rate_deg_s), 1.0, lambda k: 0.3 if last - 100 < k <= last else 0.0)
+    assert not difference.straying.is_too_far
+
+
+def test_a_drift_is_seen_although_the_line_is_late_at_times() -> None:
+    last = round((TURNS_AT_S + 1.0) * ATTITUDE_RATE_HZ)
+    late = compare(0.0, 1.0, lambda k: 0.3 if last - 100 < k <= last else 0.0, drift_rad_s=math.radians(3.0))
+    assert late.straying.is_too_far

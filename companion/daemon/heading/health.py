@@ -20,7 +20,7 @@ from companion.attitude.quaternion import (
     roll_pitch_yaw,
     rotate,
 )
-from companion.attitude.straying import Straying
+from companion.attitude.straying import LATE_S, Straying
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.daemon.heading.carrier import Carrier
 from companion.physics.units import DEG
@@ -67,6 +67,8 @@ class Difference:
     ) -> None:
         self._now, self._kept_at = now, kept_at
         self._offset_s: float | None = None
+        self._forgotten_s = 0.0
+        """By how much the instants may be too late, since no message has been as quick as expected."""
         self.theirs: tuple[float, Quaternion] | None = None
         """What the autopilot said last: the instant on our clock, and its turn from body to NED."""
         self.latest: tuple[float, float] | None = None
@@ -123,7 +125,8 @@ class Difference:
         if abs(message.pitch) < STEEP_RAD and math.isfinite(pitch_rate) and math.isfinite(yaw_rate):
             across = pitch_rate * math.sin(message.roll) + yaw_rate * math.cos(message.roll)
             rate = across / math.cos(message.pitch)
-            self.straying.add(message.time_boot_ms * 1e-3, roll_pitch_yaw(then)[2], ours.sigma_rad[2], rate)
+            heading, sigma = roll_pitch_yaw(then)[2], ours.sigma_rad[2]
+            self.straying.add(message.time_boot_ms * 1e-3, heading, sigma, rate, self._forgotten_s)
 
     def _compare(self, ours: Quaternion, theirs: Quaternion, span_s: float, t_s: float) -> None:
         first = self._since_s == math.inf
@@ -149,7 +152,13 @@ class Difference:
             self._offset_s = offset_s
         else:
             forgotten_s = FORGETS_PER_S * min(max(t_s - self.heard_s, 0.0), OLD_S)
-            self._offset_s = min(offset_s, self._offset_s + forgotten_s)
+            self._offset_s += forgotten_s
+            self._forgotten_s += forgotten_s
+            if offset_s < self._offset_s - LATE_S:
+                # The line was late, and is less so: in a turn the two would seem to part at this moment.
+                self.straying = Straying()
+        if offset_s <= self._offset_s:
+            self._offset_s, self._forgotten_s = offset_s, 0.0
         return offset_s - self._offset_s
 
 
