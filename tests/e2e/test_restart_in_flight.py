@@ -160,6 +160,34 @@ def test_a_compass_that_lies_since_is_not_followed(tmp_path: Path, firmware: Fir
     run_virtual(main())
 
 
+def test_who_may_be_armed_is_not_aligned_as_on_the_ground(tmp_path: Path) -> None:
+    """Its heartbeats are lost soon after the start: it goes on as in flight, once the heading fits."""
+
+    async def main() -> None:
+        async with flight(tmp_path) as flying:
+            rig = flying.rig
+            in_air(flying)
+            await flying.sleep(6.0)
+            compass = rig.devices["compass"]
+            assert isinstance(compass, HMR3300)
+            compass.heading_error_deg = 40.0
+            await rig.restart()
+            vehicle = rig.service.core.vehicle
+            await rig.until(lambda: vehicle.firmware is not None, 5.0)
+            rig.double.faults.heartbeat_off = True
+            await rig.until(lambda: vehicle.arm_state is ArmState.UNKNOWN, 10.0)
+            await flying.sleep(2.0)
+            assert not flying.attitude.health.pushing
+            compass.heading_error_deg = 0.0
+            right_s = rig.now_s
+            await flying.pushing(5.0)
+            assert vehicle.arm_state is ArmState.UNKNOWN
+            await flying.sleep(2.0)
+            assert worst_deg(flying, right_s) < 2.0
+
+    run_virtual(main())
+
+
 def exchanged_part(flying: Flight) -> None:
     flying.rig.double.set_parameter("INS_GYR_ID", flying.rig.double.parameter("INS_GYR_ID") + 1)
 
