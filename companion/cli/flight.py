@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import argparse
+import datetime
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from companion.calibration.records.flight_record import (
+    HEADS,
+    UNSEEN,
+    Flight,
+    ImuFlight,
+    KeptFlight,
+    Term,
+    drift_lines,
+    next_flight,
+    unit_of,
+)
 from companion.cli.terminal import AddCommand, conclude, print_lines, storage_path
 from companion.errors import StorageError
-from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
-    from companion.flight.flight import Flight, ImuFlight, Knowledge
-    from companion.flight.inertial import Drift
-    from companion.flight.split import Term
+    from companion.flight.flight import Knowledge
+    from companion.storage.flights import FlightStore
 
 _TOLD_BYTES: Final = 1 << 25
-_WORTH: Final = {"deg/h": 30.0, "mg": 1.5}
-"""Smaller findings are nobody's worry."""
 
 
 def add_commands(add: AddCommand) -> None:
@@ -41,7 +50,7 @@ async def flight(options: argparse.Namespace) -> int:
     """`companion flight`."""
     from companion.flight.flight import flights, read
 
-    known = _knowledge(options)
+    known, store = _knowledge(options)
     starts, imus, lines, found = 0, 0, [], []
     for boot in read(options.file, _Progress(options.file)):
         starts, imus = starts + 1, imus + len(boot.imus)
@@ -54,7 +63,9 @@ async def flight(options: argparse.Namespace) -> int:
         raise StorageError(f"{options.file}: no attitude and position of an EKF3 (ArduPilot) or EKF2 (PX4) in it")
     if starts > 1:
         lines.insert(0, f"{starts} starts of the autopilot in it, each by its own clock")
-    answer = {"state": "done", "reason": "", "flights": msgspec.to_builtins(found)}
+    numbers = [] if store is None else _keep(store, options.file.name, found)
+    lines += [f"kept as flight {number}: companion history" for number in numbers]
+    answer = {"state": "done", "reason": "", "flights": msgspec.to_builtins(found), "numbers": numbers}
     return conclude(options, answer, lines, good=True)
 
 
@@ -72,19 +83,39 @@ class _Progress:
             self._stream.flush()
 
 
-def _knowledge(options: argparse.Namespace) -> Knowledge:
+def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | None]:
+    """What the companion has on disk, and where it keeps flights; None: this user may not look."""
     from companion.flight.flight import Knowledge
     from companion.flight.in_force import parameter_file
+    from companion.storage.flights import FlightStore
     from companion.storage.learned import BiasStore
     from companion.storage.records import RecordStore
 
     others = {path.stem: parameter_file(path) for path in options.offsets}
     directory = storage_path(options)
     try:
-        return Knowledge(records=RecordStore(directory).history(), biases=BiasStore(directory).all(), others=others)
+        known = Knowledge(records=RecordStore(directory).history(), biases=BiasStore(directory).all(), others=others)
     except StorageError as error:
-        print_lines(f"note: {error}: looked at without the companion's history; sudo may help", error=True)
-        return Knowledge(others=others)
+        words = "looked at without the companion's history, and not kept; sudo may help"
+        print_lines(f"note: {error}: {words}", error=True)
+        return Knowledge(others=others), None
+    return known, FlightStore(directory)
+
+
+def _keep(store: FlightStore, log: str, found: Sequence[Flight]) -> list[int]:
+    """Those that flew, for report and history; their numbers there."""
+    read_at = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="seconds")
+    try:
+        if not store.folder.parent.is_dir():
+            raise StorageError(f"there is no {store.folder.parent}")
+        return [
+            store.save(KeptFlight(log=log, read_at=read_at, flight=each))
+            for each in found
+            if any(imu.drift for imu in each.imus)
+        ]
+    except StorageError as error:
+        print_lines(f"note: not kept: {error}", error=True)
+        return []
 
 
 def _flight_lines(number: int, found: Flight) -> list[str]:
@@ -105,7 +136,7 @@ def _flight_lines(number: int, found: Flight) -> list[str]:
     lines += [f"  note: {note}" for note in found.notes]
     for imu in found.imus:
         lines += _imu_lines(imu)
-    return [*lines, *([f"next flight: {_hint(found)}"] if any(imu.drift for imu in found.imus) else [])]
+    return [*lines, *([f"next flight: {next_flight(found)}"] if any(imu.drift for imu in found.imus) else [])]
 
 
 def _imu_lines(imu: ImuFlight) -> list[str]:
@@ -116,71 +147,26 @@ def _imu_lines(imu: ImuFlight) -> list[str]:
     )
     lines = [f"IMU {imu.imu}, {imu.rate_hz:.0f} Hz: {whose}"]
     lines += [f"  note: {note}" for note in imu.notes]
-    lines += [f"  {words}" for words in _drift_lines(imu.drift)]
+    lines += [f"  {words}" for words in drift_lines(imu)]
     if any(axis.in_flight for axis in imu.axes):
         lines += [f"  {words}" for words in _table(imu)]
     return lines
 
 
-_HEADS: Final = {
-    "in_flight": "in the air", "ekf": "EKF", "turn_on": "motors off", "temperature": "temperature", "motors": "motors",
-    "vibration": "per m/s^2", "trend": "a minute",
-}  # fmt: skip
-
-
 def _table(imu: ImuFlight) -> list[str]:
     """What is known of every axis; what is known of none is named once."""
-    shown = [term for term in _HEADS if any(getattr(axis, term) for axis in imu.axes)]
-    lines = [f"{'left over':13}" + "".join(f"{_HEADS[term]:>13}" for term in shown)]
+    shown = [term for term in HEADS if any(getattr(axis, term) for axis in imu.axes)]
+    lines = [f"{'left over':13}" + "".join(f"{HEADS[term]:>13}" for term in shown)]
     for axis in imu.axes:
-        unit, name, digits = _unit(axis.axis)
+        unit, name, digits = unit_of(axis.axis)
         terms = [_term(getattr(axis, term), unit, digits) for term in shown]
         lines.append(f"{', '.join((axis.axis, name)):13}" + "".join(f"{each:>13}" for each in terms))
-    if lacking := [head for term, head in _HEADS.items() if term not in shown]:
+    if lacking := [head for term, head in HEADS.items() if term not in shown]:
         lines.append(f"not known: {', '.join(lacking)}")
-    return [*lines, "accel x, y: not counted, a hover does not tell them from tilt"]
-
-
-def _unit(axis: str) -> tuple[float, str, int]:
-    return (DEG_H, "deg/h", 0) if axis.startswith("gyro") else (MG, "mg", 1)
+    return [*lines, UNSEEN]
 
 
 def _term(term: Term | None, unit: float, digits: int) -> str:
     if term is None:
         return "?"
     return f"{term.value / unit:+.{digits}f} ± {term.sigma / unit:.{digits}f}"
-
-
-def _drift_lines(drift: dict[str, list[Drift]]) -> list[str]:
-    """The figure that counts first."""
-    lines = []
-    for flown in drift.get("flown", ()):
-        others = [
-            f"with the offsets of {name} {each.median_m:.1f} m"
-            for name, rows in drift.items()
-            if name != "flown"
-            for each in rows
-            if each.seconds == flown.seconds
-        ]
-        own = f"{flown.median_m:.1f} m (95 %: {flown.worst_m:.1f} m, {flown.starts} starts)"
-        lines.append("; ".join([f"{flown.seconds:.0f} s without GNSS: {own}", *others]))
-    return lines
-
-
-def _hint(found: Flight) -> str:
-    """The largest thing that is surely there."""
-    worst: tuple[float, str] = (0.0, "nothing to do: what the offsets left is small or not surely there")
-    for imu in found.imus:
-        for axis in imu.axes:
-            unit, name, digits = _unit(axis.axis)
-            for term, what, remedy in (
-                (axis.motors, "of rectification at hover throttle", "its damping"),
-                (axis.turn_on, "before the motors", "calibrate nearer to the take-off"),
-            ):
-                if term is None or abs(term.value) < 2.0 * term.sigma:
-                    continue
-                size = abs(term.value) / unit / _WORTH[name]
-                if size > max(worst[0], 1.0):
-                    words = f"IMU {imu.imu} {axis.axis}: {abs(term.value) / unit:.{digits}f} {name} {what}: {remedy}"
-                    worst = size, words
-    return worst[1]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from companion.calibration.records.flight_record import Flight, figure
 from companion.calibration.records.record import Magnetic, outcome_word
 from companion.formats import Object
 from companion.physics.units import DEG_H, MG
@@ -261,9 +262,13 @@ def _judged(rows: Sequence[tuple[str, str, str]]) -> list[str]:
 
 
 def history_lines(
-    numbers: Sequence[int], records: Sequence[Object], armings: Sequence[Object], by_hand: Sequence[Object]
+    numbers: Sequence[int],
+    records: Sequence[Object],
+    armings: Sequence[Object],
+    by_hand: Sequence[Object],
+    flights: Sequence[Object] = (),
 ) -> list[str]:
-    """Past calibrations and alignments and the latest armings, newest first; numbers as `companion report` takes."""
+    """Past calibrations, alignments, armings and flights, newest first; numbers as `companion report` takes."""
     lines = ["no calibrations yet"]
     if records:
         lines = [f"{'no.':>4} {'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]
@@ -282,7 +287,14 @@ def history_lines(
             f"{arming['reason']}"
             for arming in armings
         ]
+    if flights:
+        lines.append(f"{'no.':>4} {'flown (UTC)':20} {'what its log says'}")
+        lines += [f"{one['number']:4} {_flown(msgspec.convert(one['flight'], Flight))}" for one in flights]
     return lines
+
+
+def _flown(flight: Flight) -> str:
+    return f"{(flight.began_at or 'time unknown')[:19]:20} {figure(flight.imus) or 'no drift known'}"
 
 
 def by_hand_words(done: Object) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,14 +15,15 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.calibration.noise.allan import PROFILES, noise_profile
 from companion.calibration.noise.robust import median
+from companion.calibration.records.flight_record import Drift, Flight, ImuFlight, Moment, Stages, Term
 from companion.calibration.records.record import Record
 from companion.calibration.solution.prior import curve_of
 from companion.errors import AutopilotError, StorageError
 from companion.flight import ardupilot_log, inertial, px4_log
 from companion.flight.in_force import calibration_in, moment, with_others, written_in
-from companion.flight.inertial import Drift, Increments, Navigation, Window, World
+from companion.flight.inertial import Increments, Navigation, Window, World
 from companion.flight.log import Boot, FlownImu
-from companion.flight.split import LENGTH_S, SHORT_S, Split, Term, split
+from companion.flight.split import LENGTH_S, SHORT_S, split
 from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
 from companion.physics.frames import Floats
 from companion.physics.units import DEG_H, MG
@@ -42,43 +44,11 @@ _LIFTED_M: Final = 1.5
 _LEAST_AIR_S: Final = 15.0
 _SLOW_HZ: Final = 80.0
 _ENCRYPTED: Final = b"ULogEnc"
-
-
-class Stages(msgspec.Struct, frozen=True):
-    """Of a flight, in s of the autopilot's clock; None where the log does not tell."""
-
-    armed_s: float
-    motors_s: float | None
-    take_off_s: float | None
-    landing_s: float | None
-    disarmed_s: float | None
-
-
-class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU in one flight."""
-
-    imu: int
-    rate_hz: float
-    calibration: str | None
-    """`started_at` of the record whose offsets it flew with."""
-    set_gyro_rad_s: tuple[float, ...] | None
-    set_accel_m_s2: tuple[float, ...] | None
-    """The offsets in force, in the IMU's own axes."""
-    axes: tuple[Split, ...]
-    drift: dict[str, list[Drift]]
-    """Without aid, by whose offsets: `flown`, `before`, those of files."""
-    notes: tuple[str, ...]
-
-
-class Flight(msgspec.Struct, frozen=True, kw_only=True):
-    """From an arming to the disarming after it."""
-
-    began_at: str | None
-    stages: Stages
-    reference: str
-    """What the drift is measured from: "ekf", or "truth" of a simulator."""
-    imus: tuple[ImuFlight, ...]
-    notes: tuple[str, ...]
+_SYSTEM_ID: Final = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
+"""ArduPilot's up to 4.6, from 4.7 on; PX4's."""
+_GROUND: Final = round(LENGTH_S / SHORT_S)
+_MOST_MOMENTS: Final = 120
+"""Of a flight of more than 20 minutes each two, three ... windows are one."""
 
 
 class Knowledge(msgspec.Struct, frozen=True, kw_only=True):
@@ -124,6 +94,8 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
             late[imu.number] = found._replace(t_s=found.t_s - inertial.lag_s(found, reference))
     return [
         Flight(
+            key=_key(boot, stages),
+            system_id=_system_id(boot.parameters_at(stages.armed_s)),
             began_at=moment(None if boot.unix_offset_s is None else boot.unix_offset_s + stages.armed_s),
             stages=stages,
             reference="ekf" if boot.truth is None else "truth",
@@ -138,6 +110,17 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
         )
         for stages in _stages(boot, reference)
     ]
+
+
+def _key(boot: Boot, stages: Stages) -> str:
+    """Parameters tell autopilots and starts apart: both firmwares count in them how often and how long they ran."""
+    sensors = [(imu.number, imu.gyro_id, imu.accel_id) for imu in boot.imus]
+    told = [boot.firmware, stages.armed_s, sensors, sorted(boot.parameters_at(stages.armed_s).items())]
+    return hashlib.sha256(msgspec.json.encode(told)).hexdigest()[:16]
+
+
+def _system_id(values: Mapping[str, float]) -> int | None:
+    return next((int(values[name]) for name in _SYSTEM_ID if math.isfinite(values.get(name, math.nan))), None)
 
 
 def _during(found: Increments, stages: Stages) -> Increments:
@@ -219,10 +202,13 @@ async def _imu(
         imu=imu.number,
         rate_hz=imu.rate_hz,
         calibration=None if match is None else match[0].started_at,
+        gyro_id=imu.gyro_id if calibration is None else calibration.gyro_id,
+        accel_id=imu.accel_id if calibration is None else calibration.accel_id,
         set_gyro_rad_s=None if calibration is None else calibration.gyro_offset_rad_s,
         set_accel_m_s2=None if calibration is None else calibration.accel_offset_m_s2,
-        axes=tuple(split(ground, flown, _levels(imu, flown), warmth, _ekf(imu, in_air))),
+        axes=tuple(split(ground, flown, _means(imu.vibration, [one.t_s for one in flown]), warmth, _ekf(imu, in_air))),
         drift=drift,
+        moments=_moments(imu, stages.armed_s, ground, flown),
         notes=tuple(notes),
     )
 
@@ -251,12 +237,33 @@ def _kept(rows: Sequence[Window]) -> list[Window]:
     return [one for one, far in zip(rows, (off > _OUTLIER * usual).any(axis=1), strict=True) if not far]
 
 
-def _levels(imu: FlownImu, rows: Sequence[Window]) -> Floats | None:
-    """Vibration in each window."""
-    if len(imu.vibration) < 2:
+def _means(table: Floats, times_s: Sequence[float]) -> Floats | None:
+    """Of rows of time and value, the value about each of these times."""
+    if len(table) < 2:
         return None
-    edges = [imu.vibration[:, 0].searchsorted([one.t_s - LENGTH_S / 2, one.t_s + LENGTH_S / 2]) for one in rows]
-    return np.array([imu.vibration[a : max(b, a + 1), 1].mean() for a, b in edges])
+    edges = [table[:-1, 0].searchsorted([at_s - LENGTH_S / 2, at_s + LENGTH_S / 2]) for at_s in times_s]
+    return np.array([table[a : max(b, a + 1), 1].mean() for a, b in edges])
+
+
+def _moments(imu: FlownImu, armed_s: float, ground: Sequence[Window], flown: Sequence[Window]) -> tuple[Moment, ...]:
+    """For plots: the windows, before the motors as long as in the air."""
+    rows = [[one.t_s, *one.gyro_rad_s, one.down_m_s2] for one in (*ground, *flown)]
+    per = max(1, math.ceil(len(flown) / _MOST_MOMENTS))
+    joined = [rows[k : k + _GROUND] for k in range(0, len(ground), _GROUND)]
+    joined += [rows[k : k + per] for k in range(len(ground), len(rows), per)]
+    means = [np.mean(each, axis=0) for each in joined]
+    times = [float(each[0]) for each in means]
+    degc, levels, ekf = _means(imu.degc, times), _means(imu.vibration, times), imu.estimated
+    found = []
+    for k, (at_s, x, y, z, down) in enumerate(np.round(means, 9).tolist()):
+        said = None
+        if ekf is not None and len(ekf.t_s) and ekf.t_s[0] <= at_s <= ekf.t_s[-1]:
+            columns = [*ekf.gyro_rad_s.T, ekf.accel_m_s2[:, 2]]
+            values = [round(float(np.interp(at_s, ekf.t_s, one)), 9) for one in columns]
+            said = (values[0], values[1], values[2], values[3]) if np.isfinite(values).all() else None
+        seen = (None if one is None else round(float(one[k]), 3) for one in (degc, levels))
+        found.append(Moment(round(at_s - armed_s, 1), (x, y, z, down), said, *seen))
+    return tuple(found)
 
 
 def _ekf(imu: FlownImu, in_air: tuple[float, float] | None) -> list[Term | None]:

@@ -10,10 +10,10 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
-import msgspec
 import numpy as np
 
 from companion.calibration.noise.robust import median
+from companion.calibration.records.flight_record import Drift
 from companion.physics.frames import Floats, rotations, running_products
 
 STEP_S: Final = 0.02
@@ -84,16 +84,6 @@ class Increments(NamedTuple):
         # What turns more has its force summed up in other axes.
         velocity = self.velocity + force_m_s2 * dt + 0.5 * np.cross(turned, self.velocity)
         return self._replace(angle=self.angle + turned, velocity=velocity)
-
-
-class Drift(msgspec.Struct, frozen=True):
-    """How far free inertial navigation is from the solution after a time."""
-
-    seconds: float
-    starts: int
-    median_m: float
-    worst_m: float
-    """In one start of twenty it is more."""
 
 
 def increments(t_s: Floats, readings: Floats, *, means: bool) -> Increments:

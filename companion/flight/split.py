@@ -11,10 +11,10 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-import msgspec
 import numpy as np
 
 from companion.calibration.noise.robust import median
+from companion.calibration.records.flight_record import AXES, Split, Term
 from companion.flight.inertial import Window
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, MG
@@ -37,33 +37,6 @@ _LEAST_SPREAD: Final = 0.15
 _LEAST_TREND_S: Final = 60.0
 
 
-class Term(msgspec.Struct, frozen=True):
-    """A part of a bias with one sigma; rad/s or m/s^2."""
-
-    value: float
-    sigma: float
-
-
-class Split(msgspec.Struct, frozen=True, kw_only=True):
-    """One axis of one IMU, over what the offsets in force left; None: the log does not carry it."""
-
-    axis: str
-    in_flight: Term | None
-    """Its mean in the air."""
-    ekf: Term | None
-    """As the EKF had it in the latter half of that."""
-    turn_on: Term | None
-    """Before the motors."""
-    temperature: Term | None
-    """From there to the mean in the air, by the learnt curve."""
-    motors: Term | None
-    """The step at their start: vibration rectification, and temperature where no curve is known."""
-    vibration: Term | None
-    """For each m/s^2 of vibration level."""
-    trend: Term | None
-    """A minute of flight."""
-
-
 def split(
     before: Sequence[Window],
     flight: Sequence[Window],
@@ -81,7 +54,7 @@ def split(
         ekf: by axis.
     """
     found = []
-    for k, axis in enumerate(("gyro x", "gyro y", "gyro z", "accel z")):
+    for k, axis in enumerate(AXES):
         ground, air = (np.array([_value(one, k) for one in each]) for each in (before, flight))
         end = _ATTITUDE_RAD[k] if k < 3 else _VELOCITY_M_S
         constant = 0.0 if k < 3 else _GRAVITY_M_S2

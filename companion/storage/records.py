@@ -16,7 +16,15 @@ from companion.calibration.collector.trace import Trace
 from companion.calibration.records.record import Record, from_json, to_json
 from companion.errors import StorageError
 from companion.storage.changes import ChangeSet
-from companion.storage.state import UNREADABLE, read_regular, remove_durably, sealed, unsealed, write_atomically
+from companion.storage.state import (
+    UNREADABLE,
+    numbers_in,
+    read_regular,
+    remove_durably,
+    sealed,
+    unsealed,
+    write_atomically,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +66,7 @@ class RecordStore:
         Raises:
             StorageError: the record could not be written; nothing is half written.
         """
-        numbers = self._numbers()
+        numbers = numbers_in(self._folder, _NAME)
         number = numbers[-1] + 1 if numbers else 1
         path, trace_path = self._path(number), self._trace_path(number)
         try:
@@ -75,7 +83,7 @@ class RecordStore:
             if old < kept[0]:
                 self._remove(self._path(old))
         with_trace = set(kept[-KEEP_TRACES:])
-        for old in self._numbers(_TRACE):
+        for old in numbers_in(self._folder, _TRACE):
             if old not in with_trace:
                 self._remove(self._trace_path(old))
         return path
@@ -86,7 +94,7 @@ class RecordStore:
         Raises:
             StorageError: the folder cannot be listed.
         """
-        for number in reversed(self._numbers()):
+        for number in reversed(numbers_in(self._folder, _NAME)):
             path = self._path(number)
             try:
                 yield Entry(number, path, from_json(unsealed(read_regular(path))))
@@ -169,15 +177,6 @@ class RecordStore:
 
     def _trace_path(self, number: int) -> Path:
         return self._folder / f"{number:06d}.trace.json.gz"
-
-    def _numbers(self, kind: re.Pattern[str] = _NAME) -> list[int]:
-        try:
-            names = [entry.name for entry in self._folder.iterdir()]
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise StorageError(f"{self._folder}: cannot be listed: {error.strerror}") from error
-        return sorted(int(match[1]) for match in map(kind.fullmatch, names) if match)
 
 
 def _unpacked(data: bytes) -> bytes:

@@ -109,6 +109,21 @@ def read_regular(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
     return data
 
 
+def numbers_in(folder: Path, kind: re.Pattern[str]) -> list[int]:
+    """The numbers in the names of a folder's files, ascending.
+
+    Raises:
+        StorageError: it cannot be listed.
+    """
+    try:
+        names = [entry.name for entry in folder.iterdir()]
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise StorageError(f"{folder}: cannot be listed: {error.strerror}") from error
+    return sorted(int(match[1]) for match in map(kind.fullmatch, names) if match)
+
+
 def _require_regular(found: os.stat_result) -> None:
     if not stat.S_ISREG(found.st_mode):
         raise OSError(errno.EINVAL, "not a regular file")

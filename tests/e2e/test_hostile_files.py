@@ -80,6 +80,7 @@ def test_it_starts_says_so_and_writes_nothing(
         "armings.json",
         "records",
         "records/000001.json",
+        "flights",
     ],
 )
 def test_nothing_else_in_the_storage_ends_or_hangs_the_start(tmp_path: Path, name: str) -> None:

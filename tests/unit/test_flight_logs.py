@@ -13,6 +13,7 @@ import pytest
 from companion.calibration.records.record import ImuRecord, Record, WrittenParameter
 from companion.cli import main as companion
 from companion.physics.units import DEG_H, MG
+from companion.storage.flights import FlightStore
 from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.records import RecordStore
 from tests.support.autopilot_files import write_ulog
@@ -123,7 +124,77 @@ def test_people_read_the_figure_that_counts(log: Path, tmp_path: Path, capsys: p
     assert "30 s without GNSS: " in out
     assert "accel x, y: not counted, a hover does not tell them from tilt\n" in out
     assert max(map(len, out.splitlines())) <= 100
-    assert out.splitlines()[-1].startswith("next flight: IMU 1 gyro x: ")
+    assert out.splitlines()[-2].startswith("next flight: IMU 1 gyro x: ")
+    assert out.splitlines()[-1].startswith("kept as flight 1")
+
+
+def test_a_flight_is_kept_once_however_often_and_in_whatever_file_it_is_read(
+    log: Path, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = storage(tmp_path)
+    _, answer = said(capsys, log, *folder)
+    assert answer["numbers"] == [1]
+    # Cut off in the air, under another name.
+    (tmp_path / "cut.bin").write_bytes(log.read_bytes()[: log.stat().st_size * 4 // 5])
+    assert said(capsys, tmp_path / "cut.bin", *folder)[1]["numbers"] == [1]
+    # Another start, as both firmwares count them in a parameter.
+    other = dataflash(tmp_path / "other.bin", messages(flown, parameters(STAT_BOOTCNT=8.0)))
+    assert said(capsys, other, *folder)[1]["numbers"] == [2]
+    assert [kept.log for kept in FlightStore(tmp_path).newest().values()] == ["other.bin", "cut.bin"]
+    # What never flew is told and not kept.
+    stood = dataflash(tmp_path / "stood.bin", messages(cut_off(flown, 66.0), parameters(STAT_BOOTCNT=9.0)))
+    code, answer = said(capsys, stood, *folder)
+    assert (code, len(answer["flights"]), answer["numbers"]) == (0, 1, [])
+
+
+def test_what_is_kept_of_a_flight_is_what_was_in_the_air(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said(capsys, log, *storage(tmp_path))
+    flight = FlightStore(tmp_path).read(1).flight
+    (imu,) = flight.imus
+    assert (imu.gyro_id, imu.accel_id) == (2752772, 2753028)
+    # Armed at 64 s, motors at 65 s; it flew from 67 s to 240 s.
+    ground = [one for one in imu.moments if one.after_arming_s < 1.0]
+    air = [one for one in imu.moments if one.after_arming_s > 5.0]
+    assert len(ground) + len(air) == len(imu.moments)
+    assert (len(ground), len(air)) == (3, 16)
+    for one in imu.moments:
+        for k, bias in enumerate(GYRO_DEG_H):
+            assert one.left[k] / DEG_H == pytest.approx(bias, abs=60.0)
+        assert one.degc == 40.0
+        assert one.ekf is None
+    for moments, level, accel_mg in ((ground[:2], 0.05, ACCEL_MG[2]), (air, 3.0, ACCEL_MG[2] + STEP_MG)):
+        for one in moments:
+            assert one.vibration_m_s2 == pytest.approx(level * np.sqrt(3.0), rel=0.01)
+            assert one.left[3] / MG == pytest.approx(accel_mg, abs=0.3)
+
+
+def test_a_flight_that_cannot_be_kept_is_told_all_the_same(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = storage(tmp_path)
+    (tmp_path / "flights").write_bytes(b"in the way")
+    code = companion(["flight", "--json", str(log), *folder])
+    out, err = capsys.readouterr()
+    assert (code, json.loads(out)["numbers"], len(json.loads(out)["flights"])) == (0, [], 1)
+    assert err == f"note: not kept: {tmp_path}/flights: cannot be listed: Not a directory\n"
+    # Where there is no companion, none is begun.
+    elsewhere = tmp_path / "elsewhere"
+    config = Path(folder[1])
+    config.write_text(config.read_text().replace(f'directory = "{tmp_path}"', f'directory = "{elsewhere}"'))
+    assert companion(["flight", "--json", str(log), *folder]) == 0
+    assert capsys.readouterr().err == f"note: not kept: there is no {elsewhere}\n"
+    assert not elsewhere.exists()
+
+
+def cut_off(flown: Flown, at_s: float) -> Flown:
+    readings, states = flown.t_s < at_s, flown.at_s < at_s
+    return dataclasses.replace(
+        flown, t_s=flown.t_s[readings], readings=flown.readings[readings], at_s=flown.at_s[states],
+        quaternions=flown.quaternions[states], velocity=flown.velocity[states], position=flown.position[states],
+        airborne_s=at_s, landed_s=at_s, disarmed_s=at_s,
+    )  # fmt: skip
 
 
 def test_a_log_too_long_for_memory_is_thinned_and_nobody_is_told_to_log_more(
@@ -298,7 +369,7 @@ def test_a_history_that_cannot_be_read_is_said_and_the_flight_told(
     assert companion(["flight", "--json", str(log), *storage(tmp_path)]) == 0
     heard = capsys.readouterr()
     assert heard.err == (
-        f"note: {tmp_path}/records: cannot be listed: Not a directory: looked at without the companion's history;"
-        " sudo may help\n"
+        f"note: {tmp_path}/records: cannot be listed: Not a directory: looked at without the companion's history,"
+        " and not kept; sudo may help\n"
     )
     assert json.loads(heard.out)["flights"][0]["imus"][0]["drift"]["flown"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator, Mapping, Sequence
 
 import msgspec
@@ -17,9 +18,12 @@ from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.offsets.subsystem import Offsets
+from companion.errors import StorageError
 from companion.formats import Object
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
+
+logger = logging.getLogger(__name__)
 
 
 class Arming(Subsystem):
@@ -77,7 +81,23 @@ class Arming(Subsystem):
             "records": [msgspec.to_builtins(record) for record in records],
             "armings": [msgspec.to_builtins(arming) for arming in armings[:limit]],
             "by_hand": self._by_hand.history()[:limit],
+            "flights": self._flights(limit),
         }
+
+    def _flights(self, limit: int | None) -> list[Object]:
+        """What `companion flight` has kept, without what only plots need."""
+        # What nobody asked for costs the start nothing.
+        from companion.storage.flights import FlightStore
+
+        try:
+            found = FlightStore(self._core.config.storage.path).newest(limit)
+        except StorageError as error:
+            logger.warning("%s", error)
+            return []
+        shown: list[Object] = [msgspec.to_builtins(kept) | {"number": number} for number, kept in found.items()]
+        for imu in (imu for each in shown for imu in each["flight"]["imus"]):
+            del imu["moments"]
+        return shown
 
 
 def shown_calibration(in_force: InForce, now_s: float) -> dict[str, object] | None:

@@ -1,0 +1,173 @@
+"""What a log of the autopilot says of a flight, as it is kept; SI units, over what the offsets in force left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+
+from companion.physics.units import DEG_H, MG
+
+FORMAT_VERSION: Final = 1
+AXES: Final = ("gyro x", "gyro y", "gyro z", "accel z")
+HEADS: Final = {
+    "in_flight": "in the air", "ekf": "EKF", "turn_on": "motors off", "temperature": "temperature", "motors": "motors",
+    "vibration": "per m/s^2", "trend": "a minute",
+}  # fmt: skip
+"""The terms of a `Split`, as tables name them."""
+UNSEEN: Final = "accel x, y: not counted, a hover does not tell them from tilt"
+_WORTH: Final = {"deg/h": 30.0, "mg": 1.5}
+"""Smaller findings are nobody's worry."""
+
+
+class Term(msgspec.Struct, frozen=True):
+    """A part of a bias with one sigma; rad/s or m/s^2."""
+
+    value: float
+    sigma: float
+
+
+class Split(msgspec.Struct, frozen=True, kw_only=True):
+    """One axis of one IMU, over what the offsets in force left; None: the log does not carry it."""
+
+    axis: str
+    in_flight: Term | None
+    """Its mean in the air."""
+    ekf: Term | None
+    """As the EKF had it in the latter half of that."""
+    turn_on: Term | None
+    """Before the motors."""
+    temperature: Term | None
+    """From there to the mean in the air, by the learnt curve."""
+    motors: Term | None
+    """The step at their start: vibration rectification, and temperature where no curve is known."""
+    vibration: Term | None
+    """For each m/s^2 of vibration level."""
+    trend: Term | None
+    """A minute of flight."""
+
+
+class Drift(msgspec.Struct, frozen=True):
+    """How far free inertial navigation is from the solution after a time."""
+
+    seconds: float
+    starts: int
+    median_m: float
+    worst_m: float
+    """In one start of twenty it is more."""
+
+
+class Stages(msgspec.Struct, frozen=True):
+    """Of a flight, in s of the autopilot's clock; None where the log does not tell."""
+
+    armed_s: float
+    motors_s: float | None
+    take_off_s: float | None
+    landing_s: float | None
+    disarmed_s: float | None
+
+
+class Moment(msgspec.Struct, frozen=True, array_like=True):
+    """Ten seconds of a flight, or some more of a long one; by axis as in `AXES`."""
+
+    after_arming_s: float
+    """Its middle."""
+    left: tuple[float, float, float, float]
+    """The bias less what the offsets in force take off."""
+    ekf: tuple[float, float, float, float] | None
+    """The same as the EKF had it."""
+    degc: float | None
+    vibration_m_s2: float | None
+
+
+class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU in one flight."""
+
+    imu: int
+    rate_hz: float
+    calibration: str | None
+    """`started_at` of the record whose offsets it flew with."""
+    gyro_id: int | None = None
+    accel_id: int | None = None
+    set_gyro_rad_s: tuple[float, ...] | None
+    set_accel_m_s2: tuple[float, ...] | None
+    """The offsets in force, in the IMU's own axes."""
+    axes: tuple[Split, ...]
+    drift: dict[str, list[Drift]]
+    """Without aid, by whose offsets: `flown`, `before`, those of files."""
+    moments: tuple[Moment, ...] = ()
+    notes: tuple[str, ...]
+
+
+class Flight(msgspec.Struct, frozen=True, kw_only=True):
+    """From an arming to the disarming after it."""
+
+    key: str
+    """Of this arming of this start of this autopilot, however often and from whichever file it is read."""
+    system_id: int | None
+    began_at: str | None
+    stages: Stages
+    reference: str
+    """What the drift is measured from: "ekf", or "truth" of a simulator."""
+    imus: tuple[ImuFlight, ...]
+    notes: tuple[str, ...]
+
+
+class KeptFlight(msgspec.Struct, frozen=True, kw_only=True):
+    """One file of the flights."""
+
+    log: str
+    """The name of the file it was read from."""
+    read_at: str
+    flight: Flight
+    format_version: int = FORMAT_VERSION
+
+
+def unit_of(axis: str) -> tuple[float, str, int]:
+    """In SI units, its name, and the digits that are worth saying."""
+    return (DEG_H, "deg/h", 0) if axis.startswith("gyro") else (MG, "mg", 1)
+
+
+def drift_lines(imu: ImuFlight) -> list[str]:
+    """The figure that counts, a line for each time."""
+    lines = []
+    for flown in imu.drift.get("flown", ()):
+        others = [
+            f"with the offsets of {name} {each.median_m:.1f} m"
+            for name, rows in imu.drift.items()
+            if name != "flown"
+            for each in rows
+            if each.seconds == flown.seconds
+        ]
+        own = f"{flown.median_m:.1f} m (95 %: {flown.worst_m:.1f} m, {flown.starts} starts)"
+        lines.append("; ".join([f"{flown.seconds:.0f} s without GNSS: {own}", *others]))
+    return lines
+
+
+def figure(imus: Sequence[ImuFlight]) -> str | None:
+    """The one line of a flight, of its first IMU and 30 s, else what is next to that; None where it did not fly."""
+    first = next((imu for imu in imus if imu.drift.get("flown")), None)
+    if first is None:
+        return None
+    rows = first.drift["flown"]
+    return drift_lines(first)[min(range(len(rows)), key=lambda k: abs(rows[k].seconds - 30.0))]
+
+
+def next_flight(found: Flight) -> str:
+    """The largest thing that is surely there."""
+    worst: tuple[float, str] = (0.0, "nothing to do: what the offsets left is small or not surely there")
+    for imu in found.imus:
+        for axis in imu.axes:
+            unit, name, digits = unit_of(axis.axis)
+            for term, what, remedy in (
+                (axis.motors, "of rectification at hover throttle", "its damping"),
+                (axis.turn_on, "before the motors", "calibrate nearer to the take-off"),
+            ):
+                if term is None or abs(term.value) < 2.0 * term.sigma:
+                    continue
+                size = abs(term.value) / unit / _WORTH[name]
+                if size > max(worst[0], 1.0):
+                    words = f"IMU {imu.imu} {axis.axis}: {abs(term.value) / unit:.{digits}f} {name} {what}: {remedy}"
+                    worst = size, words
+    return worst[1]

@@ -1,0 +1,73 @@
+"""Flights as `companion flight` keeps them, of made-up figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from companion.calibration.records.flight_record import (
+    AXES,
+    Drift,
+    Flight,
+    ImuFlight,
+    KeptFlight,
+    Moment,
+    Split,
+    Stages,
+    Term,
+)
+from companion.physics.units import DEG_H, MG
+
+UNITS = (DEG_H, DEG_H, DEG_H, MG)
+LEFT = (12.0, -30.0, 8.0, 0.5)
+"""Before the motors; deg/h and mg."""
+STEP = (-5.0, 4.0, 30.0, 5.1)
+DRIFTS = {"flown": (0.4, 2.1, 9.5), "before": (6.0, 31.0, 160.0)}
+
+
+def imu_flight(number: int = 1, *, drifts: Mapping[str, tuple[float, ...]] = DRIFTS, minutes: float = 3.0) -> ImuFlight:
+    """One that stood for 30 s and then flew."""
+    count = round(minutes * 6.0)
+    moments = tuple(
+        Moment(
+            10.0 * k + 5.0,
+            tuple(
+                (left + step * (k >= 0) + math.sin(k)) * unit
+                for left, step, unit in zip(LEFT, STEP, UNITS, strict=True)
+            ),  # type: ignore[arg-type]
+            tuple(0.8 * (left + step) * unit for left, step, unit in zip(LEFT, STEP, UNITS, strict=True)),  # type: ignore[arg-type]
+            36.0 + 0.2 * k,
+            0.1 if k < 0 else 3.0 + 0.1 * math.cos(k),
+        )
+        for k in range(-3, count)
+    )
+    axes = tuple(
+        Split(
+            axis=axis,
+            in_flight=Term((left + step) * unit, 0.6 * unit if axis == "accel z" else 12.0 * unit),
+            ekf=Term(0.8 * (left + step) * unit, unit),
+            turn_on=Term(left * unit, 0.3 * unit if axis == "accel z" else 4.0 * unit),
+            temperature=None,
+            motors=Term(step * unit, 0.6 * unit if axis == "accel z" else 12.0 * unit),
+            vibration=None,
+            trend=Term(0.1 * unit, 0.5 * unit),
+        )
+        for axis, left, step, unit in zip(AXES, LEFT, STEP, UNITS, strict=True)
+    )
+    drift = {
+        name: [Drift(seconds, 150, m, 2.4 * m) for seconds, m in zip((10.0, 30.0, 60.0), each, strict=False)]
+        for name, each in drifts.items()
+    }
+    return ImuFlight(
+        imu=number, rate_hz=400.0, calibration="2026-11-23T06:12:13.000+00:00", gyro_id=2752772, accel_id=2753028,
+        set_gyro_rad_s=(0.001,) * 3, set_accel_m_s2=(0.02,) * 3, axes=axes, drift=drift, moments=moments, notes=(),
+    )  # fmt: skip
+
+
+def kept_flight(key: str = "1", *imus: ImuFlight, began_at: str | None = "2026-11-23T08:00:46+00:00") -> KeptFlight:
+    """One of an aircraft with one IMU."""
+    stages = Stages(64.0, 65.0, 67.0, 240.0, 242.0)
+    flight = Flight(
+        key=key, system_id=1, began_at=began_at, stages=stages, reference="ekf", imus=imus or (imu_flight(),), notes=()
+    )  # fmt: skip
+    return KeptFlight(log="00000012.BIN", read_at="2026-11-23T09:10:11+00:00", flight=flight)

@@ -1,0 +1,82 @@
+"""The flights on disk."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from companion.cli.show import history_lines
+from companion.errors import StorageError
+from companion.storage import flights
+from companion.storage.flights import FlightStore
+from tests.support.flights import imu_flight, kept_flight
+
+
+def test_a_flight_comes_back_as_it_was_and_the_service_may_read_it(tmp_path: Path) -> None:
+    store, kept = FlightStore(tmp_path), kept_flight()
+    assert store.newest() == {}
+    assert store.save(kept) == 1
+    assert store.read(1) == kept
+    assert stat.S_IMODE((tmp_path / "flights/000001.json").stat().st_mode) == 0o644
+
+
+def test_the_same_flight_read_again_stays_one_with_the_later_reading(tmp_path: Path) -> None:
+    store = FlightStore(tmp_path)
+    assert [store.save(kept_flight(key)) for key in ("a", "b")] == [1, 2]
+    again = msgspec.structs.replace(kept_flight("a"), log="again.bin")
+    assert store.save(again) == 1
+    assert list(store.newest()) == [2, 1]
+    assert store.read(1).log == "again.bin"
+
+
+def test_the_oldest_makes_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flights, "KEEP", 3)
+    store = FlightStore(tmp_path)
+    assert [store.save(kept_flight(str(k))) for k in range(5)] == [1, 2, 3, 4, 5]
+    assert list(store.newest()) == [5, 4, 3]
+    # A number is not given twice, and one that is read again costs none.
+    assert store.save(kept_flight("3")) == 4
+    assert list(store.newest()) == [5, 4, 3]
+    assert list(store.newest(2)) == [5, 4]
+
+
+def test_a_damaged_one_is_passed_over_with_a_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store = FlightStore(tmp_path)
+    for k in range(3):
+        store.save(kept_flight(str(k)))
+    path = tmp_path / "flights/000002.json"
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b"400.0", b"401.0"))
+    assert list(store.newest()) == [3, 1]
+    assert caplog.messages == [
+        f"{path}: not a readable flight: its checksum does not fit: damaged, or changed by hand, passed over"
+    ]
+    for content in (b"", b"{}", data[: len(data) // 2], b"[" * 100_000):
+        path.write_bytes(content)
+        with pytest.raises(StorageError, match="not a readable flight"):
+            store.read(2)
+    with pytest.raises(StorageError, match="cannot be read: No such file"):
+        store.read(7)
+
+
+def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
+    imu = imu_flight(drifts={"flown": (0.4, float("nan"))})
+    with pytest.raises(StorageError, match="not written"):
+        FlightStore(tmp_path).save(kept_flight("1", imu))
+    assert not (tmp_path / "flights").exists()
+
+
+def test_the_history_tells_the_figure_of_each(tmp_path: Path) -> None:
+    told = [
+        {"number": 12, **msgspec.to_builtins(kept_flight())},
+        {"number": 3, **msgspec.to_builtins(kept_flight("2", imu_flight(drifts={"flown": (0.4,)}), began_at=None))},
+    ]
+    at_30_s = "30 s without GNSS: 2.1 m (95 %: 5.0 m, 150 starts)"
+    assert history_lines([], [], [], [], told)[1:] == [
+        " no. flown (UTC)          what its log says",
+        f"  12 2026-11-23T08:00:46  {at_30_s}; with the offsets of before 31.0 m",
+        "   3 time unknown         10 s without GNSS: 0.4 m (95 %: 1.0 m, 150 starts)",
+    ]
