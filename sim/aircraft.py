@@ -16,6 +16,8 @@ import numpy as np
 from sim.earth import Array, angles_of, body_from_ned, earth_rate_ned_rad_s, normal_gravity_m_s2
 from sim.motions import Motion
 
+_EARTH_M_PER_DEG = 111_320.0
+
 
 @dataclass(frozen=True, slots=True)
 class Pose:
@@ -52,6 +54,16 @@ class Site:
     def gravity_m_s2(self) -> float:
         """Local normal gravity."""
         return normal_gravity_m_s2(self.latitude_deg, self.height_m)
+
+    def north_east_m(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+        """Where a place some hundred metres away is from here."""
+        east_deg = (longitude_deg - self.longitude_deg) * math.cos(math.radians(self.latitude_deg))
+        return (latitude_deg - self.latitude_deg) * _EARTH_M_PER_DEG, east_deg * _EARTH_M_PER_DEG
+
+    def place_deg(self, north_m: float, east_m: float) -> tuple[float, float]:
+        """Latitude and longitude of a place some hundred metres away."""
+        east_deg = east_m / _EARTH_M_PER_DEG / math.cos(math.radians(self.latitude_deg))
+        return self.latitude_deg + north_m / _EARTH_M_PER_DEG, self.longitude_deg + east_deg
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,8 +26,8 @@ RIDER_PORT = 9012
 """Where a SITL that is told of one slave waits for it (SIM_JSON_Master.cpp); it cannot be told another."""
 SERVO_MAGIC = 18458
 _SILENT_S = 0.1
-COPTER_MODES = {"guided": 4, "hold": 5}
-PLANE_MODES = {"takeoff": 13, "hold": 12}
+COPTER_MODES = {"guided": 4, "hold": 5, "mission": 3}
+PLANE_MODES = {"takeoff": 13, "hold": 12, "mission": 10}
 STICKS_S = 0.2
 LOWEST_US, MIDDLE_US = 1000, 1500
 
@@ -115,10 +115,12 @@ PLANE = {
     "RLL2SRV_RMAX": 90.0, "RLL2SRV_TCONST": 0.25, "RLL_RATE_D": 0.01743, "RLL_RATE_FF": 0.237212, "RLL_RATE_I": 0.25,
     "RLL_RATE_P": 0.3, "PTCH2SRV_RMAX_DN": 90.0, "PTCH2SRV_RMAX_UP": 90.0, "PTCH2SRV_TCONST": 0.25,
     "PTCH_RATE_D": 0.007265, "PTCH_RATE_FF": 0.595723, "PTCH_RATE_I": 0.11, "PTCH_RATE_P": 0.15,
-    "TKOFF_ALT": 60.0, "THR_FAILSAFE": 0.0,
+    "TKOFF_ALT": 60.0, "THR_FAILSAFE": 0.0, "SIM_WIND_T": 0.0, "SIM_WIND_T_ALT": 40.0,
 }  # fmt: skip
-"""The tuning of SITL's plane (Tools/autotest/models/plane.parm)."""
+"""The tuning of SITL's plane (Tools/autotest/models/plane.parm), in a wind that grows with the height from none at the
+ground: on its wheels, which have no friction, it would turn in any."""
 COPTER = {
+    "SIM_WIND_T": 1.0,
     "FRAME_CLASS": 1.0, "FRAME_TYPE": 0.0, "FS_THR_ENABLE": 0.0, "FS_GCS_ENABLE": 0.0, "MOT_THST_HOVER": 0.39,
     "ATC_RAT_YAW_P": 0.3, "ATC_RAT_YAW_I": 0.02, "DISARM_DELAY": 0.0,
 }  # fmt: skip
@@ -131,7 +133,6 @@ def flying_parameters(scenario: Scenario, wind: tuple[float, float]) -> dict[str
         "SIM_WIND_SPD": wind[0],
         "SIM_WIND_DIR": wind[1],
         "SIM_WIND_TURB": 1.0 if wind[0] else 0.0,
-        "SIM_WIND_T": 1.0,
         "SIM_DRIFT_SPEED": 0.0,
         "INS_GYR_CAL": 0.0,
         "SCR_ENABLE": 1.0,
@@ -181,7 +182,7 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
         super().__init__(scenario, folder)
         self._binary = check_binary(binary)
         self.is_plane = "plane" in self._binary.name
-        self._modes = PLANE_MODES if self.is_plane else COPTER_MODES
+        self.modes = PLANE_MODES if self.is_plane else COPTER_MODES
         self._parameters = (
             flying_parameters(scenario, wind) | (PLANE if self.is_plane else COPTER) | dict(parameters or {})
         )
@@ -221,19 +222,8 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
         if not self.is_plane:
             await ground.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height_m)
         await ground.wait_for(lambda: self.height_m > 0.95 * height_m, 40.0, "take-off")
-
-    async def mode(self, ground: GroundStation, name: str) -> None:
-        """Change its mode, and wait until it says so.
-
-        Raises:
-            TimeoutError: it does not.
-        """
-        number = self._modes[name]
-        since_s = asyncio.get_running_loop().time()
-        await ground.command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, number)
-        await ground.wait_for(
-            lambda: any(beat.custom_mode == number for beat in ground.vehicle_heartbeats(since_s)), 5.0, f"mode {name}"
-        )
+        self.sticks_us[2] = MIDDLE_US
+        await asyncio.sleep(2.0 * STICKS_S)
 
     async def lie_with_own_compass(self, ground: GroundStation) -> None:
         """All its compasses are turned by 45 deg, as of now."""
@@ -241,9 +231,17 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
 
     async def hold(self, ground: GroundStation) -> None:
         """Loiter, sticks in the middle: a plane circles."""
-        self.sticks_us[2] = MIDDLE_US
-        await asyncio.sleep(2.0 * STICKS_S)
         await self.mode(ground, "hold")
+        if self.is_plane:
+            await ground.stream(mavlink.MAVLINK_MSG_ID_POSITION_TARGET_GLOBAL_INT, 1.0)
+
+    def circle(self, ground: GroundStation) -> tuple[float, float, float] | None:
+        """About the waypoint that a plane says it loiters at."""
+        targets = ground.all(mavlink.MAVLink_position_target_global_int_message) if self.is_plane else []
+        if not targets:
+            return None
+        north_m, east_m = self.aircraft.site.north_east_m(targets[-1].lat_int * 1e-7, targets[-1].lon_int * 1e-7)
+        return north_m, east_m, PLANE["WP_LOITER_RAD"]
 
     async def steer(self, ground: GroundStation) -> None:
         """Sends the sticks until cancelled."""

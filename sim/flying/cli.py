@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import math
+import itertools
 import random
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from sim.flying.faults import FAULTS
 from sim.flying.flight import SET_UPS, WATCHED_S, Plan, SetUp, flying
-from sim.flying.verdict import HEADER, Figures, Record, figures, row
+from sim.flying.verdict import HEADER, Figures, Record, figures, row, summary
 from sim.sitl.process import BinaryError
 
 HELP = "A real firmware flies with our heading, and something fails: the largest errors, as a table."
@@ -39,6 +40,11 @@ def parser() -> argparse.ArgumentParser:
     )
     command.add_argument("--seed", type=int, default=0, help="of wind, heading and noise (default 0)")
     command.add_argument(
+        "--flights", type=int, default=1, metavar="N",
+        help="so many of each, with seeds from that one on; a last line has the largest figures (default 1)",
+    )  # fmt: skip
+    command.add_argument("--mission", action="store_true", help="round a mission of waypoints, in the place of Loiter")
+    command.add_argument(
         "--watch", type=float, default=WATCHED_S, metavar="SECONDS",
         help=f"how long it flies on after the fault (default {WATCHED_S:g})",
     )  # fmt: skip
@@ -48,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def plans_of(arguments: argparse.Namespace) -> list[Plan]:
-    """What the options ask for; each flight has a wind of its own.
+    """What the options ask for, the flights of one fault and set-up together; each seed has a wind of its own.
 
     Raises:
         BinaryError: that firmware cannot do it.
@@ -60,18 +66,18 @@ def plans_of(arguments: argparse.Namespace) -> list[Plan]:
     if px4 and "own-compass" in arguments.fault:
         raise BinaryError("--fault own-compass: the compass of PX4's simulation cannot be turned; ArduPilot's can")
     able = [fault for fault in FAULTS if not px4 or fault != "own-compass"]
-    for number, fault in enumerate(arguments.fault or able):
-        dice = random.Random(arguments.seed + 1000 * number)
+    set_ups: list[SetUp] = ["px4"] if px4 else arguments.set_up or ["script"]
+    seeds = range(arguments.seed, arguments.seed + arguments.flights)
+    for fault, set_up, seed in itertools.product(arguments.fault or able, set_ups, seeds):
+        dice = random.Random(f"{fault} {seed}")
         wind = (round(dice.uniform(3.0, 8.0), 1), round(dice.uniform(0.0, 360.0)))
         heading_deg = float(round(dice.uniform(0.0, 360.0)))
-        set_ups: list[SetUp] = ["px4"] if px4 else arguments.set_up or ["script"]
-        for set_up in set_ups:
-            plans.append(
-                Plan(
-                    arguments.binary, fault, set_up, tuple(arguments.wind or wind), heading_deg,
-                    arguments.seed, arguments.watch,
-                )
-            )  # fmt: skip
+        plans.append(
+            Plan(
+                arguments.binary, fault, set_up, tuple(arguments.wind or wind), heading_deg,
+                seed, arguments.watch, arguments.mission,
+            )
+        )  # fmt: skip
     return plans
 
 
@@ -96,21 +102,29 @@ def main(argv: Sequence[str]) -> int:
         plans = plans_of(arguments)
     except BinaryError as error:
         command.error(str(error))
-    folder = arguments.dir or Path(tempfile.mkdtemp(prefix="companion-flights-"))
+    folder = (arguments.dir or Path(tempfile.mkdtemp(prefix="companion-flights-"))).absolute()
     worst = 0
     print(HEADER, flush=True)
-    for plan in plans:
-        try:
-            record, found = asyncio.run(fly(plan, folder.absolute() / f"{plan.fault}-{plan.set_up}-{plan.seed}"))
-        except (BinaryError, RuntimeError, TimeoutError, OSError, KeyError, ValueError) as error:
-            print(f"{plan.fault:16}{plan.set_up:9}did not come about: {error}", file=sys.stderr, flush=True)
-            worst = 2
-            continue
-        print(row(record, found), flush=True)
-        worst = max(worst, bool(found.wrong))
-        if arguments.words:
-            for event in record.events:
-                if event.own_s > record.struck_s - 5.0 and math.isfinite(record.struck_s):
-                    print(f"  {event.own_s - record.struck_s:+6.1f} s  {event.kind}: {event.words}", flush=True)
+    for (fault, set_up), same in itertools.groupby(plans, lambda plan: (plan.fault, plan.set_up)):
+        flights = [flown(plan, folder, words=arguments.words) for plan in same]
+        if len(flights) > 1:
+            print(summary(fault, set_up, flights), flush=True)
+        worst = max(worst, *(2 if found is None else bool(found.wrong) for found in flights))
     print(f"Records, logs and the firmware's files: {folder}", file=sys.stderr)
     return worst
+
+
+def flown(plan: Plan, folder: Path, *, words: bool) -> Figures | None:
+    """One flight, with its line of the table; None if it did not come about, which is said."""
+    plan = replace(plan, stored=folder / f"set-up-{plan.set_up}")
+    try:
+        record, found = asyncio.run(fly(plan, folder / f"{plan.fault}-{plan.set_up}-{plan.seed}"))
+    except (BinaryError, RuntimeError, TimeoutError, OSError, KeyError, ValueError) as error:
+        print(f"{plan.fault:16}{plan.set_up:9}did not come about: {error}", file=sys.stderr, flush=True)
+        return None
+    print(row(record, found), flush=True)
+    if words:
+        for event in record.events:
+            if event.own_s > record.struck_s - 5.0:
+                print(f"  {event.own_s - record.struck_s:+6.1f} s  {event.kind}: {event.words}", flush=True)
+    return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import shutil
 import signal
 from collections.abc import AsyncIterator, Callable, Coroutine
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from sim.devices import SerialDevice
 from sim.earth import Array
 from sim.flying.ardupilot import FlyingArduPilot
 from sim.flying.faults import FAULTS
+from sim.flying.mission import CORNERS_M, upload
 from sim.flying.px4 import FlyingPx4
 from sim.flying.truth import FlyingAircraft
 from sim.flying.vehicle import FlyingVehicle
@@ -46,8 +48,12 @@ STORED_S = 3.0
 """By then PX4 has stored what was written."""
 RESTARTED_S = 6.0
 HEIGHT_M = 10.0
-PLANE_HEIGHT_M = 50.0
+PLANE_HEIGHT_M = 60.0
+PLANE_LEGS = 8.0
+"""A plane's mission is so many times as large."""
 SETTLED_S = 6.0
+PLANE_SETTLED_S = 35.0
+"""By then it is on its circle."""
 WATCHED_S = 35.0
 TURNS_AFTER_S, TURN_DEG = 12.0, 120.0
 """The pilot turns it about, with the fault in force."""
@@ -65,6 +71,10 @@ class Plan:
     heading_deg: float = 40.0
     seed: int = 0
     watched_s: float = WATCHED_S
+    mission: bool = False
+    """It flies a mission, and does not hold its place."""
+    stored: Path | None = None
+    """What an autopilot that is set up has stored: taken from this folder if it is there, else put there."""
 
 
 class Flight:
@@ -74,7 +84,7 @@ class Flight:
         self, plan: Plan, vehicle: FlyingVehicle, ground: GroundStation, link: LossyLink, folder: Path
     ) -> None:
         self.plan, self.vehicle, self.ground, self.link, self.folder = plan, vehicle, ground, link, folder
-        self.record = Record(plan.fault, plan.set_up, plan.wind, hold=not vehicle.is_plane)
+        self.record = Record(plan.fault, plan.set_up, plan.wind, hold=not plan.mission)
         self._since_s = 0.0
         self._asked_modes = 0
         self._background: list[asyncio.Task[None]] = []
@@ -127,22 +137,32 @@ class Flight:
     async def set_up(self) -> None:
         """As `companion autopilot-setup` says, from a ground station, and a restart of the autopilot.
 
+        Nothing is to be done to one that has stored it already.
+
         Raises:
             RuntimeError: the companion is not content.
         """
-        shown = await self.ask("autopilot-setup")
-        wanted = {row["parameter"]: row["wanted"] for row in shown["parameters"] if row["wanted"] is not None}
+        shown, stored = await self.ask("autopilot-setup"), self.plan.stored
         only_one = self.plan.set_up == "today"
-        await self.ground.put_all({n: value for n, value in wanted.items() if not (only_one and "SRC2" in n)})
-        await self.vehicle.sleep(STORED_S)
-        await self.vehicle.power_cycle()
-        self._since_s = asyncio.get_running_loop().time()
-        await self.vehicle.sleep(RESTARTED_S)
-        shown = await self.ask("autopilot-setup")
-        if shown["state"] != ("not applied" if only_one else "applied"):
+        content = "not applied" if only_one else "applied"
+        if stored is None or not stored.exists():
+            wanted = {row["parameter"]: row["wanted"] for row in shown["parameters"] if row["wanted"] is not None}
+            await self.ground.put_all({n: value for n, value in wanted.items() if not (only_one and "SRC2" in n)})
+            if self.plan.set_up == "script":
+                await self.ground.put("CMPG_ENABLE", 0.0)  # its other half, the gate, is not what flies here
+            await self.vehicle.sleep(STORED_S)
+            await self.vehicle.power_off()
+            if stored is not None:
+                stored.mkdir(parents=True)
+                for name in self.vehicle.stored:
+                    if (self.vehicle.folder / name).exists():
+                        shutil.copy(self.vehicle.folder / name, stored)
+            await self.vehicle.power_on()
+            self._since_s = asyncio.get_running_loop().time()
+            await self.vehicle.sleep(RESTARTED_S)
+            shown = await self.ask("autopilot-setup")
+        if shown["state"] != content:
             raise RuntimeError(f"autopilot-setup: {shown}")
-        if self.plan.set_up == "script":
-            await self.ground.put("CMPG_ENABLE", 0.0)  # its other half, the gate, is not what flies here
 
     async def calibrate(self) -> None:
         """Calibrate, and wait until the heading is pushed.
@@ -172,13 +192,22 @@ class Flight:
         vehicle, ground, record = self.vehicle, self.ground, self.record
         await vehicle.ask_streams(ground)
         self.in_background(vehicle.steer(ground))
-        await vehicle.take_off(ground, PLANE_HEIGHT_M if vehicle.is_plane else HEIGHT_M)
-        await vehicle.hold(ground)
-        await vehicle.sleep(SETTLED_S)
+        height_m = PLANE_HEIGHT_M if vehicle.is_plane else HEIGHT_M
+        await vehicle.take_off(ground, height_m)
+        if self.plan.mission:
+            scale = PLANE_LEGS if vehicle.is_plane else 1.0
+            corners_m = [(scale * north_m, scale * east_m) for north_m, east_m in CORNERS_M]
+            await upload(ground, vehicle.aircraft.site, height_m, corners_m)
+            await vehicle.mode(ground, "mission")
+        else:
+            await vehicle.hold(ground)
+        await vehicle.sleep(PLANE_SETTLED_S if vehicle.is_plane else SETTLED_S)
+        record.circle = None if self.plan.mission else vehicle.circle(ground)
         record.struck_s = vehicle.truth.own_s
         await FAULTS[self.plan.fault].strike(self)
         await vehicle.sleep(TURNS_AFTER_S)
-        await vehicle.turn(TURN_DEG)
+        if not self.plan.mission:
+            await vehicle.turn(TURN_DEG)
         await vehicle.sleep(self.plan.watched_s - TURNS_AFTER_S)
         self._take_down()
         np.savez(self.folder / "record.npz", truth=record.truth, estimate=record.estimate, place=record.place)
@@ -197,7 +226,9 @@ class Flight:
         places = ground.all(mavlink.MAVLink_local_position_ned_message, since_s=self._since_s)
         record.place = np.array([(m.time_boot_ms * 1e-3, m.x, m.y, m.z) for m in places])
         arrived = np.array([t_s for t_s, _ in attitudes])
-        record.events = list(events_of(ground, self._since_s, lambda t_s: _at(t_s, arrived, record.estimate[:, 0])))
+        record.events = events_of(ground, self._since_s, lambda t_s: _at(t_s, arrived, record.estimate[:, 0]))
+        record.events += self.vehicle.source_changes()
+        record.events.sort()
 
 
 def _at(t_s: float, arrived: Array, own: Array) -> float:
@@ -241,6 +272,8 @@ async def flying(plan: Plan, folder: Path, unix_s: float) -> AsyncIterator[Fligh
     here.mkdir(parents=True)
     firmware, near_port, more = folder / "firmware", None, MORE
     px4 = None
+    if plan.stored is not None and plan.stored.exists():
+        shutil.copytree(plan.stored, firmware)
     if plan.set_up == "px4":
         px4 = FlyingPx4(plan.binary, scenario, firmware, wind=plan.wind, seed=plan.seed)
         near_port, more = px4.companion_port, MORE.replace("[push]", "[push]\nparameters = false")

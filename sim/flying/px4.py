@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import math
 import random
+import re
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -14,9 +15,11 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import Rotation
 
+from sim.aircraft import Site
 from sim.earth import STANDARD_GRAVITY_M_S2
 from sim.flying.truth import FlyingAircraft, State
 from sim.flying.vehicle import FlyingVehicle
+from sim.flying.verdict import Event
 from sim.imu_model import Bias
 from sim.scenario import Scenario
 from sim.sitl.ground import GroundStation
@@ -26,8 +29,9 @@ from sim.sitl.px4 import MEASURING_PARAMETERS, UDP_COMPANION, UDP_GROUND_LOCAL, 
 from sim.udp import open_udp
 
 MODEL = "sihsim_quadx"
-HOLD = 4, 3
-"""Main and sub mode: AUTO, LOITER."""
+MAGNETOMETER = {"cs_mag_hdg", "cs_mag_3d"}
+AUTO, LOITER, MISSION = 4, 3, 4
+"""A main mode, and two of its sub modes."""
 _UDP_TRUTH = 19410
 TRUTH_HZ = 250.0
 ASKED_EVERY_S = 1.0
@@ -38,7 +42,6 @@ GUST_SHARE = 0.1
 TURNED_S = 4.0
 FORCE_OVER = 25
 """Steps over which velocities, told in whole cm/s, are compared."""
-_EARTH_M_PER_DEG = 111_320.0
 
 
 class Truth:
@@ -94,12 +97,26 @@ class Truth:
         pushed = (last - first)[1:] / max(last[0] - first[0], 1e-3) - (0.0, 0.0, STANDARD_GRAVITY_M_S2)
         here = told.lat * 1e-7, told.lon * 1e-7, told.alt * 1e-3
         self._start = start = self._start or here
-        north = (here[0] - start[0]) * _EARTH_M_PER_DEG
-        east = (here[1] - start[1]) * _EARTH_M_PER_DEG * math.cos(math.radians(start[0]))
+        north, east = Site(*start).north_east_m(*here[:2])
         return State(
             own_s, (w, x, y, z), tuple(rate), tuple(turn.inv().apply(pushed)),
             (north, east, start[2] - here[2]), velocity,
         )  # fmt: skip
+
+
+def source_changes(flags: str) -> list[Event]:
+    """From what `listener estimator_status_flags` prints: changes between "1", a heading that is sent, and "2"."""
+    found, source = list[Event](), ""
+    for printed in flags.split("TOPIC:")[1:]:
+        own_s = re.search(r"timestamp: (\d+)", printed)
+        on = set(re.findall(r"(cs_\w+): True", printed))
+        now = "1" if "cs_ev_yaw" in on else "2" if on & MAGNETOMETER else ""
+        if own_s is None or not now or now == source:
+            continue
+        if source:
+            found.append(Event(int(own_s[1]) * 1e-6, "set", now))
+        source = now
+    return found
 
 
 class FlyingPx4(FlyingVehicle):
@@ -123,6 +140,7 @@ class FlyingPx4(FlyingVehicle):
     ) -> None:
         super().__init__(scenario, folder)
         self._binary = check_binary(binary)
+        self.modes = {"hold": AUTO << 16 | LOITER << 24, "mission": AUTO << 16 | MISSION << 24}
         self.instance = free_instance()
         self.system_id = self.instance + 1
         from_rad = math.radians(wind[1])
@@ -130,6 +148,7 @@ class FlyingPx4(FlyingVehicle):
         self._gust_m_s, self._dice = GUST_SHARE * wind[0], random.Random(seed)
         self._told = Truth(self.truth, self.system_id)
         self._ground: GroundStation | None = None
+        self._flags = self.folder / "flags.txt"
         self.sticks_us = []
 
     @property
@@ -197,6 +216,31 @@ class FlyingPx4(FlyingVehicle):
         await self.arm(ground)
         await ground.wait_for(lambda: self.height_m > 0.9 * height_m, 60.0, "take-off")
 
+    def mode_parameters(self, number: int) -> tuple[float, ...]:
+        """Main and sub mode."""
+        return number >> 16 & 0xFF, number >> 24
+
+    async def ask_streams(self, ground: GroundStation) -> None:
+        """Besides, its estimator's flags on its console: each change of them, with its time."""
+        await super().ask_streams(ground)
+        with self._flags.open("wb") as flags:
+            listener = await asyncio.create_subprocess_exec(
+                str(self._binary.with_name("px4-listener")), "--instance", str(self.instance),
+                "estimator_status_flags", "-i", "0", "-n", "1000000",
+                stdin=asyncio.subprocess.DEVNULL, stdout=flags,
+            )  # fmt: skip
+
+        async def end() -> None:
+            with contextlib.suppress(ProcessLookupError):
+                listener.terminate()
+            await listener.wait()
+
+        self._stack.push_async_callback(end)
+
+    def source_changes(self) -> list[Event]:
+        """By the estimator's flags: "1" is the heading that it is sent, "2" its magnetometer."""
+        return source_changes(self._flags.read_text(errors="replace"))
+
     async def hold(self, ground: GroundStation) -> None:
         """It holds by itself once it is up.
 
@@ -204,10 +248,10 @@ class FlyingPx4(FlyingVehicle):
             TimeoutError: it does not.
         """
         since_s = asyncio.get_running_loop().time()
-        wanted = HOLD[1] << 24 | HOLD[0] << 16
         await ground.wait_for(
-            lambda: any(beat.custom_mode == wanted for beat in ground.vehicle_heartbeats(since_s)), 30.0, "Hold"
-        )
+            lambda: any(beat.custom_mode == self.modes["hold"] for beat in ground.vehicle_heartbeats(since_s)),
+            30.0, "Hold",
+        )  # fmt: skip
 
     async def turn(self, degrees: float) -> None:
         """Told to turn clockwise on its spot."""

@@ -6,11 +6,13 @@ import asyncio
 import contextlib
 import math
 from abc import abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.flying.truth import FlyingAircraft
+from sim.flying.verdict import Event
 from sim.imu_model import Bias
 from sim.scenario import Scenario
 from sim.sitl.ground import GroundStation
@@ -28,6 +30,8 @@ class FlyingVehicle(FirmwareVehicle):
     """Roll, pitch, throttle, yaw."""
     is_plane = False
     """It circles where others stay."""
+    modes: Mapping[str, int]
+    """Custom modes by what they are for: hold, mission."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         super().__init__(scenario, folder)
@@ -74,6 +78,33 @@ class FlyingVehicle(FirmwareVehicle):
         Raises:
             TimeoutError: it does not; with what it says.
         """
+
+    async def mode(self, ground: GroundStation, name: str) -> None:
+        """Change its mode, and wait until it says so.
+
+        Raises:
+            TimeoutError: it does not.
+        """
+        number = self.modes[name]
+        since_s = asyncio.get_running_loop().time()
+        await ground.command(
+            mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, *self.mode_parameters(number)
+        )
+        await ground.wait_for(
+            lambda: any(beat.custom_mode == number for beat in ground.vehicle_heartbeats(since_s)), 5.0, f"mode {name}"
+        )
+
+    def mode_parameters(self, number: int) -> tuple[float, ...]:
+        """A custom mode in the parameters of MAV_CMD_DO_SET_MODE."""
+        return (number,)
+
+    def source_changes(self) -> list[Event]:
+        """What heading its estimator used, and since when, where it does not say so in words."""
+        return []
+
+    def circle(self, ground: GroundStation) -> tuple[float, float, float] | None:
+        """The circle it is to fly, in m: north and east of the start, and the radius; None where it is to stay."""
+        return None
 
     @abstractmethod
     async def lie_with_own_compass(self, ground: GroundStation) -> None:

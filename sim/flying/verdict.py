@@ -6,7 +6,9 @@ Pure; times are on the firmware's clock, in seconds.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -19,6 +21,8 @@ TILT_LIMIT_DEG = 70.0
 """Beyond it an aircraft that hovers is falling."""
 LOW_M = 1.0
 """Below it the flight is over."""
+BEFORE_S = 10.0
+"""What is compared with how it was before the fault is compared with so many seconds."""
 SETTLED_S = 1.0
 """What the estimate is off by, in place, is taken over so long before the fault."""
 HEADER = f"{'fault':16}{'set-up':9}{'wind':>12}{'yaw':>7}{'set 2 after':>13}{'off truth':>11}{'off spot':>10}  verdict"
@@ -50,7 +54,9 @@ class Record:
     struck_s: float = math.inf
     """When the fault happened."""
     hold: bool = True
-    """Whether it is to stay on its spot."""
+    """Whether it is to stay on its spot, or on its circle."""
+    circle: tuple[float, float, float] | None = None
+    """Where it is to be, if not on its spot: north and east of the middle, and the radius, in m."""
 
     def after(self, kind: str) -> list[Event]:
         """Events of a kind after the fault."""
@@ -70,7 +76,8 @@ class Figures:
     estimate_m: float
     """Largest horizontal error of the estimated place, less what it was before."""
     spot_m: float
-    """Largest horizontal distance from where the aircraft truly was at the fault; nan where it is not to stay."""
+    """Largest true horizontal distance from where it was at the fault, or from the circle that it is to fly: that one
+    less its largest distance in the last seconds before; nan where it is neither to stay nor to circle."""
     sets: int
     """Changes of the source set."""
     modes: int
@@ -119,17 +126,26 @@ def figures(record: Record) -> Figures:
     since = record.place[:, 0] >= struck
     off = off[since] - off[before].mean(axis=0)
     flown = record.truth[record.truth[:, 0] >= struck]
-    spot = np.hypot(*(flown[:, 4:6] - flown[0, 4:6]).T)
     return Figures(
         yaw_deg=float(np.abs(errors[own_s >= struck]).max()),
-        yaw_before_deg=float(np.abs(errors[(own_s < struck) & (own_s > struck - 10.0)]).max()),
+        yaw_before_deg=float(np.abs(errors[(own_s < struck) & (own_s > struck - BEFORE_S)]).max()),
         fallback_s=next((event.own_s - struck for event in sets if event.words == "2"), math.inf),
         estimate_m=float(np.hypot(*off.T).max()),
-        spot_m=float(spot.max()) if record.hold else math.nan,
+        spot_m=_off_spot_m(record, flown) if record.hold else math.nan,
         sets=len(sets),
         modes=len(record.after("mode")),
         crashed=_crashed(record, flown),
     )
+
+
+def _off_spot_m(record: Record, flown: Array) -> float:
+    if record.circle is None:
+        return float(np.hypot(*(flown[:, 4:6] - flown[0, 4:6]).T).max())
+    north_m, east_m, radius_m = record.circle
+    off = np.abs(np.hypot(record.truth[:, 4] - north_m, record.truth[:, 5] - east_m) - radius_m)
+    after = record.truth[:, 0] >= record.struck_s
+    before = ~after & (record.truth[:, 0] > record.struck_s - BEFORE_S)
+    return max(0.0, float(off[after].max() - off[before].max()))
 
 
 def _crashed(record: Record, flown: Array) -> str:
@@ -144,12 +160,31 @@ def _crashed(record: Record, flown: Array) -> str:
 
 def row(record: Record, found: Figures) -> str:
     """One line of the table."""
-    fallback = (
-        f"{found.fallback_s:.1f} s" if math.isfinite(found.fallback_s) else "-" if record.set_up == "px4" else "never"
-    )
+    fallback = f"{found.fallback_s:.1f} s" if math.isfinite(found.fallback_s) else "never"
     spot = f"{found.spot_m:.1f} m" if math.isfinite(found.spot_m) else "-"
     wind = f"{record.wind[0]:.0f} m/s {record.wind[1]:03.0f}"
     return (
         f"{record.fault:16}{record.set_up:9}{wind:>12}{found.yaw_deg:7.1f}{fallback:>13}"
         f"{found.estimate_m:9.1f} m{spot:>10}  {'; '.join(found.wrong) or 'good'}"
     )
+
+
+def summary(fault: str, set_up: str, flights: Sequence[Figures | None]) -> str:
+    """Of several flights with the same fault: how many were good, and the largest figures with their medians.
+
+    A flight that did not come about is None.
+    """
+    found = [flight for flight in flights if flight is not None]
+    text = f"{fault}, {set_up}: {sum(not flight.wrong for flight in found)} of {len(found)} flights good"
+    if len(found) < len(flights):
+        text += f", {len(flights) - len(found)} did not come about"
+    if not found:
+        return text
+    columns = {
+        "yaw": ([flight.yaw_deg for flight in found], "deg"),
+        "set 2 after": ([flight.fallback_s for flight in found], "s"),
+        "off truth": ([flight.estimate_m for flight in found], "m"),
+        "off spot": ([flight.spot_m for flight in found], "m"),
+    }
+    largest = (f"{name} {max(of):.1f} ({median(of):.1f}) {unit}" for name, (of, unit) in columns.items())
+    return f"{text}; largest (median): {', '.join(largest)}"

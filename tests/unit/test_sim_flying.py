@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 
 import numpy as np
@@ -10,11 +11,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.flying.ardupilot import state_of
 from sim.flying.cli import main, parser, plans_of
-from sim.flying.px4 import Truth
+from sim.flying.mission import upload
+from sim.flying.px4 import Truth, source_changes
 from sim.flying.truth import BEHIND_S, FlyingAircraft, State, angles_of_quaternion
-from sim.flying.verdict import Event, Record, figures, row
+from sim.flying.verdict import Event, Record, figures, row, summary
 from sim.imu_model import ImuModel
 from sim.scenario import site_at
+from sim.sitl.ground import GroundStation
+from tests.support.virtual_time import run_virtual
 
 STEP_S = 0.001
 STRUCK_S = 20.0
@@ -142,6 +146,41 @@ def test_a_good_flight() -> None:
     assert row(record, found).endswith("good")
 
 
+def circled(**off: float) -> Record:
+    """A plane on a circle of 120 m about 50 m north of its start, once in 40 s; from the fault on it goes outwards."""
+    record = hovered()
+    angle = record.truth[:, 0] / 40.0 * math.tau
+    radius_m = 121.0 + off.get("outwards_m", 0.0) * np.clip((record.truth[:, 0] - STRUCK_S) / 20.0, 0.0, 1.0)
+    record.truth[:, 4], record.truth[:, 5] = 50.0 + radius_m * np.cos(angle), radius_m * np.sin(angle)
+    record.place[:, 1:3] = record.truth[:, 4:6]
+    record.circle = (50.0, 0.0, 120.0)
+    return record
+
+
+def test_a_plane_is_to_stay_on_its_circle_as_well_as_before() -> None:
+    assert figures(circled()).spot_m == pytest.approx(0.0, abs=0.01)
+    assert figures(circled(outwards_m=2.0)).spot_m == pytest.approx(2.0, abs=0.01)
+    assert figures(circled(outwards_m=4.0)).wrong == ["place above 3 m"]
+
+
+def test_a_mission_has_no_spot_to_stay_on() -> None:
+    record = hovered(drifts_m=50.0)
+    record.hold = False
+    assert math.isnan(figures(record).spot_m)
+    assert not figures(record).wrong
+
+
+def test_several_flights_in_a_line() -> None:
+    flights = [figures(hovered(yaw_deg=yaw_deg)) for yaw_deg in (1.0, 2.0, 12.0)]
+    for flight in flights:
+        assert flight.fallback_s == math.inf
+    line = summary("kill", "script", [*flights, None])
+    assert line.startswith(
+        "kill, script: 2 of 3 flights good, 1 did not come about; largest (median): yaw 12.6 (2.6) deg"
+    )
+    assert summary("kill", "script", [None]) == "kill, script: 0 of 0 flights good, 1 did not come about"
+
+
 @pytest.mark.parametrize(
     ("off", "words"),
     [
@@ -176,6 +215,74 @@ def test_every_fault_has_a_wind_of_its_own_and_the_set_ups_share_it() -> None:
     assert (kill.wind, kill.heading_deg) == (kill_today.wind, kill_today.heading_deg) != (stop.wind, stop.heading_deg)
     assert all(3.0 <= plan.wind[0] <= 8.0 for plan in (kill, stop))
     assert plans_of(parser().parse_args([*words, "--wind", "7", "90", "--seed", "3"]))[0].wind == (7.0, 90.0)
+
+
+def test_flights_of_a_fault_have_seeds_and_winds_of_their_own() -> None:
+    words = ["--binary", "arducopter", "--fault", "kill", "--fault", "stop", "--flights", "3", "--seed", "5"]
+    plans = plans_of(parser().parse_args(words))
+    assert [(plan.fault, plan.seed) for plan in plans] == [
+        (fault, seed) for fault in ("kill", "stop") for seed in (5, 6, 7)
+    ]
+    assert len({plan.wind for plan in plans}) == 6
+
+
+def test_px4_says_by_its_flags_which_heading_it_uses() -> None:
+    """As `listener` prints them; without either heading nothing is said."""
+
+    def printed(own_us: int, **flags: bool) -> str:
+        lines = [f"    {name}: {on}" for name, on in flags.items()]
+        return "\033[2J\n\033[H\nTOPIC: estimator_status_flags instance 0 #1\n" + "\n".join(
+            [
+                " estimator_status_flags",
+                f"    timestamp: {own_us} (0.004000 seconds ago)",
+                "    timestamp_sample: 1",
+                *lines,
+                "",
+            ]
+        )
+
+    text = (
+        printed(9_000_000, cs_ev_yaw=True, cs_mag_hdg=False, cs_mag=True)
+        + printed(10_000_000, cs_ev_yaw=True, cs_mag_hdg=False)
+        + printed(10_400_000, cs_ev_yaw=False, cs_mag_hdg=False)
+        + printed(10_500_000, cs_ev_yaw=False, cs_mag_3d=True)
+        + printed(11_500_000, cs_ev_yaw=False, cs_mag_hdg=True)
+        + printed(20_000_000, cs_ev_yaw=True, cs_mag_hdg=False)
+    )
+    assert source_changes(text) == [Event(10.5, "set", "2"), Event(20.0, "set", "1")]
+    assert source_changes("never published\n") == []
+
+
+def test_a_mission_is_uploaded_item_by_item() -> None:
+    """To a peer that asks for each; corners are where they belong."""
+    site, station, codec = site_at(40.0, 116.0, 50.0), GroundStation("ardupilot"), mavlink.MAVLink(None, 1, 1)
+    got = dict[int, mavlink.MAVLink_mission_item_int_message]()
+    total = 0
+
+    def say(message: mavlink.MAVLink_message) -> None:
+        asyncio.get_running_loop().call_soon(
+            lambda: station.receive(message.pack(codec), asyncio.get_running_loop().time())
+        )
+
+    def peer(data: bytes) -> None:
+        nonlocal total
+        message = codec.decode(bytearray(data))
+        if isinstance(message, mavlink.MAVLink_mission_count_message):
+            total = message.count
+        elif isinstance(message, mavlink.MAVLink_mission_item_int_message):
+            got[message.seq] = message
+        number = len(got)
+        if number == total:
+            say(mavlink.MAVLink_mission_ack_message(255, 190, mavlink.MAV_MISSION_ACCEPTED))
+        else:
+            say(mavlink.MAVLink_mission_request_int_message(255, 190, number))
+
+    station.attach(peer)
+    run_virtual(upload(station, site, 30.0, [(0.0, 0.0), (100.0, -200.0)]))
+    assert [item.command for _, item in sorted(got.items())] == [16, 16, 16, 177]
+    corner = got[2]
+    assert (corner.x, corner.y, corner.z) == (400_008_983, 1_159_976_547, 30.0)
+    assert (got[3].param1, got[3].param2) == (1.0, 1000.0)
 
 
 def test_what_px4_tells_of_its_truth_is_an_aircraft_that_turns_and_speeds_up() -> None:
