@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import math
 import socket
 import struct
 from collections.abc import Mapping
@@ -27,7 +28,7 @@ RIDER_PORT = 9012
 SERVO_MAGIC = 18458
 _SILENT_S = 0.1
 COPTER_MODES = {"guided": 4, "hold": 5, "mission": 3}
-PLANE_MODES = {"takeoff": 13, "hold": 12, "mission": 10}
+PLANE_MODES = {"takeoff": 13, "hold": 15, "mission": 10}
 STICKS_S = 0.2
 LOWEST_US, MIDDLE_US = 1000, 1500
 
@@ -230,18 +231,27 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
         await ground.put_all({f"SIM_MAG{number}_ORIENT": 1.0 for number in (1, 2, 3)})  # ROTATION_YAW_45
 
     async def hold(self, ground: GroundStation) -> None:
-        """Loiter, sticks in the middle: a plane circles."""
-        await self.mode(ground, "hold")
-        if self.is_plane:
-            await ground.stream(mavlink.MAVLINK_MSG_ID_POSITION_TARGET_GLOBAL_INT, 1.0)
+        """Loiter, sticks in the middle; a plane circles clockwise from here (Guided).
 
-    def circle(self, ground: GroundStation) -> tuple[float, float, float] | None:
-        """About the waypoint that a plane says it loiters at."""
-        targets = ground.all(mavlink.MAVLink_position_target_global_int_message) if self.is_plane else []
-        if not targets:
-            return None
-        north_m, east_m = self.aircraft.site.north_east_m(targets[-1].lat_int * 1e-7, targets[-1].lon_int * 1e-7)
-        return north_m, east_m, PLANE["WP_LOITER_RAD"]
+        Raises:
+            TimeoutError: it does not.
+        """
+        if not self.is_plane:
+            await self.mode(ground, "hold")
+            return
+        *_, north_m, east_m, down_m, v_north, v_east, _ = self.truth.recorded[-1]
+        to_the_right = PLANE["WP_LOITER_RAD"] / math.hypot(v_north, v_east)
+        north_m, east_m = north_m - to_the_right * v_east, east_m + to_the_right * v_north
+        self.circle = north_m, east_m, PLANE["WP_LOITER_RAD"]
+        latitude_deg, longitude_deg = self.aircraft.site.place_deg(north_m, east_m)
+        ground.send(
+            mavlink.MAVLink_command_int_message(
+                self.system_id, 1, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT, mavlink.MAV_CMD_DO_REPOSITION, 0, 0,
+                -1.0, mavlink.MAV_DO_REPOSITION_FLAGS_CHANGE_MODE, 0.0, 0.0,
+                round(1e7 * latitude_deg), round(1e7 * longitude_deg), -down_m,
+            )
+        )  # fmt: skip
+        await self.until_mode(ground, "hold")
 
     async def steer(self, ground: GroundStation) -> None:
         """Sends the sticks until cancelled."""

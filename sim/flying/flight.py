@@ -52,7 +52,7 @@ PLANE_HEIGHT_M = 60.0
 PLANE_LEGS = 8.0
 """A plane's mission is so many times as large."""
 SETTLED_S = 6.0
-PLANE_SETTLED_S = 35.0
+PLANE_SETTLED_S = 20.0
 """By then it is on its circle."""
 WATCHED_S = 35.0
 TURNS_AFTER_S, TURN_DEG = 12.0, 120.0
@@ -202,7 +202,7 @@ class Flight:
         else:
             await vehicle.hold(ground)
         await vehicle.sleep(PLANE_SETTLED_S if vehicle.is_plane else SETTLED_S)
-        record.circle = None if self.plan.mission else vehicle.circle(ground)
+        record.circle = vehicle.circle
         record.struck_s = vehicle.truth.own_s
         await FAULTS[self.plan.fault].strike(self)
         await vehicle.sleep(TURNS_AFTER_S)

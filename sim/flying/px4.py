@@ -247,11 +247,7 @@ class FlyingPx4(FlyingVehicle):
         Raises:
             TimeoutError: it does not.
         """
-        since_s = asyncio.get_running_loop().time()
-        await ground.wait_for(
-            lambda: any(beat.custom_mode == self.modes["hold"] for beat in ground.vehicle_heartbeats(since_s)),
-            30.0, "Hold",
-        )  # fmt: skip
+        await self.until_mode(ground, "hold")
 
     async def turn(self, degrees: float) -> None:
         """Told to turn clockwise on its spot."""

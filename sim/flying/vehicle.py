@@ -19,6 +19,7 @@ from sim.sitl.ground import GroundStation
 from sim.sitl.vehicle import FirmwareVehicle
 
 ARM_WITHIN_S = 60.0
+MODE_WITHIN_S = 30.0
 YAW_STICK_US = 250
 TURNED_WITHIN_S = 8.0
 
@@ -29,7 +30,8 @@ class FlyingVehicle(FirmwareVehicle):
     sticks_us: list[int]
     """Roll, pitch, throttle, yaw."""
     is_plane = False
-    """It circles where others stay."""
+    circle: tuple[float, float, float] | None = None
+    """What a plane that holds is to fly, in m: north and east of the start, and the radius."""
     modes: Mapping[str, int]
     """Custom modes by what they are for: hold, mission."""
 
@@ -85,14 +87,24 @@ class FlyingVehicle(FirmwareVehicle):
         Raises:
             TimeoutError: it does not.
         """
-        number = self.modes[name]
-        since_s = asyncio.get_running_loop().time()
         await ground.command(
-            mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, *self.mode_parameters(number)
+            mavlink.MAV_CMD_DO_SET_MODE,
+            mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
+            *self.mode_parameters(self.modes[name]),
         )
+        await self.until_mode(ground, name)
+
+    async def until_mode(self, ground: GroundStation, name: str) -> None:
+        """Wait until it says that it is in a mode.
+
+        Raises:
+            TimeoutError: it is not.
+        """
+        since_s = asyncio.get_running_loop().time()
         await ground.wait_for(
-            lambda: any(beat.custom_mode == number for beat in ground.vehicle_heartbeats(since_s)), 5.0, f"mode {name}"
-        )
+            lambda: any(beat.custom_mode == self.modes[name] for beat in ground.vehicle_heartbeats(since_s)),
+            MODE_WITHIN_S, f"mode {name}",
+        )  # fmt: skip
 
     def mode_parameters(self, number: int) -> tuple[float, ...]:
         """A custom mode in the parameters of MAV_CMD_DO_SET_MODE."""
@@ -101,10 +113,6 @@ class FlyingVehicle(FirmwareVehicle):
     def source_changes(self) -> list[Event]:
         """What heading its estimator used, and since when, where it does not say so in words."""
         return []
-
-    def circle(self, ground: GroundStation) -> tuple[float, float, float] | None:
-        """The circle it is to fly, in m: north and east of the start, and the radius; None where it is to stay."""
-        return None
 
     @abstractmethod
     async def lie_with_own_compass(self, ground: GroundStation) -> None:
