@@ -64,7 +64,7 @@ async def flight(options: argparse.Namespace) -> int:
     if starts > 1:
         lines.insert(0, f"{starts} starts of the autopilot in it, each by its own clock")
     numbers = [] if store is None else _keep(store, options.file.name, found)
-    lines += [f"kept as flight {number}: companion history" for number in numbers]
+    lines += [f"kept as flight {number}: companion report --flight {number} makes a page of it" for number in numbers]
     answer = {"state": "done", "reason": "", "flights": msgspec.to_builtins(found), "numbers": numbers}
     return conclude(options, answer, lines, good=True)
 

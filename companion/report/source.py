@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Final
 
 from companion.calibration.noise.allan import PROFILES, NoiseProfile
+from companion.calibration.records.flight_record import KeptFlight
 from companion.calibration.records.record import Arming, Record
 from companion.calibration.solution.by_temperature import ByTemperature, by_temperature
 from companion.calibration.solution.prior import curve_of
 from companion.errors import StorageError
 from companion.report.calibration_page import Material
+from companion.storage.flights import FlightStore
 from companion.storage.learned import BiasStore
 from companion.storage.profiles import ProfileStore
 from companion.storage.records import Entry, RecordStore
@@ -73,6 +75,22 @@ def material(directory: Path, wanted: str | None) -> Material:
         armings=[arming for arming in armings if arming.calibration == record.started_at],
         damaged=damaged,
     )
+
+
+def flight(directory: Path, wanted: int) -> tuple[int, KeptFlight]:
+    """A flight by its number; 0: the latest.
+
+    Raises:
+        StorageError: there is none, none of that number, or it cannot be read.
+    """
+    store = FlightStore(directory)
+    numbers = store.numbers()
+    if not numbers:
+        raise StorageError(f"no flight yet: nothing is in {store.folder} (companion flight LOG reads one)")
+    if wanted and wanted not in numbers:
+        raise StorageError(f"no flight {wanted}; there are number {numbers[0]} to {numbers[-1]} (companion history)")
+    number = wanted or numbers[-1]
+    return number, store.read(number)
 
 
 def _by_temperature(directory: Path, record: Record) -> list[ByTemperature]:

@@ -42,7 +42,7 @@ class FlightStore:
         Raises:
             StorageError: it could not be written; nothing is half written.
         """
-        numbers = numbers_in(self.folder, _NAME)
+        numbers = self.numbers()
         earlier = (number for number, one in self.newest().items() if one.flight.key == kept.flight.key)
         number = next(earlier, numbers[-1] + 1 if numbers else 1)
         try:
@@ -63,7 +63,7 @@ class FlightStore:
             StorageError: the folder cannot be listed.
         """
         found: dict[int, KeptFlight] = {}
-        for number in reversed(numbers_in(self.folder, _NAME)):
+        for number in reversed(self.numbers()):
             if len(found) == limit:
                 break
             try:
@@ -71,6 +71,14 @@ class FlightStore:
             except StorageError as error:
                 logger.warning("%s, passed over", error)
         return found
+
+    def numbers(self) -> list[int]:
+        """All that are there, ascending, whether they can be read or not.
+
+        Raises:
+            StorageError: the folder cannot be listed.
+        """
+        return numbers_in(self.folder, _NAME)
 
     def read(self, number: int) -> KeptFlight:
         """One of them.
