@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from companion.flight.inertial import joined
-from companion.flight.log import Boot, Estimated, FlownImu, Place, Table, changes
+from companion.flight.log import Boot, Estimated, FlownImu, Place, Start, changes, starts
 from companion.physics.frames import Floats
 from companion.physics.units import DEG
-from companion.replay.autopilot_logs import Progress, dataflash
+from companion.replay.blocks import Progress
+from companion.replay.dataflash import dataflash
 
-_US: Final = 1e-6
-_AXES: Final = "XYZ"
 _ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "IMU": ("I", ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ", "T")),
     "GYR": ("I", ("GyrX", "GyrY", "GyrZ")),
@@ -38,12 +36,7 @@ _ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "RCOU": ("", tuple(f"C{k}" for k in range(1, 15))),
 }
 """By message, the field with its instance, and what is read of it."""
-_OLD: Final = {"IMU2": ("IMU", 1), "IMU3": ("IMU", 2)}
-"""Up to 4.0."""
 _IMUS: Final = 5
-_BACK_S: Final = 5.0
-"""By so much the clock goes back only at a start."""
-_DAY_S: Final = 86400.0
 _GPS_UNIX_S: Final = 315964800.0
 _LEAP_S: Final = 18.0
 _GYRO_STEP_RAD_S: Final = 0.01 * DEG
@@ -54,64 +47,17 @@ _MOTOR_FUNCTIONS: Final = (*range(33, 41), *range(82, 86), 70)
 _TURNING_US: Final = 30.0
 
 
-class _Start:
-    """What one start of the autopilot has logged, message by message."""
-
-    def __init__(self) -> None:
-        self.tables: dict[tuple[str, int], Table] = defaultdict(Table)
-        self.parameters: list[tuple[float, str, float]] = []
-
-    def rows(self, kind: str, instance: int = 0) -> Floats:
-        """(n, 1 + fields), the time first."""
-        table = self.tables.get((kind, instance))
-        return np.zeros((0, 1 + len(_ROWS[kind][1]))) if table is None else table.rows()
-
-    def instances(self, kind: str) -> list[int]:
-        """That have logged it."""
-        return sorted(instance for name, instance in self.tables if name == kind)
-
-
 def read(path: Path, progress: Progress) -> Iterator[Boot]:
     """Each start of the autopilot in it, one after another: memory is that of one.
 
     Raises:
         StorageError: one line: it cannot be read.
     """
-    start, last_s = _Start(), math.nan
-    jumped: tuple[str, float, dict[str, Any]] | None = None
-    for kind, fields in dataflash(path, {*_ROWS, *_OLD, "PARM"}, progress):
-        at_s = float(fields.get("TimeUS", math.nan)) * _US
-        if not math.isfinite(at_s):
-            continue
-        if jumped is None and not -_BACK_S < at_s - last_s < _DAY_S and last_s >= 0.0:
-            # A lone time from elsewhere is damage; where the next one agrees, it is a new start.
-            jumped = kind, at_s, fields
-            continue
-        if jumped is not None and abs(at_s - jumped[1]) < _BACK_S:
-            whole, start = _boot(start), _Start()
-            yield whole
-            _take(start, *jumped)
-        jumped, last_s = None, at_s
-        _take(start, kind, at_s, fields)
-    whole, start = _boot(start), _Start()
-    yield whole
+    fields = {name: len(columns) for name, (_, columns) in _ROWS.items()}
+    return map(_boot, starts(dataflash(path, _ROWS, progress), fields))
 
 
-def _take(start: _Start, kind: str, at_s: float, fields: dict[str, Any]) -> None:
-    try:
-        if kind == "PARM":
-            start.parameters.append((at_s, str(fields["Name"]), float(fields["Value"])))
-            return
-        name, instance = _OLD.get(kind, (kind, 0))
-        key, columns = _ROWS[name]
-        found = int(fields.get(key, instance)) if key else 0
-        if 0 <= found < _IMUS:
-            start.tables[name, found].add(at_s, *(float(fields.get(column, math.nan)) for column in columns))
-    except (KeyError, TypeError, ValueError):
-        return  # of another layout, or damaged
-
-
-def _boot(start: _Start) -> Boot:
+def _boot(start: Start) -> Boot:
     parameters = {name: value for _, name, value in start.parameters}
     cores = _cores(parameters)
     primary = _primary(start)
@@ -140,17 +86,17 @@ def _cores(parameters: dict[str, float]) -> list[int]:
     return [k for k in range(_IMUS) if mask >> k & 1]
 
 
-def _primary(start: _Start) -> int:
+def _primary(start: Start) -> int:
     rows = [start.rows("XKF4", core) for core in start.instances("XKF4")]
     told = np.concatenate([each[:, 1] for each in rows]) if rows else np.zeros(0)
     told = told[(told >= 0) & (told < _IMUS)].astype(np.int64)
     return int(np.bincount(told).argmax()) if len(told) else 0
 
 
-def _imu(start: _Start, instance: int, parameters: dict[str, float], cores: list[int]) -> FlownImu:
+def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[int]) -> FlownImu:
     rows = start.rows("IMU", instance)
     raw = _raw(start.rows("GYR", instance), start.rows("ACC", instance))
-    used = raw if len(raw) > len(rows) else rows[:, :7]
+    name, used = ("GYR", raw) if len(raw) > len(rows) else ("IMU", rows[:, :7])
     used = used[np.isfinite(used).all(axis=1)]
     vibration = start.rows("VIBE", instance)
     number = instance + 1
@@ -158,7 +104,7 @@ def _imu(start: _Start, instance: int, parameters: dict[str, float], cores: list
     ids = [parameters.get(f"{prefix}{half}{suffix}_ID") for half in ("GYR", "ACC")]
     gyro_id, accel_id = (None if each is None else round(each) for each in ids)
     return FlownImu(
-        number=number, t_s=used[:, 0], readings=used[:, 1:7], means=start.tables["IMU", instance].each > 1,
+        number=number, t_s=used[:, 0], readings=used[:, 1:7], means=start.means(name, instance),
         gyro_id=gyro_id, accel_id=accel_id,
         degc=rows[np.isfinite(rows[:, 7])][:, [0, 7]],
         vibration=np.column_stack([vibration[:, 0], np.linalg.norm(vibration[:, 1:4], axis=1)]),
@@ -174,7 +120,7 @@ def _raw(gyro: Floats, accel: Floats) -> Floats:
     return np.column_stack([gyro, *forces])
 
 
-def _estimated(start: _Start, core: int) -> Estimated | None:
+def _estimated(start: Start, core: int) -> Estimated | None:
     gyro, accel = start.rows("XKF1", core), start.rows("XKF2", core)
     if not len(gyro) or not len(accel):
         return None
@@ -184,7 +130,7 @@ def _estimated(start: _Start, core: int) -> Estimated | None:
     gyro_rad_s = gyro[:, 7:10] * DEG
     accel_m_s2 = np.column_stack([np.interp(t_s, accel[:, 0], column) for column in accel[:, 1:4].T])
     # It logs those of the core that it flies by; the others are tuned alike.
-    of = next((one for one in (core, *start.instances("XKV2")) if ("XKV2", one) in start.tables), core)
+    of = next((one for one in (core, *start.instances("XKV2")) if len(start.rows("XKV2", one))), core)
     first, second = start.rows("XKV1", of), start.rows("XKV2", of)
     known = len(first) and len(second) and step_s > 0.0
     gyro_sigma, accel_sigma = np.full(gyro_rad_s.shape, np.nan), np.full(gyro_rad_s.shape, np.nan)
@@ -211,7 +157,7 @@ def _cut(cut: Floats, step: float) -> Floats:
     return np.where(np.abs(cut) < 0.5 * step, 2.0 * step, step) / math.sqrt(12.0)
 
 
-def _events(start: _Start, what: str) -> tuple[tuple[float, bool], ...]:
+def _events(start: Start, what: str) -> tuple[tuple[float, bool], ...]:
     rows = start.rows("ARM") if what == "armed" else np.zeros((0, 2))
     if len(rows):
         return changes(rows[:, 0], rows[:, 1] > 0.5)

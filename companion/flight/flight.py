@@ -27,7 +27,8 @@ from companion.flight.split import LENGTH_S, SHORT_S, split
 from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
 from companion.physics.frames import Floats
 from companion.physics.units import DEG_H, MG
-from companion.replay.autopilot_logs import Progress, read_ulog, reader_of
+from companion.replay.autopilot_logs import read_ulog, reader_of
+from companion.replay.blocks import Progress
 from companion.storage.learned import KnownImu
 
 SPANS_S: Final = (10.0, 30.0, 60.0)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
@@ -12,51 +14,98 @@ from numpy.typing import NDArray
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.flight.inertial import Navigation
 from companion.physics.frames import Floats
+from companion.replay.blocks import PARAMETERS, Block
 
 MOST_ROWS: Final = 1 << 19
 """Of a message and instance: 20 minutes at 400 Hz; of a longer log each two, four ... are one mean."""
-_CHUNK: Final = 4096
+_MOST_PARAMETERS: Final = 1 << 16
+_INSTANCES: Final = 16
+"""More nobody has: another number is damage."""
 
 
 class Table:
     """Rows of a message, the time in s first; its memory is bounded."""
 
     def __init__(self) -> None:
-        self._rows: list[tuple[float, ...]] = []
         self._chunks: list[Floats] = []
+        self._left: list[Floats] = []
         self._count = 0
         self.each = 1
         """So many messages are one row."""
 
-    def add(self, *row: float) -> None:
-        """One more."""
-        self._rows.append(row)
-        if len(self._rows) < _CHUNK * self.each:
-            return
-        self._chunks.append(_means(np.array(self._rows), self.each))
-        self._rows = []
-        self._count += _CHUNK
-        if self._count >= MOST_ROWS:
-            self._chunks, self._count, self.each = (
-                [_means(np.concatenate(self._chunks), 2)],
-                self._count // 2,
-                2 * self.each,
-            )
+    def add(self, rows: Floats) -> None:
+        """(n, ...) more."""
+        rows = np.concatenate([*self._left, rows])
+        whole = len(rows) - len(rows) % self.each
+        self._left = [rows[whole:].copy()]
+        self._take(_means(rows[:whole], self.each))
+
+    def _take(self, means: Floats) -> None:
+        self._chunks.append(means)
+        self._count += len(means)
+        if self._count > MOST_ROWS:
+            rows = np.concatenate(self._chunks)
+            self._chunks, self._count, self.each = [], 0, 2 * self.each
+            self._take(_means(rows[: len(rows) // 2 * 2], 2))
 
     def rows(self) -> Floats:
         """(n, ...) whole numbers only, ascending in time."""
-        left = len(self._rows) - len(self._rows) % self.each
-        last = [_means(np.array(self._rows[:left]), self.each)] if left else []
-        if not self._chunks and not last:
-            return np.zeros((0, 1))
-        return ascending(np.concatenate([*self._chunks, *last]))
+        return ascending(np.concatenate(self._chunks))
+
+
+class Start:
+    """What one start of the autopilot has logged, message by message."""
+
+    def __init__(self, fields: Mapping[str, int]) -> None:
+        self._fields = fields
+        self._tables: dict[tuple[str, int], Table] = defaultdict(Table)
+        self.parameters: list[tuple[float, str, float]] = []
+
+    def take(self, block: Block) -> None:
+        """Some more of it."""
+        if block.name == PARAMETERS:
+            found = zip(block.rows[:, 0].tolist(), block.texts, block.rows[:, 1].tolist(), strict=True)
+            self.parameters += itertools.islice(found, _MOST_PARAMETERS - len(self.parameters))
+        elif 0 <= block.instance < _INSTANCES:
+            self._tables[block.name, block.instance].add(block.rows)
+
+    def rows(self, name: str, instance: int = 0) -> Floats:
+        """(n, 1 + fields), the time in s first."""
+        if (name, instance) not in self._tables:
+            return np.zeros((0, 1 + self._fields[name]))
+        return self._tables[name, instance].rows()
+
+    def means(self, name: str, instance: int) -> bool:
+        """Whether each row is of several messages."""
+        return self._tables[name, instance].each > 1
+
+    def instances(self, name: str) -> list[int]:
+        """That have logged it."""
+        return sorted(instance for each, instance in self._tables if each == name)
+
+
+def starts(blocks: Iterable[Block | None], fields: Mapping[str, int]) -> Iterator[Start]:
+    """Of a file, one after another: memory is that of one. `fields`: how many a message has."""
+    start = None
+    for block in blocks:
+        if block is not None:
+            start = start or Start(fields)
+            start.take(block)
+        elif start is not None:
+            whole, start = start, None
+            yield whole
+    if start is not None:
+        yield start
 
 
 def ascending(rows: Floats) -> Floats:
-    """Of rows that begin with a time, those in order."""
+    """Of rows that begin with a time, those in order; one alone that is ahead of all is damage."""
     rows = rows[np.isfinite(rows[:, 0])]
     if not len(rows):
         return rows
+    times = rows[:, 0]
+    ahead = (times[:-1] > times[1:]) & (times[1:] >= np.concatenate([[-np.inf], times[:-2]]))
+    rows = rows[~np.append(ahead, [False])]
     return np.asarray(rows[np.concatenate([[True], rows[1:, 0] > np.maximum.accumulate(rows[:, 0])[:-1]])])
 
 

@@ -2,153 +2,149 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from companion.flight.inertial import Navigation, joined
-from companion.flight.log import Boot, Estimated, FlownImu, Place, ascending, changes
+from companion.flight.log import Boot, Estimated, FlownImu, Place, Start, ascending, changes, starts
 from companion.physics.frames import Floats
-from companion.replay.autopilot_logs import Progress, ulog
+from companion.replay.blocks import US, Progress
+from companion.replay.ulog import DROPOUTS, ulog
 
-_US: Final = 1e-6
-_TOPICS: Final = [
-    "sensor_combined", "sensor_selection", "vehicle_imu", "vehicle_imu_status", "estimator_sensor_bias",
-    "vehicle_attitude", "vehicle_local_position", "vehicle_attitude_groundtruth", "vehicle_local_position_groundtruth",
-    "actuator_armed", "actuator_motors", "vehicle_land_detected", "vehicle_gps_position",
-]  # fmt: skip
+
+def _elements(name: str, count: int = 3) -> tuple[str, ...]:
+    return tuple(f"{name}[{k}]" for k in range(count))
+
+
+_MOVING: Final = ("timestamp_sample", "vx", "vy", "vz", "x", "y", "z", "ref_lat", "ref_alt")
+_TOPICS: Final[dict[str, tuple[str, ...]]] = {
+    "sensor_combined": (*_elements("gyro_rad"), *_elements("accelerometer_m_s2")),
+    "sensor_selection": ("gyro_device_id",),
+    "vehicle_imu": (
+        "timestamp_sample", *_elements("delta_angle"), *_elements("delta_velocity"), "delta_angle_dt",
+        "delta_velocity_dt",
+    ),
+    "vehicle_imu_status": ("gyro_device_id", "accel_device_id", "temperature_gyro", "accel_vibration_metric"),
+    "estimator_sensor_bias": (
+        "gyro_device_id", *_elements("gyro_bias"), *_elements("accel_bias"), *_elements("gyro_bias_variance"),
+        *_elements("accel_bias_variance"),
+    ),
+    "vehicle_attitude": ("timestamp_sample", *_elements("q", 4)),
+    "vehicle_attitude_groundtruth": ("timestamp_sample", *_elements("q", 4)),
+    "vehicle_local_position": _MOVING,
+    "vehicle_local_position_groundtruth": _MOVING,
+    "actuator_armed": ("armed",),
+    "actuator_motors": _elements("control", 12),
+    "vehicle_land_detected": ("landed",),
+    "vehicle_gps_position": ("time_utc_usec",),
+}  # fmt: skip
 _FAST_HZ: Final = 20.0
 """vehicle_imu is usually logged twice a second: each is then one of a hundred."""
 _TURNING: Final = 0.02
 
-_Data = Mapping[tuple[str, int], dict[str, Any]]
-
 
 def read(path: Path, progress: Progress) -> Iterator[Boot]:
-    """A ULog is of one start.
+    """Each start of the autopilot in it: of PX4 there is one in a file, unless somebody has put several together.
 
     Raises:
-        StorageError: one line: it cannot be read, or pyulog is not there.
+        StorageError: one line: it cannot be read.
     """
-    with ulog(path, _TOPICS, progress) as found:
-        data: _Data = {(each.name, int(each.multi_id)): each.data for each in found.data_list}
-        start_s = found.start_timestamp * _US
-        told = [(start_s, str(name), float(value)) for name, value in found.initial_parameters.items()]
-        told += [(at * _US, str(name), float(value)) for at, name, value in found.changed_parameters]
-        gaps = len(found.dropouts)
-        boot = _boot(data, told, gaps)
-    yield boot
+    fields = {name: len(columns) for name, columns in _TOPICS.items()} | {DROPOUTS: 1}
+    return map(_boot, starts(ulog(path, _TOPICS, progress), fields))
 
 
-def _boot(data: _Data, parameters: list[tuple[float, str, float]], gaps: int) -> Boot:
-    notes = [f"{gaps} gaps in it, in which PX4 could not write"] if gaps else []
-    armed, landed = data.get(("actuator_armed", 0)), data.get(("vehicle_land_detected", 0))
+def _boot(start: Start) -> Boot:
+    gaps = len(start.rows(DROPOUTS))
+    armed, landed = start.rows("actuator_armed"), start.rows("vehicle_land_detected")
     return Boot(
         firmware="px4",
-        imus=_imus(data),
-        solution=_navigation(data, ""),
-        truth=_navigation(data, "_groundtruth"),
-        armed=() if armed is None else changes(np.asarray(armed["timestamp"]) * _US, armed["armed"]),
-        motors=_motors(data.get(("actuator_motors", 0))),
-        airborne=()
-        if landed is None
-        else changes(np.asarray(landed["timestamp"]) * _US, np.asarray(landed["landed"]) == 0),
-        parameters=tuple(parameters),
-        unix_offset_s=_unix_offset(data),
-        place=_place(data),
-        notes=tuple(notes),
+        imus=_imus(start),
+        solution=_navigation(start, ""),
+        truth=_navigation(start, "_groundtruth"),
+        armed=changes(armed[:, 0], armed[:, 1] > 0.5),
+        motors=_motors(start),
+        airborne=changes(landed[:, 0], landed[:, 1] < 0.5),
+        parameters=tuple(start.parameters),
+        unix_offset_s=_unix_offset(start),
+        place=_place(start),
+        notes=(f"{gaps} gaps in it, in which PX4 could not write",) if gaps else (),
     )
 
 
-def _table(data: dict[str, Any], names: Sequence[str], when: str = "timestamp") -> Floats:
-    """The time and these fields, what is whole of it, in order; times of older versions are of the message."""
-    times = np.asarray(data[when if when in data else "timestamp"], dtype=np.float64) * _US
-    rows = np.column_stack([times, *(np.asarray(data[name], dtype=np.float64) for name in names)])
-    return ascending(rows[np.isfinite(rows).all(axis=1)])
+def _whole(rows: Floats) -> Floats:
+    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
 
-def _xyz(name: str, axes: int = 3) -> list[str]:
-    return [f"{name}[{k}]" for k in range(axes)]
+def _sampled(rows: Floats) -> Floats:
+    """By the time of the sample, the field after that of the message; older versions have only the latter."""
+    at_s = rows[:, 1] * US
+    return ascending(_whole(np.column_stack([np.where(np.isfinite(at_s), at_s, rows[:, 0]), rows[:, 2:]])))
 
 
-def _navigation(data: _Data, suffix: str) -> Navigation | None:
-    attitude = data.get((f"vehicle_attitude{suffix}", 0))
-    local = data.get((f"vehicle_local_position{suffix}", 0))
-    if attitude is None or local is None:
-        return None
-    moving = _table(local, ("vx", "vy", "vz", "x", "y", "z"), "timestamp_sample")
-    return joined(_table(attitude, _xyz("q", 4), "timestamp_sample"), moving)
+def _navigation(start: Start, suffix: str) -> Navigation | None:
+    attitude, moving = (start.rows(f"vehicle_{what}{suffix}") for what in ("attitude", "local_position"))
+    return joined(_sampled(attitude), _sampled(moving[:, :8]))
 
 
-def _imus(data: _Data) -> tuple[FlownImu, ...]:
+def _imus(start: Start) -> tuple[FlownImu, ...]:
     """Those whose readings are logged fast enough: the one that PX4 flies by, and others if somebody has asked."""
     found: dict[int, FlownImu] = {}
-    status = {k: each for (name, k), each in data.items() if name == "vehicle_imu_status" and "gyro_device_id" in each}
-    ids = {int(each["gyro_device_id"][-1]): k for k, each in status.items() if len(each["gyro_device_id"])}
-    combined, selection = data.get(("sensor_combined", 0)), data.get(("sensor_selection", 0))
-    if combined is not None:
-        chosen = int(selection["gyro_device_id"][-1]) if selection and "gyro_device_id" in selection else -1
-        number = ids.get(chosen, 0)
-        found[number] = _imu(data, number, _table(combined, [*_xyz("gyro_rad"), *_xyz("accelerometer_m_s2")]))
-    for (name, k), each in data.items():
-        if name != "vehicle_imu" or k in found:
-            continue
-        what = [*_xyz("delta_angle"), *_xyz("delta_velocity"), "delta_angle_dt", "delta_velocity_dt"]
-        rows = _table(each, what, "timestamp_sample")
+    status = {k: start.rows("vehicle_imu_status", k) for k in start.instances("vehicle_imu_status")}
+    ids = {rows[-1, 1]: k for k, rows in status.items() if len(rows)}
+    combined, selection = _whole(start.rows("sensor_combined")), start.rows("sensor_selection")
+    if len(combined):
+        number = ids.get(selection[-1, 1], 0) if len(selection) else 0
+        found[number] = _imu(start, number, combined)
+    for k in start.instances("vehicle_imu"):
+        rows = _sampled(start.rows("vehicle_imu", k))
         rows = rows[(rows[:, 7:] > 0.0).all(axis=1)]
-        imu = _imu(data, k, np.hstack([rows[:, :1], rows[:, 1:7] / (np.repeat(rows[:, 7:], 3, axis=1) * _US)]))
-        if imu.rate_hz >= _FAST_HZ:
+        imu = _imu(start, k, np.hstack([rows[:, :1], rows[:, 1:7] / (np.repeat(rows[:, 7:], 3, axis=1) * US)]))
+        if k not in found and imu.rate_hz >= _FAST_HZ:
             found[k] = imu
     return tuple(found[k] for k in sorted(found))
 
 
-def _imu(data: _Data, k: int, rows: Floats) -> FlownImu:
-    status = data.get(("vehicle_imu_status", k))
-    degc = vibration = np.zeros((0, 2))
-    gyro_id = accel_id = None
-    if status is not None and "gyro_device_id" in status:
-        gyro_id, accel_id = int(status["gyro_device_id"][-1]), int(status["accel_device_id"][-1])
-        degc, vibration = _table(status, ["temperature_gyro"]), _table(status, ["accel_vibration_metric"])
+def _imu(start: Start, k: int, rows: Floats) -> FlownImu:
+    status = start.rows("vehicle_imu_status", k)
+    known = status[np.isfinite(status[:, 1:3]).all(axis=1)]
+    gyro_id, accel_id = map(int, known[-1, 1:3]) if len(known) else (None, None)
     return FlownImu(
-        number=k + 1, t_s=rows[:, 0], readings=rows[:, 1:7], means=True, gyro_id=gyro_id, accel_id=accel_id, degc=degc,
-        vibration=vibration, estimated=_estimated(data, gyro_id),
+        number=k + 1, t_s=rows[:, 0], readings=rows[:, 1:7], means=True, gyro_id=gyro_id, accel_id=accel_id,
+        degc=_whole(status[:, [0, 3]]), vibration=_whole(status[:, [0, 4]]), estimated=_estimated(start, gyro_id),
     )  # fmt: skip
 
 
-def _estimated(data: _Data, gyro_id: int | None) -> Estimated | None:
-    for (name, _), each in sorted(data.items(), key=lambda item: item[0]):
-        if name != "estimator_sensor_bias" or (gyro_id is not None and int(each["gyro_device_id"][-1]) != gyro_id):
+def _estimated(start: Start, gyro_id: int | None) -> Estimated | None:
+    for instance in start.instances("estimator_sensor_bias"):
+        rows = start.rows("estimator_sensor_bias", instance)
+        if not len(rows) or gyro_id not in (None, rows[-1, 1]):
             continue
-        rows = _table(each, [name for half in ("gyro", "accel") for name in _xyz(f"{half}_bias")])
-        sigmas = _table(each, [name for half in ("gyro", "accel") for name in _xyz(f"{half}_bias_variance")])
-        sigmas = np.sqrt(np.maximum(sigmas, 0.0))
-        if len(rows) == len(sigmas):
-            return Estimated(rows[:, 0], rows[:, 1:4], sigmas[:, 1:4], rows[:, 4:7], sigmas[:, 4:7])
+        rows = _whole(rows)
+        sigmas = np.sqrt(np.maximum(rows[:, 8:], 0.0))
+        return Estimated(rows[:, 0], rows[:, 2:5], sigmas[:, :3], rows[:, 5:8], sigmas[:, 3:])
     return None
 
 
-def _motors(data: dict[str, Any] | None) -> tuple[tuple[float, bool], ...]:
-    if data is None:
-        return ()
-    outputs = np.column_stack([data[name] for name in _xyz("control", 12) if name in data])
-    return changes(np.asarray(data["timestamp"]) * _US, np.nan_to_num(outputs).max(axis=1) > _TURNING)
+def _motors(start: Start) -> tuple[tuple[float, bool], ...]:
+    outputs = start.rows("actuator_motors")
+    turning = np.any(outputs[:, 1:] > _TURNING, axis=1)
+    return changes(outputs[:, 0], turning)
 
 
-def _unix_offset(data: _Data) -> float | None:
-    gps = data.get(("vehicle_gps_position", 0))
-    rows = np.zeros((0, 2)) if gps is None else _table(gps, ["time_utc_usec"])
-    known = np.sort((rows[:, 1] * _US - rows[:, 0])[rows[:, 1] > 1e15])
+def _unix_offset(start: Start) -> float | None:
+    rows = start.rows("vehicle_gps_position")
+    known = np.sort((rows[:, 1] * US - rows[:, 0])[rows[:, 1] > 1e15])
     return float(known[len(known) // 2]) if len(known) else None
 
 
-def _place(data: _Data) -> Place | None:
-    local = data.get(("vehicle_local_position", 0))
-    rows = np.zeros((0, 3)) if local is None else _table(local, ["ref_lat", "ref_alt"])
-    rows = rows[rows[:, 1] != 0.0]
+def _place(start: Start) -> Place | None:
+    rows = _whole(start.rows("vehicle_local_position")[:, 8:10])
+    rows = rows[rows[:, 0] != 0.0]
     if not len(rows):
         return None
     # The simulator's gravity is that of the ellipsoid.
-    simulated = ("vehicle_attitude_groundtruth", 0) in data
-    return Place(float(rows[-1, 1]), 0.0 if simulated else float(rows[-1, 2]))
+    simulated = start.instances("vehicle_attitude_groundtruth")
+    return Place(float(rows[-1, 0]), 0.0 if simulated else float(rows[-1, 1]))

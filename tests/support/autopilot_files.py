@@ -57,17 +57,18 @@ _TOPICS = {
 
 def write_ulog(path: Path, topics: Mapping[tuple[str, int], tuple[Floats, Floats]]) -> Path:
     """By topic and instance, (n,) times in s and the numbers after it."""
-    parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), _message(b"B", bytes(40))]
-    parts += [_message(b"F", f"{name}:{fields}".encode()) for name, fields in _TOPICS.items()]
+    parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), ulog_message(b"B", bytes(40))]
+    parts += [ulog_message(b"F", f"{name}:{fields}".encode()) for name, fields in _TOPICS.items()]
     rows = []
     for number, ((name, instance), (times, values)) in enumerate(topics.items()):
-        parts.append(_message(b"A", struct.pack("<BH", instance, number) + name.encode()))
+        parts.append(ulog_message(b"A", struct.pack("<BH", instance, number) + name.encode()))
         rows += [(round(t_s * 1e6), number, row) for t_s, row in zip(times.tolist(), values.tolist(), strict=True)]
     for t_us, number, row in sorted(rows, key=lambda each: each[:2]):
-        parts.append(_message(b"D", struct.pack(f"<HQ{len(row)}f", number, t_us, *row)))
+        parts.append(ulog_message(b"D", struct.pack(f"<HQ{len(row)}f", number, t_us, *row)))
     path.write_bytes(b"".join(parts))
     return path
 
 
-def _message(kind: bytes, body: bytes) -> bytes:
+def ulog_message(kind: bytes, body: bytes) -> bytes:
+    """With its head."""
     return struct.pack("<Hc", len(body), kind) + body

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pyulog import ULog
 
 from companion.samples import ImuSample
-from tests.support.ulog import read_topic
 
 Floats = NDArray[np.float64]
 
@@ -48,9 +48,13 @@ class Recording(NamedTuple):
 
 def px4() -> Recording:
     """PX4 hardware, handled until 8 s, then at rest and warming up; time from the first sample on."""
-    rows = read_topic(shared("px4_pyulog/sample.ulg"), "sensor_combined")
-    time = rows["timestamp"].astype(np.float64) * 1e-6
-    return Recording(time - time[0], rows["gyro_rad"].astype(np.float64), rows["accelerometer_m_s2"].astype(np.float64))
+    found = ULog(str(shared("px4_pyulog/sample.ulg")), ["sensor_combined"]).get_dataset("sensor_combined").data
+    time = found["timestamp"] * 1e-6
+    gyro, accel = (
+        np.column_stack([found[f"{name}[{k}]"] for k in range(3)]).astype(np.float64)
+        for name in ("gyro_rad", "accelerometer_m_s2")
+    )
+    return Recording(time - time[0], gyro, accel)
 
 
 def xsens_counts() -> Recording:

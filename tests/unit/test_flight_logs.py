@@ -272,12 +272,14 @@ def test_a_flight_of_px4_is_told_alike(flown: Flown, tmp_path: Path, capsys: pyt
 def test_several_starts_in_one_file_are_each_by_their_own_clock(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    one = messages(flown, parameters())
-    code, answer = said(capsys, dataflash(tmp_path / "two.bin", [*one, *one]), *storage(tmp_path))
+    one, path = dataflash(tmp_path / "one.bin", messages(flown, parameters())).read_bytes(), tmp_path / "two.bin"
+    # Cut off in the middle of a message, as by pulling the plug.
+    path.write_bytes(one[:-5] + one)
+    code, answer = said(capsys, path, *storage(tmp_path))
     assert code == 0
     assert len(answer["flights"]) == 2
     assert answer["flights"][0]["imus"] == answer["flights"][1]["imus"]
-    assert companion(["flight", str(tmp_path / "two.bin"), *storage(tmp_path)]) == 0
+    assert companion(["flight", str(path), *storage(tmp_path)]) == 0
     assert capsys.readouterr().out.startswith("2 starts of the autopilot in it, each by its own clock\n")
 
 

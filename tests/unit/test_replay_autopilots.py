@@ -5,22 +5,21 @@ from __future__ import annotations
 import json
 import resource
 import struct
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pyulog import ULog
 
 from companion.cli import main as companion
 from companion.replay.log_files import read_logs
 from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.scenario import site_at
-from tests.support.autopilot_files import write_dataflash, write_ulog
+from tests.support.autopilot_files import ulog_message, write_dataflash, write_ulog
 from tests.support.made_noise import Floats, adis16405
-from tests.support.ulog import read_topic
 
 SAMPLE = Path(__file__).parents[3] / "shared" / "data" / "px4_pyulog" / "sample.ulg"
 SECONDS, RATE_HZ = 30, 100
@@ -60,10 +59,11 @@ def assert_near(record: dict[str, Any], seed: int) -> None:
 @pytest.mark.skipif(not SAMPLE.is_file(), reason=f"no recording of a real PX4 at {SAMPLE}")
 def test_a_real_log_of_px4_is_read_as_another_reader_reads_it(capsys: pytest.CaptureFixture[str]) -> None:
     (log,) = read_logs([SAMPLE])
-    table = read_topic(SAMPLE, "sensor_combined")
+    table = ULog(str(SAMPLE), ["sensor_combined"]).get_dataset("sensor_combined").data
     np.testing.assert_allclose(log.t_s, table["timestamp"] * 1e-6, rtol=0.0, atol=1e-9)
-    np.testing.assert_array_equal(log.readings[:, :3], table["gyro_rad"])
-    np.testing.assert_array_equal(log.readings[:, 3:], table["accelerometer_m_s2"])
+    for k in range(3):
+        np.testing.assert_array_equal(log.readings[:, k], table[f"gyro_rad[{k}]"])
+        np.testing.assert_array_equal(log.readings[:, 3 + k], table[f"accelerometer_m_s2[{k}]"])
     code, record = replay(capsys, SAMPLE)
     assert code == 0
     used = record["log"]
@@ -131,18 +131,6 @@ def test_numbers_that_are_none_and_late_ones_are_counted(tmp_path: Path, capsys:
     assert record["log"]["left_out"] == {"without a number": 10, "late or repeated": 5}
 
 
-@pytest.mark.parametrize("command", ["replay", "profile"])
-def test_without_the_extra_one_line_says_what_to_install(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
-    path = write_ulog(tmp_path / "log.ulg", {("sensor_combined", 0): (TIMES[:9], readings(1)[:9])})
-    monkeypatch.setitem(sys.modules, "pyulog", None)
-    assert companion([command, str(path)]) == 1
-    said = capsys.readouterr()
-    assert said.err == f"companion: {path}: it needs more than is installed: pip install 'companion[logs]'\n"
-    assert said.out == ""
-
-
 @pytest.mark.parametrize("kind", ["ulg", "bin"])
 @pytest.mark.parametrize("command", ["replay", "profile"])
 def test_a_damaged_log_is_one_line_or_what_is_left_of_it(
@@ -192,10 +180,6 @@ def little_memory() -> Iterator[None]:
     resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
-def ulog_message(kind: bytes, body: bytes) -> bytes:
-    return struct.pack("<Hc", len(body), kind) + body
-
-
 def circling() -> bytes:
     """A message that says that it is longer than the file: its reader goes back by that, and comes by again."""
     said = ulog_message(b"M", b"\x00\x0cchar[9000] a" + bytes(9000))
@@ -218,20 +202,11 @@ def without_length() -> bytes:
     return named(0x80, 89, b"FMT") + named(0x81, 0, b"IMU") + b"\xa3\x95\x81" + bytes(2000)
 
 
-ENDLESS = "damaged, or not of its kind: reading it comes to no end"
-
-
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [(circling(), ENDLESS), (nested(), ENDLESS), (without_length(), "no samples of an IMU in it")],
-    ids=["circling", "nested", "no length"],
-)
+@pytest.mark.parametrize("data", [circling(), nested(), without_length()], ids=["circling", "nested", "no length"])
 @pytest.mark.usefixtures("little_memory")
-def test_a_log_without_end_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], data: bytes, words: str
-) -> None:
+def test_a_log_without_end_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], data: bytes) -> None:
     path = tmp_path / "log"
     path.write_bytes(data)
     assert companion(["replay", str(path)]) == 1
     said = capsys.readouterr()
-    assert said.err == f"companion: {path}: {words}\n"
+    assert said.err == f"companion: {path}: no samples of an IMU in it\n"
