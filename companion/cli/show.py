@@ -113,8 +113,7 @@ def status_lines(status: Object) -> list[str]:
     lines += [f"warning: {warning}" for warning in status["warnings"]]
     if not status["ground_stations"]["good"]:
         lines.append(f"ground stations: {status['ground_stations']['summary']}")
-    if status["mqtt"] is not None:
-        lines.append(f"mqtt: {status['mqtt']['summary']}")
+    lines += [f"{name}: {status[name]['summary']}" for name in ("mqtt", "fleet") if status[name] is not None]
     arming = status["arming"]
     lines.append(
         f"at arming ({arming['at_arm']}): {_VERDICTS[arming['verdict']]}"
@@ -225,8 +224,7 @@ def link_rows(status: Object) -> list[tuple[bool, str, str]]:
     links += [(device["good"], device["name"], device["summary"]) for device in status["devices"]]
     if not status["ground_stations"]["good"]:
         links.append((False, "ground stations", status["ground_stations"]["summary"]))
-    if status["mqtt"] is not None:
-        links.append((status["mqtt"]["good"], "mqtt", status["mqtt"]["summary"]))
+    links += [(one["good"], name, one["summary"]) for name in ("mqtt", "fleet") if (one := status[name]) is not None]
     if status["recording"]["fault"] is not None:
         links.append((False, "recordings", status["recording"]["fault"]))
     return links

@@ -48,6 +48,8 @@ def _complaints(config: Config) -> Iterator[str]:
         yield wrong
     if config.mqtt is not None:
         yield from _mqtt(config.mqtt)
+    elif config.fleet is not None:
+        yield "'mqtt' is missing; allowed: a table with the broker's host (needed by [fleet])"
     if (config.vehicle.latitude_deg is None) != (config.vehicle.longitude_deg is None):
         yield "'vehicle': found only one of latitude_deg and longitude_deg; allowed: both or neither"
     room_mb = config.storage.recordings_mb

@@ -62,6 +62,7 @@ Platform = Literal["ground", "deck"]
 AtArm = Literal["gate", "warn", "off"]
 LogLevel = Literal["debug", "info", "warning", "error"]
 Signing = Literal["off", "sign", "require"]
+Location = Literal["off", "1km", "full"]
 
 LATITUDE_DEG: Final = (-90.0, 90.0)
 LONGITUDE_DEG: Final = (-180.0, 180.0)
@@ -257,6 +258,15 @@ class Mqtt(Section, frozen=True):
         return None if self.password_file is None else secret_path(self.password_file)
 
 
+class Fleet(Section, frozen=True):
+    """What happens is kept for a fleet's collector, and sent by way of `mqtt`; absent: it is not."""
+
+    name: NonEmpty | None = None
+    """What people call the aircraft."""
+    location: Location = "off"
+    """How much of the place goes along."""
+
+
 class Control(Section, frozen=True):
     """The socket on which `companion status`, `calibrate`, ... find the daemon, and who may use it."""
 
@@ -316,6 +326,7 @@ class Config(Section, frozen=True):
     push: Push = Push()
     component: Component = Component()
     mqtt: Mqtt | None = None
+    fleet: Fleet | None = None
     control: Control = Control()
     storage: Storage = Storage()
     log: Log = Log()

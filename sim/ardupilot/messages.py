@@ -131,7 +131,7 @@ def autopilot_version(double: Board, loop_s: float) -> Message:
     software = major << 24 | minor << 16 | (0 if double.version == NEWEST else mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL)
     nothing = [0] * 8
     return mavlink.MAVLink_autopilot_version_message(
-        capabilities, software, 0, 0, 0, nothing, nothing, nothing, 0x1209, 0x5740, 0
+        capabilities, software, 0, 0, 0, nothing, nothing, nothing, 0x1209, 0x5740, 0, list(double.uid2)
     )
 
 

@@ -55,6 +55,8 @@ class AutopilotDouble(abc.ABC):
         self.faults = Faults()
         self.buzzer = Buzzer(goes_on=tunes_go_on)
         self.armed = False
+        self.uid2 = f"virtual {seed:04d}".encode().ljust(18, b"\0")[:18]
+        """The board's unique id, in AUTOPILOT_VERSION."""
         self.calibrating = False
         self.boots = 0
         declination = math.radians(aircraft.site.declination_deg)

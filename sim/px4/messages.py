@@ -134,7 +134,7 @@ def autopilot_version(double: Board, loop_s: float) -> Message:
     nothing = [0] * 8
     software = major << 24 | minor << 16 | kind
     return mavlink.MAVLink_autopilot_version_message(
-        capabilities, software, software, 0, 0, nothing, nothing, nothing, 0x26AC, 0x0032, 0
+        capabilities, software, software, 0, 0, nothing, nothing, nothing, 0x26AC, 0x0032, 0, list(double.uid2)
     )
 
 

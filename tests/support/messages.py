@@ -33,6 +33,8 @@ NOT_FOR_PEOPLE = {
     "compile", "Formatter", "JournalFormatter", "OneLineFormatter",
     # Names of tasks.
     "create_task", "Thread",
+    # Statements of SQL.
+    "execute", "executemany", "executescript",
 }  # fmt: skip
 
 ELSEWHERE = {

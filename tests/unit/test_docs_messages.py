@@ -28,6 +28,8 @@ NOT_MESSAGES = {
     "MAVLink component", "MAVLink connection", "automatic calibration", "the state for MQTT",
     # When a rival acts, and whether a rival does: keys, not words for people.
     "at a start", "while still", "after a flight",
+    # A key of what a fleet is told.
+    "airframe changed",
     # A key of `counts` in `status --json`: its words have a row.
     "clock back",
     # What an error of the operating system is recognised by.

@@ -21,7 +21,8 @@ from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
 NOT_YET = (
-    "aiomqtt", "companion.daemon.heading.attitude_service", "companion.daemon.process.check",
+    "aiomqtt", "companion.daemon.faces.fleet", "companion.daemon.heading.attitude_service",
+    "companion.daemon.process.check", "companion.storage.fleet_items",
     "companion.cli.setup", "companion.ground", "companion.installation", "companion.setup",
     "companion.replay", "companion.report", "csv", "email", "http", "importlib.metadata", "lxml", "lz4", "mavsdk",
     "mcap", "multiprocessing", "numpy.fft", "numpy.ma", "numpy.polynomial", "numpy.random", "numpy.testing", "paho",

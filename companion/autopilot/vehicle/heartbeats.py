@@ -116,6 +116,13 @@ def firmware_of(message: mavlink.MAVLink_heartbeat_message) -> Firmware:
     return known.get(message.autopilot, "other")
 
 
+def unique_id(message: mavlink.MAVLink_autopilot_version_message) -> str | None:
+    """AUTOPILOT_VERSION.uid2 as 36 hex digits, else uid as 16; None where the board tells neither."""
+    if any(message.uid2):
+        return bytes(message.uid2).hex()
+    return f"{message.uid:016x}" if message.uid else None
+
+
 def version_text(packed: int) -> str:
     """Major, minor, patch and kind of release from AUTOPILOT_VERSION.flight_sw_version, one byte each."""
     major, minor, patch, kind = packed.to_bytes(4, "big")

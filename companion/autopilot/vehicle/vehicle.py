@@ -24,6 +24,7 @@ from companion.autopilot.vehicle.heartbeats import (
     Latch,
     firmware_of,
     is_aircraft,
+    unique_id,
     version_text,
 )
 from companion.autopilot.vehicle.whereabouts import TimeAndPlace
@@ -79,6 +80,8 @@ class Vehicle:
         """Such as "4.6.1" or "4.8.0-dev"; None until AUTOPILOT_VERSION has come."""
         self.capabilities: int | None = None
         """MAV_PROTOCOL_CAPABILITY bits; None until AUTOPILOT_VERSION has come."""
+        self.uid: str | None = None
+        """The board's unique id, hex digits (`unique_id`); None until AUTOPILOT_VERSION has come, or it tells none."""
         self.system_status: int | None = None
         """MAV_STATE of the last heartbeat."""
         self.signs = False
@@ -338,7 +341,7 @@ class Vehicle:
         self._log_conflict()
         self._armed_told = None
         self.place.restarted()
-        self.version = self.capabilities = None
+        self.version = self.capabilities = self.uid = None
         self._ask_soon()
         self._tell("rebooted")
 
@@ -354,6 +357,7 @@ class Vehicle:
     def _on_version(self, message: mavlink.MAVLink_autopilot_version_message, _t_s: float) -> None:
         self.version = version_text(message.flight_sw_version)
         self.capabilities = message.capabilities
+        self.uid = unique_id(message)
 
 
 class Moment:

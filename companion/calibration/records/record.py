@@ -233,6 +233,9 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     accel_sigma_warm_up_m_s2: Vector | None = None
     when_warm: WhenWarm | None = None
     """None: it was warm, or nobody knows where it leads."""
+    gyro_id: int | None = None
+    """The gyro's device id in the autopilot; None where it has none, or by an older version. Likewise the next."""
+    accel_id: int | None = None
 
     def _of(self, triad: Triad) -> tuple[Vector | None, Vector | None, Vector | None]:
         """sigma_use, the residual and the part of sigma_use for a warm-up."""

@@ -43,6 +43,8 @@ class Draft:
     alignment: AlignmentUsed | None = None
     """What was in force of the gradienter's alignment."""
     imu_warnings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+    device_ids: dict[str, tuple[int | None, int | None]] = dataclasses.field(default_factory=dict)
+    """By IMU of the autopilot: gyro and accelerometer."""
     points: dict[str, Point] = dataclasses.field(default_factory=dict)
     """By IMU: what later calibrations may know of this one, once it has come to a good end."""
 
@@ -96,6 +98,7 @@ class Draft:
     def _imu(self, estimate: ImuSolution) -> ImuRecord:
         owner_corrects = estimate.name in self.whole
         gyro, accel = self.whole.get(estimate.name, (estimate.gyro_rad_s, estimate.accel_m_s2))
+        gyro_id, accel_id = self.device_ids.get(estimate.name, (None, None))
         has_gyro, has_accel = estimate.gyro_rad_s is not None, estimate.accel_m_s2 is not None
         return ImuRecord(
             name=estimate.name,
@@ -118,6 +121,8 @@ class Draft:
             effective=estimate.effective,
             when_warm=estimate.when_warm,
             held_back=tuple(triad for name, triad in self.held_back if name == estimate.name),
+            gyro_id=gyro_id,
+            accel_id=accel_id,
             unchanged=tuple(sorted(triad for name, triad in self.unchanged if name == estimate.name)),
         )
 

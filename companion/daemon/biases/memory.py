@@ -118,6 +118,11 @@ class BiasMemory:
             for found in solution.imus
         }
 
+    def device_ids(self) -> dict[str, tuple[int | None, int | None]]:
+        """By IMU of the autopilot: those of gyro and accelerometer, where they are known at the moment."""
+        known = {name: imu.calibration for name, imu in self._imus.items()}
+        return {name: (each.gyro_id, each.accel_id) for name, each in known.items() if each is not None}
+
     def forgotten(self) -> dict[str, str]:
         """Forget what belongs to another sensor than there is now; by IMU, why, in one line."""
         found: dict[str, str] = {}

@@ -81,6 +81,7 @@ class Solving:
             draft.warn(name, words)
         expectation: Expectation = await offload(memory.expectation, solution, unix_s)
         self.on_solved.tell(measured, window, given, job.what, expectation)
+        draft.device_ids = memory.device_ids()
         whole = memory.whole(solution)
         weighed: Weighed = await offload(weigh, solution, whole, expectation)
         # From here on nobody can make this job theirs, so that a request is never answered with half of it.

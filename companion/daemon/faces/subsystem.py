@@ -31,6 +31,7 @@ from companion.physics.units import DEG_H, MG
 from companion.samples import Triad
 
 if TYPE_CHECKING:
+    from companion.daemon.faces.fleet.face import FleetFace
     from companion.daemon.faces.mqtt.face import MqttFace
     from companion.web.server import Page
 
@@ -79,6 +80,11 @@ class Faces(Subsystem):
             self.mqtt = MqttFace(
                 core, core.config.mqtt, self.answer, self.all_status, calibrating.conductor, heading.pose
             )
+        self.fleet: FleetFace | None = None
+        if core.config.fleet is not None and self.mqtt is not None:
+            from companion.daemon.faces.fleet.face import FleetFace
+
+            self.fleet = FleetFace(core, core.config.fleet, self.mqtt, self.answer)
         self.page: Page | None = None
         if core.config.web is not None:
             from companion.web.server import Page
@@ -129,6 +135,7 @@ class Faces(Subsystem):
             "headline": msgspec.to_builtins(self._headlines.now()),
             "vehicle": self._vehicle(),
             "mqtt": None if self.mqtt is None else self.mqtt.status(),
+            "fleet": None if self.fleet is None else self.fleet.status(),
             "page": None if self.page is None else self.page.status(),
             "spoken": [spoken._asdict() for spoken in self._core.texts.spoken],
         }
@@ -156,6 +163,8 @@ class Faces(Subsystem):
         tasks: list[Task] = [("component", self.component.run)]
         if self.mqtt is not None:
             tasks.append(("mqtt", self.mqtt.run))
+        if self.fleet is not None and self._core.only_listening is None:
+            tasks.append(("fleet", self.fleet.run))
         if self.page is not None and self._core.only_listening is None:
             tasks.append(("page", self.page.run))
         return tasks

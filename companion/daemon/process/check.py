@@ -196,8 +196,9 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     findings += [Finding("warning", good=True, words=words) for words in status["warnings"]]
     ground = status["ground_stations"]
     findings.append(Finding("ground stations", good=ground["good"], words=ground["summary"]))
-    if (mqtt := status["mqtt"]) is not None:
-        findings.append(Finding("mqtt", good=mqtt["good"], words=mqtt["summary"]))
+    for name in ("mqtt", "fleet"):
+        if (face := status[name]) is not None:
+            findings.append(Finding(name, good=face["good"], words=face["summary"]))
     # Whose noise figures an IMU's sigmas are made of.
     findings += [Finding(f"profile {one['imu']}", good=True, words=one["summary"]) for one in status["profiles"]]
     if config.push.attitude != "off" and is_running:

@@ -78,7 +78,8 @@ class MqttLink:
         self.settings, self.client_id = settings, client_id
         self.outbox = Outbox()
         self.connections = 0
-        self._will, self._subscriptions, self._on_message = will, tuple(subscriptions), on_message
+        self._will, self._subscriptions, self._on_message = will, list(subscriptions), on_message
+        self._spoken_to: aiomqtt.Client | None = None
         self._offload = offload
         self._reconnection = Reconnection("mqtt", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S)
         self._protocol: int = MQTT_5
@@ -194,7 +195,7 @@ class MqttLink:
         try:
             await _both(self._speak(client), self._receive(client))
         finally:
-            self._connected_s = None
+            self._connected_s = self._spoken_to = None
             self.outbox.closed()
             await _leave(client)
 
@@ -225,22 +226,39 @@ class MqttLink:
 
     async def _speak(self, client: aiomqtt.Client) -> None:
         await self._subscribe(client)
+        self._spoken_to = client
         self._up()
         await self._send(client)
 
+    async def hear(self, topic: str) -> None:
+        """Subscribe to one more topic, now and at every connection."""
+        import aiomqtt
+
+        if topic in self._subscriptions:
+            return
+        self._subscriptions.append(topic)
+        if self._spoken_to is not None:
+            # A connection that is lost over it brings the next one.
+            with contextlib.suppress(aiomqtt.MqttError):
+                await self._ask_for(self._spoken_to, topic)
+
     async def _subscribe(self, client: aiomqtt.Client) -> None:
+        self._refused = []
+        # One that is added meanwhile takes part.
+        for topic in self._subscriptions:
+            await self._ask_for(client, topic)
+
+    async def _ask_for(self, client: aiomqtt.Client, topic: str) -> None:
         from paho.mqtt.subscribeoptions import SubscribeOptions
 
-        self._refused = []
-        for topic in self._subscriptions:
-            if self._protocol == MQTT_5:
-                options = SubscribeOptions(qos=1, retainAsPublished=True)
-                granted = await client.subscribe(topic, options=options, timeout=ANSWER_DEADLINE_S)
-            else:
-                granted = await client.subscribe(topic, qos=1, timeout=ANSWER_DEADLINE_S)
-            if any(getattr(code, "value", code) >= _REFUSED for code in granted):
-                self._refused.append(f"the broker does not let us hear {topic} (its access list?)")
-                logger.warning("mqtt: %s: %s", self.where, self._refused[-1])
+        if self._protocol == MQTT_5:
+            options = SubscribeOptions(qos=1, retainAsPublished=True)
+            granted = await client.subscribe(topic, options=options, timeout=ANSWER_DEADLINE_S)
+        else:
+            granted = await client.subscribe(topic, qos=1, timeout=ANSWER_DEADLINE_S)
+        if any(getattr(code, "value", code) >= _REFUSED for code in granted):
+            self._refused.append(f"the broker does not let us hear {topic} (its access list?)")
+            logger.warning("mqtt: %s: %s", self.where, self._refused[-1])
 
     async def _send(self, client: aiomqtt.Client) -> None:
         while True:

@@ -22,6 +22,7 @@ from companion.daemon.faces.mqtt.requests import Requests
 from companion.daemon.heading.subsystem import PoseNow
 from companion.formats import Object
 from companion.links.mqtt.client import Incoming, MqttLink
+from companion.links.system.listeners import Listeners
 
 logger = logging.getLogger(__name__)
 _json: Final = msgspec.json.encode
@@ -140,6 +141,8 @@ class MqttFace:
         self._faulty = False
         self.link: MqttLink | None = None
         self.topics: Topics | None = None
+        self.on_other: Listeners[Incoming] = Listeners()
+        """Told of what comes under topics that are not ours."""
 
     def status(self) -> Object:
         """For `companion status` and `check`."""
@@ -277,6 +280,8 @@ class MqttFace:
         command = self.topics.command_in(message.topic)
         if command is not None:
             self._requests.accept(command, message.payload, retained=message.retained)
+        else:
+            self.on_other.tell(message)
 
     def _on_retained(self, command: str) -> None:
         if self.topics is not None:

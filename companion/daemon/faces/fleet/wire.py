@@ -1,0 +1,125 @@
+"""What an aircraft and a collector say to one another: docs/fleet/asyncapi.yaml."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, NamedTuple
+
+import msgspec
+
+from companion.config.sections import Location
+from companion.formats import decode
+from companion.storage.fleet_items import Kept, Waiting
+from companion.storage.state import UNREADABLE
+
+FORMAT_VERSION: Final = 1
+MOST_RANGES: Final = 256
+MOST_SEQUENCE: Final = 2**53
+
+_Sequence = Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
+
+_ROUNDED: Final[dict[str, int]] = {
+    "latitude_deg": 2,
+    "longitude_deg": 2,
+    "height_m": -2,
+    "gravity_m_s2": 3,
+    "declination_deg": 1,
+    "field_gauss": 3,
+    "field_expected_gauss": 3,
+    "inclination_deg": 1,
+    "inclination_expected_deg": 1,
+}
+"""Whatever tells a place (gravity and the field do, too), and to how many decimals it is no closer than a kilometre."""
+
+
+class Topics(NamedTuple):
+    """Of one aircraft."""
+
+    aircraft: str
+
+    @property
+    def hello(self) -> str:
+        """What it keeps."""
+        return f"fleet/{self.aircraft}/hello"
+
+    @property
+    def item(self) -> str:
+        """What it tells."""
+        return f"fleet/{self.aircraft}/item"
+
+    @property
+    def heard(self) -> tuple[str, str]:
+        """What a collector has, and what it lacks."""
+        return f"fleet/{self.aircraft}/confirmed", f"fleet/{self.aircraft}/wanted"
+
+
+class Said(msgspec.Struct, frozen=True):
+    """What a collector says of sequences: it has them, or wants them."""
+
+    epoch: str
+    sequences: Annotated[list[tuple[_Sequence, _Sequence]], msgspec.Meta(max_length=MOST_RANGES)]
+
+    def names(self, sequence: int) -> bool:
+        """Whether this one is among them."""
+        return any(first <= sequence <= last for first, last in self.sequences)
+
+
+def parse(payload: bytes) -> Said | None:
+    """None: it is nothing of the kind, or of a newer version. Never raises."""
+    try:
+        said: Said = decode(payload, Said, FORMAT_VERSION)
+    except UNREADABLE:
+        return None
+    return said if all(first <= last for first, last in said.sequences) else None
+
+
+def hello(kept: Kept, name: str | None, at: str) -> bytes:
+    """The payload of a hello."""
+    return msgspec.json.encode(
+        {
+            "format_version": FORMAT_VERSION,
+            "aircraft": kept.aircraft,
+            "name": name,
+            "epoch": kept.epoch,
+            "first": kept.first,
+            "last": kept.last,
+            "at": at,
+        }
+    )
+
+
+def item(waiting: Waiting, location: Location) -> bytes:
+    """The payload of an item, with as much of the place as is wanted."""
+    told = waiting.item
+    try:
+        body = msgspec.json.decode(told.body)
+    except UNREADABLE:
+        body = {}  # the disk has spoilt it
+    return msgspec.json.encode(
+        {
+            "format_version": FORMAT_VERSION,
+            "aircraft": waiting.aircraft,
+            "epoch": waiting.epoch,
+            "sequence": waiting.sequence,
+            "kind": told.kind,
+            "at": told.at,
+            "clock": told.clock,
+            "body": body if location == "full" else _less_place(body, location),
+        }
+    )
+
+
+def _less_place(value: Any, location: Location) -> Any:
+    if isinstance(value, list):
+        return [_less_place(each, location) for each in value]
+    if not isinstance(value, dict):
+        return value
+    return {
+        key: _place(each, _ROUNDED[key], location)
+        if key in _ROUNDED and not isinstance(each, dict | list)
+        else _less_place(each, location)
+        for key, each in value.items()
+    }
+
+
+def _place(value: float | None, decimals: int, location: Location) -> float | None:
+    return None if location == "off" or value is None else round(value, decimals)
