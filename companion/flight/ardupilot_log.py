@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.flight.inertial import joined
 from companion.flight.log import Boot, Estimated, FlownImu, Place, Start, changes, starts
@@ -60,7 +61,8 @@ def read(path: Path, progress: Progress) -> Iterator[Boot]:
 def _boot(start: Start) -> Boot:
     parameters = {name: value for _, name, value in start.parameters}
     cores = _cores(parameters)
-    primary = _primary(start)
+    lanes = _lanes(start)
+    primary = int(np.bincount(lanes).argmax())
     simulated = bool(start.instances("SIM"))
     return Boot(
         firmware="ardupilot",
@@ -76,7 +78,10 @@ def _boot(start: Start) -> Boot:
         # Its own physics know neither.
         earth_turns=not simulated,
         standard_gravity=simulated,
-        notes=("simulated: the Earth does not turn in it",) if simulated else (),
+        notes=(
+            *(("simulated: the Earth does not turn in it",) if simulated else ()),
+            *((f"the EKF has changed its lane: measured from lane {primary}",) if np.ptp(lanes) else ()),
+        ),
     )
 
 
@@ -86,11 +91,11 @@ def _cores(parameters: dict[str, float]) -> list[int]:
     return [k for k in range(_IMUS) if mask >> k & 1]
 
 
-def _primary(start: Start) -> int:
-    rows = [start.rows("XKF4", core) for core in start.instances("XKF4")]
-    told = np.concatenate([each[:, 1] for each in rows]) if rows else np.zeros(0)
+def _lanes(start: Start) -> NDArray[np.int64]:
+    """The core that it flies by, message by message."""
+    told = np.concatenate([np.zeros(0), *(start.rows("XKF4", core)[:, 1] for core in start.instances("XKF4"))])
     told = told[(told >= 0) & (told < _IMUS)].astype(np.int64)
-    return int(np.bincount(told).argmax()) if len(told) else 0
+    return told if len(told) else np.zeros(1, dtype=np.int64)
 
 
 def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[int]) -> FlownImu:

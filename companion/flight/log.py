@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.flight.inertial import Navigation
 from companion.physics.frames import Floats
-from companion.replay.blocks import PARAMETERS, Block
+from companion.replay.blocks import DROPOUTS, PARAMETERS, Block
 
 MOST_ROWS: Final = 1 << 19
 """Of a message and instance: 20 minutes at 400 Hz; of a longer log each two, four ... are one mean."""
@@ -60,12 +60,16 @@ class Start:
         self._fields = fields
         self._tables: dict[tuple[str, int], Table] = defaultdict(Table)
         self.parameters: list[tuple[float, str, float]] = []
+        self.gaps = 0
+        """In which the autopilot could not write."""
 
     def take(self, block: Block) -> None:
         """Some more of it."""
         if block.name == PARAMETERS:
             found = zip(block.rows[:, 0].tolist(), block.texts, block.rows[:, 1].tolist(), strict=True)
             self.parameters += itertools.islice(found, _MOST_PARAMETERS - len(self.parameters))
+        elif block.name == DROPOUTS:
+            self.gaps += len(block.rows)
         elif 0 <= block.instance < _INSTANCES:
             self._tables[block.name, block.instance].add(block.rows)
 

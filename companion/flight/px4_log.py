@@ -12,7 +12,7 @@ from companion.flight.inertial import Navigation, joined
 from companion.flight.log import Boot, Estimated, FlownImu, Place, Start, ascending, changes, starts
 from companion.physics.frames import Floats
 from companion.replay.blocks import US, Progress
-from companion.replay.ulog import DROPOUTS, ulog
+from companion.replay.ulog import ulog
 
 
 def _elements(name: str, count: int = 3) -> tuple[str, ...]:
@@ -52,12 +52,11 @@ def read(path: Path, progress: Progress) -> Iterator[Boot]:
     Raises:
         StorageError: one line: it cannot be read.
     """
-    fields = {name: len(columns) for name, columns in _TOPICS.items()} | {DROPOUTS: 1}
+    fields = {name: len(columns) for name, columns in _TOPICS.items()}
     return map(_boot, starts(ulog(path, _TOPICS, progress), fields))
 
 
 def _boot(start: Start) -> Boot:
-    gaps = len(start.rows(DROPOUTS))
     armed, landed = start.rows("actuator_armed"), start.rows("vehicle_land_detected")
     return Boot(
         firmware="px4",
@@ -70,7 +69,7 @@ def _boot(start: Start) -> Boot:
         parameters=tuple(start.parameters),
         unix_offset_s=_unix_offset(start),
         place=_place(start),
-        notes=(f"{gaps} gaps in it, in which PX4 could not write",) if gaps else (),
+        notes=(f"{start.gaps} gaps in it, in which PX4 could not write",) if start.gaps else (),
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from companion.errors import StorageError
 from companion.physics.frames import Floats
 from companion.replay import dataflash, ulog
-from companion.replay.blocks import Block
+from companion.replay.blocks import DROPOUTS, Block
 from companion.replay.log import LAST_S, StillLog
 
 _LARGEST: Final = 1e6
@@ -69,7 +69,7 @@ def read_ulog(path: Path) -> list[StillLog]:
         StorageError: one line: it cannot be read.
     """
     data = _whole(ulog.ulog(path, _TOPICS))
-    dropouts = len(data.get((ulog.DROPOUTS, 0), ()))
+    dropouts = len(data.get((DROPOUTS, 0), ()))
     logs = [log for log in _ulog_imus(path, data) if log is not None]
     if not logs:
         raise StorageError(f"{path}: no samples of an IMU in it")

@@ -15,6 +15,8 @@ from companion.physics.frames import Floats
 _PIECE: Final = 1 << 22
 US: Final = 1e-6
 PARAMETERS: Final = "parameters"
+DROPOUTS: Final = "dropouts"
+"""How long the autopilot could not write, ms."""
 
 Progress = Callable[[float], None]
 """Told how much of a file has been read, from 0 to 1."""

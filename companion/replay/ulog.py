@@ -12,11 +12,9 @@ import numpy as np
 
 from companion.calibration.noise.robust import median
 from companion.errors import StorageError
-from companion.replay.blocks import PARAMETERS, US, Block, Kept, Progress, columns, nobody, pieces
+from companion.replay.blocks import DROPOUTS, PARAMETERS, US, Block, Kept, Progress, columns, nobody, pieces
 
 MAGIC: Final = b"ULog\x01\x12\x35"
-DROPOUTS: Final = "dropouts"
-"""How long PX4 could not write, ms."""
 _START: Final = struct.Struct("<8xQ")
 _FLAGS: Final = struct.Struct("<16x2xc8xB7sQ")
 _HEADER: Final = struct.Struct("<HB")

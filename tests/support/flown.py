@@ -90,13 +90,28 @@ def fly(
     return Flown(at, readings, t[slow], q, velocity[slow], position[slow])
 
 
-_SIZES = {"Q": "Q", "B": "B", "f": "f", "c": "h", "L": "i", "H": "H", "I": "I", "N": "16s", "h": "h", "e": "i"}
+_SIZES = {
+    "Q": "Q",
+    "B": "B",
+    "b": "b",
+    "f": "f",
+    "c": "h",
+    "L": "i",
+    "H": "H",
+    "I": "I",
+    "N": "16s",
+    "h": "h",
+    "e": "i",
+}
 _MESSAGES: dict[str, tuple[str, str]] = {
     "PARM": ("QNff", "TimeUS,Name,Value,Default"),
     "IMU": ("QBffffffIIfBBHH", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz"),
     "VIBE": ("QBfffI", "TimeUS,IMU,VibeX,VibeY,VibeZ,Clip"),
     "XKF1": ("QBccCfffffffccce", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD,dPD,PN,PE,PD,GX,GY,GZ,OH"),
     "XKQ": ("QBffff", "TimeUS,C,Q1,Q2,Q3,Q4"),
+    "XKF4": ("QBcccccfffHBIHb", "TimeUS,C,SV,SP,SH,SM,SVT,errRP,OFN,OFE,FS,TS,SS,GPS,PI"),
+    "GYR": ("QBQfff", "TimeUS,I,SampleUS,GyrX,GyrY,GyrZ"),
+    "ACC": ("QBQfff", "TimeUS,I,SampleUS,AccX,AccY,AccZ"),
     "ARM": ("QBIBB", "TimeUS,ArmState,ArmChecks,Forced,Method"),
     "EV": ("QB", "TimeUS,Id"),
     "GPS": ("QBBIHBcLLeffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"),

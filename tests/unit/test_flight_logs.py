@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from companion.physics.units import DEG_H, MG
 from companion.storage.flights import FlightStore
 from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.records import RecordStore
-from tests.support.autopilot_files import write_ulog
+from tests.support.autopilot_files import ulog_message, write_ulog
 from tests.support.flown import HEIGHT_M, LATITUDE_DEG, Flown, dataflash, fly, messages, parameters
 from tests.support.histories import SLOPES_DEG_H_K, windows_of_days
 from tests.support.made_noise import Floats
@@ -236,13 +237,13 @@ def column(states: Any) -> Floats:
     return np.asarray(states, dtype=np.float64)[:, None]
 
 
-def test_a_flight_of_px4_is_told_alike(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def of_px4(flown: Flown, path: Path) -> Path:
     at, slow = flown.at_s, flown.at_s[::25]
     place = np.tile([LATITUDE_DEG, HEIGHT_M], (len(at), 1))
     spun = ((slow >= flown.motors_s) & (slow < flown.disarmed_s))[:, None]
     bias = [*(each * DEG_H for each in GYRO_DEG_H), *[1e-10] * 3, *(each * MG for each in ACCEL_MG), *[1e-6] * 3]
-    path = write_ulog(
-        tmp_path / "log.ulg",
+    return write_ulog(
+        path,
         {
             ("sensor_combined", 0): (flown.t_s, flown.readings),
             ("vehicle_attitude", 0): (at, flown.quaternions),
@@ -253,6 +254,10 @@ def test_a_flight_of_px4_is_told_alike(flown: Flown, tmp_path: Path, capsys: pyt
             ("estimator_sensor_bias", 0): (slow, np.tile([0.0, *bias], (len(slow), 1))),
         },
     )
+
+
+def test_a_flight_of_px4_is_told_alike(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = of_px4(flown, tmp_path / "log.ulg")
     code, answer = said(capsys, path, *storage(tmp_path))
     assert code == 0
     (flight,) = answer["flights"]
@@ -267,6 +272,25 @@ def test_a_flight_of_px4_is_told_alike(flown: Flown, tmp_path: Path, capsys: pyt
         assert abs(axis["in_flight"]["value"] / unit - bias_now) < 2.0 * axis["in_flight"]["sigma"] / unit
     assert imu["axes"][0]["ekf"]["value"] / DEG_H == pytest.approx(GYRO_DEG_H[0])
     assert 60.0 < imu["drift"]["flown"][1]["median_m"] < 200.0
+
+
+def test_what_px4_could_not_write_is_said_and_not_flown_over(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = (flown.t_s < 150.0) | (flown.t_s > 152.0)
+    path = of_px4(dataclasses.replace(flown, t_s=flown.t_s[there], readings=flown.readings[there]), tmp_path / "x.ulg")
+    with path.open("ab") as file:
+        file.write(ulog_message(b"O", struct.pack("<H", 1000)) * 2)
+    _, answer = said(capsys, path, *storage(tmp_path))
+    _, whole = said(capsys, of_px4(flown, tmp_path / "whole.ulg"), *storage(tmp_path))
+    (flight,), (expected,) = answer["flights"], whole["flights"]
+    assert flight["notes"] == ["2 gaps in it, in which PX4 could not write"]
+    for rows, others in zip(*(each["imus"][0]["drift"]["flown"] for each in (flight, expected)), strict=True):
+        # None begins before the gap and ends after it.
+        assert rows["starts"] == pytest.approx(others["starts"] - rows["seconds"] - 2.0, abs=2.0)
+        assert rows["median_m"] == pytest.approx(others["median_m"], rel=0.2)
+    for axis, other in zip(flight["imus"][0]["axes"], expected["imus"][0]["axes"], strict=True):
+        assert axis["in_flight"]["value"] == pytest.approx(other["in_flight"]["value"], abs=other["in_flight"]["sigma"])
 
 
 def test_several_starts_in_one_file_are_each_by_their_own_clock(
@@ -316,15 +340,105 @@ def test_a_log_without_what_it_takes_is_one_line(
         (b"", "no log of ArduPilot (.bin) or PX4 (.ulg)"),
         (b"%PDF-1.4 and more", "no log of ArduPilot (.bin) or PX4 (.ulg)"),
         (b"\xa3\x95\x80" + bytes(7), "no samples of an IMU in it"),
+        (b"ULog\x01\x12\x35\x01" + bytes(8), "no samples of an IMU in it"),
         (b"ULogEnc\x01" + bytes(100), "encrypted by PX4: decrypt it first (Tools/log_encryption of PX4)"),
+        (b"\x00\x06\x1d" + bytes(5) + b"\xfd\x09\x00\x00", "no log of ArduPilot (.bin) or PX4 (.ulg)"),
+        (b"PK\x03\x04" + bytes(100), "no log of ArduPilot (.bin) or PX4 (.ulg)"),
+        (b"FMT, 128, 89, FMT, BBnNZ, Type,Length,Name\n", "no log of ArduPilot (.bin) or PX4 (.ulg)"),
+        (None, "cannot be read: Is a directory"),
     ],
-    ids=["empty", "foreign", "beginning", "encrypted"],
+    ids=["empty", "foreign", "beginning", "beginning of PX4's", "encrypted", "tlog", "zip", "text", "folder"],
 )
-def test_another_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], data: bytes, words: str) -> None:
+def test_another_file_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], data: bytes | None, words: str
+) -> None:
     path = tmp_path / "log"
-    path.write_bytes(data)
+    if data is None:
+        path.mkdir()
+    else:
+        path.write_bytes(data)
     assert companion(["flight", str(path), *storage(tmp_path)]) == 1
     assert capsys.readouterr().err == f"companion: {path}: {words}\n"
+
+
+def test_an_ekf2_alone_is_one_line(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = dataflash(tmp_path / "x.bin", messages(flown, parameters()))
+    data = path.read_bytes()
+    for ours, theirs in ((b"XKF1", b"NKF1"), (b"XKQ\0", b"NKQ\0")):
+        assert data.count(ours) == 1
+        data = data.replace(ours, theirs)
+    path.write_bytes(data)
+    assert companion(["flight", str(path), *storage(tmp_path)]) == 1
+    words = "no attitude and position of an EKF3 (ArduPilot) or EKF2 (PX4) in it"
+    assert capsys.readouterr().err == f"companion: {path}: {words}\n"
+
+
+def test_gps_time_that_comes_late_or_leaps_dates_the_flight(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = []
+    for name, values in messages(flown, parameters()):
+        if name == "GPS" and values[0] < 140e6:
+            values = (*values[:2], 1, 0, 0, *values[5:])  # no fix: no time
+        elif name == "GPS" and 180e6 < values[0] < 190e6:
+            values = (*values[:4], values[4] + 1024, *values[5:])  # a receiver that has lost count of the weeks
+        told.append((name, values))
+    _, answer = said(capsys, dataflash(tmp_path / "x.bin", told), *storage(tmp_path))
+    assert answer["flights"][0]["began_at"] == "2026-10-11T00:00:46+00:00"
+
+
+def test_a_time_that_is_damaged_costs_no_more_than_its_message(
+    log: Path, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = messages(flown, parameters())
+    for k in range(1000, len(told), 501):
+        name, (_, *rest) = told[k]
+        told[k] = name, (2**40 if k % 2 else 0, *rest)
+    _, answer = said(capsys, dataflash(tmp_path / "x.bin", told), *storage(tmp_path))
+    _, whole = said(capsys, log, *storage(tmp_path))
+    (flight,), (expected,) = answer["flights"], whole["flights"]
+    assert flight["imus"][0]["rate_hz"] == pytest.approx(100.0, rel=0.01)
+    for axis, other in zip(flight["imus"][0]["axes"], expected["imus"][0]["axes"], strict=True):
+        assert axis["in_flight"]["value"] == pytest.approx(other["in_flight"]["value"], abs=other["in_flight"]["sigma"])
+
+
+def test_readings_at_the_sensors_own_rate_tell_the_same(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """LOG_BITMASK with IMU_RAW, and IMU messages at 10 Hz."""
+    told, k = [], 0
+    for name, values in messages(flown, parameters()):
+        if name == "IMU":
+            t_us, instance, *row = values
+            told += [("GYR", (t_us, instance, t_us, *row[:3])), ("ACC", (t_us, instance, t_us, *row[3:6]))]
+            if k % 10 == 0:
+                told.append((name, values))
+            k += 1
+        else:
+            told.append((name, values))
+    _, answer = said(capsys, dataflash(tmp_path / "raw.bin", told), *storage(tmp_path))
+    (imu,) = answer["flights"][0]["imus"]
+    assert imu["rate_hz"] == pytest.approx(100.0, rel=0.01)
+    for axis, bias, unit in zip(imu["axes"], (*GYRO_DEG_H, ACCEL_MG[2] + STEP_MG), (*[DEG_H] * 3, MG), strict=True):
+        assert abs(axis["in_flight"]["value"] / unit - bias) < 2.0 * axis["in_flight"]["sigma"] / unit
+
+
+def test_the_lane_that_it_has_flown_by_for_longest_is_the_reference(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = []
+    for name, values in messages(flown, parameters()):
+        told.append((name, values))
+        if name in {"XKF1", "XKQ"}:
+            t_us, core, *rest = values
+            # Of the other core nothing is to be believed.
+            told.append((name, (t_us, core + 1, *([0.0] * len(rest) if name == "XKQ" else rest))))
+        if name == "XKF1":
+            told.append(("XKF4", (values[0], 0, *[0] * 12, 1 if values[0] > 200e6 else 0)))
+    _, answer = said(capsys, dataflash(tmp_path / "lanes.bin", told), *storage(tmp_path))
+    (flight,) = answer["flights"]
+    assert flight["notes"] == ["the EKF has changed its lane: measured from lane 0"]
+    assert 60.0 < flight["imus"][0]["drift"]["flown"][1]["median_m"] < 200.0
 
 
 def test_a_truncated_and_damaged_log_is_read_as_far_as_it_goes(

@@ -12,9 +12,9 @@ from pymavlink.DFReader import DFReader_binary
 from pyulog import ULog
 
 from companion.errors import StorageError
-from companion.replay.blocks import PARAMETERS, Block
+from companion.replay.blocks import DROPOUTS, PARAMETERS, Block
 from companion.replay.dataflash import dataflash
-from companion.replay.ulog import DROPOUTS, ulog
+from companion.replay.ulog import ulog
 from tests.support import flown
 from tests.support.autopilot_files import ulog_message as message
 from tests.support.made_noise import Floats
