@@ -1,5 +1,5 @@
 -- companion_arming.lua: ArduPilot arms only while the companion computer says that a fresh calibration is in force,
--- and flies by its compass as soon as the companion's heading is not to be had.
+-- and flies by its gyros and GNSS as soon as the companion's heading is not to be had.
 --
 -- Copyright the companion authors. SPDX-License-Identifier: Apache-2.0
 --
@@ -35,12 +35,14 @@ local verdict = nil
 local reason = ""
 local trouble = nil
 
--- Heading: with EK3_SRC1_YAW = 6 the EKF has the companion's and no other. Source set 2 has the compass; it is taken
--- when the companion's stream ends, or when in flight the heading turns while the gyros do not, and the set is put back
--- when the stream has been there for 10 s: the companion sends only what agrees with the EKF. After a heading that turned
--- by itself not before the aircraft is disarmed. A set that somebody else has chosen stays. CMPG_HEADING 0: no part in it.
-local FROM_OUTSIDE, FROM_COMPASS = 6, 1 -- EK3_SRCn_YAW
-local SET_1, SET_2 = 0, 1
+-- Heading: with EK3_SRC1_YAW = 6 the EKF has the companion's and no other. When the companion's stream ends, or when in
+-- flight the heading turns while the gyros do not, another source set is taken: in flight set 3, by which the gyros carry
+-- the heading on and GNSS holds it, since a compass may have come to lie by then; on the ground set 2, the compass. Set 1
+-- is put back when the stream has been there for 10 s: the companion sends only what agrees with the EKF. After a heading
+-- that turned by itself not before the aircraft is disarmed. A set that somebody else has chosen stays. CMPG_HEADING 0: no
+-- part in it.
+local FROM_NONE, FROM_COMPASS, FROM_OUTSIDE = 0, 1, 6 -- EK3_SRCn_YAW
+local SET_1, SET_2, SET_3 = 0, 1, 2
 local LOST_MS = 300 -- besides the 300 ms after which visual_odom is not healthy
 local WELL_MS = 10000
 local STRAYS_RAD = math.rad(5)
@@ -51,7 +53,7 @@ local STEEP_RAD = math.rad(60)
 local is_guarding = false
 local looked_ms = nil
 local silent_since_ms, well_since_ms = nil, nil
-local fell, is_latched = false, false
+local fell, is_latched = nil, false -- the set that was fallen back to
 local strayed_rad, last_yaw_rad, last_ms = 0, nil, nil
 local is_broken = false
 local gated_ms, gate_after_ms = nil, PERIOD_MS
@@ -165,6 +167,7 @@ local function look()
     looked_ms = millis()
     is_guarding = visual_odom ~= nil and param:get("CMPG_HEADING") ~= 0
         and param:get("EK3_SRC1_YAW") == FROM_OUTSIDE and param:get("EK3_SRC2_YAW") == FROM_COMPASS
+        and param:get("EK3_SRC3_YAW") == FROM_NONE and param:get("EK3_SRC3_VELXY") ~= 0
 end
 
 local function angle_rad(name)
@@ -194,6 +197,11 @@ local function take_set(set, words)
     gcs:send_text(WARNING, words)
 end
 
+local function fall(why)
+    fell = arming:is_armed() and SET_3 or SET_2
+    take_set(fell, (fell == SET_3 and "Heading: gyros, " or "Heading: compass, ") .. why)
+end
+
 local function guard()
     look()
     if not is_guarding then
@@ -207,20 +215,21 @@ local function guard()
     end
     if set == SET_1 then
         if silent_since_ms ~= nil and since_ms(silent_since_ms) >= LOST_MS then
-            fell = true
-            take_set(SET_2, "Heading: compass, companion silent")
+            fall("companion silent")
         elseif strays() then
-            fell, is_latched = true, true
-            take_set(SET_2, "Heading: compass, companion's drifts")
+            is_latched = true
+            fall("companion's drifts")
         end
-    elseif set == SET_2 and fell then
+    elseif set == fell then
         is_latched = is_latched and arming:is_armed()
         if not is_latched and well_since_ms ~= nil and since_ms(well_since_ms) >= WELL_MS then
-            fell = false
+            fell = nil
             take_set(SET_1, "Heading: companion")
+        elseif fell == SET_3 and not arming:is_armed() then
+            fall("landed")
         end
     else
-        fell = false -- somebody else's choice
+        fell = nil -- somebody else's choice
     end
 end
 

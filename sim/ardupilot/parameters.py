@@ -151,7 +151,7 @@ def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) 
         "EK3_ENABLE": (1, INT8),
         "EK3_IMU_MASK": (2 ** min(imus, 3) - 1, INT8),
         **{f"EK3_SRC1_{what}": (value, INT8) for what, value in EKF_SOURCES.items()},
-        **{f"EK3_SRC2_{what}": (0, INT8) for what in EKF_SOURCES},
+        **{f"EK3_SRC{number}_{what}": (0, INT8) for number in (2, 3) for what in EKF_SOURCES},
         "EK3_GBIAS_P_NSE": (0.001, REAL32),
         "EK3_ABIAS_P_NSE": (0.02, REAL32),
         "EK3_ACC_BIAS_LIM": (1.0, REAL32),

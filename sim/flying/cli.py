@@ -18,6 +18,7 @@ from sim.flying.flight import SET_UPS, WATCHED_S, Plan, SetUp, flying
 from sim.flying.verdict import HEADER, Figures, Record, figures, row, summary
 from sim.sitl.process import BinaryError
 
+OWN_COMPASS = ("own-compass", "own-compass-end")
 HELP = "A real firmware flies with our heading, and something fails: the largest errors, as a table."
 
 
@@ -63,9 +64,9 @@ def plans_of(arguments: argparse.Namespace) -> list[Plan]:
     px4 = "px4" in arguments.binary.name
     if any((set_up == "px4") is not px4 for set_up in arguments.set_up):
         raise BinaryError(f"--set-up: {', '.join(arguments.set_up)}: px4 is that of PX4, the others are ArduPilot's")
-    if px4 and "own-compass" in arguments.fault:
+    if px4 and any(fault in OWN_COMPASS for fault in arguments.fault):
         raise BinaryError("--fault own-compass: the compass of PX4's simulation cannot be turned; ArduPilot's can")
-    able = [fault for fault in FAULTS if not px4 or fault != "own-compass"]
+    able = [fault for fault in FAULTS if not px4 or fault not in OWN_COMPASS]
     set_ups: list[SetUp] = ["px4"] if px4 else arguments.set_up or ["script"]
     seeds = range(arguments.seed, arguments.seed + arguments.flights)
     for fault, set_up, seed in itertools.product(arguments.fault or able, set_ups, seeds):

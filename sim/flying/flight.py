@@ -35,9 +35,9 @@ from sim.sitl.residuals import ground_station
 
 SetUp = Literal["script", "command", "today", "px4"]
 SET_UPS: dict[SetUp, str] = {
-    "script": "both source sets, and the script",
-    "command": "both source sets, no script",
-    "today": "our heading and no second source set, no script",
+    "script": "all source sets, and the script",
+    "command": "all source sets, no script",
+    "today": "our heading and no other source set, no script",
     "px4": "of PX4, which sees to another heading by itself",
 }
 MORE = '\n[push]\nattitude = "yaw"\n[calibration]\nmin_still_s = 10\nmax_s = 15\nat_arm = "off"\n'
@@ -57,6 +57,7 @@ PLANE_SETTLED_S = 20.0
 WATCHED_S = 35.0
 TURNS_AFTER_S, TURN_DEG = 12.0, 120.0
 """The pilot turns it about, with the fault in force."""
+OTHER_SETS = ("EK3_SRC2", "EK3_SRC3")
 SCRIPT = Path(__file__).parents[2] / "companion" / "lua" / "companion_arming.lua"
 
 
@@ -147,7 +148,9 @@ class Flight:
         content = "not applied" if only_one else "applied"
         if stored is None or not stored.exists():
             wanted = {row["parameter"]: row["wanted"] for row in shown["parameters"] if row["wanted"] is not None}
-            await self.ground.put_all({n: value for n, value in wanted.items() if not (only_one and "SRC2" in n)})
+            await self.ground.put_all(
+                {n: value for n, value in wanted.items() if not (only_one and n.startswith(OTHER_SETS))}
+            )
             if self.plan.set_up == "script":
                 await self.ground.put("CMPG_ENABLE", 0.0)  # its other half, the gate, is not what flies here
             await self.vehicle.sleep(STORED_S)
@@ -252,6 +255,8 @@ def events_of(ground: GroundStation, since_s: float, own: Callable[[float], floa
             found.append(Event(own(t_s), "text", message.text))
             if message.text.startswith("Heading: compass"):
                 found.append(Event(own(t_s), "set", "2"))
+            elif message.text.startswith("Heading: gyros"):
+                found.append(Event(own(t_s), "set", "3"))
             elif message.text.startswith("Heading: companion"):
                 found.append(Event(own(t_s), "set", "1"))
     return found

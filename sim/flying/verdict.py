@@ -25,7 +25,7 @@ BEFORE_S = 10.0
 """What is compared with how it was before the fault is compared with so many seconds."""
 SETTLED_S = 1.0
 """What the estimate is off by, in place, is taken over so long before the fault."""
-HEADER = f"{'fault':16}{'set-up':9}{'wind':>12}{'yaw':>7}{'set 2 after':>13}{'off truth':>11}{'off spot':>10}  verdict"
+HEADER = f"{'fault':16}{'set-up':9}{'wind':>12}{'yaw':>7}{'other set':>13}{'off truth':>11}{'off spot':>10}  verdict"
 
 
 class Event(NamedTuple):
@@ -129,7 +129,7 @@ def figures(record: Record) -> Figures:
     return Figures(
         yaw_deg=float(np.abs(errors[own_s >= struck]).max()),
         yaw_before_deg=float(np.abs(errors[(own_s < struck) & (own_s > struck - BEFORE_S)]).max()),
-        fallback_s=next((event.own_s - struck for event in sets if event.words == "2"), math.inf),
+        fallback_s=next((event.own_s - struck for event in sets if event.words != "1"), math.inf),
         estimate_m=float(np.hypot(*off.T).max()),
         spot_m=_off_spot_m(record, flown) if record.hold else math.nan,
         sets=len(sets),

@@ -15,7 +15,7 @@ from tests.support.virtual_time import run_virtual
 
 Firmware = Literal["ardupilot", "px4"]
 BEFORE: dict[Firmware, dict[str, float]] = {
-    "ardupilot": {"VISO_TYPE": 0.0, "EK3_SRC1_YAW": 1.0},
+    "ardupilot": {"VISO_TYPE": 0.0, "EK3_SRC1_YAW": 1.0, "EK3_SRC3_YAW": 1.0},
     "px4": {"EKF2_EV_CTRL": 3.0, "EKF2_EV_NOISE_MD": 1.0, "EKF2_EVA_NOISE": 0.1234, "EKF2_EV_DELAY": 12.5},
 }
 AFTER: dict[Firmware, dict[str, float]] = {
@@ -27,6 +27,11 @@ AFTER: dict[Firmware, dict[str, float]] = {
         "EK3_SRC2_VELXY": 3.0,
         "EK3_SRC2_POSZ": 1.0,
         "EK3_SRC2_VELZ": 3.0,
+        "EK3_SRC3_YAW": 0.0,
+        "EK3_SRC3_POSXY": 3.0,
+        "EK3_SRC3_VELXY": 3.0,
+        "EK3_SRC3_POSZ": 1.0,
+        "EK3_SRC3_VELZ": 3.0,
     },
     "px4": {"EKF2_EV_CTRL": 11.0, "EKF2_EV_NOISE_MD": 0.0, "EKF2_EVA_NOISE": 0.05, "EKF2_EV_DELAY": 0.0},
 }
@@ -112,26 +117,23 @@ def test_the_set_up_and_the_stream_together(tmp_path: Path) -> None:
     run_virtual(main())
 
 
-@pytest.mark.parametrize(("firmware", "parameter", "value", "named"), [
-    ("ardupilot", "COMPASS_USE", 0, "COMPASS_USE"),
-    ("px4", "EKF2_MAG_TYPE", 5, "EKF2_MAG_TYPE = 5"),
-    ("px4", "EKF2_MAG_TYPE", 6, "EKF2_MAG_TYPE = 6"),
-    ("px4", "SYS_HAS_MAG", 0, "SYS_HAS_MAG = 0"),
-    ("px4", "EKF2_SENS_EN", 8191 - 1024, "bit 10 of EKF2_SENS_EN"),
+@pytest.mark.parametrize(("parameter", "value", "named"), [
+    ("EKF2_MAG_TYPE", 5, "EKF2_MAG_TYPE = 5"),
+    ("EKF2_MAG_TYPE", 6, "EKF2_MAG_TYPE = 6"),
+    ("SYS_HAS_MAG", 0, "SYS_HAS_MAG = 0"),
+    ("EKF2_SENS_EN", 8191 - 1024, "bit 10 of EKF2_SENS_EN"),
 ])  # fmt: skip
-def test_without_a_compass_there_is_nothing_to_go_back_to(
-    tmp_path: Path, firmware: Firmware, parameter: str, value: int, named: str
+def test_without_a_compass_px4_has_nothing_to_go_back_to(
+    tmp_path: Path, parameter: str, value: int, named: str
 ) -> None:
     """The real EKF2 uses no magnetometer in flight with any of these (tests/sitl flies the stream's end)."""
 
     async def main() -> None:
-        async with flight(tmp_path, firmware=firmware, calibrated=False, used=False) as flying:
+        async with flight(tmp_path, firmware="px4", calibrated=False, used=False) as flying:
             rig = flying.rig
             await follow(rig)
             shown = await ask(rig)
-            assert (shown["state"], shown["net"]["kind"]) == (
-                "applied", "command" if firmware == "ardupilot" else "autopilot",
-            )  # fmt: skip
+            assert (shown["state"], shown["net"]["kind"]) == ("applied", "autopilot")
             rig.autopilot.write_as_another_station(parameter, value)
             shown = await ask(rig)
             assert (shown["state"], shown["net"]["kind"]) == ("not applied", "none")
@@ -140,8 +142,21 @@ def test_without_a_compass_there_is_nothing_to_go_back_to(
     run_virtual(main())
 
 
+@pytest.mark.parametrize("parameter", ["COMPASS_USE", "EK3_SRC3_YAW", "EK3_SRC3_VELXY", "EK3_SRC2_YAW"])
+def test_ardupilots_net_needs_three_sets_of_sources_and_no_compass(tmp_path: Path, parameter: str) -> None:
+    async def main() -> None:
+        async with flight(tmp_path, calibrated=False, used=False) as flying:
+            rig = flying.rig
+            await follow(rig)
+            assert (await ask(rig))["net"]["kind"] == "command"
+            rig.autopilot.write_as_another_station(parameter, 2.0 if parameter.endswith("YAW") else 0.0)
+            assert (await ask(rig))["net"]["kind"] == ("command" if parameter == "COMPASS_USE" else "none")
+
+    run_virtual(main())
+
+
 async def set_up(flying: Flight) -> None:
-    """Both sets of sources, a restart, a calibration, and our heading in use."""
+    """All sets of sources, a restart, a calibration, and our heading in use."""
     rig = flying.rig
     await follow(rig)
     rig.double.reboot()
@@ -152,9 +167,9 @@ async def set_up(flying: Flight) -> None:
     await flying.sleep(12.0)
 
 
-def test_where_there_is_no_script_the_companion_asks_for_the_compass_and_for_its_own_heading_again(
-    tmp_path: Path,
-) -> None:
+def test_where_there_is_no_script_the_companion_asks_for_another_heading_and_for_its_own_again(tmp_path: Path) -> None:
+    """In flight for that of the gyros: its own compass may have come to lie."""
+
     async def main() -> None:
         async with flight(tmp_path, calibrated=False, used=False) as flying:
             rig = flying.rig
@@ -164,19 +179,34 @@ def test_where_there_is_no_script_the_companion_asks_for_the_compass_and_for_its
             rig.autopilot.arm()
             rig.unplugged.add("own")
             await flying.sleep(0.6)
-            assert rig.double.external_nav.source_set == 2
+            assert rig.double.external_nav.source_set == 3
             assert flying.theirs_deg() < 2.0
             rig.unplugged.discard("own")
             await flying.pushing(5.0)
             await flying.sleep(9.0)
-            assert rig.double.external_nav.source_set == 2
+            assert rig.double.external_nav.source_set == 3
             await rig.until(lambda: rig.double.external_nav.source_set == 1, 2.0)
             await flying.sleep(0.1)
             texts = [text for text in rig.ground.texts() if text.startswith("Heading: ")]
-            assert texts[-2:] == ["Heading: compass, companion's is not pushed", "Heading: companion"]
+            assert texts[-2:] == ["Heading: gyros, companion's is not pushed", "Heading: companion"]
             flying.attitude.close()  # as the end of the daemon does, at once
             await flying.sleep(0.1)
-            assert rig.double.external_nav.source_set == 2
+            assert rig.double.external_nav.source_set == 3
+
+    run_virtual(main())
+
+
+def test_on_the_ground_the_companion_asks_for_the_compass(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight(tmp_path, calibrated=False, used=False) as flying:
+            rig = flying.rig
+            await set_up(flying)
+            rig.autopilot.arm()
+            rig.unplugged.add("own")
+            await rig.until(lambda: rig.double.external_nav.source_set == 3, 2.0)
+            rig.autopilot.disarm()
+            await rig.until(lambda: rig.double.external_nav.source_set == 2, 6.0)
+            assert "Heading: compass, companion's is not pushed" in rig.ground.texts()
 
     run_virtual(main())
 

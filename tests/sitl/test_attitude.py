@@ -48,7 +48,9 @@ class Bench:
         """What `companion autopilot-setup` says, from a ground station; without `net` no second set of sources."""
         shown = await self.ask("autopilot-setup")
         wanted = {row["parameter"]: row["wanted"] for row in shown["parameters"] if row["wanted"] is not None}
-        await self.ground.put_all({name: value for name, value in wanted.items() if net or "SRC2" not in name})
+        await self.ground.put_all(
+            {name: value for name, value in wanted.items() if net or name[:8] not in ("EK3_SRC2", "EK3_SRC3")}
+        )
         shown = await self.ask("autopilot-setup")
         assert shown["state"] == ("applied" if net else "not applied"), shown
         return shown

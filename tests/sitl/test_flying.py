@@ -34,6 +34,7 @@ def binary_of(craft: str) -> Path:
     ("craft", "fault"),
     [
         *((craft, fault) for craft in ("arducopter", "px4") for fault in ("kill", "restart", "gyro-drift")),
+        ("arducopter", "own-compass"),
         ("arduplane", "kill"),
         ("arduplane", "restart"),
     ],
@@ -47,7 +48,7 @@ def test_it_stays_where_it_is(tmp_path: Path, craft: str, fault: str) -> None:
     print(found, [event for event in record.events if event.own_s > record.struck_s])
     assert not found.wrong
     assert found.yaw_before_deg < 5.0
-    # A heading that drifts is not believed by EKF3 itself, sooner than anybody asks for the compass.
+    # A heading that drifts is not believed by EKF3 itself, sooner than anybody asks for another.
     if fault != "gyro-drift":
         assert found.fallback_s < 1.0
     if fault == "restart":

@@ -210,10 +210,13 @@ def test_with_no_authorisation_to_be_had_it_tries_on_and_breaks_nothing() -> Non
     script.close()
 
 
+SET_UP = ("set EK3_SRC1_YAW 6", "set EK3_SRC2_YAW 1", "set EK3_SRC3_YAW 0", "set EK3_SRC3_VELXY 3")
+
+
 @pytest.fixture
 def flown(script: Script) -> Script:
     """As `companion autopilot-setup` leaves it, with the stream there, armed."""
-    for each in ("set EK3_SRC1_YAW 6", "set EK3_SRC2_YAW 1", "fly healthy 1", "fly armed 1", "run 2000"):
+    for each in (*SET_UP, "fly healthy 1", "fly armed 1", "run 2000"):
         script(each)
     return script
 
@@ -222,11 +225,30 @@ def source(script: Script) -> str:
     return script("source")[2]
 
 
-def test_a_stream_that_ends_leaves_the_heading_to_the_compass_within_half_a_second(flown: Script) -> None:
+def test_a_stream_that_ends_in_flight_leaves_the_heading_to_the_gyros_within_half_a_second(flown: Script) -> None:
+    """And not to a compass that may have come to lie."""
     flown("fly healthy 0")
     assert flown("run 250")[2] == ""
-    assert flown("run 150")[2] == "4:Heading: compass, companion silent"
+    assert flown("run 150")[2] == "4:Heading: gyros, companion silent"
+    flown("run 600000")
+    assert source(flown) == "set 3"
+
+
+def test_on_the_ground_it_is_the_compass(flown: Script) -> None:
+    flown("fly armed 0")
+    flown("fly healthy 0")
+    assert flown("run 400")[2] == "4:Heading: compass, companion silent"
     assert source(flown) == "set 2"
+
+
+def test_after_the_landing_the_compass_takes_over_from_the_gyros(flown: Script) -> None:
+    flown("fly healthy 0")
+    flown("run 5000")
+    flown("fly armed 0")
+    assert flown("run 100")[2] == "4:Heading: compass, landed"
+    assert source(flown) == "set 2"
+    flown("fly healthy 1")
+    assert flown("run 10200")[2] == "4:Heading: companion"
 
 
 def test_a_gap_of_a_moment_does_nothing(flown: Script) -> None:
@@ -247,7 +269,7 @@ def test_the_companions_heading_is_taken_again_after_ten_good_seconds_in_a_row(f
     flown("run 100")
     flown("fly healthy 1")
     assert flown("run 9900")[2] == ""
-    assert source(flown) == "set 2"
+    assert source(flown) == "set 3"
     assert flown("run 200")[2] == "4:Heading: companion"
     assert source(flown) == "set 1"
 
@@ -255,10 +277,10 @@ def test_the_companions_heading_is_taken_again_after_ten_good_seconds_in_a_row(f
 def test_a_heading_that_turns_by_itself_is_left_until_the_aircraft_is_disarmed(flown: Script) -> None:
     flown(f"fly turns {math.radians(3.0)}")
     assert flown("run 1500")[2] == ""
-    assert flown("run 1500")[2] == "4:Heading: compass, companion's drifts"
+    assert flown("run 1500")[2] == "4:Heading: gyros, companion's drifts"
     flown("fly turns 0")
     flown("run 60000")
-    assert source(flown) == "set 2"
+    assert source(flown) == "set 3"
     flown("fly armed 0")
     assert flown("run 200")[2] == "4:Heading: companion"
 
@@ -280,7 +302,18 @@ def test_somebody_elses_choice_of_sources_stays(flown: Script) -> None:
     assert source(flown) == "set 3"
 
 
-@pytest.mark.parametrize("otherwise", ["set EK3_SRC1_YAW 1", "set EK3_SRC2_YAW 6", "set CMPG_HEADING 0"])
+def test_a_pilot_who_prefers_the_compass_in_flight_keeps_it(flown: Script) -> None:
+    flown("fly healthy 0")
+    flown("run 1000")
+    flown("fly set 1")
+    flown("fly healthy 1")
+    flown("run 60000")
+    assert source(flown) == "set 2"
+
+
+@pytest.mark.parametrize("otherwise", [
+    "set EK3_SRC1_YAW 1", "set EK3_SRC2_YAW 6", "set EK3_SRC3_YAW 1", "set EK3_SRC3_VELXY 0", "set CMPG_HEADING 0",
+])  # fmt: skip
 def test_where_the_sets_are_not_ours_nothing_is_switched(flown: Script, otherwise: str) -> None:
     flown(otherwise)
     flown("run 1000")
@@ -292,7 +325,7 @@ def test_where_the_sets_are_not_ours_nothing_is_switched(flown: Script, otherwis
 @pytest.mark.parametrize("kind", ["4.5", "colon", "taken", "full"])
 def test_the_heading_is_guarded_whatever_becomes_of_the_gate(kind: str) -> None:
     script = Script(kind)
-    for each in ("set EK3_SRC1_YAW 6", "set EK3_SRC2_YAW 1", "fly armed 1", "run 2000", "fly healthy 0", "run 500"):
+    for each in (*SET_UP, "fly armed 1", "run 2000", "fly healthy 0", "run 500"):
         script(each)
-    assert source(script) == "set 2"
+    assert source(script) == "set 3"
     script.close()

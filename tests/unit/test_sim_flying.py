@@ -137,7 +137,7 @@ def hovered(**off: float) -> Record:
 
 def test_a_good_flight() -> None:
     record = hovered(yaw_deg=4.0, drifts_m=1.0)
-    record.events = [Event(10.0, "mode", "5"), Event(20.7, "set", "2"), Event(33.0, "set", "1")]
+    record.events = [Event(10.0, "mode", "5"), Event(20.7, "set", "3"), Event(33.0, "set", "1")]
     found = figures(record)
     assert found.yaw_deg == pytest.approx(4.0 + math.degrees(0.01), abs=0.05)
     assert found.fallback_s == pytest.approx(0.7)
@@ -314,6 +314,7 @@ def test_what_px4_tells_of_its_truth_is_an_aircraft_that_turns_and_speeds_up() -
 
 @pytest.mark.parametrize(("words", "why"), [
     (["--binary", "px4", "--fault", "own-compass"], "cannot be turned"),
+    (["--binary", "px4", "--fault", "own-compass-end"], "cannot be turned"),
     (["--binary", "px4", "--set-up", "today"], "the others are ArduPilot's"),
     (["--binary", "arducopter", "--set-up", "px4"], "px4 is that of PX4"),
 ])  # fmt: skip

@@ -15,7 +15,8 @@ EV_YAW: Final = 8
 """Bit 3 of EKF2_EV_CTRL."""
 EXTNAV: Final = 6
 COMPASS: Final = 1
-"""EK3_SRCn_YAW: external navigation, and the autopilot's compass."""
+GYROS: Final = 0
+"""EK3_SRCn_YAW: external navigation, the autopilot's compass, and none: gyros carry it on, GNSS holds it."""
 MAGNETOMETER: Final = 1 << 10
 """Bit 10 of EKF2_SENS_EN."""
 Net = Literal["script", "command", "autopilot", "none"]
@@ -44,13 +45,14 @@ class Wanted:
 _ARDUPILOT: Final = (
     Wanted("VISO_TYPE", 1.0, "listens to VISION_POSITION_ESTIMATE"),
     Wanted("EK3_SRC1_YAW", float(EXTNAV), "EKF3 takes its heading from it (source set 1)"),
-    Wanted("EK3_SRC2_YAW", float(COMPASS), "where that ends, from its compass (source set 2)"),
+    Wanted("EK3_SRC2_YAW", float(COMPASS), "where that ends on the ground, from its compass (source set 2)"),
+    Wanted("EK3_SRC3_YAW", float(GYROS), "where that ends in flight, from gyros and GNSS (source set 3)"),
     *(
-        Wanted(f"EK3_SRC2_{what}", value, "and the rest as in set 1", like=f"EK3_SRC1_{what}")
+        Wanted(f"EK3_SRC{number}_{what}", value, "and the rest as in set 1", like=f"EK3_SRC1_{what}")
+        for number in (2, 3)
         for what, value in (("POSXY", 3.0), ("VELXY", 3.0), ("POSZ", 1.0), ("VELZ", 3.0))
     ),
 )
-_COMPASSES: Final = ("COMPASS_ENABLE", *(f"COMPASS_{what}{n}" for n in ("", "2", "3") for what in ("USE", "DEV_ID")))
 _MAGNETOMETERS: Final = ("EKF2_MAG_TYPE", "SYS_HAS_MAG", "EKF2_SENS_EN")
 SCRIPT: Final = "CMPG_HEADING"
 """Of the script (companion/lua): it is there, and 1 where it sees to the heading."""
@@ -63,8 +65,8 @@ _PX4: Final = (
 WANTED: Final[dict[Firmware, tuple[Wanted, ...]]] = {"ardupilot": _ARDUPILOT, "px4": _PX4}
 
 NETS: Final[dict[Net, str]] = {
-    "script": "if our heading ends, the script takes the compass within a second",
-    "command": "if our heading ends, the companion asks for the compass; if its board dies nobody does (companion lua)",
+    "script": "if our heading ends in flight, the script goes on by gyros and GNSS within a second",
+    "command": "if our heading ends, the companion asks for gyros and GNSS, but not if its board dies (companion lua)",
     "autopilot": "if our heading ends, the autopilot goes back to its magnetometer",
     "none": "if our heading ends there is none: fly only where you can land by hand",
 }
@@ -81,30 +83,27 @@ def read_for(firmware: Firmware | None) -> list[str]:
         AutopilotError: as `wanted_for`.
     """
     wanted = [name for one in wanted_for(firmware) for name in (one.parameter, one.like) if name]
-    return [*wanted, *((*_COMPASSES, SCRIPT) if firmware == "ardupilot" else _MAGNETOMETERS)]
+    return [*wanted, *((SCRIPT,) if firmware == "ardupilot" else _MAGNETOMETERS)]
 
 
 def net_of(firmware: Firmware, found: Mapping[str, float]) -> Net:
     """What is there when our heading ends, of parameters as they were read."""
-    if without_compass(firmware, found):
-        return "none"
     if firmware == "px4":
-        return "autopilot"
-    if found.get("EK3_SRC2_YAW") != COMPASS:
+        return "none" if without_compass(firmware, found) else "autopilot"
+    if (found.get("EK3_SRC2_YAW"), found.get("EK3_SRC3_YAW")) != (COMPASS, GYROS) or not found.get("EK3_SRC3_VELXY"):
         return "none"
     return "script" if found.get(SCRIPT) == 1.0 else "command"
 
 
 def without_compass(firmware: Firmware, found: Mapping[str, float]) -> str | None:
-    """The parameter that leaves it without a compass in flight; None if it has one."""
-    if firmware == "px4":
-        if found.get("SYS_HAS_MAG") == 0.0:
-            return "SYS_HAS_MAG = 0"
-        if (kind := found.get("EKF2_MAG_TYPE", 0.0)) not in (0.0, 1.0):
-            return f"EKF2_MAG_TYPE = {kind:g}"
-        return None if int(found.get("EKF2_SENS_EN", MAGNETOMETER)) & MAGNETOMETER else "bit 10 of EKF2_SENS_EN"
-    used = [found.get(f"COMPASS_USE{n}") == 1.0 and found.get(f"COMPASS_DEV_ID{n}", 1.0) != 0.0 for n in ("", "2", "3")]
-    return "COMPASS_USE" if found.get("COMPASS_ENABLE") == 0.0 or not any(used) else None
+    """The parameter that leaves PX4 without a compass in flight; None if it has one, or does not need it."""
+    if firmware != "px4":
+        return None
+    if found.get("SYS_HAS_MAG") == 0.0:
+        return "SYS_HAS_MAG = 0"
+    if (kind := found.get("EKF2_MAG_TYPE", 0.0)) not in (0.0, 1.0):
+        return f"EKF2_MAG_TYPE = {kind:g}"
+    return None if int(found.get("EKF2_SENS_EN", MAGNETOMETER)) & MAGNETOMETER else "bit 10 of EKF2_SENS_EN"
 
 
 def wanted_for(firmware: Firmware | None) -> tuple[Wanted, ...]:

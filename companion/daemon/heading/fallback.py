@@ -1,7 +1,8 @@
-"""What ArduPilot flies by when our heading ends: the compass of source set 2 (autopilots 10.4).
+"""What ArduPilot flies by when our heading ends: in flight gyros and GNSS, source set 3 (autopilots 10.4).
 
-The script on the flight controller sees to it (companion/lua); where there is none, the companion asks. Nobody does
-then if its board dies. PX4 goes back to its magnetometer by itself.
+No compass, which may have come to lie since the take-off, with nobody to compare it: the compass, source set 2, is for
+the ground. The script on the flight controller sees to it (companion/lua); where there is none, the companion asks.
+Nobody does then if its board dies. PX4 goes back to its magnetometer by itself.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.heading_parameters import EXTNAV, WANTED, Net, net_of, read_for
-from companion.autopilot.vehicle.vehicle import VehicleEvent
+from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core
 from companion.errors import AutopilotError
@@ -26,8 +27,12 @@ SCRIPT_STARTS_S: Final = 15.0
 WELL_S: Final = 10.0
 """So long our heading must have been pushed before it is asked for again."""
 AGAIN_S: Final = 1.0
-_OURS, _COMPASS = 1, 2
-_WORDS: Final = {_OURS: "Heading: companion", _COMPASS: "Heading: compass, companion's is not pushed"}
+_OURS, _COMPASS, _GYROS = 1, 2, 3
+_WORDS: Final = {
+    _OURS: "Heading: companion",
+    _COMPASS: "Heading: compass, companion's is not pushed",
+    _GYROS: "Heading: gyros, companion's is not pushed",
+}
 
 
 class Fallback:
@@ -75,9 +80,13 @@ class Fallback:
         self._pushed_since_s = min(self._pushed_since_s, now_s) if pushing else math.inf
         if self.net != "command" or not self._selected:
             return
-        wanted = _OURS if now_s - self._pushed_since_s >= WELL_S else _COMPASS
-        # Until our heading has been well for long enough, what is in use stays.
-        if wanted == self._asked or (wanted == _COMPASS and pushing) or now_s - self._tried_s < AGAIN_S:
+        if pushing:
+            if now_s - self._pushed_since_s < WELL_S:
+                return  # until ours has been well for long enough, what is in use stays
+            wanted = _OURS
+        else:
+            wanted = _COMPASS if self._vehicle.arm_state is ArmState.DISARMED else _GYROS
+        if wanted == self._asked or now_s - self._tried_s < AGAIN_S:
             return
         self._tried_s = now_s
         answer = self._vehicle.commands.send(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, wanted)
@@ -91,4 +100,4 @@ class Fallback:
     def _answered(self, wanted: int, result: int | None) -> None:
         if result == mavlink.MAV_RESULT_ACCEPTED and self._asked != wanted:
             self._asked = wanted
-            self._say(Severity.WARNING if wanted == _COMPASS else Severity.NOTICE, _WORDS[wanted], Weight.NEWS)
+            self._say(Severity.NOTICE if wanted == _OURS else Severity.WARNING, _WORDS[wanted], Weight.NEWS)
