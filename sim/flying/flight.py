@@ -55,6 +55,8 @@ SETTLED_S = 6.0
 PLANE_SETTLED_S = 20.0
 """By then it is on its circle."""
 WATCHED_S = 35.0
+SLOWEST = 0.9
+"""Share of the wall's time in which firmware and daemon still see the same world."""
 TURNS_AFTER_S, TURN_DEG = 12.0, 120.0
 """The pilot turns it about, with the fault in force."""
 OTHER_SETS = ("EK3_SRC2", "EK3_SRC3")
@@ -190,6 +192,7 @@ class Flight:
         """Take off, hold, let the fault happen, and watch; the record.
 
         Raises:
+            RuntimeError: the heading is not pushed when the fault is to happen, or this machine is too slow.
             TimeoutError: it does not take off.
         """
         vehicle, ground, record = self.vehicle, self.ground, self.record
@@ -206,12 +209,17 @@ class Flight:
             await vehicle.hold(ground)
         await vehicle.sleep(PLANE_SETTLED_S if vehicle.is_plane else SETTLED_S)
         record.circle = vehicle.circle
-        record.struck_s = vehicle.truth.own_s
+        if not (attitude := (await self.ask("status"))["attitude"])["pushing"]:
+            raise RuntimeError(f"before the fault no heading is pushed: {attitude['why_not']}")
+        begun_s, record.struck_s = asyncio.get_running_loop().time(), vehicle.truth.own_s
         await FAULTS[self.plan.fault].strike(self)
         await vehicle.sleep(TURNS_AFTER_S)
         if not self.plan.mission:
             await vehicle.turn(TURN_DEG)
         await vehicle.sleep(self.plan.watched_s - TURNS_AFTER_S)
+        speed = (vehicle.truth.own_s - record.struck_s) / (asyncio.get_running_loop().time() - begun_s)
+        if speed < SLOWEST:
+            raise RuntimeError(f"this machine is too slow: the firmware's clock ran at {speed:.2f} of the wall's")
         self._take_down()
         np.savez(self.folder / "record.npz", truth=record.truth, estimate=record.estimate, place=record.place)
         return record
