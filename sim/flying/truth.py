@@ -120,7 +120,10 @@ class FlyingAircraft(VirtualAircraft):
         """
         rows = self._rows[:, max(0, self._count - _KEPT) : self._count]
         asked, last = t_s - BEHIND_S, rows[:, -1]
-        found = np.column_stack([np.interp(asked, rows[_T], row) for row in rows[columns]])
+        after = np.clip(np.searchsorted(rows[_T], asked), 1, rows.shape[1] - 1)
+        begun, ended = rows[_T, after - 1], rows[_T, after]
+        share = np.clip((asked - begun) / (ended - begun), 0.0, 1.0)
+        found = (rows[columns, after - 1] * (1.0 - share) + rows[columns, after] * share).T
         late_s = np.clip(asked - last[_T], 0.0, LATE_S)
         if late_s[-1] > 0.0:
             self.late += 1
@@ -137,8 +140,8 @@ class FlyingAircraft(VirtualAircraft):
 
     def _moving(self, t_s: Array) -> Truth:
         angles, _ = self._euler(t_s)
-        earth = np.array([body_from_ned(*row) @ self._earth_rate_ned for row in angles])
-        at_rest = np.array([-(body_from_ned(*row) @ self._gravity_ned) for row in angles])
+        turned = np.array([body_from_ned(*row) for row in angles])
+        earth, at_rest = turned @ self._earth_rate_ned, -(turned @ self._gravity_ned)
         if self._count < 2:
             return Truth(earth, at_rest)
         both = self._columns(np.concatenate([t_s - MEAN_S, t_s]), slice(_OWN, _PUSHED.stop))
