@@ -93,6 +93,14 @@ def test_it_stands_as_it_was_put_down_until_it_is_told_otherwise() -> None:
     assert aircraft.truth_at(1.0).force_m_s2 == pytest.approx([0.0, 0.0, -aircraft.site.gravity_m_s2])
 
 
+def test_after_its_first_state_it_stands_as_that_says() -> None:
+    aircraft = FlyingAircraft(site_at(40.0, 116.0, 50.0), heading_deg=30.0, unix_s=1_795_219_200.0)
+    aircraft.begin(100.0)
+    aircraft.take(State(0.0, yawed(1.0), (0.0,) * 3, (0.0, 0.0, -9.8), (0.0,) * 3, (0.0,) * 3), 100.0)
+    for t_s in (-0.1, 0.0, 0.005, 0.2):
+        assert aircraft.angles_rad(t_s) == pytest.approx((0.0, 0.0, 1.0))
+
+
 def test_what_is_asked_for_before_its_first_state_is_at_rest() -> None:
     """A device that is a little behind, right after a restart of the firmware."""
     aircraft = turning(1.0, 1.0)
