@@ -31,7 +31,7 @@ async def request(
                 shown = reply["text"]
                 if in_place:
                     sys.stderr.write("\r")
-                    print_lines(shown, end="", error=True)
+                    print_lines(f"{shown:78}", end="", error=True)
                     continue
                 print_lines(f"[{reply['percent']:3d} %] {reply.get('word', reply['state'])}: {shown}", error=True)
     except asyncio.CancelledError:

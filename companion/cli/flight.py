@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import datetime
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,8 +24,9 @@ from companion.calibration.records.flight_record import (
     next_flight,
     unit_of,
 )
+from companion.cli.client import request
 from companion.cli.terminal import AddCommand, conclude, print_lines, storage_path
-from companion.errors import StorageError
+from companion.errors import CompanionError, ConfigError, StorageError
 
 if TYPE_CHECKING:
     from companion.flight.flight import Knowledge
@@ -35,7 +38,12 @@ _TOLD_BYTES: Final = 1 << 25
 def add_commands(add: AddCommand) -> None:
     """Add it to the parser of the command line."""
     command = add("flight", flight, "what a log of the autopilot says of a flight")
-    command.add_argument("file", type=Path, metavar="LOG", help="ArduPilot's .bin or PX4's .ulg")
+    command.add_argument("file", nargs="?", metavar="LOG", help="ArduPilot's .bin or PX4's .ulg")
+    command.add_argument(
+        "--fetch",
+        action="store_true",
+        help="get it from the autopilot first (disarmed); LOG is its name or number there, the latest if not given",
+    )
     command.add_argument(
         "--offsets",
         type=Path,
@@ -50,23 +58,45 @@ async def flight(options: argparse.Namespace) -> int:
     """`companion flight`."""
     from companion.flight.flight import flights, read
 
+    if options.file is None and not options.fetch:
+        raise ConfigError("companion flight: which LOG? --fetch gets the latest from the autopilot")
+    path = await _fetched(options) if options.fetch else Path(options.file)
     known, store = _knowledge(options)
     starts, imus, lines, found = 0, 0, [], []
-    for boot in read(options.file, _Progress(options.file)):
+    for boot in read(path, _Progress(path)):
         starts, imus = starts + 1, imus + len(boot.imus)
         for each in await flights(boot, known):
             found.append(each)
             lines += _flight_lines(starts, each)
     if not imus:
-        raise StorageError(f"{options.file}: no samples of an IMU in it")
+        raise StorageError(f"{path}: no samples of an IMU in it")
     if not found:
-        raise StorageError(f"{options.file}: no attitude and position of an EKF3 (ArduPilot) or EKF2 (PX4) in it")
+        raise StorageError(f"{path}: no attitude and position of an EKF3 (ArduPilot) or EKF2 (PX4) in it")
     if starts > 1:
         lines.insert(0, f"{starts} starts of the autopilot in it, each by its own clock")
-    numbers = [] if store is None else _keep(store, options.file.name, found)
+    numbers = [] if store is None else _keep(store, path.name, found)
     lines += [f"kept as flight {number}: companion report --flight {number} makes a page of it" for number in numbers]
-    answer = {"state": "done", "reason": "", "flights": msgspec.to_builtins(found), "numbers": numbers}
+    answer = {"state": "done", "reason": "", "file": str(path), "numbers": numbers}
+    answer["flights"] = msgspec.to_builtins(found)
     return conclude(options, answer, lines, good=True)
+
+
+async def _fetched(options: argparse.Namespace) -> Path:
+    """Where the daemon has put the log that it fetched."""
+    try:
+        reply = await request(options, {"command": "fetch", "log": options.file}, in_place=True)
+    except asyncio.CancelledError:
+        print_lines(
+            "stopped: what has come is kept, and the next companion flight --fetch goes on from there", error=True
+        )
+        raise
+    if reply["kind"] == "error":
+        raise CompanionError(reply["reason"])
+    path = Path(reply["file"])
+    print_lines(f"fetched: {path}, {reply['bytes'] / 1e6:.1f} MB", error=True)
+    if not os.access(path, os.R_OK):
+        raise StorageError(f"{path}: may only be read by root: sudo companion flight {path}")
+    return path
 
 
 class _Progress:

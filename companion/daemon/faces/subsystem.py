@@ -24,7 +24,6 @@ from companion.daemon.faces.headline import Headlines
 from companion.daemon.heading.subsystem import Heading
 from companion.daemon.job import Job
 from companion.daemon.offsets.subsystem import Offsets
-from companion.daemon.recorder.recorder import Recorder
 from companion.errors import ConfigError
 from companion.formats import Object
 from companion.physics.units import DEG_H, MG
@@ -53,7 +52,7 @@ class Faces(Subsystem):
         calibrating: Calibrating,
         arming: Arming,
         heading: Heading,
-        recorder: Recorder,
+        others: Sequence[Subsystem],
     ) -> None:
         self._core, self._devices = core, devices
         self.component = Component(
@@ -68,7 +67,7 @@ class Faces(Subsystem):
         calibrating.conductor.on_ended.add(self._show_result)
         self._headlines = Headlines(core, devices, calibrating.conductor, arming, heading.attitude)
         self._pose = heading.pose
-        self._subsystems = (self, devices, offsets, calibrating, arming, heading, recorder)
+        self._subsystems = (self, devices, offsets, calibrating, arming, heading, *others)
         self._handlers: dict[str, Handler] = {"status": self._status, "monitor": self._monitor}
         for subsystem in self._subsystems:
             self._handlers |= subsystem.commands()

@@ -1,0 +1,1 @@
+"""Logs of flights, fetched from the autopilot."""

@@ -1,0 +1,120 @@
+"""Logs of the autopilot on the companion's disk: `.part` behind the name until they are whole.
+
+Nothing here is called on the event loop.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from companion.errors import StorageError
+from companion.storage.state import sync_folder
+
+logger = logging.getLogger(__name__)
+
+MOST_BYTES: Final = 1_000_000_000
+"""Of all logs together; the oldest make room."""
+RESERVE_BYTES: Final = 32 * 1024 * 1024
+"""Left free on the disk: records and the values for undo are worth more than any log."""
+PART: Final = ".part"
+_UNUSUAL: Final = re.compile(r"[^A-Za-z0-9_.-]")
+
+
+class LogFile:
+    """One log, as much of it as is here. What touches the disk raises StorageError, in one line."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._part = path.with_name(path.name + PART)
+        self._at = path if path.is_file() else self._part
+        try:
+            self.bytes = self._at.stat().st_size if self._at.is_file() else 0
+        except OSError as error:
+            raise _refused(self._at, error) from error
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it was fetched to the end that it had then."""
+        return self._at == self.path
+
+    def tail(self, most: int) -> bytes:
+        """Its last bytes."""
+        if not self.bytes:
+            return b""
+        try:
+            with self._at.open("rb") as file:
+                file.seek(max(0, self.bytes - most))
+                return file.read(most)
+        except OSError as error:
+            raise _refused(self._at, error) from error
+
+    def begin(self, size: int) -> None:
+        """Make room for a log of that size; what is here already stays, and counts as half written from here on."""
+        folder, lacks = self.path.parent, size - self.bytes
+        try:
+            folder.mkdir(0o700, parents=True, exist_ok=True)
+            others = sorted((each for each in folder.iterdir() if each != self._at), key=lambda at: at.stat().st_mtime)
+            in_all = size + sum(each.stat().st_size for each in others)
+            for oldest in others:
+                if in_all > MOST_BYTES:
+                    in_all -= oldest.stat().st_size
+                    oldest.unlink()
+                    logger.warning("%s: removed, as the logs take more than %d MB", oldest, MOST_BYTES // 1_000_000)
+            free = shutil.disk_usage(folder).free - RESERVE_BYTES
+            if lacks > free:
+                rest = f"{lacks / 1e6:.1f} MB needed, {max(free, 0) / 1e6:.1f} MB free"
+                raise StorageError(f"{folder}: the disk has no room for the log: {rest}")
+            if self.is_whole:
+                os.replace(self.path, self._part)
+                self._at = self._part
+        except OSError as error:
+            raise _refused(folder, error) from error
+
+    def append(self, data: bytes) -> None:
+        """Write more, onto the disk itself."""
+        try:
+            with open(os.open(self._part, os.O_RDWR | os.O_CREAT, 0o600), "r+b") as file:
+                file.truncate(self.bytes)
+                file.seek(self.bytes)
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise _refused(self._part, error) from error
+        self.bytes += len(data)
+
+    def cut(self, size: int) -> None:
+        """Forget what is behind that many bytes."""
+        try:
+            if self._part.exists():
+                os.truncate(self._part, size)
+        except OSError as error:
+            raise _refused(self._part, error) from error
+        self.bytes = size
+
+    def finish(self) -> None:
+        """It is whole."""
+        try:
+            os.replace(self._part, self.path)
+            sync_folder(self.path.parent)
+        except OSError as error:
+            raise _refused(self._part, error) from error
+        self._at = self.path
+
+
+def named(folder: Path, name: str) -> Iterator[LogFile]:
+    """The places for a log of that name, the first one first: another log, such as another aircraft's, may have it."""
+    plain = Path(_UNUSUAL.sub("_", name)[-100:].lstrip(".") or "log")
+    for number in itertools.count(1):
+        yield LogFile(folder / (plain.name if number == 1 else f"{plain.stem}-{number}{plain.suffix}"))
+
+
+def _refused(path: Path, error: OSError) -> StorageError:
+    return StorageError(f"{path}: the log cannot be kept: {error.strerror or error}")
