@@ -89,19 +89,17 @@ def test_it_arrives_byte_for_byte_and_is_not_fetched_twice(tmp_path: Path, firmw
     run_virtual(main())
 
 
-@both
-def test_losses_and_copies(tmp_path: Path, firmware: Firmware) -> None:
+def test_losses_and_copies(tmp_path: Path) -> None:
     log = content(40_000)
 
     async def main() -> None:
-        async with grounded(tmp_path, firmware, log, loss=0.1, duplicate=0.1) as (rig, _):
+        async with grounded(tmp_path, "px4", log, loss=0.1, duplicate=0.1) as (rig, _):
             assert read(await fetch(rig)) == log
 
     run_virtual(main())
 
 
-@both
-def test_answers_that_come_late_twice_or_to_others(tmp_path: Path, firmware: Firmware) -> None:
+def test_answers_that_come_late_twice_or_to_others(tmp_path: Path) -> None:
     log = content(60_000)
     kept: list[bytes] = []
 
@@ -117,7 +115,7 @@ def test_answers_that_come_late_twice_or_to_others(tmp_path: Path, firmware: Fir
         return [payload, *late, payload, bytes(wrong)]
 
     async def main() -> None:
-        async with grounded(tmp_path, firmware, log) as (rig, files):
+        async with grounded(tmp_path, "ardupilot", log) as (rig, files):
             files.disturb = disturb
             assert read(await fetch(rig)) == log
 
@@ -141,18 +139,17 @@ def test_the_cable_comes_out_and_the_fetch_goes_on(tmp_path: Path, firmware: Fir
     run_virtual(main())
 
 
-@both
-def test_what_has_come_is_kept_for_the_next_time(tmp_path: Path, firmware: Firmware) -> None:
+def test_what_has_come_is_kept_for_the_next_time(tmp_path: Path) -> None:
     log = content(150_000)
 
     async def main() -> None:
-        async with grounded(tmp_path, firmware, log) as (rig, files):
+        async with grounded(tmp_path, "ardupilot", log) as (rig, files):
             fetching = asyncio.create_task(fetch(rig))
             await asyncio.sleep(2.0)
             rig.wire.cut = True
             with pytest.raises(AutopilotError, match=r"no answer .* for 30 s: stopped at \d+ % of the log"):
                 await fetching
-            part = tmp_path / "logs" / f"{NAMES[firmware]}.part"
+            part = tmp_path / "logs" / f"{NAMES['ardupilot']}.part"
             there = part.stat().st_size
             assert there > 20_000
             assert log.startswith(part.read_bytes())
@@ -166,19 +163,18 @@ def test_what_has_come_is_kept_for_the_next_time(tmp_path: Path, firmware: Firmw
     run_virtual(main())
 
 
-@both
-def test_a_client_that_goes_away_ends_it_and_another_goes_on(tmp_path: Path, firmware: Firmware) -> None:
+def test_a_client_that_goes_away_ends_it_and_another_goes_on(tmp_path: Path) -> None:
     log = content(100_000)
 
     async def main() -> None:
-        async with grounded(tmp_path, firmware, log) as (rig, _):
+        async with grounded(tmp_path, "px4", log) as (rig, _):
             first = rig.service.faces.answer({"command": "fetch"})
             for _ in range(4):
                 await anext(first)
             assert await refused(rig) == "a log is being fetched already"
             await first.aclose()  # type: ignore[attr-defined]
             await asyncio.sleep(0.1)
-            assert (tmp_path / "logs" / f"{NAMES[firmware]}.part").stat().st_size > 10_000
+            assert (tmp_path / "logs" / f"{NAMES['px4']}.part").stat().st_size > 10_000
             assert read(await fetch(rig)) == log
 
     run_virtual(main())
@@ -287,13 +283,12 @@ def test_a_log_that_grows_is_fetched_to_the_end_that_it_had(tmp_path: Path) -> N
     run_virtual(main())
 
 
-@both
-def test_a_log_that_goes_away_or_gets_shorter(tmp_path: Path, firmware: Firmware) -> None:
+def test_a_log_that_goes_away_or_gets_shorter(tmp_path: Path) -> None:
     async def main() -> None:
-        async with grounded(tmp_path, firmware, content(100_000)) as (rig, files):
+        async with grounded(tmp_path, "ardupilot", content(100_000)) as (rig, files):
             fetching = asyncio.create_task(fetch(rig))
             await asyncio.sleep(1.5)
-            files.files[PATHS[firmware]] = files.files[PATHS[firmware]][:20_000]
+            files.files[PATHS["ardupilot"]] = files.files[PATHS["ardupilot"]][:20_000]
             with pytest.raises(AutopilotError, match="not on the autopilot any more as it was"):
                 await fetching
 
