@@ -1,7 +1,8 @@
 """MAVLink FTP (mavlink.io/en/services/ftp.html): the autopilot's files are listed and read, nothing else.
 
-Not LOG_REQUEST_DATA: for each request of that kind ArduPilot ends the log that it writes, begins another one after it,
-and does not arm meanwhile. To ask for little at a time, as a bounded rate needs, would leave hundreds of logs there.
+Not LOG_REQUEST_DATA: at each such request ArduPilot ends the log that it writes and begins another one. To ask for
+little at a time, as a bounded rate needs, would leave hundreds of logs there and cost the oldest (seen on 4.8-dev: 12
+requests, 11 new logs, whatever LOG_DISARMED says).
 """
 
 from __future__ import annotations
