@@ -149,6 +149,11 @@ class FileServer:
             raise RefusedError(END_OF_FILE)
         return told
 
+    def keep_open(self) -> None:
+        """What is open was used just now."""
+        for session in self._sessions.values():
+            session.used_s = self._double.now_s()
+
     def open_as_another_station(self, path: str) -> None:
         """On PX4: another station closes what is open, and opens this."""
         self._sessions[0,] = Session(path, len(self.files[path]), self._double.now_s())

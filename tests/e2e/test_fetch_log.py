@@ -163,6 +163,37 @@ def test_what_has_come_is_kept_for_the_next_time(tmp_path: Path) -> None:
     run_virtual(main())
 
 
+@both
+def test_after_a_crash_the_file_that_was_left_open_is_waited_for(tmp_path: Path, firmware: Firmware) -> None:
+    log = content(60_000)
+
+    async def main() -> None:
+        async with grounded(tmp_path, firmware, log) as (rig, files):
+            fetching = asyncio.create_task(fetch(rig))
+            await asyncio.sleep(1.0)
+            rig.wire.cut = True
+            fetching.cancel()
+            await asyncio.gather(fetching, return_exceptions=True)
+            await rig.restart()
+            await rig.ready()
+            files.keep_open()
+            shown: list[str] = []
+            assert read(await fetch(rig, look=lambda reply: shown.append(reply.get("text", "")))) == log
+            assert any("left open on the autopilot: waits 13 s" in text for text in shown)
+            if firmware == "px4":
+                await asyncio.sleep(0.1)  # it is closed at the end
+                before_s = rig.now_s
+                files.open_as_another_station(PATHS["px4"])
+                asking = asyncio.create_task(refused(rig))
+                while not asking.done():
+                    await asyncio.sleep(1.0)
+                    files.keep_open()
+                assert "another station reads files" in await asking
+                assert rig.now_s - before_s < 20.0
+
+    run_virtual(main())
+
+
 def test_a_client_that_goes_away_ends_it_and_another_goes_on(tmp_path: Path) -> None:
     log = content(100_000)
 

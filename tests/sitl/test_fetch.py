@@ -22,7 +22,7 @@ pytestmark = pytest.mark.sitl
 ARMED_S = {"ardupilot-sitl": 30.0, "px4-sitl": 3.0}
 """Makes 1.6 MB, and, where everything is logged at a simulator's rates, 2 MB."""
 SETTLE_S = 25.0
-LEAST_BYTES = 1_000_000
+LEAST_BYTES = 500_000
 QUIET = '\n[calibration]\nat_arm = "off"\n'
 
 

@@ -25,8 +25,9 @@ _PAYLOAD_BYTES: Final = 251
 _LIST_WITH_TIME: Final = 16
 """PX4's; other firmware does not know it."""
 _AGAIN_S: Final = 1.0
-_BUSY_S: Final = 25.0
-"""A session that nobody uses any more is closed after 10 s (PX4) or 20 s (ArduPilot)."""
+_LEFT_S: Final = 13.0
+"""PX4 closes a session that was left open, such as our own after a crash, when nothing was asked of it for 10 s, not
+even to open another; ArduPilot after 3 s."""
 _ENTRIES: Final = 10_000
 _BUSY: Final = (mavlink.MAV_FTP_ERR_NOSESSIONSAVAILABLE, mavlink.MAV_FTP_ERR_FAIL)
 _MISSING: Final = (mavlink.MAV_FTP_ERR_FILENOTFOUND, mavlink.MAV_FTP_ERR_FAILERRNO)
@@ -54,6 +55,8 @@ class FileClient:
     """Reads one file at a time; `close` it. While the aircraft is not known to be disarmed nothing leaves."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
+        self.waits = ""
+        """What an answer is waited for, for people."""
         self.patience_s = 5.0
         """How long a request is asked again and again until the autopilot counts as silent."""
         self._link, self._vehicle = link, vehicle
@@ -81,11 +84,14 @@ class FileClient:
             self._is_open = False
             await self._exchange(mavlink.MAV_FTP_OPCODE_TERMINATESESSION)
         self._session = 0
-        deadline_s = asyncio.get_running_loop().time() + _BUSY_S
-        while (answer := await self._exchange(mavlink.MAV_FTP_OPCODE_OPENFILERO, path.encode())).error in _BUSY:
-            if asyncio.get_running_loop().time() > deadline_s:
-                raise AutopilotError("another station reads files of the autopilot: try again when it is done")
-            await asyncio.sleep(_AGAIN_S)
+        answer = await self._exchange(mavlink.MAV_FTP_OPCODE_OPENFILERO, path.encode())
+        if answer.error in _BUSY:
+            self.waits = f"a file was left open on the autopilot: waits {_LEFT_S:.0f} s until it is closed"
+            await asyncio.sleep(_LEFT_S)
+            self.waits = ""
+            answer = await self._exchange(mavlink.MAV_FTP_OPCODE_OPENFILERO, path.encode())
+        if answer.error in _BUSY:
+            raise AutopilotError("another station reads files of the autopilot: try again when it is done")
         if answer.error in _MISSING:
             return None
         if answer.error or len(answer.data) < 4:
