@@ -104,15 +104,16 @@ def test_answers_that_come_late_twice_or_to_others(tmp_path: Path) -> None:
     kept: list[bytes] = []
 
     def disturb(payload: bytes) -> list[bytes]:
-        """Each seventh comes behind the next one; some twice, some with other data under a number nobody asked."""
-        wrong = bytearray(payload)
+        """Each seventh comes behind the next one; copies, other data for requests that nobody made."""
+        wrong, other = bytearray(payload), bytearray(payload)
+        wrong[12:20] = other[12:20] = b"nonsense"
         wrong[0] ^= 0x55
-        wrong[12:20] = b"nonsense"
+        other[5] = 14
         kept.append(payload)
         if len(kept) % 7 == 0:
             return []
         late = [kept[-2]] if len(kept) % 7 == 1 and len(kept) > 7 else []
-        return [payload, *late, payload, bytes(wrong)]
+        return [bytes(other), payload, *late, payload, bytes(wrong)]
 
     async def main() -> None:
         async with grounded(tmp_path, "ardupilot", log) as (rig, files):
@@ -227,6 +228,25 @@ def test_arming_ends_it_at_once_and_nothing_more_is_asked(tmp_path: Path, firmwa
             assert "the aircraft is armed" in await refused(rig, NotDisarmedError)
             await asyncio.sleep(5.0)
             assert files.asked == asked
+
+    run_virtual(main())
+
+
+def test_while_nobody_knows_whether_it_is_armed_nothing_is_asked(tmp_path: Path) -> None:
+    log = content(200_000)
+
+    async def main() -> None:
+        async with grounded(tmp_path, "ardupilot", log) as (rig, files):
+            fetching = asyncio.create_task(fetch(rig))
+            await asyncio.sleep(0.5)
+            rig.autopilot.faults.heartbeat_off = True
+            await asyncio.sleep(2.5)
+            asked = files.asked
+            await asyncio.sleep(5.0)
+            assert files.asked == asked
+            assert not fetching.done()
+            rig.autopilot.faults.heartbeat_off = False
+            assert read(await fetching) == log
 
     run_virtual(main())
 
