@@ -16,20 +16,27 @@ import jsonschema
 import msgspec
 import pytest
 
+from companion.calibration.noise.allan import PROFILES
+from companion.calibration.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
 from companion.calibration.records.record import Arming, Magnetic
+from companion.calibration.solution.by_temperature import by_temperature
+from companion.calibration.solution.prior import curve_of
 from companion.config.sections import Location
 from companion.daemon.faces.fleet import face as face_module
 from companion.daemon.faces.fleet.face import FleetFace
 from companion.daemon.stands.by_hand import Done
 from companion.storage import fleet_items
+from companion.storage.flights import FlightStore
 from companion.storage.profiles import ProfileStore
 from companion.storage.records import RecordStore
 from companion.storage.state import BoundedList, sealed, write_atomically
 from tests.support.extent import extent
 from tests.support.fleet import CRANE, HERON, Aircraft, check
-from tests.support.histories import arming, record
+from tests.support.histories import arming, record, windows_of_days
 from tests.support.virtual_time import run_virtual
 from tests.unit.test_profiles import saved
+
+MODEL = PROFILES["icm42688p"]
 
 
 async def until(what: Callable[[], object], within_s: float = 3600.0) -> None:
@@ -245,6 +252,25 @@ def test_nonsense_foreign_epochs_and_retained_words_change_nothing(tmp_path: Pat
     virtually(main())
 
 
+def test_what_the_broker_keeps_of_the_hello_is_as_of_now(tmp_path: Path) -> None:
+    """Or a collector from a backup would not know what it lacks."""
+    keep(tmp_path, 0)
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        outbox = aircraft.connection.outbox
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await until_told(face)
+            keep(tmp_path, 1, 2, 3)
+            await until_told(face)
+            await asyncio.sleep(15.0)
+            assert json.loads(outbox.kept(f"fleet/{HERON}/hello") or b"")["last"] == 4
+            assert len(aircraft.collector.hellos) == 2
+
+    virtually(main())
+
+
 def test_it_says_hello_again_when_it_is_asked_and_when_its_epoch_is_not_known(tmp_path: Path) -> None:
     keep(tmp_path, 0)
 
@@ -445,7 +471,44 @@ def test_everything_that_the_disk_has_and_each_change_once(tmp_path: Path) -> No
     virtually(main())
 
 
+def test_a_flight_is_told_once_however_often_its_log_is_read(tmp_path: Path) -> None:
+    def flight(key: str, system_id: int = 1) -> KeptFlight:
+        stages = Stages(armed_s=10.0, motors_s=11.0, take_off_s=12.0, landing_s=99.0, disarmed_s=100.0)
+        term = Term(1e-4, 1e-5)
+        axis = Split(
+            axis="gyro x", in_flight=term, ekf=None, turn_on=None, temperature=None, motors=None, vibration=None,
+            trend=None,
+        )  # fmt: skip
+        imu = ImuFlight(
+            imu=1, rate_hz=400.0, calibration=None, gyro_id=7, set_gyro_rad_s=None, set_accel_m_s2=None, axes=(axis,),
+            drift={"flown": [Drift(30.0, 5, 12.0, 20.0)]}, notes=(),
+        )  # fmt: skip
+        found = Flight(
+            key=key, system_id=system_id, began_at="2026-05-01T08:00:00+00:00", stages=stages, reference="ekf",
+            imus=(imu,), notes=(),
+        )  # fmt: skip
+        return KeptFlight(log="00000012.BIN", read_at="2026-05-01T09:00:00+00:00", flight=found)
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        collector, store = aircraft.collector, FlightStore(tmp_path)
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            store.save(flight("a"))
+            await until_told(face)
+            store.save(flight("b"))
+            store.save(flight("other", system_id=9))
+            store.save(msgspec.structs.replace(flight("a"), read_at="2026-05-02T09:00:00+00:00"))
+            await until_told(face)
+        bodies = [item["body"] for item in collector.of(HERON)]
+        assert bodies == [json.loads(msgspec.json.encode(flight(key))) for key in "ab"]
+        assert {item["at"] for item in collector.of(HERON)} == {"2026-05-01T08:00:00Z"}
+
+    virtually(main())
+
+
 def test_a_curve_is_told_when_it_is_another_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(face_module, "CURVES_AFTER_S", 15.0)
     monkeypatch.setattr(face_module, "CURVES_EVERY_S", 60.0)
 
     def shown(power_ups: int) -> dict[str, Any]:
@@ -464,10 +527,20 @@ def test_a_curve_is_told_when_it_is_another_one(tmp_path: Path, monkeypatch: pyt
         async with aircraft.running() as face:
             aircraft.connection.connect()
             await until_told(face)
-            aircraft.curves = [shown(6)]
+            points = windows_of_days(12)
+            real = by_temperature(
+                "fc",
+                points,
+                curve_of(points, "gyro", MODEL.gyro),
+                curve_of(points, "accel", MODEL.accel),
+                power_up=None,
+            )
+            aircraft.curves = [msgspec.to_builtins(real)]
             await asyncio.sleep(100.0)
-        assert [item["body"]["power_ups"] for item in aircraft.collector.of(HERON)] == [4, 5, 6]
-        assert "points" not in aircraft.collector.of(HERON)[0]["body"]
+        told = [item["body"] for item in aircraft.collector.of(HERON)]
+        assert [body["power_ups"] for body in told] == [4, 5, real.power_ups]
+        assert "points" not in told[0]
+        assert len(told[2]["curve"]) == len(real.curve) > 3
 
     virtually(main())
 
@@ -537,6 +610,9 @@ def test_a_full_disk_is_said_and_nothing_is_missing_afterwards(tmp_path: Path) -
             await asyncio.sleep(30.0)
             assert face.status()["good"] is False
             assert "database or disk is full" in face.status()["summary"]
+            aircraft.collector.say(HERON, "wanted", aircraft.collector.hellos[-1]["epoch"], [[1, 1]])
+            await asyncio.sleep(5.0)
+            assert len(aircraft.collector.deliveries) >= 2, "what is there is sent all the same"
             face._items._opened = opened  # type: ignore[method-assign]
             face._items.close()
             await until_told(face)

@@ -9,12 +9,11 @@ from __future__ import annotations
 import asyncio
 import datetime
 import logging
+import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from itertools import islice
 from typing import Final
-
-import msgspec
 
 from companion.config.sections import Fleet
 from companion.daemon.core import Core, Handler
@@ -25,7 +24,7 @@ from companion.errors import StorageError
 from companion.formats import Object
 from companion.links.mqtt.client import Incoming, MqttLink
 from companion.links.system.waiting import comes
-from companion.storage.fleet_items import Clock, Entry, FleetItems, Item, Kept, Mark
+from companion.storage.fleet_items import Clock, Entry, FleetItems, Kept, Mark
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +39,9 @@ CONFIRMED_WITHIN_S: Final = 30.0
 LONGEST_WAIT_S: Final = 600.0
 HELLO_AGAIN_S: Final = 10.0
 SENT_WITHIN_S: Final = 1.0
+PAUSE_S: Final = 0.05
+CURVES_AFTER_S: Final = 60.0
+"""Likewise: they have to be worked out."""
 CURVES_EVERY_S: Final = 6 * 3600.0
 CLOCKS_AGREE_S: Final = 2.0
 INBOX: Final = 64
@@ -64,8 +66,11 @@ class FleetFace:
         self._news = True
         self._caught_up = False
         """What earlier runs have left was taken."""
-        self._started_s = self._curves_s = 0.0
-        self._greeted: tuple[MqttLink, int] | None = None
+        self._started_s = 0.0
+        self._curves_s = math.inf
+        self._connection: tuple[MqttLink, int] | None = None
+        self._greeted: dict[str, int] = {}
+        """By aircraft, the last sequence that the hello of this connection has told; -1: another hello is asked for."""
         self._hello_s = 0.0
         self._under_way: set[tuple[str, int]] = set()
         self._sent = 0
@@ -73,7 +78,8 @@ class FleetFace:
         self._expires_s = 0.0
         self._wait_s = CONFIRMED_WITHIN_S
         self._problem: str | None = None
-        self._faulty = False
+        self._faults: set[str] = set()
+        """Of the program, said once."""
         mqtt.on_other.add(self._on_message)
 
     def status(self) -> Object:
@@ -110,33 +116,31 @@ class FleetFace:
     async def run(self) -> None:
         """Keep and send until cancelled; never raises anything else."""
         self._started_s = asyncio.get_running_loop().time()
+        self._curves_s = self._started_s + CURVES_AFTER_S
         try:
             await asyncio.sleep(FIRST_LOOK_S)
             while True:
-                await self._look()
+                problems = [await self._try(step) for step in (self._listen, self._take, self._greet, self._send)]
+                self._problem = next((each for each in problems if each is not None), None)
                 self._woken.clear()
                 if not self._inbox:
                     await comes(self._woken, LOOK_S)
         finally:
             self._items.close()
 
-    async def _look(self) -> None:
+    async def _try(self, step: Callable[[], Awaitable[None]]) -> str | None:
+        """What was in its way, in words: what cannot be kept is no reason not to send, and the reverse."""
         try:
-            await self._listen()
-            await self._take()
-            await self._greet()
-            await self._send()
-            self._problem, self._faulty = None, False
+            await step()
         except StorageError as error:
             if str(error) != self._problem:
-                self._problem = str(error)
                 logger.warning("fleet: %s", error)
-            await asyncio.sleep(LOOK_S)
-        except Exception:
-            # Said once, not at every look.
-            logger.log(logging.DEBUG if self._faulty else logging.ERROR, "fleet", exc_info=True)
-            self._faulty = True
-            await asyncio.sleep(LOOK_S)
+            return str(error)
+        except Exception as error:
+            level = logging.DEBUG if repr(error) in self._faults else logging.ERROR
+            logger.log(level, "fleet", exc_info=True)
+            self._faults.add(repr(error)[:200])
+        return None
 
     # --- keeping
 
@@ -145,58 +149,51 @@ class FleetFace:
             marks = await self._offload(self._items.marks, AIRCRAFT)
             self._of = marks[AIRCRAFT].value if marks else None
             await self._count()
+        uid = self._vehicle.uid
         if self._of is not None and not self._caught_up:
             # What an earlier run has left is of the aircraft that there was then.
-            await self._take_all(self._of, None)
+            await self._take_all(Look(self._of, None, self._clock()))
         self._caught_up = True
-        uid = self._vehicle.uid
         if uid is None:
             return
-        is_first = self._of is None
+        look = Look(uid, self._vehicle.system_id, self._clock())
         if uid != self._of:
-            body = {"what": "airframe changed", "before": self._of}
-            event = Item("event", _utc_now(), self._clock()(_now()), msgspec.json.encode(body))
-            entry = Entry({AIRCRAFT: Mark("", uid)}, () if is_first else (event,))
-            await self._offload(self._items.add, uid, (entry,), _utc_now())
-            self._of, self._curves_s = uid, 0.0
-            await self._count()
+            moved = [look.item("event", _now(), {"what": "airframe changed", "before": self._of})]
+            await self._add(uid, [Entry({AIRCRAFT: Mark("", uid)}, moved if self._of is not None else [])])
+            self._of = uid
         self._news |= await self._offload(self._sources.has_news)
         if self._news:
-            await self._take_all(uid, self._vehicle.system_id)
+            await self._take_all(look)
             self._news = False
         now_s = asyncio.get_running_loop().time()
         if now_s >= self._curves_s:
             self._curves_s = now_s + CURVES_EVERY_S
-            await self._take_curves(uid)
+            await self._take_curves(look)
 
-    async def _take_all(self, aircraft: str, system_id: int | None) -> None:
-        look = Look(aircraft, system_id, self._clock())
+    async def _take_all(self, look: Look) -> None:
+        batch: list[Entry] = [Entry({})] * BATCH
+        while len(batch) == BATCH:
+            batch = await self._offload(lambda: list(islice(self._sources.entries(look), BATCH)))
+            await self._add(look.aircraft, batch)
+            # A history is no hurry.
+            await asyncio.sleep(PAUSE_S)
 
-        def take() -> bool:
-            batch = list(islice(self._sources.entries(look), BATCH))
-            if batch:
-                self._items.add(aircraft, batch, _utc_now())
-            return len(batch) == BATCH
+    async def _add(self, aircraft: str, entries: list[Entry]) -> None:
+        if entries:
+            await self._offload(self._items.add, aircraft, entries, _utc_now())
+            await self._count()
 
-        while await self._offload(take):
-            # A history is no hurry: the calibration has the processor.
-            await asyncio.sleep(SENT_WITHIN_S / BATCH)
-        await self._count()
-
-    async def _take_curves(self, aircraft: str) -> None:
+    async def _take_curves(self, look: Look) -> None:
         """The curves of biases over temperature, where they are others than were told last."""
-        marks = await self._offload(self._items.marks, f"{CURVE}{aircraft}/")
+        marks = await self._offload(self._items.marks, f"{CURVE}{look.aircraft}/")
         entries = []
         async for reply in self._answer({"command": "temperature"}, "fleet"):
             for imu in reply["imus"]:
                 body = {key: imu[key] for key in ("imu", "power_ups", "days", "curve", "accel_curve")}
-                key, mark = f"{CURVE}{aircraft}/{imu['imu']}", Mark("", f"{imu['power_ups']} {imu['summary']}")
+                key, mark = f"{CURVE}{look.aircraft}/{imu['imu']}", Mark("", imu["summary"])
                 if imu["curve"] and marks.get(key) != mark:
-                    item = Item("curve", _utc_now(), self._clock()(_now()), msgspec.json.encode(body))
-                    entries.append(Entry({key: mark}, (item,)))
-        if entries:
-            await self._offload(self._items.add, aircraft, entries, _utc_now())
-            await self._count()
+                    entries.append(Entry({key: mark}, [look.item("curve", _now(), body)]))
+        await self._add(look.aircraft, entries)
 
     def _clock(self) -> Callable[[str], Clock]:
         """How good our clock is: good if the autopilot's GNSS agrees, for whatever it has timed in this run."""
@@ -230,8 +227,8 @@ class FleetFace:
                     self._begin_again()  # somebody is there again: in order, from the first
         elif await self._offload(self._items.want, aircraft, said.epoch, said.sequences) and said.sequences:
             self._begin_again()
-        elif asyncio.get_running_loop().time() - self._hello_s >= HELLO_AGAIN_S:
-            self._greeted = None
+        else:
+            self._greeted[aircraft] = -1
 
     # --- sending
 
@@ -241,21 +238,24 @@ class FleetFace:
         return link if link is not None and link.connected else None
 
     async def _greet(self) -> None:
-        """At every connection: listen for the fleet, and say what is kept."""
-        link = self._link
-        if link is None or (self._greeted == (link, link.connections) and self._is_heard(link)):
+        """At every connection, and when there is more: listen for the fleet, and say what is kept."""
+        link, now_s = self._link, asyncio.get_running_loop().time()
+        if link is None:
             return
-        for kept in self._kept:
+        if self._connection != (link, link.connections):
+            self._connection = (link, link.connections)
+            self._greeted.clear()
+            self._begin_again()
+        news = [kept for kept in self._kept if self._greeted.get(kept.aircraft) != kept.last]
+        if now_s - self._hello_s < HELLO_AGAIN_S and all(kept.aircraft in self._greeted for kept in news):
+            return
+        for kept in news:
             topics = wire.Topics(kept.aircraft)
             for topic in topics.heard:
                 await link.hear(topic)
-            link.outbox.keep(topics.hello, wire.hello(kept, self._settings.name, _utc_now()))
-        if self._greeted != (link, link.connections):
-            self._begin_again()
-        self._greeted, self._hello_s = (link, link.connections), asyncio.get_running_loop().time()
-
-    def _is_heard(self, link: MqttLink) -> bool:
-        return all(link.outbox.kept(wire.Topics(kept.aircraft).hello) is not None for kept in self._kept)
+            name = self._settings.name if kept.aircraft == self._of else None
+            link.outbox.keep(topics.hello, wire.hello(kept, name, _utc_now()))
+            self._greeted[kept.aircraft], self._hello_s = kept.last, now_s
 
     def _begin_again(self) -> None:
         self._under_way.clear()

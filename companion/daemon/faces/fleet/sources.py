@@ -17,15 +17,16 @@ from companion.daemon.stands import by_hand
 from companion.errors import StorageError
 from companion.storage.changes import PREDICTION
 from companion.storage.fleet_items import Clock, Entry, FleetItems, Item, Mark
+from companion.storage.flights import FlightStore
 from companion.storage.learned import alignment_in, faces_in
 from companion.storage.profiles import ProfileStore
 from companion.storage.records import RecordStore
 from companion.storage.state import BoundedList
 
-RECORD, ARMING, BY_HAND, PROFILE, IMU = "record/", "arming/", "by-hand/", "profile/", "imu/"
+RECORD, ARMING, BY_HAND, PROFILE, FLIGHT, IMU = "record/", "arming/", "by-hand/", "profile/", "flight/", "imu/"
 """What marks begin with."""
 TOLD: Final = "told"
-_WATCHED: Final = ("records", "armings.json", "by-hand.json", "profiles")
+_WATCHED: Final = ("records", "armings.json", "by-hand.json", "profiles", "flights")
 
 Told = tuple[str, list[Item]]
 """The value of the mark, and the items."""
@@ -42,6 +43,7 @@ class Sources:
     def __init__(self, directory: Path, items: FleetItems) -> None:
         self._directory, self._items = directory, items
         self._records, self._profiles = RecordStore(directory), ProfileStore(directory)
+        self._flights = FlightStore(directory)
         self._seen: tuple[str, ...] | None = None
         self._settled = False
 
@@ -69,6 +71,7 @@ class Sources:
             ARMING, dict.fromkeys(at, TOLD), lambda key, _: (TOLD, [look.item("arming", key, at[key])])
         )
         yield from self._of_profiles(look)
+        yield from self._of_flights(look)
 
     def _told(self, prefix: str, stamps: Mapping[str, str], tell: Callable[[str, str], Told]) -> Iterator[Entry]:
         """Of each whose stamp is another one than before, what `tell` makes of it and of the value before."""
@@ -140,6 +143,21 @@ class Sources:
             return profile.saved_at, [look.item("profile", profile.saved_at, profile)] if is_new else []
 
         return self._told(PROFILE, {name: _stamp(self._profiles.path(name)) for name in self._profiles.names()}, tell)
+
+    def _of_flights(self, look: Look) -> Iterator[Entry]:
+        def tell(number: str, before: str) -> Told:
+            try:
+                kept = self._flights.read(int(number))
+            except StorageError:
+                return before, []
+            # Read again from its log, it is the same flight.
+            if before == kept.flight.key or not look.is_its(kept.flight.system_id):
+                return before, []
+            return kept.flight.key, [look.item("flight", kept.flight.began_at or kept.read_at, kept)]
+
+        numbers = [f"{number:06d}" for number in self._flights.numbers()]
+        folder = self._flights.folder
+        return self._told(FLIGHT, {number: _stamp(folder / f"{number}.json") for number in numbers}, tell)
 
 
 class Look(msgspec.Struct, frozen=True):
