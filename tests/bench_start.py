@@ -66,6 +66,7 @@ at_arm = "gate"
 [mqtt]
 host = "127.0.0.1"
 port = {broker}
+[fleet]
 [web]
 bind = "127.0.0.1:0"
 """

@@ -24,7 +24,7 @@ UID = b"virtual 0000".ljust(18, b"\0").hex()
 @pytest.fixture(autouse=True)
 def _hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     hurry(monkeypatch, BEST)
-    monkeypatch.setattr("companion.daemon.faces.fleet.face.FIRST_LOOK_S", 0.5)
+    monkeypatch.setattr("companion.daemon.faces.subsystem.FLEET_AFTER_S", 0.3)
 
 
 @contextlib.asynccontextmanager
@@ -116,10 +116,11 @@ def test_status_and_check_say_how_it_stands(tmp_path: Path) -> None:
             section = f"{one.section()}[fleet]\n"
             async with alone(tmp_path, section) as service:
                 await until_connected(service)
-                assert service.status()["fleet"]["summary"] == "no items waiting for the fleet, never confirmed so far"
+                words = "no items waiting for the fleet, never confirmed so far"
+                await until(lambda: service.status()["fleet"]["summary"] == words)
                 config = service.config
             found = {finding.name: finding for finding in await run_check(config, 0.5)}
-            assert found["fleet"].words == "what waits for the fleet is told while the companion runs"
+            assert found["fleet"].words == "what waits is told once the companion has run for 0 s"
             assert found["fleet"].verdict == "ok"
 
     asyncio.run(main())

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import datetime
 import json
+import os
 import random
 import sqlite3
 from collections.abc import Callable, Coroutine
@@ -24,6 +25,7 @@ from companion.calibration.solution.prior import curve_of
 from companion.config.sections import Location
 from companion.daemon.faces.fleet import face as face_module
 from companion.daemon.faces.fleet.face import FleetFace
+from companion.daemon.faces.fleet.sources import Sources
 from companion.daemon.stands.by_hand import Done
 from companion.storage import fleet_items
 from companion.storage.flights import FlightStore
@@ -239,8 +241,10 @@ def test_nonsense_foreign_epochs_and_retained_words_change_nothing(tmp_path: Pat
             ]  # fmt: skip
             for payload in nonsense:
                 connection.deliver(f"fleet/{HERON}/confirmed", payload)
-                connection.deliver(f"fleet/{HERON}/wanted", payload)
                 connection.deliver(f"fleet/{CRANE}/confirmed", json.dumps(good).encode())
+                await asyncio.sleep(1.0)
+                assert face.status()["waiting"] == 5, payload
+                connection.deliver(f"fleet/{HERON}/wanted", payload)
                 await asyncio.sleep(1.0)
             connection.deliver(f"fleet/{HERON}/confirmed", json.dumps(good).encode(), retained=True)
             await asyncio.sleep(20.0)
@@ -454,6 +458,8 @@ def test_everything_that_the_disk_has_and_each_change_once(tmp_path: Path) -> No
             by_hand.write([predicted, level])
             ProfileStore(tmp_path).write(saved("mine"))
             await until_told(face)
+            os.utime(path, (1.0, 1.0))  # copied back, say: another time, the same content
+            await until_told(face)
             assert collector.kinds()[2:] == ["undo", "calibration", "alignment", "arming", "profile"]
             undo, _, alignment, _, profile = (item["body"] for item in collector.of(HERON)[2:])
             assert undo == {"what": "calibration", "of": first.started_at, "undone_at": undone.undone_at}
@@ -469,6 +475,20 @@ def test_everything_that_the_disk_has_and_each_change_once(tmp_path: Path) -> No
         assert len(collector.database) == 9
 
     virtually(main())
+
+
+def test_what_is_written_in_the_same_tick_as_what_was_read_is_found(tmp_path: Path) -> None:
+    """A file system's clock ticks every few milliseconds."""
+    items = fleet_items.FleetItems(tmp_path)
+    sources = Sources(tmp_path, items)
+    assert [sources.has_news() for _ in range(4)] == [True, True, False, False]
+    keep(tmp_path, 0)
+    stamp = (tmp_path / "records").stat().st_mtime_ns
+    assert sources.has_news()
+    keep(tmp_path, 1)
+    os.utime(tmp_path / "records", ns=(stamp, stamp))
+    assert [sources.has_news() for _ in range(3)] == [True, False, False]
+    items.close()
 
 
 def test_a_flight_is_told_once_however_often_its_log_is_read(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ AT_ARM: Final[tuple[AtArm, ...]] = ("off", "warn", "gate")
 STATE_NUMBER: Final = {"done": 1.0, "failed": 2.0, "cancelled": 3.0}
 LARGEST: Final = 1e6
 MONITOR_EVERY_S: Final = 0.5
+FLEET_AFTER_S: Final = 10.0
 
 
 class Faces(Subsystem):
@@ -80,10 +81,6 @@ class Faces(Subsystem):
                 core, core.config.mqtt, self.answer, self.all_status, calibrating.conductor, heading.pose
             )
         self.fleet: FleetFace | None = None
-        if core.config.fleet is not None and self.mqtt is not None:
-            from companion.daemon.faces.fleet.face import FleetFace
-
-            self.fleet = FleetFace(core, core.config.fleet, self.mqtt, self.answer)
         self.page: Page | None = None
         if core.config.web is not None:
             from companion.web.server import Page
@@ -134,7 +131,7 @@ class Faces(Subsystem):
             "headline": msgspec.to_builtins(self._headlines.now()),
             "vehicle": self._vehicle(),
             "mqtt": None if self.mqtt is None else self.mqtt.status(),
-            "fleet": None if self.fleet is None else self.fleet.status(),
+            "fleet": self._fleet_status(),
             "page": None if self.page is None else self.page.status(),
             "spoken": [spoken._asdict() for spoken in self._core.texts.spoken],
         }
@@ -158,15 +155,35 @@ class Faces(Subsystem):
             "refused": {f"{system}/{one}": count for (system, one), count in refused.items()},
         }
 
+    def _fleet_status(self) -> Object | None:
+        if self._core.config.fleet is None or self.fleet is not None:
+            return None if self.fleet is None else self.fleet.status()
+        return {"good": True, "summary": f"what waits is told once the companion has run for {FLEET_AFTER_S:.0f} s"}
+
+    async def _run_fleet(self) -> None:
+        """Not before the start is over; and in a thread, as its libraries take a while."""
+        await asyncio.sleep(FLEET_AFTER_S)
+        settings = self._core.config.fleet
+        if settings is not None and self.mqtt is not None:
+            kind: type[FleetFace] = await self._core.offload(_fleet_face)
+            self.fleet = kind(self._core, settings, self.mqtt, self.answer)
+            await self.fleet.run()
+
     def tasks(self) -> Sequence[Task]:  # noqa: D102
         tasks: list[Task] = [("component", self.component.run)]
         if self.mqtt is not None:
             tasks.append(("mqtt", self.mqtt.run))
-        if self.fleet is not None and self._core.only_listening is None:
-            tasks.append(("fleet", self.fleet.run))
+        if self._core.config.fleet is not None and self._core.only_listening is None:
+            tasks.append(("fleet", self._run_fleet))
         if self.page is not None and self._core.only_listening is None:
             tasks.append(("page", self.page.run))
         return tasks
+
+
+def _fleet_face() -> type[FleetFace]:
+    from companion.daemon.faces.fleet.face import FleetFace
+
+    return FleetFace
 
 
 def own_parameters(wanted: Wanted) -> list[Parameter]:

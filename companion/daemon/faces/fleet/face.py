@@ -28,8 +28,6 @@ from companion.storage.fleet_items import Clock, Entry, FleetItems, Kept, Mark
 
 logger = logging.getLogger(__name__)
 
-FIRST_LOOK_S: Final = 10.0
-"""After the start, which comes first."""
 LOOK_S: Final = 2.0
 BATCH: Final = 20
 """Of what is taken from the disk at once; a whole history may wait there."""
@@ -41,7 +39,7 @@ HELLO_AGAIN_S: Final = 10.0
 SENT_WITHIN_S: Final = 1.0
 PAUSE_S: Final = 0.05
 CURVES_AFTER_S: Final = 60.0
-"""Likewise: they have to be worked out."""
+"""They have to be worked out first."""
 CURVES_EVERY_S: Final = 6 * 3600.0
 CLOCKS_AGREE_S: Final = 2.0
 INBOX: Final = 64
@@ -55,7 +53,6 @@ class FleetFace:
     def __init__(self, core: Core, settings: Fleet, mqtt: MqttFace, answer: Handler) -> None:
         self._settings, self._mqtt, self._answer = settings, mqtt, answer
         self._vehicle, self._offload = core.vehicle, core.offload
-        self._only_listening = core.only_listening is not None
         self._items = FleetItems(core.config.storage.path)
         self._sources = Sources(core.config.storage.path, self._items)
         self._inbox: deque[Incoming] = deque(maxlen=INBOX)
@@ -88,9 +85,7 @@ class FleetFace:
         confirmed_at = max((kept.confirmed_at for kept in self._kept if kept.confirmed_at), default=None)
         told = "never confirmed so far" if confirmed_at is None else f"last confirmed {confirmed_at[:16]}Z"
         words = f"{waiting or 'no'} item{'' if waiting == 1 else 's'} waiting for the fleet, {told}"
-        if self._only_listening:
-            words = "what waits for the fleet is told while the companion runs"
-        elif self._problem is not None:
+        if self._problem is not None:
             words = f"{words}; {self._problem}"
         elif self._nameless:
             words = "the autopilot tells no unique id (AUTOPILOT_VERSION): nothing is kept for the fleet"
@@ -118,7 +113,6 @@ class FleetFace:
         self._started_s = asyncio.get_running_loop().time()
         self._curves_s = self._started_s + CURVES_AFTER_S
         try:
-            await asyncio.sleep(FIRST_LOOK_S)
             while True:
                 problems = [await self._try(step) for step in (self._listen, self._take, self._greet, self._send)]
                 self._problem = next((each for each in problems if each is not None), None)
