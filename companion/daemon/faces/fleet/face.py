@@ -75,7 +75,7 @@ class FleetFace:
         self._expires_s = 0.0
         self._wait_s = CONFIRMED_WITHIN_S
         self._problem: str | None = None
-        self._faults: set[str] = set()
+        self._fault = ""
         """Of the program, said once."""
         mqtt.on_other.add(self._on_message)
 
@@ -131,9 +131,8 @@ class FleetFace:
                 logger.warning("fleet: %s", error)
             return str(error)
         except Exception as error:
-            level = logging.DEBUG if repr(error) in self._faults else logging.ERROR
-            logger.log(level, "fleet", exc_info=True)
-            self._faults.add(repr(error)[:200])
+            fault, self._fault = self._fault, f"{type(error).__name__} {step.__name__}"
+            logger.log(logging.DEBUG if fault == self._fault else logging.ERROR, "fleet", exc_info=True)
         return None
 
     # --- keeping
