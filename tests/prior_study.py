@@ -12,6 +12,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,6 +66,11 @@ class Case:
     earlier_zero_deg: float | None = None
     """Of another one with which all earlier calibrations were made; None: it was today's."""
 
+    flown: float | None = None
+    """If each earlier power-up's flight counted as one more: sigma of what its log says of the bias, an axis."""
+    shaken: float = 0.0
+    """By how much motors move the bias, one sigma an axis, the same in all flights."""
+
     @property
     def unit(self) -> float:
         return DEG_H if self.triad == "gyro" else MG
@@ -82,6 +88,10 @@ class Outcome:
     """Share of the trials in which it took part in the estimate."""
     doubted: float
     """Share of the trials in which something contradicted."""
+    foretold_rms: float
+    """Of what was expected of today before anything was measured."""
+    foretold_coverage: float
+    """Of 2 sigma of that."""
 
     @property
     def ratio(self) -> float:
@@ -131,8 +141,13 @@ def axes(values: Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-def one_trial(case: Case, random: np.random.Generator, effect: PoseEffect) -> tuple[Array, Array, Array, Weighed]:
-    """Errors without and with what was known, and the sigmas claimed with it; each (imus, 3), in the case's unit."""
+def one_trial(
+    case: Case, random: np.random.Generator, effect: PoseEffect
+) -> tuple[Array, Array, Array, Array, Weighed]:
+    """Errors without and with what was known, the sigmas claimed with it, and errors of what was expected by its sigma.
+
+    Each (imus, 3), the errors in the case's unit.
+    """
     unit = case.unit
     floor = np.sqrt(case.use**2 - case.stat**2)
     claimed = case.claimed_use or case.use
@@ -147,6 +162,7 @@ def one_trial(case: Case, random: np.random.Generator, effect: PoseEffect) -> tu
     for k in range(case.imus):
         mean = random.normal(0.0, 300.0, 3) if case.triad == "gyro" else random.normal(0.0, 10.0, 3)
         slope = random.normal(0.0, case.slope_per_k, 3)
+        shaken = random.normal(0.0, case.shaken, 3) if case.shaken else np.zeros(3)
 
         def measured(truth: Array, of_zero: Array) -> Array:
             draw = random.uniform(-1.0, 1.0, 3) if case.uniform_stat else random.normal(0.0, 1.0, 3)
@@ -176,6 +192,13 @@ def one_trial(case: Case, random: np.random.Generator, effect: PoseEffect) -> tu
                     accel=one if case.triad == "accel" else None,
                 )
             )
+            if case.flown is not None:
+                flown = axes(np.full(3, case.flown * unit))
+                value = axes((bias + shaken + random.normal(0.0, case.flown, 3)) * unit)
+                said = msgspec.structs.replace(one, bias=value, sigma_stat=flown, sigma_use=flown)
+                # A log does not say which of the daemon's power-ups it tells of.
+                host = PowerUp(host=f"flight {r}", since_unix_s=None)
+                points.append(msgspec.structs.replace(points[-1], power_up=host, **{case.triad: said}))
         mean = mean + random.normal(0.0, case.ageing, 3) + random.normal(0.0, 1.0, 3) * case.jump
         truth = mean + random.normal(0.0, case.scatter, 3) + slope * (today_degc - 25.0)
         truths.append(truth)
@@ -209,15 +232,20 @@ def one_trial(case: Case, random: np.random.Generator, effect: PoseEffect) -> tu
 
     sigma = np.array([np.sqrt(np.diag(imu.covariance)[part]) for imu in weighed.solution.imus]) / unit
     truth = np.array(truths)
-    return of(found) - truth, of(weighed.solution.imus) - truth, sigma, weighed
+    known = [each.gyro if case.triad == "gyro" else each.accel for each in expected]
+    nothing = np.full(3, np.nan)
+    foretold = np.array([nothing if one is None else np.array(one.value) / unit for one in known]) - truth
+    said_by = np.array([nothing if one is None else np.sqrt(one.variance) / unit for one in known])
+    return of(found) - truth, of(weighed.solution.imus) - truth, sigma, np.array([foretold, said_by]), weighed
 
 
 def study(case: Case, trials: int, seed: int = 1) -> Outcome:
     """Many trials."""
     random, effect = np.random.default_rng(seed), pose_effect(None)
-    without, having, sigmas, used, doubted = [], [], [], 0, 0
+    without, having, sigmas, ahead, used, doubted = [], [], [], [], 0, 0
     for _ in range(trials):
-        before, after, sigma, weighed = one_trial(case, random, effect)
+        before, after, sigma, foretold, weighed = one_trial(case, random, effect)
+        ahead.append(foretold)
         without.append(before)
         having.append(after)
         sigmas.append(sigma)
@@ -225,12 +253,15 @@ def study(case: Case, trials: int, seed: int = 1) -> Outcome:
         used += any(p is not None and ((p.gyro and p.gyro.used) or (p.accel and p.accel.used)) for p in priors)
         doubted += bool(weighed.doubts)
     errors = np.array(having)
+    foretold, said_by = np.moveaxis(np.array(ahead), 1, 0)
     return Outcome(
         rms_without=float(np.sqrt(np.mean(np.square(without)))),
         rms_with=float(np.sqrt(np.mean(np.square(errors)))),
         coverage=float(np.mean(np.abs(errors) <= 2.0 * np.array(sigmas))),
         used=used / trials,
         doubted=doubted / trials,
+        foretold_rms=float(np.sqrt(np.mean(np.square(foretold)))),
+        foretold_coverage=float(np.mean(np.abs(foretold) <= 2.0 * said_by)),
     )
 
 
@@ -238,6 +269,13 @@ GOOD: dict[str, Any] = {"stat": 1.6, "use": 5.0}
 """A good gyro after 30 s (method section 2.2: ICM-42688-P)."""
 OLD: dict[str, Any] = {"stat": 47.0, "use": 63.0}
 """An ADIS16405 after 10 s (likewise)."""
+FLIGHTS: dict[str, dict[str, Any]] = {
+    "scatter 20, none flown": {},
+    "each flown, as points of 12": {"flown": 12.0},
+    "each flown, as points of 54": {"flown": 54.0},
+    "each flown and shaken by 30": {"flown": 12.0, "shaken": 30.0},
+}
+"""What it would be if flights became points of the memory; they do not."""
 CASES = (
     *(Case(name=f"good gyro, scatter {s:g}", scatter=s, **GOOD) for s in (70.0, 10.0, 2.0, 0.0)),
     *(
@@ -261,6 +299,7 @@ CASES = (
         today_degc=-5.0,
         **OLD,
     ),
+    *(Case(name=f"5 power-ups, {name}", scatter=20.0, power_ups=5, **GOOD, **flown) for name, flown in FLIGHTS.items()),
     Case(name="another good gyro today", scatter=70.0, jump=1800.0, **GOOD),
     Case(name="another old gyro today", scatter=20.0, jump=1800.0, **OLD),
     Case(name="another old gyro, a little", scatter=20.0, jump=200.0, power_ups=20, **OLD),
@@ -290,12 +329,16 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
-    print(f"{'':46} {'without':>8} {'with':>8} {'ratio':>6} {'2 sigma':>8} {'used':>6} {'doubted':>8}")
+    print(
+        f"{'':46} {'without':>8} {'with':>8} {'ratio':>6} {'2 sigma':>8} {'used':>6} {'doubted':>8}"
+        f" {'foretold':>8} {'2 sigma':>8}"
+    )
     for case in CASES:
         found = study(case, given.trials, given.seed)
         print(
             f"{case.name:46} {found.rms_without:8.2f} {found.rms_with:8.2f} {found.ratio:6.3f}"
             f" {found.coverage:8.1%} {found.used:6.0%} {found.doubted:8.2%}"
+            f" {found.foretold_rms:8.2f} {found.foretold_coverage:8.1%}"
         )
 
 

@@ -56,6 +56,7 @@ def add_commands(add: AddCommand) -> None:
 
 async def flight(options: argparse.Namespace) -> int:
     """`companion flight`."""
+    from companion.calibration.records.flight_evidence import surely_moved
     from companion.flight.flight import flights, read
 
     if options.file is None and not options.fetch:
@@ -76,8 +77,10 @@ async def flight(options: argparse.Namespace) -> int:
         lines.insert(0, f"{starts} starts of the autopilot in it, each by its own clock")
     numbers = [] if store is None else _keep(store, path.name, found)
     lines += [f"kept as flight {number}: companion report --flight {number} makes a page of it" for number in numbers]
+    together = [] if store is None or not numbers else surely_moved(store.flights(), found[-1])
+    lines += [one.words for one in together]
     answer = {"state": "done", "reason": "", "file": str(path), "numbers": numbers}
-    answer["flights"] = msgspec.to_builtins(found)
+    answer |= {"flights": msgspec.to_builtins(found), "moved": msgspec.to_builtins(together)}
     return conclude(options, answer, lines, good=True)
 
 

@@ -286,8 +286,8 @@ def _make(options: argparse.Namespace, directory: Path) -> tuple[Path | None, li
     now = datetime.datetime.now(tz=datetime.UTC)
     damaged: list[str] = []
     if options.flight is not None:
-        number, kept = flight(directory, options.flight)
-        content, name = flight_page(number, kept, now), f"companion-flight-{number:06d}.html"
+        number, kept, flights = flight(directory, options.flight)
+        content, name = flight_page(number, kept, flights, now), f"companion-flight-{number:06d}.html"
     else:
         one = material(directory, options.record)
         content, damaged = calibration_page(one, now), list(one.damaged)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -55,6 +55,8 @@ class Material(msgspec.Struct, frozen=True, kw_only=True):
     damaged: Sequence[str]
     by_temperature: Sequence[ByTemperature] = ()
     """Of its IMUs, as known when the page is made."""
+    flown: Mapping[str, Sequence[str]] = {}
+    """By IMU, what flights have found that its sigma has not; likewise."""
 
 
 def calibration_page(material: Material, now: datetime.datetime) -> str:
@@ -67,7 +69,7 @@ def calibration_page(material: Material, now: datetime.datetime) -> str:
         _headline(material),
         damaged(material.damaged),
         _warnings(record),
-        *map(_imu, imus),
+        *(_imu(imu, material.flown.get(imu.name, ())) for imu in imus),
         card("caution", f"{len(record.imus) - MAX_IMUS} more IMUs are not shown.")
         if len(record.imus) > MAX_IMUS
         else None,
@@ -124,7 +126,7 @@ def _warnings(record: Record) -> Markup | None:
 # ------------------------------------------------------------------------------------------------------- an IMU
 
 
-def _imu(imu: ImuRecord) -> Markup:
+def _imu(imu: ImuRecord, flown: Sequence[str]) -> Markup:
     temperature = "temperature unknown" if imu.temperature_degc is None else f"{imu.temperature_degc:.1f} degC"
     return join(
         tag("h2", f"IMU {imu.name}"),
@@ -136,6 +138,10 @@ def _imu(imu: ImuRecord) -> Markup:
             if imu.residual_gyro_rad_s or imu.residual_accel_m_s2
             else None,
             class_="soft",
+        ),
+        *(
+            card("caution", tag("p", f"{words}, more than σ use, which is of the ground: its damping."))
+            for words in flown
         ),
         tag("div", *(_triad(imu, triad) for triad in TRIADS), class_="pairs"),
     )

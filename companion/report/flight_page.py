@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
+from companion.calibration.records.flight_evidence import surely_moved
 from companion.calibration.records.flight_record import (
-    AXES,
     HEADS,
     UNSEEN,
     Drift,
     Flight,
     ImuFlight,
     KeptFlight,
-    Moment,
     Split,
     Term,
     figure,
@@ -32,8 +31,8 @@ _MOST_SETS: Final = 8
 _SHORTEST_M: Final = 0.01
 
 
-def flight_page(number: int, kept: KeptFlight, now: datetime.datetime) -> str:
-    """The file's content."""
+def flight_page(number: int, kept: KeptFlight, flights: Sequence[Flight], now: datetime.datetime) -> str:
+    """The file's content; `flights` are all that are known, this one among them."""
     flight = kept.flight
     imus = flight.imus[:MAX_IMUS]
     notes = [*flight.notes, *(f"IMU {imu.imu}: {words}" for imu in flight.imus for words in imu.notes)]
@@ -45,12 +44,14 @@ def flight_page(number: int, kept: KeptFlight, now: datetime.datetime) -> str:
         tag("p", f"{_when(flight)}, {_whose(flight)}{_how_long(flight)}, log {kept.log}"),
         tag("p", figure(flight.imus) or "It did not fly, or too shortly to tell anything.", class_="lead"),
         card("fine" if hint.startswith("nothing") else "caution", tag("p", f"Next flight: {hint}.")),
+        *(card("caution", tag("p", f"{one.words}.")) for one in surely_moved(flights, flight)),
         *(card("", tag("p", words)) for words in notes),
         *(part for imu in imus for part in _imu(flight, imu)),
         card("caution", f"{len(flight.imus) - MAX_IMUS} more IMUs are not shown.")
         if len(flight.imus) > MAX_IMUS
         else None,
         source="from what companion flight has read in the autopilot's log",
+        clock="that log",
     )
 
 
@@ -173,68 +174,40 @@ def _term(key: str, axis: Split, term: str) -> Markup:
 
 
 def _plots(flight: Flight, imu: ImuFlight) -> list[Markup]:
-    across = svg.linear([one.after_arming_s for one in imu.moments], least=10.0)
-    gyros = [_bias_plot(flight, imu, across, k) for k in range(3)]
-    others = [
-        _bias_plot(flight, imu, across, 3),
-        _level_plot(flight, imu, across, "temperature", "degC", lambda one: one.degc),
-        _level_plot(flight, imu, across, "vibration", "m/s²", lambda one: one.vibration_m_s2),
-    ]
-    return [tag("figure", *each) for each in (gyros, [plot for plot in others if plot is not None])]
-
-
-def _bias_plot(flight: Flight, imu: ImuFlight, across: svg.Axis, k: int) -> Markup:
-    unit, name, _ = unit_of(AXES[k])
-    dots = [(one.after_arming_s, one.left[k] / unit) for one in imu.moments]
-    line = [(one.after_arming_s, one.ekf[k] / unit) for one in imu.moments if one.ekf is not None]
-    mean = next((axis.in_flight for axis in imu.axes if axis.axis == AXES[k]), None)
-    air = [x for x, _ in dots if _is_in_air(flight, x)]
-    low, high = (0.0, 0.0) if mean is None else (mean.value - mean.sigma, mean.value + mean.sigma)
-    ends = [0.0, *(y for _, y in (*dots, *line)), low / unit, high / unit]
-    plot = svg.Plot(
-        across,
-        svg.linear(ends, ticks=3),
-        name=f"IMU {imu.imu}, {AXES[k]}: bias left over against time",
-        height=96.0,
-        x_label="seconds after arming" if k >= 2 else "",
-        y_label=f"{AXES[k]}, {name}",
-    )
-    class_ = CLASSES[min(k, 2)]
-    _dashes(plot, flight, across)
-    if mean is not None and air:
-        plot.area([(x, low / unit, high / unit) for x in (air[0], air[-1])], f"area {class_}")
-    plot.line([(across.low, 0.0), (across.high, 0.0)], "run past")
-    plot.line(line, f"curve {class_}")
-    plot.points(dots, class_, [(y, y) for _, y in dots])
-    return plot.svg()
-
-
-def _level_plot(
-    flight: Flight, imu: ImuFlight, across: svg.Axis, what: str, unit: str, of: Callable[[Moment], float | None]
-) -> Markup | None:
-    points = [(one.after_arming_s, value) for one in imu.moments if (value := of(one)) is not None]
-    if not points:
-        return None
-    plot = svg.Plot(
-        across,
-        svg.linear([y for _, y in points], ticks=3, least=1.0),
-        name=f"IMU {imu.imu}: {what} against time",
-        height=60.0,
-        x_label="seconds after arming",
-        y_label=f"{what}, {unit}",
-    )
-    _dashes(plot, flight, across)
-    plot.line(points, "curve past")
-    return plot.svg()
-
-
-def _dashes(plot: svg.Plot, flight: Flight, across: svg.Axis) -> None:
     stages = flight.stages
-    for at_s in (stages.take_off_s, stages.landing_s):
-        if at_s is not None and across.low < at_s - stages.armed_s < across.high:
-            plot.upright(at_s - stages.armed_s, "now")
+    dashes = [each - stages.armed_s for each in (stages.take_off_s, stages.landing_s) if each is not None]
+    across = svg.linear([*dashes, *(one.after_arming_s for one in imu.moments)], least=10.0)
 
+    def plot(what: str, unit: str, ends: Sequence[float], height: float, *, last: bool) -> svg.Plot:
+        label = "seconds after arming" if last else ""
+        up = svg.linear(ends, ticks=3, least=1.0)
+        drawn = svg.Plot(
+            across, up, name=f"IMU {imu.imu}: {what}", height=height, x_label=label, y_label=f"{what}, {unit}"
+        )
+        for at_s in dashes:
+            drawn.upright(at_s, "now")
+        return drawn
 
-def _is_in_air(flight: Flight, after_arming_s: float) -> bool:
-    take_off_s = flight.stages.take_off_s
-    return take_off_s is not None and after_arming_s > take_off_s - flight.stages.armed_s
+    drawn = []
+    for k, axis in enumerate(imu.axes):
+        unit, name, _ = unit_of(axis.axis)
+        dots = [(one.after_arming_s, one.left[k] / unit) for one in imu.moments]
+        line = [(one.after_arming_s, one.ekf[k] / unit) for one in imu.moments if one.ekf is not None]
+        mean, air = axis.in_flight, [x for x, _ in dots if dashes and x > dashes[0]]
+        band = [] if mean is None else [(mean.value + sign * mean.sigma) / unit for sign in (-1.0, 1.0)]
+        one = plot(axis.axis, name, [0.0, *band, *(y for _, y in (*dots, *line))], 96.0, last=k > 1)
+        class_ = CLASSES[min(k, 2)]
+        if band and air:
+            one.area([(x, band[0], band[1]) for x in (air[0], air[-1])], f"area {class_}")
+        one.line([(across.low, 0.0), (across.high, 0.0)], "run past")
+        one.line(line, f"curve {class_}")
+        one.points(dots, class_, [(y, y) for _, y in dots])
+        drawn.append(one.svg())
+    warmth = [(one.after_arming_s, one.degc) for one in imu.moments if one.degc is not None]
+    shaking = [(one.after_arming_s, one.vibration_m_s2) for one in imu.moments if one.vibration_m_s2 is not None]
+    for what, unit_name, points in (("temperature", "degC", warmth), ("vibration", "m/s²", shaking)):
+        if points:
+            one = plot(what, unit_name, [y for _, y in points], 60.0, last=True)
+            one.line(points, "curve past")
+            drawn.append(one.svg())
+    return [tag("figure", *drawn[:3]), tag("figure", *drawn[3:])]

@@ -38,12 +38,18 @@ _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'
 _STYLES: Final = tuple(Path(__file__).with_name(name) for name in ("page.css", "plot.css"))
 
 
-def page(title: str, now: datetime.datetime, *body: Child, source: str = "from the records on this computer") -> str:
+def page(
+    title: str,
+    now: datetime.datetime,
+    *body: Child,
+    source: str = "from the records on this computer",
+    clock: str = "the companion's clock",
+) -> str:
     """A whole file."""
     foot = tag(
         "p",
         f"Made {now:%Y-%m-%d %H:%M} UTC by companion {__version__} {source}. All axes:"
-        " x forward, y right, z down. Times: UTC by the companion's clock.",
+        f" x forward, y right, z down. Times: UTC by {clock}.",
         class_="soft",
     )
     head = join(

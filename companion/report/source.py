@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 from companion.calibration.noise.allan import PROFILES, NoiseProfile
-from companion.calibration.records.flight_record import KeptFlight
+from companion.calibration.records.flight_evidence import moved
+from companion.calibration.records.flight_record import AXES, Flight, KeptFlight
 from companion.calibration.records.record import Arming, Record
 from companion.calibration.solution.by_temperature import ByTemperature, by_temperature
 from companion.calibration.solution.prior import curve_of
 from companion.errors import StorageError
 from companion.report.calibration_page import Material
 from companion.storage.flights import FlightStore
-from companion.storage.learned import BiasStore
+from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.profiles import ProfileStore
 from companion.storage.records import Entry, RecordStore
 from companion.storage.state import BoundedList
 
 MAX_EARLIER: Final = 60
+_NO_SIGMA: Final = (math.inf,) * 3
 
 
 def material(directory: Path, wanted: str | None) -> Material:
@@ -56,8 +59,11 @@ def material(directory: Path, wanted: str | None) -> Material:
         why = f"{error}."
         damaged.append(str(error))
     warmth: Sequence[ByTemperature] = ()
+    flown: dict[str, list[str]] = {}
     try:
-        warmth = _by_temperature(directory, record)
+        known = BiasStore(directory).all()
+        warmth = _by_temperature(directory, record, known)
+        flown = _moved_in_flight(FlightStore(directory).flights(), record, known)
     except StorageError as error:
         damaged.append(str(error))
     earlier = [
@@ -72,13 +78,14 @@ def material(directory: Path, wanted: str | None) -> Material:
         no_trace="" if trace is not None else why,
         earlier=earlier[-MAX_EARLIER:],
         by_temperature=warmth,
+        flown=flown,
         armings=[arming for arming in armings if arming.calibration == record.started_at],
         damaged=damaged,
     )
 
 
-def flight(directory: Path, wanted: int) -> tuple[int, KeptFlight]:
-    """A flight by its number; 0: the latest.
+def flight(directory: Path, wanted: int) -> tuple[int, KeptFlight, list[Flight]]:
+    """A flight by its number; 0: the latest; and all that are known.
 
     Raises:
         StorageError: there is none, none of that number, or it cannot be read.
@@ -87,16 +94,34 @@ def flight(directory: Path, wanted: int) -> tuple[int, KeptFlight]:
     numbers = store.numbers()
     if not numbers:
         raise StorageError(f"no flight yet: nothing is in {store.folder} (companion flight LOG reads one)")
-    if wanted and wanted not in numbers:
-        raise StorageError(f"no flight {wanted}; there are number {numbers[0]} to {numbers[-1]} (companion history)")
     number = wanted or numbers[-1]
-    return number, store.read(number)
+    kept = store.read(number)
+    if kept is None:
+        raise StorageError(f"no flight {wanted}; there are number {numbers[0]} to {numbers[-1]} (companion history)")
+    return number, kept, store.flights()
 
 
-def _by_temperature(directory: Path, record: Record) -> list[ByTemperature]:
+def _moved_in_flight(flights: Sequence[Flight], record: Record, known: Mapping[str, KnownImu]) -> dict[str, list[str]]:
+    """By IMU, what motors surely add to its biases, where that is more than the calibration's sigma."""
+    found: dict[str, list[str]] = {}
+    for imu in record.imus:
+        identity = known[imu.name].identity if imu.name in known else {}
+        number, gyro, accel = (identity.get(key, "") for key in ("instance", "gyro", "accel"))
+        if not (number.isdecimal() and gyro.isdecimal() and accel.isdecimal()):
+            continue
+        gyro_use, accel_use = imu.gyro_sigma_use_rad_s or _NO_SIGMA, imu.accel_sigma_use_m_s2 or _NO_SIGMA
+        found[imu.name] = [
+            one.words
+            for one in moved(flights, record.system_id, int(number), int(gyro), int(accel))
+            if one.is_sure and abs(one.moves.value) > (*gyro_use, accel_use[2])[AXES.index(one.axis)]
+        ]
+    return found
+
+
+def _by_temperature(directory: Path, record: Record, every: Mapping[str, KnownImu]) -> list[ByTemperature]:
     """What is known today of this calibration's IMUs, as far as it is the same vehicle's."""
     found = []
-    for name, known in BiasStore(directory).all().items():
+    for name, known in every.items():
         identity, points = known.identity, known.points
         if name not in {imu.name for imu in record.imus} or identity.get("system", "") not in (
             "",

@@ -7,21 +7,9 @@ import re
 from pathlib import Path
 from typing import Final
 
-import msgspec
-
-from companion import formats
-from companion.calibration.records.flight_record import FORMAT_VERSION, KeptFlight
+from companion.calibration.records.flight_record import FORMAT_VERSION, Flight, KeptFlight
 from companion.errors import StorageError
-from companion.storage.state import (
-    MOST_BYTES,
-    UNREADABLE,
-    numbers_in,
-    read_regular,
-    remove_durably,
-    sealed,
-    unsealed,
-    write_atomically,
-)
+from companion.storage.state import StateFile, numbers_in, remove_durably
 
 logger = logging.getLogger(__name__)
 
@@ -45,16 +33,18 @@ class FlightStore:
         numbers = self.numbers()
         earlier = (number for number, one in self.newest().items() if one.flight.key == kept.flight.key)
         number = next(earlier, numbers[-1] + 1 if numbers else 1)
-        try:
-            data = sealed(msgspec.json.encode(kept))
-            _from_json(data)
-        except UNREADABLE as error:
-            raise StorageError(f"{self._path(number)}: not written: {error}") from error
-        # Who reads a log is root, and who tells of it the service, which has an account of its own.
-        write_atomically(self._path(number), data, mode=0o644)
+        self._file(number).write(kept)
         for old in [each for each in numbers if each != number][: 1 - KEEP]:
-            remove_durably(self._path(old))
+            remove_durably(self._file(old).path)
         return number
+
+    def numbers(self) -> list[int]:
+        """All that are there, ascending, whether they can be read or not.
+
+        Raises:
+            StorageError: the folder cannot be listed.
+        """
+        return numbers_in(self.folder, _NAME)
 
     def newest(self, limit: int | None = None) -> dict[int, KeptFlight]:
         """The latest by their numbers, the newest first; one that cannot be read is logged and passed over.
@@ -67,39 +57,29 @@ class FlightStore:
             if len(found) == limit:
                 break
             try:
-                found[number] = self.read(number)
+                kept = self.read(number)
             except StorageError as error:
                 logger.warning("%s, passed over", error)
+            else:
+                found |= {} if kept is None else {number: kept}
         return found
 
-    def numbers(self) -> list[int]:
-        """All that are there, ascending, whether they can be read or not.
+    def flights(self) -> list[Flight]:
+        """All that can be read, the newest first.
 
         Raises:
             StorageError: the folder cannot be listed.
         """
-        return numbers_in(self.folder, _NAME)
+        return [kept.flight for kept in self.newest().values()]
 
-    def read(self, number: int) -> KeptFlight:
-        """One of them.
+    def read(self, number: int) -> KeptFlight | None:
+        """One of them, if there is one of that number.
 
         Raises:
-            StorageError: there is none of that number, or it cannot be read.
+            StorageError: it cannot be used.
         """
-        path = self._path(number)
-        try:
-            return _from_json(read_regular(path))
-        except OSError as error:
-            raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from error
-        except UNREADABLE as error:
-            raise StorageError(f"{path}: not a readable flight: {error}") from error
+        return self._file(number).read()
 
-    def _path(self, number: int) -> Path:
-        return self.folder / f"{number:06d}.json"
-
-
-def _from_json(data: bytes) -> KeptFlight:
-    if len(data) > MOST_BYTES:
-        raise msgspec.ValidationError(f"more than {MOST_BYTES} bytes")
-    found: KeptFlight = formats.decode(unsealed(data), KeptFlight, FORMAT_VERSION)
-    return found
+    def _file(self, number: int) -> StateFile[KeptFlight]:
+        # Who reads a log is root, and who tells of it the service, which has an account of its own.
+        return StateFile(self.folder / f"{number:06d}.json", KeptFlight, newest=FORMAT_VERSION, mode=0o644)

@@ -156,9 +156,14 @@ class StateFile(Generic[T]):
     """One such file; `check` raises msgspec.ValidationError where what was found, or is to be kept, cannot be."""
 
     def __init__(
-        self, path: Path, kind: Any, check: Callable[[T], None] = lambda _: None, newest: int | None = None
+        self,
+        path: Path,
+        kind: Any,
+        check: Callable[[T], None] = lambda _: None,
+        newest: int | None = None,
+        mode: int = 0o600,
     ) -> None:
-        self.path = path
+        self.path, self._mode = path, mode
         self._kind, self._check, self._newest = kind, check, newest
         self.unusable: str | None = None
         """What `take` has met last, in one line; None where all was well."""
@@ -207,7 +212,7 @@ class StateFile(Generic[T]):
             self._of(data)
         except UNREADABLE as error:
             raise StorageError(f"{self.path}: not written: {error}") from error
-        write_atomically(self.path, data)
+        write_atomically(self.path, data, mode=self._mode)
 
     def clear(self) -> None:
         """Keep nothing any more.

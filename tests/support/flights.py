@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from companion.calibration.records.flight_record import (
     AXES,
@@ -22,37 +22,46 @@ UNITS = (DEG_H, DEG_H, DEG_H, MG)
 LEFT = (12.0, -30.0, 8.0, 0.5)
 """Before the motors; deg/h and mg."""
 STEP = (-5.0, 4.0, 30.0, 5.1)
+SIGMA = (12.0, 12.0, 12.0, 0.6)
+"""Of the step."""
 DRIFTS = {"flown": (0.4, 2.1, 9.5), "before": (6.0, 31.0, 160.0)}
 
 
-def imu_flight(number: int = 1, *, drifts: Mapping[str, tuple[float, ...]] = DRIFTS, minutes: float = 3.0) -> ImuFlight:
+def imu_flight(
+    number: int = 1,
+    *,
+    step: Sequence[float] = STEP,
+    drifts: Mapping[str, tuple[float, ...]] = DRIFTS,
+    minutes: float = 3.0,
+) -> ImuFlight:
     """One that stood for 30 s and then flew."""
-    count = round(minutes * 6.0)
-    moments = tuple(
-        Moment(
+    figures = list(zip(LEFT, step, UNITS, strict=True))
+
+    def moment(k: int) -> Moment:
+        left = [(before + by * (k >= 0) + math.sin(k)) * unit for before, by, unit in figures]
+        ekf = [0.8 * (before + by) * unit for before, by, unit in figures]
+        level = 0.1 if k < 0 else 3.0 + 0.1 * math.cos(k)
+        return Moment(
             10.0 * k + 5.0,
-            tuple(
-                (left + step * (k >= 0) + math.sin(k)) * unit
-                for left, step, unit in zip(LEFT, STEP, UNITS, strict=True)
-            ),  # type: ignore[arg-type]
-            tuple(0.8 * (left + step) * unit for left, step, unit in zip(LEFT, STEP, UNITS, strict=True)),  # type: ignore[arg-type]
+            (left[0], left[1], left[2], left[3]),
+            (ekf[0], ekf[1], ekf[2], ekf[3]),
             36.0 + 0.2 * k,
-            0.1 if k < 0 else 3.0 + 0.1 * math.cos(k),
+            level,
         )
-        for k in range(-3, count)
-    )
+
+    moments = tuple(map(moment, range(-3, round(minutes * 6.0))))
     axes = tuple(
         Split(
             axis=axis,
-            in_flight=Term((left + step) * unit, 0.6 * unit if axis == "accel z" else 12.0 * unit),
-            ekf=Term(0.8 * (left + step) * unit, unit),
-            turn_on=Term(left * unit, 0.3 * unit if axis == "accel z" else 4.0 * unit),
+            in_flight=Term((before + by) * unit, sigma * unit),
+            ekf=Term(0.8 * (before + by) * unit, unit),
+            turn_on=Term(before * unit, 0.3 * unit),
             temperature=None,
-            motors=Term(step * unit, 0.6 * unit if axis == "accel z" else 12.0 * unit),
+            motors=Term(by * unit, sigma * unit),
             vibration=None,
             trend=Term(0.1 * unit, 0.5 * unit),
         )
-        for axis, left, step, unit in zip(AXES, LEFT, STEP, UNITS, strict=True)
+        for axis, sigma, (before, by, unit) in zip(AXES, SIGMA, figures, strict=True)
     )
     drift = {
         name: [Drift(seconds, 150, m, 2.4 * m) for seconds, m in zip((10.0, 30.0, 60.0), each, strict=False)]
@@ -64,10 +73,13 @@ def imu_flight(number: int = 1, *, drifts: Mapping[str, tuple[float, ...]] = DRI
     )  # fmt: skip
 
 
-def kept_flight(key: str = "1", *imus: ImuFlight, began_at: str | None = "2026-11-23T08:00:46+00:00") -> KeptFlight:
+def kept_flight(
+    key: str = "1", *imus: ImuFlight, began_at: str | None = "2026-11-23T08:00:46+00:00", system_id: int | None = 1
+) -> KeptFlight:
     """One of an aircraft with one IMU."""
     stages = Stages(64.0, 65.0, 67.0, 240.0, 242.0)
     flight = Flight(
-        key=key, system_id=1, began_at=began_at, stages=stages, reference="ekf", imus=imus or (imu_flight(),), notes=()
+        key=key, system_id=system_id, began_at=began_at, stages=stages, reference="ekf", notes=(),
+        imus=imus or (imu_flight(),),
     )  # fmt: skip
     return KeptFlight(log="00000012.BIN", read_at="2026-11-23T09:10:11+00:00", flight=flight)

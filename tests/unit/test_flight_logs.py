@@ -152,7 +152,7 @@ def test_what_is_kept_of_a_flight_is_what_was_in_the_air(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said(capsys, log, *storage(tmp_path))
-    flight = FlightStore(tmp_path).read(1).flight
+    (flight,) = FlightStore(tmp_path).flights()
     (imu,) = flight.imus
     assert (imu.gyro_id, imu.accel_id) == (2752772, 2753028)
     # Armed at 64 s, motors at 65 s; it flew from 67 s to 240 s.

@@ -29,7 +29,7 @@ def test_the_same_flight_read_again_stays_one_with_the_later_reading(tmp_path: P
     again = msgspec.structs.replace(kept_flight("a"), log="again.bin")
     assert store.save(again) == 1
     assert list(store.newest()) == [2, 1]
-    assert store.read(1).log == "again.bin"
+    assert store.newest()[1].log == "again.bin"
 
 
 def test_the_oldest_makes_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,15 +51,14 @@ def test_a_damaged_one_is_passed_over_with_a_line(tmp_path: Path, caplog: pytest
     data = path.read_bytes()
     path.write_bytes(data.replace(b"400.0", b"401.0"))
     assert list(store.newest()) == [3, 1]
-    assert caplog.messages == [
-        f"{path}: not a readable flight: its checksum does not fit: damaged, or changed by hand, passed over"
-    ]
+    (words,) = caplog.messages
+    assert words.startswith(f"{path}: cannot be used: its checksum does not fit")
+    assert words.endswith(", passed over")
     for content in (b"", b"{}", data[: len(data) // 2], b"[" * 100_000):
         path.write_bytes(content)
-        with pytest.raises(StorageError, match="not a readable flight"):
+        with pytest.raises(StorageError, match="cannot be used: "):
             store.read(2)
-    with pytest.raises(StorageError, match="cannot be read: No such file"):
-        store.read(7)
+    assert store.read(7) is None
 
 
 def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:

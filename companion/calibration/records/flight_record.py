@@ -129,6 +129,12 @@ def unit_of(axis: str) -> tuple[float, str, int]:
     return (DEG_H, "deg/h", 0) if axis.startswith("gyro") else (MG, "mg", 1)
 
 
+def is_worth_saying(axis: str, value: float) -> bool:
+    """Whether a part of a bias is more than nobody's worry."""
+    unit, name, _ = unit_of(axis)
+    return abs(value) / unit > _WORTH[name]
+
+
 def drift_lines(imu: ImuFlight) -> list[str]:
     """The figure that counts, a line for each time."""
     lines = []
