@@ -74,7 +74,7 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 
 
 def _parser() -> Parser:
-    from companion.cli import client, flight, ground, local, monitor, profile, recordings
+    from companion.cli import client, fleet, flight, ground, local, monitor, profile, recordings
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -154,4 +154,5 @@ def _parser() -> Parser:
     flight.add_commands(add)
     profile.add_command(add)
     ground.add_commands(commands, common)
+    fleet.add_commands(commands, common)
     return parser

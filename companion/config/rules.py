@@ -47,7 +47,7 @@ def _complaints(config: Config) -> Iterator[str]:
     if config.web is not None and (wrong := bind_problem(config.web.bind, "'web.bind'")) is not None:
         yield wrong
     if config.mqtt is not None:
-        yield from _mqtt(config.mqtt)
+        yield from broker_complaints(config.mqtt)
     elif config.fleet is not None:
         yield "'mqtt' is missing; allowed: a table with the broker's host (needed by [fleet])"
     if (config.vehicle.latitude_deg is None) != (config.vehicle.longitude_deg is None):
@@ -241,7 +241,8 @@ def _secret(path: str | None, here: str) -> Iterator[str]:
         )
 
 
-def _mqtt(mqtt: Mqtt) -> Iterator[str]:
+def broker_complaints(mqtt: Mqtt) -> Iterator[str]:
+    """What no single key of [mqtt] can tell, in words."""
     if mqtt.base_topic is not None:
         yield from _topic(mqtt.base_topic)
     if mqtt.password_file is not None and mqtt.username is None:

@@ -33,6 +33,8 @@ NOT_FOR_PEOPLE = {
     "compile", "Formatter", "JournalFormatter", "OneLineFormatter",
     # Names of tasks.
     "create_task", "Thread",
+    # Words to a database.
+    "Column", "create_engine", "exec_driver_sql",
     # Statements of SQL.
     "execute", "executemany", "executescript",
 }  # fmt: skip
@@ -48,6 +50,9 @@ ELSEWHERE = {
     "companion/cli/monitor.py": "the frame of the monitor: docs/page.md",
     "companion/ground": "printed on the ground laptop, each with what to do: docs/ground_stations.md",
     "companion/report": "labels of pages",
+    "companion/fleet/contract.py": "reasons in the table of what was rejected, with what was found and what is allowed",
+    "companion/fleet/settings.py": "as companion/config",
+    "companion/fleet/simulated.py": "what simulated aircraft tell",
     "companion/web": "answers to browsers that ask for the wrong thing; what people see is the page",
 }
 """Rooms whose words need no row of their own, and why."""

@@ -40,7 +40,7 @@ PUT_TOGETHER = {
     # The kind of job and how it ended, or who speaks; what follows has rows of its own.
     "1 of 3: …", "Calibration done: …", "Calibration failed: …",
     "… refused: …", "… refused: internal error, see the log",
-    "Companion: …", "FAULT: …", "waiting: …", "running, idle",
+    "Companion: …", "FAULT: …", "fleet: …: …", "waiting: …", "running, idle",
     # Too few words of its own to be looked for in the code.
     "IMU …: gyro residual x is …", "calibrate",
     "a … is running (…)", "… restarted …", "… restarted (…)", "… refuses … = …: …",

@@ -1,0 +1,198 @@
+"""A collector: hears aircraft at a broker, puts what they tell into the database, and then says that it is there.
+
+It keeps nothing itself. Whatever goes wrong, at the broker or in the database, ends its connection; what it had not
+confirmed the aircraft tell again, and at the next connection they are asked for what is lacking.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import secrets
+import socket
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from companion.config.sections import Mqtt
+from companion.errors import CompanionError, LinkError
+from companion.fleet.contract import MOST_BYTES, answers, ranges
+from companion.fleet.store import Message, Outcome, Store
+from companion.links.mqtt.broker import explain, is_of_protocol, read_password, tls_context
+from companion.links.system.connection import Backoff, Reconnection
+
+if TYPE_CHECKING:
+    import aiomqtt
+
+logger = logging.getLogger(__name__)
+_quiet = logging.getLogger(f"{__name__}.aiomqtt")
+_quiet.setLevel(logging.CRITICAL)
+
+BATCH: Final = 500
+GATHER_S: Final = 0.1
+"""How long more of a batch is waited for."""
+WAITING: Final = 4 * BATCH
+"""The most messages that wait; what is beyond is told again, or another collector hears it."""
+SWEEP_S: Final = 5.0
+"""For what aircraft said before this collector was there."""
+ANSWER_S: Final = 10.0
+FIRST_WAIT_S: Final = 0.5
+LONGEST_WAIT_S: Final = 30.0
+WORTH_S: Final = 10.0
+_HELLO: Final = "fleet/+/hello"
+_ITEM: Final = "fleet/+/item"
+_SHARED: Final = "$share/collectors/"
+_MQTT_5: Final = 5
+_MQTT_3_1_1: Final = 4
+
+
+class Collector:
+    """One of as many as are wanted at one broker; `run` it as a task. `on_state` is told of connections and losses."""
+
+    def __init__(
+        self,
+        settings: Mqtt,
+        store: Store,
+        on_state: Callable[[bool, str], object] | None = None,
+    ) -> None:
+        self.settings, self.store = settings, store
+        self.client_id = settings.client_id or f"collector-{socket.gethostname()[:40]}-{secrets.token_hex(4)}"
+        self.confirmed = self.rejected = 0
+        """Items, and payloads, since the start."""
+        self._protocol = _MQTT_5
+        self._reconnection = Reconnection(
+            "fleet", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S, on_state=on_state
+        )
+
+    @property
+    def where(self) -> str:
+        """The broker's address."""
+        return f"{self.settings.host}:{self.settings.broker_port}"
+
+    async def run(self) -> None:
+        """Collect until cancelled.
+
+        Raises:
+            StorageError: a newer companion has made the database.
+        """
+        await self._reconnection.keep(self._once)
+
+    async def _once(self) -> str:
+        """One connection to both, to its end; why it has ended."""
+        import aiomqtt
+
+        await asyncio.to_thread(self.store.prepare)
+        reached = False
+        try:
+            password = await asyncio.to_thread(read_password, self.settings)
+            async with self._client(password) as client:
+                reached = True
+                await self._serve(client)
+        except LinkError as error:
+            return str(error)
+        except CompanionError:
+            raise
+        except (aiomqtt.MqttError, OSError, TimeoutError) as error:
+            if not reached and self._protocol == _MQTT_5 and is_of_protocol(error):
+                # Too old for MQTT 5: it says so, or says nothing, or closes the connection.
+                self._protocol = _MQTT_3_1_1
+                return f"{self.where}: no MQTT 5 there, so one collector only; going on with MQTT 3.1.1"
+            self._protocol = _MQTT_5
+            return f"{self.where}: {explain(error, self.settings, self.client_id, reached=reached)}"
+        finally:
+            self.store.close()
+        return f"{self.where}: the connection has ended"
+
+    def _client(self, password: str | None) -> aiomqtt.Client:
+        import aiomqtt
+        from paho.mqtt.packettypes import PacketTypes
+        from paho.mqtt.properties import Properties
+
+        properties = None
+        if self._protocol == _MQTT_5:
+            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            properties.MaximumPacketSize = 2 * MOST_BYTES
+        return aiomqtt.Client(
+            self.settings.host,
+            self.settings.broker_port,
+            username=self.settings.username,
+            password=password,
+            identifier=self.client_id,
+            protocol=aiomqtt.ProtocolVersion(self._protocol),
+            clean_session=True if properties is None else None,
+            keepalive=self.settings.keepalive_s,
+            properties=properties,
+            timeout=ANSWER_S,
+            tls_context=tls_context(self.settings),
+            max_queued_incoming_messages=WAITING,
+            logger=_quiet,
+        )
+
+    async def _serve(self, client: aiomqtt.Client) -> None:
+        inbox: asyncio.Queue[Message] = asyncio.Queue(BATCH)
+        tasks = [
+            asyncio.create_task(self._hear(client, inbox), name="fleet listener"),
+            asyncio.create_task(self._collect(client, inbox), name="fleet writer"),
+            asyncio.create_task(self._subscribe(client), name="fleet subscriptions"),
+        ]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+        finally:
+            for task in tasks:
+                task.cancel()
+            ended = await asyncio.gather(*tasks, return_exceptions=True)
+        for end in ended:
+            if isinstance(end, Exception):
+                raise end
+
+    async def _subscribe(self, client: aiomqtt.Client) -> None:
+        alone = self._protocol == _MQTT_3_1_1
+        shared = "" if alone else _SHARED
+        for topic in (shared + _ITEM, shared + _HELLO):
+            await self._hear_of(client, topic)
+        words = "MQTT 3.1.1: no other collector beside this one" if alone else "MQTT 5"
+        self._reconnection.up(f"{self.where} ({words}) into {self.store.where}")
+        if not alone:
+            # What was said before is not told to those who share.
+            await self._hear_of(client, _HELLO, qos=0)
+            await asyncio.sleep(SWEEP_S)
+            await client.unsubscribe(_HELLO)
+        await asyncio.get_running_loop().create_future()
+
+    async def _hear_of(self, client: aiomqtt.Client, topic: str, qos: int = 1) -> None:
+        granted = await client.subscribe(topic, qos=qos)
+        if any(getattr(code, "value", code) >= 128 for code in granted):
+            raise LinkError(f"{self.where}: the broker does not let us hear {topic} (its access list?)")
+
+    async def _hear(self, client: aiomqtt.Client, inbox: asyncio.Queue[Message]) -> None:
+        async for message in client.messages:
+            if isinstance(message.payload, bytes):
+                await inbox.put(Message(message.topic.value, message.payload, bool(message.retain)))
+
+    async def _collect(self, client: aiomqtt.Client, inbox: asyncio.Queue[Message]) -> None:
+        while True:
+            batch = [await inbox.get()]
+            if inbox.qsize() < BATCH - 1:
+                await asyncio.sleep(GATHER_S)
+            with contextlib.suppress(asyncio.QueueEmpty):
+                while len(batch) < BATCH:
+                    batch.append(inbox.get_nowait())
+            await self._answer(client, await asyncio.to_thread(self.store.take, batch))
+
+    async def _answer(self, client: aiomqtt.Client, outcome: Outcome) -> None:
+        said = [
+            (f"fleet/{aircraft}/confirmed", payload)
+            for (aircraft, epoch), sequences in outcome.confirmed.items()
+            for payload in answers(epoch, ranges(sequences))
+        ]
+        said += [
+            (f"fleet/{aircraft}/wanted", payload)
+            for (aircraft, epoch), lacking in outcome.wanted.items()
+            for payload in answers(epoch, lacking)
+        ]
+        self.confirmed += sum(map(len, outcome.confirmed.values()))
+        if outcome.rejected:
+            self.rejected += len(outcome.rejected)
+            message, reason = outcome.rejected[0]
+            logger.warning("fleet: %s: not taken: %s (table rejected has it)", message.topic, reason)
+        await asyncio.gather(*(client.publish(topic, payload, qos=1) for topic, payload in said))

@@ -1,0 +1,298 @@
+"""What aircraft say (docs/fleet/asyncapi.yaml), from the bytes of a broker to rows of the tables.
+
+Whatever the bytes are, nothing here raises anything but `NotTakenError`.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import re
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+import msgspec
+
+FORMAT_VERSION: Final = 1
+MOST_RANGES: Final = 256
+"""In one message to an aircraft."""
+MOST_SEQUENCE: Final = 2**53
+MOST_BYTES: Final = 256 * 1024
+_AIRCRAFT: Final = re.compile(r"fleet/([0-9a-f]{16}|[0-9a-f]{36})/(hello|item)")
+_MOST: Final = 1e12
+
+_Aircraft = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{16}|[0-9a-f]{36})$")]
+_Epoch = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
+_Sequence = Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
+_Number = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]
+_Axes = tuple[_Number, _Number, _Number] | None
+_Device = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] | None
+_Word = Annotated[str, msgspec.Meta(max_length=16)]
+
+_Kind = TypeVar("_Kind")
+_Keyed = TypeVar("_Keyed", "Hello", "Item")
+
+Row = dict[str, Any]
+Rows = dict[str, list[Row]]
+"""By table."""
+
+
+class NotTakenError(Exception):
+    """A payload that is nothing of the contract; one line that says why."""
+
+
+class Hello(msgspec.Struct, frozen=True):
+    """What an aircraft keeps."""
+
+    aircraft: _Aircraft
+    epoch: _Epoch
+    first: _Sequence
+    last: Annotated[int, msgspec.Meta(ge=0, le=MOST_SEQUENCE)]
+    name: str | None = None
+    at: str = ""
+
+
+class Item(msgspec.Struct, frozen=True):
+    """What has happened; all but its key may be of another kind in a newer format."""
+
+    format_version: Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
+    aircraft: _Aircraft
+    epoch: _Epoch
+    sequence: _Sequence
+
+    @property
+    def key(self) -> Row:
+        """As columns."""
+        return {"aircraft": self.aircraft, "epoch": self.epoch, "sequence": self.sequence}
+
+
+class _Told(msgspec.Struct, frozen=True):
+    kind: str
+    at: str
+    clock: str
+    body: msgspec.Raw
+
+
+class _Imu(msgspec.Struct, frozen=True):
+    name: Annotated[str, msgspec.Meta(max_length=64)]
+    temperature_degc: _Number | None = None
+    gyro_id: _Device = None
+    accel_id: _Device = None
+    gyro_bias_rad_s: _Axes = None
+    gyro_sigma_stat_rad_s: _Axes = None
+    gyro_sigma_use_rad_s: _Axes = None
+    accel_bias_m_s2: _Axes = None
+    accel_sigma_stat_m_s2: _Axes = None
+    accel_sigma_use_m_s2: _Axes = None
+
+
+class _Calibration(msgspec.Struct, frozen=True):
+    state: Literal["done", "failed", "cancelled"]
+    reason: str
+    started_at: str
+    duration_s: _Number
+    imus: Annotated[list[_Imu], msgspec.Meta(max_length=64)]
+    undone_at: str | None = None
+
+
+class _Arming(msgspec.Struct, frozen=True):
+    armed_at: str
+    state: _Word
+    reason: str
+    calibration: str | None
+    gyro_sigma_use_rad_s: _Number | None = None
+    accel_sigma_use_m_s2: _Number | None = None
+
+
+class _Undo(msgspec.Struct, frozen=True):
+    what: str
+    of: str
+    undone_at: str
+
+
+class _Alignment(msgspec.Struct, frozen=True):
+    what: str
+    state: _Word
+    measured_at: str
+    reason: str
+
+
+class _Event(msgspec.Struct, frozen=True):
+    what: str
+
+
+_TRIADS: Final = tuple(name for name in _Imu.__struct_fields__ if name.endswith(("_rad_s", "_m_s2")))
+
+
+def _calibration(body: bytes) -> Rows:
+    told = msgspec.json.decode(body, type=_Calibration)
+    biases: list[Row] = []
+    for imu in {imu.name: imu for imu in told.imus}.values():
+        for number, axis in enumerate("xyz"):
+            figures = {name: value and value[number] for name in _TRIADS for value in [getattr(imu, name)]}
+            which = {"imu": imu.name, "axis": axis, "gyro_id": imu.gyro_id, "accel_id": imu.accel_id}
+            biases.append({**which, "temperature_degc": imu.temperature_degc, **figures})
+    row = {
+        "started_at": moment(told.started_at),
+        "duration_s": told.duration_s,
+        "state": told.state,
+        "reason": told.reason,
+        "undone_at": None if told.undone_at is None else moment(told.undone_at),
+    }
+    return {"calibrations": [row], "biases": biases}
+
+
+def _arming(body: bytes) -> Rows:
+    told = msgspec.json.decode(body, type=_Arming)
+    row = {
+        "armed_at": moment(told.armed_at),
+        "state": told.state,
+        "reason": told.reason,
+        "calibration_at": None if told.calibration is None else moment(told.calibration),
+        "gyro_sigma_use_rad_s": told.gyro_sigma_use_rad_s,
+        "accel_sigma_use_m_s2": told.accel_sigma_use_m_s2,
+    }
+    return {"armings": [row]}
+
+
+def _undo(body: bytes) -> Rows:
+    told = msgspec.json.decode(body, type=_Undo)
+    return {"undos": [{"what": told.what, "of_at": moment(told.of), "undone_at": moment(told.undone_at)}]}
+
+
+def _alignment(body: bytes) -> Rows:
+    told = msgspec.json.decode(body, type=_Alignment)
+    measured_at = moment(told.measured_at)
+    row = {"what": told.what, "state": told.state, "measured_at": measured_at, "reason": told.reason}
+    return {"alignments": [row]}
+
+
+def _event(body: bytes) -> Rows:
+    return {"events": [{"what": msgspec.json.decode(body, type=_Event).what, "body": body.decode()}]}
+
+
+def _kept_raw(body: bytes) -> Rows:
+    msgspec.json.decode(body, type=dict[str, Any])
+    return {}
+
+
+KINDS: Final[dict[str, Callable[[bytes], Rows]]] = {
+    "calibration": _calibration,
+    "arming": _arming,
+    "undo": _undo,
+    "alignment": _alignment,
+    "event": _event,
+    "profile": _kept_raw,
+    "curve": _kept_raw,
+}
+"""What each kind's body becomes; the others are kept until a newer companion knows them."""
+
+
+def moment(words: str) -> datetime.datetime:
+    """A time of ISO 8601, which is UTC if it does not say.
+
+    Raises:
+        NotTakenError: it is none.
+    """
+    try:
+        found = datetime.datetime.fromisoformat(words)
+        return found.replace(tzinfo=datetime.UTC) if found.tzinfo is None else found.astimezone(datetime.UTC)
+    except (ValueError, OverflowError):
+        raise NotTakenError(f"found {words[:40]!r}; allowed: a time such as 2026-11-23T06:12:00.000Z") from None
+
+
+def addressed(topic: str) -> tuple[str, str] | None:
+    """The aircraft of a topic and "hello" or "item"; None: it is another topic."""
+    match = _AIRCRAFT.fullmatch(topic)
+    return None if match is None else (match[1], match[2])
+
+
+def read_hello(aircraft: str, payload: bytes) -> Hello:
+    """A hello on that aircraft's topic.
+
+    Raises:
+        NotTakenError: it is none, of another one, or of a newer format.
+    """
+    if (version := _decode(payload, _Version).format_version) != FORMAT_VERSION:
+        raise NotTakenError(f"a hello of format {version}; allowed: {FORMAT_VERSION}")
+    return _of(aircraft, _decode(payload, Hello))
+
+
+def read_key(aircraft: str, payload: bytes) -> Item:
+    """The key of an item on that aircraft's topic, also of a newer format.
+
+    Raises:
+        NotTakenError: it has none, or that of another aircraft.
+    """
+    if len(payload) > MOST_BYTES:
+        raise NotTakenError(f"found {len(payload)} bytes; allowed: up to {MOST_BYTES}")
+    return _of(aircraft, _decode(payload, Item))
+
+
+def read_item(item: Item, payload: bytes) -> tuple[Row, Rows]:
+    """Columns of the item itself, and the rows of other tables that it makes; `state` "unknown": it is of a newer one.
+
+    Raises:
+        NotTakenError: its kind and format are known, but its body is none of them.
+    """
+    if item.format_version != FORMAT_VERSION:
+        return {"state": "unknown", "kind": None, "at": None, "clock": None, "same": None}, {}
+    told = _decode(payload, _Told)
+    columns: Row = {"kind": told.kind[:64], "at": moment(told.at), "clock": told.clock[:16], "same": None}
+    if told.kind not in KINDS:
+        return {**columns, "state": "unknown"}, {}
+    try:
+        rows = KINDS[told.kind](bytes(told.body))
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise NotTakenError(f"{told.kind}: {error}") from None
+    for event in rows.get("events", ()):
+        event["at"] = columns["at"]
+    columns["same"] = _same(told, rows)
+    return {**columns, "state": "taken"}, {table: [{**item.key, **row} for row in of] for table, of in rows.items()}
+
+
+def ranges(sequences: Iterable[int]) -> list[list[int]]:
+    """From one to another, both included, of numbers in any order."""
+    found: list[list[int]] = []
+    for sequence in sorted(set(sequences)):
+        if found and found[-1][1] == sequence - 1:
+            found[-1][1] = sequence
+        else:
+            found.append([sequence, sequence])
+    return found
+
+
+def answers(epoch: str, found: list[list[int]]) -> list[bytes]:
+    """Payloads of `confirmed` and `wanted` for that many ranges."""
+    return [
+        msgspec.json.encode(
+            {"format_version": FORMAT_VERSION, "epoch": epoch, "sequences": found[start : start + MOST_RANGES]}
+        )
+        for start in range(0, len(found), MOST_RANGES)
+    ]
+
+
+class _Version(msgspec.Struct):
+    format_version: int
+
+
+def _decode(payload: bytes, kind: type[_Kind]) -> _Kind:
+    try:
+        return msgspec.json.decode(payload, type=kind)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise NotTakenError(str(error)) from None
+
+
+def _of(aircraft: str, told: _Keyed) -> _Keyed:
+    if told.aircraft != aircraft:
+        raise NotTakenError(f"says that it is {told.aircraft}, on the topic of {aircraft}")
+    return told
+
+
+def _same(told: _Told, rows: Rows) -> str:
+    """What a thing has told again under another epoch: all but whether it has been undone since."""
+    if rows:
+        content = repr([(table, {**row, "undone_at": None}) for table in sorted(rows) for row in rows[table]])
+    else:
+        content = repr(msgspec.json.encode(msgspec.json.decode(told.body), order="deterministic"))
+    return hashlib.sha256(f"{told.kind}\0{told.at}\0{content}".encode()).hexdigest()[:32]

@@ -1,0 +1,217 @@
+"""The database: one schema for PostgreSQL and SQLite, and what brings an older one up to date.
+
+Raw items are what was told, to the letter. All else is made from them and can be made anew. Axes are the vehicle's
+FRD; times are UTC by the aircraft's clock, which may be wrong, save `heard_at`, `received_at` and what is rejected.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import sqlalchemy as sa
+
+from companion.errors import StorageError
+
+_LOCK: Final = 0x636F6D70616E696F
+"""Of PostgreSQL's advisory locks: while it is held, no other collector looks at the version."""
+
+
+class Moment(sa.types.TypeDecorator[datetime.datetime]):
+    """A time with its zone, UTC; SQLite, which has none, keeps it as a text."""
+
+    impl = sa.DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime.datetime | None, dialect: sa.Dialect) -> datetime.datetime | None:
+        """Of what goes in."""
+        return value if value is None or dialect.name != "sqlite" else value.astimezone(datetime.UTC)
+
+    def process_result_value(self, value: Any, dialect: sa.Dialect) -> datetime.datetime | None:
+        """Of what comes out."""
+        found: datetime.datetime | None = value
+        return found if found is None or found.tzinfo is not None else found.replace(tzinfo=datetime.UTC)
+
+
+class Words(sa.types.TypeDecorator[str]):
+    """A text; a zero byte, which PostgreSQL refuses, is replaced."""
+
+    impl = sa.Text
+    cache_ok = True
+
+    def process_bind_param(self, value: str | None, dialect: sa.Dialect) -> str | None:
+        """Of what goes in."""
+        return value if value is None else value.replace("\0", "\ufffd")
+
+
+tables: Final = sa.MetaData()
+
+
+def _key() -> list[sa.Column[Any]]:
+    return [
+        sa.Column("aircraft", sa.String(36), primary_key=True),
+        sa.Column("epoch", sa.String(16), primary_key=True),
+        sa.Column("sequence", sa.BigInteger, primary_key=True, autoincrement=False),
+    ]
+
+
+items: Final = sa.Table(
+    "items",
+    tables,
+    *_key(),
+    sa.Column("format_version", sa.BigInteger, nullable=False),
+    sa.Column("kind", Words, comment="null: of a newer format"),
+    sa.Column("at", Moment),
+    sa.Column("clock", Words, comment="whether at can be believed: good, unknown"),
+    sa.Column("received_at", Moment, nullable=False, comment="by the collector's clock"),
+    sa.Column("state", sa.String(8), nullable=False, comment="taken; unknown: of a newer aircraft; rejected"),
+    sa.Column("same", sa.String(32), comment="equal where one thing was told again under another epoch"),
+    sa.Column("payload", Words, nullable=False, comment="JSON, as it came"),
+)
+sa.Index("items_same", items.c.aircraft, items.c.same)
+sa.Index("items_state", items.c.state, sqlite_where=items.c.state != "taken", postgresql_where=items.c.state != "taken")
+
+aircraft: Final = sa.Table(
+    "aircraft",
+    tables,
+    sa.Column("aircraft", sa.String(36), primary_key=True, comment="the autopilot's unique id"),
+    sa.Column("name", Words),
+    sa.Column("epoch", sa.String(16), comment="of its last hello, as the next three"),
+    sa.Column("first", sa.BigInteger),
+    sa.Column("last", sa.BigInteger),
+    sa.Column("hello_at", Moment),
+    sa.Column("heard_at", Moment, comment="by the collector's clock"),
+)
+
+calibrations: Final = sa.Table(
+    "calibrations",
+    tables,
+    *_key(),
+    sa.Column("started_at", Moment, nullable=False),
+    sa.Column("duration_s", sa.Double, nullable=False),
+    sa.Column("state", sa.String(16), nullable=False, comment="done, failed, cancelled"),
+    sa.Column("reason", Words, nullable=False),
+    sa.Column("undone_at", Moment, comment="undone when it was told; later ones are in undos"),
+)
+
+biases: Final = sa.Table(
+    "biases",
+    tables,
+    *_key(),
+    sa.Column("imu", sa.String(64), primary_key=True),
+    sa.Column("axis", sa.String(1), primary_key=True, comment="x forward, y right, z down"),
+    sa.Column("gyro_id", sa.BigInteger, comment="device id in the autopilot"),
+    sa.Column("accel_id", sa.BigInteger),
+    sa.Column("temperature_degc", sa.Double),
+    sa.Column("gyro_bias_rad_s", sa.Double),
+    sa.Column("gyro_sigma_stat_rad_s", sa.Double, comment="of the mean over the window"),
+    sa.Column("gyro_sigma_use_rad_s", sa.Double, comment="of the bias over the next minutes"),
+    sa.Column("accel_bias_m_s2", sa.Double),
+    sa.Column("accel_sigma_stat_m_s2", sa.Double),
+    sa.Column("accel_sigma_use_m_s2", sa.Double),
+)
+
+armings: Final = sa.Table(
+    "armings",
+    tables,
+    *_key(),
+    sa.Column("armed_at", Moment, nullable=False),
+    sa.Column("state", sa.String(16), nullable=False, comment="calibrated, checked, uncalibrated"),
+    sa.Column("reason", Words, nullable=False),
+    sa.Column("calibration_at", Moment, comment="started_at of the calibration in force"),
+    sa.Column("gyro_sigma_use_rad_s", sa.Double, comment="the largest of all axes in force"),
+    sa.Column("accel_sigma_use_m_s2", sa.Double),
+)
+
+undos: Final = sa.Table(
+    "undos",
+    tables,
+    *_key(),
+    sa.Column("what", Words, nullable=False),
+    sa.Column("of_at", Moment, nullable=False, comment="started_at or measured_at of what was put back"),
+    sa.Column("undone_at", Moment, nullable=False),
+)
+
+alignments: Final = sa.Table(
+    "alignments",
+    tables,
+    *_key(),
+    sa.Column("what", Words, nullable=False),
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("measured_at", Moment, nullable=False),
+    sa.Column("reason", Words, nullable=False),
+)
+
+events: Final = sa.Table(
+    "events",
+    tables,
+    *_key(),
+    sa.Column("at", Moment),
+    sa.Column("what", Words, nullable=False, comment="imu exchanged, airframe changed, lost"),
+    sa.Column("body", Words, nullable=False, comment="JSON"),
+)
+
+rejected: Final = sa.Table(
+    "rejected",
+    tables,
+    sa.Column("digest", sa.String(32), primary_key=True, comment="of topic and payload"),
+    sa.Column("times", sa.BigInteger, nullable=False),
+    sa.Column("last_at", Moment, nullable=False, comment="by the collector's clock"),
+    sa.Column("topic", Words, nullable=False),
+    sa.Column("reason", Words, nullable=False),
+    sa.Column("payload", sa.LargeBinary, nullable=False, comment="its first 4 KiB"),
+)
+sa.Index("rejected_last_at", rejected.c.last_at)
+
+_version: Final = sa.Table("schema_version", tables, sa.Column("version", sa.Integer, nullable=False))
+
+_VIEW: Final = re.compile(r"-- (\w+): (.*)\n([^;]+);")
+_VIEWS: Final = Path(__file__).with_name("views.sql")
+
+Step = Callable[[sa.Connection], object]
+STEPS: Sequence[Step] = ()
+"""The n-th brings tables of version n to version n + 1; views are made anew in any case."""
+
+
+def bring_up_to_date(connection: sa.Connection) -> bool:
+    """Make the tables, or bring those of an older version up to date; whether there was anything to do.
+
+    Within the connection's transaction: it is done wholly or not at all, and by one collector only.
+
+    Raises:
+        StorageError: a newer companion has made them.
+    """
+    newest = len(STEPS) + 1
+    if connection.dialect.name == "postgresql":
+        connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
+    found = 0
+    if sa.inspect(connection).has_table(_version.name):
+        found = connection.execute(sa.select(_version.c.version)).scalar_one()
+    if found > newest:
+        raise StorageError(
+            f"the database has tables of version {found}; allowed: up to {newest} (a newer companion has made them)"
+        )
+    if found == newest:
+        return False
+    for view, _, _ in reversed(views()):
+        connection.exec_driver_sql(f"DROP VIEW IF EXISTS {view}")
+    if found == 0:
+        tables.create_all(connection)
+        connection.execute(sa.insert(_version).values(version=newest))
+    else:
+        for step in STEPS[found - 1 :]:
+            step(connection)
+        connection.execute(sa.update(_version).values(version=newest))
+    for view, purpose, query in views():
+        connection.exec_driver_sql(f"CREATE VIEW {view} AS /* {purpose} */ {query}")
+        if connection.dialect.name == "postgresql":  # which forgets what stands in a query's text
+            connection.exec_driver_sql(f"COMMENT ON VIEW {view} IS '{purpose}'")
+    return True
+
+
+def views() -> list[tuple[str, str, str]]:
+    """Name, purpose and query of each view; those that others rest on come first."""
+    return _VIEW.findall(_VIEWS.read_text(encoding="utf-8"))

@@ -1,0 +1,328 @@
+"""Writing and asking: batches in one transaction each, so that nothing is there by halves and nothing twice."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+from collections.abc import Iterable, Sequence
+from typing import Any, Final, NamedTuple
+
+import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
+
+from companion.errors import LinkError, StorageError
+from companion.fleet import schema
+from companion.fleet.contract import (
+    FORMAT_VERSION,
+    KINDS,
+    Hello,
+    Item,
+    NotTakenError,
+    Row,
+    Rows,
+    addressed,
+    moment,
+    read_hello,
+    read_item,
+    read_key,
+)
+
+MOST_REJECTED: Final = 10_000
+_SHOWN_BYTES: Final = 4096
+_STATEMENT_MS: Final = 30_000
+_BUSY_S: Final = 10.0
+_OF_THE_DATABASE: Final = (sa.exc.OperationalError, sa.exc.InterfaceError, sa.exc.InternalError, sa.exc.TimeoutError)
+"""It is not there, full, or broken: no fault of what was to be written."""
+_AGAIN: Final = 500
+"""Items of a newer aircraft that are looked at anew in one transaction after an update."""
+
+
+class Message(NamedTuple):
+    """As it came from the broker."""
+
+    topic: str
+    payload: bytes
+    retained: bool = False
+
+
+class Outcome(NamedTuple):
+    """What to answer once a batch is in the database: sequences by aircraft and epoch; and what was not taken, why."""
+
+    confirmed: dict[tuple[str, str], list[int]]
+    wanted: dict[tuple[str, str], list[list[int]]]
+    rejected: list[tuple[Message, str]]
+
+
+def url_of(database: str) -> sa.URL:
+    """The database that people mean: postgresql://..., sqlite:///..., or a file's path.
+
+    Raises:
+        StorageError: it is neither.
+    """
+    try:
+        url = sa.make_url(database if "://" in database else f"sqlite:///{database}")
+    except sa.exc.ArgumentError:
+        url = sa.URL.create("none")
+    if url.drivername in ("postgresql", "postgres"):
+        url = url.set(drivername="postgresql+psycopg")
+    if url.drivername not in ("sqlite", "postgresql+psycopg") or (url.drivername == "sqlite" and not url.database):
+        raise StorageError(
+            f"database: found {database.partition('@')[2] or database!r}; allowed: postgresql://USER@HOST/NAME,"
+            " or the path of an SQLite file"
+        )
+    return url
+
+
+def engine_of(database: str, *, reads_only: bool = False) -> sa.Engine:
+    """Connections to the database, none of which is opened yet.
+
+    Raises:
+        StorageError: the address cannot be read.
+    """
+    url = url_of(database)
+    if url.drivername == "sqlite":
+        engine = sa.create_engine(url, connect_args={"timeout": _BUSY_S})
+        sa.event.listen(engine, "connect", _prepare_sqlite)
+        sa.event.listen(engine, "begin", _begin_reading if reads_only else _begin_writing)
+        return engine
+    return sa.create_engine(
+        url,
+        # A server whose host has died is noticed within seconds, not when TCP gives up.
+        connect_args={
+            "connect_timeout": 5,
+            "tcp_user_timeout": 10_000,
+            "options": f"-c statement_timeout={_STATEMENT_MS} -c timezone=UTC"
+            + " -c default_transaction_read_only=on" * reads_only,
+        },
+    )
+
+
+def _begin_reading(connection: sa.Connection) -> None:
+    connection.exec_driver_sql("BEGIN")
+
+
+def _begin_writing(connection: sa.Connection) -> None:
+    # One that began by reading and then wrote would be refused where another has written meanwhile.
+    connection.exec_driver_sql("BEGIN IMMEDIATE")
+
+
+def _prepare_sqlite(connection: Any, _record: object) -> None:
+    connection.isolation_level = None  # transactions begin where we say so
+    connection.execute("PRAGMA journal_mode=WAL")
+    # What was confirmed outlives a power cut.
+    connection.execute("PRAGMA synchronous=FULL")
+
+
+def why(error: sa.exc.SQLAlchemyError) -> str:
+    """The database's own words, in one line."""
+    cause = getattr(error, "orig", None) or error
+    return " ".join(str(cause).split())[:300] or type(cause).__name__
+
+
+class Store:
+    """The tables; each call is one transaction or several whole ones. Calls block: they belong into a thread."""
+
+    def __init__(self, database: str) -> None:
+        self._engine = engine_of(database)
+        self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
+
+    @property
+    def where(self) -> str:
+        """The database, without a password."""
+        return self._engine.url.render_as_string()
+
+    def close(self) -> None:
+        """Leave the connections; the next call opens one anew."""
+        self._engine.dispose()
+
+    def prepare(self) -> None:
+        """Bring the tables up to date, and take in what an older version did not know.
+
+        Raises:
+            StorageError: a newer companion has made them.
+            LinkError: the database cannot be reached, or fails.
+        """
+        try:
+            with self._engine.begin() as connection:
+                schema.bring_up_to_date(connection)
+            while self._take_in_again():
+                pass
+        except sa.exc.SQLAlchemyError as error:
+            raise LinkError(f"{self.where}: {why(error)}") from None
+
+    def take(self, messages: Sequence[Message]) -> Outcome:
+        """Put a batch into the database; what is not taken is kept aside there with its reason.
+
+        Raises:
+            LinkError: the database cannot be reached, or fails; nothing of the batch may be confirmed.
+        """
+        now = datetime.datetime.now(tz=datetime.UTC)
+        try:
+            return self._take(messages, now)
+        except _OF_THE_DATABASE as error:
+            raise LinkError(f"{self.where}: {why(error)}") from None
+        except sa.exc.SQLAlchemyError as error:
+            reason = f"the database refuses it: {why(error)}"
+        # One of them it is: each by itself.
+        if len(messages) == 1:
+            return self._reject(messages[0], reason, now)
+        found = Outcome({}, {}, [])
+        for message in messages:
+            one = self.take([message])
+            for key, sequences in one.confirmed.items():
+                found.confirmed.setdefault(key, []).extend(sequences)
+            found.wanted.update(one.wanted)
+            found.rejected.extend(one.rejected)
+        return found
+
+    def _take(self, messages: Sequence[Message], now: datetime.datetime) -> Outcome:
+        outcome = Outcome({}, {}, [])
+        told: list[Row] = []
+        rows: Rows = {}
+        heard: set[str] = set()
+        hellos: dict[tuple[str, str], tuple[Hello, bool]] = {}
+        for message in messages:
+            if (to := addressed(message.topic)) is None:
+                continue
+            try:
+                if to[1] == "hello":
+                    hello = read_hello(to[0], message.payload)
+                    hellos[to[0], hello.epoch] = hello, message.retained
+                    continue
+                item = read_key(to[0], message.payload)
+            except NotTakenError as error:
+                outcome.rejected.append((message, str(error)))
+                continue
+            outcome.confirmed.setdefault((item.aircraft, item.epoch), []).append(item.sequence)
+            heard.add(item.aircraft)
+            columns, made = _read(item, message, outcome)
+            told.append({**item.key, **columns, "received_at": now})
+            for table, of in made.items():
+                rows.setdefault(table, []).extend(of)
+        with self._engine.begin() as connection:
+            self._put(connection, schema.items, told)
+            for table, of in sorted(rows.items()):
+                self._put(connection, schema.tables.tables[table], of)
+            self._hear(connection, hellos.values(), heard, now)
+            self._keep_aside(connection, outcome.rejected, now)
+            for key, (hello, _) in hellos.items():
+                if lacking := _lacking(connection, hello):
+                    outcome.wanted[key] = lacking
+        return outcome
+
+    def _put(self, connection: sa.Connection, table: sa.Table, rows: list[Row]) -> None:
+        """Rows that are not there yet, in the order of their keys: so two collectors never wait for one another."""
+        if rows:
+            keys = [column.name for column in table.primary_key]
+            rows.sort(key=lambda row: [row[key] for key in keys])
+            connection.execute(self._insert(table).on_conflict_do_nothing(), rows)
+
+    def _hear(
+        self,
+        connection: sa.Connection,
+        hellos: Iterable[tuple[Hello, bool]],
+        heard: set[str],
+        now: datetime.datetime,
+    ) -> None:
+        rows: dict[str, Row] = {name: {"aircraft": name, "heard_at": now} for name in heard}
+        for hello, retained in hellos:
+            row = rows.setdefault(hello.aircraft, {"aircraft": hello.aircraft})
+            row |= {"name": hello.name, "epoch": hello.epoch, "first": hello.first, "last": hello.last}
+            row["hello_at"] = _moment_or_none(hello.at)
+            if not retained:  # else it was said some time ago
+                row["heard_at"] = now
+        for _, row in sorted(rows.items()):
+            insert = self._insert(schema.aircraft).values(row)
+            news = {column: insert.excluded[column] for column in row if column != "aircraft"}
+            connection.execute(insert.on_conflict_do_update(index_elements=["aircraft"], set_=news))
+
+    def _keep_aside(
+        self, connection: sa.Connection, refused: Sequence[tuple[Message, str]], now: datetime.datetime
+    ) -> None:
+        table = schema.rejected
+        rows = {_digest(message): (message, reason) for message, reason in refused}
+        for digest, (message, reason) in sorted(rows.items()):
+            insert = self._insert(table).values(
+                digest=digest,
+                times=1,
+                last_at=now,
+                topic=message.topic[:200],
+                reason=reason[:600],
+                payload=message.payload[:_SHOWN_BYTES],
+            )
+            news = {"times": table.c.times + 1, "last_at": now}
+            connection.execute(insert.on_conflict_do_update(index_elements=["digest"], set_=news))
+        if rows:
+            beyond = sa.select(table.c.digest).order_by(table.c.last_at.desc()).offset(MOST_REJECTED)
+            connection.execute(sa.delete(table).where(table.c.digest.in_(beyond)))
+
+    def _reject(self, message: Message, reason: str, now: datetime.datetime) -> Outcome:
+        try:
+            with self._engine.begin() as connection:
+                self._keep_aside(connection, [(message, reason)], now)
+        except sa.exc.SQLAlchemyError as error:
+            raise LinkError(f"{self.where}: {why(error)}") from None
+        return Outcome({}, {}, [(message, reason)])
+
+    def _take_in_again(self) -> bool:
+        """Items of a newer aircraft that are known by now; whether there may be more of them."""
+        items = schema.items
+        known = (
+            sa.select(items)
+            .where(items.c.state == "unknown", items.c.format_version == FORMAT_VERSION, items.c.kind.in_(KINDS))
+            .limit(_AGAIN)
+        )
+        with self._engine.begin() as connection:
+            found = connection.execute(known).mappings().all()
+            for row in found:
+                payload = row["payload"].encode()
+                now = datetime.datetime.now(tz=datetime.UTC)
+                outcome = Outcome({}, {}, [])
+                message = Message(f"fleet/{row['aircraft']}/item", payload)
+                item = read_key(row["aircraft"], payload)
+                columns, made = _read(item, message, outcome)
+                del columns["payload"]
+                here = [items.c[key] == value for key, value in item.key.items()]
+                connection.execute(sa.update(items).where(*here).values(columns))
+                for table, of in made.items():
+                    self._put(connection, schema.tables.tables[table], of)
+                self._keep_aside(connection, outcome.rejected, now)
+        return len(found) == _AGAIN
+
+
+def _read(item: Item, message: Message, outcome: Outcome) -> tuple[Row, Rows]:
+    """Columns of an item and the rows that it makes; of one that cannot be read its reason is kept aside."""
+    raw: Row = {"format_version": item.format_version, "payload": message.payload.decode(errors="replace")}
+    try:
+        columns, rows = read_item(item, message.payload)
+    except NotTakenError as error:
+        outcome.rejected.append((message, str(error)))
+        columns, rows = {"state": "rejected", "kind": None, "at": None, "clock": None, "same": None}, {}
+    return {**raw, **columns}, rows
+
+
+def _lacking(connection: sa.Connection, hello: Hello) -> list[list[int]]:
+    """What the database lacks of what the aircraft keeps."""
+    items = schema.items
+    number = items.c.sequence
+    of = [items.c.aircraft == hello.aircraft, items.c.epoch == hello.epoch, number.between(hello.first, hello.last)]
+    there = sa.select(number, sa.func.lead(number).over(order_by=number).label("next")).where(*of).subquery()
+    ends = sa.select(sa.func.min(number), sa.func.max(number)).where(*of)
+    low, high = connection.execute(ends).one()
+    if low is None:
+        return [[hello.first, hello.last]] if hello.first <= hello.last else []
+    gaps = sa.select(there.c.sequence + 1, there.c.next - 1).where(there.c.next > there.c.sequence + 1)
+    found = [[hello.first, low - 1]] if low > hello.first else []
+    found += [list(gap) for gap in connection.execute(gaps.order_by(there.c.sequence))]
+    return found + ([[high + 1, hello.last]] if high < hello.last else [])
+
+
+def _moment_or_none(words: str) -> datetime.datetime | None:
+    try:
+        return moment(words)
+    except NotTakenError:
+        return None
+
+
+def _digest(message: Message) -> str:
+    return hashlib.sha256(message.topic.encode() + b"\0" + message.payload).hexdigest()[:32]

@@ -1,0 +1,190 @@
+"""The collector as a process, a real Mosquitto, PostgreSQL and SQLite: whatever is killed, nothing is lost or twice."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import random
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import pytest
+import sqlalchemy as sa
+
+from companion.fleet.simulated import Aircraft
+from companion.fleet.store import Store
+from companion.physics.units import DEG_H
+from tests.support.broker import MOSQUITTO, Broker, broker
+from tests.support.collecting import (
+    NOW,
+    CollectorProcess,
+    items_in,
+    quick,
+    rows_of,
+    telling,
+    told_by,
+    until_confirmed,
+)
+from tests.support.fleet import check
+from tests.support.postgres import INITDB, Postgres, postgres
+
+pytestmark = pytest.mark.skipif(MOSQUITTO is None, reason="no Mosquitto: shared subscriptions need one")
+Kind = Literal["sqlite", "postgresql"]
+KINDS: list[Kind] = ["sqlite", "postgresql"]
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Postgres]:
+    if INITDB is None:
+        pytest.skip("no PostgreSQL")
+    with postgres() as one:
+        yield one
+
+
+@pytest.fixture
+def database(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty one of the kind that the test is asked for."""
+    if request.param == "sqlite":
+        return str(tmp_path / "fleet.sqlite")
+    one: Postgres = request.getfixturevalue("server")
+    return one.create(f"fleet-{tmp_path.name}")
+
+
+def fleet_of(number: int, flights: int, seed: int) -> list[Aircraft]:
+    fleet = [Aircraft(k, seed) for k in range(number)]
+    for each in fleet:
+        each.live(NOW, flights)
+    return fleet
+
+
+@pytest.mark.parametrize("database", KINDS, indirect=True)
+def test_collectors_are_killed_and_started_again_and_again(database: str, tmp_path: Path) -> None:
+    """Two share the work, one of the two is killed at any instant; all is told several times over, and in disorder."""
+    fleet, dice = fleet_of(8, 25, seed=3), random.Random(5)
+    quick(fleet)
+
+    async def news() -> None:
+        while True:
+            await asyncio.sleep(0.1)
+            for each in fleet:
+                each.calibrate(NOW)
+                each.arm(NOW)
+
+    async def play(one: Broker) -> None:
+        names = iter(range(100))
+
+        def another() -> CollectorProcess:
+            return CollectorProcess(tmp_path, f"collector-{next(names)}", one, database)
+
+        running = [another(), another()]
+        try:
+            async with telling(fleet, one):
+                telling_on = asyncio.create_task(news())
+                for _ in range(3):
+                    await running[0].at_work()
+                    await asyncio.sleep(dice.uniform(0.0, 0.6))
+                    running.pop(0).kill()
+                    running.append(another())
+                telling_on.cancel()
+                await until_confirmed(fleet)
+            for process in running:
+                await process.at_work()
+            assert [process.stop() for process in running] == [0, 0]
+        finally:
+            for process in running:
+                process.kill()
+
+    async def main() -> None:
+        async with broker(tmp_path) as one:
+            await play(one)
+
+    asyncio.run(main())
+    assert items_in(database) == told_by(fleet)
+    assert sum(each.deliveries for each in fleet) > sum(len(each.told) for each in fleet)
+    _is_what_was_told(database, fleet)
+
+
+@pytest.mark.parametrize("database", KINDS, indirect=True)
+def test_the_broker_and_the_database_are_killed_and_come_back(
+    database: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    fleet = fleet_of(6, 12, seed=4)
+    quick(fleet)
+    server: Postgres | None = request.getfixturevalue("server") if database.startswith("postgresql") else None
+
+    def news() -> None:
+        for each in fleet:
+            each.calibrate(NOW)
+
+    async def main() -> None:
+        async with broker(tmp_path) as one:
+            collector = CollectorProcess(tmp_path, "collector", one, database)
+            try:
+                async with telling(fleet, one):
+                    await until_confirmed(fleet)
+                    one.kill()
+                    news()
+                    await one.start()
+                    await until_confirmed(fleet)
+                    if server is not None:
+                        server.kill()
+                        news()
+                        await asyncio.sleep(1.0)
+                        server.start()
+                        await until_confirmed(fleet)
+                assert collector.stop() == 0
+            finally:
+                collector.kill()
+
+    asyncio.run(main())
+    assert items_in(database) == told_by(fleet)
+
+
+@pytest.mark.parametrize("database", KINDS, indirect=True)
+def test_a_new_database_asks_for_all_that_was_confirmed_long_ago(database: str, tmp_path: Path) -> None:
+    """As one restored from a backup asks for what it lacks."""
+    fleet = fleet_of(4, 20, seed=6)
+    for each in fleet:
+        each.confirmed = {*each.told} - {7, 8, 19}
+
+    store = Store(database)
+    store.prepare()
+    store.close()
+
+    async def main() -> None:
+        async with broker(tmp_path) as one, telling(fleet, one):
+            # They have said hello before there is a collector.
+            collector = CollectorProcess(tmp_path, "collector", one, database)
+            try:
+                async with asyncio.timeout(90.0):
+                    while items_in(database) != told_by(fleet):
+                        await asyncio.sleep(0.2)
+            finally:
+                collector.kill()
+
+    asyncio.run(main())
+
+
+def _is_what_was_told(database: str, fleet: list[Aircraft]) -> None:
+    """The tables have the figures of the records, and those are the true biases within their sigma."""
+    query = sa.text(
+        "SELECT aircraft, sequence, imu, axis, gyro_bias_rad_s, accel_bias_m_s2, gyro_id FROM biases"
+        " ORDER BY aircraft, sequence, imu, axis"
+    )
+    found = [tuple(row) for row in rows_of(database, query)]
+    wanted, worst = [], 0.0
+    for each in sorted(fleet, key=lambda one: one.id):
+        for sequence in sorted(each.biases):
+            told = check("item", each.told[sequence])
+            for imu in told["body"]["imus"]:
+                true_gyro, _ = each.biases[sequence][imu["name"]]
+                for k, axis in enumerate("xyz"):
+                    gyro, accel = imu["gyro_bias_rad_s"][k], imu["accel_bias_m_s2"][k]
+                    wanted.append((each.id, sequence, imu["name"], axis, gyro, accel, imu["gyro_id"]))
+                    worst = max(worst, math.fabs(gyro - true_gyro[k]) / DEG_H)
+    assert found == wanted
+    assert 2.0 < worst < 6.0
+    armings = rows_of(database, sa.text("SELECT COUNT(*) FROM armings"))[0][0]
+    assert armings == sum(json.loads(item)["kind"] == "arming" for each in fleet for item in each.told.values())

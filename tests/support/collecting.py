@@ -1,0 +1,100 @@
+"""Collectors as processes, to be killed; what came into the database, to be compared with what was told."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import datetime
+import signal
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from companion.fleet import schema
+from companion.fleet.simulated import Aircraft
+from companion.fleet.store import engine_of
+from tests.support.broker import Broker
+
+NOW = datetime.datetime(2026, 11, 20, 12, tzinfo=datetime.UTC)
+
+
+class CollectorProcess:
+    """`companion fleet run`."""
+
+    def __init__(self, folder: Path, name: str, one: Broker, database: str) -> None:
+        self.log = folder / f"{name}.log"
+        config = folder / f"{name}.toml"
+        config.write_text(one.section(keepalive_s=5))
+        command = [sys.executable, "-m", "companion", "fleet", "run", "-c", str(config), "--database", database]
+        with self.log.open("ab") as log:
+            self._process = subprocess.Popen(command, stdout=log, stderr=log)
+
+    async def at_work(self) -> None:
+        """Until it hears the aircraft."""
+        async with asyncio.timeout(60.0):
+            while " into " not in self.log.read_text():
+                assert self._process.poll() is None, self.log.read_text()
+                await asyncio.sleep(0.05)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    def stop(self) -> int:
+        """In order; its exit code."""
+        self._process.send_signal(signal.SIGTERM)
+        return self._process.wait(60.0)
+
+
+@contextlib.asynccontextmanager
+async def telling(fleet: Sequence[Aircraft], one: Broker) -> AsyncIterator[None]:
+    """Aircraft at the broker."""
+    tasks = [asyncio.create_task(each.run("127.0.0.1", one.port)) for each in fleet]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def until_confirmed(fleet: Sequence[Aircraft], within_s: float = 120.0) -> None:
+    try:
+        async with asyncio.timeout(within_s):
+            while any(len(each.confirmed) < len(each.told) for each in fleet):
+                await asyncio.sleep(0.05)
+    except TimeoutError:
+        raise AssertionError([(len(each.confirmed), len(each.told)) for each in fleet]) from None
+
+
+def items_in(database: str) -> list[tuple[str, str, int, str]]:
+    """Aircraft, epoch, sequence and payload of every item, in order."""
+    items = schema.items.c
+    query = sa.select(items.aircraft, items.epoch, items.sequence, items.payload)
+    return sorted((row[0], row[1], row[2], row[3]) for row in rows_of(database, query))
+
+
+def rows_of(database: str, query: sa.Executable) -> Sequence[Any]:
+    engine = engine_of(database, reads_only=True)
+    try:
+        with engine.begin() as connection:
+            return connection.execute(query).all()
+    finally:
+        engine.dispose()
+
+
+def told_by(fleet: Sequence[Aircraft]) -> list[tuple[str, str, int, str]]:
+    """Likewise, of what was told."""
+    return sorted(
+        (each.id, each.epoch, sequence, payload.decode()) for each in fleet for sequence, payload in each.told.items()
+    )
+
+
+def quick(fleet: Sequence[Aircraft], again_s: float = 0.4) -> None:
+    """They tell again so soon that much comes twice."""
+    for each in fleet:
+        each.again_s = again_s

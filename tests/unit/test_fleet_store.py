@@ -1,0 +1,337 @@
+"""What the collector takes, refuses and asks for: against the contract's schemas and the payloads themselves."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import json
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import hypothesis
+import hypothesis.strategies as st
+import msgspec
+import pytest
+import sqlalchemy as sa
+
+from companion.errors import CompanionError, LinkError, StorageError
+from companion.fleet import contract, schema
+from companion.fleet.contract import MOST_RANGES, answers, ranges
+from companion.fleet.simulated import Aircraft
+from companion.fleet.store import Message, Outcome, Store, url_of
+from tests.support.collecting import NOW, items_in, rows_of, told_by
+from tests.support.fleet import check
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> str:
+    return str(tmp_path / "fleet.sqlite")
+
+
+@pytest.fixture
+def store(database: str) -> Iterator[Store]:
+    one = Store(database)
+    one.prepare()
+    yield one
+    one.close()
+
+
+def aircraft(flights: int = 5, number: int = 1) -> Aircraft:
+    one = Aircraft(number)
+    one.live(NOW, flights)
+    return one
+
+
+def items_of(one: Aircraft) -> list[Message]:
+    return [Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()]
+
+
+def changed(message: Message, **news: Any) -> Message:
+    return message._replace(payload=json.dumps(json.loads(message.payload) | news).encode())
+
+
+def hello_of(one: Aircraft) -> Message:
+    return Message(f"fleet/{one.id}/hello", one.hello)
+
+
+def query(database: str, text: str) -> list[tuple[Any, ...]]:
+    return [tuple(row) for row in rows_of(database, sa.text(text))]
+
+
+# --- the contract
+
+
+def test_the_simulated_aircraft_says_what_the_contract_says() -> None:
+    one = aircraft(150)
+    kinds = {check("item", payload)["kind"] for payload in one.told.values()}
+    assert kinds == {"calibration", "arming", "undo"}
+    check("hello", one.hello)
+
+
+@hypothesis.given(st.sets(st.integers(1, 3000), max_size=1200))
+def test_answers_name_each_number_once_and_nothing_else(numbers: set[int]) -> None:
+    found: list[int] = []
+    for payload in answers("0123456789abcdef", ranges(numbers)):
+        said = check("confirmed", payload)["sequences"]
+        assert len(said) <= MOST_RANGES
+        found += [number for first, last in said for number in range(first, last + 1)]
+    assert sorted(found) == sorted(numbers)
+
+
+@hypothesis.given(st.data())
+def test_no_bytes_raise(data: st.DataObject) -> None:
+    one = aircraft(1)
+    payload = data.draw(st.sampled_from([*one.told.values(), one.hello]))
+    if data.draw(st.booleans()):
+        at = data.draw(st.integers(0, len(payload) - 1))
+        payload = payload[:at] + data.draw(st.binary(max_size=4)) + payload[at + data.draw(st.integers(0, 3)) :]
+    else:
+        payload = data.draw(st.binary(max_size=60))
+    with contextlib.suppress(contract.NotTakenError):
+        contract.read_hello(one.id, payload)
+    with contextlib.suppress(contract.NotTakenError):
+        contract.read_item(contract.read_key(one.id, payload), payload)
+
+
+# --- what is taken
+
+
+def test_duplicates_and_disorder_change_nothing(store: Store, database: str) -> None:
+    one = aircraft(12)
+    messages = items_of(one)
+    whole = store.take(messages[::-1])
+    assert whole.confirmed == {(one.id, one.epoch): [*one.told][::-1]}
+    derived = (schema.calibrations, schema.biases, schema.armings)
+    before = [rows_of(database, sa.select(table)) for table in derived]
+    assert all(before)
+    for start in range(0, len(messages), 5):
+        some = messages[start : start + 5]
+        again = store.take([*some, *some])
+        assert sum(map(len, again.confirmed.values())) == 2 * len(some)
+    assert items_in(database) == told_by([one])
+    assert [rows_of(database, sa.select(table)) for table in derived] == before
+
+
+def test_a_clock_that_is_wrong_by_a_year_changes_no_order(store: Store, database: str) -> None:
+    """The last by number is in force, though its clock has gone back by a year, and another one was a year ahead."""
+    one = Aircraft(1)
+    for days in (0, 365, 1, -365):
+        last = one.calibrate(NOW + datetime.timedelta(days=days))
+    store.take([*items_of(one), hello_of(one)])
+    assert query(database, "SELECT sequence FROM in_force") == [(last,)]
+    one.undo(NOW)
+    store.take(items_of(one))
+    assert query(database, "SELECT sequence FROM in_force") == [(3,)]
+
+
+def test_told_again_under_a_new_epoch_is_one_thing(store: Store, database: str) -> None:
+    """A damaged memory card: what the disk still had is told anew; both tellings are kept, and shown once."""
+    one = aircraft(6)
+    store.take([*items_of(one), hello_of(one)])
+    shown = query(database, "SELECT started_at, imu, axis, gyro_bias_deg_h FROM bias_history ORDER BY 1, 2, 3")
+    fleet = query(database, "SELECT * FROM fleet")
+    assert len(shown) == 6 * len(one.biases)
+    one.epoch = "f" * 16
+    again = [changed(message, epoch=one.epoch) for message in items_of(one)]
+    store.take([*again, hello_of(one)])
+    assert len(items_in(database)) == 2 * len(one.told)
+    assert query(database, "SELECT started_at, imu, axis, gyro_bias_deg_h FROM bias_history ORDER BY 1, 2, 3") == shown
+    assert [row[3:] for row in query(database, "SELECT * FROM fleet")] == [row[3:] for row in fleet]
+
+
+def test_what_is_lacking_is_asked_for(store: Store) -> None:
+    one = aircraft(20)
+    key = (one.id, one.epoch)
+    last = len(one.told)
+    wanted = store.take([hello_of(one)]).wanted
+    assert wanted == {key: [[1, last]]}
+    there = [message for number, message in enumerate(items_of(one), 1) if number not in (1, 5, 6, 9, last)]
+    assert store.take([*there, hello_of(one)]).wanted == {key: [[1, 1], [5, 6], [9, 9], [last, last]]}
+    assert store.take([*items_of(one), hello_of(one)]).wanted == {}
+    later = json.loads(one.hello) | {"first": last + 1, "last": last}
+    assert store.take([Message(f"fleet/{one.id}/hello", json.dumps(later).encode())]).wanted == {}
+
+
+def test_what_is_unknown_is_kept_and_taken_in_after_an_update(
+    store: Store, database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = aircraft(3)
+    calibration = items_of(one)[0]
+    messages = [
+        changed(calibration, sequence=101, kind="flight", body={"minutes": 7}),
+        changed(calibration, sequence=102, format_version=2, body=[1, 2]),
+    ]
+    with monkeypatch.context() as older:
+        older.setattr(contract, "KINDS", {})
+        older.setattr("companion.fleet.store.KINDS", {})
+        outcome = store.take([calibration, *messages])
+    assert outcome.rejected == []
+    assert outcome.confirmed == {(one.id, one.epoch): [1, 101, 102]}
+    states = "SELECT sequence, state FROM items ORDER BY sequence"
+    assert query(database, states) == [(1, "unknown"), (101, "unknown"), (102, "unknown")]
+    assert query(database, "SELECT * FROM biases") == []
+    store.prepare()
+    assert query(database, states) == [(1, "taken"), (101, "unknown"), (102, "unknown")]
+    assert len(query(database, "SELECT * FROM biases")) == 6
+
+
+# --- what is refused
+
+BAD: dict[str, dict[str, Any]] = {
+    "of another aircraft": {"aircraft": "f" * 36},
+    "no sequence": {"sequence": 0},
+    "beyond all numbers": {"sequence": 2**60},
+    "no body": {"body": None},
+    "no time": {"at": "yesterday"},
+    "a time beyond all years": {"at": "9999-12-31T23:59:59-12:00"},
+    "a bias of infinity": {"body": {"bias": 1e13}},
+    "a format that is none": {"format_version": "1"},
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_a_bad_item_is_kept_aside_with_its_reason_and_stops_nothing(store: Store, database: str, what: str) -> None:
+    one = aircraft(2)
+    good = items_of(one)
+    news = BAD[what]
+    if what == "a bias of infinity":
+        body = json.loads(good[0].payload)["body"]
+        body["imus"][0]["gyro_bias_rad_s"] = [0.0, 1e13, 0.0]
+        news = {"body": body}
+    bad = changed(good[0], **news)
+    for _ in range(3):
+        outcome = store.take([good[1], bad, good[2]])
+        assert [message for message, _ in outcome.rejected] == [bad]
+    (times, reason, payload), *rest = query(database, "SELECT times, reason, payload FROM rejected")
+    assert (times, rest, payload) == (3, [], bad.payload)
+    assert reason == outcome.rejected[0][1]
+    assert {2, 3} <= {row[2] for row in items_in(database)}
+    # Of one whose number can be read no more is to be heard; it takes no other's place.
+    readable = what in ("no body", "no time", "a time beyond all years", "a bias of infinity")
+    assert outcome.confirmed == {(one.id, one.epoch): [2, 1, 3] if readable else [2, 3]}
+    assert query(database, "SELECT * FROM biases WHERE sequence = 1") == []
+
+
+def test_the_liar_is_named(store: Store) -> None:
+    one, other = aircraft(1, 1), aircraft(1, 2)
+    lie = Message(f"fleet/{one.id}/item", other.told[1])
+    (_, reason), *_ = store.take([lie]).rejected
+    assert one.id in reason
+    assert other.id in reason
+
+
+def test_what_is_kept_aside_is_bounded(store: Store, database: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.fleet.store.MOST_REJECTED", 5)
+    topic = f"fleet/{aircraft(0).id}/item"
+    for number in range(12):
+        store.take([Message(topic, b"%d" % number * 10_000)])
+    kept = query(database, "SELECT payload FROM rejected")
+    assert len(kept) == 5
+    assert max(len(row[0]) for row in kept) == 4096
+
+
+def test_zero_bytes_and_deep_nesting_do_no_harm(store: Store, database: str) -> None:
+    one = aircraft(2)
+    good = items_of(one)
+    odd = changed(good[0], body=json.loads(good[0].payload)["body"] | {"reason": "a\0b"})
+    deep = good[1]._replace(payload=b'{"body":' + b"[" * 100_000)
+    outcome = store.take([odd, deep])
+    assert [message for message, _ in outcome.rejected] == [deep]
+    assert query(database, "SELECT reason FROM calibrations") == [("a\ufffdb",)]
+
+
+# --- the database
+
+
+def test_a_full_disk_confirms_nothing_and_loses_nothing(store: Store, database: str) -> None:
+    one = aircraft(40)
+    store.take(items_of(one)[:5])
+    with sqlite3.connect(database) as connection:
+        pages = connection.execute("PRAGMA page_count").fetchone()[0]
+    limit = lambda connection, _: connection.execute(f"PRAGMA max_page_count = {pages + 3}")  # noqa: E731
+    sa.event.listen(store._engine, "connect", limit)
+    store.close()
+    with pytest.raises(LinkError, match="full"):
+        store.take(items_of(one))
+    assert items_in(database) == told_by([one])[:5]
+    sa.event.remove(store._engine, "connect", limit)
+    store.close()
+    assert sum(map(len, store.take(items_of(one)).confirmed.values())) == len(one.told)
+    assert items_in(database) == told_by([one])
+
+
+def test_what_the_database_refuses_takes_nothing_else_with_it(
+    store: Store, database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = aircraft(4)
+    messages = items_of(one)
+    real = Store._take
+
+    def refuses(self: Store, some: list[Message], now: datetime.datetime) -> Outcome:
+        if messages[3] in some:
+            raise sa.exc.DataError("INSERT", {}, ValueError("no such number"))
+        return real(self, some, now)
+
+    monkeypatch.setattr(Store, "_take", refuses)
+    outcome = store.take(messages)
+    assert [reason for _, reason in outcome.rejected] == ["the database refuses it: no such number"]
+    assert items_in(database) == [item for item in told_by([one]) if item[2] != 4]
+
+
+def test_an_older_database_is_brought_up_to_date_and_a_newer_one_refused(
+    store: Store, database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = aircraft(3)
+    store.take(items_of(one))
+
+    def step(connection: sa.Connection) -> None:
+        connection.exec_driver_sql("ALTER TABLE aircraft ADD COLUMN colour TEXT")
+
+    with monkeypatch.context() as newer:
+        newer.setattr(schema, "STEPS", (step,))
+        store.prepare()
+        store.prepare()
+        assert query(database, "SELECT version FROM schema_version") == [(2,)]
+        assert query(database, "SELECT colour FROM aircraft") == [(None,)]
+        assert len(query(database, "SELECT * FROM bias_history")) == 6 * len(one.biases)
+    with pytest.raises(StorageError, match="version 2; allowed: up to 1"):
+        store.prepare()
+    assert items_in(database) == told_by([one])
+
+
+def test_a_step_that_fails_leaves_all_as_it_was(store: Store, database: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(connection: sa.Connection) -> None:
+        connection.exec_driver_sql("DROP TABLE biases")
+        connection.exec_driver_sql("INSERT INTO nowhere VALUES (1)")
+
+    store.take(items_of(aircraft(2)))
+    before = query(database, "SELECT COUNT(*) FROM bias_history")
+    monkeypatch.setattr(schema, "STEPS", (fails,))
+    with pytest.raises(LinkError, match="nowhere"):
+        store.prepare()
+    assert query(database, "SELECT COUNT(*) FROM bias_history") == before
+
+
+def test_views_say_what_they_are_for(store: Store, database: str) -> None:
+    made = dict(query(database, "SELECT name, sql FROM sqlite_master WHERE type = 'view'"))
+    assert made.keys() == {name for name, _, _ in schema.views()}
+    assert all(f"/* {purpose} */" in made[name] for name, purpose, _ in schema.views())
+    assert all(rows_of(database, sa.select(sa.text("*")).select_from(sa.table(name))) == [] for name in made)
+    assert store.where.startswith("sqlite:///")
+
+
+@pytest.mark.parametrize("wrong", ["mysql://a:secret@h/x", "postgresql:/x://", "sqlite://", "://"])
+def test_an_address_that_is_none_is_one_line_without_the_password(wrong: str) -> None:
+    with pytest.raises(CompanionError, match="allowed: postgresql://") as error:
+        url_of(wrong)
+    assert "secret" not in str(error.value)
+
+
+def test_records_keep_every_digit(store: Store, database: str) -> None:
+    one = aircraft(1)
+    store.take(items_of(one))
+    body = msgspec.json.decode(one.told[1])["body"]
+    found = query(database, "SELECT gyro_bias_rad_s FROM biases WHERE imu = 'fc1' ORDER BY axis")
+    assert [row[0] for row in found] == body["imus"][0]["gyro_bias_rad_s"]
