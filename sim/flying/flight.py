@@ -179,6 +179,14 @@ class Flight:
         record = await self.daemon.calibrate(CALIBRATED_WITHIN_S, progress=asyncio.subprocess.DEVNULL)
         if record["state"] != "done":
             raise RuntimeError(f"calibration: {record['reason']}")
+        await self.pushed()
+
+    async def pushed(self) -> None:
+        """Wait until the heading is pushed.
+
+        Raises:
+            TimeoutError: it is not; with what the companion says.
+        """
         attitude: dict[str, Any] = {}
         try:
             async with asyncio.timeout(PUSHED_WITHIN_S):
@@ -192,8 +200,8 @@ class Flight:
         """Take off, hold, let the fault happen, and watch; the record.
 
         Raises:
-            RuntimeError: the heading is not pushed when the fault is to happen, or this machine is too slow.
-            TimeoutError: it does not take off.
+            RuntimeError: this machine is too slow.
+            TimeoutError: it does not take off, or the heading is not pushed when the fault is to happen.
         """
         vehicle, ground, record = self.vehicle, self.ground, self.record
         await vehicle.ask_streams(ground)
@@ -209,8 +217,7 @@ class Flight:
             await vehicle.hold(ground)
         await vehicle.sleep(PLANE_SETTLED_S if vehicle.is_plane else SETTLED_S)
         record.circle = vehicle.circle
-        if not (attitude := (await self.ask("status"))["attitude"])["pushing"]:
-            raise RuntimeError(f"before the fault no heading is pushed: {attitude['why_not']}")
+        await self.pushed()
         begun_s, record.struck_s = asyncio.get_running_loop().time(), vehicle.truth.own_s
         await FAULTS[self.plan.fault].strike(self)
         await vehicle.sleep(TURNS_AFTER_S)
