@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -153,6 +154,34 @@ def test_only_what_was_asked_for_is_written(tmp_path: Path, what: What) -> None:
             assert imu.covariance is not None
             assert (imu.covariance[0][0] is None) == (what is What.ACCELEROMETERS)
             assert (imu.covariance[5][5] is None) == (what is What.GYROS)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(("source", "heading_from"), [(1.0, "autopilot"), (6.0, None)], ids=["compass", "nobody's"])
+def test_without_a_compass_the_autopilots_heading_counts_if_its_own_compass_gives_it(
+    tmp_path: Path, source: float, heading_from: str | None
+) -> None:
+    """An EKF3 that waits for a heading from outside holds 0 deg and calls it as good as any (the real one, too)."""
+
+    async def main() -> None:
+        rig = Rig(tmp_path, imus=1, parameters={"VISO_TYPE": 1.0, "EK3_SRC1_YAW": source}, **QUICK)
+        rig.config = msgspec.structs.replace(rig.config, compass=None)
+        del rig.devices["compass"]
+        rig.autopilot.has_compass = True
+        async with rig.running():
+            await rig.ready()
+            await asyncio.sleep(10.0)
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert record.pose is not None
+            assert record.pose.heading_from == heading_from
+            psi_deg = record.pose.psi_deg
+            if heading_from is None:
+                assert psi_deg is None
+            else:
+                yaw = math.degrees(rig.aircraft.angles_rad(rig.aircraft.time_at(rig.now_s))[2])
+                assert psi_deg == pytest.approx(yaw % 360.0, abs=0.5)
 
     run_virtual(main())
 

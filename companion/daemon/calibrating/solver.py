@@ -7,16 +7,18 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from companion.autopilot.firmware.heading_parameters import COMPASS
 from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.calibration.means.windows import Window
 from companion.calibration.request import What
-from companion.calibration.solution.otherwise import NOTHING, Otherwise
+from companion.calibration.solution.otherwise import NOTHING, Otherwise, OwnHeading
 from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import Solution, solve
 from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.stands.alignment import AlignmentInForce
 from companion.daemon.stands.faces_in_force import FacesInForce
+from companion.errors import AutopilotError
 
 
 class Given(NamedTuple):
@@ -39,7 +41,7 @@ class Solver:
             CalibrationRefusedError: as `solve`.
         """
         config = self._core.config
-        given = Given(models.whereabouts(config, self._core.vehicle), self._otherwise(window))
+        given = Given(models.whereabouts(config, self._core.vehicle), await self._otherwise(window))
         poses = self.alignment.model(), models.compass_model(config.compass)
         platform, any_bias = config.vehicle.platform, config.calibration.any_bias
         found: Solution = await self._core.offload(
@@ -49,11 +51,22 @@ class Solver:
         )
         return found, given
 
-    def _otherwise(self, window: Window) -> Otherwise:
+    async def _otherwise(self, window: Window) -> Otherwise:
         config = self._core.config
         if config.gradienter is not None and config.compass is not None:
             return NOTHING
         return Otherwise(
             sides=self._faces.sides(window) if config.gradienter is None else {},
-            heading=self._own.heading() if config.compass is None else None,
+            heading=await self._own_heading() if config.compass is None else None,
         )
+
+    async def _own_heading(self) -> OwnHeading | None:
+        """The autopilot's; an EKF3 that waits for one from outside holds 0 deg, and calls that as good as any."""
+        found, core = self._own.heading(), self._core
+        if found is None or core.vehicle.firmware != "ardupilot":
+            return found
+        try:
+            source = await core.parameters.read_optional("EK3_SRC1_YAW")
+        except AutopilotError:
+            return None
+        return found if source in (None, COMPASS) else None
