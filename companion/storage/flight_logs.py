@@ -61,16 +61,18 @@ class LogFile:
         try:
             folder.mkdir(0o700, parents=True, exist_ok=True)
             others = sorted((each for each in folder.iterdir() if each != self._at), key=lambda at: at.stat().st_mtime)
-            in_all = size + sum(each.stat().st_size for each in others)
-            for oldest in others:
-                if in_all > MOST_BYTES:
-                    in_all -= oldest.stat().st_size
-                    oldest.unlink()
-                    logger.warning("%s: removed, as the logs take more than %d MB", oldest, MOST_BYTES // 1_000_000)
-            free = shutil.disk_usage(folder).free - RESERVE_BYTES
-            if lacks > free:
-                rest = f"{lacks / 1e6:.1f} MB needed, {max(free, 0) / 1e6:.1f} MB free"
-                raise StorageError(f"{folder}: the disk has no room for the log: {rest}")
+            sizes = {each: each.stat().st_size for each in others}
+            going = []
+            while others and size + sum(sizes[each] for each in others) > MOST_BYTES:
+                going.append(others.pop(0))
+            free = shutil.disk_usage(folder).free - RESERVE_BYTES + sum(sizes[each] for each in going)
+            room = min(free, MOST_BYTES - self.bytes)
+            if lacks > room:
+                rest = f"{lacks / 1e6:.1f} MB needed, {max(room, 0) / 1e6:.1f} MB free"
+                raise StorageError(f"{folder}: no room for the log: {rest}")
+            for oldest in going:
+                oldest.unlink()
+                logger.warning("%s: removed, as the logs take more than %d MB", oldest, MOST_BYTES // 1_000_000)
             if self.is_whole:
                 os.replace(self.path, self._part)
                 self._at = self._part

@@ -393,7 +393,7 @@ def test_what_cannot_be_fetched_is_one_line(
             rig.autopilot.faults.silent = False
             monkeypatch.setattr(flight_logs, "RESERVE_BYTES", 1 << 60)
             words = await refused(rig, StorageError)
-            assert words.endswith("the disk has no room for the log: 0.1 MB needed, 0.0 MB free"), words
+            assert words.endswith("no room for the log: 0.1 MB needed, 0.0 MB free"), words
             assert not [*(tmp_path / "logs").iterdir()]
             files.files.clear()
             assert await refused(rig) == "no log on the autopilot: has it a card, and does it log?"
@@ -432,7 +432,11 @@ def test_old_logs_make_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
             for number in (1, 2, 3):
                 files.files[f"/APM/LOGS/{number:08d}.BIN"] = content(10_000, seed=number)
                 await fetch(rig, str(number))
-            assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["00000002.BIN", "00000003.BIN"]
+            kept = ["00000002.BIN", "00000003.BIN"]
+            assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == kept
+            files.files["/APM/LOGS/00000004.BIN"] = content(30_000)
+            assert "no room for the log: 0.0 MB needed, 0.0 MB free" in await refused(rig, StorageError, "4")
+            assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == kept
 
     run_virtual(main())
 
