@@ -13,6 +13,7 @@ MODULES: Final = {
     "accuracy": "sim.accuracy.cli",
     "rest": "sim.experiments.rest",
     "fly": "sim.flying.cli",
+    "fly-bench": "sim.flying.bench",
 }
 """Commands whose `main` takes what follows; all others are told which one is meant."""
 

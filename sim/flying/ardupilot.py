@@ -49,10 +49,15 @@ def state_of(line: bytes) -> State | None:
 
 
 class Rider:
-    """A slave of SITL's physics that only listens: every step of it, in time. An async context manager."""
+    """A slave of SITL's physics that only listens: each step of it, in time. An async context manager.
 
-    def __init__(self, aircraft: FlyingAircraft) -> None:
-        self._aircraft = aircraft
+    Args:
+        aircraft: that follows it.
+        reads_each: of its steps; the others are answered and left aside.
+    """
+
+    def __init__(self, aircraft: FlyingAircraft, reads_each: int = 1) -> None:
+        self._aircraft, self._reads_each = aircraft, reads_each
         self.boots = 0
         self._frame = 0
         self._heard_s = 0.0
@@ -102,6 +107,8 @@ class Rider:
             except OSError:
                 return
             self._answer()
+            if self._frame % self._reads_each:
+                continue
             state = state_of(data)
             if state is None:
                 continue
@@ -168,6 +175,7 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
         companion: where SERIAL1 sends to.
         wind: speed in m/s and where from in degrees.
         parameters: defaults that outrank all others.
+        reads_each: of its states, a thousand a second.
 
     Raises:
         BinaryError: the binary is missing or not executable.
@@ -184,6 +192,7 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
         companion: tuple[str, int],
         wind: tuple[float, float] = (0.0, 0.0),
         parameters: Mapping[str, float] | None = None,
+        reads_each: int = 1,
     ) -> None:
         super().__init__(scenario, folder)
         self._binary = check_binary(binary)
@@ -194,7 +203,7 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
         )
         self._companion, self._ground = companion, (LOOPBACK, free_udp_port())
         self.system_id = 1
-        self.rider = Rider(self.truth)
+        self.rider = Rider(self.truth, reads_each)
         self.sticks_us = [MIDDLE_US, MIDDLE_US, LOWEST_US, MIDDLE_US]
         """Roll, pitch, throttle, yaw; sent to it while it flies."""
 
@@ -257,6 +266,10 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
             )
         )  # fmt: skip
         await self.until_mode(ground, "hold")
+
+    async def hasten(self, ground: GroundStation, speed: float) -> None:
+        """At once."""
+        await ground.put("SIM_SPEEDUP", speed)
 
     async def steer(self, ground: GroundStation) -> None:
         """Sends the sticks until cancelled."""

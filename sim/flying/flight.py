@@ -222,7 +222,7 @@ class Flight:
         await FAULTS[self.plan.fault].strike(self)
         await vehicle.sleep(TURNS_AFTER_S)
         if not self.plan.mission:
-            await vehicle.turn(TURN_DEG)
+            await vehicle.turn(ground, TURN_DEG)
         await vehicle.sleep(self.plan.watched_s - TURNS_AFTER_S)
         speed = (vehicle.truth.own_s - record.struck_s) / (asyncio.get_running_loop().time() - begun_s)
         if speed < SLOWEST:

@@ -8,7 +8,7 @@ import math
 import random
 import re
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -47,8 +47,8 @@ FORCE_OVER = 25
 class Truth:
     """Takes HIL_STATE_QUATERNION of SIH for an aircraft: rates from attitudes, forces from velocities."""
 
-    def __init__(self, aircraft: FlyingAircraft, system_id: int) -> None:
-        self.boots = 0
+    def __init__(self, aircraft: FlyingAircraft, system_id: int, rate_hz: float = TRUTH_HZ) -> None:
+        self.boots, self.rate_hz = 0, rate_hz
         self._aircraft, self._system_id = aircraft, system_id
         self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=mavlink.MAV_COMP_ID_USER2)
         self._codec.robust_parsing = True
@@ -71,7 +71,7 @@ class Truth:
                     self._aircraft.take(state, t_s)
         if self._transmit is not None and t_s - self._asked_s > ASKED_EVERY_S:
             self._asked_s = t_s
-            number, rate = mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION, 1e6 / TRUTH_HZ
+            number, rate = mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION, 1e6 / self.rate_hz
             command = mavlink.MAVLink_command_long_message(
                 self._system_id, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, rate, *[0.0] * 5
             )
@@ -128,6 +128,8 @@ class FlyingPx4(FlyingVehicle):
         folder: for the binary's files.
         wind: speed in m/s and where from in degrees.
         seed: of the gusts.
+        parameters: set at the first boot, and outrank all others.
+        truth_hz: how often it tells its truth.
 
     Raises:
         BinaryError: binary or folder is missing, or no instance is free.
@@ -136,7 +138,15 @@ class FlyingPx4(FlyingVehicle):
     firmware = "px4"
 
     def __init__(
-        self, binary: Path, scenario: Scenario, folder: Path, *, wind: tuple[float, float] = (0.0, 0.0), seed: int = 0
+        self,
+        binary: Path,
+        scenario: Scenario,
+        folder: Path,
+        *,
+        wind: tuple[float, float] = (0.0, 0.0),
+        seed: int = 0,
+        parameters: Mapping[str, float] | None = None,
+        truth_hz: float = TRUTH_HZ,
     ) -> None:
         super().__init__(scenario, folder)
         self._binary = check_binary(binary)
@@ -146,9 +156,9 @@ class FlyingPx4(FlyingVehicle):
         from_rad = math.radians(wind[1])
         self._wind = {"SIH_WIND_N": -wind[0] * math.cos(from_rad), "SIH_WIND_E": -wind[0] * math.sin(from_rad)}
         self._gust_m_s, self._dice = GUST_SHARE * wind[0], random.Random(seed)
-        self._told = Truth(self.truth, self.system_id)
-        self._ground: GroundStation | None = None
+        self._told = Truth(self.truth, self.system_id, truth_hz)
         self._flags = self.folder / "flags.txt"
+        self._parameters, self._speed = dict(parameters or {}), 1.0
         self.sticks_us = []
 
     @property
@@ -194,6 +204,7 @@ class FlyingPx4(FlyingVehicle):
         site = self.aircraft.site
         environment = {
             "PX4_SIM_MODEL": MODEL,
+            "PX4_SIM_SPEED_FACTOR": f"{self._speed:g}",
             "PX4_HOME_LAT": f"{site.latitude_deg}",
             "PX4_HOME_LON": f"{site.longitude_deg}",
             "PX4_HOME_ALT": f"{site.height_m}",
@@ -201,6 +212,7 @@ class FlyingPx4(FlyingVehicle):
         }
         if not (self.folder / self.stored[0]).exists():
             values = MEASURING_PARAMETERS | self._wind | {"SDLOG_BACKEND": 0.0, "COM_LOW_BAT_ACT": 0.0}
+            values |= self._parameters
             environment |= {f"PX4_PARAM_{name}": f"{value:g}" for name, value in values.items()}
         self.process.environment = environment
         await super().power_on()
@@ -249,16 +261,19 @@ class FlyingPx4(FlyingVehicle):
         """
         await self.until_mode(ground, "hold")
 
-    async def turn(self, degrees: float) -> None:
+    async def hasten(self, ground: GroundStation, speed: float) -> None:
+        """It can be told at its start only."""
+        self._speed = speed
+        await self.power_cycle()
+
+    async def turn(self, ground: GroundStation, degrees: float) -> None:
         """Told to turn clockwise on its spot."""
-        assert self._ground is not None
         yaw_rad = math.remainder(self.truth.recorded[-1][3] + math.radians(degrees), math.tau)
-        await self._ground.command(mavlink.MAV_CMD_DO_REPOSITION, -1.0, 0.0, 0.0, yaw_rad, *[math.nan] * 3)
+        await ground.command(mavlink.MAV_CMD_DO_REPOSITION, -1.0, 0.0, 0.0, yaw_rad, *[math.nan] * 3)
         await self.sleep(TURNED_S)
 
     async def steer(self, ground: GroundStation) -> None:
         """Gusts, until cancelled: no sticks."""
-        self._ground = ground
         while True:
             for name, mean in self._wind.items():
                 ground.send_put(name, mean + self._dice.gauss(0.0, self._gust_m_s), mavlink.MAV_PARAM_TYPE_REAL32)

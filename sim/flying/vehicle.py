@@ -126,7 +126,11 @@ class FlyingVehicle(FirmwareVehicle):
     async def hold(self, ground: GroundStation) -> None:
         """Stay over the spot, or about it, until told otherwise."""
 
-    async def turn(self, degrees: float) -> None:
+    @abstractmethod
+    async def hasten(self, ground: GroundStation, speed: float) -> None:
+        """From now on so many times real time, which the companion must not see."""
+
+    async def turn(self, ground: GroundStation, degrees: float) -> None:
         """Turned clockwise by the yaw stick, by the truth; a plane turns anyway."""
         if self.is_plane:
             return

@@ -10,26 +10,21 @@ from pathlib import Path
 from sim.companion_process import CompanionProcess
 from sim.scenario import Scenario
 from sim.serve import configuration, serve
-from sim.sitl.vehicle import SitlVehicle
+from sim.sitl.vehicle import FirmwareVehicle, SitlVehicle
 
 READY_WITHIN_S = 40.0
 PORTS_WITHIN_S = 5.0
 _IMU = '[[imu]]\nname = "fc{0}"\nsource = "autopilot"\ninstance = {0}\nprofile = "icm42688p"\n\n'
 
 
-def instances_of(vehicle: SitlVehicle) -> tuple[int, ...]:
-    """The IMUs to calibrate and look at: those whose telemetry lets one tell a mean to some deg/h."""
-    return (1,) if vehicle.firmware == "ardupilot" else (1, 2)
-
-
-def daemon_configuration(vehicle: SitlVehicle, folder: Path, more: str = "", url: str | None = None) -> str:
+def daemon_configuration(vehicle: FirmwareVehicle, folder: Path, more: str = "", url: str | None = None) -> str:
     """A companion.toml for the vehicle's IMUs with the ports in the folder; `more` is added at the end."""
     host, port = vehicle.url.removeprefix("udpin:").rsplit(":", 1)
     text = configuration(vehicle.scenario, directory=folder, udp=(host, int(port)))
     text = text.replace(vehicle.url, url or vehicle.url)
     # The autopilot's IMUs only: the serial one has nothing to do with the firmware.
     head, _, tail = text.partition("[[imu]]")
-    imus = "".join(_IMU.format(instance) for instance in instances_of(vehicle))
+    imus = "".join(_IMU.format(instance) for instance in vehicle.instances)
     return head + imus + tail[tail.index("[gradienter]") :] + more
 
 

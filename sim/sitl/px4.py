@@ -73,6 +73,7 @@ class Px4Sitl(SitlVehicle):
     """
 
     firmware = "px4"
+    instances = (1, 2)
 
     def __init__(
         self,

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG
-from sim.sitl.daemon import companion_daemon, instances_of
+from sim.sitl.daemon import companion_daemon
 from sim.sitl.ground import GroundStation
 from sim.sitl.observe import residual
 from sim.sitl.px4 import Px4Sitl
@@ -111,7 +111,7 @@ async def ground_station(vehicle: FirmwareVehicle) -> AsyncIterator[GroundStatio
         end.close()
 
 
-async def own_calibration(vehicle: SitlVehicle, ground: GroundStation, *params: float) -> str:
+async def own_calibration(vehicle: FirmwareVehicle, ground: GroundStation, *params: float) -> str:
     """MAV_CMD_PREFLIGHT_CALIBRATION until it is over; how it answered, and what it said."""
     loop = asyncio.get_running_loop()
     since_s = loop.time()
@@ -153,7 +153,7 @@ async def report(
         p = vehicle.aircraft.pose
         print(f"pitch {p.pitch_deg:g}, roll {p.roll_deg:g}, heading {p.heading_deg:g} deg; looks of {observe_s:g} s")
         print(HEADER, flush=True)
-        for instance in instances_of(vehicle):
+        for instance in vehicle.instances:
             bias = vehicle.true_bias(instance, vehicle.now_s)
             print(Row("(the true bias)", instance, np.concatenate(bias)), flush=True)
         await asyncio.sleep(SETTLE_S)
@@ -227,7 +227,7 @@ async def found(
             record = await daemon.calibrate(CALIBRATE_WITHIN_S)
             status = await daemon.status() or {}
         result = []
-        for instance, imu in zip(instances_of(vehicle), record["imus"], strict=True):
+        for instance, imu in zip(vehicle.instances, record["imus"], strict=True):
             bias = _both(imu["gyro_bias_rad_s"], imu["accel_bias_m_s2"])
             sigma = _both(imu["gyro_sigma_stat_rad_s"], imu["accel_sigma_stat_m_s2"])
             error = bias - np.concatenate(vehicle.true_bias(instance, vehicle.now_s))
@@ -272,7 +272,7 @@ async def _own_calibrations(vehicle: SitlVehicle, ground: GroundStation, observe
 
 
 async def _look(vehicle: SitlVehicle, ground: GroundStation, what: str, seconds: float) -> None:
-    for instance in instances_of(vehicle):
+    for instance in vehicle.instances:
         loop = asyncio.get_running_loop()
         begun_s, physics_s = loop.time(), vehicle.physics_s
         row = Row(what, instance, await residual(vehicle, ground, instance, seconds))

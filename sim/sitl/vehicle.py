@@ -33,6 +33,8 @@ class FirmwareVehicle(ABC):
     """
 
     firmware: Firmware
+    instances: tuple[int, ...] = (1,)
+    """The IMUs to calibrate and look at: those whose telemetry lets one tell a mean to some deg/h."""
     process: FirmwareProcess
     system_id: int
 
@@ -135,7 +137,6 @@ class FirmwareVehicle(ABC):
         """
         begun_s, starts = self.physics_s, self.backend_boots
         async with asyncio.timeout(SLOWEST * seconds + 1.0):
-            await asyncio.sleep(seconds)
             while self.backend_boots == starts and self.physics_s - begun_s < seconds:
                 await asyncio.sleep(0.05)
 

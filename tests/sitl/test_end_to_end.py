@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.sitl.daemon import companion_daemon, instances_of
+from sim.sitl.daemon import companion_daemon
 from sim.sitl.observe import residual
 from sim.sitl.residuals import CALIBRATE_WITHIN_S, HEADER, UNITS, Row
 from tests.sitl.craft import Autopilot, Craft, SitlCraft, hush
@@ -45,7 +45,7 @@ def test_one_calibration_leaves_what_noise_and_gradienter_leave(autopilot: Autop
             record = await daemon.calibrate(CALIBRATE_WITHIN_S)
         assert record["state"] == "done", record["reason"]
         print("\n" + HEADER)
-        for instance in instances_of(craft.vehicle):
+        for instance in craft.vehicle.instances:
             left = await residual(craft.vehicle, craft.ground, instance, OBSERVE_S)
             print(Row("(the true bias)", instance, np.concatenate(craft.true_bias(instance))))
             print(Row(f"companion, {record['duration_s']:.0f} s", instance, left))

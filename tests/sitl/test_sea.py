@@ -10,7 +10,7 @@ import pytest
 
 from sim.imu_model import DEG_H, MG
 from sim.sea import motions_of
-from sim.sitl.daemon import companion_daemon, instances_of
+from sim.sitl.daemon import companion_daemon
 from sim.sitl.observe import residual
 from sim.sitl.residuals import DECK, Row, ground_station
 from tests.sitl.craft import BINARIES, binary_vehicle, missing
@@ -43,7 +43,7 @@ def test_a_boat_is_calibrated_as_a_deck_and_refused_as_ground(kind: str, tmp_pat
             async with companion_daemon(vehicle, tmp_path / "deck", more=DECK) as daemon:
                 record = await daemon.calibrate(CALIBRATED_WITHIN_S)
             assert record["state"] == "done", record["reason"]
-            for instance in instances_of(vehicle):
+            for instance in vehicle.instances:
                 left = await residual(vehicle, ground, instance, OBSERVE_S)
                 print(Row("companion, after a minute of waves", instance, left))
                 assert np.abs(left[:3]).max() < LEFT_DEG_H * DEG_H, left
