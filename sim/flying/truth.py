@@ -123,7 +123,7 @@ class FlyingAircraft(VirtualAircraft):
         after = np.clip(np.searchsorted(rows[_T], asked), 1, rows.shape[1] - 1)
         begun, ended = rows[_T, after - 1], rows[_T, after]
         share = np.clip((asked - begun) / np.maximum(ended - begun, 1e-9), 0.0, 1.0)  # of one state alone, itself
-        found = (rows[columns, after - 1] * (1.0 - share) + rows[columns, after] * share).T
+        found: Array = (rows[columns, after - 1] * (1.0 - share) + rows[columns, after] * share).T
         late_s = np.clip(asked - last[_T], 0.0, LATE_S)
         if late_s[-1] > 0.0:
             self.late += 1
