@@ -151,7 +151,7 @@ class Sources:
             except StorageError:
                 return before, []
             # Read again from its log, it is the same flight.
-            if before == kept.flight.key or not look.is_its(kept.flight.system_id):
+            if kept is None or before == kept.flight.key or not look.is_its(kept.flight.system_id):
                 return before, []
             return kept.flight.key, [look.item("flight", kept.flight.began_at or kept.read_at, kept)]
 
