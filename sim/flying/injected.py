@@ -6,6 +6,7 @@ offsets, since its simulated sensor has none. Read by pymavlink and pyulog, and 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -99,12 +100,13 @@ def ardupilot_told(log: Path) -> Told:
 
     reader: Any = DFReader_binary(str(log))  # type: ignore[no-untyped-call]
     parameters, vibration = [], []
-    while (message := reader.recv_match(type=["PARM", "VIBE"])) is not None:
-        at_s = message.TimeUS * 1e-6
-        if message.get_type() == "PARM":
-            parameters.append((at_s, message.Name, message.Value))
-        elif message.IMU == 0:
-            vibration.append((at_s, float(np.linalg.norm([message.VibeX, message.VibeY, message.VibeZ]))))
+    with contextlib.closing(reader):
+        while (message := reader.recv_match(type=["PARM", "VIBE"])) is not None:
+            at_s = message.TimeUS * 1e-6
+            if message.get_type() == "PARM":
+                parameters.append((at_s, message.Name, message.Value))
+            elif message.IMU == 0:
+                vibration.append((at_s, float(np.linalg.norm([message.VibeX, message.VibeY, message.VibeZ]))))
     return Told("ardupilot", parameters, np.array(vibration).reshape(-1, 2))
 
 
