@@ -6,12 +6,19 @@ import argparse
 import asyncio
 import contextlib
 import signal
-from collections.abc import AsyncIterator, Awaitable, Callable
-from typing import Final
+import tempfile
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from companion.cli import logs
-from companion.cli.terminal import DONE, Parser
+from companion.cli.terminal import DONE, Parser, print_lines
 from companion.errors import ConfigError
+
+if TYPE_CHECKING:
+    from companion.fleet.server import Server
+
+DEFAULT_PAGE: Final = "127.0.0.1:8291"
 
 _NEEDS_MORE: Final = "companion fleet needs more than is installed: pip install 'companion[fleet]'"
 
@@ -36,6 +43,17 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
         metavar="URL",
         help="postgresql://USER@HOST/NAME, or the path of an SQLite file (default fleet.sqlite, here)",
     )
+    demo = add("demo", _demo, "thirty simulated aircraft and the page, on this computer alone, until Ctrl-C")
+    for command in (run, demo):
+        command.add_argument(
+            "--page",
+            default=DEFAULT_PAGE,
+            metavar="HOST:PORT",
+            help=f"where the page is (default {DEFAULT_PAGE}: for this computer alone; run: off for none)",
+        )
+        command.add_argument(
+            "--password-file", type=Path, metavar="FILE", help="who looks at the page is asked for what is in it"
+        )
 
 
 async def _run(options: argparse.Namespace) -> int:
@@ -48,10 +66,47 @@ async def _run(options: argparse.Namespace) -> int:
 
     mqtt = settings.load(options.config).mqtt if hasattr(options, "config") else Mqtt(host="127.0.0.1")
     store = Store(options.database)
+    pages = [] if options.page == "off" else [_server(options, options.database).run()]
     logs.set_up("info")
     async with _until_stopped():
-        await Collector(mqtt, store).run()
+        await _beside(Collector(mqtt, store).run(), *pages)
     return DONE
+
+
+async def _demo(options: argparse.Namespace) -> int:
+    """`companion fleet demo`."""
+    _check_installed()
+    from companion.fleet import demo
+
+    logs.set_up("warning")
+    with tempfile.TemporaryDirectory(prefix="companion-fleet-") as folder:
+        database = Path(folder) / "fleet.sqlite"
+        server = _server(options, str(database))
+        mosquitto = demo.find_mosquitto()
+        beside = "Mosquitto" if mosquitto else "a broker of its own"
+        print_lines(f"{demo.AIRCRAFT} simulated aircraft, {beside}, and an SQLite file in {folder}, until Ctrl-C")
+        print_lines(f"look at {server.url}")
+        async with _until_stopped():
+            await _beside(demo.play(database, mosquitto), server.run())
+    return DONE
+
+
+def _server(options: argparse.Namespace, database: str) -> Server:
+    from companion.fleet.server import Server, read_password
+
+    password = None if options.password_file is None else read_password(options.password_file)
+    return Server(options.page, database, password)
+
+
+async def _beside(*runs: Coroutine[Any, Any, None]) -> None:
+    """Until the first of them fails, with what it raised, or all are cancelled."""
+    from companion.fleet.collector import stop
+
+    tasks = [asyncio.ensure_future(run) for run in runs]
+    try:
+        await asyncio.gather(*tasks)
+    finally:
+        await stop(tasks)
 
 
 def _check_installed() -> None:

@@ -11,7 +11,7 @@ import contextlib
 import logging
 import secrets
 import socket
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable, Iterable
 from typing import TYPE_CHECKING, Final
 
 from companion.config.sections import Mqtt
@@ -36,6 +36,7 @@ WAITING: Final = 4 * BATCH
 SWEEP_S: Final = 5.0
 """For what aircraft said before this collector was there."""
 ANSWER_S: Final = 10.0
+STOP_AGAIN_S: Final = 0.5
 FIRST_WAIT_S: Final = 0.5
 LONGEST_WAIT_S: Final = 30.0
 WORTH_S: Final = 10.0
@@ -46,20 +47,52 @@ _MQTT_5: Final = 5
 _MQTT_3_1_1: Final = 4
 
 
+@contextlib.asynccontextmanager
+async def connected(client: aiomqtt.Client) -> AsyncIterator[aiomqtt.Client]:
+    """A connection whose end hides nothing: what goes wrong on leaving does not take the place of a cancellation."""
+    import aiomqtt
+
+    await client.__aenter__()
+    try:
+        yield client
+    finally:
+        with contextlib.suppress(aiomqtt.MqttError, OSError, TimeoutError):
+            await client.__aexit__(None, None, None)
+
+
+async def stop(tasks: Iterable[asyncio.Task[None]]) -> list[BaseException]:
+    """Cancel tasks until they have ended; what they raised.
+
+    Once is not enough: before Python 3.12 `asyncio.wait_for`, which aiomqtt waits with, loses a cancellation that comes
+    at the moment of its result.
+    """
+    pending = found = set(tasks)
+    while pending:
+        for task in pending:
+            task.cancel()
+        _, pending = await asyncio.wait(pending, timeout=STOP_AGAIN_S)
+    return [end for end in await asyncio.gather(*found, return_exceptions=True) if end is not None]
+
+
 class Collector:
-    """One of as many as are wanted at one broker; `run` it as a task. `on_state` is told of connections and losses."""
+    """One of as many as are wanted at one broker; `run` it as a task. `on_state` is told of connections and losses.
+
+    Without `mqtt_5` it tries MQTT 3.1.1 first, for a broker that says nothing to MQTT 5.
+    """
 
     def __init__(
         self,
         settings: Mqtt,
         store: Store,
         on_state: Callable[[bool, str], object] | None = None,
+        *,
+        mqtt_5: bool = True,
     ) -> None:
         self.settings, self.store = settings, store
         self.client_id = settings.client_id or f"collector-{socket.gethostname()[:40]}-{secrets.token_hex(4)}"
         self.confirmed = self.rejected = 0
         """Items, and payloads, since the start."""
-        self._protocol = _MQTT_5
+        self._protocol = _MQTT_5 if mqtt_5 else _MQTT_3_1_1
         self._reconnection = Reconnection(
             "fleet", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S, on_state=on_state
         )
@@ -85,7 +118,7 @@ class Collector:
         reached = False
         try:
             password = await asyncio.to_thread(read_password, self.settings)
-            async with self._client(password) as client:
+            async with connected(self._client(password)) as client:
                 reached = True
                 await self._serve(client)
         except LinkError as error:
@@ -138,9 +171,7 @@ class Collector:
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
         finally:
-            for task in tasks:
-                task.cancel()
-            ended = await asyncio.gather(*tasks, return_exceptions=True)
+            ended = await stop(tasks)
         for end in ended:
             if isinstance(end, Exception):
                 raise end

@@ -76,6 +76,7 @@ class _Told(msgspec.Struct, frozen=True):
 class _Imu(msgspec.Struct, frozen=True):
     name: Annotated[str, msgspec.Meta(max_length=64)]
     temperature_degc: _Number | None = None
+    held_back: list[_Word] = []
     gyro_id: _Device = None
     accel_id: _Device = None
     gyro_bias_rad_s: _Axes = None
@@ -132,11 +133,13 @@ def _calibration(body: bytes) -> Rows:
             figures = {name: value and value[number] for name in _TRIADS for value in [getattr(imu, name)]}
             which = {"imu": imu.name, "axis": axis, "gyro_id": imu.gyro_id, "accel_id": imu.accel_id}
             biases.append({**which, "temperature_degc": imu.temperature_degc, **figures})
+    held = [f"{imu.name} {triad}" for imu in told.imus for triad in imu.held_back]
     row = {
         "started_at": moment(told.started_at),
         "duration_s": told.duration_s,
         "state": told.state,
         "reason": told.reason,
+        "held_back": ", ".join(held),
         "undone_at": None if told.undone_at is None else moment(told.undone_at),
     }
     return {"calibrations": [row], "biases": biases}

@@ -94,6 +94,7 @@ calibrations: Final = sa.Table(
     sa.Column("duration_s", sa.Double, nullable=False),
     sa.Column("state", sa.String(16), nullable=False, comment="done, failed, cancelled"),
     sa.Column("reason", Words, nullable=False),
+    sa.Column("held_back", Words, nullable=False, comment="measured and not written, contradicting earlier ones"),
     sa.Column("undone_at", Moment, comment="undone when it was told; later ones are in undos"),
 )
 

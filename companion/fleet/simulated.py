@@ -15,6 +15,7 @@ import aiomqtt
 import msgspec
 
 from companion.calibration.records.record import Arming, ImuRecord, Record
+from companion.fleet.collector import connected, stop
 from companion.fleet.contract import FORMAT_VERSION
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
@@ -65,11 +66,13 @@ class Aircraft:
         self._changed.set()
         return sequence
 
-    def calibrate(self, at: datetime.datetime, reason: str = "") -> int:
+    def calibrate(self, at: datetime.datetime, reason: str = "", *, held_back: bool = False) -> int:
         """A calibration at a power-up of its own; one with a reason has failed for it."""
         degc = self._dice.uniform(15.0, 45.0)
         true = {} if reason else {f"fc{k + 1}": self._power_up(k, degc) for k in range(2)}
         imus = tuple(self._imu(name, k, degc, *each) for k, (name, each) in enumerate(sorted(true.items())))
+        if held_back:
+            imus = (msgspec.structs.replace(imus[0], held_back=("gyro",)), *imus[1:])
         record = Record(
             state="failed" if reason else "done",
             reason=reason,
@@ -167,22 +170,21 @@ class Aircraft:
         """Be at the broker until cancelled; whoever is thrown out comes again."""
         while True:
             with contextlib.suppress(*_LEAVES):
-                async with aiomqtt.Client(host, port, identifier=f"aircraft-{self.id}") as client:
-                    hearing = asyncio.create_task(self._hear(client))
+                async with connected(aiomqtt.Client(host, port, identifier=f"aircraft-{self.id}")) as client:
+                    tasks = [asyncio.create_task(self._hear(client)), asyncio.create_task(self._tell(client))]
                     try:
-                        await self._tell(client, hearing)
+                        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
                     finally:
-                        hearing.cancel()
-                        await asyncio.gather(hearing, return_exceptions=True)
+                        await stop(tasks)
             await asyncio.sleep(FIRST_WAIT_S)
 
-    async def _tell(self, client: aiomqtt.Client, hearing: asyncio.Task[None]) -> None:
+    async def _tell(self, client: aiomqtt.Client) -> None:
         for what in ("confirmed", "wanted"):
             await client.subscribe(f"fleet/{self.id}/{what}", qos=1)
         await client.publish(f"fleet/{self.id}/hello", self.hello, qos=1, retain=True)
         due_s: dict[int, float] = {}
         loop = asyncio.get_running_loop()
-        while not hearing.done():
+        while True:
             self._changed.clear()
             for sequence in self._wanted:
                 self.confirmed.discard(sequence)
@@ -199,16 +201,13 @@ class Aircraft:
                     await self._changed.wait()
 
     async def _hear(self, client: aiomqtt.Client) -> None:
-        try:
-            async for message in client.messages:
-                said = msgspec.json.decode(message.payload, type=dict[str, Any])
-                if said["epoch"] != self.epoch:
-                    continue
-                named = {number for first, last in said["sequences"] for number in range(first, last + 1)}
-                into = self.confirmed if message.topic.value.endswith("/confirmed") else self._wanted
-                into |= named & self.told.keys()
-                self._changed.set()
-        finally:
+        async for message in client.messages:
+            said = msgspec.json.decode(message.payload, type=dict[str, Any])
+            if said["epoch"] != self.epoch:
+                continue
+            named = {number for first, last in said["sequences"] for number in range(first, last + 1)}
+            into = self.confirmed if message.topic.value.endswith("/confirmed") else self._wanted
+            into |= named & self.told.keys()
             self._changed.set()
 
 

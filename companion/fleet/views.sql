@@ -12,7 +12,7 @@ WHERE c.state = 'done' AND c.undone_at IS NULL
                   WHERE u.aircraft = c.aircraft AND u.what = 'calibration' AND u.of_at = c.started_at);
 
 -- in_force: The latest calibration of each aircraft that stands: by number on its present memory card, else by time
-SELECT aircraft, epoch, sequence, started_at
+SELECT aircraft, epoch, sequence, started_at, held_back
 FROM (SELECT s.*, ROW_NUMBER() OVER (
         PARTITION BY s.aircraft
         ORDER BY CASE WHEN s.epoch = a.epoch THEN s.sequence END DESC NULLS LAST, s.started_at DESC) AS place
@@ -36,7 +36,7 @@ FROM (SELECT r.*, ROW_NUMBER() OVER (
 WHERE place = 1;
 
 -- fleet: A row for each aircraft: what is in force, how the latest calibration and arming went, when it was heard
-SELECT a.aircraft, a.name, a.heard_at, f.started_at AS calibrated_at,
+SELECT a.aircraft, a.name, a.heard_at, f.started_at AS calibrated_at, f.held_back,
        t.started_at AS tried_at, t.state AS tried_state, t.reason AS tried_reason,
        r.armed_at, r.state AS armed_state, r.reason AS armed_reason
 FROM aircraft a

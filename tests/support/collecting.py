@@ -15,6 +15,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from companion.fleet import schema
+from companion.fleet.collector import stop
 from companion.fleet.simulated import Aircraft
 from companion.fleet.store import engine_of
 from tests.support.broker import Broker
@@ -57,9 +58,7 @@ async def telling(fleet: Sequence[Aircraft], one: Broker) -> AsyncIterator[None]
     try:
         yield
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await stop(tasks)
 
 
 async def until_confirmed(fleet: Sequence[Aircraft], within_s: float = 120.0) -> None:

@@ -1,0 +1,248 @@
+"""The pages that people look at: the fleet at a glance, and one aircraft. Read from the views, nothing is written."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import sqlalchemy as sa
+
+from companion.calibration.records.record import Arming
+from companion.fleet.schema import Moment, rejected
+from companion.physics.units import DEG_H, MG
+from companion.report.markup import Child, Markup, row, tag
+from companion.report.page import NAMES, TRIADS, Point, arming_items, card, drift, page, with_sigma
+from companion.samples import Triad, Vector
+
+STALE: Final = datetime.timedelta(days=30)
+"""A calibration that is older is shown as stale."""
+SILENT: Final = datetime.timedelta(days=7)
+MOST_AIRCRAFT: Final = 2000
+MOST_CALIBRATIONS: Final = 120
+"""The most of one IMU that are drawn, the latest."""
+MOST_LISTED: Final = 25
+_UNITS: Final[dict[Triad, tuple[float, str, str]]] = {"gyro": (DEG_H, "deg_h", "deg/h"), "accel": (MG, "mg", "mg")}
+
+
+class Standing(NamedTuple):
+    """How an aircraft stands: the kind of card, a word, and why."""
+
+    kind: str
+    word: str
+    why: str
+
+
+_ORDER: Final = ("alarm", "caution", "fine")
+
+
+def standing(one: Any, now: datetime.datetime) -> Standing:
+    """By a row of the view `fleet`; the worst first."""
+    why = one.tried_reason if one.tried_state in ("failed", "cancelled") else ""
+    if one.calibrated_at is None:
+        return Standing("alarm", "not calibrated", why or "no calibration stands")
+    if one.held_back:
+        return Standing("alarm", "held back", f"contradicts earlier ones, not written: {one.held_back}")
+    if now - one.calibrated_at > STALE:
+        return Standing("caution", "stale", why)
+    if one.armed_state == "uncalibrated" and one.armed_at > one.calibrated_at:
+        return Standing("caution", "armed without one", one.armed_reason)
+    if why:
+        return Standing("caution", "last try failed", why)
+    return Standing("fine", "calibrated", "")
+
+
+def glance(connection: sa.Connection, now: datetime.datetime) -> str:
+    """The whole fleet."""
+    found = _rows(connection, "SELECT * FROM fleet ORDER BY name, aircraft LIMIT :most", most=MOST_AIRCRAFT)
+    each = sorted(((standing(one, now), one) for one in found), key=lambda pair: _ORDER.index(pair[0].kind))
+    counts: dict[str, int] = {}
+    for stands, _ in each:
+        counts[stands.word] = counts.get(stands.word, 0) + 1
+    silent = sum(_is_silent(one, now) for one in found)
+    words = [f"{number} {word}" for word, number in counts.items()] + [f"{silent} silent for a week"] * (silent > 0)
+    rows = [
+        row(
+            tag("td", tag("a", one.name or one.aircraft, href=f"/aircraft/{one.aircraft}"), _small(stands.why)),
+            tag(
+                "td",
+                stands.word,
+                _small("" if one.calibrated_at is None else _ago(one.calibrated_at, now)),
+                class_=_CLASSES[stands.kind],
+            ),
+            tag("td", _ago(one.heard_at, now), class_="warn" if _is_silent(one, now) else None),
+        )
+        for stands, one in each
+    ]
+    head = tag("tr", *(tag("th", words) for words in ("Aircraft", "Calibration", "Heard")))
+    return page(
+        "Fleet",
+        now,
+        tag("h1", "Fleet"),
+        tag(
+            "p", f"{len(found)} aircraft: {', '.join(words)}" if found else "No aircraft was heard yet.", class_="lead"
+        ),
+        tag("table", head, *rows) if rows else None,
+        _refused(connection, now),
+        source=_SOURCE,
+    )
+
+
+_SOURCE: Final = "from the fleet's database"
+_CLASSES: Final = {"alarm": "bad", "caution": "warn", "fine": "ok"}
+
+
+def aircraft(connection: sa.Connection, which: str, now: datetime.datetime) -> str | None:
+    """One aircraft; None: it was never heard."""
+    found = _rows(connection, "SELECT * FROM fleet WHERE aircraft = :which", which=which)
+    if not found:
+        return None
+    one = found[0]
+    stands = standing(one, now)
+    name = one.name or one.aircraft
+    calibrated = "" if one.calibrated_at is None else f", by the calibration of {_moment(one.calibrated_at)}"
+    parts: list[Child] = [
+        tag("p", tag("a", "Fleet", href="/")),
+        tag("h1", name),
+        card(
+            stands.kind,
+            tag("p", f"{stands.word.capitalize()}{calibrated}", class_="lead"),
+            tag("p", stands.why) if stands.why else None,
+            tag("p", f"Heard {_ago(one.heard_at, now)}." if one.heard_at else "Not heard by this collector yet."),
+        ),
+        tag("p", "Autopilot ", tag("span", one.aircraft, class_="mono"), class_="soft"),
+    ]
+    parts += _imus(connection, which)
+    parts += _armings(connection, which)
+    parts += _notes(connection, which)
+    return page(name, now, *parts, source=_SOURCE)
+
+
+def _imus(connection: sa.Connection, which: str) -> list[Child]:
+    query = "SELECT * FROM bias_history WHERE aircraft = :which ORDER BY started_at DESC, imu, axis LIMIT :most"
+    rows = _rows(connection, query, which=which, most=MOST_CALIBRATIONS * 3 * 4)
+    parts: list[Child] = []
+    for imu in sorted({each.imu for each in rows}):
+        of_it = [each for each in rows if each.imu == imu]
+        ids = [
+            f"{what} {value}"
+            for what, value in (("gyro", of_it[0].gyro_id), ("accelerometer", of_it[0].accel_id))
+            if value
+        ]
+        parts.append(tag("h2", f"IMU {imu}"))
+        parts.append(tag("p", f"Device ids: {', '.join(ids)}", class_="soft") if ids else None)
+        for triad in TRIADS:
+            points = _points(of_it, triad)
+            if not points:
+                continue
+            unit, _, unit_name = _UNITS[triad]
+            last = points[-1]
+            pairs = (with_sigma(last.bias[k], last.sigma_use[k], unit) for k in range(3))
+            cells = [tag("td", value, " ± ", sigma) for value, sigma in pairs]
+            parts += [
+                tag("h3", f"{NAMES[triad]}, {unit_name}"),
+                tag("table", row(*(tag("th", axis) for axis in "xyz")), row(*cells)),
+                drift(points, triad, name=f"{imu} {triad}"),
+            ]
+    return parts
+
+
+def _points(rows: Sequence[Any], triad: Triad) -> list[Point]:
+    """The latest ones, in the order of time, SI units."""
+    unit, suffix, _ = _UNITS[triad]
+    found: dict[tuple[str, int], dict[str, Any]] = {}
+    for each in rows:
+        found.setdefault((each.epoch, each.sequence), {})[each.axis] = each
+    points = []
+    for (_, sequence), axes in list(found.items())[:MOST_CALIBRATIONS]:
+        bias = _vector(axes, f"{triad}_bias_{suffix}", unit)
+        sigma = _vector(axes, f"{triad}_sigma_use_{suffix}", unit)
+        if bias is not None and sigma is not None:
+            points.append(Point(sequence, axes["x"].started_at.timestamp(), bias, sigma))
+    return points[::-1]
+
+
+def _vector(axes: dict[str, Any], column: str, unit: float) -> Vector | None:
+    found = [value * unit for axis in "xyz" if (value := getattr(axes.get(axis), column, None)) is not None]
+    return (found[0], found[1], found[2]) if len(found) == 3 else None
+
+
+def _armings(connection: sa.Connection, which: str) -> list[Child]:
+    query = """
+        SELECT a.* FROM armings a
+        JOIN tellings t ON t.aircraft = a.aircraft AND t.epoch = a.epoch AND t.sequence = a.sequence
+        WHERE a.aircraft = :which ORDER BY a.armed_at DESC LIMIT :most"""
+    found = [
+        Arming(
+            armed_at=each.armed_at.isoformat(),
+            state=each.state,
+            reason=each.reason or each.state,
+            at_arm="warn",
+            calibration=None,
+            calibrated_ago_s=None,
+            confirmed_ago_s=None,
+            gyro_sigma_use_rad_s=None,
+            accel_sigma_use_m_s2=None,
+        )
+        for each in _rows(connection, query, which=which, most=MOST_LISTED)
+    ]
+    return [tag("h2", "Armings"), arming_items(found)] if found else []
+
+
+def _notes(connection: sa.Connection, which: str) -> list[Child]:
+    """What else has happened: failed calibrations, undos, events."""
+    query = """
+        SELECT started_at AS at, 'calibration ' || state AS what, reason AS more FROM calibrations
+        WHERE aircraft = :which AND state <> 'done'
+        UNION SELECT undone_at, what || ' put back', '' FROM undos WHERE aircraft = :which
+        UNION SELECT at, what, body FROM events WHERE aircraft = :which
+        ORDER BY at DESC LIMIT :most"""
+    found = _rows(connection, query, which=which, most=MOST_LISTED)
+    notes = [
+        tag("li", tag("strong", f"{_moment(each.at)}: "), each.what, f": {each.more}" if each.more else None)
+        for each in found
+    ]
+    return [tag("h2", "Notes"), tag("ul", *notes)] if notes else []
+
+
+def _refused(connection: sa.Connection, now: datetime.datetime) -> Markup | None:
+    last = connection.execute(sa.select(rejected).order_by(rejected.c.last_at.desc()).limit(1)).first()
+    if last is None:
+        return None
+    words = f"Not everything could be taken; last {_ago(last.last_at, now)}, on {last.topic}: {last.reason}"
+    return card("caution", tag("p", words), tag("p", "The table rejected has them all.", class_="soft"))
+
+
+_MOMENTS: Final = ("heard_at", "calibrated_at", "tried_at", "armed_at", "started_at", "at")
+
+
+def _rows(connection: sa.Connection, query: str, **values: Any) -> Sequence[Any]:
+    """With times as times, also where the database keeps them as texts."""
+    names = [name for name in _MOMENTS if name in query.split()[1:] or "*" in query]
+    columns = {name: Moment() for name in names}
+    return connection.execute(sa.text(query).columns(**columns), values).all()
+
+
+def _is_silent(one: Any, now: datetime.datetime) -> bool:
+    return one.heard_at is None or now - one.heard_at > SILENT
+
+
+def _moment(at: datetime.datetime | None) -> str:
+    return "?" if at is None else f"{at:%Y-%m-%d %H:%M} UTC"
+
+
+def _ago(at: datetime.datetime | None, now: datetime.datetime) -> str:
+    """How long ago, coarsely; a time to come is shown as it is: some clock is wrong."""
+    if at is None:
+        return "never"
+    ago_s = (now - at).total_seconds()
+    if ago_s < -120.0:
+        return _moment(at)
+    for least_s, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+        if ago_s >= least_s:
+            return f"{ago_s / least_s:.0f} {unit} ago"
+    return "now"
+
+
+def _small(words: str) -> Markup | None:
+    return tag("small", words) if words else None
