@@ -182,7 +182,7 @@ class Flight:
         await self.pushed()
 
     async def pushed(self) -> None:
-        """Wait until the heading is pushed.
+        """Wait until the heading is pushed, and in use again where another has been.
 
         Raises:
             TimeoutError: it is not; with what the companion says.
@@ -190,11 +190,17 @@ class Flight:
         attitude: dict[str, Any] = {}
         try:
             async with asyncio.timeout(PUSHED_WITHIN_S):
-                while not attitude.get("pushing"):
+                while not (attitude.get("pushing") and self._is_in_use()):
                     await asyncio.sleep(0.5)
                     attitude = (await self.ask("status"))["attitude"]
         except TimeoutError:
-            raise TimeoutError(f"no heading is pushed: {attitude}") from None
+            raise TimeoutError(f"no heading is pushed, or it is not in use: {attitude}") from None
+
+    def _is_in_use(self) -> bool:
+        """Whether the latest that was said of the source of the heading, if anything, names the companion."""
+        texts = [each.text for each in self.ground.all(mavlink.MAVLink_statustext_message, since_s=self._since_s)]
+        told = [text for text in texts if text.startswith("Heading: ")]
+        return not told or told[-1].startswith("Heading: companion")
 
     async def fly(self) -> Record:
         """Take off, hold, let the fault happen, and watch; the record.
