@@ -85,6 +85,7 @@ def record_again(recorded: Record, solution: Solution, solved_with: Mapping[str,
         if calibration is not None and found.name in corrected:
             draft.whole[found.name] = whole_of(calibration, found)
     draft.written = {imu.name: dict(imu.written) for imu in recorded.imus}
+    draft.device_ids = {imu.name: (imu.gyro_id, imu.accel_id) for imu in recorded.imus}
     draft.unchanged = {(imu.name, triad) for imu in recorded.imus for triad in imu.unchanged}
     words = in_words(draft)
     reason = recorded.reason

@@ -248,6 +248,7 @@ class FleetFace:
                 await link.hear(topic)
             name = self._settings.name if kept.aircraft == self._of else None
             link.outbox.keep(topics.hello, wire.hello(kept, name, _utc_now()))
+            link.outbox.send_again(topics.hello)  # though it be the same as before
             self._greeted[kept.aircraft], self._hello_s = kept.last, now_s
 
     def _begin_again(self) -> None:
