@@ -74,7 +74,7 @@ def glance(connection: sa.Connection, now: datetime.datetime) -> str:
         )
         for stands, one in each
     ]
-    head = tag("tr", *(tag("th", words) for words in ("Aircraft", "Calibration", "Heard")))
+    head = tag("tr", *(tag("th", words) for words in ("Aircraft", "Calibration", "Seen")))
     return page(
         "Fleet",
         now,

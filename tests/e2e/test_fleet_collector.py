@@ -14,7 +14,7 @@ import pytest
 import sqlalchemy as sa
 
 from companion.fleet.simulated import Aircraft
-from companion.fleet.store import Store
+from companion.fleet.store import Store, engine_of
 from companion.physics.units import DEG_H
 from tests.support.broker import MOSQUITTO, Broker, broker
 from tests.support.collecting import (
@@ -86,6 +86,8 @@ def test_collectors_are_killed_and_started_again_and_again(database: str, tmp_pa
                     await running[0].at_work()
                     await asyncio.sleep(dice.uniform(0.0, 0.6))
                     running.pop(0).kill()
+                    confirmed = {(each.id, number) for each in fleet for number in each.confirmed}
+                    assert confirmed <= {(row[0], row[2]) for row in items_in(database)}
                     running.append(another())
                 telling_on.cancel()
                 await until_confirmed(fleet)
@@ -136,6 +138,39 @@ def test_the_broker_and_the_database_are_killed_and_come_back(
                         await until_confirmed(fleet)
                 assert collector.stop() == 0
             finally:
+                collector.kill()
+
+    asyncio.run(main())
+    assert items_in(database) == told_by(fleet)
+
+
+@pytest.mark.parametrize("database", KINDS, indirect=True)
+def test_nothing_is_confirmed_before_it_is_committed(database: str, tmp_path: Path) -> None:
+    """Somebody else holds the table: what was told waits there, and all of it is confirmed once that one has let go."""
+    (one_aircraft,) = fleet = fleet_of(1, 5, seed=7)
+    # To ask for a connection locks SQLite's file already.
+    lock = "LOCK TABLE items IN EXCLUSIVE MODE" if database.startswith("postgresql") else "SELECT 1"
+
+    async def main() -> None:
+        store = Store(database)
+        store.prepare()
+        store.close()
+        async with broker(tmp_path) as one:
+            collector = CollectorProcess(tmp_path, "collector", one, database)
+            other = engine_of(database)
+            try:
+                await collector.at_work()
+                with other.connect() as connection:
+                    connection.exec_driver_sql(lock)
+                    async with telling(fleet, one):
+                        while one_aircraft.deliveries < 8:
+                            await asyncio.sleep(0.05)
+                        await asyncio.sleep(1.0)
+                        assert one_aircraft.confirmed == set()
+                        connection.rollback()
+                        await until_confirmed(fleet)
+            finally:
+                other.dispose()
                 collector.kill()
 
     asyncio.run(main())
