@@ -7,7 +7,7 @@ import contextlib
 import json
 import shutil
 import signal
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -190,17 +190,14 @@ class Flight:
         attitude: dict[str, Any] = {}
         try:
             async with asyncio.timeout(PUSHED_WITHIN_S):
-                while not (attitude.get("pushing") and self._is_in_use()):
+                while not (attitude.get("pushing") and is_ours(self._told())):
                     await asyncio.sleep(0.5)
                     attitude = (await self.ask("status"))["attitude"]
         except TimeoutError:
             raise TimeoutError(f"no heading is pushed, or it is not in use: {attitude}") from None
 
-    def _is_in_use(self) -> bool:
-        """Whether the latest that was said of the source of the heading, if anything, names the companion."""
-        texts = [each.text for each in self.ground.all(mavlink.MAVLink_statustext_message, since_s=self._since_s)]
-        told = [text for text in texts if text.startswith("Heading: ")]
-        return not told or told[-1].startswith("Heading: companion")
+    def _told(self) -> list[str]:
+        return [each.text for each in self.ground.all(mavlink.MAVLink_statustext_message, since_s=self._since_s)]
 
     async def fly(self) -> Record:
         """Take off, hold, let the fault happen, and watch; the record.
@@ -253,6 +250,12 @@ class Flight:
         record.events = events_of(ground, self._since_s, lambda t_s: _at(t_s, arrived, record.estimate[:, 0]))
         record.events += self.vehicle.source_changes()
         record.events.sort()
+
+
+def is_ours(texts: Sequence[str]) -> bool:
+    """Whether the latest that was said of the source of the heading, if anything, names the companion."""
+    told = [text for text in texts if text.startswith("Heading: ")]
+    return not told or told[-1].startswith("Heading: companion")
 
 
 def _at(t_s: float, arrived: Array, own: Array) -> float:

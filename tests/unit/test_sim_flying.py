@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.flying.ardupilot import state_of
 from sim.flying.cli import main, parser, plans_of
+from sim.flying.flight import is_ours
 from sim.flying.mission import upload
 from sim.flying.px4 import Truth, source_changes
 from sim.flying.truth import BEHIND_S, FlyingAircraft, State, angles_of_quaternion
@@ -333,3 +334,17 @@ def test_what_a_firmware_cannot_do_is_said_before_it_is_started(
         main(words)
     assert ended.value.code == 2
     assert why in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("told", "ours"),
+    [
+        ([], True),
+        (["Heading: compass, companion silent", "Heading: companion"], True),
+        (["Heading: companion", "Heading: gyros, companion silent", "EKF3 IMU0 is using GPS"], False),
+        (["Heading: compass, companion's is not pushed"], False),
+    ],
+)
+def test_the_fault_waits_until_our_heading_is_the_one_in_use(told: list[str], ours: bool) -> None:
+    """The words are those of companion_arming.lua and of the daemon."""
+    assert is_ours(told) is ours
