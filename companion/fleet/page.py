@@ -82,7 +82,7 @@ def glance(connection: sa.Connection, now: datetime.datetime) -> str:
         tag(
             "p", f"{len(found)} aircraft: {', '.join(words)}" if found else "No aircraft was heard yet.", class_="lead"
         ),
-        tag("table", head, *rows) if rows else None,
+        tag("table", head, *rows, class_="fleet") if rows else None,
         _refused(connection, now),
         source=_SOURCE,
     )
