@@ -196,7 +196,7 @@ def test_after_a_crash_the_file_that_was_left_open_is_waited_for(tmp_path: Path,
 
 
 def test_a_client_that_goes_away_ends_it_and_another_goes_on(tmp_path: Path) -> None:
-    log = content(100_000)
+    log = content(400_000)
 
     async def main() -> None:
         async with grounded(tmp_path, "px4", log) as (rig, _):
