@@ -28,14 +28,21 @@ class Straying:
         self._last: tuple[float, float, float] | None = None
         self._turned_rad = self._sigma_rad = self._apart_rad = 0.0
 
+    def skip(self) -> None:
+        """Leave the step to the next instant out: its two ends were not told equally late."""
+        self._last = None
+
     def add(self, t_s: float, heading_rad: float, sigma_rad: float, rate_rad_s: float, late_s: float = 0.0) -> None:
         """Heading with its sigma, and how fast the other gyros turn about the vertical; after a gap it begins anew.
 
         `late_s`: by how much more than usual the times of the two may lie apart.
         """
         before, self._last = self._last, (t_s, heading_rad, rate_rad_s)
-        passed_s = 0.0 if before is None else t_s - before[0]
-        if before is None or not 0.0 < passed_s <= LONGEST_STEP_S:
+        if before is None:
+            self._sigma_rad = max(self._sigma_rad, sigma_rad)
+            return
+        passed_s = t_s - before[0]
+        if not 0.0 < passed_s <= LONGEST_STEP_S:
             self.strayed_rad = self._turned_rad = self._apart_rad = 0.0
             self._sigma_rad, self.is_too_far = sigma_rad, False
             return

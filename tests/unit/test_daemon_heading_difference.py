@@ -11,7 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.attitude.estimator import Attitude
-from companion.attitude.quaternion import Quaternion, from_roll_pitch_yaw
+from companion.attitude.quaternion import Quaternion, conjugate, from_roll_pitch_yaw, multiply, rotate
 from companion.daemon.heading.health import ATTITUDE_RATE_HZ, Difference
 
 TURNS_AT_S = 60.0
@@ -73,3 +73,31 @@ def test_a_drift_is_seen_although_the_line_is_late_at_times() -> None:
     last = round((TURNS_AT_S + 1.0) * ATTITUDE_RATE_HZ)
     late = compare(0.0, 1.0, lambda k: 0.3 if last - 100 < k <= last else 0.0, drift_rad_s=math.radians(3.0))
     assert late.straying.is_too_far
+
+
+def test_a_line_that_is_quicker_now_and_then_hides_no_drift() -> None:
+    """PX4 leaps to a heading that it has refused for 1 s; one of 3 deg/s it refuses from 2.7 s on."""
+    late = compare(0.0, 1.0, lambda k: 0.0 if k % 18 == 0 else 0.08, drift_rad_s=math.radians(3.0))
+    assert late.straying.is_too_far
+    assert late.heard_s < TURNS_AT_S + 2.7
+
+
+def test_what_is_sent_has_the_autopilots_vertical_and_our_heading() -> None:
+    """Both lean by 33 deg towards a corner, ours by 4 deg less: PX4 would take the two headings in other orders."""
+    heard: list[Callable[[Any, float], None]] = []
+    vehicle: Any = SimpleNamespace(hear=lambda _message, handler, _rate: heard.append(handler))
+    angles = (math.radians(-20.0), math.radians(21.0), math.radians(40.0))
+    sigma = (0.02, 0.02, 0.02)
+    ours = Attitude(10.0, from_roll_pitch_yaw(*angles), *angles, (0.0, 0.0, 0.0), sigma)
+    difference = Difference(vehicle, lambda: ours, lambda _t_s: (10.0, ours.quaternion))
+    assert difference.levelled(ours, 10.0) is ours
+    roll, pitch = math.radians(-24.0), math.radians(23.0)
+    heard[0](mavlink.MAVLink_attitude_message(5000, roll, pitch, math.radians(41.0), 0.0, 0.0, 0.0), 10.0)
+    found = difference.levelled(ours, 10.1)
+    assert (found.roll_rad, found.pitch_rad) == pytest.approx((roll, pitch), abs=1e-6)
+    # Turned about a level axis: what is forward, seen from above, has turned by the share of it that the tilt lets.
+    down = rotate(multiply(found.quaternion, conjugate(ours.quaternion)), (0.0, 0.0, 1.0))
+    turn = multiply(found.quaternion, conjugate(ours.quaternion))
+    assert turn[3] == pytest.approx(0.0, abs=1e-6)
+    assert math.degrees(math.acos(down[2])) == pytest.approx(4.3, abs=0.3)
+    assert (found.t_s, found.sigma_rad, found.rate_rad_s) == (ours.t_s, ours.sigma_rad, ours.rate_rad_s)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
+import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.attitude.corrections import REFUSED_S
@@ -19,6 +20,7 @@ from companion.attitude.quaternion import (
     multiply,
     roll_pitch_yaw,
     rotate,
+    shortest_arc,
 )
 from companion.attitude.straying import LATE_S, Straying
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
@@ -82,6 +84,7 @@ class Difference:
         """What we carry has been set anew."""
         self._sine = self._cosine = 0.0
         self._down: Triple = (0.0, 0.0, 0.0)
+        self._down_now: Triple = (0.0, 0.0, 0.0)
         self._since_s = math.inf
         self.straying = Straying()
         """Of our heading against the autopilot's gyros."""
@@ -103,6 +106,21 @@ class Difference:
     def heading_rad(self) -> float:
         """Theirs less ours, smoothed, in [-pi, pi]."""
         return math.atan2(self._sine, self._cosine)
+
+    def levelled(self, attitude: Attitude, now_s: float) -> Attitude:
+        """Ours, turned by the shortest way to the vertical of the autopilot, as far as that is known.
+
+        PX4 compares headings in the order of angles that a tilt asks for: its own tilt where it takes its own heading,
+        ours where it takes ours. At 30 deg of tilt the two orders are up to 10 deg apart, and to a heading that it has
+        refused for 1 s it leaps (ev_yaw_control.cpp, getEulerYaw).
+        """
+        if not self.is_heard(now_s):
+            return attitude
+        ours = rotate(conjugate(attitude.quaternion), _DOWN)
+        x, y, z = (a + b for a, b in zip(ours, self._down_now, strict=True))
+        turn = multiply(attitude.quaternion, shortest_arc((x, y, z), ours))
+        roll, pitch, yaw = roll_pitch_yaw(turn)
+        return msgspec.structs.replace(attitude, quaternion=turn, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
 
     def _on_attitude(self, message: mavlink.MAVLink_attitude_message, t_s: float) -> None:
         angles = (message.roll, message.pitch, message.yaw)
@@ -135,6 +153,7 @@ class Difference:
         gain = 1.0 if first else 1.0 - math.exp(-span_s / SMOOTHED_S)
         mine, other = rotate(conjugate(ours), _DOWN), rotate(conjugate(theirs), _DOWN)
         down = [b - a for a, b in zip(mine, other, strict=True)]
+        self._down_now = (down[0], down[1], down[2])
         x, y, z = (kept + gain * (new - kept) for kept, new in zip(self._down, down, strict=True))
         self._down = (x, y, z)
         self.latest = None
@@ -156,7 +175,7 @@ class Difference:
             self._forgotten_s += forgotten_s
             if offset_s < self._offset_s - LATE_S:
                 # The line was late, and is less so: in a turn the two would seem to part at this moment.
-                self.straying = Straying()
+                self.straying.skip()
         if offset_s <= self._offset_s:
             self._offset_s, self._forgotten_s = offset_s, 0.0
         return offset_s - self._offset_s
