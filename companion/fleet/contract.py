@@ -294,8 +294,8 @@ def _of(aircraft: str, told: _Keyed) -> _Keyed:
 
 def _same(told: _Told, rows: Rows) -> str:
     """What a thing has told again under another epoch: all but whether it has been undone since."""
-    if rows:
-        content = repr([(table, {**row, "undone_at": None}) for table in sorted(rows) for row in rows[table]])
-    else:
-        content = repr(msgspec.json.encode(msgspec.json.decode(told.body), order="deterministic"))
-    return hashlib.sha256(f"{told.kind}\0{told.at}\0{content}".encode()).hexdigest()[:32]
+    content: Any = [(table, {**row, "undone_at": None}) for table in sorted(rows) for row in rows[table]]
+    if not rows:
+        content = msgspec.json.decode(told.body)
+    told_again = msgspec.json.encode((told.kind, told.at, content), order="deterministic")
+    return hashlib.sha256(told_again).hexdigest()[:32]

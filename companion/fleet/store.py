@@ -7,6 +7,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from typing import Any, Final, NamedTuple
 
+import msgspec
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
@@ -215,7 +216,20 @@ class Store:
         if rows:
             keys = [column.name for column in table.primary_key]
             rows.sort(key=lambda row: [row[key] for key in keys])
-            connection.execute(self._insert(table).on_conflict_do_nothing(), rows)
+            insert, values = self._insert_many(table, rows)
+            connection.execute(insert.on_conflict_do_nothing(), values)
+
+    def _insert_many(self, table: sa.Table, rows: list[Row]) -> tuple[Any, Any]:
+        """A statement for all of them, and its values. PostgreSQL takes them at once, as JSON: a third of the time."""
+        insert, names = self._insert(table), list(rows[0])
+        if self._insert is sqlite.insert:
+            return insert, rows
+        text = msgspec.json.encode(rows).decode()
+        if "\\u0000" in text:
+            text = msgspec.json.encode([{name: _without_zero(row[name]) for name in row} for row in rows]).decode()
+        like = sa.text(f"NULL::{table.name}")
+        source = sa.func.json_populate_recordset(like, sa.bindparam("rows")).table_valued(*names)
+        return insert.from_select(names, sa.select(source)), {"rows": text}
 
     def _hear(
         self,
@@ -224,17 +238,19 @@ class Store:
         heard: set[str],
         now: datetime.datetime,
     ) -> None:
-        rows: dict[str, Row] = {name: {"aircraft": name, "heard_at": now} for name in heard}
+        table = schema.aircraft
+        nothing: Row = dict.fromkeys(table.c.keys())
+        rows = {name: {**nothing, "aircraft": name, "heard_at": now} for name in heard}
         for hello, retained in hellos:
-            row = rows.setdefault(hello.aircraft, {"aircraft": hello.aircraft})
+            row = rows.setdefault(hello.aircraft, {**nothing, "aircraft": hello.aircraft})
             row |= {"name": hello.name, "epoch": hello.epoch, "first": hello.first, "last": hello.last}
             row["hello_at"] = _moment_or_none(hello.at)
             if not retained:  # else it was said some time ago
                 row["heard_at"] = now
-        for _, row in sorted(rows.items()):
-            insert = self._insert(schema.aircraft).values(row)
-            news = {column: insert.excluded[column] for column in row if column != "aircraft"}
-            connection.execute(insert.on_conflict_do_update(index_elements=["aircraft"], set_=news))
+        if rows:
+            insert, values = self._insert_many(table, [row for _, row in sorted(rows.items())])
+            news = {name: sa.func.coalesce(insert.excluded[name], table.c[name]) for name in nothing}
+            connection.execute(insert.on_conflict_do_update(index_elements=["aircraft"], set_=news), values)
 
     def _keep_aside(
         self, connection: sa.Connection, refused: Sequence[tuple[Message, str]], now: datetime.datetime
@@ -322,6 +338,11 @@ def _moment_or_none(words: str) -> datetime.datetime | None:
         return moment(words)
     except NotTakenError:
         return None
+
+
+def _without_zero(value: object) -> object:
+    """PostgreSQL has no zero byte in a text."""
+    return value.replace("\0", "\ufffd") if isinstance(value, str) else value
 
 
 def _digest(message: Message) -> str:

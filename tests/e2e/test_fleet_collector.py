@@ -14,7 +14,7 @@ import pytest
 import sqlalchemy as sa
 
 from companion.fleet.simulated import Aircraft
-from companion.fleet.store import Store, engine_of
+from companion.fleet.store import Message, Store, engine_of
 from companion.physics.units import DEG_H
 from tests.support.broker import MOSQUITTO, Broker, broker
 from tests.support.collecting import (
@@ -200,6 +200,27 @@ def test_a_new_database_asks_for_all_that_was_confirmed_long_ago(database: str, 
                 collector.kill()
 
     asyncio.run(main())
+
+
+@pytest.mark.parametrize("database", KINDS, indirect=True)
+def test_odd_texts_come_into_every_database(database: str) -> None:
+    """A zero byte is none of a text of PostgreSQL; the same six characters as text, quotes and umlauts stay."""
+    one, odd = Aircraft(1), 'a\0b \\u0000 "Bö\u2028"'
+    one.calibrate(NOW, odd)
+    one.arm(NOW)
+    hello = json.loads(one.hello)
+    messages = [Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()]
+    store = Store(database)
+    store.prepare()
+    for name in (odd, None):  # a former aircraft of a companion is told without: it keeps its name
+        said = json.dumps({**hello, "name": name}).encode()
+        outcome = store.take([*messages, Message(f"fleet/{one.id}/hello", said)])
+        assert outcome == ({(one.id, one.epoch): [1, 2]}, {}, [])
+    store.close()
+    wanted = odd.replace("\0", "\ufffd")
+    assert rows_of(database, sa.text("SELECT reason FROM calibrations"))[0][0] == wanted
+    assert rows_of(database, sa.text("SELECT name FROM aircraft"))[0][0] == wanted
+    assert items_in(database) == told_by([one])
 
 
 def _is_what_was_told(database: str, fleet: list[Aircraft]) -> None:
