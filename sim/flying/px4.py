@@ -208,7 +208,7 @@ class FlyingPx4(FlyingVehicle):
             "PX4_HOME_LAT": f"{site.latitude_deg}",
             "PX4_HOME_LON": f"{site.longitude_deg}",
             "PX4_HOME_ALT": f"{site.height_m}",
-            "PX4_HOME_YAW": f"{math.degrees(self.aircraft.angles_rad(0.0)[2]):.1f}",
+            "PX4_HOME_YAW": f"{math.remainder(self.aircraft.angles_rad(0.0)[2], math.tau):.4f}",  # SIH_LOC_YAW0, in rad
         }
         if not (self.folder / self.stored[0]).exists():
             values = MEASURING_PARAMETERS | self._wind | {"SDLOG_BACKEND": 0.0, "COM_LOW_BAT_ACT": 0.0}
