@@ -188,6 +188,23 @@ def test_who_may_be_armed_is_not_aligned_as_on_the_ground(tmp_path: Path) -> Non
     run_virtual(main())
 
 
+def test_who_may_be_armed_is_carried_as_in_flight(tmp_path: Path) -> None:
+    """On the ground, its heartbeats lost: it may have armed, so that no stillness is believed until they are back."""
+
+    async def main() -> None:
+        async with flight(tmp_path) as flying:
+            rig, carrier = flying.rig, flying.attitude.carrier
+            await rig.until(lambda: (carrier.phase, carrier.still) == ("ground", True), 10.0)
+            rig.double.faults.heartbeat_off = True
+            await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.UNKNOWN, 10.0)
+            await flying.sleep(2.0)
+            assert (carrier.phase, carrier.still) == ("flight", False)
+            rig.double.faults.heartbeat_off = False
+            await rig.until(lambda: (carrier.phase, carrier.still) == ("ground", True), 10.0)
+
+    run_virtual(main())
+
+
 def exchanged_part(flying: Flight) -> None:
     flying.rig.double.set_parameter("INS_GYR_ID", flying.rig.double.parameter("INS_GYR_ID") + 1)
 
