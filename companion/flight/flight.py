@@ -180,7 +180,8 @@ async def _imu(
         began_s = datetime.datetime.fromisoformat(match[0].started_at).timestamp()
         after_s = began_s - boot.unix_offset_s - stages.armed_s
         if after_s > 0.0:
-            notes.append(f"clocks differ: by them its calibration began {after_s / 3600.0:.1f} h after this arming")
+            after = datetime.timedelta(seconds=round(after_s))
+            notes.append(f"clocks differ: by them its calibration began {after} h after this arming")
     up_s, down_s = stages.take_off_s, stages.landing_s or stages.disarmed_s or float(reference.t_s[-1])
     in_air = None if up_s is None else (up_s + _SETTLED_S, down_s - _SETTLED_S)
     if in_air is None or in_air[1] - in_air[0] < _LEAST_AIR_S:

@@ -69,7 +69,7 @@ def _boot(start: Start) -> Boot:
         parameters=tuple(start.parameters),
         unix_offset_s=_unix_offset(start),
         place=_place(start),
-        notes=(f"{start.gaps} gaps in it, in which PX4 could not write",) if start.gaps else (),
+        notes=(f"gaps in it, in which PX4 could not write: {start.gaps}",) if start.gaps else (),
     )
 
 

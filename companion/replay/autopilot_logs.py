@@ -73,7 +73,7 @@ def read_ulog(path: Path) -> list[StillLog]:
     logs = [log for log in _ulog_imus(path, data) if log is not None]
     if not logs:
         raise StorageError(f"{path}: no samples of an IMU in it")
-    notes = (f"{dropouts} gaps in it, in which PX4 could not write",) if dropouts else ()
+    notes = (f"gaps in it, in which PX4 could not write: {dropouts}",) if dropouts else ()
     return [msgspec.structs.replace(log, notes=(*log.notes, *notes)) for log in logs]
 
 

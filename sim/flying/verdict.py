@@ -182,7 +182,7 @@ def summary(fault: str, set_up: str, flights: Sequence[Figures | None]) -> str:
         return text
     columns = {
         "yaw": ([flight.yaw_deg for flight in found], "deg"),
-        "set 2 after": ([flight.fallback_s for flight in found], "s"),
+        "other set after": ([flight.fallback_s for flight in found], "s"),
         "off truth": ([flight.estimate_m for flight in found], "m"),
         "off spot": ([flight.spot_m for flight in found], "m"),
     }

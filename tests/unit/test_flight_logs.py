@@ -102,7 +102,7 @@ def test_a_flight_is_told_with_what_its_calibration_was_worth(
     assert flight["reference"] == "ekf"
     (imu,) = flight["imus"]
     assert imu["calibration"] == BEGAN
-    assert imu["notes"] == ["clocks differ: by them its calibration began 8.0 h after this arming"]
+    assert imu["notes"] == ["clocks differ: by them its calibration began 7:59:14 h after this arming"]
     found = {axis["axis"]: axis for axis in imu["axes"]}
     for axis, bias in zip("xyz", GYRO_DEG_H, strict=True):
         term = found[f"gyro {axis}"]["turn_on"]
@@ -284,7 +284,7 @@ def test_what_px4_could_not_write_is_said_and_not_flown_over(
     _, answer = said(capsys, path, *storage(tmp_path))
     _, whole = said(capsys, of_px4(flown, tmp_path / "whole.ulg"), *storage(tmp_path))
     (flight,), (expected,) = answer["flights"], whole["flights"]
-    assert flight["notes"] == ["2 gaps in it, in which PX4 could not write"]
+    assert flight["notes"] == ["gaps in it, in which PX4 could not write: 2"]
     for rows, others in zip(*(each["imus"][0]["drift"]["flown"] for each in (flight, expected)), strict=True):
         # None begins before the gap and ends after it.
         assert rows["starts"] == pytest.approx(others["starts"] - rows["seconds"] - 2.0, abs=2.0)

@@ -72,7 +72,7 @@ def test_a_real_log_of_px4_is_read_as_another_reader_reads_it(capsys: pytest.Cap
     assert used["to_s"] > 67.0
     assert any(each["why"].startswith("gyro sensor_combined") for each in used["unused"])
     assert any("drifts" in warning for warning in record["imus"][0]["warnings"])
-    assert "4 gaps in it, in which PX4 could not write" in used["notes"]
+    assert "gaps in it, in which PX4 could not write: 4" in used["notes"]
 
 
 def test_what_px4_flies_by_and_its_sensors_are_imus_of_their_own(

@@ -185,7 +185,8 @@ def test_several_flights_in_a_line() -> None:
         assert flight.fallback_s == math.inf
     line = summary("kill", "script", [*flights, None])
     assert line.startswith(
-        "kill, script: 2 of 3 flights good, 1 did not come about; largest (median): yaw 12.6 (2.6) deg"
+        "kill, script: 2 of 3 flights good, 1 did not come about; largest (median): yaw 12.6 (2.6) deg,"
+        " other set after inf (inf) s, "
     )
     assert summary("kill", "script", [None]) == "kill, script: 0 of 0 flights good, 1 did not come about"
 
