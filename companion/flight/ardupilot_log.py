@@ -18,7 +18,7 @@ from companion.replay.blocks import Progress
 from companion.replay.dataflash import dataflash
 
 _ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
-    "IMU": ("I", ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ", "T")),
+    "IMU": ("I", ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ", "T", "GH", "AH")),
     "GYR": ("I", ("GyrX", "GyrY", "GyrZ")),
     "ACC": ("I", ("AccX", "AccY", "AccZ")),
     "VIBE": ("IMU", ("VibeX", "VibeY", "VibeZ")),
@@ -102,7 +102,9 @@ def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[
     rows = start.rows("IMU", instance)
     raw = _raw(start.rows("GYR", instance), start.rows("ACC", instance))
     name, used = ("GYR", raw) if len(raw) > len(rows) else ("IMU", rows[:, :7])
-    used = used[np.isfinite(used).all(axis=1)]
+    failed = (rows[:, 8:10] < 1.0).any(axis=1)  # not so in a log that does not say
+    told = np.searchsorted(rows[:, 0], used[:, 0], side="right") - 1
+    used = used[np.isfinite(used).all(axis=1) & ~failed[np.maximum(told, 0)]]
     vibration = start.rows("VIBE", instance)
     number = instance + 1
     prefix, suffix = (f"INS{number}_", "") if number > 3 else ("INS_", "" if number == 1 else str(number))
@@ -112,6 +114,7 @@ def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[
         number=number, t_s=used[:, 0], readings=used[:, 1:7], means=start.means(name, instance),
         gyro_id=gyro_id, accel_id=accel_id,
         degc=rows[np.isfinite(rows[:, 7])][:, [0, 7]],
+        failed_s=rows[failed, 0],
         vibration=np.column_stack([vibration[:, 0], np.linalg.norm(vibration[:, 1:4], axis=1)]),
         estimated=_estimated(start, cores.index(instance)) if instance in cores else None,
     )  # fmt: skip

@@ -187,6 +187,10 @@ async def _imu(
     if in_air is None or in_air[1] - in_air[0] < _LEAST_AIR_S:
         in_air = None
         notes.append("it did not fly, or too shortly to tell anything")
+    failed_s = imu.failed_s[(imu.failed_s >= stages.armed_s) & (imu.failed_s <= down_s)]
+    if len(failed_s):
+        after_s = failed_s[0] - stages.armed_s
+        notes.append(f"the autopilot found it failed {after_s:.0f} s after arming: what it read then is left aside")
     if imu.rate_hz < _SLOW_HZ and boot.firmware == "ardupilot" and not imu.means:
         notes.append(f"logged at {imu.rate_hz:.0f} Hz only: LOG_BITMASK with IMU_FAST would tell more")
     if len(found.t_s) < 2:

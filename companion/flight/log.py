@@ -144,6 +144,8 @@ class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
     vibration: Floats = np.zeros((0, 2))
     """Time and level, m/s^2."""
     estimated: Estimated | None = None
+    failed_s: Floats = np.zeros(0)
+    """When the autopilot took it for failed: what it reads then is not among its readings."""
 
     @property
     def rate_hz(self) -> float:

@@ -441,6 +441,33 @@ def test_the_lane_that_it_has_flown_by_for_longest_is_the_reference(
     assert 60.0 < flight["imus"][0]["drift"]["flown"][1]["median_m"] < 200.0
 
 
+@pytest.mark.parametrize("raw", [False, True])
+def test_what_a_failed_imu_reads_is_left_aside(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], *, raw: bool
+) -> None:
+    """As real ArduPilots log a gyro that hangs: the same rates again and again, and GH 0."""
+    told, hangs = [], ()
+    for name, values in messages(flown, parameters()):
+        if name == "IMU":
+            t_us, instance, *row = values
+            if t_us > 164e6:
+                hangs = hangs or tuple(row[:3])
+                row = [*hangs, *row[3:9], 0, *row[10:]]
+            if raw:
+                told += [("GYR", (t_us, instance, t_us, *row[:3])), ("ACC", (t_us, instance, t_us, *row[3:6]))]
+            if not raw or t_us % 100000 == 0:
+                told.append((name, (t_us, instance, *row)))
+        else:
+            told.append((name, values))
+    _, answer = said(capsys, dataflash(tmp_path / "failed.bin", told), *storage(tmp_path))
+    (imu,) = answer["flights"][0]["imus"]
+    assert imu["notes"] == ["the autopilot found it failed 100 s after arming: what it read then is left aside"]
+    for axis, bias, unit in zip(imu["axes"], (*GYRO_DEG_H, ACCEL_MG[2] + STEP_MG), (*[DEG_H] * 3, MG), strict=True):
+        assert abs(axis["in_flight"]["value"] / unit - bias) < 2.0 * axis["in_flight"]["sigma"] / unit
+    # From 70 s to 164 s.
+    assert imu["drift"]["flown"][0]["starts"] == pytest.approx(164 - 70 - 10, abs=2)
+
+
 def test_a_truncated_and_damaged_log_is_read_as_far_as_it_goes(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
