@@ -102,7 +102,7 @@ def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[
     rows = start.rows("IMU", instance)
     raw = _raw(start.rows("GYR", instance), start.rows("ACC", instance))
     name, used = ("GYR", raw) if len(raw) > len(rows) else ("IMU", rows[:, :7])
-    failed = (rows[:, 8:10] < 1.0).any(axis=1)  # not so in a log that does not say
+    failed: NDArray[np.bool_] = np.any(rows[:, 8:10] < 1.0, axis=1)  # not so in a log that does not say
     told = np.searchsorted(rows[:, 0], used[:, 0], side="right") - 1
     used = used[np.isfinite(used).all(axis=1) & ~failed[np.maximum(told, 0)]]
     vibration = start.rows("VIBE", instance)

@@ -446,7 +446,8 @@ def test_what_a_failed_imu_reads_is_left_aside(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], *, raw: bool
 ) -> None:
     """As real ArduPilots log a gyro that hangs: the same rates again and again, and GH 0."""
-    told, hangs = [], ()
+    told: list[tuple[str, tuple[Any, ...]]] = []
+    hangs: tuple[Any, ...] = ()
     for name, values in messages(flown, parameters()):
         if name == "IMU":
             t_us, instance, *row = values
