@@ -52,11 +52,13 @@ PLANE_HEIGHT_M = 60.0
 PLANE_LEGS = 8.0
 """A plane's mission is so many times as large."""
 SETTLED_S = 6.0
-PLANE_SETTLED_S = 20.0
-"""By then it is on its circle."""
+PLANE_SETTLED_S = 75.0
+"""By then it has been on its circle for a whole one."""
 WATCHED_S = 35.0
 SLOWEST = 0.9
 """Share of the wall's time in which firmware and daemon still see the same world."""
+HANGS_S = 0.3
+"""A daemon cannot tell a firmware or a bench that this machine lets wait for so long from the fault of a flight."""
 TURNS_AFTER_S, TURN_DEG = 12.0, 120.0
 """The pilot turns it about, with the fault in force."""
 OTHER_SETS = ("EK3_SRC2", "EK3_SRC3")
@@ -91,6 +93,8 @@ class Flight:
         self._since_s = 0.0
         self._asked_modes = 0
         self._background: list[asyncio.Task[None]] = []
+        self._hung_s = 0.0
+        """The longest time without news of the firmware since the watch began."""
         self._stack = contextlib.AsyncExitStack()
         self.daemon: CompanionProcess
 
@@ -222,6 +226,7 @@ class Flight:
         record.circle = vehicle.circle
         await self.pushed()
         begun_s, record.struck_s = asyncio.get_running_loop().time(), vehicle.truth.own_s
+        self.in_background(self._watch())
         await FAULTS[self.plan.fault].strike(self)
         await vehicle.sleep(TURNS_AFTER_S)
         if not self.plan.mission:
@@ -230,9 +235,20 @@ class Flight:
         speed = (vehicle.truth.own_s - record.struck_s) / (asyncio.get_running_loop().time() - begun_s)
         if speed < SLOWEST:
             raise RuntimeError(f"this machine is too slow: the firmware's clock ran at {speed:.2f} of the wall's")
+        if self._hung_s > HANGS_S:
+            raise RuntimeError(f"this machine is too slow: nothing moved for {self._hung_s:.1f} s")
         self._take_down()
         np.savez(self.folder / "record.npz", truth=record.truth, estimate=record.estimate, place=record.place)
         return record
+
+    async def _watch(self) -> None:
+        loop, truth = asyncio.get_running_loop(), self.vehicle.truth
+        moved_s, own_s = loop.time(), truth.own_s
+        while True:
+            await asyncio.sleep(0.02)
+            self._hung_s = max(self._hung_s, loop.time() - moved_s)
+            if truth.own_s != own_s:
+                moved_s, own_s = loop.time(), truth.own_s
 
     def _take_down(self) -> None:
         """What truth and ground station have seen, as a record."""

@@ -23,6 +23,8 @@ LOW_M = 1.0
 """Below it the flight is over."""
 BEFORE_S = 10.0
 """What is compared with how it was before the fault is compared with so many seconds."""
+CIRCLE_S = 50.0
+"""A plane's circle takes about so long in any wind, which it is off by in one part of it more than in another."""
 SETTLED_S = 1.0
 """What the estimate is off by, in place, is taken over so long before the fault."""
 HEADER = f"{'fault':16}{'set-up':9}{'wind':>12}{'yaw':>7}{'other set':>13}{'off truth':>11}{'off spot':>10}  verdict"
@@ -77,7 +79,7 @@ class Figures:
     """Largest horizontal error of the estimated place, less what it was before."""
     spot_m: float
     """Largest true horizontal distance from where it was at the fault, or from the circle that it is to fly: that one
-    less its largest distance in the last seconds before; nan where it is neither to stay nor to circle."""
+    less its largest distance in the circle before; nan where it is neither to stay nor to circle."""
     sets: int
     """Changes of the source set."""
     modes: int
@@ -144,7 +146,7 @@ def _off_spot_m(record: Record, flown: Array) -> float:
     north_m, east_m, radius_m = record.circle
     off = np.abs(np.hypot(record.truth[:, 4] - north_m, record.truth[:, 5] - east_m) - radius_m)
     after = record.truth[:, 0] >= record.struck_s
-    before = ~after & (record.truth[:, 0] > record.struck_s - BEFORE_S)
+    before = ~after & (record.truth[:, 0] > record.struck_s - CIRCLE_S)
     return max(0.0, float(off[after].max() - off[before].max()))
 
 
