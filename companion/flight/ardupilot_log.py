@@ -62,12 +62,11 @@ def _boot(start: Start) -> Boot:
     parameters = {name: value for _, name, value in start.parameters}
     cores = _cores(parameters)
     lanes = _lanes(start)
-    primary = int(np.bincount(lanes).argmax())
     simulated = bool(start.instances("SIM"))
     return Boot(
         firmware="ardupilot",
         imus=tuple(_imu(start, number, parameters, cores) for number in start.instances("IMU")),
-        solution=joined(start.rows("XKQ", primary), start.rows("XKF1", primary)),
+        solution=joined(_in_use(start, "XKQ", lanes), _in_use(start, "XKF1", lanes)),
         truth=joined(start.rows("SIM"), start.rows("SIM2")),
         armed=_events(start, "armed"),
         motors=_motors(start.rows("RCOU"), parameters),
@@ -80,7 +79,7 @@ def _boot(start: Start) -> Boot:
         standard_gravity=simulated,
         notes=(
             *(("simulated: the Earth does not turn in it",) if simulated else ()),
-            *((f"the EKF has changed its lane: measured from lane {primary}",) if np.ptp(lanes) else ()),
+            *(("the EKF has changed its lane: measured from the one in use",) if np.ptp(lanes[:, 1]) else ()),
         ),
     )
 
@@ -91,11 +90,22 @@ def _cores(parameters: dict[str, float]) -> list[int]:
     return [k for k in range(_IMUS) if mask >> k & 1]
 
 
-def _lanes(start: Start) -> NDArray[np.int64]:
-    """The core that it flies by, message by message."""
-    told = np.concatenate([np.zeros(0), *(start.rows("XKF4", core)[:, 1] for core in start.instances("XKF4"))])
-    told = told[(told >= 0) & (told < _IMUS)].astype(np.int64)
-    return told if len(told) else np.zeros(1, dtype=np.int64)
+def _lanes(start: Start) -> Floats:
+    """(n, 2) time and the core that it flies by: each core tells it."""
+    told = next((start.rows("XKF4", core) for core in start.instances("XKF4")), np.zeros((0, 2)))
+    told = told[(told[:, 1] >= 0) & (told[:, 1] < _IMUS)]
+    return told if len(told) else np.zeros((1, 2))
+
+
+def _in_use(start: Start, name: str, lanes: Floats) -> Floats:
+    """Of a message of each core, those of the core that it flew by."""
+    parts = [start.rows(name)[:0]]
+    for core in start.instances(name):
+        rows = start.rows(name, core)
+        now = np.searchsorted(lanes[:, 0], rows[:, 0], side="right") - 1
+        parts.append(rows[lanes[np.maximum(now, 0), 1] == core])
+    found = np.concatenate(parts)
+    return np.asarray(found[np.argsort(found[:, 0])])
 
 
 def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[int]) -> FlownImu:

@@ -196,7 +196,11 @@ async def _imu(
     if len(found.t_s) < 2:
         in_air = None
     ground = [] if in_air is None else _stood(found, stages, reference, world)
-    flown = [] if in_air is None else _kept(inertial.windows(found, reference, world, in_air, LENGTH_S))
+    stretches = [] if in_air is None else inertial.windows(found, reference, world, in_air, LENGTH_S)
+    flown = _kept(stretches)
+    if aside := len(stretches) - len(flown):
+        of = f"{aside} of {len(stretches)} stretches of {LENGTH_S:.0f} s"
+        notes.append(f"{of} left aside, far off the others: the EKF has jumped, or the IMU")
     drift: dict[str, list[Drift]] = {}
     if in_air is not None:
         offsets = _others(calibration, match and match[1], known.others, found, in_air)

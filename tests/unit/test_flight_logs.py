@@ -423,22 +423,44 @@ def test_readings_at_the_sensors_own_rate_tell_the_same(
         assert abs(axis["in_flight"]["value"] / unit - bias) < 2.0 * axis["in_flight"]["sigma"] / unit
 
 
-def test_the_lane_that_it_has_flown_by_for_longest_is_the_reference(
+def test_the_lane_in_use_is_the_reference(
+    log: Path, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Until 200 s lane 0, then lane 1; of the other nothing is to be believed."""
+    told: list[tuple[str, tuple[Any, ...]]] = []
+    for name, values in messages(flown, parameters()):
+        if name in {"XKF1", "XKQ"}:
+            t_us, _, *rest = values
+            changed = t_us > 200e6
+            lost = (
+                [1.0, 0.0, 0.0, 0.0] if name == "XKQ" else [0, 0, 0, 30.0, 30.0, 5.0, 0, 900.0, 900.0, 90.0, *[0] * 4]
+            )
+            told += [(name, (t_us, int(changed), *rest)), (name, (t_us, int(not changed), *lost))]
+            if name == "XKF1":
+                told += [("XKF4", (t_us, core, *[0] * 12, int(changed))) for core in (0, 1)]
+        else:
+            told.append((name, values))
+    _, answer = said(capsys, dataflash(tmp_path / "lanes.bin", told), *storage(tmp_path))
+    _, whole = said(capsys, log, *storage(tmp_path))
+    (flight,), (expected,) = answer["flights"], whole["flights"]
+    assert flight["notes"] == ["the EKF has changed its lane: measured from the one in use"]
+    assert flight["imus"][0]["drift"] == expected["imus"][0]["drift"]
+    assert flight["imus"][0]["axes"] == expected["imus"][0]["axes"]
+
+
+def test_what_lies_far_off_is_left_aside_and_said(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = []
-    for name, values in messages(flown, parameters()):
-        told.append((name, values))
-        if name in {"XKF1", "XKQ"}:
-            t_us, core, *rest = values
-            # Of the other core nothing is to be believed.
-            told.append((name, (t_us, core + 1, *([0.0] * len(rest) if name == "XKQ" else rest))))
-        if name == "XKF1":
-            told.append(("XKF4", (values[0], 0, *[0] * 12, 1 if values[0] > 200e6 else 0)))
-    _, answer = said(capsys, dataflash(tmp_path / "lanes.bin", told), *storage(tmp_path))
-    (flight,) = answer["flights"]
-    assert flight["notes"] == ["the EKF has changed its lane: measured from lane 0"]
-    assert 60.0 < flight["imus"][0]["drift"]["flown"][1]["median_m"] < 200.0
+    """An accelerometer that breaks in the air: 300 mg more from 200 s to the landing."""
+    readings = flown.readings.copy()
+    readings[flown.t_s > 200.0, 5] += 300.0 * MG
+    path = dataflash(tmp_path / "x.bin", messages(dataclasses.replace(flown, readings=readings), parameters()))
+    _, answer = said(capsys, path, *storage(tmp_path))
+    (imu,) = answer["flights"][0]["imus"]
+    # Of 70 s to 237 s.
+    assert imu["notes"] == ["3 of 16 stretches of 10 s left aside, far off the others: the EKF has jumped, or the IMU"]
+    vertical = imu["axes"][3]["in_flight"]
+    assert abs(vertical["value"] / MG - ACCEL_MG[2] - STEP_MG) < 2.0 * vertical["sigma"] / MG
 
 
 @pytest.mark.parametrize("raw", [False, True])
