@@ -12,7 +12,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,13 +26,14 @@ from companion.storage.records import RecordStore
 from sim.companion_process import CompanionProcess
 from sim.earth import Array, earth_rate_ned_rad_s
 from sim.flying.ardupilot import FlyingArduPilot
-from sim.flying.injected import AXES, BIASES, OFFSETS, Row, recovered, rows_of, told, truth_of
+from sim.flying.injected import AXES, BIASES, OFFSETS, Row, recovered, rows_of, serial_rows, told, truth_of
 from sim.flying.px4 import FlyingPx4
 from sim.flying.truth import FlyingAircraft
 from sim.flying.vehicle import FlyingVehicle
 from sim.imu_model import DEG_H, MG, PARTS
 from sim.scenario import FIRST_ACCEL_MG, FIRST_GYRO_DEG_H, demo, site_at
-from sim.sitl.daemon import READY_WITHIN_S, daemon_configuration, devices
+from sim.serve import configuration
+from sim.sitl.daemon import READY_WITHIN_S, devices
 from sim.sitl.ground import GroundStation
 from sim.sitl.ports import LOOPBACK, free_udp_port
 from sim.sitl.process import BinaryError
@@ -42,7 +43,7 @@ from sim.thermal import Piece
 HELP = "A real firmware flies with known sensor errors: what its log tells of them, and how far it drifts, as tables."
 Kind = Literal["calm", "shaken", "warming"]
 KINDS: tuple[Kind, ...] = ("calm", "shaken", "warming")
-PART = PARTS["icm42688p"]
+PART, SERIAL_PART = PARTS["icm42688p"], PARTS["bmi088"]
 REFERENCE_DEGC = 25.0
 LATITUDE_DEG = 45.54
 """Where normal gravity is 9.80665 m/s^2: ArduPilot's physics know no other."""
@@ -92,6 +93,8 @@ class Draw:
     slope: Array
     """For each m/s^2 of the vibration's amplitude, about its mean."""
     heading_deg: float
+    serial: Array
+    """Of the companion's own IMU: what it turned on with."""
 
     def shaken(self, level_m_s2: float) -> Array:
         """What the motors add."""
@@ -110,7 +113,8 @@ def draw(seed: int, number: int) -> Draw:
         step[:3], slope[:3] = dice.normal(0.0, 30.0 * DEG_H, 3), dice.normal(0.0, 10.0 * DEG_H, 3)
         step[5] = dice.choice([-1.0, 1.0]) * dice.uniform(2.0, 6.0) * MG
         slope[5] = dice.normal(0.0, 0.5 * MG)
-    return Draw(kind, piece, turned_on, degc, step, slope, heading_deg)
+    serial = SERIAL_PART.piece(np.random.default_rng([seed, 2]), usual).turned_on(dice)
+    return Draw(kind, piece, turned_on, degc, step, slope, heading_deg, serial)
 
 
 @dataclass
@@ -165,6 +169,8 @@ class BenchFlight:
         self.motors_s = self.end_s = math.nan
         """On its clock."""
         self._z_shaken = math.nan
+        self.serial: list[Row] = []
+        """What the calibration has found of the companion's own IMU."""
 
     @property
     def _on_earth(self) -> Array:
@@ -202,12 +208,19 @@ class BenchFlight:
         Raises:
             RuntimeError: it failed.
         """
-        environment = {"COMPANION_BOOT_ID": f"{boot:032x}"}
-        async with CompanionProcess(self._folder, environment=environment) as daemon:
+        vehicle, folder = self._vehicle, self._folder
+        scenario, environment = vehicle.scenario, {"COMPANION_BOOT_ID": f"{boot:032x}"}
+        host, port = vehicle.url.removeprefix("udpin:").rsplit(":", 1)
+        text = configuration(scenario, directory=folder, udp=(host, int(port)))
+        still_s = 40 if vehicle.firmware == "px4" else 20
+        (folder / "companion.toml").write_text(text + MORE.format(still_s), encoding="utf-8")
+        scenario.serial_imu.turn_on(self._drawn.serial[:3], self._drawn.serial[3:])
+        async with devices(scenario, folder), CompanionProcess(folder, environment=environment) as daemon:
             await daemon.ready(READY_WITHIN_S)
             record = await daemon.calibrate(CALIBRATED_WITHIN_S, progress=asyncio.subprocess.DEVNULL)
         if record["state"] != "done":
             raise RuntimeError(f"calibration: {record['reason']}")
+        self.serial = serial_rows(record, scenario.serial_imu.mean_bias(vehicle.now_s - still_s, vehicle.now_s))
 
     async def fly(self, speed: float) -> None:
         """Stand, take off, hover while it shakes more and less; the log ends in the air.
@@ -288,7 +301,7 @@ def _temperature(drawn: Draw) -> dict[str, float]:
 
 @contextlib.asynccontextmanager
 async def bench_flight(binary: Path, drawn: Draw, folder: Path, series: Path) -> AsyncIterator[BenchFlight]:
-    """The firmware, a ground station and the devices; no daemon yet.
+    """The firmware and a ground station; neither devices nor a daemon yet.
 
     Args:
         binary: the firmware.
@@ -303,20 +316,16 @@ async def bench_flight(binary: Path, drawn: Draw, folder: Path, series: Path) ->
     unix_s = time.time()
     aircraft = FlyingAircraft(site_at(LATITUDE_DEG, 9.0, 0.0, unix_s), heading_deg=drawn.heading_deg, unix_s=unix_s)
     scenario = demo(unix_s=unix_s, aircraft=aircraft)
-    scenario = replace(scenario, imu=scenario.gradienter)  # no serial IMU: nothing here is said of it
     vehicle: FlyingVehicle
     if "px4" in binary.name:
         vehicle = FlyingPx4(binary, scenario, folder, wind=WIND, parameters=LOGGING["px4"], truth_hz=TRUTH_HZ)
-        more = MORE.format(40)
     else:
         companion = LOOPBACK, free_udp_port()
         vehicle = FlyingArduPilot(
             binary, scenario, folder, companion=companion, wind=WIND, parameters=LOGGING["ardupilot"],
             reads_each=round(1000.0 / TRUTH_HZ),
         )  # fmt: skip
-        more = MORE.format(20)
-    async with vehicle, ground_station(vehicle) as ground, devices(scenario, series):
-        (series / "companion.toml").write_text(daemon_configuration(vehicle, series, more), encoding="utf-8")
+    async with vehicle, ground_station(vehicle) as ground:
         await ground.wait_for(lambda: bool(ground.vehicle_heartbeats()), 60.0, "a heartbeat")
         flight = BenchFlight(drawn, vehicle, ground, series)
         try:
@@ -349,7 +358,7 @@ async def fly(binary: Path, seed: int, number: int, folder: Path, speed: float) 
     perfect = flown.at(before_s[:1], names)[0] + left.mean(axis=0)
     others = {"own": flight.own, "perfect": dict(zip(names, perfect.tolist(), strict=True))}
     by_truth, by_ekf = await said_of(logs[-1], series / "state", others)
-    rows = rows_of(by_ekf, truth_of(flown, by_ekf, flight.end_s))
+    rows = [*flight.serial, *rows_of(by_ekf, truth_of(flown, by_ekf, flight.end_s))]
     drift = {
         name: {each["seconds"]: each["median_m"] for each in spans}
         for name, spans in by_truth["imus"][0]["drift"].items()

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sim.earth import Array
-from sim.imu_model import DEG_H, MG
+from sim.imu_model import DEG_H, MG, Bias
 
 AXES = ("X", "Y", "Z")
 NAMED = ("gyro x", "gyro y", "gyro z", "accel z")
 """As `companion flight` names them; the horizontal accelerometers it does not count."""
 OF_AXIS = (0, 1, 2, 5)
-TERMS = ("turn_on", "in_flight", "temperature", "motors", "vibration", "trend")
+TERMS = ("own_imu", "turn_on", "in_flight", "temperature", "motors", "vibration", "trend")
 OFFSETS = {
     "ardupilot": tuple(f"INS_{kind}OFFS_{axis}" for kind in ("GYR", "ACC") for axis in AXES),
     "px4": tuple(f"CAL_{kind}0_{axis}OFF" for kind in ("GYRO", "ACC") for axis in AXES),
@@ -184,6 +184,20 @@ def rows_of(flight: Mapping[str, Any], true: Mapping[str, Mapping[str, float]]) 
                 continue  # a temperature that stays the same
             rows.append(Row(axis["axis"], term, value / unit, told_of["value"] / unit, told_of["sigma"] / unit))
     return rows
+
+
+def serial_rows(record: Mapping[str, Any], true: Bias) -> list[Row]:
+    """What a calibration has found of the companion's own IMU beside what it had; `record` as `calibrate --json`."""
+    (imu,) = (each for each in record["imus"] if each["name"] == "own")
+    units = np.repeat([DEG_H, MG], 3)
+    found, sigma = (
+        np.concatenate([imu[f"gyro_{what}_rad_s"], imu[f"accel_{what}_m_s2"]]) / units for what in ("bias", "sigma_use")
+    )
+    told_of = np.concatenate(true) / units
+    return [
+        Row(axis, "own_imu", float(told_of[k]), float(found[k]), float(sigma[k]))
+        for axis, k in zip(NAMED, OF_AXIS, strict=True)
+    ]
 
 
 RECOVERED_HEADER = (

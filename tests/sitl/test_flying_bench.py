@@ -27,7 +27,7 @@ def test_the_log_tells_what_was_injected(tmp_path: Path, kind: str, number: int)
     found = asyncio.run(fly(Path(os.environ[BINARIES[kind]]), 1, number, tmp_path, 4.0))
     rows = [Row(*row) for row in found["rows"]]
     print(*rows, found["drift"], sep="\n")
-    assert {row.term for row in rows} >= {"turn_on", "in_flight", "motors", "trend"}
+    assert {row.term for row in rows} >= {"own_imu", "turn_on", "in_flight", "motors", "trend"}
     for row in rows:
         assert abs(row.found - row.true) <= 3.0 * row.sigma, row
         if row.term in ("turn_on", "in_flight", "motors") and kind == "ardupilot-sitl":
