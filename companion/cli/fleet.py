@@ -16,6 +16,7 @@ from companion.cli.terminal import DONE, Parser, print_lines
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
+    from companion.fleet.metrics import Metrics
     from companion.fleet.server import Server
 
 DEFAULT_PAGE: Final = "127.0.0.1:8291"
@@ -37,12 +38,16 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
     run = add(
         "run", _run, "collect, until Ctrl-C; -c names a file whose [mqtt] names the broker (default: this machine's)"
     )
-    run.add_argument(
-        "--database",
-        default="fleet.sqlite",
-        metavar="URL",
-        help="postgresql://USER@HOST/NAME, or the path of an SQLite file (default fleet.sqlite, here)",
-    )
+    export = add("export", _export, "a view or a table of the database as a file, for a spreadsheet, pandas and others")
+    export.add_argument("what", metavar="VIEW", help="fleet, bias_history, ... (docs/fleet.md; another word lists all)")
+    export.add_argument("file", type=Path, metavar="FILE", help="to be written: NAME.csv or NAME.parquet")
+    for command in (run, export):
+        command.add_argument(
+            "--database",
+            default="fleet.sqlite",
+            metavar="URL",
+            help="postgresql://USER@HOST/NAME, or the path of an SQLite file (default fleet.sqlite, here)",
+        )
     demo = add("demo", _demo, "thirty simulated aircraft and the page, on this computer alone, until Ctrl-C")
     for command in (run, demo):
         command.add_argument(
@@ -54,6 +59,8 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
         command.add_argument(
             "--password-file", type=Path, metavar="FILE", help="who looks at the page is asked for what is in it"
         )
+        command.add_argument("--cert", type=Path, metavar="FILE", help="the page's certificate with its chain (PEM)")
+        command.add_argument("--key", type=Path, metavar="FILE", help="its key; with both the page speaks https")
 
 
 async def _run(options: argparse.Namespace) -> int:
@@ -65,11 +72,20 @@ async def _run(options: argparse.Namespace) -> int:
     from companion.fleet.store import Store
 
     mqtt = settings.load(options.config).mqtt if hasattr(options, "config") else Mqtt(host="127.0.0.1")
-    store = Store(options.database)
-    pages = [] if options.page == "off" else [_server(options, options.database).run()]
     logs.set_up("info")
+    collector = Collector(mqtt, Store(options.database))
+    pages = [] if options.page == "off" else [_server(options, options.database, collector.metrics).run()]
     async with _until_stopped():
-        await _beside(Collector(mqtt, store).run(), *pages)
+        await _beside(collector.run(), *pages)
+    return DONE
+
+
+async def _export(options: argparse.Namespace) -> int:
+    """`companion fleet export`."""
+    _check_installed()
+    from companion.fleet.export import export
+
+    print_lines(f"{options.file}: {export(options.database, options.what, options.file)} rows")
     return DONE
 
 
@@ -91,11 +107,15 @@ async def _demo(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _server(options: argparse.Namespace, database: str) -> Server:
+def _server(options: argparse.Namespace, database: str, counts: Metrics | None = None) -> Server:
+    from companion.fleet.certificate import Certificate
     from companion.fleet.server import Server, read_password
 
     password = None if options.password_file is None else read_password(options.password_file)
-    return Server(options.page, database, password)
+    if (options.cert is None) != (options.key is None):
+        raise ConfigError("--cert and --key: found one of them; allowed: both, or neither")
+    certificate = None if options.cert is None else Certificate(options.cert, options.key)
+    return Server(options.page, database, password, certificate, counts)
 
 
 async def _beside(*runs: Coroutine[Any, Any, None]) -> None:

@@ -11,12 +11,14 @@ import contextlib
 import logging
 import secrets
 import socket
+import time
 from collections.abc import AsyncIterator, Callable, Iterable
 from typing import TYPE_CHECKING, Final
 
 from companion.config.sections import Mqtt
 from companion.errors import CompanionError, LinkError
 from companion.fleet.contract import MOST_BYTES, answers, ranges
+from companion.fleet.metrics import Metrics
 from companion.fleet.store import Message, Outcome, Store
 from companion.links.mqtt.broker import explain, is_of_protocol, read_password, tls_context
 from companion.links.system.connection import Backoff, Reconnection
@@ -89,9 +91,8 @@ class Collector:
         mqtt_5: bool = True,
     ) -> None:
         self.settings, self.store = settings, store
+        self.metrics = Metrics()
         self.client_id = settings.client_id or f"collector-{socket.gethostname()[:40]}-{secrets.token_hex(4)}"
-        self.confirmed = self.rejected = 0
-        """Items, and payloads, since the start."""
         self._protocol = _MQTT_5 if mqtt_5 else _MQTT_3_1_1
         self._reconnection = Reconnection(
             "fleet", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S, on_state=on_state
@@ -172,6 +173,7 @@ class Collector:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
         finally:
             ended = await stop(tasks)
+            self.metrics.connected = False
         for end in ended:
             if isinstance(end, Exception):
                 raise end
@@ -183,6 +185,8 @@ class Collector:
             await self._hear_of(client, topic)
         words = "MQTT 3.1.1: no other collector beside this one" if alone else "MQTT 5"
         self._reconnection.up(f"{self.where} ({words}) into {self.store.where}")
+        self.metrics.connections += 1
+        self.metrics.connected = True
         if not alone:
             # What was said before is not told to those who share.
             await self._hear_of(client, _HELLO, qos=0)
@@ -208,7 +212,10 @@ class Collector:
             with contextlib.suppress(asyncio.QueueEmpty):
                 while len(batch) < BATCH:
                     batch.append(inbox.get_nowait())
-            await self._answer(client, await asyncio.to_thread(self.store.take, batch))
+            began_s = time.monotonic()
+            outcome = await asyncio.to_thread(self.store.take, batch)
+            self.metrics.committed(outcome, time.monotonic() - began_s)
+            await self._answer(client, outcome)
 
     async def _answer(self, client: aiomqtt.Client, outcome: Outcome) -> None:
         said = [
@@ -221,9 +228,7 @@ class Collector:
             for (aircraft, epoch), lacking in outcome.wanted.items()
             for payload in answers(epoch, lacking)
         ]
-        self.confirmed += sum(map(len, outcome.confirmed.values()))
         if outcome.rejected:
-            self.rejected += len(outcome.rejected)
             message, reason = outcome.rejected[0]
             logger.warning("fleet: %s: not taken: %s (table rejected has it)", message.topic, reason)
         await asyncio.gather(*(client.publish(topic, payload, qos=1) for topic, payload in said))

@@ -9,13 +9,14 @@ import logging
 import re
 import secrets
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
 
 import sqlalchemy as sa
 
 from companion.config.rules import bind_problem
 from companion.errors import ConfigError
-from companion.fleet import page
+from companion.fleet import metrics, page
+from companion.fleet.certificate import Certificate
 from companion.fleet.store import engine_of, why
 from companion.links.system.connection import Backoff, Reconnection
 from companion.storage.state import read_regular
@@ -29,6 +30,9 @@ LEAST_PASSWORD: Final = 12
 WRONG_PASSWORD_S: Final = 2.0
 AGAIN_S: Final = 30
 """After so long a browser looks again."""
+CERTIFICATE_S: Final = 60.0
+"""How often its files are looked at."""
+HANDSHAKE_S: Final = 10.0
 _HTML: Final = "text/html; charset=utf-8"
 _AIRCRAFT: Final = re.compile(r"/aircraft/([0-9a-f]{16,36})")
 _ALWAYS: Final = (
@@ -57,13 +61,20 @@ def read_password(path: Path) -> str:
 
 
 class Server:
-    """The pages at HOST:PORT; `run` it as a task.
+    """The pages at HOST:PORT, and the collector's `counts` at /metrics; `run` it as a task.
 
     Raises:
         ConfigError: the address is none, or others could look without a password.
     """
 
-    def __init__(self, bind: str, database: str, password: str | None) -> None:
+    def __init__(
+        self,
+        bind: str,
+        database: str,
+        password: str | None,
+        certificate: Certificate | None = None,
+        counts: metrics.Metrics | None = None,
+    ) -> None:
         if (wrong := bind_problem(bind, "--page")) is not None:
             raise ConfigError(wrong)
         self._host, self._port = split_address(bind)
@@ -71,7 +82,9 @@ class Server:
             raise ConfigError(
                 f"--page: found {bind!r}; allowed without --password-file: this computer alone, as 127.0.0.1:8291"
             )
-        self._password = password
+        if certificate is None and not is_loopback(self._host):
+            logger.warning("page: whoever listens on the network can read its password: --cert and --key prevent it")
+        self._password, self._certificate, self._counts = password, certificate, counts
         self._access = Access("", handed_out=True)
         self._engine = engine_of(database, reads_only=True)
         self._open = 0
@@ -80,21 +93,28 @@ class Server:
     @property
     def url(self) -> str:
         """Where to look."""
-        return page_url(self._host, self._port)
+        return page_url(self._host, self._port, "http" if self._certificate is None else "https")
 
     async def run(self) -> NoReturn:
         """Serve until cancelled; an address that is taken is waited for."""
         await self._reconnection.keep(self._serve)
 
     async def _serve(self) -> str:
+        tls: dict[str, Any] = {}
+        if self._certificate is not None:
+            tls = {"ssl": self._certificate.context}
+            tls |= {"ssl_handshake_timeout": HANDSHAKE_S, "ssl_shutdown_timeout": HANDSHAKE_S}
         try:
-            server = await asyncio.start_server(self._accept, self._host, self._port)
+            server = await asyncio.start_server(self._accept, self._host, self._port, **tls)
         except OSError as error:
             return f"{self._host}:{self._port}: {error.strerror or error}"
         self._port = server.sockets[0].getsockname()[1]
         self._reconnection.up(self.url)
         try:
-            await server.serve_forever()
+            while server.is_serving():
+                await asyncio.sleep(CERTIFICATE_S)
+                if self._certificate is not None:
+                    await asyncio.to_thread(self._certificate.look_again)
         finally:
             server.close()
             self._engine.dispose()
@@ -142,6 +162,8 @@ class Server:
         try:
             return await asyncio.to_thread(self._page, request.path)
         except sa.exc.SQLAlchemyError as error:
+            if request.path == "/metrics" and self._counts is not None:
+                return Response(200, self._counts.text(None), metrics.CONTENT_TYPE)
             logger.warning("page: the database cannot be read: %s", why(error))
             return _text(503, "the database cannot be read at the moment; the collector's log says why")
 
@@ -158,6 +180,8 @@ class Server:
         with self._engine.begin() as connection:
             if path == "/":
                 return Response(200, page.glance(connection, now).encode(), _HTML, (("Refresh", str(AGAIN_S)),))
+            if path == "/metrics" and self._counts is not None:
+                return Response(200, self._counts.text(metrics.heard(connection, now)), metrics.CONTENT_TYPE)
             if (match := _AIRCRAFT.fullmatch(path)) is not None:
                 found = page.aircraft(connection, match[1], now)
                 if found is not None:

@@ -52,6 +52,8 @@ class Outcome(NamedTuple):
     confirmed: dict[tuple[str, str], list[int]]
     wanted: dict[tuple[str, str], list[list[int]]]
     rejected: list[tuple[Message, str]]
+    new: int = 0
+    """Items that were not there yet."""
 
 
 def url_of(database: str) -> sa.URL:
@@ -174,6 +176,7 @@ class Store:
                 found.confirmed.setdefault(key, []).extend(sequences)
             found.wanted.update(one.wanted)
             found.rejected.extend(one.rejected)
+            found = found._replace(new=found.new + one.new)
         return found
 
     def _take(self, messages: Sequence[Message], now: datetime.datetime) -> Outcome:
@@ -201,7 +204,7 @@ class Store:
             for table, of in made.items():
                 rows.setdefault(table, []).extend(of)
         with self._engine.begin() as connection:
-            self._put(connection, schema.items, told)
+            new = self._put(connection, schema.items, told)
             for table, of in sorted(rows.items()):
                 self._put(connection, schema.tables.tables[table], of)
             self._hear(connection, hellos.values(), heard, now)
@@ -209,15 +212,20 @@ class Store:
             for key, (hello, _) in hellos.items():
                 if lacking := _lacking(connection, hello):
                     outcome.wanted[key] = lacking
-        return outcome
+        return outcome._replace(new=new)
 
-    def _put(self, connection: sa.Connection, table: sa.Table, rows: list[Row]) -> None:
-        """Rows that are not there yet, in the order of their keys: so two collectors never wait for one another."""
-        if rows:
-            keys = [column.name for column in table.primary_key]
-            rows.sort(key=lambda row: [row[key] for key in keys])
-            insert, values = self._insert_many(table, rows)
-            connection.execute(insert.on_conflict_do_nothing(), values)
+    def _put(self, connection: sa.Connection, table: sa.Table, rows: list[Row]) -> int:
+        """Rows that are not there yet, in the order of their keys: so two collectors never wait for one another.
+
+        Returns how many they were.
+        """
+        if not rows:
+            return 0
+        keys = [column.name for column in table.primary_key]
+        rows.sort(key=lambda row: [row[key] for key in keys])
+        insert, values = self._insert_many(table, rows)
+        counted = {"preserve_rowcount": True}
+        return connection.execute(insert.on_conflict_do_nothing(), values, execution_options=counted).rowcount
 
     def _insert_many(self, table: sa.Table, rows: list[Row]) -> tuple[Any, Any]:
         """A statement for all of them, and its values. PostgreSQL takes them at once, as JSON: a third of the time."""

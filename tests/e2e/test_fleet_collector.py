@@ -215,7 +215,7 @@ def test_odd_texts_come_into_every_database(database: str) -> None:
     for name in (odd, None):  # a former aircraft of a companion is told without: it keeps its name
         said = json.dumps({**hello, "name": name}).encode()
         outcome = store.take([*messages, Message(f"fleet/{one.id}/hello", said)])
-        assert outcome == ({(one.id, one.epoch): [1, 2]}, {}, [])
+        assert outcome[:3] == ({(one.id, one.epoch): [1, 2]}, {}, [])
     store.close()
     wanted = odd.replace("\0", "\ufffd")
     assert rows_of(database, sa.text("SELECT reason FROM calibrations"))[0][0] == wanted

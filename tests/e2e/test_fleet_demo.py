@@ -3,64 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
 import re
 import signal
 import sys
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
 
 from companion.fleet.demo import AIRCRAFT
-from companion.fleet.server import Server
 from companion.fleet.simulated import Aircraft
-from companion.fleet.store import Message, Store
 from tests.support import browser
 from tests.support.broker import free_port
-from tests.support.collecting import NOW
+from tests.support.collecting import NOW, basic, get, served
 
 PASSWORD = "Grus grus grus"  # noqa: S105
-
-
-async def get(port: int, path: str = "/", *headers: str, method: str = "GET") -> tuple[int, str]:
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
-    try:
-        lines = [f"{method} {path} HTTP/1.1", *(headers or ("Host: 127.0.0.1",)), "", ""]
-        writer.write("\r\n".join(lines).encode())
-        answer = (await reader.read()).decode()
-    finally:
-        writer.close()
-    return int(answer.split(" ")[1]), answer
-
-
-def basic(password: str) -> str:
-    return "Authorization: Basic " + base64.b64encode(f"anybody:{password}".encode()).decode()
-
-
-@contextlib.asynccontextmanager
-async def served(tmp_path: Path, *fleet: Aircraft, password: str | None = None) -> AsyncIterator[int]:
-    """The pages of a database with what these have told."""
-    database, port = str(tmp_path / "fleet.sqlite"), free_port()
-    store = Store(database)
-    store.prepare()
-    for one in fleet:
-        store.take([Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()])
-        store.take([Message(f"fleet/{one.id}/hello", one.hello)])
-    store.close()
-    serving = asyncio.create_task(Server(f"127.0.0.1:{port}", database, password).run())
-    try:
-        async with asyncio.timeout(30.0):
-            while True:
-                with contextlib.suppress(OSError):
-                    await get(port, method="HEAD")
-                    break
-                await asyncio.sleep(0.02)
-        yield port
-    finally:
-        serving.cancel()
-        await asyncio.gather(serving, return_exceptions=True)
 
 
 @pytest.mark.parametrize("there_is", ["mosquitto", "no mosquitto"])

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import datetime
 import signal
+import ssl
 import subprocess
 import sys
 from collections.abc import AsyncIterator, Sequence
@@ -15,10 +17,13 @@ from typing import Any
 import sqlalchemy as sa
 
 from companion.fleet import schema
+from companion.fleet.certificate import Certificate
 from companion.fleet.collector import stop
+from companion.fleet.metrics import Metrics
+from companion.fleet.server import Server
 from companion.fleet.simulated import Aircraft
-from companion.fleet.store import engine_of
-from tests.support.broker import Broker
+from companion.fleet.store import Message, Store, engine_of
+from tests.support.broker import Broker, free_port
 
 NOW = datetime.datetime(2026, 11, 20, 12, tzinfo=datetime.UTC)
 
@@ -26,11 +31,11 @@ NOW = datetime.datetime(2026, 11, 20, 12, tzinfo=datetime.UTC)
 class CollectorProcess:
     """`companion fleet run`."""
 
-    def __init__(self, folder: Path, name: str, one: Broker, database: str) -> None:
+    def __init__(self, folder: Path, name: str, one: Broker, database: str, *more: str) -> None:
         self.log = folder / f"{name}.log"
         config = folder / f"{name}.toml"
         config.write_text(one.section(keepalive_s=5))
-        command = [sys.executable, "-m", "companion", "fleet", "run", "-c", str(config), "--database", database]
+        command = [sys.executable, "-m", "companion", "fleet", "run", "-c", str(config), "--database", database, *more]
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(command, stdout=log, stderr=log)
 
@@ -97,3 +102,49 @@ def quick(fleet: Sequence[Aircraft], again_s: float = 0.4) -> None:
     """They tell again so soon that much comes twice."""
     for each in fleet:
         each.again_s = again_s
+
+
+async def get(
+    port: int, path: str = "/", *headers: str, method: str = "GET", tls: ssl.SSLContext | None = None
+) -> tuple[int, str]:
+    """The status, and all of the answer with its head."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port, ssl=tls)
+    try:
+        lines = [f"{method} {path} HTTP/1.1", *(headers or ("Host: 127.0.0.1",)), "", ""]
+        writer.write("\r\n".join(lines).encode())
+        answer = (await reader.read()).decode()
+    finally:
+        writer.close()
+    return int(answer.split(" ")[1]), answer
+
+
+def basic(password: str) -> str:
+    """The header of somebody with that password."""
+    return "Authorization: Basic " + base64.b64encode(f"anybody:{password}".encode()).decode()
+
+
+@contextlib.asynccontextmanager
+async def served(
+    folder: Path, *fleet: Aircraft, password: str | None = None, certificate: Certificate | None = None
+) -> AsyncIterator[int]:
+    """The port of the pages of a database with what these have told."""
+    database, port = str(folder / "fleet.sqlite"), free_port()
+    store = Store(database)
+    store.prepare()
+    for one in fleet:
+        store.take([Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()])
+        store.take([Message(f"fleet/{one.id}/hello", one.hello)])
+    store.close()
+    serving = asyncio.create_task(Server(f"127.0.0.1:{port}", database, password, certificate, Metrics()).run())
+    try:
+        async with asyncio.timeout(30.0):
+            while True:
+                with contextlib.suppress(OSError):
+                    _, writer = await asyncio.open_connection("127.0.0.1", port)
+                    writer.close()
+                    break
+                await asyncio.sleep(0.02)
+        yield port
+    finally:
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)

@@ -64,16 +64,26 @@ def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
         context = ssl.create_default_context(cafile=settings.ca_file)
         if settings.cert_file is not None and settings.key_file is not None:
             where = Path(settings.key_file)
-            for file in (Path(settings.cert_file), where):
-                file.open("rb").close()  # OpenSSL does not say which of them it cannot read
-            # Without a password of ours OpenSSL would ask at the terminal for that of an encrypted key.
-            context.load_cert_chain(settings.cert_file, settings.key_file, password=lambda: "")
-    except ssl.SSLError as error:
-        what = (error.reason or str(error)).lower().replace("_", " ")
-        raise LinkError(f"{where}: not usable: {what} (wanted: PEM, a key without a passphrase)") from None
+            load_pair(context, Path(settings.cert_file), where)
     except OSError as error:
-        raise LinkError(f"{error.filename or where}: {_why(error)}") from None
+        raise unusable(error, where) from None
     return context
+
+
+def load_pair(context: ssl.SSLContext, cert: Path, key: Path) -> None:
+    """Take a certificate and its key; raises OSError, of which `unusable` makes a line."""
+    for file in (cert, key):
+        file.open("rb").close()  # OpenSSL does not say which of them it cannot read
+    # Without a password of ours OpenSSL would ask at the terminal for that of an encrypted key.
+    context.load_cert_chain(cert, key, password=lambda: "")
+
+
+def unusable(error: OSError, where: Path) -> LinkError:
+    """What is wrong with a file of certificates or keys, in one line that names it."""
+    if isinstance(error, ssl.SSLError):
+        what = (error.reason or str(error)).lower().replace("_", " ")
+        return LinkError(f"{where}: not usable: {what} (wanted: PEM, a key without a passphrase)")
+    return LinkError(f"{error.filename or where}: {_why(error)}")
 
 
 def _why(error: OSError) -> str:
