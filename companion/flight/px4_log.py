@@ -69,7 +69,10 @@ def _boot(start: Start) -> Boot:
         parameters=tuple(start.parameters),
         unix_offset_s=_unix_offset(start),
         place=_place(start),
-        notes=(f"gaps in it, in which PX4 could not write: {start.gaps}",) if start.gaps else (),
+        notes=(
+            *((f"gaps in it, in which PX4 could not write: {start.gaps}",) if start.gaps else ()),
+            *(("PX4 has changed the IMU that it flies by",) if np.ptp(_selection(start)[:, 1]) else ()),
+        ),
     )
 
 
@@ -93,10 +96,12 @@ def _imus(start: Start) -> tuple[FlownImu, ...]:
     found: dict[int, FlownImu] = {}
     status = {k: start.rows("vehicle_imu_status", k) for k in start.instances("vehicle_imu_status")}
     ids = {rows[-1, 1]: k for k, rows in status.items() if len(rows)}
-    combined, selection = _whole(start.rows("sensor_combined")), start.rows("sensor_selection")
-    if len(combined):
-        number = ids.get(selection[-1, 1], 0) if len(selection) else 0
-        found[number] = _imu(start, number, combined)
+    combined, selection = _whole(start.rows("sensor_combined")), _selection(start)
+    now = np.searchsorted(selection[:, 0], combined[:, 0], side="right") - 1
+    selected = selection[np.maximum(now, 0), 1]
+    for gyro_id in np.unique(selected):
+        number = ids.get(gyro_id, 0)
+        found[number] = _imu(start, number, combined[selected == gyro_id])
     for k in start.instances("vehicle_imu"):
         rows = _sampled(start.rows("vehicle_imu", k))
         rows = rows[(rows[:, 7:] > 0.0).all(axis=1)]
@@ -104,6 +109,12 @@ def _imus(start: Start) -> tuple[FlownImu, ...]:
         if k not in found and imu.rate_hz >= _FAST_HZ:
             found[k] = imu
     return tuple(found[k] for k in sorted(found))
+
+
+def _selection(start: Start) -> Floats:
+    """(n, 2) since when it has flown by which gyro, by its device id."""
+    told = _whole(start.rows("sensor_selection"))
+    return told if len(told) else np.zeros((1, 2))
 
 
 def _imu(start: Start, k: int, rows: Floats) -> FlownImu:

@@ -44,6 +44,9 @@ _TOPICS = {
     "sensor_combined": "uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;",
     "sensor_gyro": "uint64_t timestamp;float x;float y;float z;float temperature;",
     "sensor_accel": "uint64_t timestamp;float x;float y;float z;",
+    "sensor_selection": "uint64_t timestamp;float gyro_device_id;",
+    "vehicle_imu_status": "uint64_t timestamp;float gyro_device_id;float accel_device_id;float temperature_gyro;"
+    "float accel_vibration_metric;",
     "vehicle_attitude": "uint64_t timestamp;float[4] q;",
     "vehicle_local_position": "uint64_t timestamp;float vx;float vy;float vz;float x;float y;float z;"
     "float ref_lat;float ref_alt;",

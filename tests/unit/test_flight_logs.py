@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -237,7 +238,7 @@ def column(states: Any) -> Floats:
     return np.asarray(states, dtype=np.float64)[:, None]
 
 
-def of_px4(flown: Flown, path: Path) -> Path:
+def of_px4(flown: Flown, path: Path, more: Mapping[tuple[str, int], tuple[Floats, Floats]] | None = None) -> Path:
     at, slow = flown.at_s, flown.at_s[::25]
     place = np.tile([LATITUDE_DEG, HEIGHT_M], (len(at), 1))
     spun = ((slow >= flown.motors_s) & (slow < flown.disarmed_s))[:, None]
@@ -252,7 +253,8 @@ def of_px4(flown: Flown, path: Path) -> Path:
             ("vehicle_land_detected", 0): (slow, column((slow < 67.0) | (slow >= 240.0))),
             ("actuator_motors", 0): (slow, 0.5 * np.hstack([np.tile(spun, (1, 4)), np.full((len(slow), 8), np.nan)])),
             ("estimator_sensor_bias", 0): (slow, np.tile([0.0, *bias], (len(slow), 1))),
-        },
+        }
+        | dict(more or {}),
     )
 
 
@@ -272,6 +274,34 @@ def test_a_flight_of_px4_is_told_alike(flown: Flown, tmp_path: Path, capsys: pyt
         assert abs(axis["in_flight"]["value"] / unit - bias_now) < 2.0 * axis["in_flight"]["sigma"] / unit
     assert imu["axes"][0]["ekf"]["value"] / DEG_H == pytest.approx(GYRO_DEG_H[0])
     assert 60.0 < imu["drift"]["flown"][1]["median_m"] < 200.0
+
+
+def test_an_imu_that_px4_leaves_in_the_air_is_not_taken_for_the_other(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """sensor_combined is of the one in use: from 150 s on of another, whose gyro x reads 500 deg/h more."""
+    readings = flown.readings.copy()
+    readings[flown.t_s > 150.0, 0] += 500.0 * DEG_H
+    status = {
+        ("vehicle_imu_status", k): (
+            flown.at_s[::25],
+            np.tile([gyro_id, gyro_id, 40.0, 0.1], (len(flown.at_s[::25]), 1)),
+        )
+        for k, gyro_id in enumerate((11.0, 22.0))
+    }
+    selection = np.array([1.0, 150.0]), np.array([[11.0], [22.0]])
+    path = of_px4(
+        dataclasses.replace(flown, readings=readings),
+        tmp_path / "x.ulg",
+        {("sensor_selection", 0): selection, **status},
+    )
+    _, answer = said(capsys, path, *storage(tmp_path))
+    (flight,) = answer["flights"]
+    assert flight["notes"] == ["PX4 has changed the IMU that it flies by"]
+    assert [imu["imu"] for imu in flight["imus"]] == [1, 2]
+    for imu, more_deg_h in zip(flight["imus"], (0.0, 500.0), strict=True):
+        term = imu["axes"][0]["in_flight"]
+        assert abs(term["value"] / DEG_H - GYRO_DEG_H[0] - more_deg_h) < 2.0 * term["sigma"] / DEG_H < 150.0
 
 
 def test_what_px4_could_not_write_is_said_and_not_flown_over(

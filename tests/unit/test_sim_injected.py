@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim.flying.injected import OFFSETS, Told, recovered, rows_of, truth_of
-from sim.imu_model import DEG_H, MG
+from sim.flying.injected import OFFSETS, Row, Told, recovered, rows_of, serial_rows, truth_of
+from sim.imu_model import DEG_H, MG, Bias
 
 STAGES = {"armed_s": 100.0, "motors_s": 100.5, "take_off_s": 107.0, "landing_s": None, "disarmed_s": None}
 
@@ -89,3 +89,18 @@ def test_the_table_counts_what_lies_within_two_sigma() -> None:
     lines = recovered(rows)
     assert lines[1].split() == ["turn-on,", "gyro", "x", "deg/h", "1", "10.00", "3.00", "2.00", "1", "of", "1", "1.5"]
     assert lines[-1] == "all: 1 of 2 (50.0%)"
+
+
+def test_the_companions_own_imu_is_held_against_what_it_had() -> None:
+    own = {
+        "name": "own",
+        "gyro_bias_rad_s": [110.0 * DEG_H, 0.0, 0.0], "gyro_sigma_use_rad_s": [20.0 * DEG_H] * 3,
+        "accel_bias_m_s2": [9.0, 9.0, 2.0 * MG], "accel_sigma_use_m_s2": [0.3 * MG] * 3,
+    }  # fmt: skip
+    true = Bias(np.array([100.0, -30.0, 0.0]) * DEG_H, np.array([0.0, 0.0, 1.5]) * MG)
+    rows = serial_rows({"imus": [{"name": "fc"}, own]}, true)
+    x, y, z, vertical = (Row(row.axis, row.term, *np.round(row[2:], 9)) for row in rows)
+    assert x == ("gyro x", "own_imu", 100.0, 110.0, 20.0)
+    assert y == ("gyro y", "own_imu", -30.0, 0.0, 20.0)
+    assert z == ("gyro z", "own_imu", 0.0, 0.0, 20.0)
+    assert vertical == ("accel z", "own_imu", 1.5, 2.0, 0.3)
