@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
+import math
 import secrets
 import socket
 import time
@@ -218,17 +220,20 @@ class Collector:
             await self._answer(client, outcome)
 
     async def _answer(self, client: aiomqtt.Client, outcome: Outcome) -> None:
+        # A confirmation that gets lost is given again, as the item is told again.
         said = [
-            (f"fleet/{aircraft}/confirmed", payload)
+            (f"fleet/{aircraft}/confirmed", payload, 0)
             for (aircraft, epoch), sequences in outcome.confirmed.items()
             for payload in answers(epoch, ranges(sequences))
         ]
         said += [
-            (f"fleet/{aircraft}/wanted", payload)
+            (f"fleet/{aircraft}/wanted", payload, 1)
             for (aircraft, epoch), lacking in outcome.wanted.items()
             for payload in answers(epoch, lacking)
         ]
         if outcome.rejected:
             message, reason = outcome.rejected[0]
             logger.warning("fleet: %s: not taken: %s (table rejected has it)", message.topic, reason)
-        await asyncio.gather(*(client.publish(topic, payload, qos=1) for topic, payload in said))
+        async with asyncio.timeout(ANSWER_S):  # one timer for all: theirs would cost as much as sending
+            publish = functools.partial(client.publish, timeout=math.inf)
+            await asyncio.gather(*(publish(topic, payload, qos=qos) for topic, payload, qos in said))

@@ -97,6 +97,7 @@ calibrations: Final = sa.Table(
     sa.Column("held_back", Words, nullable=False, comment="measured and not written, contradicting earlier ones"),
     sa.Column("undone_at", Moment, comment="undone when it was told; later ones are in undos"),
 )
+sa.Index("calibrations_started_at", calibrations.c.aircraft, calibrations.c.started_at)
 
 biases: Final = sa.Table(
     "biases",
@@ -126,6 +127,7 @@ armings: Final = sa.Table(
     sa.Column("gyro_sigma_use_rad_s", sa.Double, comment="the largest of all axes in force"),
     sa.Column("accel_sigma_use_m_s2", sa.Double),
 )
+sa.Index("armings_armed_at", armings.c.aircraft, armings.c.armed_at)
 
 undos: Final = sa.Table(
     "undos",
@@ -172,8 +174,15 @@ _version: Final = sa.Table("schema_version", tables, sa.Column("version", sa.Int
 _VIEW: Final = re.compile(r"-- (\w+): (.*)\n([^;]+);")
 _VIEWS: Final = Path(__file__).with_name("views.sql")
 
+
+def _indices_by_time(connection: sa.Connection) -> None:
+    for table in (calibrations, armings):
+        for index in table.indexes:
+            index.create(connection, checkfirst=True)
+
+
 Step = Callable[[sa.Connection], object]
-STEPS: Sequence[Step] = ()
+STEPS: Sequence[Step] = (_indices_by_time,)
 """The n-th brings tables of version n to version n + 1; views are made anew in any case."""
 
 
@@ -188,6 +197,7 @@ def bring_up_to_date(connection: sa.Connection) -> bool:
     newest = len(STEPS) + 1
     if connection.dialect.name == "postgresql":
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
+        connection.exec_driver_sql("SET LOCAL statement_timeout = 0")  # tables of years take their time
     found = 0
     if sa.inspect(connection).has_table(_version.name):
         found = connection.execute(sa.select(_version.c.version)).scalar_one()

@@ -209,9 +209,8 @@ class Store:
                 self._put(connection, schema.tables.tables[table], of)
             self._hear(connection, hellos.values(), heard, now)
             self._keep_aside(connection, outcome.rejected, now)
-            for key, (hello, _) in hellos.items():
-                if lacking := _lacking(connection, hello):
-                    outcome.wanted[key] = lacking
+            if hellos:
+                outcome.wanted.update(_lacking(connection, {aircraft for aircraft, _ in hellos}))
         return outcome._replace(new=new)
 
     def _put(self, connection: sa.Connection, table: sa.Table, rows: list[Row]) -> int:
@@ -325,20 +324,23 @@ def _read(item: Item, message: Message, outcome: Outcome) -> tuple[Row, Rows]:
     return {**raw, **columns}, rows
 
 
-def _lacking(connection: sa.Connection, hello: Hello) -> list[list[int]]:
-    """What the database lacks of what the aircraft keeps."""
-    items = schema.items
-    number = items.c.sequence
-    of = [items.c.aircraft == hello.aircraft, items.c.epoch == hello.epoch, number.between(hello.first, hello.last)]
-    there = sa.select(number, sa.func.lead(number).over(order_by=number).label("next")).where(*of).subquery()
-    ends = sa.select(sa.func.min(number), sa.func.max(number)).where(*of)
-    low, high = connection.execute(ends).one()
-    if low is None:
-        return [[hello.first, hello.last]] if hello.first <= hello.last else []
-    gaps = sa.select(there.c.sequence + 1, there.c.next - 1).where(there.c.next > there.c.sequence + 1)
-    found = [[hello.first, low - 1]] if low > hello.first else []
-    found += [list(gap) for gap in connection.execute(gaps.order_by(there.c.sequence))]
-    return found + ([[high + 1, hello.last]] if high < hello.last else [])
+def _lacking(connection: sa.Connection, which: Iterable[str]) -> dict[tuple[str, str], list[list[int]]]:
+    """What the database lacks of what these aircraft keep, as their last hellos say."""
+    one, items = schema.aircraft.c, schema.items.c
+    of = one.aircraft.in_(sorted(which))
+    before = sa.select(one.aircraft, one.epoch, one.last, (one.first - 1).label("number")).where(of)
+    kept = [items.aircraft == one.aircraft, items.epoch == one.epoch, items.sequence.between(one.first, one.last)]
+    there = sa.select(one.aircraft, one.epoch, one.last, items.sequence).where(of, *kept)
+    all_of = sa.union_all(before, there).subquery()
+    following = sa.func.lead(all_of.c.number, 1, all_of.c.last + 1).over(
+        partition_by=all_of.c.aircraft, order_by=all_of.c.number
+    )
+    ends = sa.select(all_of.c.aircraft, all_of.c.epoch, all_of.c.number, following.label("next")).subquery()
+    gaps = sa.select(ends).where(ends.c.next > ends.c.number + 1).order_by(ends.c.aircraft, ends.c.number)
+    found: dict[tuple[str, str], list[list[int]]] = {}
+    for aircraft, epoch, number, following_number in connection.execute(gaps):
+        found.setdefault((aircraft, epoch), []).append([number + 1, following_number - 1])
+    return found
 
 
 def _moment_or_none(words: str) -> datetime.datetime | None:

@@ -11,38 +11,57 @@ WHERE c.state = 'done' AND c.undone_at IS NULL
   AND NOT EXISTS (SELECT 1 FROM undos u
                   WHERE u.aircraft = c.aircraft AND u.what = 'calibration' AND u.of_at = c.started_at);
 
--- in_force: The latest calibration of each aircraft that stands: by number on its present memory card, else by time
-SELECT aircraft, epoch, sequence, started_at, held_back
-FROM (SELECT s.*, ROW_NUMBER() OVER (
-        PARTITION BY s.aircraft
-        ORDER BY CASE WHEN s.epoch = a.epoch THEN s.sequence END DESC NULLS LAST, s.started_at DESC) AS place
-      FROM standing s JOIN aircraft a ON a.aircraft = s.aircraft) AS numbered
-WHERE place = 1;
+-- latest: Keys of what counts now of each aircraft: the latest by number on its present memory card, else by time
+SELECT a.aircraft, a.name, a.heard_at,
+  COALESCE((SELECT o.epoch FROM standing o WHERE o.aircraft = a.aircraft AND o.epoch = a.epoch
+            ORDER BY o.sequence DESC LIMIT 1),
+           (SELECT o.epoch FROM standing o WHERE o.aircraft = a.aircraft
+            ORDER BY o.started_at DESC LIMIT 1)) AS force_epoch,
+  COALESCE((SELECT o.sequence FROM standing o WHERE o.aircraft = a.aircraft AND o.epoch = a.epoch
+            ORDER BY o.sequence DESC LIMIT 1),
+           (SELECT o.sequence FROM standing o WHERE o.aircraft = a.aircraft
+            ORDER BY o.started_at DESC LIMIT 1)) AS force_sequence,
+  COALESCE((SELECT o.epoch FROM calibrations o WHERE o.aircraft = a.aircraft AND o.epoch = a.epoch
+            ORDER BY o.sequence DESC LIMIT 1),
+           (SELECT o.epoch FROM calibrations o WHERE o.aircraft = a.aircraft
+            ORDER BY o.started_at DESC LIMIT 1)) AS tried_epoch,
+  COALESCE((SELECT o.sequence FROM calibrations o WHERE o.aircraft = a.aircraft AND o.epoch = a.epoch
+            ORDER BY o.sequence DESC LIMIT 1),
+           (SELECT o.sequence FROM calibrations o WHERE o.aircraft = a.aircraft
+            ORDER BY o.started_at DESC LIMIT 1)) AS tried_sequence,
+  COALESCE((SELECT o.epoch FROM armings o WHERE o.aircraft = a.aircraft AND o.epoch = a.epoch
+            ORDER BY o.sequence DESC LIMIT 1),
+           (SELECT o.epoch FROM armings o WHERE o.aircraft = a.aircraft
+            ORDER BY o.armed_at DESC LIMIT 1)) AS armed_epoch,
+  COALESCE((SELECT o.sequence FROM armings o WHERE o.aircraft = a.aircraft AND o.epoch = a.epoch
+            ORDER BY o.sequence DESC LIMIT 1),
+           (SELECT o.sequence FROM armings o WHERE o.aircraft = a.aircraft
+            ORDER BY o.armed_at DESC LIMIT 1)) AS armed_sequence
+FROM aircraft a;
+
+-- in_force: The latest calibration of each aircraft that stands
+SELECT c.aircraft, c.epoch, c.sequence, c.started_at, c.held_back
+FROM latest l CROSS JOIN calibrations c
+WHERE c.aircraft = l.aircraft AND c.epoch = l.force_epoch AND c.sequence = l.force_sequence;
 
 -- latest_tries: The latest calibration of each aircraft, however it ended
-SELECT aircraft, started_at, state, reason
-FROM (SELECT c.*, ROW_NUMBER() OVER (
-        PARTITION BY c.aircraft
-        ORDER BY CASE WHEN c.epoch = a.epoch THEN c.sequence END DESC NULLS LAST, c.started_at DESC) AS place
-      FROM calibrations c JOIN aircraft a ON a.aircraft = c.aircraft) AS numbered
-WHERE place = 1;
+SELECT c.aircraft, c.started_at, c.state, c.reason
+FROM latest l CROSS JOIN calibrations c
+WHERE c.aircraft = l.aircraft AND c.epoch = l.tried_epoch AND c.sequence = l.tried_sequence;
 
 -- latest_armings: The latest arming of each aircraft
-SELECT aircraft, armed_at, state, reason
-FROM (SELECT r.*, ROW_NUMBER() OVER (
-        PARTITION BY r.aircraft
-        ORDER BY CASE WHEN r.epoch = a.epoch THEN r.sequence END DESC NULLS LAST, r.armed_at DESC) AS place
-      FROM armings r JOIN aircraft a ON a.aircraft = r.aircraft) AS numbered
-WHERE place = 1;
+SELECT r.aircraft, r.armed_at, r.state, r.reason
+FROM latest l CROSS JOIN armings r
+WHERE r.aircraft = l.aircraft AND r.epoch = l.armed_epoch AND r.sequence = l.armed_sequence;
 
 -- fleet: A row for each aircraft: what is in force, how the latest calibration and arming went, when it was heard
-SELECT a.aircraft, a.name, a.heard_at, f.started_at AS calibrated_at, f.held_back,
+SELECT l.aircraft, l.name, l.heard_at, f.started_at AS calibrated_at, f.held_back,
        t.started_at AS tried_at, t.state AS tried_state, t.reason AS tried_reason,
        r.armed_at, r.state AS armed_state, r.reason AS armed_reason
-FROM aircraft a
-LEFT JOIN in_force f ON f.aircraft = a.aircraft
-LEFT JOIN latest_tries t ON t.aircraft = a.aircraft
-LEFT JOIN latest_armings r ON r.aircraft = a.aircraft;
+FROM latest l
+LEFT JOIN calibrations f ON f.aircraft = l.aircraft AND f.epoch = l.force_epoch AND f.sequence = l.force_sequence
+LEFT JOIN calibrations t ON t.aircraft = l.aircraft AND t.epoch = l.tried_epoch AND t.sequence = l.tried_sequence
+LEFT JOIN armings r ON r.aircraft = l.aircraft AND r.epoch = l.armed_epoch AND r.sequence = l.armed_sequence;
 
 -- bias_history: Biases by calibration, IMU and axis, in deg/h and mg, each calibration once
 SELECT b.aircraft, b.epoch, b.sequence, c.started_at, t.clock, b.imu, b.axis, b.gyro_id, b.accel_id,

@@ -13,6 +13,7 @@ from typing import Literal
 import pytest
 import sqlalchemy as sa
 
+from companion.fleet import schema
 from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store, engine_of
 from companion.physics.units import DEG_H
@@ -200,6 +201,17 @@ def test_a_new_database_asks_for_all_that_was_confirmed_long_ago(database: str, 
                 collector.kill()
 
     asyncio.run(main())
+
+
+def test_tables_of_years_may_take_long_to_be_brought_up_to_date(
+    server: Postgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.fleet.store._STATEMENT_MS", 200)
+    store = Store(server.create(f"fleet-{tmp_path.name}"))
+    store.prepare()
+    monkeypatch.setattr(schema, "STEPS", (*schema.STEPS, lambda connection: connection.execute(sa.func.pg_sleep(0.5))))
+    store.prepare()
+    store.close()
 
 
 @pytest.mark.parametrize("database", KINDS, indirect=True)

@@ -114,6 +114,18 @@ def test_duplicates_and_disorder_change_nothing(store: Store, database: str) -> 
     assert [rows_of(database, sa.select(table)) for table in derived] == before
 
 
+def test_each_of_many_is_asked_for_what_it_lacks(store: Store) -> None:
+    """In one batch: some are whole, some have gaps anywhere, of one nothing is there, one forgot its first."""
+    fleet = [aircraft(12, number) for number in range(5)]
+    lacks: list[set[int]] = [set(), {1, 2, 7}, {3, 4, 5, 9, len(fleet[2].told)}, {*fleet[3].told}, {11}]
+    store.take([message for one, lack in zip(fleet, lacks, strict=True) for message in items_of(one)
+                if json.loads(message.payload)["sequence"] not in lack])  # fmt: skip
+    hellos = [hello_of(one) for one in fleet]
+    hellos[4] = changed(hellos[4], first=10)
+    wanted = store.take(hellos).wanted
+    assert wanted == {(one.id, one.epoch): ranges(lack) for one, lack in zip(fleet, lacks, strict=True) if lack}
+
+
 def test_a_clock_that_is_wrong_by_a_year_changes_no_order(store: Store, database: str) -> None:
     """The last by number is in force, though its clock has gone back by a year, and another one was a year ahead."""
     one = Aircraft(1)
@@ -289,16 +301,29 @@ def test_an_older_database_is_brought_up_to_date_and_a_newer_one_refused(
     def step(connection: sa.Connection) -> None:
         connection.exec_driver_sql("ALTER TABLE aircraft ADD COLUMN colour TEXT")
 
+    newest = len(schema.STEPS) + 1
     with monkeypatch.context() as newer:
-        newer.setattr(schema, "STEPS", (step,))
+        newer.setattr(schema, "STEPS", (*schema.STEPS, step))
         store.prepare()
         store.prepare()
-        assert query(database, "SELECT version FROM schema_version") == [(2,)]
+        assert query(database, "SELECT version FROM schema_version") == [(newest + 1,)]
         assert query(database, "SELECT colour FROM aircraft") == [(None,)]
         assert len(query(database, "SELECT * FROM bias_history")) == 6 * len(one.biases)
-    with pytest.raises(StorageError, match="version 2; allowed: up to 1"):
+    with pytest.raises(StorageError, match=f"version {newest + 1}; allowed: up to {newest}"):
         store.prepare()
     assert items_in(database) == told_by([one])
+
+
+def test_version_1_gets_its_indices(store: Store, database: str) -> None:
+    asked = "SELECT name, sql FROM sqlite_master WHERE type = 'index' ORDER BY name"
+    before = query(database, asked)
+    with sqlite3.connect(database) as connection:
+        connection.executescript(
+            "DROP INDEX calibrations_started_at; DROP INDEX armings_armed_at; UPDATE schema_version SET version = 1"
+        )
+    assert query(database, asked) != before
+    store.prepare()
+    assert query(database, asked) == before
 
 
 def test_a_step_that_fails_leaves_all_as_it_was(store: Store, database: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -308,7 +333,7 @@ def test_a_step_that_fails_leaves_all_as_it_was(store: Store, database: str, mon
 
     store.take(items_of(aircraft(2)))
     before = query(database, "SELECT COUNT(*) FROM bias_history")
-    monkeypatch.setattr(schema, "STEPS", (fails,))
+    monkeypatch.setattr(schema, "STEPS", (*schema.STEPS, fails))
     with pytest.raises(LinkError, match="nowhere"):
         store.prepare()
     assert query(database, "SELECT COUNT(*) FROM bias_history") == before
