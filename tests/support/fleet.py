@@ -15,6 +15,7 @@ import jsonschema
 import yaml
 
 from companion.config.sections import Fleet, Location
+from companion.daemon.biases.model_priors import ModelPriors
 from companion.daemon.core import Handler
 from companion.daemon.faces.fleet.face import FleetFace
 from companion.formats import Object
@@ -141,7 +142,7 @@ class Aircraft:
         return self.connection.collector
 
     @contextlib.asynccontextmanager
-    async def running(self) -> AsyncIterator[FleetFace]:
+    async def running(self, models: ModelPriors | None = None) -> AsyncIterator[FleetFace]:
         async def temperature(_request: Object, _face: str) -> AsyncIterator[Object]:
             yield {"kind": "result", "imus": self.curves}
 
@@ -155,7 +156,7 @@ class Aircraft:
             config=SimpleNamespace(storage=SimpleNamespace(path=self.folder)),
         )
         settings = Fleet(name="Heron 7", location=self.location)
-        face = FleetFace(core, settings, cast("Any", self.connection), cast("Handler", temperature))
+        face = FleetFace(core, settings, cast("Any", self.connection), cast("Handler", temperature), models)
         tasks = [asyncio.create_task(face.run()), asyncio.create_task(self.connection.run())]
         try:
             yield face

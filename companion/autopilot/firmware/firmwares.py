@@ -201,3 +201,11 @@ def part_of(firmware: Firmware | None, gyro_id: int | None, accel_id: int | None
         return None
     types = (gyro_id >> _TYPE_SHIFT & _BYTE, accel_id >> _TYPE_SHIFT & _BYTE)
     return _PARTS.get(firmware or "other", {}).get(types)
+
+
+def model_of(firmware: Firmware | None, gyro_id: int | None, accel_id: int | None) -> str | None:
+    """The model of an IMU: the catalogue's name, else firmware and types in hex; None: it is not known."""
+    if not gyro_id or not accel_id or firmware is None:
+        return None
+    types = "-".join(f"{each >> _TYPE_SHIFT & _BYTE:#04x}" for each in (gyro_id, accel_id))
+    return part_of(firmware, gyro_id, accel_id) or f"{firmware}-{types}"

@@ -74,6 +74,21 @@ class PowerUpNodes:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Usual:
+    """How much other parts of the same model scatter from power-up to power-up, which counts as some more power-ups."""
+
+    variance: Array
+    """About a part's own curve, its wandering included, (3,)."""
+    power_ups: float
+    """As many as it is worth."""
+
+    @property
+    def mean(self) -> float:
+        """Over the axes."""
+        return float(self.variance.mean())
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Curve:
     """What the next power-up's bias will be.
 
@@ -92,6 +107,7 @@ class Curve:
         freedom: degrees of freedom of the scatter.
         span_degc: lowest and highest temperature seen.
         per_kelvin: one sigma of what a kelvin beyond that does.
+        surprise: by how many sigmas the power-ups scatter more than is usual of the model; 0 where that is not known.
     """
 
     order: int
@@ -107,6 +123,7 @@ class Curve:
     freedom: float
     span_degc: tuple[float, float]
     per_kelvin: float
+    surprise: float = 0.0
 
     def beyond_k(self, degc: float) -> float:
         """By how much a temperature lies beyond what is valid."""
@@ -148,27 +165,33 @@ class Curve:
 
 
 def fit(
-    power_ups: Sequence[PowerUpNodes], in_run_variance: float, per_kelvin: float, *, least_order: int = 0
+    power_ups: Sequence[PowerUpNodes],
+    in_run_variance: float,
+    per_kelvin: float,
+    *,
+    least_order: int = 0,
+    usual: Usual | None = None,
 ) -> Curve | None:
-    """The curve of one triad of one IMU; None of fewer than three power-ups.
+    """The curve of one triad of one IMU; None of fewer than three power-ups, or two where it is known what is usual.
 
     Args:
         power_ups: at least one node each, in the order in which they were measured.
         in_run_variance: by which a bias wanders within a power-up, (rad/s)^2 or (m/s^2)^2.
         per_kelvin: one sigma of how much parts move, rad/s or m/s^2 a kelvin.
         least_order: of the curve; a mean tells nothing of a change within a power-up.
+        usual: of its model; None: not known.
     """
-    if len(power_ups) < FEWEST:
+    if len(power_ups) < FEWEST - (usual is not None):
         return None
     seen = [node.degc for one in power_ups for node in one.nodes]
     span = min(seen), max(seen)
     most = _MOST_ORDER if span[1] > span[0] else least_order
     rates = any(node.k_s for one in power_ups for node in one.nodes)
     lagging = [_Sums.of(power_ups, lag_s, in_run_variance) for lag_s in (LAGS_S if rates and most else LAGS_S[:1])]
-    fullest = [_Fit(sums, most, in_run_variance, per_kelvin).curve(span) for sums in lagging]
+    fullest = [_Fit(sums, most, in_run_variance, per_kelvin, usual).curve(span) for sums in lagging]
     full = min(fullest, key=lambda curve: curve.foretold)
     sums = lagging[fullest.index(full)]
-    fewer = [_Fit(sums, order, in_run_variance, per_kelvin).curve(span) for order in range(least_order, most)]
+    fewer = [_Fit(sums, order, in_run_variance, per_kelvin, usual).curve(span) for order in range(least_order, most)]
     best, *more = *fewer, full
     for found in more:
         if found.foretold < _BETTER * best.foretold:
@@ -224,8 +247,9 @@ class _Sums:
 class _Fit:
     """One order."""
 
-    def __init__(self, sums: _Sums, order: int, in_run_variance: float, per_kelvin: float) -> None:
+    def __init__(self, sums: _Sums, order: int, in_run_variance: float, per_kelvin: float, usual: Usual | None) -> None:
         some = slice(order)
+        self._usual = usual
         self._sums, self._order, self._in_run, self._per_kelvin = sums, order, in_run_variance, per_kelvin
         self._first, between = _with_one(sums.first[:, some]), _with_one(sums.mean[:, some])
         self._change = np.concatenate([np.zeros((len(sums.change), 1)), sums.change[:, some]], axis=1)
@@ -244,9 +268,10 @@ class _Fit:
         covariance = np.linalg.inv(self._base + normal.sum(axis=0))
         squares = np.mean(np.square(error), axis=0)
         # Three axes know the scatter better than one, but one may scatter more than the others.
-        freedom = 3.0 * max(len(shares) - 1.0 - (self._order > 0), 1.0)
+        own, worth = 3.0 * max(len(shares) - 1.0 - (self._order > 0), 1.0), self._worth
+        freedom = own + 3.0 * worth
         student = freedom / (freedom - 2.0)
-        widening = np.maximum(np.mean(np.square(error) / variance[:, None], axis=0), 1.0) * student
+        widening = np.maximum(self._over(error, variance, scatter), 1.0) * student
         said, of_changes = self._by_others(scatter, self._change)
         missed, noise = np.square(self._sums.change_bias - said), self._sums.change_variance[:, None]
         surely = float((missed - np.square(_SURELY) * (of_changes[:, None] + noise)).sum())
@@ -267,7 +292,29 @@ class _Fit:
             freedom=freedom,
             span_degc=span_degc,
             per_kelvin=self._per_kelvin,
+            surprise=self._surprise(own),
         )
+
+    @property
+    def _worth(self) -> float:
+        return 0.0 if self._usual is None else self._usual.power_ups
+
+    def _over(self, error: Floats, variance: Floats, scatter: float) -> Floats:
+        """What was seen in squares over what was said, by axis, (3,): in those left out and, as more, in the model."""
+        squares = (error * error / variance[:, None]).sum(axis=0)
+        if self._usual is not None:
+            squares = squares + self._worth * self._usual.variance / (scatter + self._in_run)
+        return np.asarray(squares / (len(error) + self._worth))
+
+    def _surprise(self, own: float) -> float:
+        """Of the quotient of two variances, as a normal deviate (Abramowitz and Stegun 26.6.15)."""
+        if self._usual is None:
+            return 0.0
+        error, variance = self._foretold(max(self._usual.mean - self._in_run, 0.0))
+        # Each is foretold by all others, and so are they by it.
+        quotient = float((error * error / variance[:, None]).mean()) * (1.0 - 1.0 / len(error))
+        a, b, root = 2.0 / (9.0 * own), 2.0 / (27.0 * self._worth), math.cbrt(quotient)
+        return ((1.0 - b) * root - (1.0 - a)) / math.sqrt(b * root * root + a)
 
     def _scatter(self) -> float:
         """By which the mean square of what is foretold is what was said."""
@@ -276,7 +323,7 @@ class _Fit:
         for _ in range(_HALVINGS):
             middle = (low + high) / 2.0
             error, variance = self._foretold(math.exp(middle))
-            if float((error * error / variance[:, None]).mean()) > 1.0:
+            if float(self._over(error, variance, math.exp(middle)).mean()) > 1.0:
                 low = middle
             else:
                 high = middle

@@ -11,7 +11,7 @@ import datetime
 import logging
 import math
 from collections.abc import Collection, Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -45,6 +45,9 @@ from companion.formats import Object
 from companion.physics.frames import vector
 from companion.samples import Triad
 from companion.storage.learned import BiasStore, KnownImu
+
+if TYPE_CHECKING:
+    from companion.daemon.biases.model_priors import ModelPriors
 
 logger = logging.getLogger(__name__)
 
@@ -89,6 +92,11 @@ class BiasMemory:
         self.whose = Whose(core, imus, sensors, used)
         self.curves = Curves(core, imus)
         self._store = BiasStore(core.config.storage.path)
+        self.models: ModelPriors | None = None
+        if core.config.calibration.fleet_prior:
+            from companion.daemon.biases.model_priors import ModelPriors
+
+            self.models = ModelPriors(core.config.storage.path, self.whose.models)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], _Reference] = {}
         self._now_degc: dict[str, float | None] = {}
@@ -97,6 +105,8 @@ class BiasMemory:
     def load(self) -> None:
         """Read what was kept before this start; blocking."""
         self._known = self._store.read()
+        if self.models is not None:
+            self.models.load()
         self.follow()
 
     def follow(self) -> None:
@@ -179,14 +189,21 @@ class BiasMemory:
         earlier = self._known[name].points if name in self._known else ()
         profile = noise_profile(self._profiles.of(name))
 
+        def by_earlier(triad: Triad, model: AllanModel) -> Expected | None:
+            if self.models is None:
+                return expect(earlier, triad, now, effect, model)
+            found = expect(earlier, triad, now, effect, model, self.models.of(name, triad))
+            self.models.judged(name, triad, found)
+            return found
+
         def today(triad: Triad, model: AllanModel) -> Expected | None:
             last, curve = self._reference(name, triad), self.curves.of(name, triad)
             return None if last is None else expect_today(last, triad, now, effect, model, curve)
 
         return ExpectedImu(
             name=name,
-            gyro=expect(earlier, "gyro", now, effect, profile.gyro),
-            accel=expect(earlier, "accel", now, effect, profile.accel),
+            gyro=by_earlier("gyro", profile.gyro),
+            accel=by_earlier("accel", profile.accel),
             gyro_today=today("gyro", profile.gyro),
             accel_today=today("accel", profile.accel),
             effect=effect,

@@ -56,6 +56,7 @@ class Faces(Subsystem):
         others: Sequence[Subsystem],
     ) -> None:
         self._core, self._devices = core, devices
+        self._models = calibrating.memory.models
         self.component = Component(
             core.link,
             calibrating.conductor,
@@ -166,7 +167,7 @@ class Faces(Subsystem):
         settings = self._core.config.fleet
         if settings is not None and self.mqtt is not None:
             kind: type[FleetFace] = await self._core.offload(_fleet_face)
-            self.fleet = kind(self._core, settings, self.mqtt, self.answer)
+            self.fleet = kind(self._core, settings, self.mqtt, self.answer, self._models)
             await self.fleet.run()
 
     def tasks(self) -> Sequence[Task]:  # noqa: D102

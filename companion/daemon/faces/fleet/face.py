@@ -16,6 +16,7 @@ from itertools import islice
 from typing import Final
 
 from companion.config.sections import Fleet
+from companion.daemon.biases.model_priors import TOPIC, ModelPriors
 from companion.daemon.core import Core, Handler
 from companion.daemon.faces.fleet import wire
 from companion.daemon.faces.fleet.sources import Look, Sources, utc
@@ -50,8 +51,10 @@ AIRCRAFT, CURVE = "aircraft", "curve/"
 class FleetFace:
     """One aircraft's part of the fleet, and what is left of others that had this companion; `run` it."""
 
-    def __init__(self, core: Core, settings: Fleet, mqtt: MqttFace, answer: Handler) -> None:
-        self._settings, self._mqtt, self._answer = settings, mqtt, answer
+    def __init__(
+        self, core: Core, settings: Fleet, mqtt: MqttFace, answer: Handler, models: ModelPriors | None = None
+    ) -> None:
+        self._settings, self._mqtt, self._answer, self._models = settings, mqtt, answer, models
         self._vehicle, self._offload = core.vehicle, core.offload
         self._items = FleetItems(core.config.storage.path)
         self._sources = Sources(core.config.storage.path, self._items)
@@ -89,9 +92,11 @@ class FleetFace:
             words = f"{words}; {self._problem}"
         elif self._nameless:
             words = "the autopilot tells no unique id (AUTOPILOT_VERSION): nothing is kept for the fleet"
+        models = [] if self._models is None else self._models.status()
         return {
             "good": self._problem is None and not self._nameless,
-            "summary": words,
+            "summary": "; ".join([words, *(each["summary"] for each in models)]),
+            "models": models,
             "aircraft": self._of,
             "waiting": waiting,
             "confirmed_at": confirmed_at,
@@ -103,8 +108,8 @@ class FleetFace:
         return self._vehicle.version is not None and self._vehicle.uid is None
 
     def _on_message(self, message: Incoming) -> None:
-        # A retained one would come back at every connection.
-        if message.topic.startswith("fleet/") and not message.retained:
+        # A retained one would come back at every connection, as what is told of models should.
+        if message.topic.startswith(TOPIC) or (message.topic.startswith("fleet/") and not message.retained):
             self._inbox.append(message)
             self._woken.set()
 
@@ -205,6 +210,10 @@ class FleetFace:
         heard = bool(self._inbox)
         while self._inbox:
             message = self._inbox.popleft()
+            if message.topic.startswith(TOPIC):
+                if self._models is not None:
+                    await self._offload(self._models.take, message.topic, message.payload)
+                continue
             said = wire.parse(message.payload)
             for kept in self._kept:
                 if said is not None and message.topic in wire.Topics(kept.aircraft).heard:
@@ -239,6 +248,8 @@ class FleetFace:
             self._connection = (link, link.connections)
             self._greeted.clear()
             self._begin_again()
+        for topic in () if self._models is None else self._models.topics:
+            await link.hear(topic)
         news = [kept for kept in self._kept if self._greeted.get(kept.aircraft) != kept.last]
         if now_s - self._hello_s < HELLO_AGAIN_S and all(kept.aircraft in self._greeted for kept in news):
             return
