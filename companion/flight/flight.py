@@ -107,7 +107,10 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
                     if imu.number in late
                 ]
             ),
-            notes=boot.notes,
+            notes=(
+                *boot.notes,
+                *(f"IMU {imu.number} has nothing to go by in it" for imu in boot.imus if imu.number not in late),
+            ),
         )
         for stages in _stages(boot, reference)
     ]

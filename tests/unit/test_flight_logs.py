@@ -521,6 +521,20 @@ def test_what_a_failed_imu_reads_is_left_aside(
     assert imu["drift"]["flown"][0]["starts"] == pytest.approx(164 - 70 - 10, abs=2)
 
 
+def test_an_imu_that_has_failed_from_the_start_is_named(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told: list[tuple[str, tuple[Any, ...]]] = []
+    for name, values in messages(flown, parameters()):
+        told.append((name, values))
+        if name == "IMU":
+            told.append((name, (values[0], 1, *[0.0] * 6, 0, 0, 40.0, 0, 0, 0, 0)))
+    _, answer = said(capsys, dataflash(tmp_path / "failed.bin", told), *storage(tmp_path))
+    (flight,) = answer["flights"]
+    assert flight["notes"] == ["IMU 2 has nothing to go by in it"]
+    assert [imu["imu"] for imu in flight["imus"]] == [1]
+
+
 def test_a_truncated_and_damaged_log_is_read_as_far_as_it_goes(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
