@@ -61,6 +61,10 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
         )
         command.add_argument("--cert", type=Path, metavar="FILE", help="the page's certificate with its chain (PEM)")
         command.add_argument("--key", type=Path, metavar="FILE", help="its key; with both the page speaks https")
+    acl = add("acl", _acl, "print a broker's access list: each aircraft below its own name, and the collector")
+    acl.add_argument("broker", choices=("mosquitto", "emqx"), help="whose format")
+    words = "which user is which aircraft, by its id (default: each aircraft's user name is its id)"
+    acl.add_argument("aircraft", nargs="*", metavar="USER=ID", help=words)
 
 
 async def _run(options: argparse.Namespace) -> int:
@@ -104,6 +108,14 @@ async def _demo(options: argparse.Namespace) -> int:
         print_lines(f"look at {server.url}")
         async with _until_stopped():
             await _beside(demo.play(database, mosquitto), server.run())
+    return DONE
+
+
+async def _acl(options: argparse.Namespace) -> int:
+    """`companion fleet acl`."""
+    from companion.fleet.acl import access_list
+
+    print_lines(*access_list(options.broker, options.aircraft))
     return DONE
 
 

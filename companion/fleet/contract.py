@@ -18,10 +18,11 @@ MOST_RANGES: Final = 256
 """In one message to an aircraft."""
 MOST_SEQUENCE: Final = 2**53
 MOST_BYTES: Final = 256 * 1024
-_AIRCRAFT: Final = re.compile(r"fleet/([0-9a-f]{16}|[0-9a-f]{36})/(hello|item)")
+AIRCRAFT_ID: Final = re.compile(r"[0-9a-f]{16}|[0-9a-f]{36}")
+_AIRCRAFT: Final = re.compile(rf"fleet/({AIRCRAFT_ID.pattern})/(hello|item)")
 _MOST: Final = 1e12
 
-_Aircraft = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{16}|[0-9a-f]{36})$")]
+_Aircraft = Annotated[str, msgspec.Meta(pattern=f"^({AIRCRAFT_ID.pattern})$")]
 _Epoch = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
 _Sequence = Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
 _Number = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]

@@ -84,15 +84,21 @@ def _free_port() -> int:
 async def _mosquitto(program: str, folder: Path) -> AsyncIterator[int]:
     port, config = _free_port(), folder / "mosquitto.conf"
     await asyncio.to_thread(config.write_text, f"listener {port} 127.0.0.1\nallow_anonymous true\n")
+    # Whatever ends us closes its input, and that ends it.
     process = await asyncio.create_subprocess_exec(
-        program, "-c", str(config), stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL
+        "sh",
+        "-c",
+        'exec 3<&0; (read -r _ <&3; kill $$) & exec "$0" -c "$1" >/dev/null 2>&1 3<&-',
+        program,
+        str(config),
+        stdin=asyncio.subprocess.PIPE,
     )
     try:
         await _until_open(port, process)
         yield port
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.terminate()
+        if process.stdin is not None:
+            process.stdin.close()
         await process.wait()
 
 

@@ -10,6 +10,7 @@ import sqlalchemy as sa
 
 from companion.calibration.records.record import Arming
 from companion.fleet.schema import Moment, rejected
+from companion.fleet.schema import aircraft as known
 from companion.physics.units import DEG_H, MG
 from companion.report.markup import Child, Markup, row, tag
 from companion.report.page import NAMES, TRIADS, Point, arming_items, card, drift, page, with_sigma
@@ -22,6 +23,7 @@ MOST_AIRCRAFT: Final = 2000
 MOST_CALIBRATIONS: Final = 120
 """The most of one IMU that are drawn, the latest."""
 MOST_LISTED: Final = 25
+MOST_REFUSED: Final = 5
 _UNITS: Final[dict[Triad, tuple[float, str, str]]] = {"gyro": (DEG_H, "deg_h", "deg/h"), "accel": (MG, "mg", "mg")}
 
 
@@ -206,11 +208,22 @@ def _notes(connection: sa.Connection, which: str) -> list[Child]:
 
 
 def _refused(connection: sa.Connection, now: datetime.datetime) -> Markup | None:
-    last = connection.execute(sa.select(rejected).order_by(rejected.c.last_at.desc()).limit(1)).first()
-    if last is None:
+    """What was not taken lately, and on whose topic: with the broker's access list nobody else can have said it."""
+    last = sa.select(rejected).order_by(rejected.c.last_at.desc()).limit(MOST_REFUSED).subquery()
+    of = last.c.topic.startswith("fleet/" + known.c.aircraft + "/")
+    query = sa.select(last, known.c.name).outerjoin_from(last, known, of).order_by(last.c.last_at.desc())
+    lines = [
+        tag(
+            "li",
+            tag("strong", f"{each.name or each.topic}: "),
+            f"{each.reason} ({each.times} times, last {_ago(each.last_at, now)})",
+        )
+        for each in connection.execute(query)
+    ]
+    if not lines:
         return None
-    words = f"Not everything could be taken; last {_ago(last.last_at, now)}, on {last.topic}: {last.reason}"
-    return card("caution", tag("p", words), tag("p", "The table rejected has them all.", class_="soft"))
+    more = tag("p", "By whose topic it came on. The table rejected has them all.", class_="soft")
+    return card("caution", tag("p", "Not everything could be taken:"), tag("ul", *lines), more)
 
 
 _MOMENTS: Final = ("heard_at", "calibrated_at", "tried_at", "armed_at", "started_at", "at")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -34,6 +35,9 @@ _STATEMENT_MS: Final = 30_000
 _BUSY_S: Final = 10.0
 _OF_THE_DATABASE: Final = (sa.exc.OperationalError, sa.exc.InterfaceError, sa.exc.InternalError, sa.exc.TimeoutError)
 """It is not there, full, or broken: no fault of what was to be written."""
+_OF_THE_ITEM: Final = (sa.exc.DataError, sa.exc.IntegrityError, sa.exc.ProgrammingError)
+"""The database is well, and does not take it."""
+_REJECTED: Final[Row] = {"state": "rejected", "kind": None, "at": None, "clock": None, "same": None}
 _AGAIN: Final = 500
 """Items of a newer aircraft that are looked at anew in one transaction after an update."""
 
@@ -280,12 +284,23 @@ class Store:
             connection.execute(sa.delete(table).where(table.c.digest.in_(beyond)))
 
     def _reject(self, message: Message, reason: str, now: datetime.datetime) -> Outcome:
+        """Keep aside what the database refuses; an item is confirmed then, or its aircraft would tell it for ever."""
+        outcome = Outcome({}, {}, [(message, reason)])
+        to = addressed(message.topic)
+        item = None
+        with contextlib.suppress(NotTakenError):
+            item = read_key(to[0], message.payload) if to is not None and to[1] == "item" else None
         try:
             with self._engine.begin() as connection:
-                self._keep_aside(connection, [(message, reason)], now)
+                self._keep_aside(connection, outcome.rejected, now)
+                if item is not None:
+                    raw = {**item.key, **_raw(item, message), **_REJECTED, "received_at": now}
+                    with contextlib.suppress(*_OF_THE_ITEM), connection.begin_nested():
+                        self._put(connection, schema.items, [raw])
+                    outcome.confirmed[item.aircraft, item.epoch] = [item.sequence]
         except sa.exc.SQLAlchemyError as error:
             raise LinkError(f"{self.where}: {why(error)}") from None
-        return Outcome({}, {}, [(message, reason)])
+        return outcome
 
     def _take_in_again(self) -> bool:
         """Items of a newer aircraft that are known by now; whether there may be more of them."""
@@ -315,13 +330,16 @@ class Store:
 
 def _read(item: Item, message: Message, outcome: Outcome) -> tuple[Row, Rows]:
     """Columns of an item and the rows that it makes; of one that cannot be read its reason is kept aside."""
-    raw: Row = {"format_version": item.format_version, "payload": message.payload.decode(errors="replace")}
     try:
         columns, rows = read_item(item, message.payload)
     except NotTakenError as error:
         outcome.rejected.append((message, str(error)))
-        columns, rows = {"state": "rejected", "kind": None, "at": None, "clock": None, "same": None}, {}
-    return {**raw, **columns}, rows
+        columns, rows = _REJECTED, {}
+    return {**_raw(item, message), **columns}, rows
+
+
+def _raw(item: Item, message: Message) -> Row:
+    return {"format_version": item.format_version, "payload": message.payload.decode(errors="replace")}
 
 
 def _lacking(connection: sa.Connection, which: Iterable[str]) -> dict[tuple[str, str], list[list[int]]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import re
 import signal
 import sys
@@ -13,8 +14,9 @@ import pytest
 
 from companion.fleet.demo import AIRCRAFT
 from companion.fleet.simulated import Aircraft
+from companion.fleet.store import Message, Store
 from tests.support import browser
-from tests.support.broker import free_port
+from tests.support.broker import MOSQUITTO, free_port
 from tests.support.collecting import NOW, basic, get, served
 
 PASSWORD = "Grus grus grus"  # noqa: S105
@@ -49,6 +51,41 @@ def test_one_command_shows_a_fleet(tmp_path: Path, there_is: str) -> None:
                 await process.wait()
 
     asyncio.run(main())
+
+
+@pytest.mark.skipif(MOSQUITTO is None, reason="no Mosquitto")
+def test_its_mosquitto_ends_with_it_though_it_is_killed(tmp_path: Path) -> None:
+    start = "import sys; from companion.cli import main; sys.exit(main(['fleet', 'demo', '--page', sys.argv[1]]))"
+
+    async def main() -> None:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", start, f"127.0.0.1:{free_port()}", stdout=asyncio.subprocess.PIPE
+        )
+        try:
+            assert process.stdout is not None
+            folder = (await process.stdout.readline()).decode().partition("file in ")[2].partition(",")[0]
+            async with asyncio.timeout(60.0):
+                while not (brokers := _mosquittos(folder)):
+                    await asyncio.sleep(0.1)
+        finally:
+            process.kill()
+            await process.wait()
+        async with asyncio.timeout(20.0):
+            while any(os.path.exists(f"/proc/{pid}") for pid in brokers):  # noqa: ASYNC240 - /proc is memory
+                await asyncio.sleep(0.05)
+
+    asyncio.run(main())
+
+
+def _mosquittos(folder: str) -> list[str]:
+    """Processes of that name whose configuration is in the folder."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            words = path.read_bytes().decode().split("\0")
+            if words[0].endswith("mosquitto") and any(word.startswith(folder) for word in words):
+                found.append(path.parent.name)
+    return found
 
 
 def test_pages_fit_a_phone_and_a_desktop(tmp_path: Path) -> None:
@@ -105,6 +142,26 @@ def test_names_and_reasons_of_aircraft_are_no_markup(tmp_path: Path) -> None:
                 assert "<script" not in page
                 assert "<b>" not in page
                 assert "\u202e" not in page
+
+    asyncio.run(main())
+
+
+def test_who_lies_is_named(tmp_path: Path) -> None:
+    liar, other = Aircraft(1), Aircraft(2)
+    other.calibrate(NOW)
+
+    async def main() -> None:
+        async with served(tmp_path, liar, other) as port:
+            assert "Not everything could be taken" not in (await get(port))[1]
+            store = Store(str(tmp_path / "fleet.sqlite"))
+            for _ in range(3):
+                store.take([Message(f"fleet/{liar.id}/item", other.told[1])])
+            store.take([Message(f"fleet/{'f' * 36}/item", b"nonsense")])
+            store.close()
+            page = (await get(port))[1]
+            assert f"<strong>{liar.name}: </strong>says that it is {other.id}" in page
+            assert "(3 times, last now)" in page
+            assert f"<strong>fleet/{'f' * 36}/item: </strong>" in page
 
     asyncio.run(main())
 

@@ -433,7 +433,7 @@ def test_a_clock_is_good_where_gnss_agrees_and_never_for_what_was_before(
 
 def test_everything_that_the_disk_has_and_each_change_once(tmp_path: Path) -> None:
     async def main() -> None:
-        aircraft = Aircraft(tmp_path)
+        aircraft = Aircraft(tmp_path, location="full")
         collector = aircraft.collector
         store, armed = RecordStore(tmp_path), BoundedList(tmp_path / "armings.json", Arming, 200)
         by_hand = BoundedList(tmp_path / "by-hand.json", Done, 50)
@@ -585,7 +585,9 @@ def test_how_much_of_the_place_is_told(
     one = record(0)
     assert one.site is not None
     place = msgspec.structs.replace(one.site, latitude_deg=40.12345, height_m=51.0)
-    RecordStore(tmp_path).save(msgspec.structs.replace(one, site=place, magnetic=MAGNETIC))
+    field_is = "compass field is 0.7 gauss, the Earth's {}: wrong counts_per_gauss, or a magnet"
+    warnings = (field_is.format("0.511"),)
+    RecordStore(tmp_path).save(msgspec.structs.replace(one, site=place, magnetic=MAGNETIC, warnings=warnings))
 
     async def main() -> None:
         aircraft = Aircraft(tmp_path, location=location)
@@ -599,6 +601,7 @@ def test_how_much_of_the_place_is_told(
         names = ("field_gauss", "field_expected_gauss", "inclination_deg", "inclination_expected_deg")
         assert tuple(magnetic[name] for name in names) == field
         assert magnetic["heading_bound_deg"] == 2.0
+        assert item["body"]["warnings"] == [field_is.format("0.511" if location == "full" else "?")]
 
     virtually(main())
 

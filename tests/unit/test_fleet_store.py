@@ -289,7 +289,43 @@ def test_what_the_database_refuses_takes_nothing_else_with_it(
     monkeypatch.setattr(Store, "_take", refuses)
     outcome = store.take(messages)
     assert [reason for _, reason in outcome.rejected] == ["the database refuses it: no such number"]
-    assert items_in(database) == [item for item in told_by([one]) if item[2] != 4]
+    # It is there as it came, with its reason: so its aircraft need not tell it for ever, and is not asked for it.
+    assert items_in(database) == told_by([one])
+    assert query(database, "SELECT sequence FROM items WHERE state = 'rejected'") == [(4,)]
+    assert query(database, "SELECT times, payload FROM rejected") == [(1, messages[3].payload[:4096])]
+    assert sorted(outcome.confirmed[one.id, one.epoch]) == list(range(1, len(messages) + 1))
+    assert store.take([Message(f"fleet/{one.id}/hello", one.hello)]).wanted == {}
+
+
+def test_what_the_database_refuses_in_any_form_is_confirmed_all_the_same(
+    store: Store, database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = aircraft(2)
+    real = Store._put
+
+    def spoilt(self: Store, connection: sa.Connection, table: sa.Table, rows: list[dict[str, object]]) -> int:
+        for row in rows:
+            row |= {"received_at": None} if (table.name, row["sequence"]) == ("items", 2) else {}
+        return real(self, connection, table, rows)
+
+    monkeypatch.setattr(Store, "_put", spoilt)
+    outcome = store.take(items_of(one))
+    assert sorted(outcome.confirmed[one.id, one.epoch]) == list(range(1, len(one.told) + 1))
+    assert [row[2] for row in items_in(database)] == [1, *range(3, len(one.told) + 1)]
+    assert query(database, "SELECT times FROM rejected") == [(1,)]
+
+
+def test_a_database_that_fails_while_it_refuses_confirms_nothing(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = aircraft(1)
+    reject = store._reject(items_of(one)[0], "no such number", NOW)
+    assert reject.confirmed == {(one.id, one.epoch): [1]}
+
+    def fails(*_: object) -> None:
+        raise sa.exc.OperationalError("INSERT", {}, ValueError("disk full"))
+
+    monkeypatch.setattr(Store, "_put", fails)
+    with pytest.raises(LinkError, match="disk full"):
+        store._reject(items_of(one)[0], "no such number", NOW)
 
 
 def test_an_older_database_is_brought_up_to_date_and_a_newer_one_refused(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
@@ -29,6 +30,9 @@ _ROUNDED: Final[dict[str, int]] = {
     "inclination_expected_deg": 1,
 }
 """Whatever tells a place (gravity and the field do, too), and to how many decimals it is no closer than a kilometre."""
+_WORKED_OUT: Final[dict[str, object]] = {"covariance": None, "cross_covariance": [], "effective": None}
+"""Whose digits give away the gravity and the latitude that they were worked out with, and what is told instead."""
+_EARTHS: Final = re.compile(r"(the Earth's) [\d.]+")
 
 
 class Topics(NamedTuple):
@@ -108,18 +112,17 @@ def item(waiting: Waiting, location: Location) -> bytes:
     )
 
 
-def _less_place(value: Any, location: Location) -> Any:
+def _less_place(value: Any, location: Location, key: str = "") -> Any:
     if isinstance(value, list):
-        return [_less_place(each, location) for each in value]
-    if not isinstance(value, dict):
-        return value
-    return {
-        key: _place(each, _ROUNDED[key], location)
-        if key in _ROUNDED and not isinstance(each, dict | list)
-        else _less_place(each, location)
-        for key, each in value.items()
-    }
-
-
-def _place(value: float | None, decimals: int, location: Location) -> float | None:
-    return None if location == "off" or value is None else round(value, decimals)
+        return [_less_place(each, location, key) for each in value]
+    if isinstance(value, dict):
+        return {
+            name: _WORKED_OUT[name] if name in _WORKED_OUT else _less_place(each, location, name)
+            for name, each in value.items()
+        }
+    if isinstance(value, str):
+        return _EARTHS.sub(r"\1 ?", value)
+    if key in _ROUNDED:
+        return None if location == "off" or value is None else round(value, _ROUNDED[key])
+    # Two digits of a sigma are what it is worth; more would tell the latitude, as above.
+    return float(f"{value:.2g}") if "sigma" in key and isinstance(value, float) else value
