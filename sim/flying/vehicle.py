@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -22,6 +23,18 @@ ARM_WITHIN_S = 60.0
 MODE_WITHIN_S = 30.0
 YAW_STICK_US = 250
 TURNED_WITHIN_S = 8.0
+
+
+async def _until_accepted(
+    ground: GroundStation, ask: Callable[[], Awaitable[int]], within_s: float, otherwise: str
+) -> None:
+    since_s = asyncio.get_running_loop().time()
+    try:
+        async with asyncio.timeout(within_s):
+            while await ask() != mavlink.MAV_RESULT_ACCEPTED:
+                await asyncio.sleep(1.0)
+    except TimeoutError:
+        raise TimeoutError(f"{otherwise}: {ground.texts_since(since_s)[-400:]}") from None
 
 
 class FlyingVehicle(FirmwareVehicle):
@@ -65,13 +78,7 @@ class FlyingVehicle(FirmwareVehicle):
         Raises:
             TimeoutError: it does not; with what it says.
         """
-        since_s = asyncio.get_running_loop().time()
-        try:
-            async with asyncio.timeout(ARM_WITHIN_S):
-                while await ground.arm(wait_s=2.0) != mavlink.MAV_RESULT_ACCEPTED:
-                    await asyncio.sleep(1.0)
-        except TimeoutError:
-            raise TimeoutError(f"it does not arm: {ground.texts_since(since_s)[-400:]}") from None
+        await _until_accepted(ground, lambda: ground.arm(wait_s=2.0), ARM_WITHIN_S, "it does not arm")
 
     @abstractmethod
     async def take_off(self, ground: GroundStation, height_m: float) -> None:
@@ -82,16 +89,14 @@ class FlyingVehicle(FirmwareVehicle):
         """
 
     async def mode(self, ground: GroundStation, name: str) -> None:
-        """Change its mode, and wait until it says so.
+        """Ask until it changes its mode: PX4 refuses a mission that it has not looked through yet.
 
         Raises:
-            TimeoutError: it does not.
+            TimeoutError: it does not; with what it says.
         """
-        await ground.command(
-            mavlink.MAV_CMD_DO_SET_MODE,
-            mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
-            *self.mode_parameters(self.modes[name]),
-        )
+        words = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, *self.mode_parameters(self.modes[name])
+        ask = functools.partial(ground.command, mavlink.MAV_CMD_DO_SET_MODE, *words)
+        await _until_accepted(ground, ask, MODE_WITHIN_S, f"no mode {name}")
         await self.until_mode(ground, name)
 
     async def until_mode(self, ground: GroundStation, name: str) -> None:
