@@ -35,7 +35,9 @@ _quiet.setLevel(logging.CRITICAL)
 BATCH: Final = 500
 GATHER_S: Final = 0.1
 """How long more of a batch is waited for."""
-WAITING: Final = 4 * BATCH
+ASK_AFTER: Final = 20
+"""So many times as long of hellos: what is told with one has come by then, perhaps to another collector."""
+WAITING: Final = 20 * BATCH
 """The most messages that wait; what is beyond is told again, or another collector hears it."""
 SWEEP_S: Final = 5.0
 """For what aircraft said before this collector was there."""
@@ -165,10 +167,11 @@ class Collector:
         )
 
     async def _serve(self, client: aiomqtt.Client) -> None:
-        inbox: asyncio.Queue[Message] = asyncio.Queue(BATCH)
+        items, hellos = asyncio.Queue[Message](BATCH), asyncio.Queue[Message](BATCH)
         tasks = [
-            asyncio.create_task(self._hear(client, inbox), name="fleet listener"),
-            asyncio.create_task(self._collect(client, inbox), name="fleet writer"),
+            asyncio.create_task(self._hear(client, items, hellos), name="fleet listener"),
+            asyncio.create_task(self._collect(client, items, 1), name="fleet writer"),
+            asyncio.create_task(self._collect(client, hellos, ASK_AFTER), name="fleet asker"),
             asyncio.create_task(self._subscribe(client), name="fleet subscriptions"),
         ]
         try:
@@ -201,16 +204,21 @@ class Collector:
         if any(getattr(code, "value", code) >= 128 for code in granted):
             raise LinkError(f"{self.where}: the broker does not let us hear {topic} (its access list?)")
 
-    async def _hear(self, client: aiomqtt.Client, inbox: asyncio.Queue[Message]) -> None:
+    async def _hear(
+        self, client: aiomqtt.Client, items: asyncio.Queue[Message], hellos: asyncio.Queue[Message]
+    ) -> None:
         async for message in client.messages:
             if isinstance(message.payload, bytes):
-                await inbox.put(Message(message.topic.value, message.payload, bool(message.retain)))
+                topic = message.topic.value
+                inbox = hellos if topic.endswith("/hello") else items
+                await inbox.put(Message(topic, message.payload, bool(message.retain)))
 
-    async def _collect(self, client: aiomqtt.Client, inbox: asyncio.Queue[Message]) -> None:
+    async def _collect(self, client: aiomqtt.Client, inbox: asyncio.Queue[Message], times: int) -> None:
         while True:
             batch = [await inbox.get()]
-            if inbox.qsize() < BATCH - 1:
-                await asyncio.sleep(GATHER_S)
+            for _ in range(times):
+                if inbox.qsize() < BATCH - 1:
+                    await asyncio.sleep(GATHER_S)
             with contextlib.suppress(asyncio.QueueEmpty):
                 while len(batch) < BATCH:
                     batch.append(inbox.get_nowait())

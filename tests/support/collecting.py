@@ -46,6 +46,10 @@ class CollectorProcess:
                 assert self._process.poll() is None, self.log.read_text()
                 await asyncio.sleep(0.05)
 
+    @property
+    def process_id(self) -> int:
+        return self._process.pid
+
     def kill(self) -> None:
         self._process.kill()
         self._process.wait()

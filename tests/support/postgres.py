@@ -24,9 +24,9 @@ _USER = "postgres" if _ROOT else None
 
 
 class Postgres:
-    """A server; stop it as a crash does, and start it again on its port."""
+    """A server; stop it as a crash does, and start it again on its port. A folder that has one's data keeps them."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **settings: str) -> None:
         assert INITDB is not None
         self._bin = Path(INITDB).resolve().parent
         self._data = folder / "data"
@@ -34,7 +34,10 @@ class Postgres:
         if _ROOT:
             shutil.chown(folder, "postgres", "postgres")
         self._folder = folder
+        self._settings = {"fsync": "off", "shared_buffers": "8MB", **settings}
         self._process: subprocess.Popen[bytes] | None = None
+        if self._data.exists():
+            return
         command = [
             f"{self._bin}/initdb",
             "-D",
@@ -51,8 +54,8 @@ class Postgres:
 
     def start(self) -> None:
         """Until it answers."""
-        settings = {"port": self.port, "listen_addresses": "127.0.0.1", "fsync": "off", "shared_buffers": "8MB"}
-        settings["unix_socket_directories"] = ""
+        settings = {"port": f"{self.port}", "listen_addresses": "127.0.0.1", "unix_socket_directories": ""}
+        settings |= self._settings
         options = [part for key, value in settings.items() for part in ("-c", f"{key}={value}")]
         command = [f"{self._bin}/postgres", "-D", f"{self._data}", *options]
         with (self._folder / "log").open("ab") as log:
@@ -64,6 +67,12 @@ class Postgres:
             assert time.monotonic() < deadline_s
             assert self._process.poll() is None, (self._folder / "log").read_text()
             time.sleep(0.05)
+
+    @property
+    def process_id(self) -> int:
+        """Of the process that has started the others."""
+        assert self._process is not None
+        return self._process.pid
 
     def kill(self) -> None:
         """Without an end to what it was at: the next start recovers."""

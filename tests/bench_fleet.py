@@ -1,0 +1,290 @@
+"""How much one collector takes, of ten thousand aircraft at a real Mosquitto, into a real PostgreSQL and into SQLite.
+
+Each aircraft has a connection of its own and comes with a session: its hello, a calibration and an arming as companions
+send them. Rates are items a second, by the clock and by a core-second of the collector's process; beside them, in the
+same run, the floors: COPY of the same rows into the same tables, the same rows through the store alone, and a
+subscriber that does nothing. Then how long an item takes from being published to being confirmed, two collectors of
+which one is killed every ten seconds, and the pages of a database of five years.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import itertools
+import os
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator, Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import psycopg
+
+from companion.fleet.collector import BATCH
+from companion.fleet.contract import read_key
+from companion.fleet.simulated import Aircraft
+from companion.fleet.store import Message, Outcome, Store, _read
+from tests import bench_fleet_pages
+from tests.support.broker import Broker, broker
+from tests.support.collecting import CollectorProcess, items_in, told_by
+from tests.support.fleet_bench import (
+    MOSQUITTO,
+    NOW,
+    POSTGRES,
+    Cost,
+    Meter,
+    Place,
+    Sessions,
+    processor_s,
+    say,
+    spread,
+)
+from tests.support.light_aircraft import Fleet, Light
+from tests.support.postgres import Postgres
+
+AIRCRAFT: Final = 10_000
+AT_ONCE: Final = 1000
+"""Aircraft with something unconfirmed at any moment while a rate is measured."""
+QUIET_A_SECOND: Final = 200
+"""Sessions a second while latencies are measured, and while collectors are killed."""
+KILLED_EVERY_S: Final = 10.0
+
+
+# --- floors
+
+
+def copy_rows(url: str, batches: Sequence[Sequence[Message]], database: Callable[[], float]) -> Cost:
+    """COPY of the rows that a collector makes of these messages, a transaction each batch."""
+    tables = []
+    for batch in batches:
+        rows: dict[str, list[dict[str, Any]]] = {}
+        for message in batch:
+            item = read_key(message.topic.split("/")[1], message.payload)
+            columns, made = _read(item, message, Outcome({}, {}, []))
+            for table, of in {"items": [{**item.key, **columns, "received_at": NOW}], **made}.items():
+                rows.setdefault(table, []).extend(of)
+        tables.append([(table, list(of[0]), [tuple(row.values()) for row in of]) for table, of in rows.items()])
+    store = Store(url)
+    store.prepare()
+    store.close()
+    with psycopg.connect(url) as connection:
+        meter = Meter(time.process_time, database)
+        for each in tables:
+            with connection.cursor() as cursor:
+                for table, names, values in each:
+                    with cursor.copy(f"COPY {table} ({', '.join(names)}) FROM STDIN".encode()) as copy:
+                        for row in values:
+                            copy.write_row(row)
+            connection.commit()
+        return meter.cost(sum(map(len, batches)))
+
+
+def take(url: str, batches: Sequence[Sequence[Message]], database: Callable[[], float] = lambda: 0.0) -> Cost:
+    """The store alone."""
+    store = Store(url)
+    store.prepare()
+    store.take(batches[0])
+    meter = Meter(time.process_time, database)
+    for batch in batches[1:]:
+        outcome = store.take(batch)
+        assert not outcome.rejected, outcome.rejected[0]
+    cost = meter.cost(sum(map(len, batches[1:])))
+    store.close()
+    return cost
+
+
+_SUBSCRIBER: Final = """
+import asyncio, sys, aiomqtt
+async def main():
+    async with aiomqtt.Client("127.0.0.1", int(sys.argv[1])) as client:
+        await client.subscribe("fleet/+/item", qos=1)
+        print("there", flush=True)
+        async for message in client.messages:
+            pass
+asyncio.run(main())
+"""
+
+
+async def bare_subscriber(fleet: Fleet, sessions: Sequence[tuple[Light, list[int]]], port: int) -> Cost:
+    """One that hears every item, and does nothing."""
+    command = [sys.executable, "-c", _SUBSCRIBER, str(port)]
+    process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
+    try:
+        assert process.stdout is not None
+        await process.stdout.readline()
+        meter = Meter(lambda: processor_s(process.pid))
+        for number, (light, sequences) in enumerate(sessions):
+            light.tell(sequences)
+            if number % 20 == 0:
+                while fleet.deliveries - fleet.taken > AT_ONCE:
+                    await asyncio.sleep(0.005)
+        while True:  # until it has nothing more to do
+            cost = meter.cost(fleet.deliveries)
+            await asyncio.sleep(0.5)
+            if meter.cost(1).own_s - cost.own_s < 0.02:
+                return cost
+    finally:
+        process.kill()
+        await process.wait()
+
+
+# --- collectors
+
+
+@contextlib.asynccontextmanager
+async def collectors(place: Place, url: str, number: int) -> AsyncIterator[list[CollectorProcess]]:
+    """At work, and through with what was kept by the broker."""
+    found = [_collector(place, url) for _ in range(number)]
+    try:
+        for each in found:
+            await each.at_work()
+        await asyncio.sleep(6.0)
+        while True:
+            before_s = _spent(found)
+            await asyncio.sleep(1.0)
+            if _spent(found) - before_s < 0.05 * number:
+                break
+        yield found
+    finally:
+        for each in found:
+            each.kill()
+
+
+def _collector(place: Place, url: str) -> CollectorProcess:
+    return CollectorProcess(place.folder, f"collector-{time.monotonic_ns()}", place.one, url, "--page", "off")
+
+
+def _spent(collectors: Sequence[CollectorProcess]) -> float:
+    return sum(processor_s(each.process_id) for each in collectors)
+
+
+async def rate(place: Place, fleet: Fleet, sessions: Sequence[tuple[Light, list[int]]], url: str, number: int) -> str:
+    """Of so many collectors while there is always more."""
+    async with collectors(place, url, number) as found:
+        meter = Meter(lambda: _spent(found), lambda: processor_s(place.postgres.process_id))
+        await asyncio.wait_for(fleet.tell(sessions, AT_ONCE), 600.0)
+        cost = meter.cost(len(fleet.confirmed))
+    _check(url, fleet)
+    return f"{cost} each item told {fleet.deliveries / cost.items:.2f} times"
+
+
+def _check(url: str, fleet: Fleet) -> None:
+    assert items_in(url) == told_by([light.one for light in fleet.lights]), "lost, or there twice"
+
+
+async def latency(place: Place, fleet: Fleet, sessions: Sequence[tuple[Light, list[int]]], url: str) -> str:
+    """From publishing to the confirmation, with one collector and less to do than it could."""
+    async with collectors(place, url, 1):
+        await asyncio.wait_for(fleet.tell_at(sessions, QUIET_A_SECOND), 600.0)
+    took_ms = [1e3 * (heard_s - told_s) for told_s, heard_s in fleet.confirmed]
+    return spread(took_ms)
+
+
+async def killed(place: Place, fleet: Fleet, sessions: Sequence[tuple[Light, list[int]]], url: str) -> str:
+    """Two collectors; every ten seconds one of them is killed, by turns, and another one started."""
+    async with collectors(place, url, 2) as found:
+        killings = 0
+
+        async def kill() -> None:
+            nonlocal killings
+            while True:
+                await asyncio.sleep(KILLED_EVERY_S)
+                found.pop(0).kill()
+                killings += 1
+                found.append(_collector(place, url))
+
+        killing = asyncio.create_task(kill())
+        await asyncio.wait_for(fleet.tell_at(sessions, QUIET_A_SECOND), 600.0)
+        killing.cancel()
+    _check(url, fleet)
+    again = fleet.deliveries - len(fleet.confirmed)
+    return (
+        f"{len(fleet.confirmed)} items, {killings} killings: none lost, none twice; {again} deliveries more than items"
+    )
+
+
+async def rates(place: Place, number: int, sessions: Sessions) -> None:
+    """All but the pages."""
+    folder, postgres = place.folder, place.postgres
+    fleet, one_of = Fleet([Aircraft(k) for k in range(number)]), Aircraft(number)
+    sizes = [len(one_of.told[sequence]) for sequence in sessions.add(one_of, NOW)]
+    print(f"{number} aircraft; a calibration has {sizes[0]} bytes, an arming {sizes[1]}")
+    async with broker(folder, "mosquitto", more=MOSQUITTO) as one:
+        place, numbers = place._replace(one=one), itertools.count(2)
+
+        def another() -> str:
+            return postgres.create(f"rates-{time.monotonic_ns()}")
+
+        def another_file() -> str:
+            return str(folder / f"rates-{time.monotonic_ns()}.sqlite")
+
+        def of_database() -> float:
+            return processor_s(postgres.process_id)
+
+        begun_s = time.monotonic()
+        async with fleet.at(one.port):
+            print(f"all at the broker after {time.monotonic() - begun_s:.1f} s")
+            print(f"\n{'items a second':52} {'by clock':>9} {'a core-s':>9} {'with db':>9}")
+            told = sessions.of(fleet, 1)
+            messages = [Message(f"fleet/{each.one.id}/item", each.one.told[k]) for each, of in told for k in of]
+            batches = [messages[k : k + BATCH] for k in range(0, len(messages), BATCH)]
+            say("floor: COPY of the same rows", copy_rows(another(), batches, of_database))
+            say("the store alone, PostgreSQL", take(another(), batches, of_database))
+            say("the store alone, SQLite", take(another_file(), batches))
+            say("floor: a subscriber that does nothing", await bare_subscriber(fleet, told, one.port))
+            for words, where, many in (
+                ("one collector, PostgreSQL", another(), 1),
+                ("two collectors, PostgreSQL", another(), 2),
+                ("one collector, SQLite", another_file(), 1),
+            ):
+                say(words, await rate(place, fleet, sessions.of(fleet, next(numbers)), where, many))
+            words = f"published to confirmed, {2 * QUIET_A_SECOND} items/s"
+            say(words, await latency(place, fleet, sessions.of(fleet, next(numbers)), another()))
+            words = "one of two killed every 10 s"
+            say(words, await killed(place, fleet, sessions.of(fleet, next(numbers)), another()))
+
+
+def main() -> None:
+    """By the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", default=["rates", "pages"], help="rates, pages, seed (default: all)")
+    parser.add_argument("--aircraft", type=int, default=AIRCRAFT, help=f"at the broker (default {AIRCRAFT})")
+    parser.add_argument("--aircraft-of-years", type=int, default=bench_fleet_pages.AIRCRAFT)
+    parser.add_argument("--folder", type=Path, help="for the databases; those of five years are used again")
+    options = parser.parse_args()
+    sessions = Sessions()
+    with tempfile.TemporaryDirectory(prefix="companion-bench-") as text:
+        folder = options.folder or Path(text)
+        folder.mkdir(exist_ok=True)
+        folder.chmod(0o755)
+        (folder / "postgres").mkdir(exist_ok=True)
+        postgres = Postgres(folder / "postgres", **POSTGRES)
+        postgres.start()
+        try:
+            _play(options, Place(folder, Broker(folder), postgres), sessions)
+        finally:
+            postgres.kill()
+
+
+def _play(options: argparse.Namespace, place: Place, sessions: Sessions) -> None:
+    name, number = f"pages{options.aircraft_of_years}", options.aircraft_of_years
+    urls = [place.postgres.url(name), str(place.folder / f"{name}.sqlite")]
+    if "rates" in options.parts:
+        asyncio.run(rates(place, options.aircraft, sessions))
+    for url in urls if {"pages", "seed"} & set(options.parts) else ():
+        done = place.folder / f"{name}-{'://' in url}.done"
+        if not done.exists():
+            if "://" in url:
+                place.postgres.create(name)
+            bench_fleet_pages.seed(url, sessions, number)
+            done.touch()
+    if "pages" in options.parts:
+        asyncio.run(bench_fleet_pages.pages(place, urls, number))
+    print(f"\nload average {os.getloadavg()[0]:.1f}")
+
+
+if __name__ == "__main__":
+    main()
