@@ -13,6 +13,8 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 import msgspec
 
+from companion.physics.units import DEG_H, MG
+
 FORMAT_VERSION: Final = 1
 MOST_RANGES: Final = 256
 """In one message to an aircraft."""
@@ -123,6 +125,61 @@ class _Event(msgspec.Struct, frozen=True):
     what: str
 
 
+class _GyroNode(msgspec.Struct, frozen=True):
+    degc: _Number
+    gyro_deg_h: _Axes
+    sigma_deg_h: _Axes
+
+
+class _AccelNode(msgspec.Struct, frozen=True):
+    degc: _Number
+    accel_mg: _Axes
+    sigma_mg: _Axes
+
+
+class _Curve(msgspec.Struct, frozen=True):
+    imu: Annotated[str, msgspec.Meta(max_length=64)]
+    power_ups: Annotated[int, msgspec.Meta(ge=0, le=MOST_SEQUENCE)]
+    curve: list[_GyroNode]
+    accel_curve: list[_AccelNode]
+
+
+class _Term(msgspec.Struct, frozen=True):
+    value: _Number
+    sigma: _Number
+
+
+class _Split(msgspec.Struct, frozen=True):
+    axis: _Word
+    in_flight: _Term | None = None
+    turn_on: _Term | None = None
+    motors: _Term | None = None
+
+
+class _Drift(msgspec.Struct, frozen=True):
+    seconds: _Number
+    median_m: _Number
+
+
+class _ImuFlight(msgspec.Struct, frozen=True):
+    imu: Annotated[int, msgspec.Meta(ge=0, le=64)]
+    calibration: str | None
+    axes: list[_Split]
+    drift: dict[str, list[_Drift]]
+    gyro_id: _Device = None
+    accel_id: _Device = None
+
+
+class _Flight(msgspec.Struct, frozen=True):
+    key: str
+    began_at: str | None
+    imus: Annotated[list[_ImuFlight], msgspec.Meta(max_length=64)]
+
+
+class _KeptFlight(msgspec.Struct, frozen=True):
+    flight: _Flight
+
+
 _TRIADS: Final = tuple(name for name in _Imu.__struct_fields__ if name.endswith(("_rad_s", "_m_s2")))
 
 
@@ -175,6 +232,42 @@ def _event(body: bytes) -> Rows:
     return {"events": [{"what": msgspec.json.decode(body, type=_Event).what, "body": body.decode()}]}
 
 
+def _curve(body: bytes) -> Rows:
+    told = msgspec.json.decode(body, type=_Curve)
+    found = [("gyro", node.degc, node.gyro_deg_h, node.sigma_deg_h, DEG_H) for node in told.curve]
+    found += [("accel", node.degc, node.accel_mg, node.sigma_mg, MG) for node in told.accel_curve]
+    rows: list[Row] = []
+    for triad, degc, bias, sigma, unit in found:
+        for axis, value, error in zip("xyz", bias or (), sigma or (), strict=False):
+            which = {"triad": triad, "axis": axis, "degc": degc, "imu": told.imu, "power_ups": told.power_ups}
+            rows.append({**which, "bias": value * unit, "sigma": error * unit})
+    return {"curves": rows}
+
+
+def _flight(body: bytes) -> Rows:
+    flight = msgspec.json.decode(body, type=_KeptFlight).flight
+    rows: list[Row] = []
+    for imu in flight.imus:
+        flown = min(imu.drift.get("flown", ()), key=lambda each: abs(each.seconds - 30.0), default=None)
+        which = {
+            "flight": flight.key,
+            "began_at": flight.began_at and moment(flight.began_at),
+            "instance": imu.imu,
+            "gyro_id": imu.gyro_id,
+            "accel_id": imu.accel_id,
+            "calibration_at": imu.calibration and moment(imu.calibration),
+            "drift_s": flown and flown.seconds,
+            "drift_m": flown and flown.median_m,
+        }
+        for axis in imu.axes:
+            terms = {"in_flight": axis.in_flight, "turn_on": axis.turn_on, "motors": axis.motors}
+            figures = {name: term and term.value for name, term in terms.items()}
+            sigmas = {f"{name}_sigma": term and term.sigma for name, term in terms.items()}
+            triad, _, letter = axis.axis.partition(" ")
+            rows.append({**which, "triad": triad, "axis": letter[:1], **figures, **sigmas})
+    return {"flights": rows}
+
+
 def _kept_raw(body: bytes) -> Rows:
     msgspec.json.decode(body, type=dict[str, Any])
     return {}
@@ -187,7 +280,8 @@ KINDS: Final[dict[str, Callable[[bytes], Rows]]] = {
     "alignment": _alignment,
     "event": _event,
     "profile": _kept_raw,
-    "curve": _kept_raw,
+    "curve": _curve,
+    "flight": _flight,
 }
 """What each kind's body becomes; the others are kept until a newer companion knows them."""
 
@@ -249,8 +343,8 @@ def read_item(item: Item, payload: bytes) -> tuple[Row, Rows]:
         rows = KINDS[told.kind](bytes(told.body))
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise NotTakenError(f"{told.kind}: {error}") from None
-    for event in rows.get("events", ()):
-        event["at"] = columns["at"]
+    for row in (*rows.get("events", ()), *rows.get("curves", ())):
+        row["at"] = columns["at"]
     columns["same"] = _same(told, rows)
     return {**columns, "state": "taken"}, {table: [{**item.key, **row} for row in of] for table, of in rows.items()}
 

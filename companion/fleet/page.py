@@ -170,10 +170,7 @@ def _vector(axes: dict[str, Any], column: str, unit: float) -> Vector | None:
 
 
 def _armings(connection: sa.Connection, which: str) -> list[Child]:
-    query = """
-        SELECT a.* FROM armings a
-        JOIN tellings t ON t.aircraft = a.aircraft AND t.epoch = a.epoch AND t.sequence = a.sequence
-        WHERE a.aircraft = :which ORDER BY a.armed_at DESC LIMIT :most"""
+    query = "SELECT * FROM arming_history WHERE aircraft = :which ORDER BY armed_at DESC LIMIT :most"
     found = [
         Arming(
             armed_at=each.armed_at.isoformat(),

@@ -157,6 +157,44 @@ events: Final = sa.Table(
     sa.Column("body", Words, nullable=False, comment="JSON"),
 )
 
+curves: Final = sa.Table(
+    "curves",
+    tables,
+    *_key(),
+    sa.Column("triad", sa.String(8), primary_key=True, comment="gyro, accel"),
+    sa.Column("axis", sa.String(1), primary_key=True),
+    sa.Column("degc", sa.Double, primary_key=True),
+    sa.Column("at", Moment),
+    sa.Column("imu", sa.String(64), nullable=False),
+    sa.Column("power_ups", sa.BigInteger, nullable=False, comment="that it was learned from"),
+    sa.Column("bias", sa.Double, nullable=False, comment="rad/s or m/s^2"),
+    sa.Column("sigma", sa.Double, nullable=False, comment="at the next power-up"),
+)
+
+flights: Final = sa.Table(
+    "flights",
+    tables,
+    *_key(),
+    sa.Column("instance", sa.BigInteger, primary_key=True, autoincrement=False, comment="of the IMU in the autopilot"),
+    sa.Column("triad", sa.String(16), primary_key=True, comment="gyro, accel"),
+    sa.Column("axis", sa.String(1), primary_key=True),
+    sa.Column("flight", Words, nullable=False, comment="the same from whichever log it was read"),
+    sa.Column("began_at", Moment),
+    sa.Column("gyro_id", sa.BigInteger),
+    sa.Column("accel_id", sa.BigInteger),
+    sa.Column("calibration_at", Moment, comment="started_at of the calibration whose offsets it flew with"),
+    sa.Column("drift_s", sa.Double, comment="a time of free inertial navigation"),
+    sa.Column("drift_m", sa.Double, comment="how far it is off by then, median"),
+    sa.Column(
+        "in_flight", sa.Double, comment="mean in the air, over what the offsets left; rad/s or m/s^2, as the next"
+    ),
+    sa.Column("in_flight_sigma", sa.Double),
+    sa.Column("turn_on", sa.Double, comment="before the motors"),
+    sa.Column("turn_on_sigma", sa.Double),
+    sa.Column("motors", sa.Double, comment="the step at their start"),
+    sa.Column("motors_sigma", sa.Double),
+)
+
 rejected: Final = sa.Table(
     "rejected",
     tables,
@@ -181,8 +219,15 @@ def _indices_by_time(connection: sa.Connection) -> None:
             index.create(connection, checkfirst=True)
 
 
+def curves_and_flights(connection: sa.Connection) -> None:
+    """Tables of their own; until then they were kept as they came."""
+    for table in (curves, flights):
+        table.create(connection, checkfirst=True)
+    connection.execute(sa.update(items).where(items.c.kind == "curve").values(state="unknown"))
+
+
 Step = Callable[[sa.Connection], object]
-STEPS: Sequence[Step] = (_indices_by_time,)
+STEPS: Sequence[Step] = (_indices_by_time, curves_and_flights)
 """The n-th brings tables of version n to version n + 1; views are made anew in any case."""
 
 

@@ -81,3 +81,45 @@ SELECT aircraft, imu, gyro_id, accel_id,
 FROM bias_history
 WHERE axis = 'x'
 GROUP BY aircraft, imu, gyro_id, accel_id;
+
+-- calibration_history: Calibrations however they ended, each once, with when they were put back
+SELECT c.aircraft, a.name, c.epoch, c.sequence, c.started_at, t.clock, c.duration_s, c.state, c.reason, c.held_back,
+       COALESCE(c.undone_at, (SELECT MIN(u.undone_at) FROM undos u
+                              WHERE u.aircraft = c.aircraft AND u.what = 'calibration' AND u.of_at = c.started_at)) AS undone_at
+FROM calibrations c
+JOIN tellings t ON t.aircraft = c.aircraft AND t.epoch = c.epoch AND t.sequence = c.sequence
+LEFT JOIN aircraft a ON a.aircraft = c.aircraft;
+
+-- arming_history: Armings, each once
+SELECT r.aircraft, a.name, r.epoch, r.sequence, r.armed_at, t.clock, r.state, r.reason, r.calibration_at
+FROM armings r
+JOIN tellings t ON t.aircraft = r.aircraft AND t.epoch = r.epoch AND t.sequence = r.sequence
+LEFT JOIN aircraft a ON a.aircraft = r.aircraft;
+
+-- temperature_curves: Biases over temperature of each IMU, by the latest curve that its aircraft has told
+SELECT aircraft, name, imu, at, power_ups, triad, axis, degc,
+       CASE WHEN triad = 'gyro' THEN bias * 206264.80624709636 END AS gyro_bias_deg_h,
+       CASE WHEN triad = 'gyro' THEN sigma * 206264.80624709636 END AS gyro_sigma_deg_h,
+       CASE WHEN triad = 'accel' THEN bias / 0.00980665 END AS accel_bias_mg,
+       CASE WHEN triad = 'accel' THEN sigma / 0.00980665 END AS accel_sigma_mg
+FROM (SELECT c.*, a.name, RANK() OVER (
+        PARTITION BY c.aircraft, c.imu
+        ORDER BY CASE WHEN c.epoch = a.epoch THEN c.sequence END DESC NULLS LAST, c.at DESC, c.sequence DESC) AS place
+      FROM curves c LEFT JOIN aircraft a ON a.aircraft = c.aircraft) AS numbered
+WHERE place = 1;
+
+-- flight_history: Biases in flight over what the offsets in force left, by IMU and axis, each flight once
+SELECT aircraft, name, flight, began_at, instance, gyro_id, accel_id, calibration_at, drift_s, drift_m, triad, axis,
+       CASE WHEN triad = 'gyro' THEN in_flight * 206264.80624709636 END AS in_flight_deg_h,
+       CASE WHEN triad = 'gyro' THEN in_flight_sigma * 206264.80624709636 END AS in_flight_sigma_deg_h,
+       CASE WHEN triad = 'gyro' THEN turn_on * 206264.80624709636 END AS turn_on_deg_h,
+       CASE WHEN triad = 'gyro' THEN motors * 206264.80624709636 END AS motors_deg_h,
+       CASE WHEN triad = 'accel' THEN in_flight / 0.00980665 END AS in_flight_mg,
+       CASE WHEN triad = 'accel' THEN in_flight_sigma / 0.00980665 END AS in_flight_sigma_mg,
+       CASE WHEN triad = 'accel' THEN turn_on / 0.00980665 END AS turn_on_mg,
+       CASE WHEN triad = 'accel' THEN motors / 0.00980665 END AS motors_mg
+FROM (SELECT f.*, a.name, RANK() OVER (
+        PARTITION BY f.aircraft, f.flight
+        ORDER BY CASE WHEN f.epoch = a.epoch THEN f.sequence END DESC NULLS LAST, f.epoch DESC, f.sequence DESC) AS place
+      FROM flights f LEFT JOIN aircraft a ON a.aircraft = f.aircraft) AS numbered
+WHERE place = 1;

@@ -172,7 +172,7 @@ def test_what_is_unknown_is_kept_and_taken_in_after_an_update(
     one = aircraft(3)
     calibration = items_of(one)[0]
     messages = [
-        changed(calibration, sequence=101, kind="flight", body={"minutes": 7}),
+        changed(calibration, sequence=101, kind="battery", body={"minutes": 7}),
         changed(calibration, sequence=102, format_version=2, body=[1, 2]),
     ]
     with monkeypatch.context() as older:
