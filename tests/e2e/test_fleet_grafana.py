@@ -1,0 +1,111 @@
+"""The dashboard of docs/fleet: the SQL of every panel and variable, as Grafana would send it, at a real PostgreSQL."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+
+from companion.fleet import demo, schema
+from companion.fleet.store import Message, Store
+from tests.e2e.test_fleet_views import curve, kept_flight
+from tests.support.postgres import INITDB, postgres
+
+DASHBOARD = json.loads((Path(__file__).parents[2] / "docs/fleet/grafana.json").read_text(encoding="utf-8"))
+PANELS: list[dict[str, Any]] = DASHBOARD["panels"]
+VARIABLES: list[dict[str, Any]] = DASHBOARD["templating"]["list"]
+NOW = datetime.datetime.now(tz=datetime.UTC)
+
+
+@pytest.fixture(scope="module")
+def database() -> Iterator[str]:
+    """With the fleet of the demonstration."""
+    if INITDB is None:
+        pytest.skip("no PostgreSQL")
+    fleet = demo.fleet_of(demo.AIRCRAFT, NOW)
+    one = fleet[0]
+    one.tell("curve", NOW, curve("fc1", 7.0))
+    one.tell("flight", NOW, kept_flight("a", (NOW - datetime.timedelta(days=3)).isoformat(), 11.0))
+    with postgres() as server:
+        where = server.create("fleet")
+        store = Store(where)
+        store.prepare()
+        for each in fleet:
+            store.take([Message(f"fleet/{each.id}/item", payload) for payload in each.told.values()])
+            store.take([Message(f"fleet/{each.id}/hello", each.hello)])
+        store.close()
+        with psycopg.connect(where, autocommit=True) as connection:  # as docs/fleet.md says
+            connection.execute("CREATE ROLE grafana LOGIN PASSWORD '...'")
+            connection.execute("GRANT pg_read_all_data TO grafana")
+        yield where.replace("fleet@", "grafana@")
+
+
+def as_sent(sql: str, aircraft: str) -> str:
+    """Macros and variables replaced as Grafana's PostgreSQL data source does, for its last 90 days."""
+    since, until = (f"{at:%Y-%m-%dT%H:%M:%SZ}" for at in (NOW - datetime.timedelta(days=90), NOW))
+    sql = sql.replace("${aircraft:sqlstring}", "'" + aircraft.replace("'", "''") + "'")
+    sql = re.sub(r"\$__timeFilter\((\w+)\)", rf"\1 BETWEEN '{since}' AND '{until}'", sql)
+    sql = re.sub(r"\$__timeGroupAlias\((\w+), *'1d'\)", r'floor(extract(epoch from \1)/86400)*86400 AS "time"', sql)
+    assert "$" not in sql
+    return sql
+
+
+def answer(database: str, sql: str, aircraft: str = "nobody") -> tuple[list[psycopg.Column], list[tuple[Any, ...]]]:
+    with psycopg.connect(database) as connection:
+        found = connection.execute(as_sent(sql, aircraft).encode())
+        return found.description or [], found.fetchall()
+
+
+@pytest.fixture(scope="module")
+def somebody(database: str) -> str:
+    """What the variable gives for the first aircraft."""
+    (variable,) = (each for each in VARIABLES if each["type"] == "query")
+    columns, rows = answer(database, variable["query"])
+    assert [column.name for column in columns] == ["__text", "__value"]
+    assert len(rows) == demo.AIRCRAFT
+    return str(next(value for text, value in rows if text == "Heron 1"))
+
+
+@pytest.mark.parametrize("panel", PANELS, ids=lambda panel: panel["title"])
+def test_every_panel_has_an_answer(database: str, somebody: str, panel: dict[str, Any]) -> None:
+    (target,) = panel["targets"]
+    columns, rows = answer(database, target["rawSql"], somebody)
+    assert rows
+    names = [column.name for column in columns]
+    if target["format"] == "time_series":  # the time, a name for each line, and the value
+        assert names == ["time", "metric", "value"]
+        types = [column.type_display for column in columns]
+        assert types[0] in ("timestamptz", "numeric")
+        assert types[1].startswith(("text", "varchar"))
+        assert types[2] in ("float8", "int8")
+        assert [row[0] for row in rows] == sorted(row[0] for row in rows)
+    else:
+        assert len({*names}) == len(names) > 1
+
+
+@pytest.mark.parametrize("panel", PANELS, ids=lambda panel: panel["title"])
+def test_panels_ask_the_views_of_the_database_that_is_chosen(panel: dict[str, Any]) -> None:
+    (target,) = panel["targets"]
+    assert panel["datasource"] == target["datasource"]
+    assert panel["datasource"] == {"type": "grafana-postgresql-datasource", "uid": "${database}"}
+    assert {each["type"]: each["query"] for each in VARIABLES}["datasource"] == "grafana-postgresql-datasource"
+    asked = set(re.findall(r"(?:FROM|JOIN) (\w+)", target["rawSql"]))
+    assert asked <= {view for view, _, _ in schema.views()}
+    assert asked
+
+
+def test_panels_do_not_overlap() -> None:
+    taken: set[tuple[int, int]] = set()
+    for panel in PANELS:
+        at = panel["gridPos"]
+        cells = {(at["x"] + k, at["y"] + j) for k in range(at["w"]) for j in range(at["h"])}
+        assert not cells & taken, panel["title"]
+        assert at["x"] + at["w"] <= 24
+        taken |= cells
+    assert len({panel["id"] for panel in PANELS}) == len(PANELS)
