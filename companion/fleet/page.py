@@ -6,11 +6,15 @@ import datetime
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 import sqlalchemy as sa
 
 from companion.calibration.records.record import Arming
+from companion.calibration.solution.by_temperature import Seen
+from companion.fleet.imu_pages import by_temperature, curves
 from companion.fleet.schema import Moment, rejected
 from companion.fleet.schema import aircraft as known
+from companion.physics.frames import vector
 from companion.physics.units import DEG_H, MG
 from companion.report.markup import Child, Markup, row, tag
 from companion.report.page import NAMES, TRIADS, Point, arming_items, card, drift, page, with_sigma
@@ -86,11 +90,11 @@ def glance(connection: sa.Connection, now: datetime.datetime) -> str:
         ),
         tag("table", head, *rows, class_="fleet") if rows else None,
         _refused(connection, now),
-        source=_SOURCE,
+        source=SOURCE,
     )
 
 
-_SOURCE: Final = "from the fleet's database"
+SOURCE: Final = "from the fleet's database"
 _CLASSES: Final = {"alarm": "bad", "caution": "warn", "fine": "ok"}
 
 
@@ -117,13 +121,14 @@ def aircraft(connection: sa.Connection, which: str, now: datetime.datetime) -> s
     parts += _imus(connection, which)
     parts += _armings(connection, which)
     parts += _notes(connection, which)
-    return page(name, now, *parts, source=_SOURCE)
+    return page(name, now, *parts, source=SOURCE)
 
 
 def _imus(connection: sa.Connection, which: str) -> list[Child]:
     query = "SELECT * FROM bias_history WHERE aircraft = :which ORDER BY started_at DESC, imu, axis LIMIT :most"
     rows = _rows(connection, query, which=which, most=MOST_CALIBRATIONS * 3 * 4)
     parts: list[Child] = []
+    told = curves(connection, which)
     for imu in sorted({each.imu for each in rows}):
         of_it = [each for each in rows if each.imu == imu]
         ids = [
@@ -146,7 +151,37 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
                 tag("table", row(*(tag("th", axis) for axis in "xyz")), row(*cells)),
                 drift(points, triad, name=f"{imu} {triad}"),
             ]
+        parts.append(by_temperature(told.get(imu), _seen(of_it)))
     return parts
+
+
+def _seen(rows: Sequence[Any]) -> list[Seen]:
+    """At which temperature which bias was found."""
+    degc = {(each.sequence, each.started_at.timestamp()): each.temperature_degc for each in rows}
+    accel = {(point.number, point.unix_s): point for point in _points(rows, "accel")}
+
+    def shown(point: Point | None, values: str, unit: float) -> Vector | None:
+        return None if point is None else vector(np.array(getattr(point, values)) / unit)
+
+    found = []
+    for number, point in enumerate(_points(rows, "gyro")):
+        key = (point.number, point.unix_s)
+        bias, sigma = (shown(point, values, DEG_H) for values in ("bias", "sigma_use"))
+        if degc.get(key) is not None and bias is not None and sigma is not None:
+            forces, of_forces = (shown(accel.get(key), values, MG) for values in ("bias", "sigma_use"))
+            found.append(
+                Seen(
+                    at_unix_s=key[1] or 0.0,
+                    started_at="",
+                    power_up=number,
+                    degc=degc[key],
+                    gyro_deg_h=bias,
+                    sigma_deg_h=sigma,
+                    accel_mg=forces,
+                    accel_sigma_mg=of_forces,
+                )
+            )
+    return found
 
 
 def _points(rows: Sequence[Any], triad: Triad) -> list[Point]:

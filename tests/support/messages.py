@@ -53,6 +53,7 @@ ELSEWHERE = {
     "companion/fleet/acl.py": "lines of brokers' files; what is no aircraft and its user, with what is allowed",
     "companion/fleet/contract.py": "reasons in the table of what was rejected, with what was found and what is allowed",
     "companion/fleet/demo.py": "what simulated aircraft tell, and words to their broker",
+    "companion/fleet/imu_pages.py": "labels of pages: docs/fleet.md",
     "companion/fleet/metrics.py": "what Prometheus reads: docs/fleet.md",
     "companion/fleet/page.py": "labels of pages: docs/fleet.md",
     "companion/fleet/server.py": "answers to browsers; what of its options is wrong, with what is allowed",
