@@ -33,8 +33,9 @@ class Straying:
         self._last = None
 
     def add(self, t_s: float, heading_rad: float, sigma_rad: float, rate_rad_s: float, late_s: float = 0.0) -> None:
-        """Heading with its sigma, and how fast the other gyros turn about the vertical; after a gap it begins anew.
+        """Heading with its sigma, and how fast the other gyros turn about the vertical.
 
+        What happens in a gap is not counted; after one of `WITHIN_S` it begins anew.
         `late_s`: by how much more than usual the times of the two may lie apart.
         """
         before, self._last = self._last, (t_s, heading_rad, rate_rad_s)
@@ -42,17 +43,17 @@ class Straying:
             self._sigma_rad = max(self._sigma_rad, sigma_rad)
             return
         passed_s = t_s - before[0]
-        if not 0.0 < passed_s <= LONGEST_STEP_S:
-            self.strayed_rad = self._turned_rad = self._apart_rad = 0.0
-            self._sigma_rad, self.is_too_far = sigma_rad, False
-            return
-        kept = 1.0 - passed_s / WITHIN_S
-        by_gyros = 0.5 * (rate_rad_s + before[2]) * passed_s
-        heading = math.remainder(heading_rad - before[1], 2.0 * math.pi)
-        self.strayed_rad = self.strayed_rad * kept + heading - by_gyros
-        self._turned_rad = self._turned_rad * kept + abs(by_gyros)
+        kept = 1.0 - passed_s / WITHIN_S if 0.0 < passed_s < WITHIN_S else 0.0
+        self.strayed_rad *= kept
+        self._turned_rad *= kept
+        self._apart_rad *= kept
         self._sigma_rad = max(self._sigma_rad * kept, sigma_rad)
-        self._apart_rad = max(self._apart_rad * kept, late_s * max(abs(rate_rad_s), abs(heading / passed_s)))
+        if 0.0 < passed_s <= LONGEST_STEP_S:
+            by_gyros = 0.5 * (rate_rad_s + before[2]) * passed_s
+            heading = math.remainder(heading_rad - before[1], 2.0 * math.pi)
+            self.strayed_rad += heading - by_gyros
+            self._turned_rad += abs(by_gyros)
+            self._apart_rad = max(self._apart_rad, late_s * max(abs(rate_rad_s), abs(heading / passed_s)))
         apart = LATE_S * abs(rate_rad_s) + self._apart_rad
         allowed = max(STRAYS_RAD, SIGMAS * self._sigma_rad) + SCALES * self._turned_rad + apart
         self.is_too_far = abs(self.strayed_rad) > allowed

@@ -71,3 +71,17 @@ def test_what_happened_while_nothing_came_is_not_known() -> None:
     assert not straying.is_too_far
     straying.add(2.1, 1.2, 0.02, 0.0)
     assert straying.is_too_far
+
+
+def test_a_drift_is_found_on_a_line_that_loses_a_fifth() -> None:
+    """Two lost in a row are a gap in which nothing is compared, and nothing is forgotten."""
+    straying, dice = Straying(), np.random.default_rng(3)
+    for seed in range(20):
+        straying, found_s = Straying(), math.inf
+        for t_s in np.arange(10.0, 30.0, 1.0 / HZ):
+            if dice.random() > 0.2:
+                straying.add(float(t_s), math.radians(3.0 * max(0.0, t_s - 20.0)), math.radians(1.0), 0.0)
+            if straying.is_too_far:
+                found_s = float(t_s)
+                break
+        assert 20.0 < found_s < 24.0, seed
