@@ -67,12 +67,17 @@ def main() -> int:
     parser.add_argument("--slice", type=int, metavar="N", help="only N faults, each in one phase, chosen by the seed")
     parser.add_argument("--progress", action="store_true", help="tell of each cell as it ends")
     parser.add_argument("--hour", action="store_true", help="an hour of operation with random faults instead")
+    parser.add_argument("--fleet", action="store_true", help="faults between a fleet and its database instead")
     parser.add_argument("--minutes", type=float, default=60.0, help="with --hour: so long")
     options = parser.parse_args()
     if options.hour:
         from tests.campaign.hour import main as hour
 
         return hour(options.seed, options.minutes, options.json)
+    if options.fleet:
+        from tests.campaign.fleet import main as fleet
+
+        return fleet(options.seed, options.only)
     cells = [(name, phase, options.seed) for name in _chosen(options.only) for phase in options.phase or PHASES]
     if options.slice is not None:
         cells = slice_of(options.seed, options.slice)

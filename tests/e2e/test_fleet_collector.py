@@ -110,42 +110,6 @@ def test_collectors_are_killed_and_started_again_and_again(database: str, tmp_pa
 
 
 @pytest.mark.parametrize("database", KINDS, indirect=True)
-def test_the_broker_and_the_database_are_killed_and_come_back(
-    database: str, request: pytest.FixtureRequest, tmp_path: Path
-) -> None:
-    fleet = fleet_of(6, 12, seed=4)
-    quick(fleet)
-    server: Postgres | None = request.getfixturevalue("server") if database.startswith("postgresql") else None
-
-    def news() -> None:
-        for each in fleet:
-            each.calibrate(NOW)
-
-    async def main() -> None:
-        async with broker(tmp_path) as one:
-            collector = CollectorProcess(tmp_path, "collector", one, database)
-            try:
-                async with telling(fleet, one):
-                    await until_confirmed(fleet)
-                    one.kill()
-                    news()
-                    await one.start()
-                    await until_confirmed(fleet)
-                    if server is not None:
-                        server.kill()
-                        news()
-                        await asyncio.sleep(1.0)
-                        server.start()
-                        await until_confirmed(fleet)
-                assert collector.stop() == 0
-            finally:
-                collector.kill()
-
-    asyncio.run(main())
-    assert items_in(database) == told_by(fleet)
-
-
-@pytest.mark.parametrize("database", KINDS, indirect=True)
 def test_nothing_is_confirmed_before_it_is_committed(database: str, tmp_path: Path) -> None:
     """Somebody else holds the table: what was told waits there, and all of it is confirmed once that one has let go."""
     (one_aircraft,) = fleet = fleet_of(1, 5, seed=7)

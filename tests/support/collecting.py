@@ -31,10 +31,12 @@ NOW = datetime.datetime(2026, 11, 20, 12, tzinfo=datetime.UTC)
 class CollectorProcess:
     """`companion fleet run`."""
 
-    def __init__(self, folder: Path, name: str, one: Broker, database: str, *more: str) -> None:
+    def __init__(
+        self, folder: Path, name: str, one: Broker, database: str, *more: str, username: str | None = None
+    ) -> None:
         self.log = folder / f"{name}.log"
         config = folder / f"{name}.toml"
-        config.write_text(one.section(keepalive_s=5))
+        config.write_text(one.section(keepalive_s=5, **({} if username is None else {"username": username})))
         command = [sys.executable, "-m", "companion", "fleet", "run", "-c", str(config), "--database", database, *more]
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(command, stdout=log, stderr=log)

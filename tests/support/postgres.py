@@ -91,6 +91,21 @@ class Postgres:
             connection.execute(f'CREATE DATABASE "{name}"'.encode())
         return self.url(name)
 
+    @contextlib.contextmanager
+    def created_in(self, folder: Path) -> Iterator[str]:
+        """The address of a new database whose tables are in a folder of their own; it is gone at the end."""
+        if _ROOT:
+            shutil.chown(folder, "postgres", "postgres")
+        name = folder.name
+        with psycopg.connect(self.url("postgres"), autocommit=True) as connection:
+            connection.execute(f"CREATE TABLESPACE \"{name}\" LOCATION '{folder}'".encode())
+            connection.execute(f'CREATE DATABASE "{name}" TABLESPACE "{name}"'.encode())
+            try:
+                yield self.url(name)
+            finally:
+                connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)'.encode())
+                connection.execute(f'DROP TABLESPACE "{name}"'.encode())
+
 
 @contextlib.contextmanager
 def postgres() -> Iterator[Postgres]:
