@@ -318,3 +318,54 @@ def test_an_access_list_that_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyP
             one.kill()
 
     asyncio.run(main())
+
+
+# --- it does not take everything
+
+
+@mosquitto_only
+@pytest.mark.parametrize("limit", ["max_packet_size 9000", "message_size_limit 8800"])
+def test_a_message_that_is_too_long_for_the_broker_is_left_out_and_the_others_go_on(tmp_path: Path, limit: str) -> None:
+    async def main() -> None:
+        async with broker(tmp_path, more=limit) as one, alone(tmp_path, one.section()) as service:
+            await until_connected(service)
+            assert service.faces.mqtt is not None
+            assert service.faces.mqtt.link is not None
+            outbox = service.faces.mqtt.link.outbox
+            async with peer(one) as watcher:
+                outbox.answer("fleet/of/long", b"x" * 9000, droppable=True)
+                outbox.answer("fleet/of/short", b"behind it", droppable=True)
+                await watcher.until("fleet/of/short", is_(b"behind it"))
+                await until_bad(service, "messages of 9.0 kB or more end the connection (the broker's size limit?)")
+                connections = service.faces.mqtt.link.connections
+                for k in range(5):
+                    outbox.answer("fleet/of/long", b"x" * 9000, droppable=True)
+                    outbox.answer("fleet/of/almost", b"%d" % k + b"x" * 8500, droppable=True)
+                    await watcher.until("fleet/of/almost", is_(b"%d" % k + b"x" * 8500))
+                assert service.faces.mqtt.link.connections == connections
+                assert not [heard for heard in watcher.heard if heard.topic == "fleet/of/long"]
+
+    asyncio.run(main())
+
+
+@mosquitto_only
+def test_what_the_broker_refuses_is_said(tmp_path: Path) -> None:
+    words = "the broker does not let us publish to fleet/of/long (its access list?)"
+    (tmp_path / "acl").write_text(f"topic readwrite {BASE}/#\n")
+
+    async def main() -> None:
+        async with (
+            broker(tmp_path, more=f"acl_file {tmp_path}/acl") as one,
+            alone(tmp_path, one.section()) as service,
+        ):
+            await until_connected(service)
+            assert service.faces.mqtt is not None
+            assert service.faces.mqtt.link is not None
+            assert service.status()["mqtt"]["good"]
+            for _ in range(3):
+                service.faces.mqtt.link.outbox.answer("fleet/of/long", b"x" * 9500, droppable=True)
+            await until_bad(service, words)
+            assert service.status()["mqtt"]["summary"].count("publish to") == 1
+            assert service.faces.mqtt.link.connections == 1
+
+    asyncio.run(main())

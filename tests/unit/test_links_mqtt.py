@@ -31,7 +31,7 @@ class Breaking(MqttLink):
     async def _subscribe(self, client: Any) -> None:
         pass
 
-    async def _send(self, client: Any) -> None:
+    async def _send(self, client: Any, broker: Any) -> None:
         await asyncio.get_running_loop().create_future()
 
     async def _receive(self, client: Any) -> None:

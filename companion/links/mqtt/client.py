@@ -14,13 +14,14 @@ import datetime
 import importlib
 import importlib.util
 import logging
+import math
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from companion.config.sections import Mqtt
 from companion.links.mqtt.broker import explain, is_of_protocol, is_open_to_all, read_password, tls_context
 from companion.links.mqtt.filter import LEAVE_DEADLINE_S, MAX_PACKET_BYTES, MqttFilter
-from companion.links.mqtt.outbox import Outbox
+from companion.links.mqtt.outbox import Outbox, Parcel
 from companion.links.system.connection import Backoff, Reconnection
 from companion.links.system.waiting import comes
 
@@ -44,6 +45,12 @@ MQTT_3_1_1: Final = 4
 MQTT_5: Final = 5
 """The numbers of the two protocols on the wire."""
 _REFUSED: Final = 128
+_NOT_AUTHORISED: Final = 0x87
+LONG_BYTES: Final = 4096
+"""What is shorter is no reason for a broker to end a connection."""
+LOSSES: Final = 3
+"""So often a connection ends at one long message before it is left out."""
+LEFT_OUT_S: Final = 3600.0
 
 Offload = Callable[..., Awaitable[Any]]
 
@@ -86,6 +93,11 @@ class MqttLink:
         self._connected_s: float | None = None
         self._since = datetime.datetime.now(tz=datetime.UTC)
         self._refused: list[str] = []
+        self._under_way: Parcel | None = None
+        self._lost: tuple[Parcel | None, int] = None, 0
+        """The long message that the last connection ended at, and how many have."""
+        self._left_out: tuple[float, float] = math.inf, -math.inf
+        """Messages of so many bytes are not sent, until then."""
         self._warned_open = False
         self._echoed = will is None
 
@@ -111,6 +123,8 @@ class MqttLink:
         next_s = self._reconnection.retry_s
         retry_s = None if next_s is None else max(0.0, next_s - now_s)
         refused_now = [*self._refused]
+        if now_s < self._left_out[1]:
+            refused_now.append(_left_out_words(self._left_out[0]))
         if since_s is not None and since_s > ANSWER_DEADLINE_S and not self._echoed:
             # Few brokers tell a client that they let it neither speak nor hear.
             refused_now.append("our own messages do not come back (the broker's access list?)")
@@ -193,8 +207,9 @@ class MqttLink:
         client = self._client(broker.address, password)
         await _enter(client, broker)
         try:
-            await _both(self._speak(client), self._receive(client))
+            await _both(self._speak(client, broker), self._receive(client))
         finally:
+            self._count_loss()
             self._connected_s = self._spoken_to = None
             self.outbox.closed()
             await _leave(client)
@@ -224,11 +239,11 @@ class MqttLink:
             logger=_quiet,
         )
 
-    async def _speak(self, client: aiomqtt.Client) -> None:
+    async def _speak(self, client: aiomqtt.Client, broker: MqttFilter) -> None:
         await self._subscribe(client)
         self._spoken_to = client
         self._up()
-        await self._send(client)
+        await self._send(client, broker)
 
     async def hear(self, topic: str) -> None:
         """Subscribe to one more topic, now and at every connection."""
@@ -260,13 +275,40 @@ class MqttLink:
             self._refused.append(f"the broker does not let us hear {topic} (its access list?)")
             logger.warning("mqtt: %s: %s", self.where, self._refused[-1])
 
-    async def _send(self, client: aiomqtt.Client) -> None:
+    async def _send(self, client: aiomqtt.Client, broker: MqttFilter) -> None:
+        loop = asyncio.get_running_loop()
         while True:
             parcel = await self.outbox.next()
-            await client.publish(
-                parcel.topic, parcel.payload, qos=parcel.qos, retain=parcel.retain, timeout=ANSWER_DEADLINE_S
-            )
+            least_bytes, until_s = self._left_out
+            if len(parcel.payload) < least_bytes or loop.time() >= until_s:
+                self._under_way = parcel
+                await client.publish(
+                    parcel.topic, parcel.payload, qos=parcel.qos, retain=parcel.retain, timeout=ANSWER_DEADLINE_S
+                )
+                self._under_way = None
+                if parcel.qos and broker.receipt >= _REFUSED:
+                    self._say_refused(parcel.topic, broker.receipt)
             self.outbox.sent(parcel)
+
+    def _say_refused(self, topic: str, code: int) -> None:
+        """Once for each topic and connection; only brokers of MQTT 5 say it."""
+        words = f"the broker refuses what we publish to {topic} (reason {code})"
+        if code == _NOT_AUTHORISED:
+            words = f"the broker does not let us publish to {topic} (its access list?)"
+        if words not in self._refused:
+            self._refused.append(words)
+            logger.warning("mqtt: %s: %s", self.where, words)
+
+    def _count_loss(self) -> None:
+        """A long message at which connections end again and again is more than the broker, or the line, takes."""
+        lost, self._under_way = self._under_way, None
+        if lost is None or len(lost.payload) < LONG_BYTES:
+            return
+        self._lost = lost, self._lost[1] + 1 if self._lost[0] == lost else 1
+        if self._lost[1] >= LOSSES:
+            self._lost = None, 0
+            self._left_out = len(lost.payload), asyncio.get_running_loop().time() + LEFT_OUT_S
+            logger.warning("mqtt: %s: %s", self.where, _left_out_words(len(lost.payload)))
 
     async def _receive(self, client: aiomqtt.Client) -> None:
         """Wait for the end of the connection; what comes is dealt with as it comes (`_inbox`)."""
@@ -289,6 +331,12 @@ class MqttLink:
         self.outbox.opened()
         protocol = {MQTT_5: "MQTT 5", MQTT_3_1_1: "MQTT 3.1.1"}[self._protocol]
         self._reconnection.up(f"connected to {self.where} ({protocol})")
+
+
+def _left_out_words(size: float) -> str:
+    return (
+        f"messages of {size / 1e3:.1f} kB or more end the connection (the broker's size limit?): left out for an hour"
+    )
 
 
 async def _both(sending: Coroutine[Any, Any, None], receiving: Coroutine[Any, Any, None]) -> None:

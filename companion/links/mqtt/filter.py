@@ -64,6 +64,8 @@ class MqttFilter:
         self._greeted = False
         self.fault: BaseException | None = None
         """Why the connection was ended here: a `BrokerFaultError`, a `NoGreetingError` or an `OSError`."""
+        self.receipt = 0
+        """The reason code of the broker's last receipt, which the library does not show; 128 or more: a refusal."""
 
     async def __aenter__(self) -> Self:
         """Reach the broker; raises OSError where that or TLS fails, UnicodeError where the host cannot be a name."""
@@ -187,6 +189,8 @@ class MqttFilter:
 
     def _passed_on(self, kind: int, body: bytes) -> bytes:
         """A packet as the library gets it: without properties."""
+        if kind == PUBACK:
+            self.receipt = body[2] if len(body) > 2 else 0
         try:
             at = _properties_at(kind, body)
             if self._protocol >= _MQTT_5 and len(body) > at:
