@@ -13,6 +13,8 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 import msgspec
 
+from companion.calibration.records.flight_record import KeptFlight
+from companion.calibration.solution.by_temperature import Expected, ExpectedForces
 from companion.physics.units import DEG_H, MG
 
 FORMAT_VERSION: Final = 1
@@ -125,59 +127,14 @@ class _Event(msgspec.Struct, frozen=True):
     what: str
 
 
-class _GyroNode(msgspec.Struct, frozen=True):
-    degc: _Number
-    gyro_deg_h: _Axes
-    sigma_deg_h: _Axes
+class Curve(msgspec.Struct, frozen=True):
+    """How the biases of an IMU follow the temperature."""
 
-
-class _AccelNode(msgspec.Struct, frozen=True):
-    degc: _Number
-    accel_mg: _Axes
-    sigma_mg: _Axes
-
-
-class _Curve(msgspec.Struct, frozen=True):
     imu: Annotated[str, msgspec.Meta(max_length=64)]
     power_ups: Annotated[int, msgspec.Meta(ge=0, le=MOST_SEQUENCE)]
-    curve: list[_GyroNode]
-    accel_curve: list[_AccelNode]
-
-
-class _Term(msgspec.Struct, frozen=True):
-    value: _Number
-    sigma: _Number
-
-
-class _Split(msgspec.Struct, frozen=True):
-    axis: _Word
-    in_flight: _Term | None = None
-    turn_on: _Term | None = None
-    motors: _Term | None = None
-
-
-class _Drift(msgspec.Struct, frozen=True):
-    seconds: _Number
-    median_m: _Number
-
-
-class _ImuFlight(msgspec.Struct, frozen=True):
-    imu: Annotated[int, msgspec.Meta(ge=0, le=64)]
-    calibration: str | None
-    axes: list[_Split]
-    drift: dict[str, list[_Drift]]
-    gyro_id: _Device = None
-    accel_id: _Device = None
-
-
-class _Flight(msgspec.Struct, frozen=True):
-    key: str
-    began_at: str | None
-    imus: Annotated[list[_ImuFlight], msgspec.Meta(max_length=64)]
-
-
-class _KeptFlight(msgspec.Struct, frozen=True):
-    flight: _Flight
+    days: int
+    curve: tuple[Expected, ...]
+    accel_curve: tuple[ExpectedForces, ...]
 
 
 _TRIADS: Final = tuple(name for name in _Imu.__struct_fields__ if name.endswith(("_rad_s", "_m_s2")))
@@ -233,19 +190,20 @@ def _event(body: bytes) -> Rows:
 
 
 def _curve(body: bytes) -> Rows:
-    told = msgspec.json.decode(body, type=_Curve)
+    told = msgspec.json.decode(body, type=Curve)
     found = [("gyro", node.degc, node.gyro_deg_h, node.sigma_deg_h, DEG_H) for node in told.curve]
     found += [("accel", node.degc, node.accel_mg, node.sigma_mg, MG) for node in told.accel_curve]
-    rows: list[Row] = []
-    for triad, degc, bias, sigma, unit in found:
-        for axis, value, error in zip("xyz", bias or (), sigma or (), strict=False):
-            which = {"triad": triad, "axis": axis, "degc": degc, "imu": told.imu, "power_ups": told.power_ups}
-            rows.append({**which, "bias": value * unit, "sigma": error * unit})
+    which = {"imu": told.imu, "power_ups": told.power_ups}
+    rows: list[Row] = [
+        {**which, "triad": triad, "axis": axis, "degc": degc, "bias": bias[k] * unit, "sigma": sigma[k] * unit}
+        for triad, degc, bias, sigma, unit in found
+        for k, axis in enumerate("xyz")
+    ]
     return {"curves": rows}
 
 
 def _flight(body: bytes) -> Rows:
-    flight = msgspec.json.decode(body, type=_KeptFlight).flight
+    flight = msgspec.json.decode(body, type=KeptFlight).flight
     rows: list[Row] = []
     for imu in flight.imus:
         flown = min(imu.drift.get("flown", ()), key=lambda each: abs(each.seconds - 30.0), default=None)
@@ -259,12 +217,13 @@ def _flight(body: bytes) -> Rows:
             "drift_s": flown and flown.seconds,
             "drift_m": flown and flown.median_m,
         }
-        for axis in imu.axes:
-            terms = {"in_flight": axis.in_flight, "turn_on": axis.turn_on, "motors": axis.motors}
-            figures = {name: term and term.value for name, term in terms.items()}
-            sigmas = {f"{name}_sigma": term and term.sigma for name, term in terms.items()}
-            triad, _, letter = axis.axis.partition(" ")
-            rows.append({**which, "triad": triad, "axis": letter[:1], **figures, **sigmas})
+        for split in imu.axes:
+            triad, _, axis = split.axis.partition(" ")
+            row: Row = {**which, "triad": triad[:16], "axis": axis[:1]}
+            for name in ("in_flight", "turn_on", "motors"):
+                term = getattr(split, name)
+                row |= {name: term and term.value, f"{name}_sigma": term and term.sigma}
+            rows.append(row)
     return {"flights": rows}
 
 

@@ -8,7 +8,8 @@ from typing import Final
 import msgspec
 import sqlalchemy as sa
 
-from companion.calibration.solution.by_temperature import ByTemperature, Expected, ExpectedForces, Seen
+from companion.calibration.solution.by_temperature import ByTemperature, Seen
+from companion.fleet.contract import Curve
 from companion.fleet.schema import items
 from companion.report.by_temperature import biases_by_temperature
 from companion.report.markup import Markup
@@ -17,19 +18,11 @@ _CURVES: Final = 16
 """The latest that are looked at, of all IMUs of an aircraft."""
 
 
-class _Curve(msgspec.Struct, frozen=True):
-    imu: str
-    power_ups: int
-    days: int
-    curve: tuple[Expected, ...]
-    accel_curve: tuple[ExpectedForces, ...] = ()
-
-
 class Told(msgspec.Struct, frozen=True):
     """An item."""
 
     at: str
-    body: _Curve
+    body: Curve
 
 
 def curves(connection: sa.Connection, which: str) -> dict[str, Told]:
