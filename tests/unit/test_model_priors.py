@@ -32,14 +32,13 @@ GOOD: dict[str, Any] = {
     "model": MODEL,
     "parts": 31,
     "turn_ons": 812,
-    "gyro_scatter_rad_s": [30 * DEG_H] * 3,
-    "gyro_scatter_sigma_rad_s": [5 * DEG_H] * 3,
-    "gyro_per_k_rad_s": [10 * DEG_H, 0, -10 * DEG_H],
-    "gyro_per_k_spread_rad_s": [6 * DEG_H] * 3,
-    "accel_scatter_m_s2": [0.3 * MG] * 3,
-    "accel_scatter_sigma_m_s2": [0.05 * MG] * 3,
-    "accel_per_k_m_s2": None,
-    "accel_per_k_spread_m_s2": None,
+    "gyro_rad_s": {
+        "scatter": [30 * DEG_H] * 3,
+        "scatter_sigma": [5 * DEG_H] * 3,
+        "per_k": [10 * DEG_H, 0, -10 * DEG_H],
+        "per_k_spread": [6 * DEG_H] * 3,
+    },
+    "accel_m_s2": {"scatter": [0.3 * MG] * 3, "scatter_sigma": [0.05 * MG] * 3, "per_k": None, "per_k_spread": None},
 }
 
 
@@ -47,14 +46,22 @@ def payload(**other: object) -> bytes:
     return json.dumps(GOOD | other).encode()
 
 
+def gyro(**other: object) -> bytes:
+    return payload(gyro_rad_s=GOOD["gyro_rad_s"] | other)
+
+
+def accel(**other: object) -> bytes:
+    return payload(accel_m_s2=GOOD["accel_m_s2"] | other)
+
+
 def test_what_is_told_is_by_the_contract_and_is_read() -> None:
     check("prior", payload())
-    gyro, accel = read(payload(), MODEL).of("gyro"), read(payload(), MODEL).of("accel")
-    assert gyro is not None
-    assert gyro.scatter == pytest.approx([30 * DEG_H] * 3)
-    assert accel is not None
-    assert accel.per_k is None
-    assert read(payload(gyro_scatter_rad_s=None), MODEL).of("gyro") is None
+    gyros, accels = read(payload(), MODEL).of("gyro"), read(payload(), MODEL).of("accel")
+    assert gyros is not None
+    assert gyros.scatter == pytest.approx([30 * DEG_H] * 3)
+    assert accels is not None
+    assert accels.per_k is None
+    assert read(payload(gyro_rad_s=None), MODEL).of("gyro") is None
 
 
 @pytest.mark.parametrize(
@@ -63,14 +70,14 @@ def test_what_is_told_is_by_the_contract_and_is_read() -> None:
         (payload(format_version=2), "found format 2; allowed: up to 1"),
         (payload(model="bmi088"), "found model 'bmi088'; allowed: 'icm42688p'"),
         (payload(parts=2), "parts"),
-        (payload(gyro_scatter_rad_s=[1e-9, 1e-4, 1e-4]), "gyro scatter: found 1e-09"),
-        (payload(gyro_scatter_rad_s=[-1e-4] * 3), "gyro scatter: found -0.0001"),
-        (payload(gyro_scatter_rad_s=[1e300] * 3), "gyro scatter: found 1e\\+300"),
-        (payload(gyro_scatter_sigma_rad_s=[0.0] * 3), "gyro scatter_sigma: found 0"),
-        (payload(gyro_per_k_rad_s=[0.1] * 3), "gyro per_k: found 0.1"),
-        (payload(accel_scatter_m_s2=[9.8] * 3), "accel scatter: found 9.8"),
-        (payload(accel_scatter_m_s2=["a"] * 3), "float"),
-        (payload(accel_scatter_m_s2=[0.1]), "length 3"),
+        (gyro(scatter=[1e-9, 1e-4, 1e-4]), "gyro scatter: found 1e-09"),
+        (gyro(scatter=[-1e-4] * 3), "gyro scatter: found -0.0001"),
+        (gyro(scatter=[1e300] * 3), "gyro scatter: found 1e\\+300"),
+        (gyro(scatter_sigma=[0.0] * 3), "gyro scatter_sigma: found 0"),
+        (gyro(per_k=[0.1] * 3), "gyro per_k: found 0.1"),
+        (accel(scatter=[9.8] * 3), "accel scatter: found 9.8"),
+        (accel(scatter=["a"] * 3), "float"),
+        (accel(scatter=[0.1]), "length 3"),
         (payload().replace(b"812", b"NaN"), "malformed"),
         (b"[" * 4000, "expected `object`"),
         (b"\xff\xfe", "malformed"),
@@ -140,7 +147,8 @@ def test_it_is_kept_without_a_network_and_what_is_refused_changes_nothing(
 
 def test_a_spoilt_file_is_set_aside(tmp_path: Path) -> None:
     kept(tmp_path).take(TOPIC, payload())
-    (tmp_path / "model-priors.json").write_bytes(payload(models={MODEL: GOOD | {"gyro_scatter_rad_s": [9, 9, 9]}}))
+    spoilt = GOOD | {"gyro_rad_s": {"scatter": [9, 9, 9], "scatter_sigma": [1, 1, 1]}}
+    (tmp_path / "model-priors.json").write_bytes(payload(models={MODEL: spoilt}))
     assert kept(tmp_path).of("fc", "gyro") is None
     assert (tmp_path / "model-priors.json.unusable").exists()
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final
 
 import msgspec
 import numpy as np
@@ -34,18 +34,16 @@ _RANGES: Final[Mapping[Triad, tuple[float, float, float, str]]] = {
 }
 """Least and most scatter, and the most that a kelvin moves."""
 
-_Count = Annotated[int, msgspec.Meta(ge=1, le=10**9)]
 
-
-class TriadPrior(NamedTuple):
+class TriadPrior(msgspec.Struct, frozen=True):
     """Of one triad; vehicle FRD, rad/s or m/s^2."""
 
     scatter: Vector
     scatter_sigma: Vector
     """How different that of one part is, one sigma."""
-    per_k: Vector | None
+    per_k: Vector | None = None
     """Mean slope over temperature; None: not known."""
-    per_k_spread: Vector | None
+    per_k_spread: Vector | None = None
     """How different that of one part is."""
 
     @property
@@ -72,26 +70,14 @@ class ModelPrior(msgspec.Struct, frozen=True, kw_only=True):
 
     model: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-z-]{1,40}$")]
     parts: Annotated[int, msgspec.Meta(ge=LEAST_PARTS, le=10**9)]
-    turn_ons: _Count
-    gyro_scatter_rad_s: Vector | None = None
-    gyro_scatter_sigma_rad_s: Vector | None = None
-    gyro_per_k_rad_s: Vector | None = None
-    gyro_per_k_spread_rad_s: Vector | None = None
-    accel_scatter_m_s2: Vector | None = None
-    accel_scatter_sigma_m_s2: Vector | None = None
-    accel_per_k_m_s2: Vector | None = None
-    accel_per_k_spread_m_s2: Vector | None = None
+    turn_ons: Annotated[int, msgspec.Meta(ge=1, le=10**9)]
+    gyro_rad_s: TriadPrior | None = None
+    accel_m_s2: TriadPrior | None = None
     format_version: int = FORMAT_VERSION
 
     def of(self, triad: Triad) -> TriadPrior | None:
         """None: nothing is known of this one."""
-        if triad == "gyro":
-            scatter, sigma = self.gyro_scatter_rad_s, self.gyro_scatter_sigma_rad_s
-            slope, spread = self.gyro_per_k_rad_s, self.gyro_per_k_spread_rad_s
-        else:
-            scatter, sigma = self.accel_scatter_m_s2, self.accel_scatter_sigma_m_s2
-            slope, spread = self.accel_per_k_m_s2, self.accel_per_k_spread_m_s2
-        return None if scatter is None or sigma is None else TriadPrior(scatter, sigma, slope, spread)
+        return self.gyro_rad_s if triad == "gyro" else self.accel_m_s2
 
 
 def read(payload: bytes, model: str) -> ModelPrior:
@@ -119,18 +105,10 @@ def check(found: ModelPrior) -> None:
         msgspec.ValidationError: not; where, and what is allowed.
     """
     for triad, (least, most, most_per_k, unit) in _RANGES.items():
-        known = found.of(triad)
-        if known is None:
+        if (known := found.of(triad)) is None:
             continue
-        limits = {
-            "scatter": (least, most),
-            "scatter_sigma": (least / 100.0, most),
-            "per_k": (-most_per_k, most_per_k),
-            "per_k_spread": (0.0, most_per_k),
-        }
-        for what, (low, high) in limits.items():
-            values: Vector | None = getattr(known, what)
-            # Written so that NaN, which JSON has not, would not pass.
+        limits = ((least, most), (least / 100.0, most), (-most_per_k, most_per_k), (0.0, most_per_k))
+        for (what, values), (low, high) in zip(msgspec.structs.asdict(known).items(), limits, strict=True):
             if values is not None and not all(low <= value <= high for value in values):
                 shown = ", ".join(f"{value:.3g}" for value in values)
                 raise msgspec.ValidationError(f"{triad} {what}: found {shown}; allowed: {low:.2g} to {high:.2g} {unit}")

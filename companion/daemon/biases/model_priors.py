@@ -17,7 +17,6 @@ from companion.storage.state import StateFile
 
 logger = logging.getLogger(__name__)
 
-MOST_MODELS: Final = 8
 TOPIC: Final = "fleet/priors/"
 """And the model."""
 _TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
@@ -75,7 +74,7 @@ class ModelPriors:
                 return
         self._refused.pop(model, None)
         if known != self._known:
-            self._known = dict(list(known.items())[-MOST_MODELS:])
+            self._known = known
             self._file.write(_File(models=self._known))
 
     def of(self, name: str, triad: Triad) -> TriadPrior | None:
