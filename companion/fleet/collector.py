@@ -41,6 +41,10 @@ WAITING: Final = 20 * BATCH
 """The most messages that wait; what is beyond is told again, or another collector hears it."""
 SWEEP_S: Final = 5.0
 """For what aircraft said before this collector was there."""
+JUDGE_S: Final = 2.0
+"""Between two looks for aircraft that are to be judged."""
+REST: Final = 4.0
+"""Times as long as a judgement took it rests after it: what comes in goes first."""
 ANSWER_S: Final = 10.0
 STOP_AGAIN_S: Final = 0.5
 FIRST_WAIT_S: Final = 0.5
@@ -173,6 +177,7 @@ class Collector:
             asyncio.create_task(self._collect(client, items, 1), name="fleet writer"),
             asyncio.create_task(self._collect(client, hellos, ASK_AFTER), name="fleet asker"),
             asyncio.create_task(self._subscribe(client), name="fleet subscriptions"),
+            asyncio.create_task(self._judge(), name="fleet judgement"),
         ]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
@@ -226,6 +231,13 @@ class Collector:
             outcome = await asyncio.to_thread(self.store.take, batch)
             self.metrics.committed(outcome, time.monotonic() - began_s)
             await self._answer(client, outcome)
+
+    async def _judge(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            began_s = loop.time()
+            found = await asyncio.to_thread(self.store.judge)
+            await asyncio.sleep(REST * (loop.time() - began_s) if found else JUDGE_S)
 
     async def _answer(self, client: aiomqtt.Client, outcome: Outcome) -> None:
         # A confirmation that gets lost is given again, as the item is told again.

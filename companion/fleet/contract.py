@@ -78,8 +78,21 @@ class _Told(msgspec.Struct, frozen=True):
     body: msgspec.Raw
 
 
+class _Found(msgspec.Struct, frozen=True):
+    measured_rad_s: _Axes = None
+    measured_m_s2: _Axes = None
+
+
+class _Prior(msgspec.Struct, frozen=True):
+    gyro: _Found | None = None
+    accel: _Found | None = None
+
+
 class _Imu(msgspec.Struct, frozen=True):
     name: Annotated[str, msgspec.Meta(max_length=64)]
+    samples: Annotated[int, msgspec.Meta(ge=0, le=MOST_SEQUENCE)] | None = None
+    prior: _Prior | None = None
+    written: dict[str, msgspec.Raw] = {}
     temperature_degc: _Number | None = None
     held_back: list[_Word] = []
     gyro_id: _Device = None
@@ -92,6 +105,16 @@ class _Imu(msgspec.Struct, frozen=True):
     accel_sigma_use_m_s2: _Axes = None
 
 
+class _Magnetic(msgspec.Struct, frozen=True):
+    heading_bound_deg: _Number | None = None
+
+
+class _Zero(msgspec.Struct, frozen=True):
+    measured_at: str
+    offset_deg: tuple[_Number, _Number]
+    sigma_deg: _Number
+
+
 class _Calibration(msgspec.Struct, frozen=True):
     state: Literal["done", "failed", "cancelled"]
     reason: str
@@ -99,6 +122,8 @@ class _Calibration(msgspec.Struct, frozen=True):
     duration_s: _Number
     imus: Annotated[list[_Imu], msgspec.Meta(max_length=64)]
     undone_at: str | None = None
+    magnetic: _Magnetic | None = None
+    alignment: _Zero | None = None
 
 
 class _Arming(msgspec.Struct, frozen=True):
@@ -137,6 +162,8 @@ class Curve(msgspec.Struct, frozen=True):
     accel_curve: tuple[ExpectedForces, ...]
 
 
+_FIRMWARES: Final = {"INS": "ardupilot", "CAL": "px4", "TC": "px4"}
+"""By what the names of their parameters begin with."""
 _TRIADS: Final = tuple(name for name in _Imu.__struct_fields__ if name.endswith(("_rad_s", "_m_s2")))
 
 
@@ -147,8 +174,11 @@ def _calibration(body: bytes) -> Rows:
         for number, axis in enumerate("xyz"):
             figures = {name: value and value[number] for name in _TRIADS for value in [getattr(imu, name)]}
             which = {"imu": imu.name, "axis": axis, "gyro_id": imu.gyro_id, "accel_id": imu.accel_id}
-            biases.append({**which, "temperature_degc": imu.temperature_degc, **figures})
+            found = {name: value and value[number] for name, value in _by_readings(imu).items()}
+            how = {"temperature_degc": imu.temperature_degc, "samples": imu.samples}
+            biases.append({**which, **how, **figures, **found})
     held = [f"{imu.name} {triad}" for imu in told.imus for triad in imu.held_back]
+    zero = told.alignment
     row = {
         "started_at": moment(told.started_at),
         "duration_s": told.duration_s,
@@ -156,8 +186,27 @@ def _calibration(body: bytes) -> Rows:
         "reason": told.reason,
         "held_back": ", ".join(held),
         "undone_at": None if told.undone_at is None else moment(told.undone_at),
+        "firmware": _firmware(told.imus),
+        "heading_bound_deg": told.magnetic and told.magnetic.heading_bound_deg,
+        "zero_at": zero and moment(zero.measured_at),
+        "zero_x_deg": zero and zero.offset_deg[0],
+        "zero_y_deg": zero and zero.offset_deg[1],
+        "zero_sigma_deg": zero and zero.sigma_deg,
     }
     return {"calibrations": [row], "biases": biases}
+
+
+def _by_readings(imu: _Imu) -> dict[str, _Axes]:
+    """Whole biases before earlier ones were weighed in; None: none were."""
+    prior = imu.prior or _Prior()
+    gyro, accel = prior.gyro or _Found(), prior.accel or _Found()
+    return {"gyro_read_rad_s": gyro.measured_rad_s, "accel_read_m_s2": accel.measured_m_s2}
+
+
+def _firmware(imus: Iterable[_Imu]) -> str | None:
+    """Whose parameters were written; None: there were none."""
+    prefixes = {name.partition("_")[0] for imu in imus for name in imu.written}
+    return next((firmware for prefix, firmware in _FIRMWARES.items() if prefix in prefixes), None)
 
 
 def _arming(body: bytes) -> Rows:

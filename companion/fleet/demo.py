@@ -17,9 +17,12 @@ from companion.errors import LinkError
 from companion.fleet.collector import Collector, stop
 from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Store
+from companion.physics.units import DEG_H
 
 AIRCRAFT: Final = 30
 FLIGHTS: Final = 24
+FAULT_DEG_H: Final = 80.0
+"""By how much one gyro has moved in two of them."""
 SEED: Final = 19
 PAUSE_S: Final = 4.0
 """Between two flights of the fleet."""
@@ -33,6 +36,10 @@ def fleet_of(number: int, now: datetime.datetime) -> list[Aircraft]:
         if k % 15 == 7:
             each.calibrate(now - datetime.timedelta(days=2), "not still: gyro x 0.31 deg/s")
             each.arm(now - datetime.timedelta(days=2, minutes=-5))
+        elif k % 15 == 5:
+            each.live(now - datetime.timedelta(days=40), FLIGHTS, 50.0)
+            each.moved_rad_s = FAULT_DEG_H * DEG_H
+            each.live(now, FLIGHTS // 2, 38.0)
         elif k % 15 == 11:
             each.live(now - datetime.timedelta(days=40), FLIGHTS)
         else:

@@ -6,9 +6,8 @@ Pure functions of what calibrations have found; columns are gyro x y z, then acc
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Final, NamedTuple
 
-import msgspec
 import numpy as np
 
 from companion.calibration.noise.robust import median
@@ -19,15 +18,18 @@ LEAST_POWER_UPS: Final = 8
 LEAST_PARTS: Final = 4
 """Of a model, before it is one to compare with."""
 WANDER_LAG: Final = 30
+_STEP_K: Final = 15.0
+_FOR_A_TERM: Final = 24
+"""Power-ups for each further power of the temperature."""
 _MAD_TO_SIGMA: Final = 1.4826
 _OUTLIER: Final = 3.0
 """Sigmas beyond which a step counts no more for the slope over temperature."""
-_GROUPS: Final = ((0, 1, 2), (3, 4), (5,))
+_GROUPS: Final = (slice(0, 3), slice(3, 5), slice(5, 6))
 """Columns whose scatter is one: parts are mounted in any direction, but that of the level accelerometers has the
 gradienter's share in it."""
 
 
-class Scatter(msgspec.Struct, frozen=True):
+class Scatter(NamedTuple):
     """Of one part, or of a model: (6,) each, NaN where it is not known."""
 
     power_ups: int
@@ -36,27 +38,18 @@ class Scatter(msgspec.Struct, frozen=True):
     """One sigma from one power-up to another at one temperature, errors of the calibrations included."""
     wander: Floats
     """One sigma of the step that stays, from one power-up to the next."""
-
-
-def model_of(firmware: Literal["ardupilot", "px4"] | None, gyro_id: int | None, accel_id: int | None) -> str | None:
-    """The IMU model by the device types in its ids, whose numbers are each firmware's own; None: it is not known."""
-    if not gyro_id or not accel_id or firmware is None:
-        return None
-    from companion.autopilot.firmware.firmwares import part_of
-
-    types = f"{gyro_id >> 16 & 0xFF:#04x}/{accel_id >> 16 & 0xFF:#04x}"
-    return part_of(firmware, gyro_id, accel_id) or f"{firmware} {types}"
+    per_k: Floats
+    """How it follows the temperature, at the mean of those that were told."""
 
 
 def scatter_of_part(biases: Floats, temperature_degc: Floats) -> Scatter:
     """Of one part over its power-ups in their order, (n, 6) and (n,); NaN: not measured.
 
     Made of the steps between power-ups that follow one another, which neither a bias that ages nor one that has moved
-    once makes larger, less a line over temperature.
+    once makes larger, less what follows the temperature.
     """
-    found = [_column(column, temperature_degc) for column in biases.T]
-    turn_on, wander = np.array(found).reshape(-1, 2).T
-    return Scatter(len(biases), 1, turn_on, wander)
+    turn_on, wander, per_k = np.array([_column(column, temperature_degc) for column in biases.T]).T
+    return Scatter(len(biases), 1, turn_on, wander, per_k)
 
 
 def scatter_of_model(parts: Sequence[Scatter]) -> Scatter | None:
@@ -64,11 +57,11 @@ def scatter_of_model(parts: Sequence[Scatter]) -> Scatter | None:
     telling = [part for part in parts if np.isfinite(part.turn_on).any()]
     if len(telling) < LEAST_PARTS:
         return None
-    turn_on, wander = np.full(6, np.nan), np.full(6, np.nan)
-    for group in map(list, _GROUPS):
-        turn_on[group] = _middle(np.array([part.turn_on[group] for part in telling]))
-        wander[group] = _middle(np.array([part.wander[group] for part in telling]))
-    return Scatter(sum(part.power_ups for part in telling), len(telling), turn_on, wander)
+    figures = np.array([part[2:] for part in telling])
+    middle = np.empty((3, 6))
+    for group in _GROUPS:
+        middle[:, group] = [[_middle(each)] for each in np.moveaxis(figures[:, :, group], 1, 0)]
+    return Scatter(sum(part.power_ups for part in telling), len(telling), *middle)
 
 
 def _middle(values: Floats) -> float:
@@ -76,25 +69,27 @@ def _middle(values: Floats) -> float:
     return float(median(there)) if there.size else np.nan
 
 
-def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float]:
+def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float, float]:
     there = np.isfinite(bias)
     value, degc = bias[there], temperature_degc[there]
     if len(value) < LEAST_POWER_UPS:
-        return np.nan, np.nan
-    step, warmer = np.diff(value), np.nan_to_num(np.diff(degc))
-    slope = 0.0
+        return np.nan, np.nan, np.nan
+    known = np.isfinite(degc)
+    warmer = np.where(known, degc - (degc[known].mean() if known.any() else 0.0), 0.0) / _STEP_K
+    # A line for few, up to a cubic for many.
+    laws = warmer[:, None] ** np.arange(1, 2 + min(len(value) // _FOR_A_TERM, 2))
+    step, by = np.diff(value), np.diff(laws, axis=0)
     weight = np.ones(len(step))
     for _ in range(3):
-        slope = float((weight * warmer * step).sum() / max(float((weight * warmer**2).sum()), 1e-9))
-        scale = _sigma(step - slope * warmer)
-        weight = (np.abs(step - slope * warmer) <= _OUTLIER * scale).astype(np.float64)
+        terms = np.linalg.lstsq(by * weight[:, None], step * weight, rcond=None)[0]
+        scale = _sigma(step - by @ terms)
+        weight = (np.abs(step - by @ terms) <= _OUTLIER * scale).astype(np.float64)
     turn_on = scale / np.sqrt(2.0)
     if len(value) < 3 * WANDER_LAG:
-        return turn_on, np.nan
-    known = np.isfinite(degc)
-    level = value - slope * np.where(known, degc - (degc[known].mean() if known.any() else 0.0), 0.0)
+        return turn_on, np.nan, terms[0] / _STEP_K
+    level = value - laws @ terms
     far = _sigma(level[WANDER_LAG:] - level[:-WANDER_LAG])
-    return turn_on, float(np.sqrt(max(far**2 - scale**2, 0.0) / (WANDER_LAG - 1)))
+    return turn_on, np.sqrt(max(far**2 - scale**2, 0.0) / (WANDER_LAG - 1)), terms[0] / _STEP_K
 
 
 def _sigma(steps: Floats) -> float:

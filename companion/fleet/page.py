@@ -12,7 +12,7 @@ import sqlalchemy as sa
 from companion.calibration.records.record import Arming
 from companion.calibration.solution.by_temperature import Seen
 from companion.fleet.imu_pages import by_temperature, curves
-from companion.fleet.schema import Moment, rejected
+from companion.fleet.schema import Moment, findings, rejected
 from companion.fleet.schema import aircraft as known
 from companion.physics.frames import vector
 from companion.physics.units import DEG_H, MG
@@ -28,6 +28,8 @@ MOST_CALIBRATIONS: Final = 120
 """The most of one IMU that are drawn, the latest."""
 MOST_LISTED: Final = 25
 MOST_REFUSED: Final = 5
+MOST_FINDINGS: Final = 8
+"""The worst."""
 _UNITS: Final[dict[Triad, tuple[float, str, str]]] = {"gyro": (DEG_H, "deg_h", "deg/h"), "accel": (MG, "mg", "mg")}
 
 
@@ -88,6 +90,7 @@ def glance(connection: sa.Connection, now: datetime.datetime) -> str:
         tag(
             "p", f"{len(found)} aircraft: {', '.join(words)}" if found else "No aircraft was heard yet.", class_="lead"
         ),
+        _findings(connection),
         tag("table", head, *rows, class_="fleet") if rows else None,
         _refused(connection, now),
         source=SOURCE,
@@ -116,12 +119,31 @@ def aircraft(connection: sa.Connection, which: str, now: datetime.datetime) -> s
             tag("p", stands.why) if stands.why else None,
             tag("p", f"Heard {_ago(one.heard_at, now)}." if one.heard_at else "Not heard by this collector yet."),
         ),
+        _findings(connection, which),
         tag("p", "Autopilot ", tag("span", one.aircraft, class_="mono"), class_="soft"),
     ]
     parts += _imus(connection, which)
     parts += _armings(connection, which)
     parts += _notes(connection, which)
     return page(name, now, *parts, source=SOURCE)
+
+
+def _findings(connection: sa.Connection, which: str | None = None) -> Markup | None:
+    """What is to be said against sensors, the worst first: of one aircraft, or each one's worst."""
+    each, one = findings.c, sa.join(findings, known, findings.c.aircraft == known.c.aircraft)
+    query = sa.select(each.aircraft, known.c.name, each.words, sa.func.count().over().label("all")).select_from(one)
+    query = query.where(each.place == 0 if which is None else each.aircraft == which)
+    found = connection.execute(query.order_by(each.size.desc(), each.aircraft).limit(MOST_FINDINGS)).all()
+    if not found:
+        return None
+    lines = [
+        tag("li", row.words)
+        if which is not None
+        else tag("li", tag("a", row.name or row.aircraft, href=f"/aircraft/{row.aircraft}"), f": {row.words}")
+        for row in found
+    ]
+    more = found[0].all - len(found)
+    return card("caution", tag("ul", *lines), tag("p", f"and {more} more", class_="soft") if more else None)
 
 
 def _imus(connection: sa.Connection, which: str) -> list[Child]:

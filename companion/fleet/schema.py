@@ -96,6 +96,12 @@ calibrations: Final = sa.Table(
     sa.Column("reason", Words, nullable=False),
     sa.Column("held_back", Words, nullable=False, comment="measured and not written, contradicting earlier ones"),
     sa.Column("undone_at", Moment, comment="undone when it was told; later ones are in undos"),
+    sa.Column("firmware", sa.String(16), comment="ardupilot, px4; null: nothing was written"),
+    sa.Column("heading_bound_deg", sa.Double, comment="the heading's error exceeds it in one case of twenty"),
+    sa.Column("zero_at", Moment, comment="of the gradienter's alignment in force, as the next three"),
+    sa.Column("zero_x_deg", sa.Double),
+    sa.Column("zero_y_deg", sa.Double),
+    sa.Column("zero_sigma_deg", sa.Double),
 )
 sa.Index("calibrations_started_at", calibrations.c.aircraft, calibrations.c.started_at)
 
@@ -114,6 +120,9 @@ biases: Final = sa.Table(
     sa.Column("accel_bias_m_s2", sa.Double),
     sa.Column("accel_sigma_stat_m_s2", sa.Double),
     sa.Column("accel_sigma_use_m_s2", sa.Double),
+    sa.Column("samples", sa.BigInteger),
+    sa.Column("gyro_read_rad_s", sa.Double, comment="before earlier ones were weighed in; null: none were"),
+    sa.Column("accel_read_m_s2", sa.Double),
 )
 
 armings: Final = sa.Table(
@@ -195,6 +204,42 @@ flights: Final = sa.Table(
     sa.Column("motors_sigma", sa.Double),
 )
 
+judgements: Final = sa.Table(
+    "judgements",
+    tables,
+    sa.Column("aircraft", sa.String(36), primary_key=True),
+    sa.Column("news", sa.BigInteger, nullable=False, comment="batches with calibrations or undos of it"),
+    sa.Column("judged", sa.BigInteger, nullable=False, comment="how many they were when it was last judged"),
+)
+
+parts: Final = sa.Table(
+    "parts",
+    tables,
+    sa.Column("aircraft", sa.String(36), primary_key=True),
+    sa.Column("imu", sa.String(64), primary_key=True),
+    sa.Column("triad", sa.String(8), primary_key=True, comment="gyro, accel"),
+    sa.Column("axis", sa.String(1), primary_key=True),
+    sa.Column("model", Words, comment="by its device ids; null: not known"),
+    sa.Column("power_ups", sa.BigInteger, nullable=False),
+    sa.Column("turn_on", sa.Double, comment="its scatter from power-up to power-up, rad/s or m/s^2; null: too few"),
+    sa.Column("wander", sa.Double, comment="likewise the step that stays, from one to the next"),
+    sa.Column("per_k", sa.Double, comment="how it follows the temperature, a kelvin"),
+)
+sa.Index("parts_model", parts.c.model)
+
+findings: Final = sa.Table(
+    "findings",
+    tables,
+    sa.Column("aircraft", sa.String(36), primary_key=True),
+    sa.Column("place", sa.BigInteger, primary_key=True, autoincrement=False, comment="0: the worst"),
+    sa.Column("kind", sa.String(16), nullable=False, comment="bias, drift, scatter, noise, zero, compass"),
+    sa.Column("imu", sa.String(64)),
+    sa.Column("since", Moment, comment="by the aircraft's clock"),
+    sa.Column("power_ups", sa.BigInteger, nullable=False, comment="since then"),
+    sa.Column("size", sa.Double, nullable=False, comment="in what is usual: the worst of them are the largest"),
+    sa.Column("words", Words, nullable=False),
+)
+
 rejected: Final = sa.Table(
     "rejected",
     tables,
@@ -226,8 +271,26 @@ def curves_and_flights(connection: sa.Connection) -> None:
     connection.execute(sa.update(items).where(items.c.kind == "curve").values(state="unknown"))
 
 
+def _to_be_judged(connection: sa.Connection) -> None:
+    """What a sensor is judged by; calibrations are taken in anew, as an older version left that out."""
+    for table in (calibrations, biases):
+        there = {column["name"] for column in sa.inspect(connection).get_columns(table.name)}
+        for column in table.columns:
+            if column.name not in there:
+                words = sa.schema.CreateColumn(column).compile(dialect=connection.dialect)
+                connection.exec_driver_sql(f"ALTER TABLE {table.name} ADD COLUMN {words}")
+                if column.comment and connection.dialect.supports_comments:
+                    connection.execute(sa.schema.SetColumnComment(column))
+    for table in (parts, findings, judgements):
+        table.create(connection, checkfirst=True)
+    for table in (biases, calibrations):
+        connection.execute(sa.delete(table))
+    connection.execute(sa.update(items).where(items.c.kind == "calibration", _TAKEN).values(state="unknown"))
+
+
+_TAKEN: Final = items.c.state == "taken"
 Step = Callable[[sa.Connection], object]
-STEPS: Sequence[Step] = (_indices_by_time, curves_and_flights)
+STEPS: Sequence[Step] = (_indices_by_time, curves_and_flights, _to_be_judged)
 """The n-th brings tables of version n to version n + 1; views are made anew in any case."""
 
 

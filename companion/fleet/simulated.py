@@ -14,7 +14,7 @@ from typing import Any, Final
 import aiomqtt
 import msgspec
 
-from companion.calibration.records.record import Arming, ImuRecord, Record
+from companion.calibration.records.record import Arming, ImuRecord, Record, WrittenParameter
 from companion.fleet.collector import connected, stop
 from companion.fleet.contract import FORMAT_VERSION
 from companion.physics.units import DEG_H, MG
@@ -46,6 +46,8 @@ class Aircraft:
         self.confirmed: set[int] = set()
         self.deliveries = 0
         self.again_s = AGAIN_S
+        self.moved_rad_s = 0.0
+        """By how much the first gyro of its second IMU has moved: a fault."""
         self._of_imus = [(self._triad(120.0 * DEG_H), self._triad(4.0 * MG)) for _ in range(2)]
         self._changed = asyncio.Event()
         self._wanted: set[int] = set()
@@ -125,7 +127,7 @@ class Aircraft:
         gyro, accel = self._of_imus[imu]
         turn_on, warmer = self._triad(5.0 * DEG_H), degc - 25.0
         x, y, z = (bias + each + warmer * DEG_H for bias, each in zip(gyro, turn_on, strict=True))
-        return (x, y, z), accel
+        return (x + self.moved_rad_s * imu, y, z), accel
 
     def _imu(self, name: str, k: int, degc: float, gyro: Vector, accel: Vector) -> ImuRecord:
         def measured(true: Vector, sigma: float) -> Vector:
@@ -145,6 +147,9 @@ class Aircraft:
             covariance=None,
             residual_gyro_rad_s=None,
             residual_accel_m_s2=None,
+            written={
+                f"CAL_GYRO{k}_XOFF": WrittenParameter(before=0.0, after=gyro[0], read_back=gyro[0], outcome="stored")
+            },
             gyro_id=_GYRO_IDS[k],
             accel_id=_ACCEL_IDS[k],
         )

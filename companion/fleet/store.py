@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import datetime
 import hashlib
+import logging
 from collections.abc import Iterable, Sequence
 from typing import Any, Final, NamedTuple
 
 import msgspec
+import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
@@ -28,6 +30,9 @@ from companion.fleet.contract import (
     read_item,
     read_key,
 )
+from companion.fleet.judging import Judged, judged
+
+logger = logging.getLogger(__name__)
 
 MOST_REJECTED: Final = 10_000
 _SHOWN_BYTES: Final = 4096
@@ -130,7 +135,7 @@ class Store:
     """The tables; each call is one transaction or several whole ones. Calls block: they belong into a thread."""
 
     def __init__(self, database: str) -> None:
-        self._engine = engine_of(database)
+        self._engine, self._reads = engine_of(database), engine_of(database, reads_only=True)
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
 
     @property
@@ -141,6 +146,7 @@ class Store:
     def close(self) -> None:
         """Leave the connections; the next call opens one anew."""
         self._engine.dispose()
+        self._reads.dispose()
 
     def prepare(self) -> None:
         """Bring the tables up to date, and take in what an older version did not know.
@@ -156,6 +162,39 @@ class Store:
                 pass
         except sa.exc.SQLAlchemyError as error:
             raise LinkError(f"{self.where}: {why(error)}") from None
+
+    def judge(self) -> bool:
+        """Judge an aircraft of which there is something new; whether there was one.
+
+        Raises:
+            LinkError: the database cannot be reached, or fails.
+        """
+        table = schema.judgements
+        try:
+            with self._reads.begin() as connection:
+                due = connection.execute(sa.select(table).where(table.c.judged < table.c.news).limit(1)).first()
+                if due is None:
+                    return False
+                found = self._judged(connection, due.aircraft)
+            is_it = table.c.aircraft == due.aircraft
+            with self._engine.begin() as connection:
+                # Not if there was something new meanwhile.
+                update = sa.update(table).where(is_it, table.c.news == due.news).values(judged=due.news)
+                if connection.execute(update).rowcount and found is not None:
+                    for of, rows in ((schema.parts, found.parts), (schema.findings, found.findings)):
+                        connection.execute(sa.delete(of).where(of.c.aircraft == due.aircraft))
+                        self._put(connection, of, rows)
+        except sa.exc.SQLAlchemyError as error:
+            raise LinkError(f"{self.where}: {why(error)}") from None
+        return True
+
+    def _judged(self, connection: sa.Connection, aircraft: str) -> Judged | None:
+        try:
+            with np.errstate(all="ignore"):
+                return judged(connection, aircraft)
+        except (ArithmeticError, LookupError, ValueError):
+            logger.error("fleet: %s cannot be judged; what was found before stands", aircraft, exc_info=True)
+            return None
 
     def take(self, messages: Sequence[Message]) -> Outcome:
         """Put a batch into the database; what is not taken is kept aside there with its reason.
@@ -212,10 +251,22 @@ class Store:
             for table, of in sorted(rows.items()):
                 self._put(connection, schema.tables.tables[table], of)
             self._hear(connection, hellos.values(), heard, now)
+            self._to_judge(connection, rows)
             self._keep_aside(connection, outcome.rejected, now)
             if hellos:
                 outcome.wanted.update(_lacking(connection, {aircraft for aircraft, _ in hellos}))
         return outcome._replace(new=new)
+
+    def _to_judge(self, connection: sa.Connection, rows: Rows) -> None:
+        """The aircraft of which there is something new to be judged by."""
+        table = schema.judgements
+        which = {row["aircraft"] for name in ("calibrations", "undos") for row in rows.get(name, ())}
+        if which:
+            insert, values = self._insert_many(
+                table, [{"aircraft": one, "news": 1, "judged": 0} for one in sorted(which)]
+            )
+            news = {"news": table.c.news + 1}
+            connection.execute(insert.on_conflict_do_update(index_elements=["aircraft"], set_=news), values)
 
     def _put(self, connection: sa.Connection, table: sa.Table, rows: list[Row]) -> int:
         """Rows that are not there yet, in the order of their keys: so two collectors never wait for one another.
@@ -324,6 +375,7 @@ class Store:
                 connection.execute(sa.update(items).where(*here).values(columns))
                 for table, of in made.items():
                     self._put(connection, schema.tables.tables[table], of)
+                self._to_judge(connection, made)
                 self._keep_aside(connection, outcome.rejected, now)
         return len(found) == _AGAIN
 

@@ -55,6 +55,8 @@ ELSEWHERE = {
     "companion/fleet/demo.py": "what simulated aircraft tell, and words to their broker",
     "companion/fleet/imu_pages.py": "labels of pages: docs/fleet.md",
     "companion/fleet/metrics.py": "what Prometheus reads: docs/fleet.md",
+    "companion/fleet/judgement.py": "what is said against sensors: docs/fleet.md",
+    "companion/fleet/judging.py": "likewise",
     "companion/fleet/page.py": "labels of pages: docs/fleet.md",
     "companion/fleet/server.py": "answers to browsers; what of its options is wrong, with what is allowed",
     "companion/fleet/settings.py": "as companion/config",

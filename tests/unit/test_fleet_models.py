@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.fleet.models import LEAST_PARTS, Scatter, model_of, scatter_of_model, scatter_of_part
+from companion.fleet.models import LEAST_PARTS, Scatter, scatter_of_model, scatter_of_part
 from companion.physics.frames import Floats
 
 TRUE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 5.0])
@@ -23,7 +23,9 @@ def test_scatter_is_that_of_the_draws_whatever_the_temperature_and_a_step() -> N
     biases, degc = drawn(600, 1)
     biases[300:] += 40.0 * TRUE
     biases[::50] += 100.0
-    assert scatter_of_part(biases, degc).turn_on == pytest.approx(TRUE, rel=0.12)
+    found = scatter_of_part(biases, degc)
+    assert found.turn_on == pytest.approx(TRUE, rel=0.12)
+    assert found.per_k == pytest.approx(0.3 * TRUE, rel=0.1)
 
 
 def test_wander_is_told_by_many_parts() -> None:
@@ -46,7 +48,7 @@ def test_too_few_tell_nothing() -> None:
     assert np.isnan(scatter_of_part(*drawn(7, 1)).turn_on).all()
     few = [scatter_of_part(*drawn(60, seed)) for seed in range(LEAST_PARTS - 1)]
     assert scatter_of_model(few) is None
-    empty = Scatter(0, 1, np.full(6, np.nan), np.full(6, np.nan))
+    empty = Scatter(0, 1, *np.full((3, 6), np.nan))
     assert scatter_of_model([*few, empty]) is None
 
 
@@ -57,19 +59,3 @@ def test_gaps_and_unknown_temperatures_are_left_out() -> None:
     assert scatter_of_part(biases, degc).turn_on == pytest.approx(TRUE, rel=0.2)
     unknown = scatter_of_part(biases, np.full(300, np.nan)).turn_on
     assert unknown == pytest.approx(TRUE * np.hypot(1.0, 0.3 * 40.0 / np.sqrt(12.0)), rel=0.25)
-
-
-# Types by the firmwares: AP_InertialSensor_Backend.h (BMI088 0x2B), PX4's drv_sensor.h (BMI088 0x66, 0x6A).
-@pytest.mark.parametrize(
-    ("firmware", "gyro_id", "accel_id", "model"),
-    [
-        ("ardupilot", 0x2B0102, 0x2B0201, "bmi088"),
-        ("px4", 0x660102, 0x6A0201, "bmi088"),
-        ("px4", 0x2B0102, 0x2B0201, "px4 0x2b/0x2b"),
-        (None, 0x2B0102, 0x2B0201, None),
-        ("px4", None, 0x2B0201, None),
-        ("px4", 0, 0, None),
-    ],
-)
-def test_the_model_is_in_the_ids(firmware: str, gyro_id: int, accel_id: int, model: str) -> None:
-    assert model_of(firmware, gyro_id, accel_id) == model  # type: ignore[arg-type]

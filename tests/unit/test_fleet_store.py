@@ -350,18 +350,6 @@ def test_an_older_database_is_brought_up_to_date_and_a_newer_one_refused(
     assert items_in(database) == told_by([one])
 
 
-def test_version_1_gets_its_indices(store: Store, database: str) -> None:
-    asked = "SELECT name, sql FROM sqlite_master WHERE type = 'index' ORDER BY name"
-    before = query(database, asked)
-    with sqlite3.connect(database) as connection:
-        connection.executescript(
-            "DROP INDEX calibrations_started_at; DROP INDEX armings_armed_at; UPDATE schema_version SET version = 1"
-        )
-    assert query(database, asked) != before
-    store.prepare()
-    assert query(database, asked) == before
-
-
 def test_a_step_that_fails_leaves_all_as_it_was(store: Store, database: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(connection: sa.Connection) -> None:
         connection.exec_driver_sql("DROP TABLE biases")

@@ -1,0 +1,198 @@
+"""Whether a figure that is measured at each power-up stays what it was: sequential tests.
+
+A Kalman filter foretells each value from those before: a level that wanders as those of its model do, and a cubic over
+temperature. What it is off by, in its sigmas, goes into two-sided CUSUMs (Page, Biometrika 41 (1954) 100-115) for a
+level that has moved; the scatter of each value about the three before it into one for twice the scatter, by the
+likelihood ratio. Single values count no more than `CLIP` sigmas: no knock alone raises an alarm.
+
+The limits are those at which tests/judgement_study.py finds less than one false alarm a hundred aircraft and month.
+"""
+
+from __future__ import annotations
+
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.noise.robust import HUBER_C, median
+from companion.physics.frames import Floats
+
+CLIP: Final = 3.0
+LEAST_SHIFT: Final = 0.5
+"""In sigmas: half of the shift that is found the soonest."""
+LEVEL_LIMIT: Final = 17.0
+SCATTER_LIMIT: Final = 20.0
+_FURTHER: Final = 6.0
+"""So far beyond its limit the sum goes at most: thus it comes back when the scatter does."""
+_TWICE: Final = (0.375, np.log(2.0))
+"""Of z^2, and of none: the likelihood ratio of twice the scatter."""
+OWN_WEIGHT: Final = 8.0
+"""Power-ups that its model's scatter counts for: that of the parts of one model differs by a quarter."""
+_HELD: Final = 2.5
+_HELD_MEAN: Final = 0.9775
+"""Mean of the square of a normal number that is held to `_HELD`."""
+_MEDIAN_OF_3: Final = 0.449
+"""Variance of the median of three normal numbers."""
+_STEP_K: Final = 15.0
+_AT_DEGC: Final = 20.0
+_BEFORE: Final = np.square([100.0, 50.0, 10.0, 2.0])
+"""Variances at first, in scatters: level, and what a step of temperature, its square and its cube do."""
+_NEW_LEVEL: Final = 1e4
+_BASE: Final = 20
+"""Power-ups before that a level is compared with."""
+
+
+class Alarm(NamedTuple):
+    """One column's figure has changed."""
+
+    column: int
+    kind: Literal["level", "scatter"]
+    since: int
+    """The first power-up that counts towards it, by index."""
+    at: int
+    """When it was seen."""
+    until: int
+    """When it was as before again; a level that has moved stays. The number of power-ups: not yet."""
+    size: float
+    """By how much the level has moved, or what the scatter was then, and is if it is so still; in scatters."""
+
+
+def watch(  # noqa: PLR0915
+    values: Floats,
+    variance: Floats,
+    temperature_degc: Floats,
+    wander: Floats,
+    relevel: NDArray[np.bool_],
+    first: NDArray[np.int_],
+    most_own: Floats,
+    least: Floats,
+) -> list[Alarm]:
+    """All alarms of all columns, in the order in which they were raised.
+
+    Args:
+        values: (n, c) of n power-ups in their order, in the scatter that is usual; NaN: not measured.
+        variance: (n, c) by which a value is less certain than usual, in squares of that scatter.
+        temperature_degc: (n, c); NaN: not known.
+        wander: (c,) one sigma of the step of the level from one power-up to the next, likewise.
+        relevel: (n, c) where what it is measured with has changed, so that its level may be another.
+        first: (c,) how many tell at first what is usual, at least 3.
+        most_own: (c,) up to how many usual scatters its own may be without being too large.
+        least: (c,) what moves by less, or scatters less, raises no alarm yet.
+    """
+    n, c = values.shape
+    there = np.isfinite(values)
+    unknown = ~np.isfinite(temperature_degc)
+    warmer = (np.where(unknown, _AT_DEGC, temperature_degc) - _AT_DEGC) / _STEP_K
+    unknown &= ~unknown.all(axis=0)
+    laws = warmer[:, :, None] ** np.arange(4)
+    columns = np.arange(c)
+    # What was not measured stands as that before it: for the filter it does not count.
+    held = np.maximum.accumulate(np.where(there, np.arange(n)[:, None], there.argmax(axis=0)), axis=0)
+    y, laws = np.nan_to_num(values[held, columns] - values[held[0], columns]), laws[held, columns]
+    x, p = np.zeros((c, 4)), np.tile(np.diag(_BEFORE), (c, 1, 1))
+    own, count = np.full(c, OWN_WEIGHT), np.full(c, OWN_WEIGHT)
+    up, down, wide = np.zeros((3, c))
+    up_0, down_0, wide_0 = np.zeros((3, c), dtype=int)
+    latest = np.zeros((3, c), dtype=int)
+    seen = np.zeros(c, dtype=int)
+    is_open: dict[int, Alarm] = {}
+    alarms: list[Alarm] = []
+    for k in range(n):
+        h, here = laws[k], there[k] & (k >= first)
+        for column in np.flatnonzero(first == k).tolist():
+            tell = there[:k, column] & ~unknown[:k, column]
+            x[column], p[column], squares = _begin(y[:k, column], laws[:k, column], tell)
+            own[column] += squares
+            count[column] += max(tell.sum() - 4, 0)
+            p[column] *= np.clip(own[column] / count[column], 1.0, most_own[column] ** 2)
+            p[column, 0, 0] += _NEW_LEVEL * relevel[:k, column].any()
+            latest[:, column], seen[column] = range(k - 3, k), there[:k, column].sum()
+        p[:, 0, 0] += wander**2
+        p[relevel[k], 0, 0] += _NEW_LEVEL
+        seen[relevel[k]] = 0
+        usual = np.clip(own / count, 1.0, most_own**2)
+        ph = (p * h[:, None, :]).sum(axis=2)
+        of_filter = (ph * h).sum(axis=1)
+        # One without a temperature may have been taken at any.
+        law = np.square(x[:, 1:]) + p[:, range(1, 4), range(1, 4)]
+        more = variance[k] + unknown[k] * law.sum(axis=1)
+        total = of_filter + usual + more
+        off = np.where(here, y[k] - (x * h).sum(axis=1), 0.0)
+        z = off / np.sqrt(total)
+        gain = ph * (here / total)[:, None]
+        # Once it knows its level it follows slowly what may be a fault.
+        most = np.where(of_filter < usual, HUBER_C, CLIP)
+        x += gain * (np.clip(z, -most, most) * np.sqrt(total))[:, None]
+        p -= gain[:, :, None] * ph[:, None, :]
+
+        # The scatter: about the median of the three before it, so that a level that moves is two large ones.
+        before = y[latest, columns] - (laws[latest, columns, 1:] * x[:, 1:]).sum(axis=2)
+        middle = before.sum(axis=0) - before.max(axis=0) - before.min(axis=0)
+        apart = h[:, 1:] - laws[latest, columns, 1:].mean(axis=0)
+        of_law = ((p[:, 1:, 1:] * apart[:, None, :]).sum(axis=2) * apart).sum(axis=1)
+        about = usual * (1.0 + _MEDIAN_OF_3) + more + of_law
+        d2 = np.square(y[k] - (h[:, 1:] * x[:, 1:]).sum(axis=1) - middle) / about
+        tells = here & (seen >= 3)
+        wide = np.where(tells, np.maximum(wide + _TWICE[0] * np.minimum(d2, CLIP**2) - _TWICE[1], 0.0), wide)
+        wide = np.minimum(wide, SCATTER_LIMIT + _FURTHER)
+        wide_0 = np.where(wide == 0.0, k + 1, wide_0)
+
+        z = np.clip(z, -CLIP, CLIP)
+        up = np.where(here, np.maximum(up + z - LEAST_SHIFT, 0.0), up)
+        down = np.where(here, np.maximum(down - z - LEAST_SHIFT, 0.0), down)
+        up_0, down_0 = np.where(up == 0.0, k + 1, up_0), np.where(down == 0.0, k + 1, down_0)
+
+        # What it has learned of its own scatter; not while that is in doubt, nor of what the filter did not know.
+        learns = here & (wide < SCATTER_LIMIT / 4.0) & (of_filter < usual)
+        own = own + np.where(learns, usual * np.minimum(np.square(z), _HELD**2) / _HELD_MEAN, 0.0)
+        count = count + learns
+        latest = np.where(here, np.stack([latest[1], latest[2], np.full(c, k)]), latest)
+        seen = seen + here
+
+        for column in np.flatnonzero((up > LEVEL_LIMIT) | (down > LEVEL_LIMIT)).tolist():
+            rose = up[column] > LEVEL_LIMIT
+            since = int((up_0 if rose else down_0)[column])
+            level = _at_one_temperature(y, laws, x, column)
+            moved = median(level[since : k + 1]) - median(level[max(since - _BASE, 0) : since])
+            if not abs(moved) >= least[column]:
+                continue
+            alarms.append(Alarm(column, "level", since, k, n, float(moved)))
+            up[column] = down[column] = 0.0
+            p[column, 0, 0] += _NEW_LEVEL
+        for column in np.flatnonzero(wide > SCATTER_LIMIT).tolist():
+            if column not in is_open:
+                since = int(wide_0[column])
+                size = _scatter(_at_one_temperature(y, laws, x, column)[since : k + 1])
+                if size >= least[column]:
+                    is_open[column] = Alarm(column, "scatter", since, k, n, size)
+        for column in [column for column in is_open if wide[column] == 0.0]:
+            alarms.append(is_open.pop(column)._replace(until=k))
+    for column, alarm in is_open.items():
+        size = _scatter(_at_one_temperature(y, laws, x, column)[alarm.since :])
+        alarms.append(alarm._replace(size=size))
+    return sorted(alarms, key=lambda alarm: (alarm.at, alarm.column))
+
+
+def _begin(y: Floats, laws: Floats, there: NDArray[np.bool_]) -> tuple[Floats, Floats, float]:
+    """Level and law of one column's first power-ups, their covariance, and the sum of squares about them.
+
+    Knocked ones count for little.
+    """
+    weight: Floats = there.astype(np.float64)
+    for _ in range(8):
+        inverse = np.linalg.inv((laws * weight[:, None]).T @ laws + np.diag(1.0 / _BEFORE))
+        x = inverse @ (laws * weight[:, None]).T @ y
+        off = np.abs(y - laws @ x)
+        scale = max(1.4826 * float(median(off)), 1.0)
+        weight = np.asarray(there * np.minimum(HUBER_C * scale / np.maximum(off, 1e-9), 1.0), dtype=np.float64)
+    return x, np.asarray(inverse, dtype=np.float64), float((weight * np.square(off)).sum())
+
+
+def _scatter(level: Floats) -> float:
+    return float(1.4826 * median(np.abs(np.diff(level))) / np.sqrt(2.0)) if len(level) > 1 else 0.0
+
+
+def _at_one_temperature(y: Floats, laws: Floats, x: Floats, column: int) -> Floats:
+    """(n,) of one column."""
+    return np.asarray(y[:, column] - laws[:, column, 1:] @ x[column, 1:])
