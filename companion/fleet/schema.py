@@ -291,7 +291,7 @@ def _to_be_judged(connection: sa.Connection) -> None:
 _TAKEN: Final = items.c.state == "taken"
 Step = Callable[[sa.Connection], object]
 STEPS: Sequence[Step] = (_indices_by_time, curves_and_flights, _to_be_judged)
-"""The n-th brings tables of version n to version n + 1; views are made anew in any case."""
+"""The n-th brings tables of version n to version n + 1; views are made anew after it, and where one is lacking."""
 
 
 def bring_up_to_date(connection: sa.Connection) -> bool:
@@ -306,21 +306,21 @@ def bring_up_to_date(connection: sa.Connection) -> bool:
     if connection.dialect.name == "postgresql":
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
         connection.exec_driver_sql("SET LOCAL statement_timeout = 0")  # tables of years take their time
-    found = 0
-    if sa.inspect(connection).has_table(_version.name):
+    found, inspector = 0, sa.inspect(connection)
+    if inspector.has_table(_version.name):
         found = connection.execute(sa.select(_version.c.version)).scalar_one()
     if found > newest:
         raise StorageError(
             f"the database has tables of version {found}; allowed: up to {newest} (a newer companion has made them)"
         )
-    if found == newest:
+    if found == newest and {view for view, _, _ in views()} <= {*inspector.get_view_names()}:
         return False
     for view, _, _ in reversed(views()):
         connection.exec_driver_sql(f"DROP VIEW IF EXISTS {view}")
     if found == 0:
         tables.create_all(connection)
         connection.execute(sa.insert(_version).values(version=newest))
-    else:
+    elif found < newest:
         for step in STEPS[found - 1 :]:
             step(connection)
         connection.execute(sa.update(_version).values(version=newest))

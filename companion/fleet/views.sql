@@ -123,3 +123,15 @@ FROM (SELECT f.*, a.name, RANK() OVER (
         ORDER BY CASE WHEN f.epoch = a.epoch THEN f.sequence END DESC NULLS LAST, f.epoch DESC, f.sequence DESC) AS place
       FROM flights f LEFT JOIN aircraft a ON a.aircraft = f.aircraft) AS numbered
 WHERE place = 1;
+
+-- part_scatter: How far the biases of each IMU that is in an aircraft scatter from power-up to power-up, and wander, by model
+SELECT p.aircraft, a.name, p.imu, p.model, p.triad, p.axis, p.power_ups,
+       CASE WHEN p.triad = 'gyro' THEN p.turn_on * 206264.80624709636 END AS turn_on_deg_h,
+       CASE WHEN p.triad = 'gyro' THEN p.wander * 206264.80624709636 END AS wander_deg_h,
+       CASE WHEN p.triad = 'accel' THEN p.turn_on / 0.00980665 END AS turn_on_mg,
+       CASE WHEN p.triad = 'accel' THEN p.wander / 0.00980665 END AS wander_mg
+FROM parts p LEFT JOIN aircraft a ON a.aircraft = p.aircraft;
+
+-- sensor_findings: What calibrations say against the sensors of each aircraft, as of its latest; place 0 is the worst
+SELECT f.aircraft, a.name, f.place, f.kind, f.imu, f.since, f.power_ups, f.size, f.words
+FROM findings f LEFT JOIN aircraft a ON a.aircraft = f.aircraft;

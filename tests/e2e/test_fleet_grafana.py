@@ -39,6 +39,8 @@ def database() -> Iterator[str]:
         for each in fleet:
             store.take([Message(f"fleet/{each.id}/item", payload) for payload in each.told.values()])
             store.take([Message(f"fleet/{each.id}/hello", each.hello)])
+        while store.judge():
+            pass
         store.close()
         with psycopg.connect(where, autocommit=True) as connection:  # as docs/fleet.md says
             connection.execute("CREATE ROLE grafana LOGIN PASSWORD '...'")

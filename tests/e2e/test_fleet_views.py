@@ -170,6 +170,25 @@ def test_flights_each_once(told: str) -> None:
         assert sigma == pytest.approx(0.5)
 
 
+def test_scatter_and_findings_in_the_units_of_people(told: str) -> None:
+    engine = engine_of(told)
+    part = {"aircraft": ONE.id, "imu": "fc1", "axis": "x", "model": "ICM-42688-P", "power_ups": 9}
+    finding = {"aircraft": ONE.id, "kind": "scatter", "since": NOW, "power_ups": 4, "size": 4.0, "words": "replace it"}
+    with engine.begin() as connection:
+        for triad, unit in (("gyro", RAD_S), ("accel", MG)):
+            figures = {"triad": triad, "turn_on": 3.0 * unit, "wander": 0.5 * unit}
+            connection.execute(sa.insert(schema.parts).values(part | figures))
+        connection.execute(sa.insert(schema.findings).values(finding | {"place": 0}))
+    engine.dispose()
+    accel, gyro = asked(told, "SELECT * FROM part_scatter ORDER BY triad")
+    assert (gyro["name"], gyro["model"], gyro["power_ups"]) == (ONE.name, "ICM-42688-P", 9)
+    names = ("turn_on_deg_h", "wander_deg_h", "turn_on_mg", "wander_mg")
+    assert [gyro[name] for name in names] == [pytest.approx(3.0), pytest.approx(0.5), None, None]
+    assert [accel[name] for name in names] == [None, None, pytest.approx(3.0), pytest.approx(0.5)]
+    (found,) = asked(told, "SELECT * FROM sensor_findings")
+    assert (found["name"], found["words"], found["place"]) == (ONE.name, "replace it", 0)
+
+
 def test_an_older_database_has_them_after_an_update(told: str) -> None:
     """Curves and flights were kept as they came."""
     queries = [f"SELECT * FROM {table} ORDER BY 1, 2, 3, 4, 5, 6" for table in ("curves", "flights")]  # noqa: S608

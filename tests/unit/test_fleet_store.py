@@ -363,6 +363,15 @@ def test_a_step_that_fails_leaves_all_as_it_was(store: Store, database: str, mon
     assert query(database, "SELECT COUNT(*) FROM bias_history") == before
 
 
+def test_a_view_that_is_lacking_is_made(store: Store, database: str) -> None:
+    asked = "SELECT name, sql FROM sqlite_master WHERE type = 'view' ORDER BY name"
+    before = query(database, asked)
+    with sqlite3.connect(database) as connection:
+        connection.execute("DROP VIEW bias_history")
+    store.prepare()
+    assert query(database, asked) == before
+
+
 def test_views_say_what_they_are_for(store: Store, database: str) -> None:
     made = dict(query(database, "SELECT name, sql FROM sqlite_master WHERE type = 'view'"))
     assert made.keys() == {name for name, _, _ in schema.views()}
