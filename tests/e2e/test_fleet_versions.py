@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import sqlalchemy as sa
 from companion.fleet import schema
 from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store, engine_of
+from companion.physics.units import DEG_H
 from tests.support.collecting import NOW, rows_of
 from tests.support.postgres import INITDB, Postgres, postgres
 
@@ -46,6 +48,17 @@ def content(database: str) -> list[list[Any]]:
     items = schema.items.c
     derived = [sorted(map(tuple, rows_of(database, sa.select(table))), key=str) for table in DERIVED]
     return [*derived, sorted(map(tuple, rows_of(database, sa.select(items.sequence, items.state, items.same))))]
+
+
+def judged(database: str) -> list[Any]:
+    """The rows of all parts, and what was found against one of them."""
+    p = schema.parts.c
+    rows = rows_of(database, sa.select(schema.parts).order_by(p.imu, p.triad, p.axis))
+    assert len(rows) == 2 * 6
+    assert all(row.turn_on is not None for row in rows)
+    (found,) = rows_of(database, sa.select(schema.findings))
+    assert found.words.startswith("replace IMU fc2: gyro x bias has moved by ")
+    return [*map(tuple, rows), tuple(found)]
 
 
 def tables_of(database: str) -> dict[str, dict[str, tuple[str, bool]]]:
@@ -93,7 +106,10 @@ def fill_as_older(older: Path, database: str, source: str) -> None:
 def test_an_earlier_version_becomes_the_present_one(databases: tuple[str, str], older: Path) -> None:
     database, new = databases
     one = Aircraft(1)
-    one.live(NOW, 12)
+    one.live(NOW - datetime.timedelta(days=40), 12, 20.0)
+    for days_ago in range(40, 0, -1):
+        one.moved_rad_s = 80.0 * DEG_H * (days_ago <= 15)
+        one.calibrate(NOW - datetime.timedelta(days=days_ago))
     fresh, store = Store(new), Store(database)
     fresh.prepare()
     fresh.take(messages_of(one))
@@ -101,8 +117,10 @@ def test_an_earlier_version_becomes_the_present_one(databases: tuple[str, str], 
     store.prepare()
     assert tables_of(database) == tables_of(new)
     assert content(database) == content(new)
-    ((_, news, done),) = rows_of(database, sa.select(schema.judgements))
-    assert news > done
+    for each in (store, fresh):
+        assert each.judge()
+        assert not each.judge()
+    assert judged(database) == judged(new)
     # Told again under another epoch it is known again.
     before = rows_of(database, sa.text("SELECT COUNT(*) FROM bias_history"))
     one.epoch = "f" * 16
