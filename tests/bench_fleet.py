@@ -28,6 +28,7 @@ from companion.fleet.contract import read_key
 from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Outcome, Store, _read
 from tests import bench_fleet_pages
+from tests.bench_memory import memory
 from tests.support.broker import Broker, broker
 from tests.support.collecting import CollectorProcess, items_in, told_by
 from tests.support.fleet_bench import (
@@ -165,10 +166,12 @@ async def rate(place: Place, fleet: Fleet, sessions: Sequence[tuple[Light, list[
     """Of so many collectors while there is always more."""
     async with collectors(place, url, number) as found:
         meter = Meter(lambda: _spent(found), lambda: processor_s(place.postgres.process_id))
+        of_broker = Meter(lambda: processor_s(place.one.process_id))
         await asyncio.wait_for(fleet.tell(sessions, AT_ONCE), 600.0)
-        cost = meter.cost(len(fleet.confirmed))
+        cost, brokers = meter.cost(len(fleet.confirmed)), of_broker.cost(len(fleet.confirmed))
     _check(url, fleet)
-    return f"{cost} each item told {fleet.deliveries / cost.items:.2f} times"
+    often = fleet.deliveries / cost.items
+    return f"{cost} told {often:.2f} times each; broker: {brokers.items / brokers.own_s:.0f} a core-s"
 
 
 def _check(url: str, fleet: Fleet) -> None:
@@ -226,7 +229,8 @@ async def rates(place: Place, number: int, sessions: Sessions) -> None:
 
         begun_s = time.monotonic()
         async with fleet.at(one.port):
-            print(f"all at the broker after {time.monotonic() - begun_s:.1f} s")
+            resident_mib = memory(one.process_id).resident
+            print(f"all at the broker after {time.monotonic() - begun_s:.1f} s, which has {resident_mib:.0f} MiB then")
             print(f"\n{'items a second':52} {'by clock':>9} {'a core-s':>9} {'with db':>9}")
             told = sessions.of(fleet, 1)
             messages = [Message(f"fleet/{each.one.id}/item", each.one.told[k]) for each, of in told for k in of]

@@ -131,6 +131,11 @@ class Broker:
                         await writer.wait_closed()
                     return self
 
+    @property
+    def process_id(self) -> int:
+        assert self._process is not None
+        return self._process.pid
+
     def kill(self) -> None:
         """As a power cut does."""
         if self._process is not None:
