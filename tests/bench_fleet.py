@@ -168,7 +168,8 @@ async def rate(place: Place, fleet: Fleet, sessions: Sequence[tuple[Light, list[
         meter = Meter(lambda: _spent(found), lambda: processor_s(place.postgres.process_id))
         of_broker = Meter(lambda: processor_s(place.one.process_id))
         await asyncio.wait_for(fleet.tell(sessions, AT_ONCE), 600.0)
-        cost, brokers = meter.cost(len(fleet.confirmed)), of_broker.cost(len(fleet.confirmed))
+        items = sum(len(sequences) for _, sequences in sessions)
+        cost, brokers = meter.cost(items), of_broker.cost(items)
     _check(url, fleet)
     often = fleet.deliveries / cost.items
     return f"{cost} told {often:.2f} times each; broker: {brokers.items / brokers.own_s:.0f} a core-s"
@@ -203,10 +204,8 @@ async def killed(place: Place, fleet: Fleet, sessions: Sequence[tuple[Light, lis
         await asyncio.wait_for(fleet.tell_at(sessions, QUIET_A_SECOND), 600.0)
         killing.cancel()
     _check(url, fleet)
-    again = fleet.deliveries - len(fleet.confirmed)
-    return (
-        f"{len(fleet.confirmed)} items, {killings} killings: none lost, none twice; {again} deliveries more than items"
-    )
+    items = sum(len(sequences) for _, sequences in sessions)
+    return f"{items} items, {killings} killings: none lost, none twice; told {fleet.deliveries / items:.2f} times each"
 
 
 async def rates(place: Place, number: int, sessions: Sessions) -> None:

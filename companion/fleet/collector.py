@@ -35,10 +35,12 @@ _quiet.setLevel(logging.CRITICAL)
 BATCH: Final = 500
 GATHER_S: Final = 0.1
 """How long more of a batch is waited for."""
-ASK_AFTER: Final = 20
+ASK_AFTER: Final = 50
 """So many times as long of hellos: what is told with one has come by then, perhaps to another collector."""
 WAITING: Final = 20 * BATCH
 """The most messages that wait; what is beyond is told again, or another collector hears it."""
+AT_ONCE: Final = 50
+"""Messages that are being sent; aiomqtt looks at each of them for every further one."""
 SWEEP_S: Final = 5.0
 """For what aircraft said before this collector was there."""
 JUDGE_S: Final = 2.0
@@ -256,4 +258,5 @@ class Collector:
             logger.warning("fleet: %s: not taken: %s (table rejected has it)", message.topic, reason)
         async with asyncio.timeout(ANSWER_S):  # one timer for all: theirs would cost as much as sending
             publish = functools.partial(client.publish, timeout=math.inf)
-            await asyncio.gather(*(publish(topic, payload, qos=qos) for topic, payload, qos in said))
+            for some in (said[k : k + AT_ONCE] for k in range(0, len(said), AT_ONCE)):
+                await asyncio.gather(*(publish(topic, payload, qos=qos) for topic, payload, qos in some))
