@@ -11,7 +11,6 @@ import contextlib
 import datetime
 import json
 import random
-import subprocess
 import sys
 import tempfile
 import time
@@ -39,6 +38,7 @@ from tests.support.collecting import (
     until_confirmed,
 )
 from tests.support.postgres import Postgres, postgres
+from tests.support.small_disk import small_disk
 
 Kind = Literal["sqlite", "postgresql"]
 KINDS: tuple[Kind, ...] = ("sqlite", "postgresql")
@@ -240,21 +240,15 @@ async def _collected(scene: Scene) -> AsyncIterator[None]:
 @contextlib.contextmanager
 def _on_small_disk(kind: Kind, server: Postgres | None) -> Iterator[tuple[Path, str]]:
     """A small file system, and the address of a new database on it."""
-    folder = Path(tempfile.mkdtemp(prefix="companion-small-"))
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={ROOM_MB[kind]}m", "tmpfs", str(folder)]
-    if subprocess.run(mount, check=False, capture_output=True).returncode != 0:
-        folder.rmdir()
-        raise NotApplicableError("this user may not mount a small file system")
-    try:
+    with small_disk(ROOM_MB[kind]) as folder:
+        if folder is None:
+            raise NotApplicableError("this user may not mount a small file system")
         if kind == "sqlite":
             yield folder, str(folder / "fleet.sqlite")
         else:
             assert server is not None
             with server.created_in(folder) as database:
                 yield folder, database
-    finally:
-        subprocess.run(["umount", str(folder)], check=True)
-        folder.rmdir()
 
 
 def judge(database: str, fleet: list[Aircraft]) -> None:

@@ -113,5 +113,7 @@ def test_no_figure_tells_more_of_the_place_than_is_wanted(tmp_path: Path) -> Non
         for key in ("gyro_sigma_use_rad_s", "accel_sigma_use_m_s2", "gyro_sigma_stat_rad_s"):
             for sigma, exact in zip(now[key], before[key], strict=True):
                 assert abs(sigma / exact - 1.0) <= 0.05
+                # With all its digits the latitude could be worked out from it.
+                assert sigma == float(f"{sigma:.1e}")
 
     run_virtual(main())
