@@ -28,6 +28,8 @@ MOST_PARTS: Final = 300
 """Of a model."""
 SAME_POWER_UP: Final = datetime.timedelta(minutes=30)
 """Calibrations that follow one another sooner and agree are of one power-up."""
+MOST_DEGC: Final = 150.0
+"""Beyond this a thermometer tells none: above all one whose kelvins were not turned into degrees."""
 _AGREE_SIGMAS: Final = 5.0
 _TOGETHER: Final = 10
 """Power-ups within which accelerometers that moved have moved together."""
@@ -148,9 +150,10 @@ def _history(calibrations: Sequence[_Calibration]) -> History:
     rate = np.array([np.fmax.reduce(rate[max(k - 7, 0) : k + 1]) for k in range(len(rate))])
     degc = [np.nan if (told := one.axes[0].temperature_degc) is None else told for one in calibrations]
     zeros = [one.about.zero_at for one in calibrations]
+    warmth = np.array(degc, dtype=np.float64)
     return History(
         at=[one.at for one in calibrations],
-        temperature_degc=np.array(degc),
+        temperature_degc=np.where(np.abs(warmth) < MOST_DEGC, warmth, np.nan),
         biases=_matrix(calibrations, "read"),
         sigma_use=_matrix(calibrations, "sigma_use"),
         white=_matrix(calibrations, "sigma_stat") * np.sqrt(samples / rate)[:, None],

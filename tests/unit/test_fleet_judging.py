@@ -159,6 +159,20 @@ def test_disorder_repetition_and_wrong_clocks_change_nothing(store: Store, datab
     assert [row[:5] + row[6:] for row in found] == [row[:5] + row[6:] for row in expected]
 
 
+def test_absurd_figures_keep_nobody_from_being_judged(
+    store: Store, database: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    one = faulty()
+    for sequence, degc, duration_s in ((2, 1e12, 0.0), (3, -1e12, -3.0), (12, 1e-300, 1e12)):
+        imus = json.loads(one.told[sequence])["body"]["imus"]
+        for imu in imus:
+            imu |= {"temperature_degc": degc, "samples": 0, "gyro_sigma_use_rad_s": [0.0, -1.0, 1e12]}
+        changed(one, sequence, imus=imus, duration_s=duration_s)
+    (found,) = judged(store, database, messages_of(one))
+    assert found.kind == "bias"
+    assert "cannot be judged" not in caplog.text
+
+
 def test_what_was_undone_does_not_count(store: Store, database: str) -> None:
     one = faulty()
     moved = [sequence for sequence in one.told if sequence > 30]
