@@ -256,7 +256,8 @@ class Collector:
         if outcome.rejected:
             message, reason = outcome.rejected[0]
             logger.warning("fleet: %s: not taken: %s (table rejected has it)", message.topic, reason)
-        async with asyncio.timeout(ANSWER_S):  # one timer for all: theirs would cost as much as sending
-            publish = functools.partial(client.publish, timeout=math.inf)
-            for some in (said[k : k + AT_ONCE] for k in range(0, len(said), AT_ONCE)):
+        # One timer for some: theirs would cost as much as sending.
+        publish = functools.partial(client.publish, timeout=math.inf)
+        for some in (said[k : k + AT_ONCE] for k in range(0, len(said), AT_ONCE)):
+            async with asyncio.timeout(ANSWER_S):
                 await asyncio.gather(*(publish(topic, payload, qos=qos) for topic, payload, qos in some))
