@@ -70,12 +70,13 @@ def times(values: Sequence[float]) -> Axis:
 def in_order(values: Sequence[float]) -> Axis:
     """An axis on which each of these UTC times has the place of its number, counted from 0."""
     every = math.ceil(len(values) / 4)
-    form = "%-d %b %H:%M"
-    ticks = [
-        (float(k), datetime.datetime.fromtimestamp(values[k], tz=datetime.UTC).strftime(form))
-        for k in range(0, len(values), every)
-    ]
-    return Axis(-0.5, len(values) - 0.5, tuple(ticks))
+    moments = [datetime.datetime.fromtimestamp(value, tz=datetime.UTC) for value in values]
+    # Four labels with day and time would stand in one another.
+    days = [f"{moment:%-d %b}" for moment in moments[::every]]
+    if len(set(days)) < len(days):
+        every = math.ceil(len(values) / 3)
+        days = [f"{moment:%-d %b %H:%M}" for moment in moments[::every]]
+    return Axis(-0.5, len(values) - 0.5, tuple(zip(map(float, range(0, len(values), every)), days, strict=True)))
 
 
 def _nice(step: float) -> float:

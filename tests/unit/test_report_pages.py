@@ -482,3 +482,14 @@ def _contrast(a: str, b: str) -> float:
 
     bright, dim = sorted((luminance(a), luminance(b)), reverse=True)
     return (bright + 0.05) / (dim + 0.05)
+
+
+@pytest.mark.parametrize("every_s", [600.0, 86400.0 * 3.0, 86400.0 / 3.0], ids=["minutes", "days", "some a day"])
+def test_dates_below_a_plot_do_not_stand_in_one_another(every_s: float) -> None:
+    """A letter takes 7 of the 310 that are there."""
+    axis = svg.in_order([1.7e9 + every_s * k for k in range(26)])
+    assert len(axis.ticks) >= 3
+    letters = [len(label) for _, label in axis.ticks]
+    apart = 310.0 * (axis.ticks[1][0] - axis.ticks[0][0]) / (axis.high - axis.low)
+    assert max(letters) * 7.0 <= apart
+    assert len({label for _, label in axis.ticks}) == len(letters)
