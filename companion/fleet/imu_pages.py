@@ -1,28 +1,175 @@
-"""What the pages show of IMUs: one's biases over temperature."""
+"""What the pages show of IMUs: a model with all its parts, and one IMU's biases over temperature."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import datetime
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import msgspec
+import numpy as np
 import sqlalchemy as sa
 
 from companion.calibration.solution.by_temperature import ByTemperature, Seen
-from companion.fleet.contract import Curve
-from companion.fleet.schema import items
+from companion.calibration.solution.model_prior import TriadPrior
+from companion.fleet.models import Scatter
+from companion.fleet.priors import Part, model_prior, models, parts_of
+from companion.fleet.schema import aircraft, items
+from companion.report import svg
 from companion.report.by_temperature import biases_by_temperature
-from companion.report.markup import Markup
+from companion.report.markup import Child, Markup, join, row, tag
+from companion.report.page import AXES, CLASSES, NAMES, TRIADS, UNITS, page
+from companion.samples import Triad
 
+OUTSIDE: Final = 3.0
+"""Sigmas of how parts differ."""
+MOST_OUTSIDE: Final = 30
+_BINS: Final = 40
+_DOT: Final = 7.5
+_LEAST_HEIGHT: Final = 36.0
+_MOST_HEIGHT: Final = 180.0
 _CURVES: Final = 16
 """The latest that are looked at, of all IMUs of an aircraft."""
+
+
+def model_links(connection: sa.Connection) -> Markup | None:
+    """To the page of each model."""
+    links = [join(_link(model), f" ({count} parts) ") for model, count in models(connection).items()]
+    return tag("p", "IMU models: ", *links) if links else None
+
+
+def _link(model: str) -> Markup:
+    return tag("a", model, href=f"/model/{model}")
+
+
+def model_page(connection: sa.Connection, model: str, now: datetime.datetime, source: str) -> str | None:
+    """All parts of one model; None: there are none."""
+    of_model = parts_of(connection, model)
+    if not of_model:
+        return None
+    names = {row.aircraft: row.name for row in connection.execute(sa.select(aircraft.c.aircraft, aircraft.c.name))}
+    prior = model_prior(model, list(of_model.values()))
+    all_parts = models(connection).get(model, 0)
+    power_ups = sum(part.power_ups for part in of_model.values())
+    parts: list[Child] = [
+        tag("p", tag("a", "Fleet", href="/")),
+        tag("h1", f"IMU model {model}"),
+        tag("p", f"{len(of_model)} parts, {power_ups} power-ups", class_="lead"),
+        tag("p", f"The first {len(of_model)} of {all_parts} parts.") if len(of_model) < all_parts else None,
+        tag("p", "How far the biases of each part scatter from one power-up to the next, at one temperature."),
+    ]
+    for triad in TRIADS:
+        known = None if prior is None else prior.of(triad)
+        parts += _distribution(of_model, triad, known)
+        parts += _outside(of_model, triad, known, names)
+    if prior is None:
+        parts.append(tag("p", "New aircraft are told nothing of this model yet: too few parts tell how they scatter."))
+    return page(f"IMU model {model}", now, *parts, source=source)
+
+
+def _distribution(of_model: Mapping[Part, Scatter], triad: Triad, known: TriadPrior | None) -> list[Child]:
+    """A dot for each part, above the others that scatter as much, and what new aircraft are told."""
+    unit, unit_name = UNITS[triad]
+    columns = {axis: _scatters(of_model, triad, axis) for axis in range(3)}
+    every = [value / unit for of_axis in columns.values() for value in of_axis.values()]
+    if not every:
+        return []
+    across = svg.linear([0.0, *every])
+    across = msgspec.structs.replace(across, low=0.0, ticks=tuple(tick for tick in across.ticks if tick[0] >= 0.0))
+    plots = []
+    for axis, of_axis in columns.items():
+        points = _stacked([value / unit for value in of_axis.values()], across)
+        most = max((place for _, place in points), default=1.0)
+        plot = svg.Plot(
+            across,
+            svg.Axis(0.0, most + 1.0, ()),
+            name=f"{NAMES[triad].lower()} {AXES[axis]}: turn-on scatter of each part",
+            told=f"{len(points)} parts",
+            height=min(max(_DOT * (most + 1.0), _LEAST_HEIGHT), _MOST_HEIGHT),
+            x_label=f"turn-on scatter, {unit_name}" if axis == 2 else "",
+            y_label=f"{AXES[axis]}, {unit_name}{_in_words(known, axis, unit)}",
+            left=16.0,
+        )
+        plot.points(points, CLASSES[axis], [(place, place) for _, place in points])
+        if known is not None:
+            plot.upright(known.scatter[axis] / unit, "now")
+        plots.append(plot.svg())
+    words = "A dot is a part. " + ("Dashes: the typical one." if known is not None else "")
+    return [tag("h2", NAMES[triad]), tag("figure", *plots, tag("figcaption", words)), _slopes(known, triad)]
+
+
+def _scatters(of_model: Mapping[Part, Scatter], triad: Triad, axis: int) -> dict[Part, float]:
+    k = 3 * TRIADS.index(triad) + axis
+    found = {key: float(part.turn_on[k]) for key, part in of_model.items()}
+    return {key: value for key, value in found.items() if np.isfinite(value)}
+
+
+def _stacked(values: Sequence[float], across: svg.Axis) -> list[svg.Pair]:
+    """Each where it belongs, one step above those that are there already."""
+    there: Counter[int] = Counter()
+    points = []
+    for value in sorted(values):
+        place = round(across.share(value) * _BINS)
+        there[place] += 1
+        points.append((value, float(there[place])))
+    return points
+
+
+def _in_words(known: TriadPrior | None, axis: int, unit: float) -> str:
+    if known is None:
+        return ""
+    scatter, differ = known.scatter[axis] / unit, known.scatter_sigma[axis] / unit
+    return f": typically {scatter:.3g}, parts differ by {differ:.2g}"
+
+
+def _slopes(known: TriadPrior | None, triad: Triad) -> Markup | None:
+    if known is None or known.per_k is None or known.per_k_spread is None:
+        return None
+    unit, unit_name = UNITS[triad]
+    each = ", ".join(
+        f"{axis} {mean / unit:+.2g} ± {spread / unit:.2g}"
+        for axis, mean, spread in zip(AXES, known.per_k, known.per_k_spread, strict=True)
+    )
+    return tag("p", f"By temperature, {unit_name} a kelvin, mean and how parts differ: {each}.")
+
+
+def _outside(
+    of_model: Mapping[Part, Scatter], triad: Triad, known: TriadPrior | None, names: Mapping[str, str | None]
+) -> list[Child]:
+    """Parts that scatter far more, or less, than the others."""
+    if known is None:
+        return []
+    unit, unit_name = UNITS[triad]
+    found = [
+        (value / known.scatter[axis], value, axis, key)
+        for axis in range(3)
+        for key, value in _scatters(of_model, triad, axis).items()
+        if abs(value - known.scatter[axis]) > OUTSIDE * known.scatter_sigma[axis]
+    ]
+    if not found:
+        return [tag("p", "No part is far off the others (three times what they differ).", class_="soft")]
+    rows = [
+        row(
+            tag("td", tag("a", names.get(key[0]) or key[0], href=f"/aircraft/{key[0]}"), tag("small", f"IMU {key[1]}")),
+            AXES[axis],
+            f"{value / unit:.3g}",
+            tag("td", f"{ratio:.1f}", class_="warn"),
+        )
+        for ratio, value, axis, key in sorted(found, reverse=True)[:MOST_OUTSIDE]
+    ]
+    head = row(*(tag("th", words) for words in ("Far off the others", "axis", unit_name, "times the typical")))
+    return [tag("table", head, *rows, class_="fleet")]
+
+
+# --- one aircraft
 
 
 class Told(msgspec.Struct, frozen=True):
     """An item."""
 
     at: str
-    body: Curve
+    body: ByTemperature
 
 
 def curves(connection: sa.Connection, which: str) -> dict[str, Told]:
@@ -47,18 +194,7 @@ def by_temperature(told: Told | None, points: Sequence[Seen]) -> Markup | None:
     """Its curve, and what its calibrations have found."""
     if told is None:
         return None
-    curve = told.body
-    shown = ByTemperature(
-        imu=f"{curve.imu} by temperature",
-        summary=f"From {curve.power_ups} power-ups on {curve.days} days, as told {told.at[:10]}",
-        power_ups=curve.power_ups,
-        days=curve.days,
-        points=tuple(points),
-        curve=curve.curve,
-        accel_curve=curve.accel_curve,
-        needs=None,
-        today=None,
-        now=None,
-        at_power_up=None,
-    )
+    summary = f"From {told.body.power_ups} power-ups on {told.body.days} days, as told {told.at[:10]}"
+    name = f"{told.body.imu} by temperature"
+    shown = msgspec.structs.replace(told.body, imu=name, summary=summary, points=tuple(points))
     return biases_by_temperature([shown], looking_back=True)

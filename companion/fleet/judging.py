@@ -18,6 +18,7 @@ from companion.fleet import schema
 from companion.fleet.contract import Row
 from companion.fleet.judgement import Finding, History, judge, judge_compass, judge_zero
 from companion.fleet.models import Scatter, scatter_of_model, scatter_of_part
+from companion.fleet.priors import parts_of
 from companion.fleet.schema import Moment
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, MG, G
@@ -169,15 +170,7 @@ def _model(connection: sa.Connection, aircraft: str, model: str | None) -> Scatt
     """Of the parts in other aircraft."""
     if model is None:
         return None
-    p = schema.parts.c
-    query = sa.select(schema.parts).where(p.model == model, p.aircraft != aircraft).limit(MOST_PARTS * 6)
-    found: dict[tuple[str, str], Scatter] = {}
-    for row in connection.execute(query):
-        one = found.setdefault((row.aircraft, row.imu), Scatter(row.power_ups, 1, *np.full((3, 6), np.nan)))
-        place = "xyz".index(row.axis) + 3 * (row.triad == "accel")
-        for name in ("turn_on", "wander", "per_k"):
-            getattr(one, name)[place] = np.nan if (value := getattr(row, name)) is None else value
-    return scatter_of_model(list(found.values()))
+    return scatter_of_model(list(parts_of(connection, model, but=aircraft, most=MOST_PARTS).values()))
 
 
 def _part(aircraft: str, imu: str, model: str | None, scatter: Scatter) -> list[Row]:

@@ -11,7 +11,7 @@ import sqlalchemy as sa
 
 from companion.calibration.records.record import Arming
 from companion.calibration.solution.by_temperature import Seen
-from companion.fleet.imu_pages import by_temperature, curves
+from companion.fleet.imu_pages import by_temperature, curves, model_links
 from companion.fleet.schema import Moment, findings, rejected
 from companion.fleet.schema import aircraft as known
 from companion.physics.frames import vector
@@ -92,6 +92,7 @@ def glance(connection: sa.Connection, now: datetime.datetime) -> str:
         ),
         _findings(connection),
         tag("table", head, *rows, class_="fleet") if rows else None,
+        model_links(connection),
         _refused(connection, now),
         source=SOURCE,
     )
@@ -180,30 +181,21 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
 def _seen(rows: Sequence[Any]) -> list[Seen]:
     """At which temperature which bias was found."""
     degc = {(each.sequence, each.started_at.timestamp()): each.temperature_degc for each in rows}
-    accel = {(point.number, point.unix_s): point for point in _points(rows, "accel")}
-
-    def shown(point: Point | None, values: str, unit: float) -> Vector | None:
-        return None if point is None else vector(np.array(getattr(point, values)) / unit)
-
-    found = []
-    for number, point in enumerate(_points(rows, "gyro")):
-        key = (point.number, point.unix_s)
-        bias, sigma = (shown(point, values, DEG_H) for values in ("bias", "sigma_use"))
-        if degc.get(key) is not None and bias is not None and sigma is not None:
-            forces, of_forces = (shown(accel.get(key), values, MG) for values in ("bias", "sigma_use"))
-            found.append(
-                Seen(
-                    at_unix_s=key[1] or 0.0,
-                    started_at="",
-                    power_up=number,
-                    degc=degc[key],
-                    gyro_deg_h=bias,
-                    sigma_deg_h=sigma,
-                    accel_mg=forces,
-                    accel_sigma_mg=of_forces,
-                )
-            )
-    return found
+    gyro, accel = ({(one.number, one.unix_s): one for one in _points(rows, triad)} for triad in TRIADS)
+    return [
+        Seen(
+            at_unix_s=key[1] or 0.0,
+            started_at="",
+            power_up=number,
+            degc=degc[key],
+            gyro_deg_h=vector(np.array(one.bias) / DEG_H),
+            sigma_deg_h=vector(np.array(one.sigma_use) / DEG_H),
+            accel_mg=vector(np.array(accel[key].bias) / MG) if key in accel else None,
+            accel_sigma_mg=vector(np.array(accel[key].sigma_use) / MG) if key in accel else None,
+        )
+        for number, (key, one) in enumerate(gyro.items())
+        if degc.get(key) is not None
+    ]
 
 
 def _points(rows: Sequence[Any], triad: Triad) -> list[Point]:

@@ -15,7 +15,7 @@ import sqlalchemy as sa
 
 from companion.config.rules import bind_problem
 from companion.errors import ConfigError
-from companion.fleet import metrics, page
+from companion.fleet import imu_pages, metrics, page
 from companion.fleet.certificate import Certificate
 from companion.fleet.store import engine_of, why
 from companion.links.system.connection import Backoff, Reconnection
@@ -35,6 +35,7 @@ CERTIFICATE_S: Final = 60.0
 HANDSHAKE_S: Final = 10.0
 _HTML: Final = "text/html; charset=utf-8"
 _AIRCRAFT: Final = re.compile(r"/aircraft/([0-9a-f]{16,36})")
+_MODEL: Final = re.compile(r"/model/([0-9a-z-]{1,40})")
 _ALWAYS: Final = (
     ("X-Content-Type-Options", "nosniff"),
     ("X-Frame-Options", "DENY"),
@@ -184,6 +185,10 @@ class Server:
                 return Response(200, self._counts.text(metrics.heard(connection, now)), metrics.CONTENT_TYPE)
             if (match := _AIRCRAFT.fullmatch(path)) is not None:
                 found = page.aircraft(connection, match[1], now)
+                if found is not None:
+                    return Response(200, found.encode(), _HTML)
+            if (match := _MODEL.fullmatch(path)) is not None:
+                found = imu_pages.model_page(connection, match[1], now, page.SOURCE)
                 if found is not None:
                     return Response(200, found.encode(), _HTML)
         return _text(404, "nothing is here")

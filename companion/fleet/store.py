@@ -31,6 +31,7 @@ from companion.fleet.contract import (
     read_key,
 )
 from companion.fleet.judging import Judged, judged
+from companion.fleet.priors import payloads
 
 logger = logging.getLogger(__name__)
 
@@ -195,6 +196,18 @@ class Store:
         except (ArithmeticError, LookupError, ValueError):
             logger.error("fleet: %s cannot be judged; what was found before stands", aircraft, exc_info=True)
             return None
+
+    def model_priors(self) -> dict[str, bytes]:
+        """By topic, what is known of each IMU model.
+
+        Raises:
+            LinkError: the database cannot be reached, or fails.
+        """
+        try:
+            with self._reads.begin() as connection:
+                return payloads(connection)
+        except sa.exc.SQLAlchemyError as error:
+            raise LinkError(f"{self.where}: {why(error)}") from None
 
     def take(self, messages: Sequence[Message]) -> Outcome:
         """Put a batch into the database; what is not taken is kept aside there with its reason.

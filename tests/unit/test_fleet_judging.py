@@ -134,7 +134,7 @@ def test_a_fleet_without_faults_has_nothing_said_of_it(store: Store, database: s
         flown(one, 60, 100.0)
         assert judged(store, database, messages_of(one)) == []
     with store._reads.begin() as connection:
-        assert "IMU" not in page.glance(connection, NOW)
+        assert " IMU " not in page.glance(connection, NOW)
 
 
 def test_disorder_repetition_and_wrong_clocks_change_nothing(store: Store, database: str, tmp_path: Path) -> None:

@@ -58,22 +58,22 @@ class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU."""
 
     imu: str
-    summary: str
+    summary: str = ""
     """How much was seen."""
     power_ups: int
     days: int
-    points: tuple[Seen, ...]
+    points: tuple[Seen, ...] = ()
     curve: tuple[Expected, ...]
     """Of the next power-up; empty: not known yet."""
     accel_curve: tuple[ExpectedForces, ...] = ()
     """Likewise, where a gradienter has shown it."""
-    needs: str | None
+    needs: str | None = None
     """Why there is no curve, and what will make one."""
-    today: int | None
+    today: int | None = None
     """Which power-up is this one; None: nothing is known of it yet."""
-    now: Expected | None
+    now: Expected | None = None
     """The bias now: as last measured in this power-up, and moved along the curve since."""
-    at_power_up: Expected | None
+    at_power_up: Expected | None = None
     """What the curve expects of a power-up at the temperature now."""
 
 
