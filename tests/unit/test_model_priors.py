@@ -17,8 +17,10 @@ from companion.autopilot.firmware.firmwares import model_of
 from companion.calibration.records.history import Point
 from companion.calibration.solution.model_prior import MOST_BYTES, TriadPrior, read
 from companion.calibration.solution.prior import expect
+from companion.calibration.temperature.curve import Node, PowerUpNodes, fit
 from companion.daemon.biases.model_priors import ModelPriors
 from companion.errors import ConfigError
+from companion.physics.frames import vector
 from tests.prior_study import STEADY, Case, study
 from tests.support.extent import extent
 from tests.support.fleet import Aircraft, check
@@ -217,6 +219,17 @@ def test_own_power_ups_that_contradict_it_are_taken_alone() -> None:
             alone.weighs,
         )
         assert of(points[:2], usual(lie)) is None
+
+
+def test_parts_as_their_model_says_contradict_it_by_chance_only() -> None:
+    for count in (2, 3, 5):
+        draws = [some(count, seed=seed, scale=30.0 * DEG_H) for seed in range(60)]
+        known = TriadPrior((30.0 * DEG_H,) * 3, (0.2 * DEG_H,) * 3)
+        nodes = [[PowerUpNodes([Node(25.0, vector(bias), 1e-14)]) for bias in draw] for draw in draws]
+        surprises = [curve.surprise for each in nodes if (curve := fit(each, 1e-14, 50.0 * DEG_H, usual=known.usual))]
+        assert len(surprises) == 60
+        assert abs(np.mean(surprises)) < 0.35
+        assert 0.7 < np.std(surprises) < 1.3
 
 
 def test_a_slope_that_own_power_ups_have_not_seen_is_no_promise() -> None:

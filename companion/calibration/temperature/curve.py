@@ -311,8 +311,7 @@ class _Fit:
         if self._usual is None:
             return 0.0
         error, variance = self._foretold(max(self._usual.mean - self._in_run, 0.0))
-        # Each is foretold by all others, and so are they by it.
-        quotient = float((error * error / variance[:, None]).mean()) * (1.0 - 1.0 / len(error))
+        quotient = float((error * error / variance[:, None]).mean())
         a, b, root = 2.0 / (9.0 * own), 2.0 / (27.0 * self._worth), math.cbrt(quotient)
         return ((1.0 - b) * root - (1.0 - a)) / math.sqrt(b * root * root + a)
 
