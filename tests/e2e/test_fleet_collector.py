@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-import random
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -17,12 +16,11 @@ from companion.fleet import schema
 from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store, engine_of
 from companion.physics.units import DEG_H
-from tests.support.broker import MOSQUITTO, Broker, broker
+from tests.support.broker import MOSQUITTO, broker
 from tests.support.collecting import (
     NOW,
     CollectorProcess,
     items_in,
-    quick,
     rows_of,
     telling,
     told_by,
@@ -58,55 +56,6 @@ def fleet_of(number: int, flights: int, seed: int) -> list[Aircraft]:
     for each in fleet:
         each.live(NOW, flights)
     return fleet
-
-
-@pytest.mark.parametrize("database", KINDS, indirect=True)
-def test_collectors_are_killed_and_started_again_and_again(database: str, tmp_path: Path) -> None:
-    """Two share the work, one of the two is killed at any instant; all is told several times over, and in disorder."""
-    fleet, dice = fleet_of(8, 25, seed=3), random.Random(5)
-    quick(fleet)
-
-    async def news() -> None:
-        while True:
-            await asyncio.sleep(0.1)
-            for each in fleet:
-                each.calibrate(NOW)
-                each.arm(NOW)
-
-    async def play(one: Broker) -> None:
-        names = iter(range(100))
-
-        def another() -> CollectorProcess:
-            return CollectorProcess(tmp_path, f"collector-{next(names)}", one, database)
-
-        running = [another(), another()]
-        try:
-            async with telling(fleet, one):
-                telling_on = asyncio.create_task(news())
-                for _ in range(3):
-                    await running[0].at_work()
-                    await asyncio.sleep(dice.uniform(0.0, 0.6))
-                    running.pop(0).kill()
-                    confirmed = {(each.id, number) for each in fleet for number in each.confirmed}
-                    assert confirmed <= {(row[0], row[2]) for row in items_in(database)}
-                    running.append(another())
-                telling_on.cancel()
-                await until_confirmed(fleet)
-            for process in running:
-                await process.at_work()
-            assert [process.stop() for process in running] == [0, 0]
-        finally:
-            for process in running:
-                process.kill()
-
-    async def main() -> None:
-        async with broker(tmp_path) as one:
-            await play(one)
-
-    asyncio.run(main())
-    assert items_in(database) == told_by(fleet)
-    assert sum(each.deliveries for each in fleet) > sum(len(each.told) for each in fleet)
-    _is_what_was_told(database, fleet)
 
 
 @pytest.mark.parametrize("database", KINDS, indirect=True)

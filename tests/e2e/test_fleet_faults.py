@@ -19,6 +19,10 @@ from tests.support.collecting import NOW
 from tests.support.extent import extent
 from tests.support.postgres import INITDB, Postgres, postgres
 
+ALL = [cell for cell in itertools.product(FAULTS, KINDS) if cell != ("database killed", "sqlite")]
+SLICE = [(fault, kind) for fault, kind in ALL if kind == "postgresql" or fault in ("collector killed", "disk full")]
+"""Of a file nothing else is different."""
+
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[Postgres]:
@@ -29,9 +33,7 @@ def server() -> Iterator[Postgres]:
 
 
 @pytest.mark.skipif(MOSQUITTO is None, reason="no Mosquitto")
-@pytest.mark.parametrize(
-    ("fault", "kind"), [cell for cell in itertools.product(FAULTS, KINDS) if cell != ("database killed", "sqlite")]
-)
+@pytest.mark.parametrize(("fault", "kind"), extent(whole=ALL, a_slice=SLICE))
 def test_nothing_is_lost_and_nothing_is_there_twice(
     tmp_path: Path, request: pytest.FixtureRequest, fault: str, kind: Kind
 ) -> None:
