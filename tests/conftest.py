@@ -22,7 +22,7 @@ from tests.support.extent import LONG
 # everybody: a suite is green or red, and no matter of dice. Those of `make long` are new every time.
 hypothesis.settings.register_profile(
     "anywhere",
-    max_examples=40,
+    max_examples=30,
     deadline=None,
     derandomize=True,
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
