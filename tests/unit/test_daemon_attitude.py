@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.config import parse
 from companion.config.sections import Imu
 from companion.configured import models
-from companion.daemon.heading.attitude_service import Sender, is_sane
+from companion.daemon.heading.attitude_service import AttitudeService, Sender, is_sane
 from companion.daemon.heading.carrier import settings_of, turn_between, without_truncation
 from companion.errors import AutopilotError
 from companion.links.mavlink.link import MavlinkLink
@@ -155,6 +156,29 @@ def test_the_rate_on_the_average_and_the_spacing_always(rate_hz: float, samples_
     assert gaps.min() >= 0.02 - 1e-5
     assert len(sent) / 20.0 <= 50.0 + 1.0
     assert len(sent) / 20.0 > 0.75 * min(rate_hz, samples_hz)
+
+
+def test_the_autopilot_gets_what_is_levelled_and_people_what_is_ours() -> None:
+    """PX4 leaps to a heading whose tilt is not its own."""
+    sent: list[Any] = []
+
+    def send(message: object) -> bool:
+        sent.append(message)
+        return True
+
+    link: Any = SimpleNamespace(send=send)
+    ours, levelled = attitude(yaw_deg=40.0), attitude(yaw_deg=41.0)
+    service: Any = SimpleNamespace(
+        _vehicle=SimpleNamespace(firmware="px4"),
+        health=SimpleNamespace(pushing=True),
+        sender=Sender(link, 30.0, full=True),
+        carrier=SimpleNamespace(heard_s=12.5, now=lambda: ours, reset_counter=0),
+        difference=SimpleNamespace(levelled=lambda found, _now_s: levelled if found is ours else None),
+    )
+    AttitudeService._push(service, 12.5)
+    pushed, shown, _ = sent
+    assert math.degrees(pushed.yaw) == pytest.approx(41.0)
+    assert math.degrees(shown.yaw) == pytest.approx(40.0)
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 179.5, -179.5])
