@@ -237,7 +237,7 @@ class VirtualAircraft:
             if len(t_s) == 0 or t_s[-1] < motion.start_s:
                 continue
             if t_s[0] >= motion.end_s:
-                angles += motion.leaves_rad()
+                angles += motion.leaves_rad
                 continue
             if motion.start_s <= t_s[0] and t_s[-1] < motion.end_s:
                 added, slopes = motion.euler_rad(t_s)
@@ -247,7 +247,7 @@ class VirtualAircraft:
             added, slopes = motion.euler_rad(np.clip(t_s, motion.start_s, motion.end_s))
             acting = (t_s >= motion.start_s) & (t_s < motion.end_s)
             over = t_s >= motion.end_s
-            angles += np.where(over[:, None], motion.leaves_rad(), np.where(acting[:, None], added, 0.0))
+            angles += np.where(over[:, None], motion.leaves_rad, np.where(acting[:, None], added, 0.0))
             rates += np.where(acting[:, None], slopes, 0.0)
         return angles, rates
 

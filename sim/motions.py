@@ -6,6 +6,7 @@ derivatives, so the true body rate needs no numerical differentiation. Times are
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ def smooth_step(u: Array) -> tuple[Array, Array]:
     return u**3 * (10.0 - 15.0 * u + 6.0 * u**2), 30.0 * u**2 * (1.0 - u) ** 2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Motion(ABC):
     """Something that happens from `start_s` for `duration_s`."""
 
@@ -48,13 +49,14 @@ class Motion(ABC):
         """The same (n, 3) along the heading, to the right of it, and down: of what goes up and down as a whole."""
         return np.zeros((len(t_s), 3))
 
+    @functools.cached_property
     def leaves_rad(self) -> Array:
         """What stays of the angles afterwards (3)."""
         result: Array = self.euler_rad(np.array([self.end_s]))[0][0]
         return result
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Turn(Motion):
     """A smooth change of pose that stays: somebody sets the aircraft down differently."""
 
@@ -69,7 +71,7 @@ class Turn(Motion):
         return step[:, None] * change, slope[:, None] * change / self.duration_s
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class SlowTurn(Motion):
     """A steady turn of the heading, the motion that a spread of the readings does not show."""
 
@@ -90,7 +92,7 @@ class SlowTurn(Motion):
         return angles, rates
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Handling(Motion):
     """Somebody holds the aircraft: irregular turning and shaking that ends where it began."""
 
@@ -99,6 +101,7 @@ class Handling(Motion):
     """m/s^2, about the largest."""
     seed: int = 0
 
+    @functools.cached_property
     def _waves(self) -> tuple[Array, Array]:
         """Angular frequencies (3 axes, 4 waves) in rad/s and phases in rad."""
         generator = np.random.default_rng([self.seed, 17])
@@ -111,7 +114,7 @@ class Handling(Motion):
 
     def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
         """Added angles and rates."""
-        frequencies, phases = self._waves()
+        frequencies, phases = self._waves
         window, window_slope = self._window(t_s)
         arguments = frequencies[None] * (t_s - self.start_s)[:, None, None] + phases[None]
         scale = math.radians(self.angle_deg) / 2.0
@@ -121,14 +124,14 @@ class Handling(Motion):
 
     def acceleration_m_s2(self, t_s: Array) -> Array:
         """Shaking of the hand in body axes."""
-        frequencies, phases = self._waves()
+        frequencies, phases = self._waves
         window, _ = self._window(t_s)
         arguments = 2.3 * frequencies[None] * (t_s - self.start_s)[:, None, None] - phases[None]
         result: Array = self.acceleration / 2.0 * window[:, None] * np.sin(arguments).sum(axis=2)
         return result
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Knock(Motion):
     """Somebody bumps into the table: a short swing about roll and pitch that comes back."""
 
@@ -153,7 +156,7 @@ class Knock(Motion):
         return result
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Vibration(Motion):
     """A running motor or generator near by: no turning, a steady shake."""
 
@@ -180,6 +183,7 @@ class Vibration(Motion):
         result: Array = self._gate(t_s)[:, None] * self.amplitude_m_s2 * waves * np.array([0.4, 0.4, 1.0])
         return result
 
+    @functools.cached_property
     def leaves_rad(self) -> Array:
         """Nothing."""
         return np.zeros(3)

@@ -37,7 +37,7 @@ SWELL: Final = (Wave(0.2, 5.0), Wave(0.05, 1.0))
 """A small boat at its mooring, with some swell."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Sea(Motion):
     """Roll and pitch by waves, with the accelerations that belong to them."""
 
@@ -92,6 +92,7 @@ class Sea(Motion):
         result: Array = STANDARD_GRAVITY_M_S2 * height[:, None] * np.array([forward, right, down]).T
         return result
 
+    @functools.cached_property
     def leaves_rad(self) -> Array:
         """Nothing."""
         return np.zeros(3)

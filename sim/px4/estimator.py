@@ -80,14 +80,15 @@ class Ekf2:
         self.accel_bias_m_s2[2] += learnt * (accel_error[2] - self.accel_bias_m_s2[2])
         mismatch = accel_error[:2] - self.accel_bias_m_s2[:2] - self._tilt_m_s2
         share = _SHARE_LATE + _SHARE_EARLY * math.exp(-(self.time_s - self._started_s) / _SETTLES_S)
-        if np.linalg.norm(mismatch) > _OBVIOUS_M_S2:
+        if math.hypot(*mismatch) > _OBVIOUS_M_S2:
             share = 1.0
         self._tilt_m_s2 += learnt * share * mismatch
         self.accel_bias_m_s2[:2] += learnt * (1.0 - share) * mismatch
         np.clip(self.accel_bias_m_s2, -ACCEL_LIMIT_M_S2, ACCEL_LIMIT_M_S2, out=self.accel_bias_m_s2)
         self.time_s = t_s
         now = np.concatenate((self.gyro_bias_rad_s, self.accel_bias_m_s2))
-        moved = np.linalg.norm((now + self._wander - self.published).reshape(2, 3), axis=1).max() > _PUBLISHED_STEP
+        off = (now + self._wander - self.published).tolist()
+        moved = max(math.hypot(*off[:3]), math.hypot(*off[3:])) > _PUBLISHED_STEP
         if moved or t_s - self._published_s >= _PUBLISHED_EVERY_S:
             self._wander = 0.98 * self._wander + _WANDER * self._random.standard_normal(6)
             self.published, self._published_s = now + self._wander, t_s

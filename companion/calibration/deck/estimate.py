@@ -326,6 +326,6 @@ def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:
     means = np.array([one.mean for one in seconds])
     spread = np.sqrt(means.var(axis=0) + np.mean([one.variance for one in seconds], axis=0))
     hidden = np.where(spread < _DITHERED * steps, np.square(steps / 2.0), 0.0)
-    hidden = hidden + np.mean([np.broadcast_to(one.shared_variance, 6) for one in seconds], axis=0)
+    hidden = hidden + np.mean([one.shared_variance for one in seconds], axis=0)
     turn = np.square(imu.rotation)
     return np.concatenate([turn @ hidden[:3], turn @ hidden[3:]])

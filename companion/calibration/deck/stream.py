@@ -47,7 +47,7 @@ class ImuSecond(msgspec.Struct, frozen=True):
     temperature_degc: float | None
     white2: float
     """N^2 of the gyros, from second differences of neighbouring samples; the mean of the axes."""
-    shared_variance: Floats | float = 0.0
+    shared_variance: Floats = np.zeros(6)
     """As in `Batch`; (6,), the sensor's axes."""
 
 

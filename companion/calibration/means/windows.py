@@ -205,7 +205,7 @@ def estimates(
     flicker = _flicker(slots, level, measured, flicker)
     quantum, half_step = _quantisation(batches, steps)
     quantum, half_step = np.where(whole.of, whole.hidden, quantum), np.where(whole.of, whole.unknown, half_step)
-    shared = _columns([[np.broadcast_to(batch.shared_variance, 6) for batch in item] for item in batches])
+    shared = _columns([[batch.shared_variance for batch in item] for item in batches])
     quantum = np.sqrt(np.square(quantum) + shared.mean(axis=0))
     # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
     # by anything from nothing to slope * H / 2.

@@ -69,8 +69,8 @@ class Batch(msgspec.Struct, frozen=True):
     """Of a stream of integers; None for floats, and for a second that spans more than `MAX_LEVELS`."""
     allan: Floats = np.zeros((0, 0))
     """(k, c) Allan variances at averaging times of 1/2, 1/4 ... 1/32 of the second, each of four samples or more."""
-    shared_variance: Floats | float = 0.0
-    """Of an error that its samples, and those of other seconds, have in common."""
+    shared_variance: Floats = np.zeros(6)
+    """(6,) of an IMU: of an error that its samples, and those of other seconds, have in common."""
 
 
 def summary(
