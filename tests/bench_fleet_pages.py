@@ -16,8 +16,9 @@ from typing import Any, Final
 import sqlalchemy as sa
 
 from companion.fleet import schema
+from companion.fleet.database import engine_of
 from companion.fleet.simulated import Aircraft
-from companion.fleet.store import Message, Store, engine_of
+from companion.fleet.store import Message, Store
 from tests.support.broker import broker, free_port
 from tests.support.collecting import CollectorProcess
 from tests.support.fleet_bench import MOSQUITTO, NOW, Meter, Place, Sessions, p95, processor_s, say, spread

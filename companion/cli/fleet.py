@@ -54,7 +54,7 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
             "--page",
             default=DEFAULT_PAGE,
             metavar="HOST:PORT",
-            help=f"where the page is (default {DEFAULT_PAGE}: for this computer alone; run: off for none)",
+            help=f"where the page is (default {DEFAULT_PAGE}: for this computer alone; off: no page, no /metrics)",
         )
         command.add_argument(
             "--password-file", type=Path, metavar="FILE", help="who looks at the page is asked for what is in it"

@@ -26,7 +26,7 @@ MOST_BYTES: Final = 64 * 1024
 MOST_LINE: Final = 4096
 """The most characters of a line: the time that TOML takes for a key grows with the square of its dots."""
 CATALOGUE: Final[tuple[str, ...]] = typing.get_args(Profile)
-
+_Kind = typing.TypeVar("_Kind", bound=msgspec.Struct)
 
 Saved = Callable[[Path, str], Noise | str]
 """What a profile of that name is which a storage directory has; a name stays one where nobody looks there.
@@ -53,18 +53,38 @@ def load(path: Path, saved: Saved = _none) -> Config:
     Raises:
         ConfigError: one line that names the file, the key, what was found and what is allowed.
     """
+    text = read(path, "companion setup makes it (or give another with -c FILE)")
+    return parse(text, str(path), saved)
+
+
+def read(path: Path, missing: str) -> str:
+    """The text of a configuration file; `missing` is what to do where there is none.
+
+    Raises:
+        ConfigError: one line that names the file.
+    """
     try:
         with path.open("rb") as file:
-            text = file.read(MOST_BYTES + 1).decode()
+            return file.read(MOST_BYTES + 1).decode()
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file: companion setup makes it (or give another with -c FILE)") from None
+        raise ConfigError(f"{path}: no such file: {missing}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
-    return parse(text, str(path), saved)
 
 
 def parse(text: str, name: str, saved: Saved = _none) -> Config:
     """Check the text of a configuration file; `name` stands for the file in messages, `saved` as for `load`.
+
+    Raises:
+        ConfigError: one line that names the file, the key, what was found and what is allowed.
+    """
+    config = converted(text, name, Config)
+    check_together(config, name)
+    return _with_saved_profiles(config, name, saved)
+
+
+def converted(text: str, name: str, kind: type[_Kind]) -> _Kind:
+    """The text of a file as such a structure; what depends on one another is not checked.
 
     Raises:
         ConfigError: one line that names the file, the key, what was found and what is allowed.
@@ -80,13 +100,11 @@ def parse(text: str, name: str, saved: Saved = _none) -> Config:
         raise ConfigError(f"{name}: not valid TOML: brackets within brackets, too deep") from None
     except ValueError as error:  # TOML's own errors, and what Python says of a number with thousands of digits
         raise ConfigError(f"{name}: not valid TOML: {brief(str(error))}") from None
-    refuse_unknown_keys(raw, Config, "", name)
+    refuse_unknown_keys(raw, kind, "", name)
     try:
-        config = msgspec.convert(raw, Config, strict=True)
+        return msgspec.convert(raw, kind, strict=True)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{name}: {explain(str(error), raw)}") from None
-    check_together(config, name)
-    return _with_saved_profiles(config, name, saved)
 
 
 def _with_saved_profiles(config: Config, name: str, saved: Saved) -> Config:

@@ -49,6 +49,7 @@ class NotTakenError(Exception):
 class Hello(msgspec.Struct, frozen=True):
     """What an aircraft keeps."""
 
+    format_version: Annotated[int, msgspec.Meta(ge=FORMAT_VERSION, le=FORMAT_VERSION)]
     aircraft: _Aircraft
     epoch: _Epoch
     first: _Sequence
@@ -255,6 +256,7 @@ def _flight(body: bytes) -> Rows:
     flight = msgspec.json.decode(body, type=KeptFlight).flight
     rows: list[Row] = []
     for imu in flight.imus:
+        msgspec.convert((imu.imu, imu.gyro_id, imu.accel_id), tuple[_Device, _Device, _Device])
         flown = min(imu.drift.get("flown", ()), key=lambda each: abs(each.seconds - 30.0), default=None)
         which = {
             "flight": flight.key,
@@ -319,8 +321,6 @@ def read_hello(aircraft: str, payload: bytes) -> Hello:
     Raises:
         NotTakenError: it is none, of another one, or of a newer format.
     """
-    if (version := _decode(payload, _Version).format_version) != FORMAT_VERSION:
-        raise NotTakenError(f"a hello of format {version}; allowed: {FORMAT_VERSION}")
     return _of(aircraft, _decode(payload, Hello))
 
 
@@ -376,10 +376,6 @@ def answers(epoch: str, found: list[list[int]]) -> list[bytes]:
         )
         for start in range(0, len(found), MOST_RANGES)
     ]
-
-
-class _Version(msgspec.Struct):
-    format_version: int
 
 
 def _decode(payload: bytes, kind: type[_Kind]) -> _Kind:

@@ -33,17 +33,20 @@ def fleet_of(number: int, now: datetime.datetime) -> list[Aircraft]:
     """Aircraft with a history: a few have not flown for long, one has never been calibrated, one's last was refused."""
     found = [Aircraft(k, SEED) for k in range(number)]
     for k, each in enumerate(found):
+        last = now - datetime.timedelta(days=40 * (k % 15 == 11))
         if k % 15 == 7:
             each.calibrate(now - datetime.timedelta(days=2), "not still: gyro x 0.31 deg/s")
             each.arm(now - datetime.timedelta(days=2, minutes=-5))
-        elif k % 15 == 5:
+            continue
+        if k % 15 == 5:
             each.live(now - datetime.timedelta(days=40), FLIGHTS, 50.0)
             each.moved_rad_s = FAULT_DEG_H * DEG_H
             each.live(now, FLIGHTS // 2, 38.0)
-        elif k % 15 == 11:
-            each.live(now - datetime.timedelta(days=40), FLIGHTS)
         else:
-            each.live(now, FLIGHTS)
+            each.live(last, FLIGHTS)
+        for days_ago in (8, 3, 1):
+            each.fly(last - datetime.timedelta(days=days_ago))
+        each.learn(last)
         if k % 15 == 3:
             each.calibrate(now - datetime.timedelta(hours=3), held_back=True)
     return found

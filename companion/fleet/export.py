@@ -18,7 +18,7 @@ import sqlalchemy as sa
 
 from companion.errors import ConfigError, LinkError, StorageError
 from companion.fleet import schema
-from companion.fleet.store import engine_of, url_of, why
+from companion.fleet.database import engine_of, url_of, why
 from companion.storage.state import sync_folder
 
 ROWS: Final = 1000

@@ -5,17 +5,19 @@ from __future__ import annotations
 import datetime
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import groupby
+from operator import attrgetter
 from typing import Final
 
 import msgspec
 import numpy as np
 import sqlalchemy as sa
 
-from companion.calibration.solution.by_temperature import ByTemperature, Seen
+from companion.calibration.solution.by_temperature import ByTemperature, Expected, ExpectedForces, Seen
 from companion.calibration.solution.model_prior import TriadPrior
 from companion.fleet.models import Scatter
 from companion.fleet.priors import Part, model_prior, models, parts_of
-from companion.fleet.schema import aircraft, items
+from companion.fleet.schema import Moment, aircraft
 from companion.report import svg
 from companion.report.by_temperature import biases_by_temperature
 from companion.report.markup import Child, Markup, join, row, tag
@@ -29,8 +31,6 @@ _BINS: Final = 40
 _DOT: Final = 7.5
 _LEAST_HEIGHT: Final = 36.0
 _MOST_HEIGHT: Final = 180.0
-_CURVES: Final = 16
-"""The latest that are looked at, of all IMUs of an aircraft."""
 
 
 def model_links(connection: sa.Connection) -> Markup | None:
@@ -165,36 +165,33 @@ def _outside(
 # --- one aircraft
 
 
-class Told(msgspec.Struct, frozen=True):
-    """An item."""
-
-    at: str
-    body: ByTemperature
-
-
-def curves(connection: sa.Connection, which: str) -> dict[str, Told]:
+def curves(connection: sa.Connection, which: str) -> dict[str, ByTemperature]:
     """The latest curve over temperature of each IMU of an aircraft."""
-    query = (
-        sa.select(items.c.payload)
-        .where(items.c.aircraft == which, items.c.kind == "curve", items.c.state == "taken")
-        .order_by(items.c.received_at.desc(), items.c.sequence.desc())
-        .limit(_CURVES)
-    )
-    found: dict[str, Told] = {}
-    for payload in connection.execute(query).scalars():
-        try:
-            told = msgspec.json.decode(payload, type=Told)
-        except (msgspec.MsgspecError, RecursionError):
-            continue
-        found.setdefault(told.body.imu, told)
+    query = """
+        SELECT imu, triad, degc, power_ups, at,
+               COALESCE(gyro_bias_deg_h, accel_bias_mg) AS bias, COALESCE(gyro_sigma_deg_h, accel_sigma_mg) AS sigma
+        FROM temperature_curves WHERE aircraft = :which ORDER BY imu, degc, triad, axis"""
+    found: dict[str, ByTemperature] = {}
+    told = connection.execute(sa.text(query).columns(at=Moment()), {"which": which})
+    for imu, rows in groupby(told, key=attrgetter("imu")):
+        gyro, accel = list[Expected](), list[ExpectedForces]()
+        for (degc, triad), (x, y, z) in groupby(rows, key=attrgetter("degc", "triad")):
+            bias, sigma = (x.bias, y.bias, z.bias), (x.sigma, y.sigma, z.sigma)
+            if triad == "gyro":
+                gyro.append(Expected(degc=degc, gyro_deg_h=bias, sigma_deg_h=sigma))
+            else:
+                accel.append(ExpectedForces(degc=degc, accel_mg=bias, sigma_mg=sigma))
+        found[imu] = ByTemperature(
+            imu=f"{imu} by temperature",
+            summary=f"The curve of {x.power_ups} power-ups, as told {x.at:%Y-%m-%d}",
+            curve=tuple(gyro),
+            accel_curve=tuple(accel),
+        )
     return found
 
 
-def by_temperature(told: Told | None, points: Sequence[Seen]) -> Markup | None:
+def by_temperature(told: ByTemperature | None, points: Sequence[Seen]) -> Markup | None:
     """Its curve, and what its calibrations have found."""
     if told is None:
         return None
-    summary = f"From {told.body.power_ups} power-ups on {told.body.days} days, as told {told.at[:10]}"
-    name = f"{told.body.imu} by temperature"
-    shown = msgspec.structs.replace(told.body, imu=name, summary=summary, points=tuple(points))
-    return biases_by_temperature([shown], looking_back=True)
+    return biases_by_temperature([msgspec.structs.replace(told, points=tuple(points))], looking_back=True)

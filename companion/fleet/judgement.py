@@ -9,8 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.noise.robust import median
-from companion.fleet.models import Scatter, scatter_of_part
+from companion.fleet.models import Scatter, middle_of, scatter_of_part
 from companion.fleet.sequential import Alarm, watch
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG, G
@@ -97,13 +96,13 @@ def columns_of(history: History, model: Scatter | None) -> Columns:
         first[:6][known], most_own[:6][known] = _WITH_MODEL, _OF_MODEL
     unit = np.where(turn_on > 0.0, turn_on, np.nan)
     use = np.square(history.sigma_use)
-    usual = np.array([_middle(column) for column in use.T])
+    usual = np.array([middle_of(column) for column in use.T])
     # What is in all calibrations alike is in the scatter already.
     variance = np.nan_to_num(np.maximum(use - usual, 0.0) / unit**2)
     noise = np.log(np.where(history.white > 0.0, history.white, np.nan))
     # The end of a warm-up is that of a line, whose sigma tells nothing of the noise.
     share = np.sqrt(use) / history.white
-    noise = np.where(share > 3.0 * np.array([_middle(column) for column in share.T]), np.nan, noise)
+    noise = np.where(share > 3.0 * np.array([middle_of(column) for column in share.T]), np.nan, noise)
     of_noise = scatter_of_part(noise[:LEARNS], history.temperature_degc[:LEARNS]).turn_on
     of_noise = np.fmax(of_noise, np.where(np.isfinite(of_noise), _LEAST_NOISE, np.nan))
     values = np.hstack([history.biases / unit, noise / of_noise])
@@ -163,7 +162,7 @@ def _noise(found: dict[tuple[int, str], Finding], alarm: Alarm, columns: Columns
     before = found.get((axis, "noise"))
     since = before.since if before else alarm.since
     values = columns.values[:, alarm.column] * unit
-    times = float(np.exp(_middle(values[-LEARNS:]) - _middle(values[max(since - LEARNS, 0) : since])))
+    times = float(np.exp(middle_of(values[-LEARNS:]) - middle_of(values[max(since - LEARNS, 0) : since])))
     found.pop((axis, "noise"), None)
     if times >= LEAST_TIMES:
         words = f"{_AXES[axis]} noise {times:.1f} times what it was"
@@ -177,8 +176,8 @@ def judge_compass(heading_bound_deg: Floats) -> list[Finding]:
     columns = compass_column(heading_bound_deg)
     found = []
     for alarm in watch(*columns[:-1]):
-        now = _middle(heading_bound_deg[-LEARNS // 2 :])
-        before = _middle(heading_bound_deg[max(alarm.since - LEARNS, 0) : alarm.since])
+        now = middle_of(heading_bound_deg[-LEARNS // 2 :])
+        before = middle_of(heading_bound_deg[max(alarm.since - LEARNS, 0) : alarm.since])
         if alarm.kind == "level" and now > max(_BOUND_DEG, LEAST_TIMES * before):
             words = f"compass: heading good to {now:.0f} deg, before to {before:.1f}: iron near it?"
             found = [Finding("compass", -1, alarm.since, now / before, words)]
@@ -211,8 +210,3 @@ def judge_zero(offset_deg: Floats, sigma_deg: Floats) -> list[Finding]:
         return []
     words = f"gradienter: its zero has moved by {moved:.2f} deg between two alignments ({moved * G * DEG / MG:.1f} mg)"
     return [Finding("zero", -1, len(offset_deg) - 1, sigmas / 2.0, words)]
-
-
-def _middle(values: Floats) -> float:
-    there = values[np.isfinite(values)]
-    return float(median(there)) if there.size else np.nan

@@ -21,7 +21,7 @@ WANDER_LAG: Final = 30
 _STEP_K: Final = 15.0
 _FOR_A_TERM: Final = 24
 """Power-ups for each further power of the temperature."""
-_MAD_TO_SIGMA: Final = 1.4826
+MAD_TO_SIGMA: Final = 1.4826
 _OUTLIER: Final = 3.0
 """Sigmas beyond which a step counts no more for the slope over temperature."""
 _GROUPS: Final = (slice(0, 3), slice(3, 5), slice(5, 6))
@@ -60,13 +60,14 @@ def scatter_of_model(parts: Sequence[Scatter]) -> Scatter | None:
     figures = np.array([part[2:] for part in telling])
     middle = np.empty((3, 6))
     for group in _GROUPS:
-        middle[:, group] = [[_middle(each)] for each in np.moveaxis(figures[:, :, group], 1, 0)]
+        middle[:, group] = [[middle_of(each)] for each in np.moveaxis(figures[:, :, group], 1, 0)]
     return Scatter(sum(part.power_ups for part in telling), len(telling), *middle)
 
 
-def _middle(values: Floats) -> float:
+def middle_of(values: Floats, least: int = 1) -> float:
+    """The median of those that are known; NaN: they are fewer than `least`."""
     there = values[np.isfinite(values)]
-    return float(median(there)) if there.size else np.nan
+    return float(median(there)) if len(there) >= least else np.nan
 
 
 def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float, float]:
@@ -93,4 +94,4 @@ def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float, float
 
 
 def _sigma(steps: Floats) -> float:
-    return _MAD_TO_SIGMA * float(median(np.abs(steps)))
+    return MAD_TO_SIGMA * float(median(np.abs(steps)))

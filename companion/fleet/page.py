@@ -9,7 +9,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import sqlalchemy as sa
 
-from companion.calibration.records.record import Arming
 from companion.calibration.solution.by_temperature import Seen
 from companion.fleet.imu_pages import by_temperature, curves, model_links
 from companion.fleet.schema import Moment, findings, rejected
@@ -221,30 +220,23 @@ def _vector(axes: dict[str, Any], column: str, unit: float) -> Vector | None:
 def _armings(connection: sa.Connection, which: str) -> list[Child]:
     query = "SELECT * FROM arming_history WHERE aircraft = :which ORDER BY armed_at DESC LIMIT :most"
     found = [
-        Arming(
-            armed_at=each.armed_at.isoformat(),
-            state=each.state,
-            reason=each.reason or each.state,
-            at_arm="warn",
-            calibration=None,
-            calibrated_ago_s=None,
-            confirmed_ago_s=None,
-            gyro_sigma_use_rad_s=None,
-            accel_sigma_use_m_s2=None,
-        )
+        (each.armed_at.isoformat(), each.state, each.reason or each.state)
         for each in _rows(connection, query, which=which, most=MOST_LISTED)
     ]
     return [tag("h2", "Armings"), arming_items(found)] if found else []
 
 
 def _notes(connection: sa.Connection, which: str) -> list[Child]:
-    """What else has happened: failed calibrations, undos, events."""
+    """What else has happened: failed calibrations, undos, events, flights."""
     query = """
         SELECT started_at AS at, 'calibration ' || state AS what, reason AS more FROM calibrations
         WHERE aircraft = :which AND state <> 'done'
         UNION SELECT undone_at, what || ' put back', '' FROM undos WHERE aircraft = :which
         UNION SELECT at, what, body FROM events WHERE aircraft = :which
-        ORDER BY at DESC LIMIT :most"""
+        UNION SELECT began_at, 'flight, ' || CAST(MAX(drift_s) AS INTEGER) || ' s without GNSS',
+                     'off by ' || ROUND(CAST(MAX(drift_m) AS NUMERIC), 1) || ' m'
+              FROM flight_history WHERE aircraft = :which AND drift_m IS NOT NULL GROUP BY flight, began_at
+        ORDER BY at DESC NULLS LAST LIMIT :most"""
     found = _rows(connection, query, which=which, most=MOST_LISTED)
     notes = [
         tag("li", tag("strong", f"{_moment(each.at)}: "), each.what, f": {each.more}" if each.more else None)

@@ -9,16 +9,14 @@ import msgspec
 import numpy as np
 import sqlalchemy as sa
 
-from companion.calibration.noise.robust import median
 from companion.calibration.solution.model_prior import LEAST_PARTS, ModelPrior, TriadPrior, check
-from companion.fleet.models import Scatter, scatter_of_model
+from companion.fleet.models import MAD_TO_SIGMA, Scatter, middle_of, scatter_of_model
 from companion.fleet.schema import parts
 from companion.physics.frames import Floats
 from companion.samples import Vector
 
 MOST_PARTS: Final = 1000
 """Of a model, that are asked."""
-_MAD_TO_SIGMA: Final = 1.4826
 _ALIKE: Final = 0.05
 """The least share by which parts are said to differ."""
 _DIGITS: Final = 3
@@ -60,7 +58,7 @@ def model_prior(model: str, of_model: Sequence[Scatter]) -> ModelPrior | None:
     if usual is None or len(telling) < LEAST_PARTS:
         return None
     turn_on, per_k = (np.array([getattr(part, name) for part in telling]) for name in ("turn_on", "per_k"))
-    slope = np.array([_middle(column) for column in per_k.T])
+    slope = np.array([middle_of(column, LEAST_PARTS) for column in per_k.T])
     differ = np.maximum(_spread(turn_on, usual.turn_on), _ALIKE * usual.turn_on)
     spread = _spread(per_k, slope)
     gyro, accel = (_of_triad(*(each[at] for each in (usual.turn_on, differ, slope, spread))) for at in _TRIADS)
@@ -72,14 +70,9 @@ def model_prior(model: str, of_model: Sequence[Scatter]) -> ModelPrior | None:
     return prior
 
 
-def _middle(values: Floats) -> float:
-    there = values[np.isfinite(values)]
-    return float(median(there)) if len(there) >= LEAST_PARTS else np.nan
-
-
 def _spread(values: Floats, about: Floats) -> Floats:
     """By how much parts differ, one sigma by the median, of each column."""
-    return _MAD_TO_SIGMA * np.array([_middle(np.abs(of - middle)) for of, middle in zip(values.T, about, strict=True)])
+    return MAD_TO_SIGMA * np.array([middle_of(off, LEAST_PARTS) for off in np.abs(values - about).T])
 
 
 def _of_triad(*figures: Floats) -> TriadPrior | None:

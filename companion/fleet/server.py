@@ -17,7 +17,7 @@ from companion.config.rules import bind_problem
 from companion.errors import ConfigError
 from companion.fleet import imu_pages, metrics, page
 from companion.fleet.certificate import Certificate
-from companion.fleet.store import engine_of, why
+from companion.fleet.database import engine_of, why
 from companion.links.system.connection import Backoff, Reconnection
 from companion.storage.state import read_regular
 from companion.web.access import Access, is_loopback, page_url, split_address

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 import msgspec
 
-from companion.config import MOST_BYTES
+from companion.config import converted, read
 from companion.config.rules import broker_complaints
 from companion.config.sections import Mqtt
-from companion.config.words import brief, explain, refuse_unknown_keys
 from companion.errors import ConfigError
 
 
@@ -26,20 +24,8 @@ def load(path: Path) -> Settings:
     Raises:
         ConfigError: one line that names the file, the key, what was found and what is allowed.
     """
-    try:
-        with path.open("rb") as file:
-            raw = tomllib.loads(file.read(MOST_BYTES).decode())
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file: write one with a section [mqtt] that names the broker") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from None
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not valid TOML: {brief(str(error))}") from None
-    refuse_unknown_keys(raw, Settings, "", str(path))
-    try:
-        settings = msgspec.convert(raw, Settings, strict=True)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {explain(str(error), raw)}") from None
+    text = read(path, "write one with a section [mqtt] that names the broker")
+    settings = converted(text, str(path), Settings)
     for wrong in broker_complaints(settings.mqtt):
         raise ConfigError(f"{path}: {wrong}")
     return settings

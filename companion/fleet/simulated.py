@@ -14,6 +14,7 @@ from typing import Any, Final
 import aiomqtt
 import msgspec
 
+from companion.calibration.records.flight_record import AXES, Drift, ImuFlight, Split, Stages, Term
 from companion.calibration.records.record import Arming, ImuRecord, Record, WrittenParameter
 from companion.fleet.collector import connected, stop
 from companion.fleet.contract import FORMAT_VERSION
@@ -112,6 +113,35 @@ class Aircraft:
         of, self._calibration = self._calibration, None
         return self.tell("undo", at, {"what": "calibration", "of": of, "undone_at": _iso(at)})
 
+    def learn(self, at: datetime.datetime) -> None:
+        """It tells how the biases of its IMUs follow the temperature."""
+        for k in range(2):
+            true = [(degc, *self._biases(k, degc)) for degc in range(15, 46)]
+            gyro = [{"degc": degc, "gyro_deg_h": _in(DEG_H, of), "sigma_deg_h": (5.0,) * 3} for degc, of, _ in true]
+            accel = [{"degc": degc, "accel_mg": _in(MG, of), "sigma_mg": (0.1,) * 3} for degc, _, of in true]
+            known = {"imu": f"fc{k + 1}", "power_ups": len(self.biases), "days": len(self.biases)}
+            self.tell("curve", at, {**known, "curve": gyro, "accel_curve": accel})
+
+    def fly(self, at: datetime.datetime) -> int:
+        """A flight whose log is read on the aircraft."""
+        nothing: dict[str, Any] = dict.fromkeys((*ImuFlight.__struct_fields__, *Split.__struct_fields__))
+        imus = []
+        for k in range(2):
+            axes = []
+            for axis in AXES:
+                sigma = 5.0 * DEG_H if axis.startswith("gyro") else 0.2 * MG
+                before, step = self._dice.gauss(0.0, sigma), self._dice.gauss(0.0, 2.0 * sigma)
+                terms = {"in_flight": before + step, "turn_on": before, "motors": step}
+                axes.append({**nothing, "axis": axis, **{name: Term(terms[name], sigma) for name in terms}})
+            about = {"imu": k + 1, "rate_hz": 400.0, "gyro_id": _GYRO_IDS[k], "accel_id": _ACCEL_IDS[k]}
+            drift = {"flown": [Drift(30.0, 60, median := round(self._dice.uniform(1.5, 4.0), 1), 2.4 * median)]}
+            its = {"calibration": self._calibration, "axes": axes, "drift": drift, "moments": (), "notes": ()}
+            imus.append({**nothing, **about, **its})
+        flight = {"key": f"{self.epoch} {_iso(at)}", "system_id": 1, "began_at": _iso(at), "reference": "ekf"}
+        flight |= {"stages": Stages(40.0, 42.0, 45.0, 610.0, 612.0), "imus": imus, "notes": ()}
+        log = {"format_version": 1, "log": "00000012.BIN", "read_at": _iso(at)}
+        return self.tell("flight", at + datetime.timedelta(minutes=15), {**log, "flight": flight})
+
     def live(self, until: datetime.datetime, flights: int, days: float = 90.0) -> None:
         """Flights in the days before, each with a calibration; here and there one fails, or is put back."""
         days_ago = sorted((self._dice.uniform(0.05, days) for _ in range(flights)), reverse=True)
@@ -123,11 +153,15 @@ class Aircraft:
                 self.undo(at + datetime.timedelta(minutes=2))
             self.arm(at + datetime.timedelta(minutes=5))
 
-    def _power_up(self, imu: int, degc: float) -> tuple[Vector, Vector]:
+    def _biases(self, imu: int, degc: float) -> tuple[Vector, Vector]:
         gyro, accel = self._of_imus[imu]
-        turn_on, warmer = self._triad(5.0 * DEG_H), degc - 25.0
-        x, y, z = (bias + each + warmer * DEG_H for bias, each in zip(gyro, turn_on, strict=True))
+        x, y, z = (bias + (degc - 25.0) * DEG_H for bias in gyro)
         return (x + self.moved_rad_s * imu, y, z), accel
+
+    def _power_up(self, imu: int, degc: float) -> tuple[Vector, Vector]:
+        gyro, accel = self._biases(imu, degc)
+        x, y, z = (bias + each for bias, each in zip(gyro, self._triad(5.0 * DEG_H), strict=True))
+        return (x, y, z), accel
 
     def _imu(self, name: str, k: int, degc: float, gyro: Vector, accel: Vector) -> ImuRecord:
         def measured(true: Vector, sigma: float) -> Vector:
@@ -214,6 +248,10 @@ class Aircraft:
             into = self.confirmed if message.topic.value.endswith("/confirmed") else self._wanted
             into |= named & self.told.keys()
             self._changed.set()
+
+
+def _in(unit: float, axes: Vector) -> list[float]:
+    return [round(each / unit, 3) for each in axes]
 
 
 def _iso(at: datetime.datetime) -> str:

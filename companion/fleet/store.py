@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import hashlib
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -14,7 +14,7 @@ import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
-from companion.errors import LinkError, StorageError
+from companion.errors import LinkError
 from companion.fleet import schema
 from companion.fleet.contract import (
     FORMAT_VERSION,
@@ -30,6 +30,7 @@ from companion.fleet.contract import (
     read_item,
     read_key,
 )
+from companion.fleet.database import OF_THE_DATABASE, OF_THE_ITEM, engine_of, why
 from companion.fleet.judging import Judged, judged
 from companion.fleet.priors import payloads
 
@@ -37,12 +38,6 @@ logger = logging.getLogger(__name__)
 
 MOST_REJECTED: Final = 10_000
 _SHOWN_BYTES: Final = 4096
-_STATEMENT_MS: Final = 30_000
-_BUSY_S: Final = 10.0
-_OF_THE_DATABASE: Final = (sa.exc.OperationalError, sa.exc.InterfaceError, sa.exc.InternalError, sa.exc.TimeoutError)
-"""It is not there, full, or broken: no fault of what was to be written."""
-_OF_THE_ITEM: Final = (sa.exc.DataError, sa.exc.IntegrityError, sa.exc.ProgrammingError)
-"""The database is well, and does not take it."""
 _REJECTED: Final[Row] = {"state": "rejected", "kind": None, "at": None, "clock": None, "same": None}
 _AGAIN: Final = 500
 """Items of a newer aircraft that are looked at anew in one transaction after an update."""
@@ -66,72 +61,6 @@ class Outcome(NamedTuple):
     """Items that were not there yet."""
 
 
-def url_of(database: str) -> sa.URL:
-    """The database that people mean: postgresql://..., sqlite:///..., or a file's path.
-
-    Raises:
-        StorageError: it is neither.
-    """
-    try:
-        url = sa.make_url(database if "://" in database else f"sqlite:///{database}")
-    except sa.exc.ArgumentError:
-        url = sa.URL.create("none")
-    if url.drivername in ("postgresql", "postgres"):
-        url = url.set(drivername="postgresql+psycopg")
-    if url.drivername not in ("sqlite", "postgresql+psycopg") or (url.drivername == "sqlite" and not url.database):
-        raise StorageError(
-            f"database: found {database.partition('@')[2] or database!r}; allowed: postgresql://USER@HOST/NAME,"
-            " or the path of an SQLite file"
-        )
-    return url
-
-
-def engine_of(database: str, *, reads_only: bool = False) -> sa.Engine:
-    """Connections to the database, none of which is opened yet.
-
-    Raises:
-        StorageError: the address cannot be read.
-    """
-    url = url_of(database)
-    if url.drivername == "sqlite":
-        engine = sa.create_engine(url, connect_args={"timeout": _BUSY_S})
-        sa.event.listen(engine, "connect", _prepare_sqlite)
-        sa.event.listen(engine, "begin", _begin_reading if reads_only else _begin_writing)
-        return engine
-    return sa.create_engine(
-        url,
-        # A server whose host has died is noticed within seconds, not when TCP gives up.
-        connect_args={
-            "connect_timeout": 5,
-            "tcp_user_timeout": 10_000,
-            "options": f"-c statement_timeout={_STATEMENT_MS} -c timezone=UTC"
-            + " -c default_transaction_read_only=on" * reads_only,
-        },
-    )
-
-
-def _begin_reading(connection: sa.Connection) -> None:
-    connection.exec_driver_sql("BEGIN")
-
-
-def _begin_writing(connection: sa.Connection) -> None:
-    # One that began by reading and then wrote would be refused where another has written meanwhile.
-    connection.exec_driver_sql("BEGIN IMMEDIATE")
-
-
-def _prepare_sqlite(connection: Any, _record: object) -> None:
-    connection.isolation_level = None  # transactions begin where we say so
-    connection.execute("PRAGMA journal_mode=WAL")
-    # What was confirmed outlives a power cut.
-    connection.execute("PRAGMA synchronous=FULL")
-
-
-def why(error: sa.exc.SQLAlchemyError) -> str:
-    """The database's own words, in one line."""
-    cause = getattr(error, "orig", None) or error
-    return " ".join(str(cause).split())[:300] or type(cause).__name__
-
-
 class Store:
     """The tables; each call is one transaction or several whole ones. Calls block: they belong into a thread."""
 
@@ -149,6 +78,13 @@ class Store:
         self._engine.dispose()
         self._reads.dispose()
 
+    @contextlib.contextmanager
+    def _link_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except sa.exc.SQLAlchemyError as error:
+            raise LinkError(f"{self.where}: {why(error)}") from None
+
     def prepare(self) -> None:
         """Bring the tables up to date, and take in what an older version did not know.
 
@@ -156,13 +92,11 @@ class Store:
             StorageError: a newer companion has made them.
             LinkError: the database cannot be reached, or fails.
         """
-        try:
+        with self._link_errors():
             with self._engine.begin() as connection:
                 schema.bring_up_to_date(connection)
             while self._take_in_again():
                 pass
-        except sa.exc.SQLAlchemyError as error:
-            raise LinkError(f"{self.where}: {why(error)}") from None
 
     def judge(self) -> bool:
         """Judge an aircraft of which there is something new; whether there was one.
@@ -171,7 +105,7 @@ class Store:
             LinkError: the database cannot be reached, or fails.
         """
         table = schema.judgements
-        try:
+        with self._link_errors():
             with self._reads.begin() as connection:
                 due = connection.execute(sa.select(table).where(table.c.judged < table.c.news).limit(1)).first()
                 if due is None:
@@ -185,8 +119,6 @@ class Store:
                     for of, rows in ((schema.parts, found.parts), (schema.findings, found.findings)):
                         connection.execute(sa.delete(of).where(of.c.aircraft == due.aircraft))
                         self._put(connection, of, rows)
-        except sa.exc.SQLAlchemyError as error:
-            raise LinkError(f"{self.where}: {why(error)}") from None
         return True
 
     def _judged(self, connection: sa.Connection, aircraft: str) -> Judged | None:
@@ -203,11 +135,8 @@ class Store:
         Raises:
             LinkError: the database cannot be reached, or fails.
         """
-        try:
-            with self._reads.begin() as connection:
-                return payloads(connection)
-        except sa.exc.SQLAlchemyError as error:
-            raise LinkError(f"{self.where}: {why(error)}") from None
+        with self._link_errors(), self._reads.begin() as connection:
+            return payloads(connection)
 
     def take(self, messages: Sequence[Message]) -> Outcome:
         """Put a batch into the database; what is not taken is kept aside there with its reason.
@@ -218,10 +147,10 @@ class Store:
         now = datetime.datetime.now(tz=datetime.UTC)
         try:
             return self._take(messages, now)
-        except _OF_THE_DATABASE as error:
+        except OF_THE_DATABASE as error:
             raise LinkError(f"{self.where}: {why(error)}") from None
         except sa.exc.SQLAlchemyError as error:
-            reason = f"the database refuses it: {why(error)}"
+            reason = _refusal(error)
         # One of them it is: each by itself.
         if len(messages) == 1:
             return self._reject(messages[0], reason, now)
@@ -261,19 +190,25 @@ class Store:
                 rows.setdefault(table, []).extend(of)
         with self._engine.begin() as connection:
             new = self._put(connection, schema.items, told)
-            for table, of in sorted(rows.items()):
-                self._put(connection, schema.tables.tables[table], of)
+            self._put_made(connection, rows)
             self._hear(connection, hellos.values(), heard, now)
-            self._to_judge(connection, rows)
             self._keep_aside(connection, outcome.rejected, now)
             if hellos:
                 outcome.wanted.update(_lacking(connection, {aircraft for aircraft, _ in hellos}))
         return outcome._replace(new=new)
 
-    def _to_judge(self, connection: sa.Connection, rows: Rows) -> None:
-        """The aircraft of which there is something new to be judged by."""
+    def _put_made(self, connection: sa.Connection, made: Rows) -> None:
+        """What was made of items; an aircraft of which there is something new to be judged by is noted."""
+        for name, rows in sorted(made.items()):
+            self._put(connection, schema.tables.tables[name], rows)
+        if "curves" in made:  # a new one at each power-up, of hundreds of rows: only the latest is asked for
+            older, later = schema.curves, schema.curves.alias()
+            same = (older.c[name] == later.c[name] for name in ("aircraft", "epoch", "imu"))
+            of = older.c.aircraft.in_({row["aircraft"] for row in made["curves"]})
+            gone = sa.delete(older).where(of, sa.exists().where(*same, later.c.sequence > older.c.sequence))
+            connection.execute(gone)
         table = schema.judgements
-        which = {row["aircraft"] for name in ("calibrations", "undos") for row in rows.get(name, ())}
+        which = {row["aircraft"] for name in ("calibrations", "undos") for row in made.get(name, ())}
         if which:
             insert, values = self._insert_many(
                 table, [{"aircraft": one, "news": 1, "judged": 0} for one in sorted(which)]
@@ -319,7 +254,8 @@ class Store:
         for hello, retained in hellos:
             row = rows.setdefault(hello.aircraft, {**nothing, "aircraft": hello.aircraft})
             row |= {"name": hello.name, "epoch": hello.epoch, "first": hello.first, "last": hello.last}
-            row["hello_at"] = _moment_or_none(hello.at)
+            with contextlib.suppress(NotTakenError):
+                row["hello_at"] = moment(hello.at)
             if not retained:  # else it was said some time ago
                 row["heard_at"] = now
         if rows:
@@ -354,42 +290,36 @@ class Store:
         item = None
         with contextlib.suppress(NotTakenError):
             item = read_key(to[0], message.payload) if to is not None and to[1] == "item" else None
-        try:
-            with self._engine.begin() as connection:
-                self._keep_aside(connection, outcome.rejected, now)
-                if item is not None:
-                    raw = {**item.key, **_raw(item, message), **_REJECTED, "received_at": now}
-                    with contextlib.suppress(*_OF_THE_ITEM), connection.begin_nested():
-                        self._put(connection, schema.items, [raw])
-                    outcome.confirmed[item.aircraft, item.epoch] = [item.sequence]
-        except sa.exc.SQLAlchemyError as error:
-            raise LinkError(f"{self.where}: {why(error)}") from None
+        with self._link_errors(), self._engine.begin() as connection:
+            self._keep_aside(connection, outcome.rejected, now)
+            if item is not None:
+                raw = {**item.key, **_raw(item, message), **_REJECTED, "received_at": now}
+                with contextlib.suppress(*OF_THE_ITEM), connection.begin_nested():
+                    self._put(connection, schema.items, [raw])
+                outcome.confirmed[item.aircraft, item.epoch] = [item.sequence]
         return outcome
 
     def _take_in_again(self) -> bool:
         """Items of a newer aircraft that are known by now; whether there may be more of them."""
-        items = schema.items
-        known = (
-            sa.select(items)
-            .where(items.c.state == "unknown", items.c.format_version == FORMAT_VERSION, items.c.kind.in_(KINDS))
-            .limit(_AGAIN)
-        )
+        items, each, refused = schema.items, schema.items.c, []
+        of_a_kind = each.kind.is_(None) | each.kind.in_(KINDS)
+        known = sa.select(items).where(each.state == "unknown", each.format_version == FORMAT_VERSION, of_a_kind)
         with self._engine.begin() as connection:
-            found = connection.execute(known).mappings().all()
+            found = connection.execute(known.limit(_AGAIN)).all()
             for row in found:
-                payload = row["payload"].encode()
-                now = datetime.datetime.now(tz=datetime.UTC)
-                outcome = Outcome({}, {}, [])
-                message = Message(f"fleet/{row['aircraft']}/item", payload)
-                item = read_key(row["aircraft"], payload)
-                columns, made = _read(item, message, outcome)
-                del columns["payload"]
-                here = [items.c[key] == value for key, value in item.key.items()]
-                connection.execute(sa.update(items).where(*here).values(columns))
-                for table, of in made.items():
-                    self._put(connection, schema.tables.tables[table], of)
-                self._to_judge(connection, made)
-                self._keep_aside(connection, outcome.rejected, now)
+                item = Item(row.format_version, row.aircraft, row.epoch, row.sequence)
+                message = Message(f"fleet/{row.aircraft}/item", row.payload.encode())
+                update = sa.update(items).where(*(each[key] == value for key, value in item.key.items()))
+                try:
+                    with connection.begin_nested():
+                        columns, made = read_item(item, message.payload)
+                        connection.execute(update.values(columns))
+                        self._put_made(connection, made)
+                except (NotTakenError, *OF_THE_ITEM) as error:
+                    connection.execute(update.values(_REJECTED))
+                    reason = _refusal(error) if isinstance(error, sa.exc.SQLAlchemyError) else str(error)
+                    refused.append((message, reason))
+            self._keep_aside(connection, refused, datetime.datetime.now(tz=datetime.UTC))
         return len(found) == _AGAIN
 
 
@@ -401,6 +331,10 @@ def _read(item: Item, message: Message, outcome: Outcome) -> tuple[Row, Rows]:
         outcome.rejected.append((message, str(error)))
         columns, rows = _REJECTED, {}
     return {**_raw(item, message), **columns}, rows
+
+
+def _refusal(error: sa.exc.SQLAlchemyError) -> str:
+    return f"the database refuses it: {why(error)}"
 
 
 def _raw(item: Item, message: Message) -> Row:
@@ -424,13 +358,6 @@ def _lacking(connection: sa.Connection, which: Iterable[str]) -> dict[tuple[str,
     for aircraft, epoch, number, following_number in connection.execute(gaps):
         found.setdefault((aircraft, epoch), []).append([number + 1, following_number - 1])
     return found
-
-
-def _moment_or_none(words: str) -> datetime.datetime | None:
-    try:
-        return moment(words)
-    except NotTakenError:
-        return None
 
 
 def _without_zero(value: object) -> object:

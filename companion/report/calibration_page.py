@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Final
 
 import msgspec
@@ -32,6 +33,7 @@ from companion.report.page import (
 from companion.report.seconds import stillness
 from companion.samples import Triad
 
+_ARMED: Final = attrgetter("armed_at", "state", "reason")
 _OUTCOMES: Final[dict[Outcome, tuple[str, str]]] = {
     "verified": ("ok", "read back, and seen in the telemetry"),
     "stored": ("warn", "read back; its effect could not be seen"),
@@ -74,7 +76,7 @@ def calibration_page(material: Material, now: datetime.datetime) -> str:
         if len(record.imus) > MAX_IMUS
         else None,
         _written(record),
-        join(tag("h2", "Armed with it"), arming_items(material.armings)) if material.armings else None,
+        join(tag("h2", "Armed with it"), arming_items(map(_ARMED, material.armings))) if material.armings else None,
         _pose(record),
         stillness(material.trace, material.no_trace),
         _drift(material),

@@ -5,14 +5,14 @@ from __future__ import annotations
 import datetime
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
 from companion import __version__
-from companion.calibration.records.record import Arming, Record
+from companion.calibration.records.record import Record
 from companion.physics.units import DEG_H, MG
 from companion.report import svg
 from companion.report.markup import Child, Markup, join, number, tag
@@ -183,10 +183,10 @@ def drift(points: Sequence[Point], triad: Triad, *, name: str, this: int | None 
     return tag("figure", *plots, tag("figcaption", why, "Bars: one sigma for the next minutes."))
 
 
-def arming_items(armings: Sequence[Arming]) -> Markup:
-    """Armings as a list, in the order given."""
+def arming_items(armings: Iterable[tuple[str, str, str]]) -> Markup:
+    """Armings as a list, in the order given: when, in which state, and why."""
     states = {"uncalibrated": tag("strong", "UNCALIBRATED: ", class_="bad"), "checked": "checked: "}
     return tag(
         "ul",
-        *(tag("li", tag("strong", f"{moment(one.armed_at)}: "), states.get(one.state), one.reason) for one in armings),
+        *(tag("li", tag("strong", f"{moment(at)}: "), states.get(state), reason) for at, state, reason in armings),
     )

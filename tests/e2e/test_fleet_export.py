@@ -20,9 +20,10 @@ import sqlalchemy as sa
 from companion.cli import main as companion
 from companion.errors import StorageError
 from companion.fleet import schema
+from companion.fleet.database import engine_of
 from companion.fleet.export import export, names
 from companion.fleet.simulated import Aircraft
-from companion.fleet.store import Message, Store, engine_of
+from companion.fleet.store import Message, Store
 from tests.support.collecting import NOW
 from tests.support.postgres import INITDB, postgres
 

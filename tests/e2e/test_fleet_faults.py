@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
+from companion.fleet.database import engine_of
 from companion.fleet.simulated import Aircraft
-from companion.fleet.store import Message, Store, engine_of
+from companion.fleet.store import Message, Store
 from tests.campaign.__main__ import SEED
 from tests.campaign.fleet import FAULTS, KINDS, Kind, judge, play
 from tests.support.broker import MOSQUITTO

@@ -14,7 +14,6 @@ import pytest
 
 from companion.fleet import demo, schema
 from companion.fleet.store import Message, Store
-from tests.e2e.test_fleet_views import curve, kept_flight
 from tests.support.postgres import INITDB, postgres
 
 DASHBOARD = json.loads((Path(__file__).parents[2] / "docs/fleet/grafana.json").read_text(encoding="utf-8"))
@@ -29,9 +28,6 @@ def database() -> Iterator[str]:
     if INITDB is None:
         pytest.skip("no PostgreSQL")
     fleet = demo.fleet_of(demo.AIRCRAFT, NOW)
-    one = fleet[0]
-    one.tell("curve", NOW, curve("fc1", 7.0))
-    one.tell("flight", NOW, kept_flight("a", (NOW - datetime.timedelta(days=3)).isoformat(), 11.0))
     with postgres() as server:
         where = server.create("fleet")
         store = Store(where)

@@ -14,8 +14,9 @@ import sqlalchemy as sa
 
 from companion.calibration.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
 from companion.fleet import schema
+from companion.fleet.database import engine_of
 from companion.fleet.simulated import Aircraft
-from companion.fleet.store import Message, Store, engine_of
+from companion.fleet.store import Message, Store
 from tests.support.collecting import NOW, rows_of
 from tests.support.fleet import check
 from tests.support.postgres import INITDB, postgres
@@ -142,6 +143,19 @@ def test_the_latest_curve_of_each_imu(told: str) -> None:
     assert figures == [
         tuple(pytest.approx(each) if isinstance(each, float) else each for each in row) for row in wanted
     ]
+
+
+def test_rows_of_former_curves_go(told: str) -> None:
+    """Each power-up makes another curve, of hundreds of rows; in whichever order they come."""
+    latest = {sequence for sequence, payload in ONE.told.items() if json.loads(payload)["kind"] == "curve"} - {6}
+    counted = "SELECT epoch, sequence, COUNT(*) AS rows FROM curves GROUP BY epoch, sequence ORDER BY sequence"
+    before = asked(told, counted)
+    assert {row["sequence"] for row in before} == latest
+    store = Store(told)
+    for payload in reversed(ONE.told.values()):
+        store.take([Message(f"fleet/{ONE.id}/item", payload)])
+    store.close()
+    assert sorted(map(str, asked(told, counted))) == sorted(map(str, before))
 
 
 NAMES = ("gyro_bias_deg_h", "gyro_sigma_deg_h", "accel_bias_mg", "accel_sigma_mg")

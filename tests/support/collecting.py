@@ -19,10 +19,11 @@ import sqlalchemy as sa
 from companion.fleet import schema
 from companion.fleet.certificate import Certificate
 from companion.fleet.collector import stop
+from companion.fleet.database import engine_of
 from companion.fleet.metrics import Metrics
 from companion.fleet.server import Server
 from companion.fleet.simulated import Aircraft
-from companion.fleet.store import Message, Store, engine_of
+from companion.fleet.store import Message, Store
 from tests.support.broker import Broker, free_port
 
 NOW = datetime.datetime(2026, 11, 20, 12, tzinfo=datetime.UTC)

@@ -169,7 +169,7 @@ def test_an_aircrafts_page_shows_its_curve_with_sigma(store: Store) -> None:
         shown = page.aircraft(connection, one.id, NOW)
     assert shown is not None
     assert "IMU fc1 by temperature" in shown
-    assert "From 13 power-ups on 11 days" in shown
+    assert f"The curve of 13 power-ups, as told {NOW + datetime.timedelta(days=1):%Y-%m-%d}." in shown
     assert 'class="area sx"' in shown
     assert "fc9" not in shown
     dots = re.search(r"IMU fc1 by temperature, gyro x: bias by temperature</title><desc>(\d+) points", shown)

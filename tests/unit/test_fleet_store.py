@@ -19,10 +19,12 @@ import sqlalchemy as sa
 from companion.errors import CompanionError, LinkError, StorageError
 from companion.fleet import contract, schema
 from companion.fleet.contract import MOST_RANGES, answers, ranges
+from companion.fleet.database import url_of
 from companion.fleet.simulated import Aircraft
-from companion.fleet.store import Message, Outcome, Store, url_of
+from companion.fleet.store import Message, Outcome, Store
 from tests.support.collecting import NOW, items_in, rows_of, told_by
 from tests.support.fleet import check
+from tests.support.flights import kept_flight
 
 
 @pytest.fixture
@@ -65,8 +67,10 @@ def query(database: str, text: str) -> list[tuple[Any, ...]]:
 
 def test_the_simulated_aircraft_says_what_the_contract_says() -> None:
     one = aircraft(150)
+    one.fly(NOW)
+    one.learn(NOW)
     kinds = {check("item", payload)["kind"] for payload in one.told.values()}
-    assert kinds == {"calibration", "arming", "undo"}
+    assert kinds == {"calibration", "arming", "undo", "flight", "curve"}
     check("hello", one.hello)
 
 
@@ -189,6 +193,52 @@ def test_what_is_unknown_is_kept_and_taken_in_after_an_update(
     assert len(query(database, "SELECT * FROM biases")) == 6
 
 
+def test_a_newer_format_is_taken_in_after_an_update(
+    store: Store, database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = aircraft(1)
+    store.take([changed(items_of(one)[0], format_version=2)])
+    for module in ("contract", "store"):
+        monkeypatch.setattr(f"companion.fleet.{module}.FORMAT_VERSION", 2)
+    store.prepare()
+    assert query(database, "SELECT state, kind FROM items") == [("taken", "calibration")]
+    assert len(query(database, "SELECT * FROM biases")) == 6
+
+
+@pytest.mark.parametrize("what", ["no text", "no number", "no JSON"])
+def test_what_can_never_be_taken_in_keeps_no_collector_from_its_start(
+    store: Store, database: str, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """It was of an unknown kind when it came; one that a database refuses takes no other with it."""
+    one = aircraft(3)
+    first, *good = items_of(one)
+    bad = changed(first, body={"reason": "?"})
+    if what == "no text":  # three times as long as it came, once it is a text
+        bad = bad._replace(payload=bad.payload.replace(b"?", b"\xff" * 100_000))
+    with monkeypatch.context() as older:
+        for module in ("contract", "store"):
+            older.setattr(f"companion.fleet.{module}.KINDS", {})
+        assert store.take([bad, *good]).rejected == []
+    with sqlite3.connect(database) as connection:
+        if what != "no text":
+            payload = "{" if what == "no JSON" else first.payload.decode()
+            connection.execute("UPDATE items SET payload = ? WHERE sequence = 1", [payload])
+        if what == "no number":
+            connection.execute(
+                "CREATE TRIGGER refuses BEFORE INSERT ON biases WHEN NEW.sequence = 1"
+                " BEGIN SELECT RAISE(ABORT, 'no such number'); END"
+            )
+    connection.close()
+    store.prepare()
+    states = dict(query(database, "SELECT sequence, state FROM items"))
+    assert states.pop(1) == "rejected"
+    assert {*states.values()} == {"taken"}
+    assert query(database, "SELECT * FROM calibrations WHERE sequence = 1") == []
+    ((times, topic, reason),) = query(database, "SELECT times, topic, reason FROM rejected")
+    assert (times, topic) == (1, first.topic)
+    assert reason
+
+
 # --- what is refused
 
 BAD: dict[str, dict[str, Any]] = {
@@ -224,6 +274,17 @@ def test_a_bad_item_is_kept_aside_with_its_reason_and_stops_nothing(store: Store
     readable = what in ("no body", "no time", "a time beyond all years", "a bias of infinity")
     assert outcome.confirmed == {(one.id, one.epoch): [2, 1, 3] if readable else [2, 3]}
     assert query(database, "SELECT * FROM biases WHERE sequence = 1") == []
+
+
+@pytest.mark.parametrize("which", ["imu", "gyro_id", "accel_id"])
+def test_a_flight_with_a_number_that_no_database_holds_stops_nothing(store: Store, which: str) -> None:
+    one = aircraft(1)
+    flight = json.loads(msgspec.json.encode(kept_flight()))
+    flight["flight"]["imus"][0][which] = 2**63
+    bad = changed(items_of(one)[0], kind="flight", sequence=100, body=flight)
+    ((message, reason),) = store.take([*items_of(one), bad]).rejected
+    assert message == bad
+    assert "9223372036854775807" in reason
 
 
 def test_the_liar_is_named(store: Store) -> None:

@@ -60,8 +60,8 @@ class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
     imu: str
     summary: str = ""
     """How much was seen."""
-    power_ups: int
-    days: int
+    power_ups: int = 0
+    days: int = 0
     points: tuple[Seen, ...] = ()
     curve: tuple[Expected, ...]
     """Of the next power-up; empty: not known yet."""
