@@ -11,7 +11,7 @@ import numpy as np
 
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
-from companion.autopilot.firmware.px4 import Sensor, SlotMemory
+from companion.autopilot.firmware.px4 import SlotMemory
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.vehicle import Firmware
@@ -19,6 +19,7 @@ from companion.calibration.records.record import Record
 from companion.errors import AutopilotError, StorageError
 from companion.flight.log import FlownImu
 from companion.physics.frames import Floats
+from companion.samples import Triad
 
 
 class _Logged:
@@ -54,7 +55,7 @@ async def calibration_in(firmware: Firmware, values: Mapping[str, float], imu: F
         AutopilotError: they do not say.
     """
     memory = SlotMemory()
-    ids: dict[Sensor, int | None] = {"gyro": imu.gyro_id, "accel": imu.accel_id}
+    ids: dict[Triad, int | None] = {"gyro": imu.gyro_id, "accel": imu.accel_id}
     for sensor, device_id in ids.items():
         if device_id is not None:
             memory.learn(sensor, device_id, imu.number)

@@ -37,7 +37,6 @@ def test_the_whole_step_is_seen_and_verified() -> None:
     verdict = judge(observation((-0.002, 0.003, -0.004), (-0.00201, 0.00298, -0.00401)))
     assert words(verdict) == ["seen"] * 3
     assert verdict.ok
-    assert verdict.fraction == pytest.approx(1.0, abs=0.01)
     assert verdict.outcome("INS_GYROFFS_Y") == "verified"
     assert verdict.hidden == ()
 
@@ -113,7 +112,6 @@ def test_sigmas_turn_with_the_board() -> None:
 def test_what_remains_is_compared_with_the_tolerance() -> None:
     seen = dataclasses.replace(observation((-0.002, 0.003, -0.004), (-0.002, 0.003, -0.004)), truth=(0.0, 0.0, 0.001))
     verdict = judge(seen)
-    assert verdict.residual[2] == pytest.approx(-0.001)
     assert not verdict.ok
     assert "still off by -0.001 rad/s" in verdict.problems[0]
 

@@ -10,8 +10,8 @@ import pytest
 
 from companion.autopilot.firmware.ardupilot import parameters_of
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import Verdict
-from companion.autopilot.parameters.writer import Change
 from companion.calibration.means.windows import ImuWindow
 from companion.daemon.offsets.effect import Sides, judge_vectors
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
@@ -35,16 +35,14 @@ from companion.errors import AutopilotError, AutopilotRebootedError
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.physics.units import MG
 from companion.rotations import ROTATION_NAMES
-from companion.samples import Vector
-
-Sensor = Literal["gyro", "accel"]
+from companion.samples import Triad, Vector
 
 SLOTS: Final = 4
 THERMAL_ENABLE: Final = "TC_G_ENABLE"
 LEVEL: Final = ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF", "SENS_BOARD_Z_OFF")
 NO_IMU: Final = 0
-PREFIX: Final[dict[Sensor, str]] = {"gyro": "CAL_GYRO", "accel": "CAL_ACC"}
-WORDS: Final[dict[Sensor, str]] = {"gyro": "gyro", "accel": "accelerometer"}
+PREFIX: Final[dict[Triad, str]] = {"gyro": "CAL_GYRO", "accel": "CAL_ACC"}
+WORDS: Final[dict[Triad, str]] = {"gyro": "gyro", "accel": "accelerometer"}
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -60,24 +58,24 @@ class SlotMemory:
     """Which device is which IMU; since the last restart: which offsets are in use, which rivals act."""
 
     def __init__(self) -> None:
-        self._instance_of: dict[tuple[Sensor, int], int] = {}
-        self._enabled: dict[Sensor, int] = {}
+        self._instance_of: dict[tuple[Triad, int], int] = {}
+        self._enabled: dict[Triad, int] = {}
         self._in_use: dict[tuple[str, str, str], tuple[int, Vector]] = {}
         self.rivals: dict[str, int] = {}
         """As `read_rivals` keeps it."""
 
-    def learn(self, sensor: Sensor, device_id: int, instance: int) -> None:
+    def learn(self, sensor: Triad, device_id: int, instance: int) -> None:
         """The offsets in the slot of this device act on the telemetry of this IMU (NO_IMU: of none)."""
         for other in [key for key, known in self._instance_of.items() if key[0] == sensor and known == instance]:
             if instance != NO_IMU:
                 del self._instance_of[other]
         self._instance_of[sensor, device_id] = instance
 
-    def known(self, sensor: Sensor, device_id: int) -> int | None:
+    def known(self, sensor: Triad, device_id: int) -> int | None:
         """The IMU that a device was seen to be; NO_IMU: none in the telemetry."""
         return self._instance_of.get((sensor, device_id))
 
-    def holds_strangers(self, sensor: Sensor, imus: int) -> bool:
+    def holds_strangers(self, sensor: Triad, imus: int) -> bool:
         """Whether more slots are in use than there may be IMUs: then one may be of a sensor that is not there."""
         return self._enabled.get(sensor, 0) > imus
 
@@ -93,7 +91,7 @@ class SlotMemory:
         """Whether this very vector is known to be used."""
         return self._in_use.get(names) == (boots, vector)
 
-    def choose(self, sensor: Sensor, instance: int, slots: tuple[Slot, ...], like: int | None = None) -> Slot:
+    def choose(self, sensor: Triad, instance: int, slots: tuple[Slot, ...], like: int | None = None) -> Slot:
         """The slot to write for an IMU (1 to 3), of all that hold a device id: the known one, else the best guess.
 
         `like`: the device id of the IMU's other half; of a chip that is both, it is the same.
@@ -176,7 +174,7 @@ def thermal_names(sensor: int) -> tuple[str, ...]:
     return (*head, *(f"{own}X{power}_{axis}" for power in range(4) for axis in range(3)))
 
 
-async def read_slots(parameters: Parameters, sensor: Sensor) -> tuple[Slot, ...]:
+async def read_slots(parameters: Parameters, sensor: Triad) -> tuple[Slot, ...]:
     """All slots that hold a device id, in order.
 
     Raises:
@@ -247,16 +245,20 @@ def stale_tilt_deg(changes: Sequence[Change]) -> float:
     return math.degrees(max(step.values(), default=0.0) / (1e3 * MG))
 
 
+def accel_offset_with(calibration: ImuCalibration, changes: Sequence[Change]) -> Vector:
+    """The accelerometer offsets after these changes."""
+    after = {change.parameter: change.after for change in changes}
+    names, before = calibration.parameters.accel_offset, calibration.accel_offset_m_s2
+    x, y, z = (after.get(name, old) for name, old in zip(names, before, strict=True))
+    return x, y, z
+
+
 def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tuple[str, ...]:
     """What PX4 makes of these changes later, for people."""
-    if calibration.far_step is None:  # not PX4
+    after = accel_offset_with(calibration, changes)
+    if calibration.far_step is None or not too_small_to_apply_at_boot(after):  # None: not PX4
         return ()
-    after = {change.parameter: change.after for change in changes}
-    names = calibration.parameters.accel_offset
-    x, y, z = (after.get(n, old) for n, old in zip(names, calibration.accel_offset_m_s2, strict=True))
-    if not too_small_to_apply_at_boot((x, y, z)):
-        return ()
-    size = f"{names[0]}, Y and Z are {math.hypot(x, y, z) / MG:.2f} mg in all"
+    size = f"{calibration.parameters.accel_offset[0]}, Y and Z are {math.hypot(*after) / MG:.2f} mg in all"
     return (f"{size}: below 1 mg (0.01 m/s^2) PX4 starts without them; calibrate again after a restart",)
 
 
@@ -294,7 +296,7 @@ async def _read_angle(parameters: Parameters, name: str) -> float:
     return angle_deg
 
 
-async def _read_mounting(parameters: Parameters, sensor: Sensor, slot: Slot) -> Matrix:
+async def _read_mounting(parameters: Parameters, sensor: Triad, slot: Slot) -> Matrix:
     """How a sensor is mounted on the vehicle, level adjustment apart."""
     own = await read_integer(parameters, f"{PREFIX[sensor]}{slot.number}_ROT")
     bus = _bus(slot)

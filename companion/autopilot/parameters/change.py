@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 from companion.autopilot.parameters.wire import float32
 from companion.calibration.records.record import WrittenParameter
-from companion.errors import AutopilotError, AutopilotRebootedError, NotDisarmedError
+from companion.errors import AutopilotError, NotDisarmedError
 
 FailureKind = Literal[
     "refused",
@@ -78,7 +78,3 @@ class WriteFailedError(AutopilotError):
         self.reason = reason
         self.written = written
         self.left_changed = left_changed
-
-
-class RebootedWhileWritingError(WriteFailedError, AutopilotRebootedError):
-    """A WriteFailedError of kind "rebooted in the middle": what persisted was read again afterwards."""

@@ -20,7 +20,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from companion.physics.frames import Array, Matrix, vector
+from companion.physics.frames import Array, Matrix
 from companion.samples import Vector
 
 SIGMAS: Final = 4.0
@@ -76,11 +76,8 @@ class Verdict:
     """One vector."""
 
     axes: tuple[AxisVerdict, AxisVerdict, AxisVerdict]
-    fraction: float | None
-    """Of the expected step that was made, over all axes; None when nothing was to be moved."""
     fraction_sigma: float | None
-    residual: Vector
-    """Mean after the write minus truth, vehicle FRD."""
+    """Of the share of the expected step that was made, over all axes; None when nothing was to be moved."""
     problems: tuple[str, ...]
     hidden: tuple[str, ...]
     """The parameters whose step could not be judged."""
@@ -129,9 +126,7 @@ def judge(seen: Observation) -> Verdict:
     hidden = [axis.parameter for axis in axes if axis.word == "too small to see" and axis.expected != 0.0]
     return Verdict(
         axes=axes,
-        fraction=fraction,
         fraction_sigma=fraction_sigma,
-        residual=vector(residual),
         problems=tuple(problems),
         hidden=tuple(hidden) if together != "seen" else (),
     )

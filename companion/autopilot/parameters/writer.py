@@ -17,13 +17,7 @@ from typing import Final
 from msgspec import structs
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.change import (
-    Change,
-    FailureKind,
-    NothingWrittenError,
-    RebootedWhileWritingError,
-    WriteFailedError,
-)
+from companion.autopilot.parameters.change import Change, FailureKind, NothingWrittenError, WriteFailedError
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.vehicle import ArmState, Moment, Vehicle
@@ -31,12 +25,11 @@ from companion.calibration.records.record import Outcome, WrittenParameter
 from companion.errors import (
     AutopilotError,
     AutopilotRebootedError,
+    CompanionError,
     NotDisarmedError,
     ParameterMismatchError,
     ParameterRefusedError,
 )
-
-__all__ = ["Change", "ParameterWriter", "RebootedWhileWritingError", "WriteFailedError"]
 
 logger = logging.getLogger(__name__)
 
@@ -228,7 +221,7 @@ class ParameterWriter:
             await self._parameters.write(name, value)
             item.confirmed = True
         except AutopilotError as error:
-            raise self._failure(error) from error
+            raise _Failure(kind_of(error, self._vehicle, self._boots), str(error)) from error
         finally:
             item.sent |= self._parameters.writes > sent_before
         self._check_boot(f"after {name} was written")
@@ -262,24 +255,9 @@ class ParameterWriter:
         try:
             value = await self._parameters.read(name)
         except AutopilotError as error:
-            raise self._failure(error) from error
+            raise _Failure(kind_of(error, self._vehicle, self._boots), str(error)) from error
         self._check_boot(f"before {name} was read")
         return value
-
-    def _failure(self, error: AutopilotError) -> _Failure:
-        kind: FailureKind
-        if self._vehicle.boots != self._boots or isinstance(error, AutopilotRebootedError):
-            kind = "rebooted in the middle"
-        elif isinstance(error, NotDisarmedError):
-            armed = self._vehicle.arm_state is ArmState.ARMED
-            kind = "armed in the middle" if armed else "arm state unknown"
-        elif isinstance(error, ParameterMismatchError):
-            kind = "answered another value"
-        elif isinstance(error, ParameterRefusedError):
-            kind = "refused"
-        else:
-            kind = "no answer"
-        return _Failure(kind, str(error))
 
     # --- back
 
@@ -298,8 +276,7 @@ class ParameterWriter:
         if self._vehicle.boots != self._boots and kind != "rebooted in the middle":
             kind, reason = "rebooted in the middle", f"{self._vehicle.name} restarted ({reason})"
         await self._put_back(items, leave_foreign=kind == "rebooted in the middle")
-        error = RebootedWhileWritingError if kind == "rebooted in the middle" else WriteFailedError
-        raise error(kind, reason, self.written, self.left_changed) from failure
+        raise WriteFailedError(kind, reason, self.written, self.left_changed) from failure
 
     async def _put_back(self, items: list[_Item], *, leave_foreign: bool) -> None:
         touched = [item for item in reversed(items) if item.sent]
@@ -383,6 +360,19 @@ class ParameterWriter:
         self.written = {item.change.parameter: item.seen() for item in items}
         self.left_changed = tuple(item.change.parameter for item in items if item.left)
         return self.written
+
+
+def kind_of(error: CompanionError, vehicle: Vehicle, boots: int) -> FailureKind:
+    """The cause in a word of what has ended a write; `boots`: restarts of the autopilot until it began."""
+    if vehicle.boots != boots or isinstance(error, AutopilotRebootedError):
+        return "rebooted in the middle"
+    if isinstance(error, WriteFailedError):
+        return error.kind
+    if isinstance(error, NotDisarmedError):
+        return "armed in the middle" if vehicle.arm_state is ArmState.ARMED else "arm state unknown"
+    if isinstance(error, ParameterMismatchError):
+        return "answered another value"
+    return "refused" if isinstance(error, ParameterRefusedError) else "no answer"
 
 
 def _same(one: float | None, other: float) -> bool:

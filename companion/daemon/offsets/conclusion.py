@@ -97,7 +97,7 @@ class Conclusion:
         """The write is done and stays; a cancel ends only the waiting for the autopilot's EKF."""
         job.lasts(settles_within_s(plan.firmware))
         try:
-            words = await self._firmware.settle(plan.gyros, plan.firmware, job.going_on(CONCLUDING_PERCENT))
+            words = await self._firmware.settle(plan, job.going_on(CONCLUDING_PERCENT))
         except JobCancelledError as cancelled:
             words = f"wait 2 min before take-off: {cancelled} while the EKF took in the new offsets, which stay"
         if words is not None:

@@ -16,7 +16,8 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
-from companion.autopilot.parameters.writer import Change, ParameterWriter
+from companion.autopilot.parameters.change import Change
+from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Moment
 from companion.calibration.collector.intake import LIMITS_IMU
 from companion.calibration.machine import Event
@@ -79,7 +80,6 @@ class Ditherer:
         self._vehicle, self._parameters, self._collector = core.vehicle, core.parameters, core.collector
         self._machine, self._imus, self._writer, self._ledger = core.machine, imus, writer, ledger
         self._profiles = core.profiles
-        self._horizon_s = 180.0
 
     async def refine(self, window: Window, job: Job, draft: Draft) -> Window:
         """Dither every IMU of the window that needs it; returns the window with their means in place.
@@ -128,7 +128,9 @@ class Ditherer:
         await imu.refresh()
         if imu.in_force.offsets != work.before:
             raise AutopilotError(f"imu {work.name}: somebody changed its offsets while they were dithered")
-        return combine(done, work.steps_si, noise_profile(self._profiles.of(window.name)), self._horizon_s)
+        return combine(
+            done, work.steps_si, noise_profile(self._profiles.of(window.name)), self._wanted.settings.horizon_s
+        )
 
     async def _steps(self, work: _Work, job: Job) -> list[Step]:
         """All steps, and the old values again."""

@@ -16,9 +16,8 @@ import numpy as np
 
 from companion.autopilot.firmware.firmwares import settle_s
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
-from companion.autopilot.firmware.px4 import Sensor
+from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import Observation, Verdict, judge
-from companion.autopilot.parameters.writer import Change
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import ArmState, Moment
 from companion.calibration.collector.rolling import MIN_BATCHES
@@ -31,7 +30,7 @@ from companion.daemon.offsets.px4_writes import FarMean, Px4Writes, step_from_fa
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H, MG
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 
 VERIFY_MAX_S: Final = 60.0
 """How long the aircraft may move after the write before its effect counts as not seen."""
@@ -163,7 +162,7 @@ class Sides:
 class OnTheWay:
     """What was seen between: the output while far values were in force, and the step from there to the new ones."""
 
-    far: Mapping[Sensor, FarMean]
+    far: Mapping[Triad, FarMean]
     gyro_step: Vector
     accel_step: Vector
 
@@ -171,7 +170,7 @@ class OnTheWay:
 class _Half(NamedTuple):
     """The gyros or the accelerometers of one IMU, as they were written."""
 
-    sensor: Sensor
+    sensor: Triad
     parameters: tuple[str, str, str]
     unit: str
     residual: Array
@@ -245,7 +244,7 @@ def _judge_half(half: _Half, sides: Sides, calibration: ImuCalibration, on_the_w
     )
 
 
-def _as_at_end(sensor: Sensor, sides: Sides, before: Vector, after: Vector) -> tuple[Vector, Vector, Array]:
+def _as_at_end(sensor: Triad, sides: Sides, before: Vector, after: Vector) -> tuple[Vector, Vector, Array]:
     """Both means as if the temperature had stayed as it was at the end of the first, and one sigma of that, (3,)."""
     first, second = sides.before.warming, sides.after.warming
     if first is None or sides.before.dithered:

@@ -29,15 +29,17 @@ from companion.autopilot.firmware.gyro_calibration import (
     changed,
     read_gyro_parameters,
 )
-from companion.autopilot.parameters.change import Change, FailureKind, WriteFailedError
+from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.parameters.writer import ParameterWriter, kind_of
 from companion.autopilot.vehicle.ekf import SETTLED_RAD_S, EkfWatch
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.records.record import WrittenParameter
+from companion.calibration.solution.draft import Draft
 from companion.config.sections import Platform
 from companion.daemon.offsets.ledger import Ledger
-from companion.errors import AutopilotError, AutopilotRebootedError, CompanionError, NotDisarmedError
+from companion.daemon.offsets.plan import Plan
+from companion.errors import AutopilotError, CompanionError
 from companion.physics.units import DEG_H
 from companion.storage.changes import ChangeSet
 
@@ -53,17 +55,6 @@ of it for gyro bias (a step of 30 mg: 850 deg/h for a moment, settled after 26 s
 
 SETTLE_ALONE_S: Final = 150.0
 """By itself EKF3 takes about two minutes (9.3.1: 140 s)."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Done:
-    """What a write with the firmware's calibration in it has done."""
-
-    written: dict[str, WrittenParameter]
-    collateral: tuple[Change, ...]
-    """What the firmware changed besides: gyro offsets, calibration temperatures and ids that we do not calibrate."""
-    outcome: Outcome
-    warnings: tuple[str, ...]
 
 
 class FirmwareCalibration:
@@ -102,18 +93,17 @@ class FirmwareCalibration:
             return None
         return before
 
-    async def write(
-        self, changes: Sequence[Change], gyros: Sequence[Change], before: GyroParameters, go_on: Callable[[str], None]
-    ) -> Done:
+    async def write(self, plan: Plan, before: GyroParameters, draft: Draft, go_on: Callable[[str], None]) -> Plan:
         """All offsets, the firmware's calibration, the gyro offsets again: all, or all the old values are back.
 
-        In a transaction of these changes, which grows with what the firmware may change besides.
+        In a transaction of these changes, which grows with what the firmware may change besides. The plan with that,
+        and how the calibration ended.
 
         Raises:
             NothingWrittenError: as `ParameterWriter.apply`.
             WriteFailedError: as `ParameterWriter.apply`.
         """
-        boots = self._vehicle.boots
+        boots, changes = self._vehicle.boots, plan.changes
         written = await self._writer.apply(changes)
         wanted = {change.parameter: change.after for change in changes}
         now = dataclasses.replace(before, values={n: wanted.get(n, value) for n, value in before.values.items()})
@@ -121,9 +111,9 @@ class FirmwareCalibration:
             ours = [change for change in changes if change.parameter not in before.values]
             await self._ledger.widen(ChangeSet.of(self._vehicle.system_id, ours, before.values))
             calibration = await calibrate_gyros(self._parameters, now, go_on)
-            go_on(f"writing {len(gyros)} fine gyro offsets")
+            go_on(f"writing {len(plan.gyros)} fine gyro offsets")
             coarse = calibration.after.values
-            fine = await self._writer.apply([Change(c.parameter, coarse[c.parameter], c.after) for c in gyros])
+            fine = await self._writer.apply([Change(c.parameter, coarse[c.parameter], c.after) for c in plan.gyros])
             collateral = tuple(
                 Change(name, old, new)
                 for name, (old, new) in changed(before, calibration.after).items()
@@ -134,27 +124,27 @@ class FirmwareCalibration:
             await self._put_back(changes, before, boots, error)
             raise
         # What was in force before all this is what the record says, not the firmware's coarse value in between.
-        written |= {c.parameter: msgspec.structs.replace(fine[c.parameter], before=c.before) for c in gyros}
-        warnings = [calibration.words] if calibration.words else []
+        written |= {c.parameter: msgspec.structs.replace(fine[c.parameter], before=c.before) for c in plan.gyros}
+        plan.note(draft, written)
+        if calibration.words:
+            draft.warnings.append(calibration.words)
         if collateral:
-            warnings.append(
+            draft.warnings.append(
                 "the firmware's gyro calibration, which resets its EKF, has changed others too:"
                 f" {', '.join(c.parameter for c in collateral)}; undo puts them back"
             )
-        return Done(written, collateral, calibration.outcome, tuple(warnings))
+        return dataclasses.replace(plan, collateral=collateral, firmware=calibration.outcome)
 
-    async def settle(
-        self, gyros: Sequence[Change], outcome: Outcome | None, go_on: Callable[[str], None]
-    ) -> str | None:
+    async def settle(self, plan: Plan, go_on: Callable[[str], None]) -> str | None:
         """After new gyro offsets: wait until the EKF agrees with them.
 
         Returns:
             What a pilot should know when it has not settled; None when it has, or when nothing is to settle.
         """
-        if self._vehicle.firmware != "ardupilot" or not gyros:
+        if self._vehicle.firmware != "ardupilot" or not plan.gyros:
             return None
         try:
-            return await self._ekf.settle(settles_within_s(outcome), go_on)
+            return await self._ekf.settle(settles_within_s(plan.firmware), go_on)
         finally:
             self._ekf.stop()
 
@@ -182,17 +172,7 @@ class FirmwareCalibration:
             left = failure.left_changed
         except AutopilotError:
             left = tuple(dict.fromkeys((*(change.parameter for change in back), *before.values)))
-        raise WriteFailedError(self._kind(error, boots), reason, _outcomes(changes, left), left) from error
-
-    def _kind(self, error: CompanionError, boots: int) -> FailureKind:
-        if self._vehicle.boots != boots or isinstance(error, AutopilotRebootedError):
-            return "rebooted in the middle"
-        if isinstance(error, WriteFailedError):
-            return error.kind
-        if isinstance(error, NotDisarmedError):
-            armed = self._vehicle.arm_state is ArmState.ARMED
-            return "armed in the middle" if armed else "arm state unknown"
-        return "no answer"
+        raise WriteFailedError(kind_of(error, self._vehicle, boots), reason, _outcomes(changes, left), left) from error
 
 
 def settles_within_s(outcome: Outcome | None) -> float:

@@ -16,9 +16,9 @@ import msgspec
 
 from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.autopilot.firmware.gyro_calibration import wait_until_over
-from companion.autopilot.parameters.change import NothingWrittenError, WriteFailedError
+from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
 from companion.autopilot.parameters.wire import same_float32
-from companion.autopilot.parameters.writer import Change, ParameterWriter
+from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Firmware
 from companion.calibration.records.record import WrittenParameter
 from companion.component.statustext import Severity, Weight

@@ -14,7 +14,7 @@ from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.gyro_calibration import Outcome as FirmwareOutcome
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for, whole_of
 from companion.autopilot.firmware.px4 import SlotMemory, warnings_about
-from companion.autopilot.parameters.writer import Change
+from companion.autopilot.parameters.change import Change
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.calibration.means.windows import ImuWindow
 from companion.calibration.records.record import Outcome, WrittenParameter
@@ -66,7 +66,7 @@ class Plan:
     boots: int
     """How often the autopilot had rebooted when this was made."""
     collateral: tuple[Change, ...] = ()
-    """What the firmware's own gyro calibration has changed besides."""
+    """What the firmware's own gyro calibration has changed besides: offsets, temperatures and ids of other gyros."""
     firmware: FirmwareOutcome | None = None
     """How that ended; None where it was not used."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from typing import Final
@@ -30,11 +29,7 @@ from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.offsets.plan import Plan, Target
 from companion.daemon.offsets.px4_writes import Px4Writes
 from companion.daemon.offsets.reboot_owed import RebootOwed
-from companion.errors import (
-    AutopilotError,
-    NotDisarmedError,
-    StorageError,
-)
+from companion.errors import AutopilotError, NotDisarmedError, StorageError
 from companion.storage.changes import ChangeSet, Origin
 
 logger = logging.getLogger(__name__)
@@ -136,10 +131,7 @@ class Pusher:
         def go_on(words: str) -> None:
             job.progress(MEASURED_PERCENT, words)
 
-        done = await self._firmware.write(plan.changes, plan.gyros, firmware, go_on)
-        plan.note(draft, done.written)
-        draft.warnings += done.warnings
-        return dataclasses.replace(plan, collateral=done.collateral, firmware=done.outcome)
+        return await self._firmware.write(plan, firmware, draft, go_on)
 
     def _kept(self, job: Job, plan: Plan, draft: Draft) -> ChangeSet:
         return ChangeSet.of(self._vehicle.system_id, plan.everything, origin=Origin(job.short, draft.started))

@@ -20,7 +20,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, vector_changes
-from companion.autopilot.firmware.px4 import NO_IMU, WORDS, Sensor, SlotMemory
+from companion.autopilot.firmware.px4 import NO_IMU, WORDS, SlotMemory, accel_offset_with
 from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.telemetry import imu_messages
@@ -30,12 +30,12 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.offsets.ledger import Ledger
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.physics.frames import Array, vector
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 from companion.storage.changes import ChangeSet
 
 logger = logging.getLogger(__name__)
 
-SENSORS: Final[tuple[Sensor, Sensor]] = ("accel", "gyro")
+SENSORS: Final[tuple[Triad, Triad]] = ("accel", "gyro")
 RATE_HZ: Final = 50.0
 """Rate asked of IMUs that nobody listens to otherwise."""
 HEAR_S: Final = 0.4
@@ -58,7 +58,7 @@ class FarStep:
     """What the output of one IMU must do when a far value comes into force in the slot of one of its sensors."""
 
     instance: int
-    sensor: Sensor
+    sensor: Triad
     device_id: int
     slot: str
     """For people: CAL_GYRO0."""
@@ -78,13 +78,13 @@ class _Sums:
     """Samples of all IMUs over one stretch."""
 
     def __init__(self) -> None:
-        self._sums: dict[tuple[int, Sensor], list[Array]] = {}
+        self._sums: dict[tuple[int, Triad], list[Array]] = {}
 
     def add(self, instance: int, reading: imu_messages.Reading) -> None:
         self._sums.setdefault((instance, "gyro"), []).append(np.array(reading.gyro_rad_s))
         self._sums.setdefault((instance, "accel"), []).append(np.array(reading.accel_m_s2))
 
-    def mean(self, instance: int, sensor: Sensor) -> FarMean | None:
+    def mean(self, instance: int, sensor: Triad) -> FarMean | None:
         samples = self._sums.get((instance, sensor), ())
         if len(samples) < LEAST_SAMPLES:
             return None
@@ -96,7 +96,7 @@ class _FarStepWatch:
     """Watches the telemetry of all IMUs over a write in two steps, and tells the memory what was seen."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, memory: SlotMemory) -> None:
-        self.means: Mapping[tuple[int, Sensor], FarMean] = {}
+        self.means: Mapping[tuple[int, Triad], FarMean] = {}
         """By instance, from the last look: only of what moved as it should."""
         self._link, self._vehicle, self._memory = link, vehicle, memory
         self.learned = False
@@ -165,7 +165,7 @@ class _FarStepWatch:
     def _judge(self, steps: Sequence[FarStep], before: _Sums, during: _Sums) -> str | None:
         """Remember whose output moved; why this is not as it was believed, if so."""
         wrong: list[str] = []
-        means: dict[tuple[int, Sensor], FarMean] = {}
+        means: dict[tuple[int, Triad], FarMean] = {}
         for step in steps:
             rivals = [each for each in steps if each.sensor == step.sensor]
             moved: list[int] = []
@@ -262,10 +262,10 @@ class Px4Writes:
         for calibration, changes, _ in targets:
             written = {change.parameter for change in changes}
             if calibration.far_step is not None and written.intersection(calibration.parameters.accel_offset):
-                after = _offsets(calibration, changes)
+                after = accel_offset_with(calibration, changes)
                 self._memory.brought_into_use(calibration.parameters.accel_offset, after, self._vehicle.boots)
 
-    def seen_far(self, calibration: ImuCalibration) -> Mapping[Sensor, FarMean]:
+    def seen_far(self, calibration: ImuCalibration) -> Mapping[Triad, FarMean]:
         """The output of an IMU while the far values of the last write were in force, as far as it was seen."""
         found = {sensor: self._watch.means.get((calibration.instance, sensor)) for sensor in SENSORS}
         return {sensor: mean for sensor, mean in found.items() if mean is not None}
@@ -296,18 +296,16 @@ class Px4Writes:
         return True
 
 
-def far_steps(
-    calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector = (0.0, 0.0, 0.0)
-) -> list[FarStep]:
+def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> list[FarStep]:
     """What the output must do when the far values of these changes come into force; it reads `accel_m_s2` before."""
     gyro, accel = output_step(calibration, _far(changes), accel_m_s2)
     names, found = calibration.parameters, []
-    for sensor, device_id, name, step in (
+    halves: tuple[tuple[Triad, int | None, str, Vector], ...] = (
         ("gyro", calibration.gyro_id, names.gyro_id, gyro),
         ("accel", calibration.accel_id, names.accel_id, accel),
-    ):
+    )
+    for kind, device_id, name, step in halves:
         if any(step) and device_id is not None:
-            kind: Sensor = "gyro" if sensor == "gyro" else "accel"
             slot = name.removesuffix("_ID")
             constant = calibration.thermal.gyro_constant
             if kind == "gyro" and any(change.parameter in constant for change in changes):
@@ -317,10 +315,7 @@ def far_steps(
 
 
 def step_from_far(
-    calibration: ImuCalibration,
-    changes: Sequence[Change],
-    accel_m_s2: Vector = (0.0, 0.0, 0.0),
-    unseen: Sequence[Change] = (),
+    calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector, unseen: Sequence[Change]
 ) -> tuple[Vector, Vector]:
     """By how much the output must move from the far values to the new ones: gyro rad/s, accelerometer m/s^2.
 
@@ -341,11 +336,3 @@ def _again(calibration: ImuCalibration) -> list[Change]:
     if far is None:
         return []
     return vector_changes(calibration.parameters.accel_offset, offset, offset, far.accel_m_s2)
-
-
-def _offsets(calibration: ImuCalibration, changes: Sequence[Change]) -> Vector:
-    """The accelerometer offsets after these changes."""
-    by_name = {change.parameter: change.after for change in changes}
-    names, before = calibration.parameters.accel_offset, calibration.accel_offset_m_s2
-    x, y, z = (by_name.get(name, old) for name, old in zip(names, before, strict=True))
-    return x, y, z
