@@ -68,7 +68,11 @@ async def follow(rig: Rig, hands: Hands, job: Job) -> JobResult:
 
 
 async def aligned(rig: Rig, hands: Hands, plan: Plan) -> JobResult:
-    return await follow(rig, hands, started(rig.service.calibrating.conductor.start_alignment(plan, "test", 900.0)))
+    return await follow(
+        rig,
+        hands,
+        started(rig.service.calibrating.start_alignment({"action": plan.kind, "headings": plan.headings}, "test")),
+    )
 
 
 @pytest.mark.parametrize("plan", [Plan("zero"), Plan("zero", headings=4)], ids=["there-and-back", "four"])
@@ -115,7 +119,7 @@ def test_a_spot_that_moved_is_refused_in_words_and_the_old_zero_stays(tmp_path: 
     async def main() -> None:
         async with made.running():
             await made.ready()
-            job = started(made.service.calibrating.conductor.start_alignment(Plan("zero"), "test", 900.0))
+            job = started(made.service.calibrating.start_alignment({"action": "zero"}, "test"))
             await moved(made, hands, job, 2, 180.0)
             hands.bump(0.3, 0.0)
             await moved(made, hands, job, 3, 180.0)
@@ -137,7 +141,7 @@ def test_tilts_tell_bias_and_scale_apart(tmp_path: Path) -> None:
     async def main() -> None:
         async with made.running():
             await made.ready()
-            job = started(made.service.calibrating.conductor.start_alignment(Plan("tilts"), "test", 900.0))
+            job = started(made.service.calibrating.start_alignment({"action": "tilts"}, "test"))
             for stand in (2, 3, 4):
                 await moved(made, hands, job, stand, 90.0)
             said: list[str] = []
@@ -172,7 +176,7 @@ def test_without_a_compass_the_gyros_tell_the_turn(tmp_path: Path) -> None:
     async def main() -> None:
         async with made.running():
             await made.ready()
-            job = started(made.service.calibrating.conductor.start_alignment(Plan("zero"), "test", 900.0))
+            job = started(made.service.calibrating.start_alignment({"action": "zero"}, "test"))
             await moved(made, hands, job, 2, 100.0)
             await made.until(lambda: "turn it by" in job.words and "degrees more" in job.words, 60.0)
             assert re.search(r": (99|100|101) degrees, not 180: turn", job.words)
@@ -271,7 +275,7 @@ def test_who_may_start_one_and_how_it_ends(tmp_path: Path) -> None:
             conductor = made.service.calibrating.conductor
             await made.ready()
             # A calibration and an alignment exclude each other.
-            job = started(conductor.start_alignment(Plan("zero"), "test", 900.0))
+            job = started(made.service.calibrating.start_alignment({"action": "zero"}, "test"))
             refused = conductor.start_calibration(What.BOTH, "test")
             assert isinstance(refused, Refusal)
             assert "a gradienter alignment is running (" in refused.reason
@@ -279,24 +283,24 @@ def test_who_may_start_one_and_how_it_ends(tmp_path: Path) -> None:
             assert conductor.cancel("the test")
             assert (await job.finished).outcome == "cancelled"
             running = started(conductor.start_calibration(What.BOTH, "test"))
-            refused = conductor.start_alignment(Plan("zero"), "test", 900.0)
+            refused = made.service.calibrating.start_alignment({"action": "zero"}, "test")
             assert isinstance(refused, Refusal)
             assert "a calibration is running" in refused.reason
             conductor.cancel("the test")
             await running.finished
             # Nobody turns it: it ends by itself, and says where it was.
-            job = started(conductor.start_alignment(Plan("zero"), "test", 40.0))
+            job = started(made.service.calibrating.start_alignment({"action": "zero", "timeout_s": 40.0}, "test"))
             result = await job.finished
             assert result.outcome == "failed"
             assert "not finished in the time given: 2 of 3" in result.reason
             # Armed in the middle.
-            job = started(conductor.start_alignment(Plan("zero"), "test", 900.0))
+            job = started(made.service.calibrating.start_alignment({"action": "zero"}, "test"))
             await made.until(lambda: "measuring" in job.words, 60.0)
             made.double.arm()
             result = await job.finished
             assert result.outcome == "failed"
             assert "armed during the alignment" in result.reason
-            refused = conductor.start_alignment(Plan("zero"), "test", 900.0)
+            refused = made.service.calibrating.start_alignment({"action": "zero"}, "test")
             assert isinstance(refused, Refusal)
             assert refused.kind == "armed"
 
@@ -330,7 +334,7 @@ def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, to
     async def main() -> None:
         async with made.running():
             await made.ready()
-            job = started(made.service.calibrating.conductor.start_alignment(Plan("zero"), "test", 900.0))
+            job = started(made.service.calibrating.start_alignment({"action": "zero"}, "test"))
             await made.until(lambda: "waiting for it to move" in job.words, 60.0)
             if told:
                 made.double.write_as_another_station(offset_names(1, "accel")[0], 0.03)

@@ -36,7 +36,9 @@ def rig(folder: Path, **more: Any) -> tuple[Rig, Hands]:
 
 
 def faced(rig: Rig, *, write: bool) -> Job:
-    return started(rig.service.calibrating.conductor.start_faces("test", 2000.0, write=write))
+    return started(
+        rig.service.calibrating.start_alignment({"action": "faces", "write": write, "timeout_s": 2000.0}, "test")
+    )
 
 
 def read(rig: Rig, what: str) -> np.ndarray[Any, Any]:
@@ -137,7 +139,7 @@ def test_who_asks_for_what_cannot_be_is_told_at_once(tmp_path: Path) -> None:
     async def main() -> None:
         async with made.running():
             await made.ready()
-            refused = made.service.calibrating.conductor.start_faces("test", 100.0, write=True)
+            refused = made.service.calibrating.start_alignment({"action": "faces", "write": True}, "test")
             assert isinstance(refused, Refusal)
             assert "push.parameters is false" in refused.reason
 

@@ -12,7 +12,6 @@ import pytest
 from companion.calibration.records.align_record import TurnRecord
 from companion.component.service import Refusal
 from companion.daemon.job import Job
-from companion.daemon.stands.turning import TurnAsked
 from sim.aircraft import Pose
 from sim.ardupilot.double import offset_names
 from sim.earth import mounting_matrix
@@ -34,7 +33,9 @@ def rig(folder: Path, pose: Pose, firmware: str = "ardupilot", **more: Any) -> t
 
 
 def turn(rig: Rig, headings: int, *, write: bool) -> Job:
-    return started(rig.service.calibrating.conductor.start_turn(TurnAsked(headings, write=write), "test", 900.0))
+    return started(
+        rig.service.calibrating.start_alignment({"action": "turn", "headings": headings, "write": write}, "test")
+    )
 
 
 async def turned(rig: Rig, hands: Hands, headings: int, *, write: bool, meddle: Meddle = NOTHING) -> TurnRecord:
@@ -172,10 +173,14 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
     async def sides() -> None:
         async with first.running():
             await first.ready()
-            refused = first.service.calibrating.conductor.start_turn(TurnAsked(4, level=True), "test", 900.0)
+            refused = first.service.calibrating.start_alignment({"action": "turn", "level": True}, "test")
             assert isinstance(refused, Refusal)
             assert "align faces --write first" in refused.reason
-            job = started(first.service.calibrating.conductor.start_faces("test", 2000.0, write=True))
+            job = started(
+                first.service.calibrating.start_alignment(
+                    {"action": "faces", "write": True, "timeout_s": 2000.0}, "test"
+                )
+            )
             result = await follow(first, hand, job)
             assert result.outcome == "done", result
 
@@ -188,7 +193,7 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
             await made.ready()
             result, calibration = await calibrated(made)
             assert result.outcome == "done", result
-            job = started(made.service.calibrating.conductor.start_turn(TurnAsked(4, level=True), "test", 900.0))
+            job = started(made.service.calibrating.start_alignment({"action": "turn", "level": True}, "test"))
             result = await follow(made, hands, job)
             assert result.outcome == "done", result
             record = job.product
@@ -230,14 +235,20 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
             await made.ready()
             old = {name: made.autopilot.parameter(name) for name in ("CAL_ACC0_XOFF", "CAL_ACC0_YOFF", "CAL_ACC0_ZOFF")}
             result = await follow(
-                made, hands, started(made.service.calibrating.conductor.start_faces("test", 2000.0, write=True))
+                made,
+                hands,
+                started(
+                    made.service.calibrating.start_alignment(
+                        {"action": "faces", "write": True, "timeout_s": 2000.0}, "test"
+                    )
+                ),
             )
             assert result.outcome == "done", result
             hands.spot(made.aircraft.time_at(made.now_s), STEEP.pitch_deg, STEEP.roll_deg)
             await asyncio.sleep(15.0)
             if not follows:
                 monkeypatch.setattr(SensorCalibration, "_set_rotation", lambda *_: None)
-            job = started(made.service.calibrating.conductor.start_turn(TurnAsked(4, level=True), "test", 900.0))
+            job = started(made.service.calibrating.start_alignment({"action": "turn", "level": True}, "test"))
             result = await follow(made, hands, job)
             if not follows:
                 assert result.outcome == "failed"

@@ -14,7 +14,6 @@ from companion.calibration.deck.estimate import DeckWork
 from companion.calibration.records.record import Record
 from companion.calibration.request import What
 from companion.component.service import Refusal
-from companion.daemon.stands.align_steps import Plan
 from sim.imu_model import DEG_H, MG
 from sim.motions import SlowTurn
 from sim.sea import DAY_S, Sea, Wave
@@ -218,7 +217,7 @@ def test_no_zero_of_a_gradienter_is_measured_on_a_deck(tmp_path: Path) -> None:
     async def main() -> None:
         async with boat(tmp_path).running() as rig:
             await rig.ready()
-            refused = rig.service.calibrating.conductor.start_alignment(Plan("zero"), "test", 60.0)
+            refused = rig.service.calibrating.start_alignment({"action": "zero", "timeout_s": 60.0}, "test")
             assert isinstance(refused, Refusal)
             assert "ashore" in refused.reason
 

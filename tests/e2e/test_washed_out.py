@@ -11,7 +11,6 @@ from companion.calibration.request import What
 from companion.component.service import Refusal
 from companion.daemon.calibrating.why_not import MOST_REQUESTERS, StartLimit
 from companion.daemon.job import Job
-from companion.daemon.stands.align_steps import Plan
 from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, TEMPORARILY_REJECTED
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -119,7 +118,9 @@ def test_alignments_have_the_same_limit(tmp_path: Path) -> None:
             await rig.ready()
             answers = []
             for _ in range(30):
-                answers.append(rig.service.calibrating.conductor.start_alignment(Plan("zero", 2), "a script", 60.0))
+                answers.append(
+                    rig.service.calibrating.start_alignment({"action": "zero", "timeout_s": 60.0}, "a script")
+                )
                 rig.service.calibrating.conductor.cancel("a script")
                 if isinstance(job := answers[-1], Job):
                     await job.finished

@@ -17,7 +17,6 @@ from companion.daemon.stands.align_steps import (
     Plan,
     Seen,
     asked_turn_deg,
-    hold,
     leaned,
     objection,
     request,
@@ -48,16 +47,16 @@ def test_how_many_stands(plan: Plan, total: int, on_spot: int) -> None:
 
 def test_there_and_back() -> None:
     plan = Plan("zero")
-    assert "marked spot" in request(plan, [])
+    assert "marked spot" in request(plan, [])[0]
     assert objection(plan, [], LEVEL) is None
     propped = Seen(np.array([np.sin(np.radians(45.0)), 0.0, -np.cos(np.radians(45.0))]), 0.0)
     assert objection(plan, [], propped) == "tilted by 45 degrees: stand it on its base"
-    assert "by 180 degrees" in request(plan, [LEVEL])
+    assert "by 180 degrees" in request(plan, [LEVEL])[0]
     for heading in (170.0, 150.0, 195.0):
         assert objection(plan, [LEVEL], stands(heading)) is None
     said = objection(plan, [LEVEL], stands(90.0))
     assert said == "100 degrees, not 180: turn it by 80 degrees more"
-    assert "the same way" in request(plan, [LEVEL, stands(170.0)])
+    assert "the same way" in request(plan, [LEVEL, stands(170.0)])[0]
     assert objection(plan, [LEVEL, stands(170.0)], stands(5.0)) is None
     assert objection(plan, [LEVEL, stands(170.0)], stands(170.0)) is not None
 
@@ -75,7 +74,7 @@ def test_quarters_in_any_order() -> None:
 def test_quarters_out_of_order_are_led_to_the_one_that_is_open() -> None:
     plan = Plan("zero", headings=4, back=True)
     taken = [stands(10.0), stands(190.0), stands(283.0)]
-    assert request(plan, taken) == "turn it by 180 degrees on its spot"
+    assert request(plan, taken)[0] == "turn it by 180 degrees on its spot"
     assert objection(plan, taken, stands(6.0)) == "0 degrees again: turn it on by 90 degrees"
     assert objection(plan, taken, stands(185.0)) == "180 degrees again: turn it on by 270 degrees"
     assert asked_turn_deg(plan, [*taken, stands(102.0)]) == 270.0
@@ -93,10 +92,10 @@ def test_a_lean_within_a_stand_is_told_from_noise() -> None:
 def test_tilts_to_sides_not_yet_taken() -> None:
     plan = Plan("tilts")
     spot = [stands(350.0), stands(80.0), stands(170.0), stands(260.0)]
-    assert "nose up, nose down, left or right side down" in request(plan, spot)
+    assert "nose up, nose down, left or right side down" in request(plan, spot)[0]
     assert "tilted by 5 degrees only" in (objection(plan, spot, stands(3.0, 5.0)) or "")
     taken = [*spot, stands(3.0, 22.0), stands(9.0, 0.0, -22.0)]
-    assert "not nose up or left side down again" in request(plan, taken)
+    assert "not nose up or left side down again" in request(plan, taken)[0]
     assert "nose up again" in (objection(plan, taken, stands(0.0, 20.0, 5.0)) or "")
     assert objection(plan, taken, stands(0.0, -20.0)) is None
     assert objection(plan, taken, stands(0.0, 1.0, 25.0)) is None
@@ -131,7 +130,7 @@ def every_request() -> Iterator[Asked]:
         tilted = [stands(0.0, 22.0), stands(0.0, -22.0), stands(0.0, 0.0, -22.0), stands(0.0, 0.0, 22.0)]
         taken = [*spot, *tilted][: plan.total]
         for number in range(plan.total):
-            yield Asked(number + 1, plan.total, request(plan, taken[:number]), hold(plan, taken[:number]))
+            yield Asked(number + 1, plan.total, *request(plan, taken[:number]))
     for side in (*SIDES, *EDGES):
         yield Asked(24, 24, str(Missing(side, "z scale uncertain by 0.46 %")), Hold(up_of(side)))
 

@@ -28,13 +28,9 @@ from companion.daemon.calibrating.course import Course
 from companion.daemon.calibrating.results import Results
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.core import Core
-from companion.daemon.job import ALIGNMENT, FACES, TURN, Job, JobCancelledError, Undone
+from companion.daemon.job import Job, JobCancelledError, Undone
 from companion.daemon.offsets.ledger import Recovery
-from companion.daemon.stands.align_steps import Plan
-from companion.daemon.stands.aligner import Aligner
 from companion.daemon.stands.by_hand import ByHand
-from companion.daemon.stands.facing import Facing
-from companion.daemon.stands.turning import TurnAsked, Turning
 from companion.errors import CompanionError
 from companion.links.system.listeners import Listeners
 from companion.storage.changes import AUTOMATIC, BY_HAND, PREDICTION
@@ -49,19 +45,14 @@ class Conductor:
         self,
         core: Core,
         course: Course,
-        aligner: Aligner,
-        facing: Facing,
-        turning: Turning,
         recovery: Recovery,
         results: Results,
         by_hand: ByHand,
     ) -> None:
         self._machine, self._wanted, self._only_listening = core.machine, core.wanted, core.only_listening
         self._vehicle, self._collector, self._say, self._tunes = core.vehicle, core.collector, core.say, core.tunes
-        self._course, self._aligner, self._facing, self._turning = course, aligner, facing, turning
-        self._recovery, self._results, self._by_hand = recovery, results, by_hand
+        self._course, self._recovery, self._results, self._by_hand = course, recovery, results, by_hand
         self._has_gradienter = core.config.gradienter is not None
-        self._on_deck = core.config.vehicle.platform == "deck"
         self._starts = StartLimit()
         self._task: asyncio.Task[None] | None = None
         self.job: Job | None = None
@@ -146,31 +137,6 @@ class Conductor:
         job = Job(PREDICTION, What.GYROS, requester, None, automatic=True)
         return self._start(job, Event.REQUEST, self._keep_by_hand(job, lambda job: self._course.predict(job, foretold)))
 
-    def start_alignment(self, plan: Plan, requester: str, timeout_s: float) -> Job | Refusal:
-        """Start measuring the gradienter's zero, or say why not."""
-        missing = None if self._has_gradienter else "there is no gradienter to align: none is configured"
-        return self._start_stands(ALIGNMENT, requester, timeout_s, missing, lambda job: self._aligner.run(job, plan))
-
-    def start_faces(self, requester: str, timeout_s: float, *, write: bool) -> Job | Refusal:
-        """Start measuring the accelerometers in stands of any orientation, or say why not."""
-        missing = self._facing.why_not(write=write)
-        return self._start_stands(FACES, requester, timeout_s, missing, lambda job: self._facing.run(job, write=write))
-
-    def start_turn(self, asked: TurnAsked, requester: str, timeout_s: float) -> Job | Refusal:
-        """Start finding the level by turning on a spot, without a gradienter, or say why not."""
-        missing = self._turning.why_not(asked)
-        return self._start_stands(TURN, requester, timeout_s, missing, lambda job: self._turning.run(job, asked))
-
-    def _start_stands(
-        self, kind: str, requester: str, timeout_s: float, missing: str | None, run: Callable[[Job], Awaitable[str]]
-    ) -> Job | Refusal:
-        if self._on_deck and kind == ALIGNMENT:
-            return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
-        if self._on_deck:
-            return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
-        what = What.BOTH if kind == ALIGNMENT else What.ACCELEROMETERS
-        return self.start_job(kind, what, requester, timeout_s, missing, run)
-
     def start_job(
         self,
         kind: str,
@@ -193,7 +159,6 @@ class Conductor:
         if (refusal := self._refusal(requester, missing)) is not None:
             return refusal
         job = Job(kind, what, requester, asyncio.get_running_loop().time() + timeout_s)
-
         return self._start(job, Event.REQUEST, self._keep_by_hand(job, run))
 
     async def _keep_by_hand(self, job: Job, run: Callable[[Job], Awaitable[str]]) -> None:

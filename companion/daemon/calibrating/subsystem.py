@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from functools import partial
 from typing import Final
 
 import msgspec
@@ -21,7 +22,7 @@ from companion.daemon.calibrating.solver import Solver
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.job import TEMPERATURE, Job
+from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job
 from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.subsystem import Offsets
@@ -74,17 +75,15 @@ class Calibrating(Subsystem):
         conclusion = Conclusion(core, offsets.effect, offsets.firmware, offsets.owed)
         course = Course(core, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, conclusion)
         self.stands = stands = Stands(core, imus, measuring)
-        writes = AccelWrites(core, imus, offsets, conclusion)
-        aligner = Aligner(core, stands, self.alignment)
-        facing = Facing(core, imus, stands, writes, self.faces)
+        self._writes = writes = AccelWrites(core, imus, offsets, conclusion)
+        self._aligner = Aligner(core, stands, self.alignment)
+        self._facing = Facing(core, imus, stands, writes, self.faces)
         levels = LevelWrites(core, imus, offsets, own)
-        turning = Turning(core, imus, stands, writes, levels, self.faces)
+        self._turning = Turning(core, imus, stands, writes, levels, self.faces)
         self._results = Results(core, self.store, self.memory)
         self.by_hand = ByHand(core, imus)
         self._into_autopilot = IntoAutopilot(core, imus, measuring, self.memory, offsets, conclusion)
-        self.conductor = Conductor(
-            core, course, aligner, facing, turning, offsets.recovery, self._results, self.by_hand
-        )
+        self.conductor = Conductor(core, course, offsets.recovery, self._results, self.by_hand)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.alignment.load()
@@ -206,7 +205,7 @@ class Calibrating(Subsystem):
             words = "the configuration's zero and sigma are in force" if was else "there was no alignment to forget"
             yield {"kind": "result", "state": "done", "reason": words}
         else:
-            job = self._start_alignment(request, face)
+            job = _accepted(self.start_alignment(request, f"{face} align"))
             if request.get("wait") is False:
                 yield {"kind": "result", "state": self.conductor.state.shown, "reason": f"{job.kind} started"}
                 return
@@ -231,20 +230,33 @@ class Calibrating(Subsystem):
         found = {"alignment": msgspec.to_builtins(alignment.record), "accelerometers": sides}
         return {"state": state, "reason": reason, **found}
 
-    def _start_alignment(self, request: Object, face: str) -> Job:
+    def start_alignment(self, request: Object, by: str) -> Job | Refusal:
+        """Start measuring in stands, or say why not.
+
+        Raises:
+            CalibrationRefusedError: the request is not understood.
+        """
         action, headings, timeout_s = (request.get(key) for key in ("action", "headings", "timeout_s"))
         timeout_s = ALIGN_TIMEOUT_S if timeout_s is None else timeout_s
         if headings not in (None, 2, HEADINGS) or not is_time_limit(timeout_s):
             action = None
-        conductor, write, by = self.conductor, request.get("write") is True, f"{face} align"
+        kind, what, write = FACES, What.ACCELEROMETERS, request.get("write") is True
+        run: Callable[[Job], Awaitable[str]]
         if action == "faces":
-            return _accepted(conductor.start_faces(by, timeout_s, write=write))
-        if action == "turn":
+            missing, run = self._writes.why_not(write=write), partial(self._facing.run, write=write)
+        elif action == "turn":
             asked = TurnAsked(headings or HEADINGS, write=write, level=request.get("level") is True)
-            return _accepted(conductor.start_turn(asked, by, timeout_s))
-        if action in ("zero", "tilts"):
-            return _accepted(conductor.start_alignment(Plan(action, headings or 2), by, timeout_s))
-        raise CalibrationRefusedError(f"align: {request} is not understood")
+            kind, missing, run = TURN, self._turning.why_not(asked), partial(self._turning.run, asked=asked)
+        elif action in ("zero", "tilts"):
+            kind, what, missing = ALIGNMENT, What.BOTH, self._aligner.why_not()
+            run = partial(self._aligner.run, plan=Plan(action, headings or 2))
+        else:
+            raise CalibrationRefusedError(f"align: {request} is not understood")
+        if self._core.config.vehicle.platform == "deck":
+            if kind == ALIGNMENT:
+                return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
+            return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
+        return self.conductor.start_job(kind, what, by, timeout_s, missing, run)
 
     async def _progress(self, job: Job) -> AsyncIterator[Object]:
         while job.is_running:

@@ -80,32 +80,23 @@ class Seen:
     heading_deg: float
 
 
-def request(plan: Plan, taken: Sequence[Seen]) -> str:
-    """What the person at the aircraft should do now; up to a colon it is spoken aloud too (`Asked.spoken`)."""
+def request(plan: Plan, taken: Sequence[Seen]) -> tuple[str, Hold]:
+    """What the person at the aircraft should do now, and as a picture; up to a colon it is spoken aloud too."""
     number = len(taken)
     if number == 0:
-        return "stand it on a firm, marked spot"
+        return "stand it on a firm, marked spot", Hold(LEVEL)
     if number >= plan.on_spot:
         done = [_side(taken[0].up, seen.up) for seen in taken[plan.on_spot :]]
+        hold = Hold(next((up for side, up in _TILTED.items() if side not in done), LEVEL))
         if done:
-            return f"tilt it to another side, prop it up: not {' or '.join(done)} again"
-        return "tilt it 20 to 28 degrees, prop it up: nose up, nose down, left or right side down"
+            return f"tilt it to another side, prop it up: not {' or '.join(done)} again", hold
+        return "tilt it 20 to 28 degrees, prop it up: nose up, nose down, left or right side down", hold
+    hold = Hold(LEVEL, asked_turn_deg(plan, taken))
     if plan.on_spot >= HEADINGS:
-        return f"turn it by {_to_next_deg(taken, taken[-1]):.0f} degrees on its spot"
+        return f"turn it by {hold.turn_deg:.0f} degrees on its spot", hold
     if number == 1:
-        return "turn it by 180 degrees, onto its marks"
-    return "turn it the same way to its first marks"
-
-
-def hold(plan: Plan, taken: Sequence[Seen]) -> Hold:
-    """What `request` asks for, as a picture."""
-    number = len(taken)
-    if number == 0:
-        return Hold(LEVEL)
-    if number >= plan.on_spot:
-        done = {_side(taken[0].up, seen.up) for seen in taken[plan.on_spot :]}
-        return Hold(next((up for side, up in _TILTED.items() if side not in done), LEVEL))
-    return Hold(LEVEL, asked_turn_deg(plan, taken))
+        return "turn it by 180 degrees, onto its marks", hold
+    return "turn it the same way to its first marks", hold
 
 
 def asked_turn_deg(plan: Plan, taken: Sequence[Seen]) -> float:

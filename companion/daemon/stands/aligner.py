@@ -26,6 +26,8 @@ from companion.daemon.stands.taken import Taken, ground, readable
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG
 
+LEAST_STANDS: Final = 3
+"""Of every plan: the first that tell a zero."""
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
 
@@ -36,6 +38,13 @@ class Aligner:
     def __init__(self, core: Core, stands: Stands, alignment: AlignmentInForce) -> None:
         self._config, self._stands, self._alignment = core.config, stands, alignment
         self._offload, self._machine = core.offload, core.machine
+        self._zero_deg = (0.0, 0.0) if core.config.gradienter is None else core.config.gradienter.offset_deg
+        """As configured."""
+
+    def why_not(self) -> str | None:
+        """Why there is nothing to measure; None where all is well."""
+        has_one = self._config.gradienter is not None
+        return None if has_one else "there is no gradienter to align: none is configured"
 
     async def run(self, job: Job, plan: Plan) -> str:
         """Measure all stands, work out, keep; returns the result in one line.
@@ -45,12 +54,8 @@ class Aligner:
             JobCancelledError: cancelled; likewise.
         """
         model = models.gradienter_model(self._config.gradienter)
-        settings = self._alignment.settings()
-        if model is None or settings is None:
-            raise CalibrationRefusedError("there is no gradienter to align: none is configured")
-        local: LocalEarth | None = None
+        assert model is not None
         taken: list[Taken] = []
-        result: Alignment | None = None
 
         def see(window: Window) -> Taken:
             return self._seen(plan, model, taken, window)
@@ -58,15 +63,13 @@ class Aligner:
         self._stands.begin(job)
         while len(taken) < plan.total:
             taken.append(await self._stands.take(job, plan, taken, see))
-            if len(taken) >= min(3, plan.total):
+            if len(taken) >= LEAST_STANDS:
                 # What does not fit is said at once, not after five more stands.
                 await self._stands.check_offsets()
                 local = await self._stands.local_earth()
                 result = await self._offload(self._solve, plan, model, taken, local)
                 if result.complaint is not None:
                     raise CalibrationRefusedError(in_words(result.complaint))
-        assert result is not None
-        assert local is not None
         record = self._record(plan, result, taken, local)
         job.deliver(record)
         await self._alignment.keep(record)
@@ -98,17 +101,12 @@ class Aligner:
         return align(model.law, model.vehicle_from_sensor, stands, around)
 
     def _as_stands(self, plan: Plan, taken: list[Taken], names: list[str], local: LocalEarth) -> list[Stand]:
-        compass, zero_deg = self._config.compass, self._configured
+        compass = self._config.compass
         north_deg = local.declination_deg if compass is not None and compass.reference == "magnetic" else 0.0
         return [
-            one.as_stand(names, on_spot=k < plan.on_spot, north_deg=north_deg, zero_deg=zero_deg)
+            one.as_stand(names, on_spot=k < plan.on_spot, north_deg=north_deg, zero_deg=self._zero_deg)
             for k, one in enumerate(taken)
         ]
-
-    @property
-    def _configured(self) -> tuple[float, float]:
-        gradienter = self._config.gradienter
-        return (0.0, 0.0) if gradienter is None else gradienter.offset_deg
 
     def _record(self, plan: Plan, result: Alignment, taken: list[Taken], local: LocalEarth) -> AlignmentRecord:
         settings = self._alignment.settings()
@@ -131,7 +129,7 @@ class Aligner:
             freedom=result.freedom,
             temperature_degc=tilt.temperature_degc if tilt is not None else None,
             stands=tuple(
-                stand_record(stand, result, k, taken[k].seconds, self._configured) for k, stand in enumerate(stands)
+                stand_record(stand, result, k, taken[k].seconds, self._zero_deg) for k, stand in enumerate(stands)
             ),
             imus=tuple(imu_record(imu, degrees.get(imu.name)) for imu in result.imus),
             warnings=(*local.warnings, *self._warnings(result)),

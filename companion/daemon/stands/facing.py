@@ -61,10 +61,6 @@ class Facing:
         self._core, self._machine, self._imus = core, core.machine, imus
         self._stands, self._writes, self._kept = stands, writes, kept
 
-    def why_not(self, *, write: bool) -> str | None:
-        """Why there is nothing to measure, or nothing could be written; None where all is well."""
-        return self._writes.why_not(write=write)
-
     async def run(self, job: Job, *, write: bool) -> str:
         """Measure stand after stand, work out, write; returns the result in one line.
 

@@ -269,7 +269,7 @@ class Stands:
             found = see(window)
             return found, align_steps.objection(plan, seen, found.seen)
 
-        asked = Asked(len(taken) + 1, plan.total, align_steps.request(plan, seen), align_steps.hold(plan, seen))
+        asked = Asked(len(taken) + 1, plan.total, *align_steps.request(plan, seen))
         return await self.next(job, asked, fits, if_armed)
 
     def turned(self, plan: Plan, taken: Sequence[Taken], now: Window, up: Array, first_sigma_deg: float) -> Taken:
