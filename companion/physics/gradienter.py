@@ -21,7 +21,7 @@ from typing import Literal
 
 import numpy as np
 
-from companion.physics.frames import Array, Matrix
+from companion.physics.frames import Array, Floats, Matrix
 from companion.physics.units import DEG
 
 Law = Literal["axis", "slope", "euler"]
@@ -60,19 +60,17 @@ def up_in_sensor(law: Law, x_deg: float, y_deg: float) -> Array:
     return np.array([math.sin(theta), -math.sin(gamma) * math.cos(theta), -math.cos(gamma) * math.cos(theta)])
 
 
-def readings_from_up(law: Law, up: Array) -> tuple[float, float]:
-    """The two readings (qx, qy) in degrees that a gradienter of this law gives; the inverse of `up_in_sensor`.
+def readings_from_up(law: Law, up: Floats) -> Floats:
+    """The two readings (qx, qy) in degrees that a gradienter of this law gives, (..., 2); undoes `up_in_sensor`.
 
-    `up`: unit vector of specific force at rest in the sensor's own FRD axes, shape (3,).
+    `up`: specific force in the sensor's own FRD axes, (..., 3), of any length.
     """
-    x, y, z = (float(value) for value in up)
+    x, y, z = np.moveaxis(up / np.linalg.norm(up, axis=-1, keepdims=True), -1, 0)
     if law == "axis":
-        return math.asin(max(-1.0, min(1.0, -y))) / DEG, math.asin(max(-1.0, min(1.0, x))) / DEG
-    gamma = math.atan2(-y, -z)
-    if law == "slope":
-        # tan theta / cos gamma, without dividing by the cosine.
-        return gamma / DEG, math.atan2(x, math.hypot(y, z) * math.cos(gamma)) / DEG
-    return gamma / DEG, math.atan2(x, math.hypot(y, z)) / DEG
+        return np.asarray(np.stack([np.arcsin(-y), np.arcsin(x)], axis=-1) / DEG)
+    # By slope tan theta / cos gamma, with cos gamma = -z / hypot.
+    across = -z if law == "slope" else np.hypot(y, z)
+    return np.asarray(np.stack([np.arctan2(-y, -z), np.arctan2(x, across)], axis=-1) / DEG)
 
 
 def up_jacobian(law: Law, x_deg: float, y_deg: float) -> Matrix:

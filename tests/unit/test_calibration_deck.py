@@ -11,7 +11,7 @@ import pytest
 
 from companion.calibration.deck.deck import Deck
 from companion.calibration.deck.estimate import DeckFound
-from companion.calibration.deck.fluid import Fluid, Level, readings_deg
+from companion.calibration.deck.fluid import Fluid, Level
 from companion.calibration.deck.smoother import passage
 from companion.calibration.deck.stream import Surroundings
 from companion.calibration.deck.waves import Wander, Waves, fit_waves, whitened
@@ -21,7 +21,6 @@ from companion.calibration.noise.allan import PROFILES
 from companion.calibration.seconds.batch import Batch, summary
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import rotations, running_products
-from companion.physics.gradienter import Law, readings_from_up
 from sim.accuracy.deck import Voyage, feed, sail
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array, body_from_ned
@@ -70,13 +69,6 @@ def test_running_products_are_products() -> None:
     for turn, found in zip(turns, running_products(turns), strict=True):
         whole = whole @ turn
         assert np.allclose(whole, found)
-
-
-@pytest.mark.parametrize("law", ["axis", "slope", "euler"])
-def test_laws_are_those_of_the_gradienter(law: Law) -> None:
-    for x, y, z in np.array([0.0, 0.0, -4.0]) + np.random.default_rng(3).normal(size=(20, 3)):
-        up = np.array([x, y, z])
-        assert np.allclose(readings_deg(law, up[None])[0], readings_from_up(law, up / np.linalg.norm(up)))
 
 
 def test_the_fluid_follows_as_a_first_order_lag_does() -> None:

@@ -178,7 +178,9 @@ def test_readings_are_those_of_the_simulator_and_lead_back(law: Law) -> None:
     rng = np.random.default_rng(8)
     for pitch, roll in rng.uniform(-35.0, 35.0, (50, 2)):
         aircraft = VirtualAircraft(Pose(pitch, roll, 12.0), site_at(40.0, 116.0, 50.0))
-        up = aircraft.truth_at(0.0).force_m_s2 / aircraft.site.gravity_m_s2
-        readings = readings_from_up(law, up)
+        force = aircraft.truth_at(0.0).force_m_s2
+        up = force / aircraft.site.gravity_m_s2
+        readings, others = readings_from_up(law, np.array([force, -2.0 * force]))
+        assert others == pytest.approx(readings_from_up(law, -up))
         assert readings == pytest.approx(SimGradienter(aircraft, law=law).tilt_deg(np.array([0.0]))[0], abs=1e-9)
         assert up_in_sensor(law, *readings) == pytest.approx(up, abs=1e-12)

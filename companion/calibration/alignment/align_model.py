@@ -263,7 +263,7 @@ class Model:
         stand = self.stands[k]
         if stand.tilt_deg is None:
             return
-        x_deg, y_deg = readings_from_up(self._law, self._mounting.T @ up)
+        x_deg, y_deg = readings_from_up(self._law, self._mounting.T @ up).tolist()
         read = np.array([math.remainder(a - b, 360.0) for a, b in zip(stand.tilt_deg, (x_deg, y_deg), strict=True)])
         # On the sphere of directions the readings' Jacobian is the left inverse of that of the direction.
         by_up = np.linalg.pinv(up_jacobian(self._law, x_deg, y_deg)) @ self._mounting.T

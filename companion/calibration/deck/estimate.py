@@ -21,7 +21,7 @@ from companion.calibration.means.warming import drifting
 from companion.calibration.means.windows import ImuInput, ImuWindow, Window
 from companion.calibration.noise.allan import AllanModel, floor_variance, slope_variance
 from companion.errors import CalibrationRefusedError
-from companion.physics.frames import Array, Floats, Matrix, vector
+from companion.physics.frames import Array, Floats, Matrix, body_from_ned, vector
 from companion.physics.gradienter import up_in_sensor, up_jacobian
 from companion.physics.units import DEG, MG
 
@@ -134,7 +134,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
                 x_deg=reference[0], y_deg=reference[1], x_sigma_deg=0.0, y_sigma_deg=0.0, temperature_degc=None
             ),
             heading=None if around.compass is None or last is None else self._heading(last, around.compass),
-            turn_rad_s=None if last is None else vector(_turn_rad_s(self.seconds[0], last)),
+            turn_rad_s=None if last is None else vector(last.turn_rad_s),
         )
         return DeckFound(window, tuple(known for _, triads, _ in found for known in triads))
 
@@ -173,7 +173,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         found = smooth([one.passage for one in seconds], headings, forward, believed)
         direction, own = _felt(found, gradienter, reference, compared)
         gyro_own = found.gyro_covariance
-        mean_rate = np.linalg.norm(_turn_rad_s(seconds, found))
+        mean_rate = np.linalg.norm(found.turn_rad_s)
         steps = _hidden_steps(imu, seconds)
         going_on = np.square(found.ramp_rad_s2 * self.horizon_s / 2.0) / 3.0
         gyro, accel = imu.profile.gyro, imu.profile.accel
@@ -187,6 +187,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         covariance[:3, :3] = gyro_own + np.diag(gyro_floor)
         covariance[3:, 3:] = own + np.diag(accel_floor)
         use = np.sqrt(np.diag(covariance))
+        heading_rad = math.atan2(found.body_to_ned[-1, 1, 0], found.body_to_ned[-1, 0, 0])
         temperatures = [one.temperature_degc for one in seconds if one.temperature_degc is not None]
         window = ImuWindow(
             name=imu.name,
@@ -203,7 +204,8 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             drifting=drifting(imu.name, np.append(found.ramp_rad_s2, np.zeros(3)), temperatures),
             named=imu.profile.is_named,
             covariance=covariance,
-            by_earth=found.by_earth @ _level_axes(found.body_to_ned[-1]),
+            # Of its level axes: along the heading, to the right of it, and down.
+            by_earth=found.by_earth @ body_from_ned(0.0, 0.0, heading_rad).T,
         )
         worst = int(np.argmax(use[:3]))
         gyros = Known(
@@ -304,20 +306,6 @@ def _felt(
 def _up(gradienter: GradienterModel, x_deg: float, y_deg: float) -> Array:
     """(3,) up in the vehicle's axes by readings without an offset: which zero is in force is known later."""
     return gradienter.vehicle_from_sensor @ up_in_sensor(gradienter.law, x_deg, y_deg)
-
-
-def _level_axes(body_to_ned: Matrix) -> Matrix:
-    """(3, 3) to NED from the level axes along the heading, to the right of it, and down."""
-    heading = math.atan2(body_to_ned[1, 0], body_to_ned[0, 0])
-    c, s = math.cos(heading), math.sin(heading)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _turn_rad_s(seconds: Sequence[ImuSecond], found: Found) -> Array:
-    """(3,) how fast it turned on the mean, in its own axes."""
-    whole = np.sum([one.passage.turn for one in seconds], axis=0)
-    turned = np.array([whole[2, 1] - whole[1, 2], whole[0, 2] - whole[2, 0], whole[1, 0] - whole[0, 1]]) / 2.0
-    return turned / sum(one.passage.span_s for one in seconds) - found.gyro_rad_s
 
 
 def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:

@@ -17,8 +17,7 @@ import numpy as np
 from companion.calibration.deck.waves import Waves, fit_waves, whitened
 from companion.calibration.means.pose import GradienterModel
 from companion.physics.frames import Array, Floats, Matrix
-from companion.physics.gradienter import Law
-from companion.physics.units import DEG
+from companion.physics.gradienter import readings_from_up
 
 
 class Level(msgspec.Struct, frozen=True):
@@ -38,17 +37,6 @@ class Compared(NamedTuple):
     covariance_deg2: Matrix
 
 
-def readings_deg(law: Law, up: Floats) -> Floats:
-    """(n, 2) what a gradienter of this law reads for forces (n, 3) in its own axes; as `physics.readings_from_up`."""
-    x, y, z = (up / np.linalg.norm(up, axis=1, keepdims=True)).T
-    if law == "axis":
-        return np.asarray(np.column_stack([np.arcsin(-y), np.arcsin(x)]) / DEG)
-    # By slope: tan theta / cos gamma with cos gamma = -z / hypot.
-    return np.asarray(
-        np.column_stack([np.arctan2(-y, -z), np.arctan2(x, -z if law == "slope" else np.hypot(y, z))]) / DEG
-    )
-
-
 class Fluid:
     """What the gradienter would show of one IMU's specific force."""
 
@@ -59,7 +47,7 @@ class Fluid:
 
     def follow(self, times_s: Floats, forces_m_s2: Floats) -> Floats:
         """(n, 2) after its lag, for forces (n, 3) in the vehicle's axes; exact for a tilt that changes evenly."""
-        felt = readings_deg(self._law, forces_m_s2 @ self._turn)
+        felt = readings_from_up(self._law, forces_m_s2 @ self._turn)
         if self._lag_s <= 0.0:
             return felt
         found = np.empty_like(felt)

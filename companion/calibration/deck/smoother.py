@@ -22,7 +22,16 @@ import msgspec
 import numpy as np
 
 from companion.calibration.deck.waves import Wander, Waves, fit_waves, whitened
-from companion.physics.frames import Array, Floats, Matrix, rotations, running_products, skews
+from companion.physics.frames import (
+    Array,
+    Floats,
+    Matrix,
+    body_from_ned,
+    roll_pitch_from_up,
+    rotations,
+    running_products,
+    skews,
+)
 
 EARTH_RATE_NORTH_RAD_S: Final = 5.2e-5
 """W cos L halfway between the equator and 65 degrees: what is left of it, once the latitude is known, is linear."""
@@ -68,6 +77,8 @@ class Found:
     """(3, 3): `gyro_rad_s` is the bias and this times the Earth's rate (NED)."""
     ramp_rad_s2: Array
     """(3,) zero where none is plain."""
+    turn_rad_s: Array
+    """(3,) how fast it turned on the mean."""
     force_m_s2: float
     """Mean specific force along the vertical, up."""
     force_sigma_m_s2: float
@@ -102,6 +113,13 @@ class _Stretch:
         """(n + 1,) times of the knots, from zero."""
         return np.concatenate([[0.0], np.cumsum(self.spans)])
 
+    @property
+    def rate(self) -> Array:
+        """(3,) the mean by the gyros, with their bias: swaying comes back."""
+        whole = self.turn.sum(axis=0)
+        turned = np.array([whole[2, 1] - whole[1, 2], whole[0, 2] - whole[2, 0], whole[1, 0] - whole[0, 1]]) / 2.0
+        return np.asarray(turned / self.spans.sum())
+
     def attitudes(self, start: Matrix, bias: Array) -> Floats:
         """(n + 1, 3, 3) body to NED, by gyros with this bias."""
         steps = rotations(-(self.turned @ bias)) @ self.turn
@@ -116,16 +134,6 @@ class _Stretch:
         return np.asarray(np.einsum("nij,nj->ni", attitudes[:-1], felt) / self.spans[:, None])
 
 
-def level_attitude(force: Array, heading_rad: float) -> Matrix:
-    """Body to NED, from a specific force that is up and a heading."""
-    down = -force / np.linalg.norm(force)
-    forward = np.array([1.0, 0.0, 0.0]) - down * down[0]
-    forward /= np.linalg.norm(forward)
-    c, s = math.cos(heading_rad), math.sin(heading_rad)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(turn @ np.array([forward, np.cross(down, forward), down]))
-
-
 def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: Array, believed: Believed) -> Found:
     """Work it out, of at least ten passages, one after another without a gap.
 
@@ -134,9 +142,8 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
     """
     stretch = _Stretch.of(passages)
     known = headings_rad[np.isfinite(headings_rad)]
-    start = level_attitude(
-        stretch.velocity[: len(passages) // 4 + 1].sum(axis=0), float(known[0]) if len(known) else 0.0
-    )
+    up = stretch.velocity[: len(passages) // 4 + 1].sum(axis=0)
+    start = body_from_ned(*roll_pitch_from_up(up), float(known[0]) if len(known) else 0.0).T
     bias, ramp = _coarse_bias(stretch, start, headings_rad), np.zeros(3)
     noise: tuple[Waves, Waves] | None = None
     for _ in range(_ROUNDS):
@@ -156,7 +163,7 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
         ramping = system.solve(system.noise(ramping), believed, _UNKNOWNS)
         bias = bias + ramping.values[_GYRO]
         answer, ramp = ramping, ramping.values[_RAMP]
-    up, up_sigma = _mean_up(-forces[:, 2], stretch.spans, believed.accel_white)
+    force, force_sigma = _mean_up(-forces[:, 2], stretch.spans, believed.accel_white)
     # What the Earth was taken to do beforehand is put back: `by_earth` is of all of it.
     bias = bias + answer.by_earth[_GYRO] @ np.array([EARTH_RATE_NORTH_RAD_S, 0.0, 0.0])
     return Found(
@@ -164,8 +171,9 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
         gyro_covariance=answer.covariance[_GYRO, _GYRO],
         by_earth=answer.by_earth[_GYRO],
         ramp_rad_s2=ramp,
-        force_m_s2=up,
-        force_sigma_m_s2=up_sigma,
+        turn_rad_s=stretch.rate - bias,
+        force_m_s2=force,
+        force_sigma_m_s2=force_sigma,
         body_to_ned=attitudes,
         heading_sigma_rad=math.sqrt(noise[1].variance / max(len(known), 1)),
     )
@@ -176,14 +184,11 @@ def _coarse_bias(stretch: _Stretch, start: Matrix, headings_rad: Floats) -> Arra
 
     A firmware's own calibration on a boat leaves degrees a second.
     """
-    skew = stretch.turn.sum(axis=0)
-    rate = np.array([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]) / 2.0
-    rate /= stretch.spans.sum()
     known = np.isfinite(headings_rad)
     if known.sum() < 2:
-        return rate
+        return stretch.rate
     turn = np.polyfit(stretch.ends[1:][known], np.unwrap(headings_rad[known]), 1)[0]
-    return np.asarray(rate - turn * start[2])
+    return np.asarray(stretch.rate - turn * start[2])
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
