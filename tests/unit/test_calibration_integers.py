@@ -78,7 +78,7 @@ def sigmas(found: ImuEstimate) -> Floats:
 
 
 def unknown(found: ImuEstimate) -> NDArray[np.bool_]:
-    return np.concatenate([found.gyro.undecided, found.accel.undecided])
+    return found.own.undecided
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.386, 0.5, 1.0])
@@ -113,7 +113,7 @@ def test_noise_behind_a_filter_widens_sigma_by_what_it_scatters_from_second_to_s
     for _ in range(12):
         mean = rng.uniform(-3.0, 3.0, 6) + GRAVITY_LSB
         found = estimate(batches_of(filtered(rng, mean, 0.6, 30, rate_hz, cutoff_hz), rate_hz))
-        whites = np.sqrt(np.concatenate([found.gyro.white_variance, found.accel.white_variance])) / STEPS
+        whites = np.sqrt(found.own.white_variance) / STEPS
         pulls += (errors(found, mean) / whites)[~unknown(found)].tolist()
     assert len(pulls) > 50
     assert 0.75 < math.sqrt(np.mean(np.square(pulls))) < 1.2
@@ -136,7 +136,7 @@ def test_a_ramp_is_followed_to_its_end() -> None:
     off = errors(found, 0.8 + GRAVITY_LSB)
     assert abs(off[0]) * LSB_DEG_H < 15.0
     assert any("drifts" in line for line in found.window.drifting)
-    assert not found.gyro.ramp_per_s[1:].any()
+    assert not found.own.lines.ramp[1:3].any()
 
 
 def test_a_knock_of_three_seconds_moves_the_mean_by_less_than_its_sigma() -> None:
@@ -183,7 +183,7 @@ def test_an_axis_of_two_values_takes_the_noise_of_its_neighbours_with_a_tenth_of
         exact[:, 0] *= ratio
         found = estimate(batches_of(exact + lsb))
         assert found.window.refused("gyro") is None
-        assert found.gyro.undecided.tolist() == [True, False, False]
+        assert unknown(found)[:3].tolist() == [True, False, False]
         off = errors(found, lsb)[0]
         assert abs(off) * LSB_DEG_H < 60.0
         scaled.append(off / sigmas(found)[0])

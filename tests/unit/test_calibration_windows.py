@@ -137,10 +137,10 @@ def test_a_ramp_is_neither_white_noise_nor_flicker() -> None:
     warming = noise + 2.0 * np.arange(60.0)[:, None]
     model = AllanModel(0.5, 0.05, 0.0)
     source = imu("fc", NoiseProfile("made", model, model))
-    (calm, _), (steep, _) = (
+    calm, steep = (
         estimates([source], [batches_of(values)], end_s=160.0, horizon_s=180.0)[0] for values in (noise, warming)
     )
-    assert steep.ramp_per_s == pytest.approx([2.0] * 3, abs=0.05)
+    assert steep.lines.ramp == pytest.approx([2.0] * 6, abs=0.05)
     assert steep.white == pytest.approx(calm.white, rel=0.05)
     assert steep.flicker == pytest.approx(calm.flicker, abs=0.2)
 

@@ -93,39 +93,39 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
         return max(math.floor(self.max_s), self.min_slots)
 
 
-def is_enough(settings: Settings, estimates: Sequence[ImuEstimate]) -> bool:
+def is_enough(settings: Settings, found: Sequence[ImuEstimate]) -> bool:
     """Whether every axis meets its target, or its white part is below 30 % of what averaging cannot remove."""
+    target = _targets(settings)
     return all(
-        bool(_done(triad.white_variance, triad.use_variance, np.asarray(target), _waited_for(settings, triad)).all())
-        for triad, target in _triads(settings, estimates)
+        bool(_done(one.white_variance, one.use_variance, target, _waited_for(settings, one)).all())
+        for one in (each.own for each in found)
     )
 
 
-def expected_s(settings: Settings, estimates: Sequence[ImuEstimate]) -> int:
+def expected_s(settings: Settings, found: Sequence[ImuEstimate]) -> int:
     """Good seconds after which it is expected to be enough, the noise staying as seen so far."""
-    triads = _triads(settings, estimates)
-    if not triads:
+    if not found:
         return settings.min_slots
+    own = [each.own for each in found]
     seconds = np.arange(settings.min_slots, settings.max_slots + 1, dtype=np.float64)[:, None]
-    white = np.square(np.concatenate([triad.white for triad, _ in triads])) / seconds
+    white = np.square(np.concatenate([one.white for one in own])) / seconds
     floor = floor_variance(
-        np.concatenate([triad.flicker for triad, _ in triads]),
-        np.concatenate([triad.walk for triad, _ in triads]),
+        np.concatenate([one.flicker for one in own]),
+        np.concatenate([one.walk for one in own]),
         seconds,
         settings.horizon_s,
     )
-    undecided = np.concatenate([_waited_for(settings, triad) for triad, _ in triads])
-    done = _done(white, white + floor, np.repeat([target for _, target in triads], 3), undecided).all(axis=1)
+    undecided = np.concatenate([_waited_for(settings, one) for one in own])
+    done = _done(white, white + floor, np.tile(_targets(settings), len(own)), undecided).all(axis=1)
     return settings.min_slots + int(done.argmax()) if done.any() else settings.max_slots
 
 
-def _triads(settings: Settings, estimates: Sequence[ImuEstimate]) -> list[tuple[Estimate, float]]:
-    gyros = [(item.gyro, settings.target_gyro_sigma_rad_s) for item in estimates]
-    return gyros + [(item.accel, settings.target_accel_sigma_m_s2) for item in estimates]
+def _targets(settings: Settings) -> Floats:
+    return np.repeat([settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2], 3)
 
 
-def _waited_for(settings: Settings, triad: Estimate) -> NDArray[np.bool_]:
-    return triad.undecided & (not settings.dither)
+def _waited_for(settings: Settings, own: Estimate) -> NDArray[np.bool_]:
+    return own.undecided & (not settings.dither)
 
 
 def _done(white: Floats, use: Floats, target: Floats, undecided: NDArray[np.bool_]) -> NDArray[np.bool_]:

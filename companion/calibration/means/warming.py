@@ -244,15 +244,17 @@ def _resolution_k(degc: Floats) -> float:
 
 
 class Lines(NamedTuple):
-    """Of gyro and accelerometer, (6,), sensor's axes; variances are infinite where the window tells nothing."""
+    """Slopes of gyro and accelerometer, (6,), sensor's axes; variances are infinite where the window tells nothing."""
 
     hidden: Floats
-    """Slopes, zero of ramps that were seen."""
+    """Of those that are not significant; zero of the others."""
     hidden_variance: Floats
     ramp: Floats
+    """Of those that are."""
     variance: Floats
-    """Of the slopes, ramps too."""
+    """Of both."""
     level_variance: Floats
+    """Of the mean over the window for the next minutes, as if there were no ramp."""
 
 
 def warming(rotation: Matrix, lines: Lines, warm_up: tuple[float, float], batches: Sequence[Batch]) -> Warming:

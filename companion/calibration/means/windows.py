@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -139,7 +139,7 @@ class Window(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
-    """One triad in the sensor's own axes; arrays are (3,)."""
+    """One IMU in its own axes; arrays are (6,), gyro in rad/s, then accelerometer in m/s^2."""
 
     mean: Floats
     stat_variance: Floats
@@ -150,16 +150,7 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     """N in force: measured, or the profile's where that is larger."""
     flicker: Floats
     walk: Floats
-    ramp_per_s: Floats
-    """Zero where no ramp is significant."""
-    slope_per_s: Floats
-    """Of those that are not significant; zero of the others."""
-    slope_variance: Floats
-    """Of `slope_per_s`; infinite where the window is too short for a line."""
-    line_variance: Floats
-    """The same, of ramps too."""
-    level_variance: Floats
-    """`use_variance` of the mean over the window, as if there were no ramp."""
+    lines: Lines
     half_step: NDArray[np.bool_]
     """Fewer than 3 distinct readings; of a stream of integers, too few outside the two commonest."""
     undecided: NDArray[np.bool_]
@@ -170,18 +161,17 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     """Of integers: displacement of their edges, in steps, for which sigma allows (`quantised.shape_variance`)."""
 
 
-class ImuEstimate(msgspec.Struct, frozen=True, kw_only=True):
-    """Both triads of one IMU, and its window."""
+class ImuEstimate(msgspec.Struct, frozen=True):
+    """Of one IMU, and its window."""
 
-    gyro: Estimate
-    accel: Estimate
+    own: Estimate
     window: ImuWindow
 
 
 def estimates(
     imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float
-) -> list[tuple[Estimate, Estimate]]:
-    """Gyro and accelerometer of every IMU over the same good seconds, at least 2, each in its sensor's axes.
+) -> list[Estimate]:
+    """Every IMU over the same good seconds, at least 2.
 
     All columns of all IMUs go through each step at once: numpy's cost is by the call, not by the column. A ramp is
     evaluated at the end of the window, `end_s`, and never later; `horizon_s` is H of V(T, H).
@@ -216,8 +206,14 @@ def estimates(
     use = white_part + rest + going_on
     of_line = np.square(white) / max(float(np.square(slots - slots.mean()).sum()), 1.0) + wander
     of_line = np.where(np.isnan(hidden), np.inf, of_line + 3.0 * np.square(quantum / (end_s - slots[0])))
-
-    columns: dict[str, Any] = {
+    lines = Lines(
+        hidden=np.nan_to_num(hidden),
+        hidden_variance=np.where(slope != 0.0, 0.0, of_line),
+        ramp=slope,
+        variance=of_line,
+        level_variance=np.square(white) / seconds + rest,
+    )
+    figures = {
         "mean": mean,
         "stat_variance": stat,
         "use_variance": use,
@@ -225,21 +221,15 @@ def estimates(
         "white": white,
         "flicker": flicker,
         "walk": walk,
-        "ramp_per_s": slope,
-        "slope_per_s": np.nan_to_num(hidden),
-        "slope_variance": np.where(slope != 0.0, 0.0, of_line),
-        "line_variance": of_line,
-        "level_variance": np.square(white) / seconds + rest,
         "half_step": half_step,
         "undecided": whole.unknown,
         "useless": whole.useless,
         "edge_rms": whole.edge_rms,
     }
-    triads = [
-        Estimate(**{name: figures[at : at + 3] for name, figures in columns.items()})
-        for at in range(0, 6 * len(imus), 3)
+    return [
+        Estimate(lines=Lines(*(each[part] for each in lines)), **{name: each[part] for name, each in figures.items()})
+        for part in (slice(at, at + 6) for at in range(0, 6 * len(imus), 6))
     ]
-    return list(zip(triads[::2], triads[1::2], strict=True))
 
 
 def _levelled(
@@ -310,40 +300,35 @@ def imu_estimates(
         return []
     for imu, own in zip(imus, batches, strict=True):
         refuse_broken(imu.name, (imu.gyro_step_rad_s, imu.accel_step_m_s2), own)
-    triads = estimates(imus, batches, end_s=end_s, horizon_s=horizon_s)
-    return [_imu_estimate(imu, own, *both, rejected) for imu, own, both in zip(imus, batches, triads, strict=True)]
+    found = estimates(imus, batches, end_s=end_s, horizon_s=horizon_s)
+    return [
+        ImuEstimate(own, _imu_window(imu, seconds, own, rejected))
+        for imu, seconds, own in zip(imus, batches, found, strict=True)
+    ]
 
 
-def _imu_estimate(
-    imu: ImuInput, batches: Sequence[Batch], gyro: Estimate, accel: Estimate, rejected: int
-) -> ImuEstimate:
+def _imu_window(imu: ImuInput, batches: Sequence[Batch], found: Estimate, rejected: int) -> ImuWindow:
     temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
     rotation = np.asarray(imu.rotation, dtype=np.float64)
-    lines = Lines(
-        *(
-            np.concatenate([getattr(gyro, each), getattr(accel, each)])
-            for each in ("slope_per_s", "slope_variance", "ramp_per_s", "line_variance", "level_variance")
-        )
-    )
-    window = ImuWindow(
+    gyro, accel = slice(0, 3), slice(3, 6)
+    return ImuWindow(
         name=imu.name,
         samples=sum(batch.n for batch in batches),
         duration_s=float(len(batches)),
-        gyro_rad_s=vector(rotation @ gyro.mean),
-        accel_m_s2=vector(rotation @ accel.mean),
-        gyro_sigma_stat_rad_s=_turned(rotation, gyro.stat_variance),
-        accel_sigma_stat_m_s2=_turned(rotation, accel.stat_variance),
-        gyro_sigma_use_rad_s=_turned(rotation, gyro.use_variance),
-        accel_sigma_use_m_s2=_turned(rotation, accel.use_variance),
+        gyro_rad_s=vector(rotation @ found.mean[gyro]),
+        accel_m_s2=vector(rotation @ found.mean[accel]),
+        gyro_sigma_stat_rad_s=_turned(rotation, found.stat_variance[gyro]),
+        accel_sigma_stat_m_s2=_turned(rotation, found.stat_variance[accel]),
+        gyro_sigma_use_rad_s=_turned(rotation, found.use_variance[gyro]),
+        accel_sigma_use_m_s2=_turned(rotation, found.use_variance[accel]),
         temperature_degc=float(np.mean(temperatures)) if temperatures else None,
-        warnings=tuple(_warnings(imu, batches, gyro, accel, rejected)),
-        hidden=_hidden(imu, gyro, accel),
+        warnings=tuple(_warnings(imu, batches, found, rejected)),
+        hidden=_hidden(imu, found),
         named=imu.profile.is_named,
         mounting=(vector(rotation[0]), vector(rotation[1]), vector(rotation[2])),
-        warming=warming(rotation, lines, imu.profile.warm_up, batches),
-        drifting=drifting(imu.name, lines.ramp, temperatures),
+        warming=warming(rotation, found.lines, imu.profile.warm_up, batches),
+        drifting=drifting(imu.name, found.lines.ramp, temperatures),
     )
-    return ImuEstimate(gyro=gyro, accel=accel, window=window)
 
 
 def _turned(rotation: Floats, variance: Floats) -> Vector:
@@ -351,23 +336,24 @@ def _turned(rotation: Floats, variance: Floats) -> Vector:
     return vector(np.sqrt(np.square(rotation) @ variance))
 
 
-def _hidden(imu: ImuInput, gyro: Estimate, accel: Estimate) -> dict[Triad, Hidden]:
+def _hidden(imu: ImuInput, own: Estimate) -> dict[Triad, Hidden]:
     found: dict[Triad, Hidden] = {}
     part: Triad
     for part, triad, step, grid, unit in (
-        ("gyro", gyro, f"{imu.gyro_step_rad_s / DEG_H:.0f} deg/h", imu.gyro_grid_rad_s / DEG_H, "deg/h"),
-        ("accel", accel, f"{imu.accel_step_m_s2 / MG:.1f} mg", imu.accel_grid_m_s2 / MG, "mg"),
+        ("gyro", slice(0, 3), f"{imu.gyro_step_rad_s / DEG_H:.0f} deg/h", imu.gyro_grid_rad_s / DEG_H, "deg/h"),
+        ("accel", slice(3, 6), f"{imu.accel_step_m_s2 / MG:.1f} mg", imu.accel_grid_m_s2 / MG, "mg"),
     ):
-        if triad.undecided.any():
-            useless = bool(triad.useless.any())
-            axes = _axes(triad.useless if useless else triad.undecided)
+        undecided, useless_axes = own.undecided[triad], own.useless[triad]
+        if undecided.any():
+            useless = bool(useless_axes.any())
+            axes = _axes(useless_axes if useless else undecided)
             what = "around 0 the mean is not known" if useless else "up to half a step may be hidden, sigma widened"
             found[part] = Hidden(
                 f"{part} {imu.name} {axes}: integer steps of {step} and too little noise for them, {what}; set"
                 " push.dither = true",
                 useless,
             )
-        elif grid > 0.0 and (triad.edge_rms > EDGE_RMS).any():
+        elif grid > 0.0 and (own.edge_rms[triad] > EDGE_RMS).any():
             found[part] = Hidden(
                 f"{part} {imu.name}: the sensor has coarse steps of its own ({grid:.3g} {unit}) below"
                 " the integers, sigma widened; push.dither = true takes them away",
@@ -380,12 +366,14 @@ def _axes(which: NDArray[np.bool_]) -> str:
     return "".join(axis for axis, is_it in zip("xyz", which.tolist(), strict=True) if is_it)
 
 
-def _warnings(imu: ImuInput, batches: Sequence[Batch], gyro: Estimate, accel: Estimate, rejected: int) -> list[str]:
+def _warnings(imu: ImuInput, batches: Sequence[Batch], own: Estimate, rejected: int) -> list[str]:
     found: list[str] = []
-    for part, triad, grid in (("gyro", gyro, imu.gyro_grid_rad_s), ("accel", accel, imu.accel_grid_m_s2)):
-        if axes := _axes(triad.half_step & ~triad.undecided):
+    few, uneven = own.half_step & ~own.undecided, own.edge_rms > EDGE_RMS
+    parts = (("gyro", slice(0, 3), imu.gyro_grid_rad_s), ("accel", slice(3, 6), imu.accel_grid_m_s2))
+    for part, triad, grid in parts:
+        if axes := _axes(few[triad]):
             found.append(f"{part} {imu.name} {axes}: fewer than 3 distinct readings, half a step may be hidden")
-        if not grid and (axes := _axes(triad.edge_rms > EDGE_RMS)):
+        if not grid and (axes := _axes(uneven[triad])):
             why = "a coarser step inside the sensor?"
             found.append(f"{part} {imu.name} {axes}: integers not spread like noise ({why}), sigma widened")
     if (share := lost(batches)) > _LOST_WARNING:

@@ -152,9 +152,7 @@ def _estimated(windows: Sequence[Sequence[Batch]], profile: NoiseProfile, next_s
     imu = ImuInput(name="", rotation=np.eye(3), profile=profile)
     end_s = windows[0][-1].slot + 1.0
     found = estimates([imu] * len(windows), windows, end_s=end_s, horizon_s=float(next_s))
-    mean = [np.concatenate([gyro.mean, accel.mean]) for gyro, accel in found]
-    use = [np.concatenate([gyro.use_variance, accel.use_variance]) for gyro, accel in found]
-    return np.array(mean), np.array(use)
+    return np.array([each.mean for each in found]), np.array([each.use_variance for each in found])
 
 
 def _summary(triad: Triad, columns: slice, mean_s: int, misses: _Misses) -> Kept:
