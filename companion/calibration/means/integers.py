@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.means.quantised import MIN_BEYOND_TWO, Cells, Fit, fit, shape_variance, truncation_edges
 from companion.calibration.noise.robust import HUBER_C as FLOAT_HUBER_C
-from companion.calibration.noise.robust import median
+from companion.calibration.noise.robust import MAD_TO_SIGMA, median
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
 
@@ -41,7 +41,6 @@ _LEAST_SPREAD: Final = 0.3
 _CORE_MARGIN: Final = 3
 _MAX_REACH: Final = 1024
 _CELLS_PER_SIGMA: Final = 4.0
-_MAD_TO_SIGMA: Final = 1.4826
 
 
 class IntegerColumns(msgspec.Struct, frozen=True):
@@ -106,31 +105,32 @@ def _work_out(batches: Sequence[Batch], steps: Floats, edges: Floats, result: In
     plain = np.array([batch.mean for batch in batches]) / steps
     start, tables = _aligned(batches, plain, steps)
     pooled = tables.sum(axis=0)
-    width = _widths(pooled, start)
+    integers = start + np.arange(len(pooled), dtype=np.int64)[:, None]
+    width = _widths(pooled, integers)
     bounds, grouped = _grouped(tables, start, width)
     weight = np.ones_like(plain)
-    found, values, scale = _linearised(bounds, grouped, sizes, weight, None, None)
+    found, values, scale = _linearised(bounds, grouped, sizes, weight, None)
     own = found.identified
     sigma = _borrowed(found, grouped.sum(axis=0))
     slope = np.zeros(len(steps))
     if sigma is not None and not own.all():
-        found, values, scale = _linearised(bounds, grouped, sizes, weight, sigma, None)
+        found, values, scale = _linearised(bounds, grouped, sizes, weight, sigma)
         other = fit(Cells(bounds, grouped.sum(axis=0)), sigma * (1.0 + BORROWED_RMS))
         slope = np.where(found.identified & ~own, np.abs(other.mean - found.mean), 0.0)
-    outside = np.abs(values - median(values)) > _OUTLIER * np.maximum(scale, _mad(values))
+    centre = median(values)
+    outside = np.abs(values - centre) > _OUTLIER * np.maximum(scale, MAD_TO_SIGMA * median(np.abs(values - centre)))
     outside &= found.identified
     if outside.any():
         weight = np.where(outside, 0.0, 1.0)
-        found, values, scale = _linearised(bounds, grouped, sizes, weight, sigma, (found.mean, found.sigma))
+        found, values, scale = _linearised(bounds, grouped, sizes, weight, sigma)
     cells = Cells(bounds, (grouped * weight[:, None, :]).sum(axis=0))
     second = np.sqrt(found.variance * cells.counts.sum(axis=0) / sizes.mean())
     dispersion = _dispersion(values, second)
     shape, edge = shape_variance(cells, found, dispersion, edges)
-    has_zero = _share_of_zero(pooled, start) > 0.0
-    known = found.identified
-    sided = np.abs(_sides(pooled, start)) == 1.0
-    unknown = np.where(sided, HALF_STEP, NO_SIDE)
-    means = _half_step_means(tables, start, pooled, plain)
+    has_zero = ((integers == 0) & (pooled > 0.0)).any(axis=0)
+    known, side = found.identified, _sides(pooled, integers)
+    unknown = np.where(np.abs(side) == 1.0, HALF_STEP, NO_SIDE)
+    means = _half_step_means(tables, integers, side, plain)
     of = result.of[part]
     result.values[:, part] = np.where(known, values, means) * steps
     result.least[part] = np.where(of & known, second, 0.0) * steps
@@ -154,15 +154,10 @@ def _borrowed(found: Fit, counts: Floats) -> Floats | None:
 
 
 def _linearised(
-    edges: Floats,
-    grouped: Floats,
-    sizes: Floats,
-    weight: Floats,
-    sigma: Floats | None,
-    start: tuple[Floats, Floats] | None,
+    edges: Floats, grouped: Floats, sizes: Floats, weight: Floats, sigma: Floats | None
 ) -> tuple[Fit, Floats, Floats]:
     """The fit of the weighted counts, every second's own mean (m, c), and the sigma of those."""
-    found = fit(Cells(edges, (grouped * weight[:, None, :]).sum(axis=0)), sigma, start)
+    found = fit(Cells(edges, (grouped * weight[:, None, :]).sum(axis=0)), sigma)
     inside = np.maximum(grouped.sum(axis=1), 1.0)
     values = found.mean + np.einsum("mkc,kc->mc", grouped, found.influence) / inside
     total = (weight * sizes[:, None]).sum(axis=0)
@@ -196,9 +191,8 @@ def _aligned(batches: Sequence[Batch], plain: Floats, steps: Floats) -> tuple[In
     return start, tables
 
 
-def _widths(pooled: Floats, start: Integers) -> Integers:
+def _widths(pooled: Floats, integers: Integers) -> Integers:
     """(c,) how many integers go into one cell: a quarter of sigma, so that wide noise costs no more than narrow."""
-    integers = start + np.arange(len(pooled), dtype=np.int64)[:, None]
     total = np.maximum(pooled.sum(axis=0), 1.0)
     mean = (pooled * integers).sum(axis=0) / total
     sigma = np.sqrt((pooled * np.square(integers - mean)).sum(axis=0) / total)
@@ -221,30 +215,18 @@ def _grouped(tables: Floats, start: Integers, width: Integers) -> tuple[Floats, 
     return truncation_edges(start + first - width, cells, width), counts
 
 
-def _half_step_means(tables: Floats, start: Integers, pooled: Floats, plain: Floats) -> Floats:
+def _half_step_means(tables: Floats, integers: Integers, side: Floats, plain: Floats) -> Floats:
     """(m, c) where there is no fit: the plain means, half a step further from zero."""
-    integers = start + np.arange(len(pooled), dtype=np.int64)[:, None]
-    shift = np.where(integers == 0, np.sign(_sides(pooled, start)), np.sign(integers)) * HALF_STEP
+    shift = np.where(integers == 0, side, np.sign(integers)) * HALF_STEP
     counted = tables.sum(axis=1)
     moved = np.einsum("mkc,kc->mc", tables, integers + shift) / np.maximum(counted, 1.0)
     return np.where(counted > 0.0, moved, plain + np.sign(plain) * HALF_STEP)
 
 
-def _sides(pooled: Floats, start: Integers) -> Floats:
+def _sides(pooled: Floats, integers: Integers) -> Floats:
     """(c,) +1 or -1 where all readings that are not zero lie on that side; 0 where there are both or none."""
-    integers = start + np.arange(len(pooled), dtype=np.int64)[:, None]
-    positive = (pooled * (integers > 0)).sum(axis=0) > 0.0
-    negative = (pooled * (integers < 0)).sum(axis=0) > 0.0
-    return np.asarray(positive.astype(np.float64) - negative.astype(np.float64))
-
-
-def _share_of_zero(pooled: Floats, start: Integers) -> Floats:
-    integers = start + np.arange(len(pooled), dtype=np.int64)[:, None]
-    return np.asarray((pooled * (integers == 0)).sum(axis=0))
-
-
-def _mad(values: Floats) -> Floats:
-    return np.asarray(_MAD_TO_SIGMA * median(np.abs(values - median(values))))
+    sides = np.sign(integers) * (pooled > 0.0)
+    return np.asarray(sides.max(axis=0, initial=0) + sides.min(axis=0, initial=0), dtype=np.float64)
 
 
 def _dispersion(values: Floats, second: Floats) -> Floats:

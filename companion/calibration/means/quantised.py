@@ -91,11 +91,11 @@ def beyond_two(counts: Floats) -> Floats:
     return np.asarray(np.sort(counts, axis=0)[:-2].sum(axis=0))
 
 
-def fit(cells: Cells, sigma: Floats | None = None, start: tuple[Floats, Floats] | None = None) -> Fit:
+def fit(cells: Cells, sigma: Floats | None = None) -> Fit:
     """Maximum-likelihood mean, and sigma unless it is given.
 
     `sigma` (c,) of the noise where it is known from elsewhere, NaN in a column where it is not; a wrong one is worse
-    than none (0.33 instead of 0.386 LSB makes 14 deg/h, autopilots 9.3.2). `start`: mean and sigma near the solution.
+    than none (0.33 instead of 0.386 LSB makes 14 deg/h, autopilots 9.3.2).
     """
     known = np.zeros(cells.counts.shape[1], dtype=np.bool_) if sigma is None else sigma > 0.0
     occupied = (cells.counts > 0.0).sum(axis=0)
@@ -111,15 +111,11 @@ def fit(cells: Cells, sigma: Floats | None = None, start: tuple[Floats, Floats] 
     middle = (cells.edges[1:] + cells.edges[:-1]) / 2.0
     centre = (counts * middle).sum(axis=0) / total
     spread = np.sqrt(np.maximum((counts * np.square(middle - centre)).sum(axis=0) / total - 1.0 / 12.0, 0.04))
-    offset = np.zeros_like(centre)
-    if start is not None:
-        offset = np.where(identified, start[0] - centre, 0.0)
-        spread = np.where(identified & (start[1] > 0.0), start[1], spread)
     if sigma is not None:
         spread = np.where(sigma > 0.0, np.maximum(sigma, LEAST_SIGMA), spread)
     edges = cells.edges - centre
     h = 1.0 / spread
-    a = offset * h
+    a = np.zeros_like(centre)
     state = _state(edges, counts, a, h)
     for _ in range(_ROUNDS):
         step_a, step_h = _newton(state, known)

@@ -130,7 +130,7 @@ def floor_variance(flicker: Floats | float, walk: Floats | float, mean_s: Floats
     )
 
 
-def slope_variance(flicker: Floats, walk: Floats, mean_s: float) -> Floats:
+def slope_variance(flicker: Floats | float, walk: Floats | float, mean_s: float) -> Floats:
     """Variance of a straight line's slope over `mean_s` seconds that flicker and random walk make where there is none.
 
     The line's weights on the generalised covariance -(B^2 / pi) ln|t| - (K^2 / 2)|t| of method section 2.2: the double

@@ -21,7 +21,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.noise.allan import FLOOR_OF_FLICKER, WARM_UP_K, AllanModel, NoiseProfile, floor_variance
+from companion.calibration.noise.allan import (
+    FLOOR_OF_FLICKER,
+    WARM_UP_K,
+    AllanModel,
+    NoiseProfile,
+    floor_variance,
+    slope_variance,
+)
 from companion.calibration.noise.allan_fit import AxisFit, curve, fit_axis, not_negative
 from companion.calibration.seconds.batch import Batch, summary
 from companion.calibration.stillness.gates import ImuGate
@@ -149,7 +156,6 @@ DRIFT_LEAST_S: Final = 300
 MEAN_S: Final = 60.0
 HORIZON_S: Final = 180.0
 """The minutes for which a drift must be allowed for: a calibration's mean, and what it is used for."""
-_BLOCKS: Final = 64
 _AXES: Final = "xyz"
 _NAMES: Final = ("N", "B", "K")
 
@@ -262,18 +268,9 @@ def _without_line(rest: Rest) -> tuple[Floats, Floats]:
 
 def _slope_sigma(rest: Rest, figures: tuple[float, float, float]) -> float:
     """Standard error of a least squares slope over the stretch under such noise."""
-    span_s = float(rest.slots[-1] - rest.slots[0] + 1)
-    centres = (np.arange(_BLOCKS) + 0.5) * span_s / _BLOCKS
-    weights = (centres - centres.mean()) / float(np.square(centres - centres.mean()).sum())
-    lags = np.abs(centres[:, None] - centres[None, :])
-    block = span_s / _BLOCKS
     white, flicker, walk = figures
-    # Generalised covariance of block averages; for lags of a block and more the averaging changes flicker by 1 %.
-    near = np.where(lags > 0.0, lags, block * math.exp(-1.5))
-    covariance = -(flicker**2 / math.pi) * np.log(near) - walk**2 / 2.0 * lags
-    covariance[np.diag_indices(_BLOCKS)] += white**2 / block
-    variance = float(weights @ covariance @ weights)
-    return math.sqrt(max(variance, white**2 * 12.0 / span_s**3))
+    span_s = float(rest.slots[-1] - rest.slots[0] + 1)
+    return math.sqrt(12.0 * white**2 / span_s**3 + float(slope_variance(flicker, walk, span_s)))
 
 
 HORIZONS_S: Final = tuple(itertools.product((10, 30, 60), (60, 180)))
