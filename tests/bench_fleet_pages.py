@@ -1,4 +1,4 @@
-"""How long the fleet's pages take with five years of a thousand aircraft, and what those weigh.
+"""How long the fleet's pages and judgements take with five years of a thousand aircraft, and what those weigh.
 
 Real requests, one after another, to the server of a `companion fleet run`.
 """
@@ -17,6 +17,7 @@ import sqlalchemy as sa
 
 from companion.fleet import schema
 from companion.fleet.database import engine_of
+from companion.fleet.priors import models
 from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
 from tests.support.broker import broker, free_port
@@ -90,6 +91,31 @@ def sizes(url: str, aircraft: int) -> str:
     return f"{sum(rows.values()):.0f} rows ({words}), {kib:.0f} KiB an aircraft and year"
 
 
+def judging(url: str) -> None:
+    """Of all that nobody has judged yet, one after another."""
+    store, took_ms = Store(url), list[float]()
+    meter, begun_s = Meter(time.process_time), time.perf_counter()
+    while store.judge():
+        took_ms.append(1e3 * (time.perf_counter() - begun_s))
+        begun_s = time.perf_counter()
+    store.close()
+    if took_ms:
+        cost = meter.cost(len(took_ms))
+        say(
+            f"judging {len(took_ms)} aircraft",
+            f"{spread(took_ms)};",
+            f"processor {1e3 * cost.own_s / cost.items:.0f} ms each",
+        )
+
+
+def _models(url: str) -> dict[str, int]:
+    engine = engine_of(url, reads_only=True)
+    with engine.connect() as connection:
+        found = models(connection)
+    engine.dispose()
+    return found
+
+
 def _get(port: int, path: str) -> tuple[float, int]:
     """How long a page takes, in ms, and its bytes."""
     begun_s = time.perf_counter()
@@ -110,7 +136,9 @@ async def page_latency(place: Place, url: str, aircraft: int) -> None:
     try:
         await one.at_work()
         of_one = [f"/aircraft/{Aircraft(dice.randrange(aircraft // COPIES)).id}" for _ in range(200)]
-        for words, paths in (("the fleet", ["/"] * 50), ("an aircraft", of_one)):
+        kinds = [("the fleet", ["/"] * 50), ("an aircraft", of_one)]
+        kinds += [(f"a model of {parts} parts", [f"/model/{name}"] * 50) for name, parts in _models(url).items()]
+        for words, paths in kinds:
             await asyncio.to_thread(_get, port, paths[0])
             meter = Meter(lambda: processor_s(one.process_id), lambda: processor_s(place.postgres.process_id))
             found = [await asyncio.to_thread(_get, port, path) for path in paths]
@@ -132,4 +160,5 @@ async def pages(place: Place, urls: Sequence[str], aircraft: int) -> None:
     async with broker(place.folder, "mosquitto", more=MOSQUITTO) as one:
         for url in urls:
             print(f"\n{'SQLite' if '://' not in url else 'PostgreSQL'}: {sizes(url, aircraft)}")
+            await asyncio.to_thread(judging, url)
             await page_latency(place._replace(one=one), url, aircraft)
