@@ -324,7 +324,7 @@ def _warmth(
     part = own.identity.get("profile", "")
     curve = curve_of(own.points, "gyro", noise_profile(part if part in PROFILES else None).gyro)
     then, now = (float(degc.mean()) for degc in seen)
-    if curve is None or not curve.order or max(curve.beyond_k(then), curve.beyond_k(now)) > 0.0:
+    if curve is None or max(curve.beyond_k(then), curve.beyond_k(now)) > 0.0:
         return nothing
     step, variance = curve.change((then, 0.0), (now, 0.0))
     step = step - calibration.thermal_change("gyro", then, now)

@@ -151,7 +151,7 @@ def test_what_was_learned_stays_and_goes_on_while_the_autopilot_takes_a_part_off
             assert usual is not None
             assert (await rig.ask(action="write"))["state"] == "done"
             rig.degc = 30.0
-            await rig.rest(30.0)
+            await rig.rest(60.0)
             memory = rig.service.calibrating.memory
             assert memory.forgotten() == {}
             assert memory.curves.of("fc", "gyro") is not None

@@ -29,7 +29,7 @@ def curve() -> Curve:
         degc = random.uniform(10.0, 25.0) + np.arange(0.0, 20.0, 2.0)
         bias = random.normal(0.0, 30.0, 3) + bent(degc)[:, None] + random.normal(0.0, 0.5, (10, 3))
         days.append(power_up(bias, degc, noise=0.5))
-    found = fit(days, 0.1, PER_K, least_order=1)
+    found = fit(days, 0.1, PER_K, may_be_mean=False)
     assert found is not None
     return found
 

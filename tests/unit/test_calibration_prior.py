@@ -96,7 +96,7 @@ def test_several_calibrations_of_one_power_up_are_one_point() -> None:
     once = [point(bias, str(k)) for k, bias in enumerate(biases)]
     often = [*once[:2], *[point(biases[2], "2") for _ in range(20)]]
     many, few = found(often), found(once)
-    np.testing.assert_allclose([many.value, many.variance], [few.value, few.variance], rtol=1e-6)
+    np.testing.assert_allclose([many.value, many.variance], [few.value, few.variance], rtol=1e-5)
     assert (many.power_ups, many.limit, many.weighs) == (few.power_ups, few.limit, few.weighs)
     assert expect(often[1:], "gyro", now(), ASSUMED, STEADY) is None
     # The companion restarted, the autopilot did not, or the other way round: it may be the same power-up.
@@ -114,8 +114,11 @@ def test_two_temperatures_of_one_power_up_tell_of_the_others() -> None:
     biases = some(5)
     cold = [point(bias + 10.0 * slope, str(k), temperature=10.0) for k, bias in enumerate(biases)]
     warm = point(biases[2] + 35.0 * slope, "2", temperature=35.0)
-    expected = found([*cold, warm], now(30.0))
-    np.testing.assert_allclose(expected.value, biases.mean(axis=0) + 30.0 * slope, atol=10.0 * DEG_H)
+    at_35, between = found([*cold, warm], now(35.0)), found([*cold, warm], now(30.0))
+    np.testing.assert_allclose(at_35.value, biases.mean(axis=0) + 35.0 * slope, atol=10.0 * DEG_H)
+    off = np.abs(between.value - (biases.mean(axis=0) + 30.0 * slope))
+    assert (off < np.sqrt(between.variance)).all(), "it need not be straight there"
+    assert off.max() < 60.0 * DEG_H
     assert found(cold, now(11.0)).value == pytest.approx(biases.mean(axis=0) + 10.0 * slope)
 
 
@@ -190,7 +193,7 @@ def test_the_gate_is_as_improbable_for_few_points_as_four_sigma_for_many(freedom
 # --- temperature
 
 
-def test_a_line_over_temperature_is_that_of_a_least_squares_fit() -> None:
+def test_a_line_over_temperature_is_near_that_of_a_least_squares_fit() -> None:
     from scipy import stats
 
     temperatures = np.array([5.0, 11.0, 14.0, 22.0, 25.0, 31.0])
@@ -201,18 +204,18 @@ def test_a_line_over_temperature_is_that_of_a_least_squares_fit() -> None:
     assert expected.by_temperature
     for axis in range(3):
         fit = stats.linregress(temperatures, biases[:, axis])
-        np.testing.assert_allclose(expected.value[axis], fit.intercept + 18.0 * fit.slope, atol=0.02 * DEG_H)
-    assert np.sqrt(expected.variance).max() < 5.0 * DEG_H
+        np.testing.assert_allclose(expected.value[axis], fit.intercept + 18.0 * fit.slope, atol=2.0 * DEG_H)
+    assert np.sqrt(expected.variance).max() < 7.0 * DEG_H
 
 
-def test_a_line_only_where_it_foretells_better() -> None:
+def test_a_curve_only_where_it_foretells_better() -> None:
     temperatures = np.linspace(10.0, 30.0, 8)
-    lines = 0
+    curves = 0
     for seed in range(40):
         biases = some(8, seed=seed)
         points = [point(bias, str(t), temperature=t) for bias, t in zip(biases, temperatures, strict=True)]
-        lines += found(points, now(22.0)).by_temperature
-    assert lines <= 8
+        curves += found(points, now(22.0)).by_temperature
+    assert curves <= 8
     slope = np.array([18.0, -30.0, 5.0]) * DEG_H
     points = [point(slope * t, str(t), temperature=t) for t in (5.0, 15.0, 25.0, 35.0)]
     assert found(points, now(22.0)).by_temperature

@@ -315,7 +315,7 @@ def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve 
     if len(groups) < WEIGHS_FROM or not _told(groups):
         return None
     nodes = [PowerUpNodes([_along(group[0], point, triad) for point in group]) for group in groups]
-    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad], least_order=1)
+    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad], may_be_mean=False)
     assert curve is not None
     low, high = curve.span_degc
     _, variance = curve.change((low, 0.0), (low + 1.0, 0.0))

@@ -11,9 +11,10 @@ tau.
 The coefficients have a prior as wide as the catalogue's parts move, so that a curve that has seen little is uncertain
 where it has seen nothing.
 
-Each power-up in turn is foretold by the others, at its first node: that decides the lag and how many terms there are,
-and tau is such that those errors are as large as is said. Likewise its change from there to its last node: what is said
-of changes is as uncertain as that shows, and a thermometer that is none of this IMU explains little of them.
+Each power-up in turn is foretold by the others, at its first node: that decides the lag, and whether a mean does as
+well as the curve, and tau is such that those errors are as large as is said. Likewise its change from there to its last
+node: what is said of changes is as uncertain as that shows, and a thermometer that is none of this IMU explains little
+of them.
 """
 
 from __future__ import annotations
@@ -36,9 +37,10 @@ VALID_K: Final = 3.0
 """How far beyond the temperatures seen the curve goes on (method section 3)."""
 FEWEST: Final = 3
 """Power-ups."""
-_MOST_ORDER: Final = 3
+_ORDER: Final = 3
+"""Of every curve. One of fewer terms would be as sure of itself where it has seen little as where it has seen much."""
 _BETTER: Final = 0.9
-"""Of the mean square of what is foretold: a term more must be worth it."""
+"""Of the mean square of what is foretold: a curve must be worth it."""
 _AT_LEAST: Final = 0.5
 """The least share of what the power-ups show that counts as their scatter; the noise said of them may be too much."""
 _RANGE: Final = 18.0
@@ -47,6 +49,7 @@ _HALVINGS: Final = 25
 _SURELY: Final = 2.0
 """Sigmas."""
 _LITTLE: Final = 1e-6
+"""In squares: of a kelvin, what no thermometer shows; of noise, what nobody sees."""
 _PRIOR_K: Final = np.array([UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
 """One sigma of each term's coefficient, in kelvin of what parts move."""
 State = tuple[float, float]
@@ -93,7 +96,7 @@ class Curve:
     """What the next power-up's bias will be.
 
     Attributes:
-        order: 0 a mean, 1 a line and so on.
+        order: 0 a mean, 3 a cubic.
         lag_s: of the die behind its thermometer.
         coefficients: mean and those of the terms, (1 + terms, 3).
         covariance: of these, for an axis that scatters as usual.
@@ -143,7 +146,7 @@ class Curve:
     def change(self, then: State, now: State) -> tuple[Array, Array]:
         """By how much the bias of one power-up is more now than then, and its variance, (3,) each.
 
-        Both are a temperature and how fast it rises, degC and K/s. Of a curve of order 1 and more.
+        Both are a temperature and how fast it rises, degC and K/s. Not of a mean.
         """
         return self.moves([(-1.0, then), (1.0, now)])
 
@@ -169,7 +172,7 @@ def fit(
     in_run_variance: float,
     per_kelvin: float,
     *,
-    least_order: int = 0,
+    may_be_mean: bool = True,
     usual: Usual | None = None,
 ) -> Curve | None:
     """The curve of one triad of one IMU; None of fewer than three power-ups, or two where it is known what is usual.
@@ -178,25 +181,26 @@ def fit(
         power_ups: at least one node each, in the order in which they were measured.
         in_run_variance: by which a bias wanders within a power-up, (rad/s)^2 or (m/s^2)^2.
         per_kelvin: one sigma of how much parts move, rad/s or m/s^2 a kelvin.
-        least_order: of the curve; a mean tells nothing of a change within a power-up.
+        may_be_mean: where that foretells as well; it tells nothing of a change within a power-up.
         usual: of its model; None: not known.
     """
     if len(power_ups) < FEWEST - (usual is not None):
         return None
     seen = [node.degc for one in power_ups for node in one.nodes]
     span = min(seen), max(seen)
-    most = _MOST_ORDER if span[1] > span[0] else least_order
+    in_run_variance = max(in_run_variance, _LITTLE * per_kelvin**2)
+
+    def of(order: int, lag_s: float = 0.0) -> Curve:
+        sums = _Sums.of(power_ups, lag_s, in_run_variance)
+        return _Fit(sums, order, in_run_variance, per_kelvin, usual).curve(span)
+
+    mean = of(0) if may_be_mean else None
+    if mean is not None and span[0] == span[1]:
+        return mean
     rates = any(node.k_s for one in power_ups for node in one.nodes)
-    lagging = [_Sums.of(power_ups, lag_s, in_run_variance) for lag_s in (LAGS_S if rates and most else LAGS_S[:1])]
-    fullest = [_Fit(sums, most, in_run_variance, per_kelvin, usual).curve(span) for sums in lagging]
-    full = min(fullest, key=lambda curve: curve.foretold)
-    sums = lagging[fullest.index(full)]
-    fewer = [_Fit(sums, order, in_run_variance, per_kelvin, usual).curve(span) for order in range(least_order, most)]
-    best, *more = *fewer, full
-    for found in more:
-        if found.foretold < _BETTER * best.foretold:
-            best = found
-    return best
+    curves = (of(_ORDER, lag_s) for lag_s in (LAGS_S if rates else LAGS_S[:1]))
+    curve = min(curves, key=lambda one: one.foretold)
+    return curve if mean is None or curve.foretold < _BETTER * mean.foretold else mean
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
