@@ -8,12 +8,13 @@ Vectors are in the sensor's own axes until a `mounting` has turned them into the
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
 import msgspec
 
 Vector = tuple[float, float, float]
 Triad = Literal["gyro", "accel"]
+TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 
 
 class ImuSample(msgspec.Struct, frozen=True, gc=False):

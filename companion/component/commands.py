@@ -44,7 +44,7 @@ NOTHING_RAN: Final = 1
 """`result_param2` of a cancel's ACK when there was nothing to cancel."""
 REMEMBER_FINAL_S = 3.0
 SAME_PACKET_S = 0.5
-_REMEMBERED = 32
+MAX_REMEMBERED: Final = 32
 _RETRY_S = 0.1
 
 _RESULTS = {
@@ -59,10 +59,6 @@ _WORDS = {
 }
 _NAMES: dict[type, str] = {requests.Calibrate: "Calibration", requests.Undo: "Undo", requests.Cancel: "Cancel"}
 """What not everybody may ask for."""
-# Arm authorisation is a verdict, not a job, and silence is one of its answers.
-_LEFT_TO_OTHERS = frozenset({mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST})
-
-MAX_REMEMBERED: Final = 32
 
 
 class Permission:
@@ -119,7 +115,7 @@ class CommandServer:
         self._running: _Running | None = None
         self._next_ack_s = 0.0
         self._finals: OrderedDict[requests.Key, _Final] = OrderedDict()
-        self._packets: deque[tuple[float, bytes]] = deque(maxlen=_REMEMBERED)
+        self._packets: deque[tuple[float, bytes]] = deque(maxlen=MAX_REMEMBERED)
         self._subscriptions = (
             link.subscribe(mavlink.MAVLink_command_long_message, self._on_message),
             link.subscribe(mavlink.MAVLink_command_int_message, self._on_message),
@@ -156,8 +152,8 @@ class CommandServer:
             return
         if (message.get_srcSystem(), message.get_srcComponent()) == (self._link.system_id, self._link.component_id):
             return
-        if message.command in _LEFT_TO_OTHERS:
-            return
+        if message.command == mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST:
+            return  # a verdict, not a job, and silence is one of its answers
         command = requests.from_message(message)
         request = self._permit(command, requests.judge(command))
         copy = self._is_copy(command, now_s)
@@ -211,7 +207,7 @@ class CommandServer:
                 self._refuse(key, result, reason, now_s, Severity.INFO if unsupported else Severity.WARNING)
 
     def _start(self, key: requests.Key, request: requests.Calibrate | requests.Undo, now_s: float) -> None:
-        name = "Undo" if isinstance(request, requests.Undo) else "Calibration"
+        name = _NAMES[type(request)]
         if self._running is not None and self._running.job.finished.done():
             self.step(now_s)
         if self._running is not None:
@@ -266,7 +262,7 @@ class CommandServer:
         sent = self._acknowledge(key, result, detail=detail)
         self._finals[key] = _Final(result, detail, now_s, sent)
         self._finals.move_to_end(key)
-        if len(self._finals) > _REMEMBERED:
+        if len(self._finals) > MAX_REMEMBERED:
             self._finals.popitem(last=False)
         if not sent:
             self._wake()

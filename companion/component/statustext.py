@@ -147,8 +147,6 @@ class StatusText:
     def __init__(self, link: MavlinkLink) -> None:
         self.woken = asyncio.Event()
         """Set when there is something new to send: whoever calls `step` waits for it."""
-        self.dropped = 0
-        """Texts that a full queue pushed out, or that waited for a link until they were stale."""
         self._link = link
         self._waiting: dict[Weight, deque[_Text]] = {weight: deque() for weight in reversed(Weight)}
         self._said_s: OrderedDict[tuple[Severity, str], float] = OrderedDict()
@@ -207,7 +205,6 @@ class StatusText:
         for weight, waiting in self._waiting.items():
             while weight is not Weight.RESULT and waiting and now_s - waiting[0].said_s > STALE_S:
                 waiting.popleft()
-                self.dropped += 1
             if waiting:
                 text = waiting.popleft()
                 for severity, line in as_lines(text.severity, text.text):
@@ -216,7 +213,6 @@ class StatusText:
 
     def _make_room(self, weight: Weight) -> bool:
         """Drop the oldest of the lightest texts, unless all that waits is heavier than the new one."""
-        self.dropped += 1
         for lighter in Weight:
             if lighter > weight:
                 return False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
+import datetime
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 from typing import Any, Final
 
@@ -14,6 +14,8 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.machine import Machine
 from companion.calibration.means.windows import Window
+from companion.calibration.records.record import Record
+from companion.calibration.solution.draft import Draft
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.component.tunes import Tune, Tunes
 from companion.config.sections import AtArm, Config
@@ -63,52 +65,32 @@ class Wanted:
         self.on_retarget.tell(self.settings)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Core:
-    """The configuration, the autopilot's link and the collector, which all subsystems share."""
+    """The configuration, the autopilot's link and the collector, which all subsystems share.
 
-    config: Config
-    offload: Offload
-    link: MavlinkLink
-    vehicle: Vehicle
-    parameters: ParameterClient
-    profiles: Profiles
-    collector: RecordedCollector
-    texts: StatusText
-    tunes: Tunes
-    machine: Machine
-    wanted: Wanted
-    only_listening: str | None
-    """Why nothing may be started although requests arrive: a check listens and must change nothing."""
+    A test brings a link that is on a wire of its own.
+    """
 
-    @classmethod
-    def of(cls, config: Config, link: MavlinkLink | None, offload: Offload, only_listening: str | None) -> Core:
-        """Make it; a test brings a link that is on a wire of its own."""
-        link = link or MavlinkLink(system_id=config.vehicle.system_id or 1, component_id=config.mavlink.component_id)
-        collector = RecordedCollector(config)
+    def __init__(self, config: Config, link: MavlinkLink | None, offload: Offload, only_listening: str | None) -> None:
+        self.config, self.offload = config, offload
+        self.only_listening = only_listening
+        """Why nothing may be started although requests arrive: a check listens and must change nothing."""
+        system_id = config.vehicle.system_id
+        self.link = link or MavlinkLink(system_id=system_id or 1, component_id=config.mavlink.component_id)
+        self.vehicle = Vehicle(self.link, system_id=system_id, is_carried=self._is_carried)
+        self.parameters = ParameterClient(self.link, self.vehicle)
+        self.profiles, self.collector, self.machine = Profiles(config), RecordedCollector(config), Machine()
+        self.wanted, self.texts = Wanted(config), StatusText(self.link)
+        self.tunes = Tunes(self.link, self.vehicle, lambda: self.wanted.tunes, self.texts.woken)
 
-        def is_carried() -> bool:
-            if vehicle.arm_state is ArmState.ARMED:
-                return True
-            return collector.glance(asyncio.get_running_loop().time()).moving
+    def _is_carried(self) -> bool:
+        if self.vehicle.arm_state is ArmState.ARMED:
+            return True
+        return self.collector.glance(asyncio.get_running_loop().time()).moving
 
-        vehicle = Vehicle(link, system_id=config.vehicle.system_id, is_carried=is_carried)
-        parameters = ParameterClient(link, vehicle)
-        wanted, texts = Wanted(config), StatusText(link)
-        return cls(
-            config,
-            offload,
-            link,
-            vehicle,
-            parameters,
-            Profiles(config),
-            collector,
-            texts,
-            Tunes(link, vehicle, lambda: wanted.tunes, texts.woken),
-            Machine(),
-            wanted,
-            only_listening,
-        )
+    def draft(self, before: Record | None = None) -> Draft:
+        """Of what is measured from now on; `before`: the calibration that is in force."""
+        return Draft(datetime.datetime.now(tz=datetime.UTC), self.vehicle.system_id, before=before)
 
     async def keep_ticking(self) -> None:
         """Tell the collector the time until cancelled: the only one in the daemon who does."""
@@ -145,6 +127,11 @@ class Core:
         """Tell whoever is at the aircraft what to do now: by the buzzer, and in words that are spoken."""
         self.tunes.play(tune)
         self.say(Severity.NOTICE, text)
+
+
+def utc_now() -> str:
+    """ISO 8601, as records have it."""
+    return datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
 
 
 class Subsystem:

@@ -8,7 +8,7 @@ to an autopilot, so that they may name nothing else than what the companion writ
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -16,10 +16,11 @@ import msgspec
 
 from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.autopilot.parameters.change import Change
+from companion.errors import StorageError
 from companion.formats import Object
-from companion.storage.state import StateFile, remove_durably, write_atomically
+from companion.storage.state import StateFile, numbers_in, remove_durably, write_atomically
 
-_UNDO: Final = re.compile(r"undo-(\d{1,3})\.json")
+_UNDO: Final = re.compile(r"undo-(0|[1-9][0-9]{0,2})\.json")
 _SYSTEM_IDS: Final = range(1, 256)
 MOST_STEPS: Final = 10
 """Writes that can be undone one after the other; the oldest one makes room."""
@@ -183,8 +184,10 @@ class ChangeLog:
 
     def undos(self) -> list[StateFile[Undoable]]:
         """Of all vehicles of which there is one."""
-        numbers = [match[1] for match in map(_UNDO.fullmatch, self._names()) if match]
-        return [self.undo_of(int(number)) for number in sorted(numbers) if number == str(int(number))]
+        try:
+            return [self.undo_of(number) for number in numbers_in(self._directory, _UNDO)]
+        except StorageError:
+            return []  # `check_writable` has said so
 
     def check_writable(self) -> None:
         """Find out now, not at the first write, whether anything can be kept here.
@@ -194,12 +197,6 @@ class ChangeLog:
         """
         write_atomically(self._probe, b"")
         remove_durably(self._probe)
-
-    def _names(self) -> Iterator[str]:
-        try:
-            yield from (path.name for path in self._directory.iterdir())
-        except OSError:
-            return  # there is none, or `check_writable` has said so
 
     def _check(self, found: ChangeSet, system_id: int | None = None) -> None:
         if found.system_id not in _SYSTEM_IDS or found.system_id != (system_id or found.system_id):

@@ -5,6 +5,7 @@ Nothing here is called on the event loop.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 import os
@@ -34,10 +35,8 @@ class LogFile:
         self.path = path
         self._part = path.with_name(path.name + PART)
         self._at = path if path.is_file() else self._part
-        try:
+        with _on_disk(self._at):
             self.bytes = self._at.stat().st_size if self._at.is_file() else 0
-        except OSError as error:
-            raise _refused(self._at, error) from error
 
     @property
     def is_whole(self) -> bool:
@@ -48,17 +47,14 @@ class LogFile:
         """Its last bytes."""
         if not self.bytes:
             return b""
-        try:
-            with self._at.open("rb") as file:
-                file.seek(max(0, self.bytes - most))
-                return file.read(most)
-        except OSError as error:
-            raise _refused(self._at, error) from error
+        with _on_disk(self._at), self._at.open("rb") as file:
+            file.seek(max(0, self.bytes - most))
+            return file.read(most)
 
     def begin(self, size: int) -> None:
         """Make room for a log of that size; what is here already stays, and counts as half written from here on."""
         folder, lacks = self.path.parent, size - self.bytes
-        try:
+        with _on_disk(folder):
             folder.mkdir(0o700, parents=True, exist_ok=True)
             others = sorted((each for each in folder.iterdir() if each != self._at), key=lambda at: at.stat().st_mtime)
             sizes = {each: each.stat().st_size for each in others}
@@ -76,38 +72,29 @@ class LogFile:
             if self.is_whole:
                 os.replace(self.path, self._part)
                 self._at = self._part
-        except OSError as error:
-            raise _refused(folder, error) from error
 
     def append(self, data: bytes) -> None:
         """Write more, onto the disk itself."""
-        try:
-            with open(os.open(self._part, os.O_RDWR | os.O_CREAT, 0o600), "r+b") as file:
-                file.truncate(self.bytes)
-                file.seek(self.bytes)
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise _refused(self._part, error) from error
+        with _on_disk(self._part), open(os.open(self._part, os.O_RDWR | os.O_CREAT, 0o600), "r+b") as file:
+            file.truncate(self.bytes)
+            file.seek(self.bytes)
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
         self.bytes += len(data)
 
     def cut(self, size: int) -> None:
         """Forget what is behind that many bytes."""
-        try:
+        with _on_disk(self._part):
             if self._part.exists():
                 os.truncate(self._part, size)
-        except OSError as error:
-            raise _refused(self._part, error) from error
         self.bytes = size
 
     def finish(self) -> None:
         """It is whole."""
-        try:
+        with _on_disk(self._part):
             os.replace(self._part, self.path)
             sync_folder(self.path.parent)
-        except OSError as error:
-            raise _refused(self._part, error) from error
         self._at = self.path
 
 
@@ -118,5 +105,9 @@ def named(folder: Path, name: str) -> Iterator[LogFile]:
         yield LogFile(folder / (plain.name if number == 1 else f"{plain.stem}-{number}{plain.suffix}"))
 
 
-def _refused(path: Path, error: OSError) -> StorageError:
-    return StorageError(f"{path}: the log cannot be kept: {error.strerror or error}")
+@contextlib.contextmanager
+def _on_disk(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{path}: the log cannot be kept: {error.strerror or error}") from error

@@ -17,12 +17,13 @@ from companion.calibration.noise.allan import PROFILES, AllanModel, NoiseProfile
 from companion.config import CATALOGUE, no_profile
 from companion.config.sections import Noise
 from companion.errors import ConfigError, StorageError
-from companion.storage.state import UNREADABLE, read_regular, sealed, unsealed, write_atomically
+from companion.storage.state import UNREADABLE, named_in, read_regular, sealed, unsealed, write_atomically
 
 logger = logging.getLogger(__name__)
 
 FORMAT_VERSION: Final = 1
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]{0,39}")
+_FILE: Final = re.compile(rf"({_NAME.pattern})\.json")
 
 
 class Source(msgspec.Struct, frozen=True, kw_only=True):
@@ -111,13 +112,7 @@ class ProfileStore:
         Raises:
             StorageError: the folder cannot be listed.
         """
-        try:
-            files = [entry.stem for entry in self._folder.iterdir() if entry.suffix == ".json"]
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise StorageError(f"{self._folder}: cannot be listed: {error.strerror or error}") from error
-        return sorted(name for name in files if _NAME.fullmatch(name))
+        return named_in(self._folder, _FILE)
 
     def read(self, name: str) -> SavedProfile:
         """One profile.

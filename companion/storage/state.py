@@ -110,8 +110,8 @@ def read_regular(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
     return data
 
 
-def numbers_in(folder: Path, kind: re.Pattern[str]) -> list[int]:
-    """The numbers in the names of a folder's files, ascending.
+def named_in(folder: Path, kind: re.Pattern[str]) -> list[str]:
+    """The first group of such names of files, in order; none where there is no folder.
 
     Raises:
         StorageError: it cannot be listed.
@@ -121,8 +121,13 @@ def numbers_in(folder: Path, kind: re.Pattern[str]) -> list[int]:
     except FileNotFoundError:
         return []
     except OSError as error:
-        raise StorageError(f"{folder}: cannot be listed: {error.strerror}") from error
-    return sorted(int(match[1]) for match in map(kind.fullmatch, names) if match)
+        raise StorageError(f"{folder}: cannot be listed: {error.strerror or error}") from error
+    return sorted(match[1] for match in map(kind.fullmatch, names) if match)
+
+
+def numbers_in(folder: Path, kind: re.Pattern[str]) -> list[int]:
+    """The same of numbers, ascending; raises as well."""
+    return sorted(map(int, named_in(folder, kind)))
 
 
 def _require_regular(found: os.stat_result) -> None:

@@ -326,7 +326,7 @@ def _creep(rig: Rig, by_rad_s: float) -> None:
 def test_only_the_conductor_starts_what_a_check_must_not(tmp_path: Path) -> None:
     async def main() -> None:
         async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
-            rig.service.calibrating.conductor._only_listening = "only a check is running"
+            rig.service.core.only_listening = "only a check is running"
             await asyncio.sleep(60.0)
             assert rig.double.writes == []
             assert isinstance(rig.service.calibrating.conductor.start_undo("test"), Refusal)

@@ -599,7 +599,7 @@ def test_a_check_that_only_listens_starts_nothing(tmp_path: Path) -> None:
     async def main() -> None:
         async with Rig(tmp_path).running() as rig:
             await rig.ready()
-            rig.service.calibrating.conductor._only_listening = "only a check is running"
+            rig.service.core.only_listening = "only a check is running"
             for answer in (
                 rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"),
                 rig.service.calibrating.conductor.start_undo("test"),

@@ -17,6 +17,7 @@ from companion.autopilot.parameters.change import WriteFailedError
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.verify import Observation, judge
 from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.telemetry.ekf_bias import EkfBias
 from companion.autopilot.telemetry.imu_stream import ImuStream
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.links.mavlink.link import MavlinkLink
@@ -70,7 +71,15 @@ class Stage:
         self.client = ParameterClient(self.link, self.vehicle)
         self.writer = ParameterWriter(self.client, self.vehicle)
         self.samples: list[ImuSample] = []
-        self.stream = ImuStream(self.link, self.vehicle, instance, self.samples.append, rate_hz=rate_hz)
+        self.stream = ImuStream(
+            self.link,
+            self.vehicle,
+            instance,
+            self.samples.append,
+            rate_hz=rate_hz,
+            ekf_bias=EkfBias(self.link, self.vehicle),
+            on_kind_change=lambda kind: None,
+        )
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:

@@ -150,7 +150,7 @@ def test_the_rate_on_the_average_and_the_spacing_always(rate_hz: float, samples_
     for k, late_s in enumerate(jitter):
         t_s, now_s = 5.0 + k / samples_hz, 5.0 + k / samples_hz + float(late_s)
         if sender.is_due(t_s, now_s):
-            sender.send("ardupilot", attitude(t_s), 0, now_s)
+            sender.send("ardupilot", attitude(t_s), attitude(t_s), 0, now_s)
             sent.append((t_s, now_s))
     gaps = np.diff(np.array(sent), axis=0)
     assert gaps.min() >= 0.02 - 1e-5

@@ -89,7 +89,7 @@ directory = "{folder}"
 """
 
     async def made() -> FacesInForce:
-        core = Core.of(parse(text, "a.toml"), None, inline, None)
+        core = Core(parse(text, "a.toml"), None, inline, None)
         await There(core, {}).keep(record(when))
         again = There(core, {})
         again.load()

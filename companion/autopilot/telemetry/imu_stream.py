@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
@@ -67,12 +66,10 @@ class ImuStream:
         instance: int,
         on_sample: Callable[[ImuSample], None],
         *,
-        rate_hz: float = 100.0,
-        ekf_bias: EkfBias | None = None,
-        on_kind_change: Callable[[StreamKind | None], None] | None = None,
+        rate_hz: float,
+        ekf_bias: EkfBias,
+        on_kind_change: Callable[[StreamKind | None], None],
     ) -> None:
-        if instance not in imu_messages.ARDUPILOT:
-            raise ValueError(f"no IMU {instance}: 1, 2 or 3")
         self.kind: StreamKind | None = None
         """What the samples come from; None while there are none."""
         self.samples = 0
@@ -80,16 +77,15 @@ class ImuStream:
         """Why there are no samples, one line; empty while there are."""
         self.turns = 0
         """Turns of `run`, one at least every `BEAT_WITHIN_S`, whether samples come or not."""
-        self.rejected: Counter[str] = Counter()
         self._vehicle, self._instance = vehicle, instance
         self._on_sample, self._on_kind_change = on_sample, on_kind_change
+        self._ekf_bias = ekf_bias
         self._rates_hz = [rate_hz, *(rate for rate in SLOWER_RATES_HZ if rate < rate_hz)]
         self._link = link
         self._sources: list[Source] = []
         self._current: Source | None = None
         self.temperature: tuple[float, float] | None = None
         """Of the IMU, degC, and when it was told; None: not since the restart."""
-        self._ekf_bias = ekf_bias
         self._restart = asyncio.Event()
         self._arrived = asyncio.Event()
 
@@ -133,9 +129,8 @@ class ImuStream:
         if self._vehicle.firmware == "ardupilot":
             messages = imu_messages.ARDUPILOT[self._instance]
         elif self._vehicle.firmware == "px4":
-            floats = () if self._ekf_bias is None else (imu_messages.PX4_FLOATS,)
-            messages = (*floats, *imu_messages.PX4[self._instance])
-            if self._ekf_bias is not None and self._ekf_bias.may_look:
+            messages = (imu_messages.PX4_FLOATS, *imu_messages.PX4[self._instance])
+            if self._ekf_bias.may_look:
                 # Floats that begin late would begin a measurement anew.
                 await comes(self._ekf_bias.settled, BEAT_WITHIN_S / 2.0)
         else:
@@ -222,7 +217,7 @@ class ImuStream:
                 await self._ask_for_temperature(source)
             if now_s - source.last_s < SILENCE_S:
                 silent_asks = 0
-                if self._temperature_is_old(now_s) and now_s - temperature_s > _TEMPERATURE_AGE_S:
+                if self._degc(now_s) is None and now_s - temperature_s > _TEMPERATURE_AGE_S:
                     temperature_s = now_s
                     await self._ask_for_temperature(source)
                 better_s = await self._ask_for_better(source, better_s)
@@ -269,11 +264,12 @@ class ImuStream:
 
     def _usable(self, source: Source) -> bool:
         """Not while it wants a bias that is not known, or is of another IMU."""
-        known = self._ekf_bias is not None and self._ekf_bias.known_of(self._instance)
-        return known or source.message is not imu_messages.PX4_FLOATS
+        return source.message is not imu_messages.PX4_FLOATS or self._ekf_bias.known_of(self._instance)
 
-    def _temperature_is_old(self, now_s: float) -> bool:
-        return self.temperature is None or now_s - self.temperature[1] > _TEMPERATURE_AGE_S
+    def _degc(self, now_s: float) -> float | None:
+        """Of the IMU, unless that was told too long ago."""
+        known = self.temperature
+        return None if known is None or now_s - known[1] > _TEMPERATURE_AGE_S else known[0]
 
     async def _pause(self, seconds: float) -> bool:
         """Wait, but not beyond the loss or restart of the autopilot; True when that came."""
@@ -302,24 +298,21 @@ class ImuStream:
             return
         reading = source.message.decode(message)
         if isinstance(reading, str):
-            self.rejected[reading] += 1
             source.reason = reading
             return
         if reading.all_zero:
-            self.rejected["all zero"] += 1
             source.zeros = min(source.zeros + 1, ABSENT_AFTER)
             self._arrived.set()
             return
         if -0.5 < reading.t_device_s - source.device_s <= 0.0:
-            self.rejected["repeated or late"] += 1
-            return
+            return  # repeated or late
         source.device_s, source.last_s, source.zeros, source.reason = reading.t_device_s, t_s, 0, ""
         source.recent += 1
         self._arrived.set()
         if reading.temperature_degc is not None:
             self.temperature = (reading.temperature_degc, t_s)
         if source is self._current:
-            if source.message is imu_messages.PX4_FLOATS and self._ekf_bias is not None:
+            if source.message is imu_messages.PX4_FLOATS:
                 self._hand_on(*self._ekf_bias.restored(reading), t_s)
             else:
                 self._hand_on(reading, None, t_s)
@@ -327,11 +320,9 @@ class ImuStream:
     def _hand_on(self, reading: Reading, shared_variance: tuple[float, ...] | None, t_s: float) -> None:
         self.samples += 1
         self.problem = ""
-        known = self.temperature
-        temperature = None if known is None or t_s - known[1] > _TEMPERATURE_AGE_S else known[0]
         self._on_sample(
             ImuSample(
-                t_s, reading.gyro_rad_s, reading.accel_m_s2, temperature, None, reading.t_device_s,
+                t_s, reading.gyro_rad_s, reading.accel_m_s2, self._degc(t_s), None, reading.t_device_s,
                 shared_variance=shared_variance,
             )
         )  # fmt: skip
@@ -347,17 +338,14 @@ class ImuStream:
         if source is self._current:
             return
         self._current = source
+        kind = None
         if source is not None:
-            self.problem = ""
-        self._set_kind(None if source is None else source.message.kind)
-
-    def _set_kind(self, kind: StreamKind | None) -> None:
+            self.problem, kind = "", source.message.kind
         if kind != self.kind:
             self.kind = kind
             if kind is not None:
                 logger.info("IMU %d: %s at up to %g Hz", self._instance, kind.message, self.rate_hz)
-            if self._on_kind_change is not None:
-                self._on_kind_change(kind)
+            self._on_kind_change(kind)
 
     def _why_none(self) -> str:
         ordinal = {1: "first", 2: "second", 3: "third"}[self._instance]

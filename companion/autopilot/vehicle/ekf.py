@@ -64,14 +64,11 @@ class EkfWatch:
         loop = asyncio.get_running_loop()
         self._seen.clear()  # what came before the write says nothing
         boots, give_up_s = self._vehicle.boots, loop.time() + within_s
-        if await self.bias_rad_s() is None:
-            if self._vehicle.boots != boots:
-                return "the autopilot restarted while its EKF settled"
+        if await self.bias_rad_s() is None and self._vehicle.boots == boots:
             return (
                 "wait 2 min before take-off, or restart the autopilot: it does not tell whether its EKF has settled"
                 " (no AHRS message)"
             )
-        bias: float | None = None
         asked_s = loop.time()
         while True:
             if self._vehicle.boots != boots:

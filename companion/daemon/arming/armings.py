@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import datetime
 import logging
 from collections.abc import Iterable
 from typing import Final
@@ -15,7 +14,7 @@ from companion.autopilot.vehicle.vehicle import VehicleEvent
 from companion.calibration.records.record import Arming, Record
 from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.readiness import Readiness
-from companion.daemon.core import Core
+from companion.daemon.core import Core, utc_now
 from companion.errors import StorageError
 from companion.storage.state import BoundedList
 
@@ -63,7 +62,7 @@ class Armings:
         state, words = readiness.state(now_s)
         calibrated_s, confirmed_s = in_force.calibrated_s, in_force.confirmed_s
         self.last = Arming(
-            armed_at=datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds"),
+            armed_at=utc_now(),
             state=state,
             reason=words,
             at_arm=readiness.at_arm,

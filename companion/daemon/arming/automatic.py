@@ -12,9 +12,9 @@ until the next request or restart, and says so.
 from __future__ import annotations
 
 import asyncio
-import datetime
 import logging
 import math
+import time
 from collections.abc import Mapping
 from typing import Final
 
@@ -122,7 +122,7 @@ class Automatic:
 
     def _writes_today(self) -> int:
         # The clock of a field computer may jump: what seems to lie in the future counts as of today.
-        since_s = datetime.datetime.now(tz=datetime.UTC).timestamp() - _DAY_S
+        since_s = time.time() - _DAY_S
         return sum(write.at_unix_s > since_s for write in self._writes)
 
     # --- the work
@@ -234,7 +234,7 @@ class Automatic:
         parameters = sum(len(imu.written) for imu in job.record.imus) if job.record is not None else 0
         parameters += len(job.product.written) if isinstance(job.product, Predicted) else 0
         if parameters:
-            write = AutomaticWrite(datetime.datetime.now(tz=datetime.UTC).timestamp(), parameters)
+            write = AutomaticWrite(time.time(), parameters)
             self._writes = [*self._writes, write][-PER_DAY - 8 :]
             self._to_keep.append(write)
             self._this_boot = (self._vehicle.boots, self._writes_this_boot() + 1)

@@ -48,12 +48,11 @@ from companion.daemon.job import Job, Predicted
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import vector
 from companion.physics.units import DEG_H
-from companion.samples import Triad, Vector
+from companion.samples import TRIADS, Triad, Vector
 from companion.storage.changes import PREDICTION
 
 logger = logging.getLogger(__name__)
 
-_TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 # Causes that a measurement settles. What the pilot undid and what somebody else chose is theirs until asked for, and
 # what a boot replaced is pushed again.
@@ -81,7 +80,7 @@ class InForce:
             "accel": settings.target_accel_sigma_m_s2,
         }
         self._sources = {imu.name: imu for imu in _judged(config)}
-        triads = _TRIADS if config.gradienter is not None else _TRIADS[:1]
+        triads = TRIADS if config.gradienter is not None else TRIADS[:1]
         self._held: dict[Key, Held | Why] = {(name, triad): Why.NEVER for name in self._sources for triad in triads}
         self._left_out: set[Key] = set()
         """What no calibration can settle, and is not judged."""
@@ -179,7 +178,7 @@ class InForce:
 
     def record_of(self, name: str) -> ImuRecord | None:
         """What the last calibration found in one IMU; None when nothing did, or something has replaced it."""
-        keys: list[Key] = [(name, triad) for triad in _TRIADS]
+        keys: list[Key] = [(name, triad) for triad in TRIADS]
         if self.calibration is None or any(
             isinstance(self._held.get(key), Why) or key in self._held_back for key in keys
         ):
@@ -321,7 +320,7 @@ class InForce:
                 (imu.gyro_rad_s, imu.gyro_sigma_use_rad_s, settled[:3]),
                 (imu.accel_m_s2, imu.accel_sigma_use_m_s2, settled[3:]),
             )
-            for triad, (residual, sigma, compared) in zip(_TRIADS, found, strict=True):
+            for triad, (residual, sigma, compared) in zip(TRIADS, found, strict=True):
                 key = (imu.name, triad)
                 if key in solution.unknown:
                     self._leave_out(key)

@@ -5,7 +5,6 @@ The output at the temperature of that moment stays as it is, and that is what is
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -17,7 +16,6 @@ from companion.autopilot.firmware.px4 import THERMAL_ENABLE
 from companion.autopilot.parameters.wire import same_float32
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
-from companion.calibration.solution.draft import Draft
 from companion.calibration.temperature.curve import Curve
 from companion.calibration.temperature.polynomial import Polynomial, of_curve
 from companion.component.service import MEASURED_PERCENT
@@ -84,7 +82,7 @@ class IntoAutopilot:
             CompanionError: it failed, and why; the old values are back, or it is said which are not.
             JobCancelledError: cancelled; likewise.
         """
-        draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._core.vehicle.system_id)
+        draft = self._core.draft()
         await self._core.offload(self._memory.follow)
         self._measuring.begin()
         window = await self._measuring.measure(job)

@@ -7,9 +7,9 @@ powered all the while, is remembered besides: it says most.
 from __future__ import annotations
 
 import asyncio
-import datetime
 import logging
 import math
+import time
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -43,7 +43,7 @@ from companion.daemon.stands.alignment import AlignmentInForce
 from companion.errors import AutopilotError, StorageError
 from companion.formats import Object
 from companion.physics.frames import vector
-from companion.samples import Triad
+from companion.samples import TRIADS, Triad
 from companion.storage.learned import BiasStore, KnownImu
 
 if TYPE_CHECKING:
@@ -57,7 +57,6 @@ WRITE_EVERY_S: Final = 60.0
 AT_POWER_UP_S: Final = 300.0
 """Since its power came an IMU's offsets may not have been seen right by anybody else, such as a ground station."""
 _MUCH_BETTER: Final = 0.7
-_TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 
 
 class _Reference(msgspec.Struct):
@@ -142,7 +141,7 @@ class BiasMemory:
                 continue
             known = self._known.pop(name)
             self.curves.forget(name)
-            for triad in _TRIADS:
+            for triad in TRIADS:
                 self._today.pop((name, triad), None)
             if known.points:
                 found[name] = f"imu {name}: {what} changed since then: its earlier biases are forgotten"
@@ -160,7 +159,7 @@ class BiasMemory:
             return "its calibration is not known of"
         if what := changed(known.identity, self.whose.identity(name, known.identity)):
             return f"another IMU than was calibrated ({what})"
-        same = name in self._imus or point.power_up.is_same(self.whose.power_up(name, _unix_s()))
+        same = name in self._imus or point.power_up.is_same(self.whose.power_up(name, time.time()))
         return None if same else "the IMU was without power since its calibration"
 
     def expectation(self, solution: Solution, unix_s: float) -> Expectation:
@@ -223,7 +222,7 @@ class BiasMemory:
         known, calibration = self._known.get(name), self._imus[name].calibration
         if not self._config.calibration.prior or known is None or calibration is None or calibration.thermal.enabled_by:
             return None
-        unix_s = _unix_s()
+        unix_s = time.time()
         power_up = self.whose.power_up(name, unix_s)
         since_s = power_up.since_unix_s
         if since_s is None or unix_s - since_s > AT_POWER_UP_S or self._changed(name):
@@ -256,7 +255,7 @@ class BiasMemory:
             if degc is not None and end_degc is not None and degc != end_degc:
                 gyro, accel = (
                     bias if bias is None else bias - self.curves.taken_off(imu.name, triad, degc, end_degc)
-                    for triad, bias in zip(_TRIADS, whole[imu.name], strict=True)
+                    for triad, bias in zip(TRIADS, whole[imu.name], strict=True)
                 )
                 at_mean[imu.name] = gyro, accel
         return points(
@@ -277,13 +276,13 @@ class BiasMemory:
             if point.temperature_degc is not None or all(one.temperature_degc is None for one in known.points):
                 # As many as the disk keeps: what is asked must not depend on when the daemon was started.
                 self._known[name] = msgspec.structs.replace(known, points=kept((*known.points, point)))
-            for triad in _TRIADS:
+            for triad in TRIADS:
                 self._refer(name, triad, point)
         await self._write()
 
     async def look(self, solution: Solution) -> None:
         """Remember what a still window tells that nobody calibrated from: of each kelvin of a power-up the best."""
-        unix_s = _unix_s()
+        unix_s = time.time()
         self._now_degc |= {imu.name: imu.temperature_degc for imu in solution.imus}
         news = [imu.name for imu in solution.imus if self._tells_more(imu, unix_s)]
         if not news:
@@ -368,7 +367,7 @@ class BiasMemory:
         from companion.calibration.solution.by_temperature import by_temperature
 
         self.follow()
-        unix_s = _unix_s()
+        unix_s = time.time()
         found = []
         for name in self.whose.names:
             what = self._changed(name)
@@ -376,7 +375,7 @@ class BiasMemory:
             shown = by_temperature(
                 name,
                 () if known is None else known.points,
-                *(None if known is None else self.curves.of(name, triad) for triad in _TRIADS),
+                *(None if known is None else self.curves.of(name, triad) for triad in TRIADS),
                 power_up=self.whose.power_up(name, unix_s),
                 now_degc=self._now_degc.get(name),
             )
@@ -390,10 +389,6 @@ class BiasMemory:
     def _reference(self, name: str, triad: Triad) -> Point | None:
         found = self._today.get((name, triad))
         return found.point if found is not None and found.session == self.whose.session(name) else None
-
-
-def _unix_s() -> float:
-    return datetime.datetime.now(tz=datetime.UTC).timestamp()
 
 
 def _is_near(point: Point, degc: float) -> bool:

@@ -12,14 +12,13 @@ import msgspec
 from companion.calibration.solution.model_prior import FORMAT_VERSION, ModelPrior, TriadPrior, check, read
 from companion.calibration.solution.prior import CONTRADICTS, Expected
 from companion.formats import Object
-from companion.samples import Triad
+from companion.samples import TRIADS, Triad
 from companion.storage.state import StateFile
 
 logger = logging.getLogger(__name__)
 
 TOPIC: Final = "fleet/priors/"
 """And the model."""
-_TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 
 
 class _File(msgspec.Struct, frozen=True, kw_only=True):
@@ -97,7 +96,7 @@ class ModelPriors:
         known = self._known.get(model)
         if known is None:
             return self._refused.get(model) or f"imu {name}: the fleet has told nothing of its model ({model}) yet"
-        words = ", ".join(f"{triad} {self._verdict(name, triad)}" for triad in _TRIADS if known.of(triad) is not None)
+        words = ", ".join(f"{triad} {self._verdict(name, triad)}" for triad in TRIADS if known.of(triad) is not None)
         line = f"imu {name}: model {model} of the fleet ({known.parts} parts): {words}"
         return f"{line}; {self._refused[model]}" if model in self._refused else line
 

@@ -7,7 +7,6 @@ Who may start one, who takes over one that runs by itself, and what becomes of i
 from __future__ import annotations
 
 import asyncio
-import datetime
 import logging
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
 from typing import Literal
@@ -19,7 +18,7 @@ from companion.calibration.collector.outlook import Settings
 from companion.calibration.machine import Event, State
 from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.calibration.solution.draft import Draft, in_words
+from companion.calibration.solution.draft import in_words
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.component.tunes import Tune
@@ -49,7 +48,7 @@ class Conductor:
         results: Results,
         by_hand: ByHand,
     ) -> None:
-        self._machine, self._wanted, self._only_listening = core.machine, core.wanted, core.only_listening
+        self._core, self._machine, self._wanted = core, core.machine, core.wanted
         self._vehicle, self._collector, self._say, self._tunes = core.vehicle, core.collector, core.say, core.tunes
         self._course, self._recovery, self._results, self._by_hand = course, recovery, results, by_hand
         self._has_gradienter = core.config.gradienter is not None
@@ -202,8 +201,8 @@ class Conductor:
     def _refusal(
         self, requester: str, missing: str | None, kind: Literal["other", "nothing_to_undo"] = "other"
     ) -> Refusal | None:
-        if self._only_listening is not None:
-            return Refusal("other", self._only_listening)
+        if self._core.only_listening is not None:
+            return Refusal("other", self._core.only_listening)
         if (found := self.why_not()) is not None:
             return found.refusal
         return self._starts.refuses(requester) if missing is None else Refusal(kind, missing)
@@ -258,7 +257,7 @@ class Conductor:
     async def _calibrate(self, job: Job) -> None:
         loop = asyncio.get_running_loop()
         started_s = loop.time()
-        draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._vehicle.system_id, before=self._results.good)
+        draft = self._core.draft(before=self._results.good)
 
         async def run() -> str:
             await self._course.run(job, draft)

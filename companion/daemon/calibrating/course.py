@@ -7,7 +7,6 @@ is the conductor's.
 from __future__ import annotations
 
 import asyncio
-import datetime
 import logging
 from collections.abc import Container, Mapping
 from typing import Final
@@ -30,7 +29,7 @@ from companion.config.sections import Platform
 from companion.daemon.biases.memory import BiasMemory, Foretold
 from companion.daemon.calibrating import held_back
 from companion.daemon.calibrating.solver import Given, Solver
-from companion.daemon.core import Core
+from companion.daemon.core import Core, utc_now
 from companion.daemon.job import Job, Predicted
 from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.dither import Ditherer
@@ -181,7 +180,7 @@ class Course:
             CompanionError: it failed, and why; the autopilot is in order, or it is said what is not.
             JobCancelledError: cancelled; nothing was written.
         """
-        at = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
+        at = utc_now()
         targets = [(each.calibration, each.changes) for each in foretold.values()]
         written = await self._pusher.push_unseen(job, targets, Origin(PREDICTION, at))
         sigma = max(each.sigma_rad_s for each in foretold.values()) / DEG_H

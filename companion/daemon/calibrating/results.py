@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import logging
 
 import msgspec
@@ -10,7 +9,7 @@ import msgspec
 from companion.calibration.records.record import Record
 from companion.component.statustext import Severity
 from companion.daemon.biases.memory import BiasMemory
-from companion.daemon.core import Core
+from companion.daemon.core import Core, utc_now
 from companion.errors import StorageError
 from companion.storage.changes import ChangeSet
 from companion.storage.records import RecordStore
@@ -61,7 +60,7 @@ class Results:
 
     async def undone(self, step: ChangeSet) -> bool:
         """Note that what was written in this step is in force no more; whether it was of calibrations."""
-        now = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
+        now = utc_now()
         try:
             marked: list[str] = await self._offload(self._store.mark_undone, step, now)
         except StorageError as error:

@@ -42,7 +42,7 @@ class SensorRole:
     """What a device is used as, as `companion status` shows it."""
 
     def __init__(self, sensor: SerialSensor, role: Role) -> None:
-        self.name, self.kind, self.role = role.name, role.kind, role
+        self.name, self.kind = role.name, role.kind
         self._sensor = sensor
         self._samples = 0
         self._last_s: float | None = None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from collections.abc import Sequence
 
 from companion.autopilot.firmware.imu_calibration import accel_taken_off
@@ -15,7 +14,7 @@ from companion.calibration.stillness.plausible import misplaced
 from companion.configured import models
 from companion.configured.models import Role, collect, serial_devices
 from companion.daemon.core import Core, Subsystem, Task
-from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
+from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.reach import Reach
 from companion.daemon.devices.sensor_watch import UNTOUCHED, Corrected, SensorWatch
 from companion.daemon.devices.sensors import SensorRole, SerialSensor
@@ -55,10 +54,6 @@ class Devices(Subsystem):
         why = self.signing.rejecting
         behind = f": {why}" if why else ""
         return f"not heard yet on {self._core.config.mavlink.url}{behind}"
-
-    def changing(self) -> contextlib.AbstractContextManager[None]:
-        """While we write offsets of any of the autopilot's IMUs ourselves."""
-        return changing(self.imus.values())
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.signing.load()

@@ -73,14 +73,14 @@ class Sender:
         )
 
     def send(
-        self, firmware: Firmware, attitude: Attitude, reset_counter: int, now_s: float, levelled: Attitude | None = None
+        self, firmware: Firmware, attitude: Attitude, levelled: Attitude, reset_counter: int, now_s: float
     ) -> None:
         """Send it, and what goes with it; to the autopilot `levelled` in its place."""
         t_s = attitude.t_s
         # The rhythm is kept on the average, but what a gap has missed is not made up for.
         self._next_s = self._next_s + self._period_s if self._next_s > t_s - self._period_s else t_s + self._period_s
         self._last_s, self._left_s = t_s, now_s
-        if self._link.send(vision_position_estimate(firmware, levelled or attitude, reset_counter)):
+        if self._link.send(vision_position_estimate(firmware, levelled, reset_counter)):
             self.sent += 1
         if self._full and now_s - self._shown_s >= SHOWN_EVERY_S:
             self._shown_s = now_s
@@ -180,7 +180,7 @@ class AttitudeService:
             self.health.stop("attitude lost: samples were missing for too long")
             return
         levelled = self.difference.levelled(attitude, read_s)
-        self.sender.send(firmware, attitude, self.carrier.reset_counter, read_s, levelled)
+        self.sender.send(firmware, attitude, levelled, self.carrier.reset_counter, read_s)
 
     def _on_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, _t_s: float) -> None:
         if not self._fixed_wing and message.type == mavlink.MAV_TYPE_FIXED_WING:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -23,6 +23,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, Firmware
 from companion.calibration.records.record import WrittenParameter
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core, Offload
+from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
 from companion.links.system.listeners import Listeners
@@ -170,18 +171,18 @@ class Ledger:
 
 
 class Recovery:
-    """Puts values back, guarded like every write; `changing` tells the IMUs that it is us who change them."""
+    """Puts values back, guarded like every write."""
 
     def __init__(
         self,
         core: Core,
         writer: ParameterWriter,
         ledger: Ledger,
-        changing: Callable[[], contextlib.AbstractContextManager[None]],
+        imus: Mapping[str, AutopilotImu],
         owed: RebootOwed,
     ) -> None:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
-        self._writer, self.ledger, self._changing, self._owed = writer, ledger, changing, owed
+        self._writer, self.ledger, self._imus, self._owed = writer, ledger, imus, owed
         self.on_recovered: Listeners[str] = Listeners()
         """Told, in words, of what was put in order."""
 
@@ -222,7 +223,7 @@ class Recovery:
             await wait_until_over(self._parameters, unknown)
         ours, foreign = await self._sort(open_set)
         if ours:
-            with self._changing():
+            with changing(self._imus.values()):
                 await self._writer.restore(ours)
         await self.ledger.undone()
         words = f"Interrupted write: {f'{len(ours)} old values back' if ours else 'nothing of ours was in force'}"
@@ -258,7 +259,7 @@ class Recovery:
         if foreign:
             logger.warning("changed by somebody else since, left alone: %s", "; ".join(foreign))
         async with self.ledger.transaction(step):
-            with self._changing():
+            with changing(self._imus.values()):
                 written = await self._writer.undo(ours)
             await self._owed.after(ours)
             await self.ledger.undone()

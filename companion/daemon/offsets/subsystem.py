@@ -38,7 +38,7 @@ class Offsets(Subsystem):
         self.effect = EffectWatch(core, px4)
         self.planner = Planner(core, imus, devices.slots, self.rivalry)
         self.pusher = Pusher(core, imus, self.writer, self.ledger, px4, self.firmware, self.effect, self.owed)
-        self.recovery = Recovery(core, self.writer, self.ledger, devices.changing, self.owed)
+        self.recovery = Recovery(core, self.writer, self.ledger, imus, self.owed)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.owed.load()

@@ -43,7 +43,7 @@ class Service:
         only_listening: str | None = None,
     ) -> None:
         self.config = config
-        self.core = core = Core.of(config, link, offload, only_listening)
+        self.core = core = Core(config, link, offload, only_listening)
         self.devices = Devices(core, imu_rate_hz)
         self.offsets = Offsets(core, self.devices)
         self.calibrating = Calibrating(core, self.devices, self.offsets)

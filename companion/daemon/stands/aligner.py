@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import math
 from collections.abc import Sequence
 from typing import Final
@@ -17,7 +16,7 @@ from companion.calibration.means.windows import Window
 from companion.calibration.records.align_record import AlignmentRecord, imu_record, stand_record
 from companion.calibration.solution.site import LocalEarth
 from companion.configured import models
-from companion.daemon.core import Core
+from companion.daemon.core import Core, utc_now
 from companion.daemon.job import Job
 from companion.daemon.stands.align_steps import Plan, Seen
 from companion.daemon.stands.alignment import AlignmentInForce
@@ -118,7 +117,7 @@ class Aligner:
         tilt = taken[0].window.tilt
         return AlignmentRecord(
             kind=plan.kind,
-            measured_at=datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds"),
+            measured_at=utc_now(),
             gradienter=settings,
             offset_deg=(round(float(offset[0]), 6), round(float(offset[1]), 6)),
             sigma_deg=round(float(result.offset_sigma_deg.max()), 6),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import logging
 from collections.abc import Mapping
 
@@ -11,7 +10,7 @@ import msgspec
 from companion.autopilot.parameters.wire import same_float32
 from companion.calibration.records.align_record import AlignmentRecord, FacesRecord, TurnRecord
 from companion.component.service import JobResult
-from companion.daemon.core import Core
+from companion.daemon.core import Core, utc_now
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job, Predicted
 from companion.errors import StorageError
@@ -55,29 +54,21 @@ class ByHand:
         """Remember how a job with stands, or a prediction, has ended, where it has come so far."""
         record = job.product
         if isinstance(record, Predicted):
-            written = {name: one.after for name, one in record.written.items()}
-            await self._add(PREDICTION, "predicted", record.predicted_at, result.reason, written)
+            what, state, at, parts = PREDICTION, "predicted", record.predicted_at, [record.written]
+        elif result.outcome == "cancelled" or not isinstance(record, AlignmentRecord | FacesRecord | TurnRecord):
             return
-        if result.outcome == "cancelled" or not isinstance(record, AlignmentRecord | FacesRecord | TurnRecord):
-            return
-        board = record.board.written if isinstance(record, TurnRecord) and record.board is not None else {}
-        parts = [] if isinstance(record, AlignmentRecord) else [imu.written for imu in record.imus]
-        written = {
-            name: one.after
-            for part in (*parts, board)
-            for name, one in part.items()
-            if one.outcome in ("verified", "stored")
-        }
-        await self._add("level" if board else record.kind, result.outcome, record.measured_at, result.reason, written)
-
-    async def _add(self, what: str, state: str, at: str, reason: str, written: dict[str, float]) -> None:
+        else:
+            board = record.board.written if isinstance(record, TurnRecord) and record.board is not None else {}
+            what, state, at = "level" if board else record.kind, result.outcome, record.measured_at
+            parts = [board, *([] if isinstance(record, AlignmentRecord) else [imu.written for imu in record.imus])]
+        kept = [(name, one) for part in parts for name, one in part.items() if one.outcome in ("verified", "stored")]
         done = Done(
             what=what,
             state=state,
             measured_at=at,
-            reason=reason,
+            reason=result.reason,
             system_id=self._vehicle.system_id,
-            written=written,
+            written={name: one.after for name, one in kept},
         )
         # Every power-up may bring another prediction: they must not push out what somebody has measured.
         earlier = [each for each in self._done if each.what != what or what != PREDICTION]
@@ -85,7 +76,7 @@ class ByHand:
 
     async def undone(self, step: ChangeSet) -> None:
         """What was written in this step is in force no more."""
-        now = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
+        now = utc_now()
         await self._write(
             [
                 msgspec.structs.replace(each, undone_at=now) if each.measured_at == step.origin.at else each

@@ -5,7 +5,6 @@ It needs neither a gradienter nor a level spot. Every stand says what is still m
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
@@ -86,7 +85,7 @@ class Facing:
             self._name_left_out(before, known)
         assert local is not None
         await self._stands.check_offsets()
-        draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._core.vehicle.system_id)
+        draft = self._core.draft()
         draft.warnings += local.warnings
         if known.wish is not None:
             draft.warnings.append(f"after {MOST} stands {known.wish.partition(': ')[2]}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
@@ -96,7 +95,7 @@ class Turning:
         found: Alignment = await self._core.offload(turned, stands, ground(local, None))
         if found.complaint is not None:
             raise CalibrationRefusedError(in_words(found.complaint, gradienter=False))
-        draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._core.vehicle.system_id)
+        draft = self._core.draft()
         draft.warnings += local.warnings
         if plan.headings == 2 and _sigma_m_s2(found) > LOOSE_M_S2:
             draft.warnings.append(

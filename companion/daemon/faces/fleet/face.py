@@ -17,7 +17,7 @@ from typing import Final
 
 from companion.config.sections import Fleet
 from companion.daemon.biases.model_priors import TOPIC, ModelPriors
-from companion.daemon.core import Core, Handler
+from companion.daemon.core import Core, Handler, utc_now
 from companion.daemon.faces.fleet import wire
 from companion.daemon.faces.fleet.sources import Look, Sources, utc
 from companion.daemon.faces.mqtt.face import MqttFace
@@ -156,7 +156,7 @@ class FleetFace:
             return
         look = Look(uid, self._vehicle.system_id, self._clock())
         if uid != self._of:
-            moved = [look.item("event", _now(), {"what": "airframe changed", "before": self._of})]
+            moved = [look.item("event", utc_now(), {"what": "airframe changed", "before": self._of})]
             await self._add(uid, [Entry({AIRCRAFT: Mark("", uid)}, moved if self._of is not None else [])])
             self._of = uid
         self._news |= await self._offload(self._sources.has_news)
@@ -178,7 +178,7 @@ class FleetFace:
 
     async def _add(self, aircraft: str, entries: list[Entry]) -> None:
         if entries:
-            await self._offload(self._items.add, aircraft, entries, _utc_now())
+            await self._offload(self._items.add, aircraft, entries, utc(utc_now()))
             await self._count()
 
     async def _take_curves(self, look: Look) -> None:
@@ -190,7 +190,7 @@ class FleetFace:
                 body = {key: imu[key] for key in ("imu", "power_ups", "days", "curve", "accel_curve")}
                 key, mark = f"{CURVE}{look.aircraft}/{imu['imu']}", Mark("", imu["summary"])
                 if imu["curve"] and marks.get(key) != mark:
-                    entries.append(Entry({key: mark}, [look.item("curve", _now(), body)]))
+                    entries.append(Entry({key: mark}, [look.item("curve", utc_now(), body)]))
         await self._add(look.aircraft, entries)
 
     def _clock(self) -> Callable[[str], Clock]:
@@ -223,7 +223,7 @@ class FleetFace:
 
     async def _heed(self, aircraft: str, said: wire.Said, *, confirmed: bool) -> None:
         if confirmed:
-            if await self._offload(self._items.confirm, aircraft, said.epoch, said.sequences, _utc_now()):
+            if await self._offload(self._items.confirm, aircraft, said.epoch, said.sequences, utc(utc_now())):
                 self._under_way = {one for one in self._under_way if one[0] != aircraft or not said.names(one[1])}
                 if self._wait_s > CONFIRMED_WITHIN_S:
                     self._begin_again()  # somebody is there again: in order, from the first
@@ -258,7 +258,7 @@ class FleetFace:
             for topic in topics.heard:
                 await link.hear(topic)
             name = self._settings.name if kept.aircraft == self._of else None
-            link.outbox.keep(topics.hello, wire.hello(kept, name, _utc_now()))
+            link.outbox.keep(topics.hello, wire.hello(kept, name, utc(utc_now())))
             link.outbox.send_again(topics.hello)  # though it be the same as before
             self._greeted[kept.aircraft], self._hello_s = kept.last, now_s
 
@@ -290,11 +290,3 @@ class FleetFace:
         self._under_way = {(waiting.aircraft, waiting.sequence) for waiting in batch}
         self._sent = batch[-1].number if batch else 0
         self._expires_s = now_s + self._wait_s
-
-
-def _now() -> str:
-    return datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
-
-
-def _utc_now() -> str:
-    return utc(_now())
