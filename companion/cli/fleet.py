@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 DEFAULT_PAGE: Final = "127.0.0.1:8291"
 
-_NEEDS_MORE: Final = "companion fleet needs more than is installed: pip install 'companion[fleet]'"
+_NEEDS_MORE: Final = (
+    "companion fleet needs more than is installed: pip install '.[fleet]' in the folder of the companion's sources"
+)
 
 
 def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:

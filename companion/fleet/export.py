@@ -129,7 +129,8 @@ def _parquet(file: IO[bytes], columns: dict[str, Any], parts: Rows) -> int:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError as error:
-        raise ConfigError(f"Parquet needs more than is installed: pip install 'companion[parquet]' ({error})") from None
+        how = "pip install '.[parquet]' in the folder of the companion's sources"
+        raise ConfigError(f"Parquet needs more than is installed: {how} ({error})") from None
     kinds: dict[type[Any], Any] = {
         schema.Moment: pa.timestamp("us", "UTC"),
         sa.BigInteger: pa.int64(),

@@ -30,7 +30,9 @@ MOST_BYTES: Final = 16 * 1024 * 1024
 MOST_TIMES: Final = 100
 """The most that all chunks together may unpack to, in sizes of the file, beside one chunk; ours reach four."""
 MOST_TOPICS: Final = 1024
-_NEEDS_MORE: Final = "a recording needs more than is installed: pip install 'companion[recording]'"
+_NEEDS_MORE: Final = (
+    "a recording needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
+)
 
 
 class Message(msgspec.Struct, frozen=True, gc=False):

@@ -738,11 +738,11 @@ def test_without_the_means_the_daemon_runs_and_says_so_only_where_recordings_wer
         rig.config = msgspec.structs.replace(rig.config, storage=storage)
         async with rig.running():
             await rig.ready()
-            with pytest.raises(StorageError, match=r"pip install 'companion\[recording\]'"):
+            with pytest.raises(StorageError, match=r"pip install '\.\[recording\]'"):
                 await asked(rig)
 
     run_virtual(main())
-    assert len([entry for entry in caplog.records if "companion[recording]" in entry.message]) == said
+    assert len([entry for entry in caplog.records if "'.[recording]'" in entry.message]) == said
     assert not (tmp_path / "recordings").exists()
 
 
@@ -800,7 +800,7 @@ def test_without_the_means_a_replay_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "zstandard", None)
     assert companion(["replay", str(usual[0])]) == 1
-    assert "pip install 'companion[recording]'" in capsys.readouterr().err
+    assert "pip install '.[recording]'" in capsys.readouterr().err
 
 
 def test_the_command_says_the_same_and_ends_with_0(

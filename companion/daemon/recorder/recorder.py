@@ -52,7 +52,9 @@ PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
 """How long the daemon's end waits for the disk at most."""
 INTERNAL: Final = "internal error; the log has the details"
-HOW_TO_INSTALL: Final = "recording needs more than is installed: pip install 'companion[recording]'"
+HOW_TO_INSTALL: Final = (
+    "recording needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
+)
 
 
 class Surroundings:
