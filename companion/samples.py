@@ -17,6 +17,11 @@ Triad = Literal["gyro", "accel"]
 TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 
 
+def rows_of(triad: Triad) -> slice:
+    """Its rows of six."""
+    return slice(0, 3) if triad == "gyro" else slice(3, 6)
+
+
 class ImuSample(msgspec.Struct, frozen=True, gc=False):
     """Angular rate and specific force of one IMU at one instant.
 

@@ -20,7 +20,7 @@ from companion.calibration.noise.allan import WARM_UP_K
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats, Matrix, vector
 from companion.physics.units import DEG_H, MG
-from companion.samples import Triad, Vector
+from companion.samples import Triad, Vector, rows_of
 
 QUICKEST_S: Final = 60.0
 """The shortest time constant of a warm-up: boards take 1 to 20 min."""
@@ -42,15 +42,24 @@ _STEPS_K: Final = (1.0, 0.5, 0.25, 0.1, 0.05, 0.01)
 """Resolutions of thermometers, coarse ones first."""
 
 
-class Line(msgspec.Struct, frozen=True, kw_only=True):
-    """One triad's readings over a window as a straight line; vehicle FRD, rad/s or m/s^2, and those a second."""
+class Lines(NamedTuple):
+    """Straight lines through the readings of gyro and accelerometer, rad/s^2 and m/s^3; (6,), or the (3,) of one."""
 
-    slope: Vector
-    slope_variance: Vector
-    ramp: Vector
-    """What of the slope was seen as a ramp, so that the mean that is given is its end."""
-    level_variance: Vector
-    """Of the mean over the window for the next minutes, without any slope."""
+    hidden: Floats
+    """Slopes that are not significant; zero of the others."""
+    hidden_variance: Floats
+    """Likewise; infinite where the window tells nothing."""
+    ramp: Floats
+    """Slopes that are, so that the mean that is given is the end of the line."""
+    variance: Floats
+    """Of both."""
+    level_variance: Floats
+    """Of the mean over the window for the next minutes, as if there were no ramp."""
+
+    @property
+    def slope(self) -> Floats:
+        """Significant or not."""
+        return self.hidden + self.ramp
 
 
 class Path(msgspec.Struct, frozen=True, kw_only=True):
@@ -79,22 +88,15 @@ class Path(msgspec.Struct, frozen=True, kw_only=True):
 class Warming(msgspec.Struct, frozen=True, kw_only=True):
     """What one window tells of slopes; vehicle FRD, rad/s^2 and m/s^3."""
 
-    gyro_slope: Vector
-    """Zero, with a variance of zero, where a ramp was seen: its end is the mean then."""
-    gyro_variance: Vector
-    accel_slope: Vector
-    accel_variance: Vector
-    gyro_warm_up: float
-    """By how much a warm-up of `WARM_UP_K` moves the bias, rad/s."""
-    accel_warm_up: float
-    """m/s^2."""
+    lines: Lines
+    """Variances are at most `_NOTHING`."""
+    warm_up: tuple[float, float]
+    """By how much a warm-up of `WARM_UP_K` moves the biases of gyro and accelerometer, rad/s and m/s^2."""
     lever_s: float
     """Middle of the window to the middle of the next minute."""
     k_s: float | None
     """How fast its thermometer goes up; None: it has none."""
     k_s_variance: float = 0.0
-    gyro_line: Line | None = None
-    accel_line: Line | None = None
     path: Path | None = None
     """None: its temperature is not known to have changed."""
 
@@ -103,27 +105,23 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
         """Middle of the window to its end."""
         return self.lever_s - NEXT_S / 2.0
 
-    def line(self, triad: Triad) -> Line | None:
-        """Of one triad; None where there is no such thing."""
-        return self.gyro_line if triad == "gyro" else self.accel_line
+    def of(self, triad: Triad) -> Lines:
+        """Those of one triad."""
+        return Lines(*(each[rows_of(triad)] for each in self.lines))
 
     def ahead(self, triad: Triad) -> Floats:
         """By how much the mean that is given is more than that over the window, where it is the end of a ramp, (3,)."""
-        line = self.line(triad)
-        return np.zeros(3) if line is None else np.array(line.ramp) * self.half_s
+        return self.of(triad).ramp * self.half_s
 
     def goes_on(self, triad: Triad) -> tuple[Floats, Floats]:
         """The slope that will go on for some seconds and one sigma of it, (3,).
 
         That of a ramp, or what the thermometer's rate leaves of another.
         """
-        line, move = self.line(triad), self.gyro_warm_up if triad == "gyro" else self.accel_warm_up
-        if line is None:
-            return np.zeros(3), np.zeros(3)
-        slope, variance = np.array(line.slope), np.array(line.slope_variance)
+        lines, move = self.of(triad), self.warm_up[0 if triad == "gyro" else 1]
         prior = np.square(self.rate_k_s * move / WARM_UP_K)
-        share = np.where(np.array(line.ramp) != 0.0, 1.0, prior / np.maximum(prior + variance, np.finfo(float).tiny))
-        return share * slope, np.sqrt(share * variance)
+        share = np.where(lines.ramp != 0.0, 1.0, prior / np.maximum(prior + lines.variance, np.finfo(float).tiny))
+        return share * lines.slope, np.sqrt(share * lines.variance)
 
     @property
     def rate_k_s(self) -> float:
@@ -136,9 +134,8 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
         `powered_s`: for so long the sensor has been switched on at least, at the end of the window.
         """
         kelvin = self._kelvin(powered_s) / WARM_UP_K**2
-        slope = np.array([*self.gyro_slope, *self.accel_slope])
-        variance = np.array([*self.gyro_variance, *self.accel_variance])
-        prior = kelvin * np.repeat([self.gyro_warm_up**2, self.accel_warm_up**2], 3)
+        slope, variance = self.lines.hidden, self.lines.hidden_variance
+        prior = kelvin * np.repeat(np.square(self.warm_up), 3)
         share = prior / np.maximum(prior + variance, np.finfo(float).tiny)
         return np.asarray((np.square(share * slope) + share * variance) * self.lever_s**2)
 
@@ -243,52 +240,27 @@ def _resolution_k(degc: Floats) -> float:
     return next((step for step in _STEPS_K if abs(value / step - round(value / step)) < 1e-6), 0.0)
 
 
-class Lines(NamedTuple):
-    """Slopes of gyro and accelerometer, (6,), sensor's axes; variances are infinite where the window tells nothing."""
-
-    hidden: Floats
-    """Of those that are not significant; zero of the others."""
-    hidden_variance: Floats
-    ramp: Floats
-    """Of those that are."""
-    variance: Floats
-    """Of both."""
-    level_variance: Floats
-    """Of the mean over the window for the next minutes, as if there were no ramp."""
-
-
 def warming(rotation: Matrix, lines: Lines, warm_up: tuple[float, float], batches: Sequence[Batch]) -> Warming:
     """Of one window, turned into the vehicle's axes; `warm_up` is what `WARM_UP_K` does."""
+
+    def turned(values: Floats, turn: Matrix, most: float = math.inf) -> Floats:
+        both = [turn @ np.minimum(values[rows], most) for rows in (slice(0, 3), slice(3, 6))]
+        return np.minimum(np.concatenate(both), most)
+
     square = np.square(rotation)
-
-    def both(values: Floats, turn: Matrix, most: float = math.inf) -> list[Vector]:
-        return [vector(np.minimum(turn @ np.minimum(values[of], most), most)) for of in (slice(0, 3), slice(3, 6))]
-
-    gyro_slope, accel_slope = both(lines.hidden, rotation)
-    gyro_variance, accel_variance = both(lines.hidden_variance, square, _NOTHING)
-    gyro_line, accel_line = (
-        Line(slope=slope, slope_variance=variance, ramp=ramp, level_variance=level)
-        for slope, variance, ramp, level in zip(
-            both(lines.hidden + lines.ramp, rotation),
-            both(lines.variance, square, _NOTHING),
-            both(lines.ramp, rotation),
-            both(lines.level_variance, square),
-            strict=True,
-        )
-    )
     rate = temperature_rate(batches)
     return Warming(
-        gyro_slope=gyro_slope,
-        gyro_variance=gyro_variance,
-        accel_slope=accel_slope,
-        accel_variance=accel_variance,
-        gyro_warm_up=warm_up[0],
-        accel_warm_up=warm_up[1],
+        lines=Lines(
+            turned(lines.hidden, rotation),
+            turned(lines.hidden_variance, square, _NOTHING),
+            turned(lines.ramp, rotation),
+            turned(lines.variance, square, _NOTHING),
+            turned(lines.level_variance, square),
+        ),
+        warm_up=warm_up,
         lever_s=(batches[-1].slot + 1.0 - batches[0].slot + NEXT_S) / 2.0,
         k_s=None if rate is None else rate[0],
         k_s_variance=0.0 if rate is None else rate[1],
-        gyro_line=gyro_line,
-        accel_line=accel_line,
         path=temperature_path(batches),
     )
 

@@ -20,7 +20,7 @@ from companion.calibration.solution.solve import ImuSolution, Shared
 from companion.calibration.temperature.along import Along
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H, MG
-from companion.samples import Triad
+from companion.samples import Triad, rows_of
 
 TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 _CONTRADICTS: Final = 4.0
@@ -32,11 +32,6 @@ _OF_END: Final = 0.25
 _WORDS: Final = {"gyro": (DEG_H, "deg/h", ".0f"), "accel": (MG, "mg", ".1f")}
 
 Pair = tuple[Array | None, Array | None]
-
-
-def rows_of(triad: Triad) -> slice:
-    """Its rows of six."""
-    return slice(0, 3) if triad == "gyro" else slice(3, 6)
 
 
 def at_end(
@@ -76,12 +71,12 @@ def at_end(
 
 def _end(imu: ImuSolution, triad: Triad, along: Along) -> tuple[Array, Array, Array, Array, Array] | None:
     """What is added to the bias, its variance, that of the mean, what the slope may yet do, and what was a ramp."""
-    line = None if imu.warming is None else imu.warming.line(triad)
-    if line is None or imu.warming is None:
+    if imu.warming is None:
         return None
-    half_s, slope, ramp = imu.warming.half_s, np.array(along.slope), np.array(line.ramp)
-    of_line, of_slope = np.array(line.slope_variance), np.array(along.slope_variance)
-    more = np.array(line.slope) - slope
+    lines = imu.warming.of(triad)
+    half_s, slope, ramp = imu.warming.half_s, np.array(along.slope), lines.ramp
+    of_line, of_slope = lines.variance, np.array(along.slope_variance)
+    more = lines.slope - slope
     if (np.abs(more) > _CONTRADICTS * np.sqrt(of_line + of_slope)).any():
         return None
     share = of_slope / (of_line + of_slope)
@@ -89,7 +84,7 @@ def _end(imu: ImuSolution, triad: Triad, along: Along) -> tuple[Array, Array, Ar
     bend = np.maximum(np.array(along.shift_variance) - half_s**2 * of_slope, 0.0)
     # It may go on, or end now.
     goes_on = np.square(slope + share * more) / 3.0 + share * of_line
-    return shift, half_s**2 * share * of_line + bend, np.array(line.level_variance), goes_on, ramp != 0.0
+    return shift, half_s**2 * share * of_line + bend, lines.level_variance, goes_on, ramp != 0.0
 
 
 def foretold(imu: ImuSolution, whole: Pair, expected: ExpectedImu | None, followed: Collection[Triad]) -> ImuSolution:

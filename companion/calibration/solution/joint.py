@@ -26,14 +26,14 @@ import numpy as np
 
 from companion.calibration.records.history import Measured, Point, PowerUp
 from companion.calibration.records.record import AccelPrior, GyroPrior, Prior
-from companion.calibration.solution.at_end import TRIADS, Pair, at_end, foretold, rows_of
+from companion.calibration.solution.at_end import TRIADS, Pair, at_end, foretold
 from companion.calibration.solution.doubt import Doubt, Witness, doubts
 from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.calibration.turning.watch import CHANCE_SIGMAS, Turn
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG
-from companion.samples import Triad, Vector
+from companion.samples import Triad, Vector, rows_of
 
 Whole = Mapping[str, Pair]
 """By IMU: whole gyro and accelerometer bias by the readings alone, (3,) each, vehicle FRD."""
