@@ -62,31 +62,37 @@ def vector(values: Array) -> Vector:
     return x, y, z
 
 
-def skew(vector: Array) -> Matrix:
-    """The cross-product matrix [v x], 3x3."""
+def skew(vectors: Floats) -> Floats:
+    """The cross-product matrices [v x], (..., 3, 3), of (..., 3)."""
+    found = np.zeros((*vectors.shape, 3))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    found[..., 0, 1], found[..., 0, 2], found[..., 1, 2] = -z, y, -x
+    found[..., 1, 0], found[..., 2, 0], found[..., 2, 1] = z, -y, x
+    return found
+
+
+def symmetric(beside: Array) -> Matrix:
+    """The 3x3 matrix with xy, xz and yz beside a diagonal of zeros."""
+    xy, xz, yz = beside
+    return np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
+
+
+def symmetric_by(vector: Array) -> Matrix:
+    """How `symmetric(beside) @ vector` changes with xy, xz and yz, 3x3."""
     x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.array([[y, z, 0.0], [x, 0.0, z], [0.0, x, y]])
 
 
 def rotations(vectors: Floats) -> Floats:
-    """(n, 3, 3) matrices of rotation vectors (n, 3) in rad (Rodrigues)."""
-    angle2 = np.einsum("ni,ni->n", vectors, vectors)
+    """Matrices (..., 3, 3) of rotation vectors (..., 3) in rad (Rodrigues)."""
+    angle2 = np.einsum("...i,...i->...", vectors, vectors)
     angle = np.sqrt(angle2)
     small = angle < 1e-4
     divisor = np.where(small, 1.0, angle)
     sine = np.where(small, 1.0 - angle2 / 6.0, np.sin(angle) / divisor)
     cosine = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(angle)) / np.square(divisor))
-    cross = skews(vectors)
-    return np.asarray(np.eye(3) + sine[:, None, None] * cross + cosine[:, None, None] * (cross @ cross))
-
-
-def skews(vectors: Floats) -> Floats:
-    """(n, 3, 3) cross-product matrices of (n, 3)."""
-    found = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    found[:, 0, 1], found[:, 0, 2], found[:, 1, 2] = -z, y, -x
-    found[:, 1, 0], found[:, 2, 0], found[:, 2, 1] = z, -y, x
-    return found
+    cross = skew(vectors)
+    return np.asarray(np.eye(3) + sine[..., None, None] * cross + cosine[..., None, None] * (cross @ cross))
 
 
 def running_products(turns: Floats) -> Floats:

@@ -57,7 +57,7 @@ def test_a_second_of_a_sea_turns_as_the_aircraft_has_turned() -> None:
     # The bias that is put in comes out as its derivatives say.
     bias = np.radians([0.05, -0.04, 0.03])
     biased = passage(times, rates - earth + bias, forces)
-    corrected = rotations(-(biased.turned @ bias)[None])[0] @ biased.turn
+    corrected = rotations(-biased.turned @ bias) @ biased.turn
     assert math.degrees(np.linalg.norm(corrected - found.turn)) < 0.02 * math.degrees(np.linalg.norm(bias)) * 5.0
     change = biased.velocity_m_s + biased.velocity_by_bias @ bias - found.velocity_m_s
     assert np.linalg.norm(change) < 0.02 * np.linalg.norm(biased.velocity_m_s - found.velocity_m_s)

@@ -61,7 +61,8 @@ class Wandering(Sensor):
 
     def known(self) -> Accelerometer:
         stands = [Face(self.mean(EVERY_S * k, self.up(*pose)), self.use) for k, pose in enumerate(TWELVE)]
-        return faces(stands, SITE.gravity_m_s2, 3e-4, self.wander).accelerometer
+        found = faces(stands, SITE.gravity_m_s2, 3e-4, self.wander)
+        return Accelerometer(found.figures, found.covariance)
 
     def later(self, known: Accelerometer, gap_s: float, step_m_s2: Floats, aged_m_s2: float) -> Later:
         """On some ground, with a bias that has stepped besides."""

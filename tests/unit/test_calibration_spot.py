@@ -145,7 +145,8 @@ def held(board_deg: tuple[float, float, float], orientation: str = "ROTATION_NON
         aircraft = VirtualAircraft(Pose(pitch + 3.0 * math.sin(k), roll + 4.0 * math.cos(k), 30.0 * k), SITE)
         # In the sensor's axes, as `ImuModel` gives them.
         stands.append(Face(model(aircraft, board_deg).expected(0.0)[3:], np.full(3, SIGMA)))
-    return faces(stands, G, 0.0).accelerometer
+    found = faces(stands, G, 0.0)
+    return Accelerometer(found.figures, found.covariance)
 
 
 def test_the_boards_tilt_is_found_on_a_slope() -> None:

@@ -124,10 +124,8 @@ def align(
     chi_square, freedom = float(residual @ residual), len(residual) - int(sought.sum()) - model.damped
     complaint, checked = _worst(residual, scaled @ inverse, scaled, rows, model)
     covariance = np.zeros((model.size, model.size))
-    # More scatter than chance makes of the sigmas widens them; less of it proves nothing.
-    spread = chi_square / freedom if freedom > 0 and chi_square > by_chance(freedom) else 1.0
     sigma = model.sigma[sought]
-    covariance[np.ix_(sought, sought)] = spread * inverse * np.outer(sigma, sigma)
+    covariance[np.ix_(sought, sought)] = widened_by(chi_square, freedom) * inverse * np.outer(sigma, sigma)
     return Alignment(
         offset_deg=at.values[model.offset] / DEG,
         offset_covariance_deg2=covariance[model.offset, model.offset] / DEG**2,
@@ -173,10 +171,16 @@ def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:
     return f"the stands do not fit what is known of the sensors ({by}): begin again"
 
 
-def by_chance(freedom: int) -> float:
-    """The 99 % point of chi square (Wilson and Hilferty, PNAS 17, 684, 1931)."""
+def widened_by(chi_square: float, freedom: int) -> float:
+    """The scatter over that of the sigmas, where it is more than chance makes of them: less of it proves nothing.
+
+    Beyond the 99 % point of chi square (Wilson and Hilferty, PNAS 17, 684, 1931).
+    """
+    if freedom <= 0:
+        return 1.0
     part = 2.0 / (9.0 * freedom)
-    return float(freedom * (1.0 - part + 2.326 * math.sqrt(part)) ** 3)
+    by_chance = freedom * (1.0 - part + 2.326 * math.sqrt(part)) ** 3
+    return chi_square / freedom if chi_square > by_chance else 1.0
 
 
 def _first_attitude(law: Law, mounting: Matrix, stand: Stand) -> Matrix:

@@ -29,16 +29,14 @@ from typing import Final, Literal
 
 import numpy as np
 
-from companion.physics.frames import Array, Matrix, rotations, skew, skews
+from companion.physics.frames import Array, Matrix, rotations, skew, symmetric, symmetric_by
 from companion.physics.gradienter import Law, readings_from_up, up_jacobian
 from companion.physics.units import DEG, MG
 
 DOWN: Final = np.array([0.0, 0.0, 1.0])
 Group = Literal["gradienter", "accelerometer", "gyro", "compass", "turn", "spot", "zero", "prior", "nothing"]
 
-_SHEAR: Final = np.array([[[0, 1, 0], [1, 0, 0], [0, 0, 0]], [[0, 0, 1], [0, 0, 0], [1, 0, 0]],
-                          [[0, 0, 0], [0, 0, 1], [0, 1, 0]]], dtype=np.float64)  # fmt: skip
-_AXES: Final = skews(np.eye(3))
+_AXES: Final = skew(np.eye(3))
 _ANYHOW_RAD: Final = 1.0
 """Sigma about the first guess of what only the readings determine: it keeps the equations solvable."""
 
@@ -197,7 +195,7 @@ class Model:
         at.values = at.values + by
         at.values[self._poses : self._first_imu] = 0.0
         for k in range(len(self.stands)):
-            at.attitudes[k] = _turned(-by[self.pose(k)]) @ at.attitudes[k]
+            at.attitudes[k] = rotations(-by[self.pose(k)]) @ at.attitudes[k]
 
     # --- residuals
 
@@ -286,11 +284,11 @@ class Model:
     def reading_by(self, at: Unknowns, imu: int, up: Array) -> Matrix:
         """How that changes with everything but the attitude, (3, size)."""
         misalignment, gravity = at.imus[imu, Part.MISALIGNMENT], at.gravity_m_s2
-        stretch, aligned = _stretch(at, imu), _turned(-misalignment) @ up
+        stretch, aligned = _stretch(at, imu), rotations(-misalignment) @ up
         by = np.zeros((3, self.size))
         by[:, self.imu(imu, Part.MISALIGNMENT)] = gravity * stretch @ skew(aligned) @ _jacobian(-misalignment)
         by[:, self.imu(imu, Part.SCALE)] = gravity * np.diag(aligned)
-        by[:, self.imu(imu, Part.SHEAR)] = gravity * (_SHEAR @ aligned).T
+        by[:, self.imu(imu, Part.SHEAR)] = gravity * symmetric_by(aligned)
         by[:, self.imu(imu, Part.ACCEL_BIAS)] = np.eye(3)
         by[:, self.gravity] = (stretch @ aligned)[:, None]
         return by
@@ -326,18 +324,17 @@ class _Rows:
         return np.concatenate(residuals), np.vstack(derivatives), self._labels
 
 
+def response(scale: Array, shear: Array) -> Matrix:
+    """I + S, (3, 3), of scale x y z and shear xy, xz, yz."""
+    return np.diag(1.0 + scale) + symmetric(shear)
+
+
 def _stretch(at: Unknowns, imu: int) -> Matrix:
-    return np.asarray(
-        np.eye(3) + np.diag(at.imus[imu, Part.SCALE]) + np.tensordot(at.imus[imu, Part.SHEAR], _SHEAR, axes=1)
-    )
+    return response(at.imus[imu, Part.SCALE], at.imus[imu, Part.SHEAR])
 
 
 def _response(at: Unknowns, imu: int) -> Matrix:
-    return _stretch(at, imu) @ _turned(-at.imus[imu, Part.MISALIGNMENT])
-
-
-def _turned(vector_rad: Array) -> Matrix:
-    return np.asarray(rotations(vector_rad[None])[0])
+    return _stretch(at, imu) @ rotations(-at.imus[imu, Part.MISALIGNMENT])
 
 
 def _jacobian(vector_rad: Array) -> Matrix:

@@ -22,9 +22,10 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.alignment.align import by_chance
+from companion.calibration.alignment.align import widened_by
+from companion.calibration.alignment.align_model import response
 from companion.errors import CalibrationRefusedError
-from companion.physics.frames import Array, Matrix
+from companion.physics.frames import Array, Matrix, symmetric_by
 from companion.physics.units import MG
 
 FIGURES: Final = 9
@@ -39,7 +40,6 @@ W_LIMIT: Final = 3.9
 """|w| of a stand (Baarda): passed by chance once in ten thousand."""
 LEAST_SPARE: Final = 2
 """Stands beyond the figures, below which a wrong one cannot be told from the others."""
-_PAIRS: Final = ((0, 1), (0, 2), (1, 2))
 _MAX_ROUNDS: Final = 30
 _CONVERGED: Final = 1e-8
 _LEAST_REDUNDANCY: Final = 1e-3
@@ -89,11 +89,6 @@ class Faces:
         return both
 
     @property
-    def accelerometer(self) -> Accelerometer:
-        """The figures alone."""
-        return Accelerometer(self.figures, self.covariance)
-
-    @property
     def sigma(self) -> Array:
         """One sigma of each figure, (9,)."""
         return np.sqrt(np.diag(self.covariance))
@@ -126,7 +121,7 @@ def faces(
             break
         worst = mended[0] if mended else min(kept, key=lambda k: without[k].chi_square)
         left_out, fit = (*left_out, worst), without[worst]
-    stretch, bias = response(fit.figures), fit.figures[BIAS]
+    stretch, bias = response(fit.figures[SCALE], fit.figures[SHEAR]), fit.figures[BIAS]
     inside = np.linalg.solve(stretch, np.array([stand.accel_m_s2 - bias for stand in stands]).T).T
     lengths = np.linalg.norm(inside, axis=1)
     return Faces(
@@ -144,8 +139,7 @@ def faces(
 
 def along(up: Array, gravity_m_s2: float) -> Array:
     """How the length of a reading changes with the figures, (9,), where `up` is up in the sensor's axes."""
-    doubled = 2.0 * np.array([up[i] * up[j] for i, j in _PAIRS])
-    return np.concatenate([up, gravity_m_s2 * up**2, gravity_m_s2 * doubled])
+    return np.concatenate([up, gravity_m_s2 * up**2, gravity_m_s2 * up @ symmetric_by(up)])
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -154,14 +148,6 @@ class _Fit:
     covariance: Matrix
     chi_square: float
     fits: bool
-
-
-def response(figures: Array) -> Matrix:
-    """I + S of figures (9,) or more, (3, 3)."""
-    result = np.diag(1.0 + figures[SCALE])
-    for (i, j), value in zip(_PAIRS, figures[SHEAR], strict=True):
-        result[i, j] = result[j, i] = value
-    return result
 
 
 def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, float]) -> _Fit:
@@ -185,7 +171,7 @@ def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, flo
 
 def _linearised(force: Matrix, variance: Matrix, at: Array, gravity_m_s2: float, prior: Array) -> tuple[Array, Matrix]:
     """Residuals over sigma, measured minus foretold, and the derivatives of what is foretold times the prior sigmas."""
-    inverse = np.linalg.inv(response(at))
+    inverse = np.linalg.inv(response(at[SCALE], at[SHEAR]))
     inside = (force - at[BIAS]) @ inverse
     lengths = np.linalg.norm(inside, axis=1)
     across = inside / lengths[:, None] @ inverse
@@ -194,8 +180,7 @@ def _linearised(force: Matrix, variance: Matrix, at: Array, gravity_m_s2: float,
     derivative = np.empty((len(force), FIGURES + 1))
     derivative[:, BIAS] = across
     derivative[:, SCALE] = across * inside
-    for column, (i, j) in enumerate(_PAIRS):
-        derivative[:, SHEAR.start + column] = across[:, i] * inside[:, j] + across[:, j] * inside[:, i]
+    derivative[:, SHEAR] = [one @ symmetric_by(other) for one, other in zip(across, inside, strict=True)]
     derivative[:, FIGURES] = 1.0
     residual = lengths - gravity_m_s2 - at[FIGURES]
     return (
@@ -212,9 +197,7 @@ def _judged(residual: Array, scaled: Matrix, at: Array, prior: Array, count: int
     w = residual / np.sqrt(np.maximum(redundancy, _LEAST_REDUNDANCY))
     # Against what the other stands scatter, where that is more than their sigmas.
     others = np.maximum((chi_square - w**2) / (freedom - 1), 1.0) if freedom > 1 else np.ones(count)
-    # More scatter than chance makes of the sigmas widens them; less of it proves nothing.
-    spread = chi_square / freedom if freedom > 0 and chi_square > by_chance(freedom) else 1.0
-    covariance = spread * inverse * np.outer(prior, prior)
+    covariance = widened_by(chi_square, freedom) * inverse * np.outer(prior, prior)
     return _Fit(
         figures=at[:FIGURES],
         covariance=covariance[:FIGURES, :FIGURES],

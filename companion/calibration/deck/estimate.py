@@ -22,7 +22,7 @@ from companion.calibration.means.windows import ImuInput, ImuWindow, Window
 from companion.calibration.noise.allan import AllanModel, floor_variance, slope_variance
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Floats, Matrix, body_from_ned, vector
-from companion.physics.gradienter import up_in_sensor, up_jacobian
+from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG, MG
 
 MIN_S: Final = 60
@@ -238,7 +238,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         accel, accel_sigma = np.zeros(3), _UNKNOWN_ACCEL_M_S2
         if gradienter is not None and compared is not None and reference is not None:
             off = np.array(reference) - compared.difference_deg
-            accel = _GRAVITY_M_S2 * (_up(gradienter, *off.tolist()) - _up(gradienter, *reference))
+            accel = _GRAVITY_M_S2 * (gradienter.up(*off.tolist()) - gradienter.up(*reference))
             accel_sigma = _LEAST_ACCEL_M_S2
         model = imu.profile.gyro
         white = model.white
@@ -297,15 +297,10 @@ def _felt(
         up /= np.linalg.norm(up)
         return size * up, np.outer(up, up) * found.force_sigma_m_s2**2
     x, y = (np.array(reference) - compared.difference_deg).tolist()
-    right, up = _up(gradienter, *reference), _up(gradienter, x, y)
+    right, up = gradienter.up(*reference), gradienter.up(x, y)
     by_reading = size * DEG * gradienter.vehicle_from_sensor @ up_jacobian(gradienter.law, x, y)
     covariance = by_reading @ compared.covariance_deg2 @ by_reading.T
     return size * up / float(up @ right), covariance + np.outer(right, right) * found.force_sigma_m_s2**2
-
-
-def _up(gradienter: GradienterModel, x_deg: float, y_deg: float) -> Array:
-    """(3,) up in the vehicle's axes by readings without an offset: which zero is in force is known later."""
-    return gradienter.vehicle_from_sensor @ up_in_sensor(gradienter.law, x_deg, y_deg)
 
 
 def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:

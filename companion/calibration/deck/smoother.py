@@ -30,7 +30,7 @@ from companion.physics.frames import (
     roll_pitch_from_up,
     rotations,
     running_products,
-    skews,
+    skew,
 )
 
 EARTH_RATE_NORTH_RAD_S: Final = 5.2e-5
@@ -152,7 +152,7 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
         system = _System.of(stretch, attitudes, forces, (headings_rad, compass_forward), believed.compass_lag_s)
         answer = system.solve(noise, believed, _NO_RAMP)
         noise = system.noise(answer)
-        start = rotations(answer.values[None, _START])[0] @ start
+        start = rotations(answer.values[_START]) @ start
         bias = bias + answer.values[_GYRO]
         if (np.square(answer.values[_GYRO]) < _NEAR**2 * np.diag(answer.covariance)[_GYRO]).all():
             break
@@ -320,7 +320,7 @@ def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> Passag
     half = (whole[1:] + whole[:-1]) / 2.0 * steps[:, None, None]
     turned = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(half, axis=0)])
     felt = np.einsum("nij,nj->ni", whole, forces_m_s2)
-    by_bias = skews(felt) @ turned
+    by_bias = skew(felt) @ turned
     return Passage(
         span_s=float(times_s[-1] - times_s[0]),
         turn=turns[-1],

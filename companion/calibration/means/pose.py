@@ -38,6 +38,14 @@ class GradienterModel:
     offset_deg: tuple[float, float]
     sigma_deg: float
 
+    def up(self, x_deg: float, y_deg: float) -> Array:
+        """Up in the vehicle's axes, (3,), by readings without an offset: which zero is in force may be known later.
+
+        Raises:
+            ValueError: the readings cannot belong together.
+        """
+        return self.vehicle_from_sensor @ up_in_sensor(self.law, x_deg, y_deg)
+
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class CompassModel:
@@ -63,13 +71,8 @@ class CompassModel:
 
 
 def up_in_vehicle(model: GradienterModel, x_deg: float, y_deg: float) -> Array:
-    """Up in the vehicle's axes, shape (3,), from the gradienter's two readings.
-
-    Raises:
-        ValueError: the readings cannot belong together.
-    """
-    x_deg, y_deg = x_deg - model.offset_deg[0], y_deg - model.offset_deg[1]
-    return model.vehicle_from_sensor @ up_in_sensor(model.law, x_deg, y_deg)
+    """Up in the vehicle's axes, shape (3,), from the gradienter's two readings; raises as `GradienterModel.up`."""
+    return model.up(x_deg - model.offset_deg[0], y_deg - model.offset_deg[1])
 
 
 def vehicle_heading_rad(compass: CompassModel, heading_deg: float, up: Array) -> float:

@@ -14,12 +14,13 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from companion.calibration.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Accelerometer, response
+from companion.calibration.alignment.align_model import response
+from companion.calibration.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Accelerometer
 from companion.calibration.means.windows import ImuWindow
 from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.calibration.solution.prior import CATALOGUE_PER_K, CATALOGUE_SCATTER
 from companion.calibration.solution.site import LocalEarth
-from companion.physics.frames import Array, Matrix, vector
+from companion.physics.frames import Array, Matrix, symmetric_by, vector
 from companion.physics.units import DEG, MG
 from companion.samples import Vector
 
@@ -127,13 +128,12 @@ def _force(imu: ImuWindow, known: Sides) -> tuple[Array, Matrix]:
     """The specific force in the vehicle's axes, (3,), and its covariance, (3, 3)."""
     figures, sigma = np.array(known.figures), np.array(known.sigma)
     turn = np.array(known.vehicle_from_sensor)
-    inverse = np.linalg.inv(response(figures))
+    inverse = np.linalg.inv(response(figures[SCALE], figures[SHEAR]))
     force = inverse @ (turn.T @ np.array(imu.accel_m_s2) - figures[BIAS])
-    x, y, z = force
     by = np.zeros((3, FIGURES))
     by[:, BIAS] = np.eye(3)
     by[:, SCALE] = np.diag(force)
-    by[:, SHEAR] = [[y, z, 0.0], [x, 0.0, z], [0.0, x, y]]
+    by[:, SHEAR] = symmetric_by(force)
     mean = turn.T @ np.diag(np.square(imu.accel_sigma_stat_m_s2)) @ turn
     inside = inverse @ (by @ np.diag(np.square(sigma)) @ by.T + mean) @ inverse.T
     return turn @ force, turn @ inside @ turn.T

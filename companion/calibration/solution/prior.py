@@ -34,7 +34,7 @@ from companion.calibration.records.history import Measured, Point, PowerUp, beli
 from companion.calibration.records.record import Effective
 from companion.calibration.temperature.along import WARM_AFTER, Along, Settling, along
 from companion.calibration.temperature.curve import REFERENCE_DEGC, Curve, Node, PowerUpNodes, fit
-from companion.physics.frames import Array, Floats, Matrix, skew, vector
+from companion.physics.frames import Array, Floats, Matrix, skew, symmetric, vector
 from companion.physics.units import DEG, DEG_H, MG, G
 from companion.samples import Triad, Vector
 
@@ -103,10 +103,10 @@ def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:
     shear, shear_sigma = _known(aligned.accel_shear if aligned else none, 1.0, _PRIORS.shear)
     turn, turn_sigma = _known(aligned.misalignment_deg if aligned else none, DEG, _PRIORS.misalignment_deg * DEG)
     return PoseEffect(
-        mean=np.diag(scale) + _beside(shear),
-        sigma=np.diag(scale_sigma) + _beside(shear_sigma),
+        mean=np.diag(scale) + symmetric(shear),
+        sigma=np.diag(scale_sigma) + symmetric(shear_sigma),
         misalignment_mean=-skew(turn),
-        misalignment_sigma=_beside(turn_sigma[::-1]),
+        misalignment_sigma=symmetric(turn_sigma[::-1]),
         source="alignment" if aligned is not None and any(aligned.accel_scale.known) else "assumed",
     )
 
@@ -116,12 +116,6 @@ def _known(found: Determined | None, unit: float, assumed: float) -> tuple[Array
         return np.zeros(3), np.full(3, assumed)
     known = np.array(found.known)
     return np.where(known, found.value, 0.0) * unit, np.where(known, np.array(found.sigma) * unit, assumed)
-
-
-def _beside(values: Array) -> Matrix:
-    """xy, xz, yz as a symmetric matrix."""
-    xy, xz, yz = values
-    return np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
 
 
 GUARDS_FROM: Final = 3

@@ -43,7 +43,6 @@ from companion.calibration.turning.watch import Turn
 from companion.config.sections import Platform
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, roll_pitch_from_up, skew
-from companion.physics.gradienter import up_in_sensor
 from companion.physics.units import DEG
 from companion.samples import Triad
 
@@ -270,7 +269,7 @@ def _tipped(window: Window, gradienter: GradienterModel | None, truth: Truth, tu
     """What the gyro means of a deck hold of its turn because its axis is another one than the readings alone said."""
     if window.turn_rad_s is None or window.tilt is None or gradienter is None:
         return np.zeros(3)
-    said = gradienter.vehicle_from_sensor @ up_in_sensor(gradienter.law, window.tilt.x_deg, window.tilt.y_deg)
+    said = gradienter.up(window.tilt.x_deg, window.tilt.y_deg)
     return np.cross(np.cross(said, truth.up), turn_rad_s)
 
 
