@@ -16,6 +16,7 @@ from companion.calibration.machine import Machine
 from companion.calibration.means.windows import Window
 from companion.calibration.records.record import Record
 from companion.calibration.solution.draft import Draft
+from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.component.tunes import Tune, Tunes
 from companion.config.sections import AtArm, Config
@@ -87,6 +88,11 @@ class Core:
         if self.vehicle.arm_state is ArmState.ARMED:
             return True
         return self.collector.glance(asyncio.get_running_loop().time()).moving
+
+    async def local_earth(self) -> LocalEarth:
+        """Gravity and the Earth's rate where it stands, as known now."""
+        found: LocalEarth = await self.offload(local_earth, models.whereabouts(self.config, self.vehicle))
+        return found
 
     def draft(self, before: Record | None = None) -> Draft:
         """Of what is measured from now on; `before`: the calibration that is in force."""

@@ -60,7 +60,9 @@ def verdict_of(
     before = window(rng.normal(0.0, noise, (spans[0], 3)), 0.0)
     after = window(rng.normal(0.0, noise, (spans[1], 3)), step if used else np.zeros(3))
     changes = [Change(name, 0.0, float(each)) for name, each in zip(parameters_of(1).gyro_offset, step, strict=True)]
-    (verdict,) = judge_vectors(Sides(before, after, np.asarray(step), None), calibration(), changes, None, "icm42688p")
+    (verdict,) = judge_vectors(
+        Sides(before, after, np.asarray(step), None), calibration(), changes, None, "icm42688p", {}
+    )
     return verdict
 
 
@@ -69,7 +71,7 @@ def judged(rng: np.random.Generator, seconds_after: int, *, used: bool = True) -
     after = window(rng.normal(0.0, NOISE_RAD_S, (seconds_after, 3)), STEP_RAD_S if used else -0.01)
     changes = [Change(name, 0.0, STEP_RAD_S) for name in parameters_of(1).gyro_offset]
     sides = Sides(before, after, np.array(before.gyro_rad_s) + 1e-9, None)
-    (verdict,) = judge_vectors(sides, calibration(), changes, None, "icm42688p")
+    (verdict,) = judge_vectors(sides, calibration(), changes, None, "icm42688p", {})
     return verdict.ok
 
 
@@ -117,5 +119,5 @@ def test_what_is_known_of_the_noise_after_the_write_still_counts() -> None:
     )
     changes = [Change(name, 0.0, STEP_RAD_S) for name in parameters_of(1).gyro_offset]
     sides = Sides(before, after, np.array(before.gyro_rad_s) + 1e-9, None)
-    (verdict,) = judge_vectors(sides, calibration(), changes, None, "icm42688p")
+    (verdict,) = judge_vectors(sides, calibration(), changes, None, "icm42688p", {})
     assert verdict.ok

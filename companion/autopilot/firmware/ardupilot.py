@@ -12,7 +12,7 @@ from typing import Final
 
 from companion.autopilot.firmware.ardupilot_tcal import TcalParameters, names_of, read_thermal
 from companion.autopilot.firmware.imu_calibration import ACCEL_SCALE_RANGE, ImuCalibration, ImuParameters, read_rivals
-from companion.autopilot.parameters.reading import Parameters, read_integer, read_offsets, read_scales
+from companion.autopilot.parameters.reading import SCALES, Parameters, read_integer, read_vector
 from companion.errors import AutopilotError, AutopilotRebootedError
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.rotations import ROTATION_NAMES
@@ -74,9 +74,9 @@ async def read_calibration(parameters: Parameters, instance: int) -> ImuCalibrat
     calibration = ImuCalibration(
         instance=instance,
         parameters=names,
-        gyro_offset_rad_s=await read_offsets(parameters, names.gyro_offset),
-        accel_offset_m_s2=await read_offsets(parameters, names.accel_offset),
-        accel_scale=await read_scales(parameters, names.accel_scale),
+        gyro_offset_rad_s=await read_vector(parameters, names.gyro_offset),
+        accel_offset_m_s2=await read_vector(parameters, names.accel_offset),
+        accel_scale=await read_vector(parameters, names.accel_scale, *SCALES),
         gyro_id=gyro_id,
         accel_id=accel_id,
         orientation=await read_board_rotation(parameters),

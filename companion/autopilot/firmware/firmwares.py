@@ -23,7 +23,7 @@ from companion.autopilot.firmware.imu_calibration import (
 )
 from companion.autopilot.firmware.px4 import SLOTS, SlotMemory
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.reading import Parameters
+from companion.autopilot.parameters.reading import SCALES, Parameters
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.calibration.records.record import Outcome, WrittenParameter
 from companion.calibration.temperature.polynomial import Polynomial
@@ -115,8 +115,7 @@ _ACCEL_M_S2: Final = MAX_ACCEL_OFFSET_M_S2 + MAX_ACCEL_RESIDUAL_M_S2 + 0.4
 
 GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
 ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
-ACCEL_SCALE: Final = Range(0.5, 2.0)
-"""With others nothing is calibrated."""
+ACCEL_SCALE: Final = Range(*SCALES)
 _DEGC: Final = Range(-300.0, 400.0, unit="deg C")
 """-300: not known. Up to what a thermometer in kelvin shows: the autopilot notes what its own says."""
 _TCAL: Final = Range(-1e6, 1e6)

@@ -30,7 +30,7 @@ from companion.autopilot.firmware.imu_calibration import (
     read_rivals,
 )
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.reading import Parameters, read_integer, read_offsets, read_scales
+from companion.autopilot.parameters.reading import SCALES, Parameters, read_integer, read_vector
 from companion.errors import AutopilotError, AutopilotRebootedError
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.physics.units import MG
@@ -201,15 +201,15 @@ async def read_calibration(parameters: Parameters, instance: int, memory: SlotMe
     accel = memory.choose("accel", instance, await read_slots(parameters, "accel"))
     gyro = memory.choose("gyro", instance, await read_slots(parameters, "gyro"), like=accel.device_id)
     names = parameters_of(gyro.number, accel.number)
-    offset = await read_offsets(parameters, names.accel_offset)
+    offset = await read_vector(parameters, names.accel_offset)
     small = too_small_to_apply_at_boot(offset)
     signs = FAR_SIGNS[instance]
     calibration = ImuCalibration(
         instance=instance,
         parameters=names,
-        gyro_offset_rad_s=await read_offsets(parameters, names.gyro_offset),
+        gyro_offset_rad_s=await read_vector(parameters, names.gyro_offset),
         accel_offset_m_s2=offset,
-        accel_scale=await read_scales(parameters, names.accel_scale),
+        accel_scale=await read_vector(parameters, names.accel_scale, *SCALES),
         gyro_id=gyro.device_id,
         accel_id=accel.device_id,
         orientation=await _read_rotation(parameters, gyro, accel),
@@ -285,15 +285,11 @@ async def read_level(parameters: Parameters) -> Vector:
     Raises:
         AutopilotError: as `Parameters.read`, or no angles.
     """
-    x, y, z = LEVEL
-    return await _read_angle(parameters, x), await _read_angle(parameters, y), await _read_angle(parameters, z)
-
-
-async def _read_angle(parameters: Parameters, name: str) -> float:
-    angle_deg = await parameters.read(name)
-    if not math.isfinite(angle_deg):
-        raise AutopilotError(f"{name} is {angle_deg}; an angle was expected")
-    return angle_deg
+    x, y, z = [await parameters.read(name) for name in LEVEL]
+    for name, angle_deg in zip(LEVEL, (x, y, z), strict=True):
+        if not math.isfinite(angle_deg):
+            raise AutopilotError(f"{name} is {angle_deg}; an angle was expected")
+    return x, y, z
 
 
 async def _read_mounting(parameters: Parameters, sensor: Triad, slot: Slot) -> Matrix:

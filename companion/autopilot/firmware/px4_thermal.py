@@ -56,7 +56,7 @@ async def read_thermal(parameters: Parameters, gyro_id: int | None) -> Thermal:
         enabled_by=THERMAL_ENABLE if acts else "",
         values={**switch, **found},
         gyro=polynomial if acts else NOTHING,
-        gyro_constant=_constant(sensor),
+        gyro_constant=thermal_names(sensor)[4:7],
     )
 
 
@@ -113,11 +113,6 @@ async def _switching_on(parameters: Parameters, slot: str, gyro_id: int) -> list
     return [Change(name, before[name], value) for name, value in wanted.items() if before[name] != value]
 
 
-def _constant(sensor: int) -> tuple[str, str, str]:
-    x, y, z = thermal_names(sensor)[4:7]
-    return x, y, z
-
-
 def values_of(sensor: int, device_id: int, polynomial: Polynomial) -> dict[str, float]:
     """By parameter, what makes PX4 take this off the gyro with this id; of a `stored` one exactly this."""
     terms = (term for each in polynomial.coefficients for term in each)
@@ -156,9 +151,7 @@ def stored(polynomial: Polynomial, zero_degc: float) -> Polynomial:
         coefficients=((0.0, 0.0, 0.0), first, second, third), reference_degc=middle, low_degc=low, high_degc=high
     ).zero_at(zero_degc)
     constant = vector(_kept(np.array(found.coefficients[0])))
-    return Polynomial(
-        coefficients=(constant, first, second, third), reference_degc=middle, low_degc=low, high_degc=high
-    )
+    return msgspec.structs.replace(found, coefficients=(constant, first, second, third))
 
 
 def _about(polynomial: Polynomial, degc: float) -> Array:

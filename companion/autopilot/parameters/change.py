@@ -19,7 +19,6 @@ FailureKind = Literal[
     "changed by someone else",
     "not as believed",
     "without effect",
-    "cancelled",
 ]
 
 

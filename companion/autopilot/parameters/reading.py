@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Protocol
+from typing import Final, Protocol
 
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.errors import AutopilotError
 from companion.samples import Vector
+
+SCALES: Final = (0.5, 2.0)
+"""Of accelerometers, which are divided by; with others nothing is calibrated."""
 
 
 class Owner(Protocol):
@@ -47,22 +50,19 @@ class Parameters(Protocol):
         """Several; where `optional`, what does not exist is left out."""
 
 
-async def read_offsets(parameters: Parameters, names: tuple[str, str, str]) -> Vector:
-    """Three offsets; any finite ones will do, for they are only added to.
+async def read_vector(
+    parameters: Parameters, names: tuple[str, str, str], low: float = -math.inf, high: float = math.inf
+) -> Vector:
+    """Three numbers within limits, such as `SCALES`.
 
     Raises:
-        AutopilotError: one is not a number; or as `Parameters.read`.
+        AutopilotError: one is not; or as `Parameters.read`.
     """
-    return await _read_vector(parameters, names, -math.inf, math.inf)
-
-
-async def read_scales(parameters: Parameters, names: tuple[str, str, str]) -> Vector:
-    """Three scales, which will be divided by.
-
-    Raises:
-        AutopilotError: one is far from 1; or as `Parameters.read`.
-    """
-    return await _read_vector(parameters, names, 0.5, 2.0)
+    x, y, z = [await parameters.read(name) for name in names]
+    for name, value in zip(names, (x, y, z), strict=True):
+        if not math.isfinite(value) or not low <= value <= high:
+            raise AutopilotError(f"{name} is {value:.9g}; this cannot be right, calibrate the accelerometers first")
+    return x, y, z
 
 
 async def read_integer(parameters: Parameters, name: str) -> int | None:
@@ -77,11 +77,3 @@ async def read_integer(parameters: Parameters, name: str) -> int | None:
     if not math.isfinite(value):
         raise AutopilotError(f"{name} is {value}; a whole number was expected")
     return round(value)
-
-
-async def _read_vector(parameters: Parameters, names: tuple[str, str, str], low: float, high: float) -> Vector:
-    x, y, z = [await parameters.read(name) for name in names]
-    for name, value in zip(names, (x, y, z), strict=True):
-        if not math.isfinite(value) or not low <= value <= high:
-            raise AutopilotError(f"{name} is {value:.9g}; this cannot be right, calibrate the accelerometers first")
-    return x, y, z

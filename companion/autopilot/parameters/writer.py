@@ -33,6 +33,9 @@ from companion.errors import (
 
 logger = logging.getLogger(__name__)
 
+Look = Callable[[], Awaitable[str | None]]
+"""Looks at the effect of values on the way; gives a reason to put everything back, if there is one."""
+
 HOLD_S: Final = 2.5
 """How long a value on the way (`Change.via`) stays: PX4 looks at its parameters at most once a second (autopilots 9.2),
 and 2.5 s is what a real one was tried with (9.3.2)."""
@@ -93,9 +96,7 @@ class ParameterWriter:
         self._boots = 0
         self._give_up_s = self._deadline_s = 0.0
 
-    async def apply(
-        self, changes: Sequence[Change], on_the_way: Callable[[], Awaitable[str | None]] | None = None
-    ) -> dict[str, WrittenParameter]:
+    async def apply(self, changes: Sequence[Change], on_the_way: Look | None = None) -> dict[str, WrittenParameter]:
         """Write all changes or none; a parameter that already has its new value is not written again.
 
         `on_the_way` is called while the values on the way (`Change.via`) are in force, and may look at their effect;
@@ -199,9 +200,7 @@ class ParameterWriter:
                     f"{name} is {_words(now)} now but was {_words(before)} when it was measured; nothing was written",
                 )
 
-    async def _write_on_the_way(
-        self, items: list[_Item], on_the_way: Callable[[], Awaitable[str | None]] | None
-    ) -> None:
+    async def _write_on_the_way(self, items: list[_Item], on_the_way: Look | None) -> None:
         indirect = [(item, item.change.via) for item in items if item.change.via is not None]
         for item, via in indirect:
             await self._write(item, via)

@@ -7,17 +7,17 @@ believed but the messages that arrive: the answer to a request only saves time.
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.telemetry import imu_messages
 from companion.autopilot.telemetry.ekf_bias import EkfBias
-from companion.autopilot.telemetry.imu_messages import Reading, StreamKind
-from companion.autopilot.telemetry.source import ABSENT_AFTER, Source
+from companion.autopilot.telemetry.imu_messages import ImuMessage, Reading, StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.system.waiting import comes
@@ -50,6 +50,33 @@ _TEMPERATURE_RATE_HZ: Final = 2.0
 _SEEN_BY_RATE_HZ: Final = 4.0
 """Of PX4's integers beside its floats: a write looks who is there for 0.4 s (`daemon.offsets.px4_writes`)."""
 _TEMPERATURE_AGE_S: Final = 5.0
+_ABSENT_AFTER: Final = 10
+"""Readings of nothing but zeros in a row, and there is no such IMU."""
+
+
+@dataclasses.dataclass(slots=True)
+class _Source:
+    """A message that the samples may come in, and what is known of whether it does."""
+
+    message: ImuMessage
+    rates_hz: Sequence[float]
+    rate: int = 0
+    refused: bool = False
+    last_s: float = -math.inf
+    recent: int = 0
+    zeros: int = 0
+    reason: str = ""
+    device_s: float = -math.inf
+
+    @property
+    def name(self) -> str:
+        """Of the message."""
+        return self.message.kind.message
+
+    @property
+    def absent(self) -> bool:
+        """Whether there is no such IMU."""
+        return self.zeros >= _ABSENT_AFTER
 
 
 class ImuStream:
@@ -82,8 +109,8 @@ class ImuStream:
         self._ekf_bias = ekf_bias
         self._rates_hz = [rate_hz, *(rate for rate in SLOWER_RATES_HZ if rate < rate_hz)]
         self._link = link
-        self._sources: list[Source] = []
-        self._current: Source | None = None
+        self._sources: list[_Source] = []
+        self._current: _Source | None = None
         self.temperature: tuple[float, float] | None = None
         """Of the IMU, degC, and when it was told; None: not since the restart."""
         self._restart = asyncio.Event()
@@ -137,7 +164,7 @@ class ImuStream:
             self._lose("this autopilot is neither ArduPilot nor PX4: what its IMU messages carry is not known")
             await self._pause(60.0)
             return
-        self._sources = [Source(message, self._rates_hz) for message in messages]
+        self._sources = [_Source(message, self._rates_hz) for message in messages]
         if messages[0] is imu_messages.PX4_FLOATS and self._rates_hz[0] < SLOWER_RATES_HZ[0]:
             self._sources[0].rates_hz = [_BESIDE_CONSOLE * self._rates_hz[0], *self._rates_hz[1:]]
         self.temperature = None
@@ -151,7 +178,7 @@ class ImuStream:
             else:
                 await self._keep(found)
 
-    async def _find(self) -> Source | None:
+    async def _find(self) -> _Source | None:
         """The first source, best first, that sends."""
         for source in filter(self._usable, self._sources):
             for _ in range(_ASKS):
@@ -166,7 +193,7 @@ class ImuStream:
                     source.rate += 1  # the denial may have been lost or be late
         return None
 
-    async def _ask(self, source: Source) -> int | None:
+    async def _ask(self, source: _Source) -> int | None:
         """Ask for a message at the fastest rate that is not denied: the last answer, None when none came in time."""
         while True:
             self.turns += 1
@@ -182,7 +209,7 @@ class ImuStream:
                 source.refused, source.reason = True, "not supported"
             return _REFUSED if source.refused else result
 
-    async def _sends(self, source: Source) -> bool:
+    async def _sends(self, source: _Source) -> bool:
         """Whether the source brings a sample within the time of a silence."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + SILENCE_S
@@ -195,7 +222,7 @@ class ImuStream:
                 break
         return False
 
-    async def _keep(self, source: Source) -> None:
+    async def _keep(self, source: _Source) -> None:
         """Serve from a source until it falls silent for good, a better one sends, or the autopilot is lost."""
         loop = asyncio.get_running_loop()
         self._switch(source)
@@ -232,7 +259,7 @@ class ImuStream:
                 if await self._ask(source) == _REFUSED:
                     return
 
-    def _better_than(self, source: Source) -> Source | None:
+    def _better_than(self, source: _Source) -> _Source | None:
         """A better source that has begun to send at a useful rate."""
         found = None
         for each in self._sources[: self._sources.index(source)]:
@@ -241,7 +268,7 @@ class ImuStream:
             each.recent = 0
         return found
 
-    async def _ask_for_better(self, source: Source, asked_s: float) -> float:
+    async def _ask_for_better(self, source: _Source, asked_s: float) -> float:
         """Now and then, and as soon as all can be used; when that was."""
         if not all(map(self._usable, self._sources)):
             return -math.inf
@@ -253,7 +280,7 @@ class ImuStream:
                 await self._ask(each)
         return now_s
 
-    async def _ask_for_temperature(self, source: Source) -> None:
+    async def _ask_for_temperature(self, source: _Source) -> None:
         """HIGHRES_IMU carries the barometer's; the IMU's comes with the integer messages."""
         if source.message.message is imu_messages.HIGHRES.message:
             rate_hz = _TEMPERATURE_RATE_HZ if source.message is imu_messages.HIGHRES else _SEEN_BY_RATE_HZ
@@ -262,7 +289,7 @@ class ImuStream:
                 if result in (mavlink.MAV_RESULT_ACCEPTED, None):
                     return
 
-    def _usable(self, source: Source) -> bool:
+    def _usable(self, source: _Source) -> bool:
         """Not while it wants a bias that is not known, or is of another IMU."""
         return source.message is not imu_messages.PX4_FLOATS or self._ekf_bias.known_of(self._instance)
 
@@ -301,7 +328,7 @@ class ImuStream:
             source.reason = reading
             return
         if reading.all_zero:
-            source.zeros = min(source.zeros + 1, ABSENT_AFTER)
+            source.zeros = min(source.zeros + 1, _ABSENT_AFTER)
             self._arrived.set()
             return
         if -0.5 < reading.t_device_s - source.device_s <= 0.0:
@@ -334,7 +361,7 @@ class ImuStream:
             logger.log(logging.WARNING if self._vehicle.alive else logging.DEBUG, "IMU %d: %s", self._instance, problem)
         self.problem = problem
 
-    def _switch(self, source: Source | None) -> None:
+    def _switch(self, source: _Source | None) -> None:
         if source is self._current:
             return
         self._current = source

@@ -142,7 +142,7 @@ class InForce:
     @property
     def earlier(self) -> Record | None:
         """The last calibration, be it of before this start, if it was good and has not been undone."""
-        return None if self.undone else self._conductor.last_good
+        return None if self.undone else self._conductor.results.good
 
     @property
     def worth_writing_s(self) -> float:

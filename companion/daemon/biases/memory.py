@@ -164,17 +164,16 @@ class BiasMemory:
 
     def expectation(self, solution: Solution, unix_s: float) -> Expectation:
         """What earlier calibrations say of these IMUs today."""
-        wanted = self._config.calibration.prior
         return Expectation(
-            imus=tuple(self._expected(imu, solution.shared, unix_s, wanted=wanted) for imu in solution.imus),
+            imus=tuple(self._expected(imu, solution.shared, unix_s) for imu in solution.imus),
             zero_is_known=self._alignment.used is not None
             or (self._config.gradienter is not None and self._config.gradienter.sigma_deg is not None),
         )
 
-    def _expected(self, imu: ImuSolution, shared: Shared, unix_s: float, *, wanted: bool) -> ExpectedImu:
+    def _expected(self, imu: ImuSolution, shared: Shared, unix_s: float) -> ExpectedImu:
         name = imu.name
         effect = pose_effect(self.whose.aligned(name))
-        if not wanted:
+        if not self._config.calibration.prior:
             return ExpectedImu(name=name, effect=effect)
         now = Now(
             unix_s=unix_s,

@@ -16,7 +16,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.machine import Event, State
-from companion.calibration.records.record import Record
 from companion.calibration.request import What
 from companion.calibration.solution.draft import in_words
 from companion.component.service import JobResult, Refusal
@@ -50,7 +49,7 @@ class Conductor:
     ) -> None:
         self._core, self._machine, self._wanted = core, core.machine, core.wanted
         self._vehicle, self._collector, self._say, self._tunes = core.vehicle, core.collector, core.say, core.tunes
-        self._course, self._recovery, self._results, self._by_hand = course, recovery, results, by_hand
+        self._course, self._recovery, self.results, self._by_hand = course, recovery, results, by_hand
         self._has_gradienter = core.config.gradienter is not None
         self._starts = StartLimit()
         self._task: asyncio.Task[None] | None = None
@@ -81,16 +80,6 @@ class Conductor:
     def running(self) -> Job | None:
         """The job under way."""
         return self.job if self.job is not None and self.job.is_running else None
-
-    @property
-    def last_good(self) -> Record | None:
-        """The latest calibration, be it of before this start, if it was good and has not been undone."""
-        return self._results.good
-
-    @property
-    def last(self) -> Record | None:
-        """What the latest calibration has found, or has been found before this start."""
-        return self._results.last
 
     def why_not(self, rungs: Collection[Rung] = tuple(Rung)) -> Obstacle | None:
         """What of these stands in the way of starting something."""
@@ -257,7 +246,7 @@ class Conductor:
     async def _calibrate(self, job: Job) -> None:
         loop = asyncio.get_running_loop()
         started_s = loop.time()
-        draft = self._core.draft(before=self._results.good)
+        draft = self._core.draft(before=self.results.good)
 
         async def run() -> str:
             await self._course.run(job, draft)
@@ -266,7 +255,7 @@ class Conductor:
         result = await _result(job, run())
         record = draft.record(result.outcome, result.reason, loop.time() - started_s)
         job.deliver(record)
-        await self._results.keep(record, started_s, draft.measured_s)
+        await self.results.keep(record, started_s, draft.measured_s)
         self._collector.retarget(self._wanted.settings)
         self._end(job, result)
 
@@ -289,7 +278,7 @@ class Conductor:
             if by_hand := step.origin.what in BY_HAND:
                 await self._by_hand.undone(step)
             else:
-                by_hand = not await self._results.undone(step)
+                by_hand = not await self.results.undone(step)
             job.deliver(Undone(step, written, by_hand))
             self._machine.on(Event.CONCLUDED)
             return f"{len(written)} old values back{step.origin.what and f': {step.origin.what}'}"

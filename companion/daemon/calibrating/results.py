@@ -24,10 +24,11 @@ class Results:
         self._store, self._memory = store, memory
         self._collector, self._say, self._offload = core.collector, core.say, core.offload
         self.last: Record | None = None
+        """What the latest calibration has found, or has been found before this start."""
 
     @property
     def good(self) -> Record | None:
-        """The latest one, if it was good and has not been undone."""
+        """The latest one, be it of before this start, if it was good and has not been undone."""
         return self.last if self.last is not None and self.last.state == "done" and not self.last.undone_at else None
 
     def load(self) -> None:

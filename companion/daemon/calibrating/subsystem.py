@@ -114,7 +114,7 @@ class Calibrating(Subsystem):
             "alignment": self.alignment.status(),
             "by_hand": self.by_hand.latest(),
             "stands": msgspec.to_builtins(self.stands.shown),
-            "last": _summary(conductor.last),
+            "last": _summary(conductor.results.last),
         }
 
     async def _calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:

@@ -275,7 +275,7 @@ class Carrier:
         if found is None:
             self.waiting_for = "waiting for a calibration"
             return
-        local = self._local = await self._offload(local_earth, models.whereabouts(self._config, self._vehicle))
+        local = self._local = await self._core.local_earth()
         settings = settings_of(self._core.profiles.imu(self.imu.name), found, local, self.gyro_step_rad_s)
         if settings is None:
             self.estimator, self.waiting_for = None, "waiting for a calibration of the gyros"

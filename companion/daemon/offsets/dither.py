@@ -53,7 +53,6 @@ BACK_WITHIN_S: Final = 20.0
 class _Work:
     """One IMU's dither."""
 
-    name: str
     imu: AutopilotImu
     calibration: ImuCalibration
     steps_si: Array
@@ -127,7 +126,7 @@ class Ditherer:
                 raise kind(words) from error
         await imu.refresh()
         if imu.in_force.offsets != work.before:
-            raise AutopilotError(f"imu {work.name}: somebody changed its offsets while they were dithered")
+            raise AutopilotError(f"imu {work.imu.name}: somebody changed its offsets while they were dithered")
         return combine(
             done, work.steps_si, noise_profile(self._profiles.of(window.name)), self._wanted.settings.horizon_s
         )
@@ -150,9 +149,9 @@ class Ditherer:
                 done.append(step)
                 continue
             voids += 1
-            logger.info("dithering %s: step %d is void: %s", work.name, len(done) + 1, why)
+            logger.info("dithering %s: step %d is void: %s", work.imu.name, len(done) + 1, why)
             if voids > MOST_VOID:
-                raise CalibrationRefusedError(f"imu {work.name}: not still while its offsets dithered: {why}")
+                raise CalibrationRefusedError(f"imu {work.imu.name}: not still while its offsets dithered: {why}")
         job.progress(0.0, f"dithering IMU {work.imu.instance}: putting its offsets back")
         await self._writer.restore([Change(name, before, in_force[name]) for name, before in work.before.items()])
         return done
@@ -170,7 +169,7 @@ class Ditherer:
         reading = np.array([*window.gyro_rad_s, *window.accel_m_s2]) / steps_si
         shifts = shifts_lsb(reading, alternate=px4)
         values = tuple(_offsets(calibration, shift * steps_si) for shift in shifts)
-        return _Work(window.name, imu, calibration, steps_si, values, self._vehicle.boots)
+        return _Work(imu, calibration, steps_si, values, self._vehicle.boots)
 
     def _journal(self, work: _Work) -> ChangeSet:
         return ChangeSet(
@@ -215,7 +214,7 @@ class Ditherer:
                 await job.pause(POLL_S)
                 self._check(job, work)
                 source.close_before(loop.time() - 0.5)
-                moved = moved or self._moving(work.name)
+                moved = moved or self._moving(work.imu.name)
         finally:
             stop()
         batches: Sequence[Batch] = list(source.batches.values())[:SECONDS]

@@ -30,7 +30,7 @@ from companion.daemon.offsets.px4_writes import FarMean, Px4Writes, step_from_fa
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H, MG
-from companion.samples import Triad, Vector
+from companion.samples import TRIADS, Triad, Vector
 
 VERIFY_MAX_S: Final = 60.0
 """How long the aircraft may move after the write before its effect counts as not seen."""
@@ -131,7 +131,8 @@ class EffectWatch:
             apart_s=(after.start_s + after.end_s - before.start_s - before.end_s) / 2.0,
         )
         steps = step_from_far(target.calibration, target.changes, sides.before.accel_m_s2, target.unseen)
-        on_the_way = OnTheWay(self._px4.seen_far(target.calibration), *steps)
+        seen = self._px4.seen_far(target.calibration)
+        on_the_way = {triad: (seen[triad], step) for triad, step in zip(TRIADS, steps, strict=True) if triad in seen}
         profile = self._profiles.of(target.name)
         return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile, on_the_way)
 
@@ -158,13 +159,8 @@ class Sides:
     """Of their middles."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class OnTheWay:
-    """What was seen between: the output while far values were in force, and the step from there to the new ones."""
-
-    far: Mapping[Triad, FarMean]
-    gyro_step: Vector
-    accel_step: Vector
+OnTheWay = Mapping[Triad, tuple[FarMean, Vector]]
+"""What was seen between: the output while far values were in force, and the step from there to the new ones."""
 
 
 class _Half(NamedTuple):
@@ -191,7 +187,7 @@ def judge_vectors(
     changes: list[Change],
     kind: StreamKind | None,
     profile: str | Noise | None,
-    on_the_way: OnTheWay | None = None,
+    on_the_way: OnTheWay,
 ) -> list[Verdict]:
     """Judge the vectors that were written: accelerometers, gyros, or both.
 
@@ -213,7 +209,7 @@ def judge_vectors(
     return [_judge_half(half, sides, calibration, on_the_way) for half in halves]
 
 
-def _judge_half(half: _Half, sides: Sides, calibration: ImuCalibration, on_the_way: OnTheWay | None) -> Verdict:
+def _judge_half(half: _Half, sides: Sides, calibration: ImuCalibration, on_the_way: OnTheWay) -> Verdict:
     (before, before_sigma, use), (after, after_sigma, _) = half.of(sides.before), half.of(sides.after)
     spans_s = (sides.before.duration_s, sides.after.duration_s)
     before, after, warmed = _as_at_end(half.sensor, sides, before, after)
@@ -230,15 +226,15 @@ def _judge_half(half: _Half, sides: Sides, calibration: ImuCalibration, on_the_w
         orientation=calibration.orientation,
     )
     verdict = judge(observation)
-    far = on_the_way.far.get(half.sensor) if on_the_way is not None else None
-    if not verdict.ok or on_the_way is None or far is None:
+    if not verdict.ok or half.sensor not in on_the_way:
         return verdict
+    far, step = on_the_way[half.sensor]
     return judge(
         dataclasses.replace(
             observation,
             before=vector(far.mean),
             before_sigma=vector(far.sigma),
-            expected_step=on_the_way.gyro_step if half.sensor == "gyro" else on_the_way.accel_step,
+            expected_step=step,
             resolution=half.resolution,
         )
     )

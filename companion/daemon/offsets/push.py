@@ -81,10 +81,7 @@ class Pusher:
             StorageError: the old values could not be kept, so nothing was written.
             JobCancelledError: raised by `go_on`; the old values are back, or it is said which are not.
         """
-        job.check_cancelled()
-        self._machine.on(Event.WRITE)
-        job.progress(MEASURED_PERCENT, f"writing {len(plan.changes)} parameters")
-        await self._wait_disarmed()
+        await self._begin(job, plan.changes)
         firmware = await self._firmware.prepare(plan.gyros, draft.warnings.append)
         async with self._ledger.transaction(self._kept(job, plan, draft)):
             with self._changing(plan, everything=firmware is not None):
@@ -107,11 +104,8 @@ class Pusher:
             AutopilotError: as `push`.
             StorageError: as `push`.
         """
-        job.check_cancelled()
-        self._machine.on(Event.WRITE)
         changes = [change for _, each in targets for change in each]
-        job.progress(MEASURED_PERCENT, f"writing {len(changes)} parameters")
-        await self._wait_disarmed()
+        await self._begin(job, changes)
         kept = ChangeSet.of(self._vehicle.system_id, changes, origin=origin)
         async with self._ledger.transaction(kept):
             with changing(self._imus.values()):
@@ -121,6 +115,12 @@ class Pusher:
         for event in (Event.WRITTEN, Event.VERIFIED, Event.CONCLUDED):
             self._machine.on(event)
         return written
+
+    async def _begin(self, job: Job, changes: Sequence[Change]) -> None:
+        job.check_cancelled()
+        self._machine.on(Event.WRITE)
+        job.progress(MEASURED_PERCENT, f"writing {len(changes)} parameters")
+        await self._wait_disarmed()
 
     async def _write(self, job: Job, plan: Plan, firmware: GyroParameters | None, draft: Draft) -> Plan:
         if firmware is None:

@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import logging
 import math
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, vector_changes
 from companion.autopilot.firmware.px4 import NO_IMU, WORDS, SlotMemory, accel_offset_with
 from companion.autopilot.parameters.change import Change, WriteFailedError
-from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.parameters.writer import Look, ParameterWriter
 from companion.autopilot.telemetry import imu_messages
 from companion.autopilot.vehicle.vehicle import ArmState, Moment, Vehicle
 from companion.component.statustext import Say, Severity, Weight
@@ -35,7 +35,6 @@ from companion.storage.changes import ChangeSet
 
 logger = logging.getLogger(__name__)
 
-SENSORS: Final[tuple[Triad, Triad]] = ("accel", "gyro")
 RATE_HZ: Final = 50.0
 """Rate asked of IMUs that nobody listens to otherwise."""
 HEAR_S: Final = 0.4
@@ -49,8 +48,6 @@ LEAST_SAMPLES: Final = 5
 MATCH: Final = 0.4
 """Of the expected step: so far may what was seen be from it. PX4 may have used other offsets than its parameters say,
 by up to 0.01 of the 0.035 rad/s (0.087 m/s^2) that a far step has at least."""
-
-Look = Callable[[], Awaitable[str | None]]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +104,7 @@ class _FarStepWatch:
         """IMUs of which nobody could say whether there is such a one."""
 
     @contextlib.asynccontextmanager
-    async def watching(self, steps: Sequence[FarStep]) -> AsyncIterator[Callable[[], Awaitable[str | None]] | None]:
+    async def watching(self, steps: Sequence[FarStep]) -> AsyncIterator[Look | None]:
         """Collect from now on; gives what to call while the far values are in force (None: there are none)."""
         self.means, self.learned = {}, False
         if not steps:
@@ -267,8 +264,7 @@ class Px4Writes:
 
     def seen_far(self, calibration: ImuCalibration) -> Mapping[Triad, FarMean]:
         """The output of an IMU while the far values of the last write were in force, as far as it was seen."""
-        found = {sensor: self._watch.means.get((calibration.instance, sensor)) for sensor in SENSORS}
-        return {sensor: mean for sensor, mean in found.items() if mean is not None}
+        return {of: mean for (number, of), mean in self._watch.means.items() if number == calibration.instance}
 
     async def make_sure(self, imus: Sequence[AutopilotImu]) -> bool:
         """Bring offsets that may not be in use into use, unchanged; True when there were any.

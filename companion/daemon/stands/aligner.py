@@ -35,8 +35,7 @@ class Aligner:
     """Measures alignments; who may start one is the conductor's."""
 
     def __init__(self, core: Core, stands: Stands, alignment: AlignmentInForce) -> None:
-        self._config, self._stands, self._alignment = core.config, stands, alignment
-        self._offload, self._machine = core.offload, core.machine
+        self._core, self._config, self._stands, self._alignment = core, core.config, stands, alignment
         self._zero_deg = (0.0, 0.0) if core.config.gradienter is None else core.config.gradienter.offset_deg
         """As configured."""
 
@@ -65,14 +64,14 @@ class Aligner:
             if len(taken) >= LEAST_STANDS:
                 # What does not fit is said at once, not after five more stands.
                 await self._stands.check_offsets()
-                local = await self._stands.local_earth()
-                result = await self._offload(self._solve, plan, model, taken, local)
+                local = await self._core.local_earth()
+                result = await self._core.offload(self._solve, plan, model, taken, local)
                 if result.complaint is not None:
                     raise CalibrationRefusedError(in_words(result.complaint))
         record = self._record(plan, result, taken, local)
         job.deliver(record)
         await self._alignment.keep(record)
-        self._machine.on(Event.NOTHING_TO_WRITE)
+        self._core.machine.on(Event.NOTHING_TO_WRITE)
         x_deg, y_deg = record.offset_deg
         return f"zero x {x_deg:+.3f} y {y_deg:+.3f} deg, sigma {record.sigma_deg:.3f}; now: companion calibrate"
 

@@ -75,7 +75,7 @@ class Facing:
         self._stands.begin(job, imus_alone=True)
         while known.wish is not None and len(windows) < MOST:
             windows.append(await self._next(job, known, len(windows) + 1))
-            local = await self._stands.local_earth()
+            local = await self._core.local_earth()
             try:
                 before, known = known, await self._core.offload(self._solve, windows, local)
             except CalibrationRefusedError:

@@ -46,13 +46,6 @@ _UP: Final = np.array([0.0, 0.0, -1.0])
 REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the new level after that"
 
 
-class Level(NamedTuple):
-    """What was written."""
-
-    written: dict[str, WrittenParameter]
-    warning: str | None
-
-
 class _Plan(NamedTuple):
     changes: list[Change]
     turn: Matrix
@@ -66,8 +59,10 @@ class LevelWrites:
         self._core, self._machine, self._imus, self._own = core, core.machine, imus, own
         self._ledger, self._writer, self._owed = offsets.ledger, offsets.writer, offsets.owed
 
-    async def write(self, job: Job, board: Mounting, last: Window, origin: Origin) -> Level:
-        """Write and look; the aircraft stands still as in the last stand.
+    async def write(
+        self, job: Job, board: Mounting, last: Window, origin: Origin
+    ) -> tuple[dict[str, WrittenParameter], str | None]:
+        """Write and look; the aircraft stands still as in the last stand. What was written, and what to know of it.
 
         Raises:
             CompanionError: it failed, and why; the old values are back, or it is said which are not.
@@ -100,7 +95,7 @@ class LevelWrites:
                 await self._ledger.done(kept)
         for event in (Event.VERIFIED, Event.CONCLUDED):
             self._machine.on(event)
-        return Level({name: msgspec.structs.replace(one, outcome=outcome) for name, one in written.items()}, warning)
+        return {name: msgspec.structs.replace(one, outcome=outcome) for name, one in written.items()}, warning
 
     @property
     def _turns_imus(self) -> bool:

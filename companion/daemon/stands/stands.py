@@ -18,11 +18,9 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.calibration.collector.outlook import Glance
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
-from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.component.service import JobResult
 from companion.component.statustext import LINE_BYTES, Severity
 from companion.component.tunes import Tune
-from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, same
 from companion.daemon.job import Job
@@ -286,12 +284,6 @@ class Stands:
         if counted is not None:
             turn_deg, sigma_deg = counted.angle_rad / DEG, counted.sigma_rad / DEG
         return Taken(now, Seen(up, seen[-1].heading_deg + turn_deg), sigma_deg, counted=True)
-
-    async def local_earth(self) -> LocalEarth:
-        """Gravity and the Earth's rate where it stands, as known now."""
-        where = models.whereabouts(self._core.config, self._core.vehicle)
-        local: LocalEarth = await self._core.offload(local_earth, where)
-        return local
 
     async def check_offsets(self) -> None:
         """Read them afresh: somebody may have changed them without a word.

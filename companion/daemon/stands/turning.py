@@ -89,7 +89,7 @@ class Turning:
         while len(taken) < plan.on_spot:
             taken.append(await self._stands.take(job, plan, taken, see, if_armed=None))
         await self._stands.check_offsets()
-        local = await self._stands.local_earth()
+        local = await self._core.local_earth()
         names = readable(taken, self._imus)
         stands = [one.as_stand(names) for one in taken]
         found: Alignment = await self._core.offload(turned, stands, ground(local, None))

@@ -241,8 +241,8 @@ class MqttFace:
 
     def _look_rarely(self, link: MqttLink, topics: Topics, now_s: float) -> None:
         """What costs more than a glance."""
-        if self._conductor.last is not None:
-            link.outbox.keep(topics.record, to_json(self._conductor.last))
+        if (last := self._conductor.results.last) is not None:
+            link.outbox.keep(topics.record, to_json(last))
         said = summary(self._all_status())
         if self._pace.is_due(said, now_s):
             link.outbox.keep(topics.state, _json(said))
