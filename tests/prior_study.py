@@ -23,6 +23,7 @@ from companion.calibration.solution.joint import Weighed, weigh
 from companion.calibration.solution.model_prior import TriadPrior
 from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, PoseEffect, expect, pose_effect
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
+from companion.samples import TRIADS
 
 Array = NDArray[np.float64]
 DEG = np.pi / 180.0
@@ -243,8 +244,7 @@ def one_trial(
         expected.append(
             ExpectedImu(
                 name=f"imu{k}",
-                gyro=expect(points, "gyro", now, effect, STEADY, case.known),
-                accel=expect(points, "accel", now, effect, STEADY, case.known),
+                earlier={triad: expect(points, triad, now, effect, STEADY, case.known) for triad in TRIADS},
                 effect=effect,
             )
         )
@@ -258,7 +258,7 @@ def one_trial(
 
     sigma = np.array([np.sqrt(np.diag(imu.covariance)[part]) for imu in weighed.solution.imus]) / unit
     truth = np.array(truths)
-    known = [each.gyro if case.triad == "gyro" else each.accel for each in expected]
+    known = [each.earlier["gyro" if case.triad == "gyro" else "accel"] for each in expected]
     nothing = np.full(3, np.nan)
     foretold = np.array([nothing if one is None else np.array(one.value) / unit for one in known]) - truth
     said_by = np.array([nothing if one is None else np.sqrt(one.variance) / unit for one in known])

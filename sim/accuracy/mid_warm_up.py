@@ -76,7 +76,7 @@ def mid_warm_up(part: str, rate_k_min: float, seed: int, number: int) -> MidRun:
         path = None if plain.warming is None else plain.warming.path
         said, known = plain, ExpectedImu(name="imu")
         if curve is not None and path is not None:
-            known = ExpectedImu(name="imu", gyro_along=follow(curve, path, settles, profile.gyro))
+            known = ExpectedImu(name="imu", along={"gyro": follow(curve, path, settles, profile.gyro)})
             said, end, followed = at_end(plain, plain_end, known, solution.shared)
             said = foretold(said, end, known, followed)
         truth = standing.bias(window.end_s - 0.5, window.end_s + 0.5)[:3]

@@ -23,6 +23,7 @@ from companion.calibration.solution.prior import Expectation, Expected, Expected
 from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution, solve
 from companion.calibration.turning.watch import Turn
+from companion.samples import Triad
 from tests.prior_study import BY_READING, DEG, DEG_H, LEVEL, MG, G, imu_solution, shared_errors, solution
 from tests.support.windows import about, ideal_window, ned_from_body
 
@@ -84,7 +85,7 @@ def test_it_is_the_least_squares_solution_of_the_stacked_system(same: float) -> 
     other_rad, sigma, own = 0.02 * DEG, 0.4 * MG, 0.05 * MG
     of = solution(imus([accel + tilt for accel in accels], shared), shared)
     known = [
-        ExpectedImu(name=f"imu{k}", accel=expected(prior, sigma, same_zero=same, other_zero_rad=other_rad))
+        ExpectedImu(name=f"imu{k}", earlier={"accel": expected(prior, sigma, same_zero=same, other_zero_rad=other_rad)})
         for k, prior in enumerate(priors)
     ]
     found = weighed(of, known)
@@ -134,7 +135,7 @@ def test_gyros_are_weighed_each_for_itself() -> None:
     shared = shared_errors(0.0)
     gyros = [np.array([10.0, 20.0, 30.0]) * DEG_H, np.zeros(3)]
     of = solution(imus([np.zeros(3)] * 2, shared, gyros=gyros), shared)
-    found = weighed(of, [ExpectedImu(name="imu0", gyro=expected(np.zeros(3), 20.0 * DEG_H))]).solution
+    found = weighed(of, [ExpectedImu(name="imu0", earlier={"gyro": expected(np.zeros(3), 20.0 * DEG_H)})]).solution
     np.testing.assert_allclose(gyro_of(found.imus[0]), gyros[0] / 2.0)
     np.testing.assert_allclose(found.imus[0].gyro_sigma_use_rad_s, 20.0 * DEG_H / np.sqrt(2.0))
     np.testing.assert_allclose(gyro_of(found.imus[1]), 0.0)
@@ -181,7 +182,7 @@ def test_nothing_known_changes_nothing() -> None:
 def test_a_cautious_sigma_of_the_zero_is_no_reason_to_believe_the_past() -> None:
     shared = shared_errors(ZERO_RAD)
     of = solution(imus([np.array([1.5, 0.0, 0.0]) * MG], shared), shared)
-    known = (ExpectedImu(name="imu0", accel=expected(np.zeros(3), 0.4 * MG, other_zero_rad=0.01 * DEG)),)
+    known = (ExpectedImu(name="imu0", earlier={"accel": expected(np.zeros(3), 0.4 * MG, other_zero_rad=0.01 * DEG)}),)
     guessed = weigh(of, whole_of(of), Expectation(imus=known, zero_is_known=False)).solution
     vouched = weigh(of, whole_of(of), Expectation(imus=known, zero_is_known=True)).solution
     assert accel_of(guessed.imus[0])[0] > 1.49 * MG
@@ -199,7 +200,7 @@ def test_what_a_compass_does_not_know_of_a_turn_earlier_power_ups_know_better() 
         read = [bias + turn + random.normal(0.0, 20.0 * DEG_H, 3) for bias in biases]
         of = solution(imus([np.zeros(3)] * 2, shared, gyros=read), shared)
         of = dataclasses.replace(of, turn=Turn(sigma_rad_s=turns, by="compass"))
-        known = [ExpectedImu(name=f"imu{k}", gyro=expected(np.zeros(3), scatter)) for k in range(2)]
+        known = [ExpectedImu(name=f"imu{k}", earlier={"gyro": expected(np.zeros(3), scatter)}) for k in range(2)]
         for imu, bias in zip(weighed(of, known).solution.imus, biases, strict=True):
             errors.append((gyro_of(imu) - bias)[2])
             sigmas.append(imu.gyro_sigma_use_rad_s[2])
@@ -230,8 +231,10 @@ def _turned_case(turn: Array, order: Sequence[int]) -> tuple[Solution, Weighed]:
         known.append(
             ExpectedImu(
                 name=f"imu{k}",
-                gyro=expected(turn @ (gyros[k] + random.normal(0, 30 * DEG_H, 3)), 40.0 * DEG_H),
-                accel=expected(turn @ (accels[k] + random.normal(0, 0.5 * MG, 3)), 0.7 * MG, same_zero=0.5),
+                earlier={
+                    "gyro": expected(turn @ (gyros[k] + random.normal(0, 30 * DEG_H, 3)), 40.0 * DEG_H),
+                    "accel": expected(turn @ (accels[k] + random.normal(0, 0.5 * MG, 3)), 0.7 * MG, same_zero=0.5),
+                },
             )
         )
     of = solution([found[k] for k in order], shared)
@@ -274,7 +277,7 @@ def test_turning_everything_and_exchanging_imus_turns_and_exchanges_the_result(
 
 
 def doubted(
-    shifts: Sequence[Array], *, triad: str = "accel", sigmas: Sequence[float] | None = None, **others: Any
+    shifts: Sequence[Array], *, triad: Triad = "accel", sigmas: Sequence[float] | None = None, **others: Any
 ) -> Weighed:
     """IMUs whose readings differ by these shifts (mg, or deg/h) from what was known of each."""
     unit = MG if triad == "accel" else DEG_H
@@ -287,8 +290,7 @@ def doubted(
     known = []
     for k, sigma in enumerate(usual):
         one = expected(np.zeros(3), sigma * unit, **{"same_zero": 1.0 if triad == "accel" else 0.0, **others})
-        accel, gyro = (one, None) if triad == "accel" else (None, one)
-        known.append(ExpectedImu(name=f"imu{k}", gyro=gyro, accel=accel))
+        known.append(ExpectedImu(name=f"imu{k}", earlier={triad: one}))
     return weighed(of, known)
 
 
@@ -391,7 +393,7 @@ def test_all_gyros_off_alike_turn() -> None:
 def test_what_is_remembered_is_what_was_measured_not_what_became_of_it() -> None:
     shared = shared_errors(ZERO_RAD, gravity_sigma=0.3 * MG)
     of = solution(imus([np.ones(3) * MG], shared), shared)
-    known = [ExpectedImu(name="imu0", accel=expected(np.zeros(3), 0.3 * MG))]
+    known = [ExpectedImu(name="imu0", earlier={"accel": expected(np.zeros(3), 0.3 * MG)})]
     found = weighed(of, known)
     assert abs(accel_of(found.solution.imus[0])[0]) < 0.9 * MG
     kept = points(

@@ -17,6 +17,7 @@ from companion.config.sections import Noise
 from companion.errors import ConfigError
 from companion.physics.frames import Floats
 from companion.physics.units import DEG_H, MG
+from companion.samples import Triad
 
 FLOOR_OF_FLICKER: Final = math.sqrt(2.0 * math.log(2.0) / math.pi)
 """Allan deviation of pure flicker noise over B: 0.664."""
@@ -53,6 +54,10 @@ class NoiseProfile(msgspec.Struct, frozen=True):
     accel: AllanModel
     warm_up: tuple[float, float] = WARM_UP
     """By how much the biases of gyro and accelerometer may move from cold to warm, two sigma."""
+
+    def of(self, triad: Triad) -> AllanModel:
+        """Of one of the two."""
+        return self.gyro if triad == "gyro" else self.accel
 
     @property
     def is_named(self) -> bool:

@@ -15,10 +15,10 @@ import numpy as np
 from companion.calibration.means.windows import ImuInput, estimates
 from companion.calibration.noise.allan import NoiseProfile, allan_variance
 from companion.calibration.noise.robust import median
-from companion.calibration.profiling.profile_fit import CHANNELS, LEAST_STILL_S, MIN_SECONDS, TRIADS, Rest, fit_profile
+from companion.calibration.profiling.profile_fit import CHANNELS, LEAST_STILL_S, MIN_SECONDS, Rest, fit_profile
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
-from companion.samples import Triad
+from companion.samples import TRIADS, Triad, rows_of
 
 MEANS_S: Final = (10, 30, 60)
 NEXT_S: Final = 60
@@ -96,12 +96,7 @@ def keeps(
     for rests, profile in tests:
         for mean_s, misses in found.items():
             _predict(rests, profile, (mean_s, next_s), misses)
-    return [
-        _summary(triad, columns, mean_s, misses)
-        for triad, columns in TRIADS
-        for mean_s, misses in found.items()
-        if misses.miss
-    ]
+    return [_summary(triad, mean_s, misses) for triad in TRIADS for mean_s, misses in found.items() if misses.miss]
 
 
 def _halves(rests: Sequence[Rest]) -> tuple[list[Rest], list[Rest]]:
@@ -155,7 +150,7 @@ def _estimated(windows: Sequence[Sequence[Batch]], profile: NoiseProfile, next_s
     return np.array([each.mean for each in found]), np.array([each.use_variance for each in found])
 
 
-def _summary(triad: Triad, columns: slice, mean_s: int, misses: _Misses) -> Kept:
+def _summary(triad: Triad, mean_s: int, misses: _Misses) -> Kept:
     all_of = (misses.miss, misses.use, misses.seen)
-    miss, use, seen = (np.concatenate(each)[:, columns] for each in all_of)
+    miss, use, seen = (np.concatenate(each)[:, rows_of(triad)] for each in all_of)
     return Kept.against(miss, use, seen, triad=triad, mean_s=mean_s, windows=len(miss), minutes=misses.minutes)

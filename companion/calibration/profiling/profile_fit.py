@@ -36,7 +36,7 @@ from companion.calibration.stillness.own_noise import learned_of
 from companion.calibration.stillness.stretch import Stretch
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats
-from companion.samples import Triad
+from companion.samples import TRIADS, rows_of
 
 CHANNELS: Final = 6
 MIN_SECONDS: Final = 16
@@ -147,7 +147,6 @@ def seconds_of(t_s: Floats, readings: Floats, temperature_degc: Floats | None = 
     return batches
 
 
-TRIADS: Final[tuple[tuple[Triad, slice], ...]] = (("gyro", slice(0, 3)), ("accel", slice(3, 6)))
 LEAST_STILL_S: Final = 60
 """Less says nothing that a calibration does not measure itself."""
 DRIFT_T: Final = 5.0
@@ -210,8 +209,9 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Fin
                 drift = slope
         axes.append(AxisFinding(fit=without if drift else fit, drift_per_s=drift))
     models, kept = [], []
-    for triad, part in TRIADS:
-        model, unknown = _triad(axes[part], fallback.gyro if triad == "gyro" else fallback.accel)
+    for triad in TRIADS:
+        part = rows_of(triad)
+        model, unknown = _triad(axes[part], fallback.of(triad))
         models.append(within_horizon(model, [(rest.slots, rest.means[:, part]) for rest in rests]))
         kept += [f"{triad} {_NAMES[which]}" for which in unknown]
     return Finding(

@@ -44,14 +44,20 @@ class Determined(msgspec.Struct, frozen=True, kw_only=True):
     known: tuple[bool, bool, bool]
 
 
-class ImuAlignmentRecord(msgspec.Struct, frozen=True, kw_only=True):
+class LevelRecord(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU, vehicle FRD. Of an autopilot's IMU all is of its output, from which it has taken its own offsets."""
 
     name: str
     temperature_degc: float | None
     level_bias_mg: Vector
-    """The effective accelerometer bias when level: what a calibration there finds."""
+    """The effective accelerometer bias when the base is level: what a calibration there finds."""
     level_sigma_mg: Vector
+    gyro_bias_deg_h: Determined
+
+
+class ImuAlignmentRecord(LevelRecord, frozen=True, kw_only=True):
+    """Likewise, beside a gradienter."""
+
     accel_bias_mg: Determined
     """Without scale, shear and misalignment, each of which looks like a bias in one pose."""
     accel_scale: Determined
@@ -59,7 +65,6 @@ class ImuAlignmentRecord(msgspec.Struct, frozen=True, kw_only=True):
     """xy, xz, yz."""
     misalignment_deg: Determined
     """Small rotation from the gradienter's axes to this IMU's."""
-    gyro_bias_deg_h: Determined
 
 
 class StandRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -76,30 +81,35 @@ class StandRecord(msgspec.Struct, frozen=True, kw_only=True):
     seconds: float
 
 
-class AlignmentRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """A finished alignment."""
+class SpotRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """What stands on one spot have in common."""
 
     format_version: int = FORMAT_VERSION
-    kind: Kind
     measured_at: str
     """UTC, ISO 8601; the host's clock."""
-    gradienter: GradienterSettings
-    offset_deg: Pair
-    """What the gradienter shows too much, on top of `gradienter.offset_deg`."""
-    sigma_deg: float
-    """Of both axes: the larger."""
-    covariance_deg2: tuple[Pair, Pair]
     slope_deg: float
     """Of the spot."""
     checked: bool
     """Whether a spot that moved between the stands would have been noticed."""
     chi_square: float
     freedom: int
+    stands: tuple[StandRecord, ...]
+    warnings: tuple[str, ...] = ()
+
+
+class AlignmentRecord(SpotRecord, frozen=True, kw_only=True):
+    """A finished alignment."""
+
+    kind: Kind
+    gradienter: GradienterSettings
+    offset_deg: Pair
+    """What the gradienter shows too much, on top of `gradienter.offset_deg`."""
+    sigma_deg: float
+    """Of both axes: the larger."""
+    covariance_deg2: tuple[Pair, Pair]
     temperature_degc: float | None
     """Of the gradienter."""
-    stands: tuple[StandRecord, ...]
     imus: tuple[ImuAlignmentRecord, ...]
-    warnings: tuple[str, ...] = ()
 
 
 def check(record: AlignmentRecord) -> None:
@@ -258,15 +268,9 @@ def _determined(found: Faces, part: slice, unit: float, before: float) -> Determ
     return determined(Figures(found.figures[part], sigma, sigma < DETERMINED * before), unit)
 
 
-class TurnImuRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU, vehicle FRD, of its output as it was."""
+class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
+    """Likewise, and what became of it."""
 
-    name: str
-    temperature_degc: float | None
-    level_bias_mg: Vector
-    """What the accelerometers of the aircraft read too much when its base is level."""
-    level_sigma_mg: Vector
-    gyro_bias_deg_h: Determined
     written: dict[str, WrittenParameter] = {}
     """Empty where nothing was to be written."""
 
@@ -283,21 +287,13 @@ class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
     written: dict[str, WrittenParameter] = {}
 
 
-class TurnRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Finished; figures as in `AlignmentRecord`."""
+class TurnRecord(SpotRecord, frozen=True, kw_only=True):
+    """Finished."""
 
-    format_version: int = FORMAT_VERSION
     kind: Literal["turn"] = "turn"
-    measured_at: str
-    slope_deg: float
-    checked: bool
-    chi_square: float
-    freedom: int
-    stands: tuple[StandRecord, ...]
     imus: tuple[TurnImuRecord, ...]
     board: BoardRecord | None = None
     """None where nothing is known from all sides."""
-    warnings: tuple[str, ...] = ()
 
 
 def turn_imu_record(

@@ -20,9 +20,8 @@ from companion.calibration.solution.solve import ImuSolution, Shared
 from companion.calibration.temperature.along import Along
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H, MG
-from companion.samples import Triad, rows_of
+from companion.samples import TRIADS, Triad, rows_of
 
-TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 _CONTRADICTS: Final = 4.0
 """Sigmas between the slope of the readings and that of the curve."""
 _WORTH_SAYING: Final = 2.0
@@ -44,7 +43,7 @@ def at_end(
     stat = [imu.gyro_sigma_stat_rad_s, imu.accel_sigma_stat_m_s2]
     followed: list[Triad] = []
     for k, triad in enumerate(TRIADS):
-        along, bias = expected.along(triad), found[k]
+        along, bias = expected.along.get(triad), found[k]
         end = None if along is None or bias is None else _end(imu, triad, along)
         if end is None or bias is None:
             continue
@@ -89,17 +88,12 @@ def _end(imu: ImuSolution, triad: Triad, along: Along) -> tuple[Array, Array, Ar
 
 def foretold(imu: ImuSolution, whole: Pair, expected: ExpectedImu | None, followed: Collection[Triad]) -> ImuSolution:
     """With what its biases, now `whole`, will be when it is warm, where that is known."""
-    warms = (
-        {}
-        if expected is None
-        else {triad: along.warm for triad in followed if (along := expected.along(triad)) and along.warm is not None}
-    )
     figures: dict[Triad, tuple[Array, Array]] = {}
     words, degc = [], 0.0
-    for triad, warm in warms.items():
-        k = TRIADS.index(triad)
-        now = whole[k]
-        if now is None:
+    for triad, now in zip(TRIADS, whole, strict=True):
+        along = None if expected is None or triad not in followed else expected.along.get(triad)
+        warm = None if along is None else along.warm
+        if warm is None or now is None:
             continue
         change, degc = np.array(warm.change), warm.degc
         sigma = np.sqrt(np.diag(imu.covariance)[rows_of(triad)] + np.array(warm.variance))

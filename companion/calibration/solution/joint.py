@@ -26,14 +26,14 @@ import numpy as np
 
 from companion.calibration.records.history import Measured, Point, PowerUp
 from companion.calibration.records.record import AccelPrior, GyroPrior, Prior
-from companion.calibration.solution.at_end import TRIADS, Pair, at_end, foretold
+from companion.calibration.solution.at_end import Pair, at_end, foretold
 from companion.calibration.solution.doubt import Doubt, Witness, doubts
 from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.calibration.turning.watch import CHANCE_SIGMAS, Turn
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG
-from companion.samples import Triad, Vector, rows_of
+from companion.samples import TRIADS, Triad, Vector, rows_of
 
 Whole = Mapping[str, Pair]
 """By IMU: whole gyro and accelerometer bias by the readings alone, (3,) each, vehicle FRD."""
@@ -251,7 +251,8 @@ def _known(
     found: list[_Known] = []
     for k, imu in enumerate(solution.imus):
         measured = whole[imu.name][TRIADS.index(triad)] if imu.name in whole else None
-        known = expected[imu.name].of(triad, today=today) if imu.name in expected else None
+        said = expected.get(imu.name)
+        known = None if said is None else (said.today if today else said.earlier).get(triad)
         if measured is not None and known is not None:
             witness = _witness(imu, solution.shared, triad, known, measured)
             found.append(_Known(k, triad, known, measured, witness))

@@ -172,28 +172,17 @@ class Expected(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ExpectedImu(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU: from earlier power-ups, and from earlier in this one."""
+    """One IMU."""
 
     name: str
-    gyro: Expected | None = None
-    accel: Expected | None = None
-    gyro_today: Expected | None = None
-    accel_today: Expected | None = None
+    earlier: dict[Triad, Expected | None] = {}
+    """By earlier power-ups."""
+    today: dict[Triad, Expected | None] = {}
+    """By what was measured earlier in this one."""
+    along: dict[Triad, Along | None] = {}
+    """What the curve says of a window in which the temperature changed."""
     effect: PoseEffect | None = None
     """How its accelerometers' bias moves with the attitude."""
-    gyro_along: Along | None = None
-    accel_along: Along | None = None
-    """What the curve says of a window in which the temperature changed."""
-
-    def along(self, triad: Triad) -> Along | None:
-        """One of these two."""
-        return self.gyro_along if triad == "gyro" else self.accel_along
-
-    def of(self, triad: Triad, *, today: bool) -> Expected | None:
-        """One of the four."""
-        if today:
-            return self.gyro_today if triad == "gyro" else self.accel_today
-        return self.gyro if triad == "gyro" else self.accel
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):

@@ -85,20 +85,14 @@ class Step(msgspec.Struct, frozen=True, kw_only=True):
     """By how much the mean of the latest window is then off what was before."""
 
 
-class Tilting(msgspec.Struct, frozen=True, kw_only=True):
-    """How fast the direction of gravity moves in the vehicle."""
-
-    rate_rad_s: Array
-    """(3,) horizontal, vehicle FRD."""
-    variance: float
-    """Of a component."""
-
-
 class Look(msgspec.Struct, frozen=True, kw_only=True):
     """What one IMU shows."""
 
     change: Change | None
-    tilting: Tilting
+    tilting_rad_s: Array
+    """How fast the direction of gravity moves: (3,) horizontal, vehicle FRD."""
+    tilting_variance: float
+    """Of a component."""
     step: Step | None
     white: float
     """N about the vertical."""
@@ -235,7 +229,13 @@ class ImuLevel:
         step = None
         if self._steps[0] == 0.0 and len(seconds) >= RESTED_S + LEVEL_S:
             step = _step(seconds[:, _SLOT], seconds[:, _RATES] @ down, white, self._gyro, len(slots))
-        return Look(change=change, tilting=_tilting(force, slope), step=step, white=white)
+        return Look(
+            change=change,
+            tilting_rad_s=_tilting(-down, slope.per_s[3:] / _length(force)),
+            tilting_variance=float(slope.variance[3:].max()) / _length(force) ** 2,
+            step=step,
+            white=white,
+        )
 
     def _change(self, latest: Floats, slope: Slope, down: Array) -> Change | None:
         level, white = self._level, slope.white[:3]
@@ -284,15 +284,11 @@ def _length(vector: Floats) -> float:
     return math.sqrt(vector @ vector)
 
 
-def _tilting(force: Floats, slope: Slope) -> Tilting:
-    size = _length(force)
-    up = force / size
-    moves = slope.per_s[3:] / size
+def _tilting(up: Array, moves: Array) -> Array:
+    """The level part, (3,), of the rate at which a direction moves."""
     moves = moves - up * (up @ moves)
     # d up / dt = -rate x up, so that the level part of the rate is (d up / dt) x up.
-    (a, b, c), (x, y, z) = moves.tolist(), up.tolist()
-    rate = np.array([b * z - c * y, c * x - a * z, a * y - b * x])
-    return Tilting(rate_rad_s=rate, variance=float(slope.variance[3:].max()) / size**2)
+    return np.cross(moves, up)
 
 
 def _step(slots: Floats, values: Floats, white: float, model: AllanModel, window: int) -> Step | None:

@@ -153,15 +153,6 @@ _COLUMNS: Final = 8
 """Of a second of the compass."""
 
 
-class _Seen(msgspec.Struct, frozen=True):
-    """The slope of the heading."""
-
-    rate: float
-    variance: float
-    is_even: bool
-    """It goes on from beginning to end, as a turn does and no jump."""
-
-
 class TurnWatch:
     """Sees every second of all sources, and says how fast the platform turns.
 
@@ -268,11 +259,11 @@ class TurnWatch:
         seen = self._slope(measured)
         self.turn, changed = self._weigh(common, seen, changes)
         if looks:
-            tilting = min((look.tilting for look in looks.values()), key=lambda one: one.variance)
+            surest = min(looks.values(), key=lambda one: one.tilting_variance)
             self.turn = msgspec.structs.replace(
                 self.turn,
-                tilting_rad_s=vector(tilting.rate_rad_s),
-                tilting_sigma_rad_s=math.sqrt(tilting.variance),
+                tilting_rad_s=vector(surest.tilting_rad_s),
+                tilting_sigma_rad_s=math.sqrt(surest.tilting_variance),
                 step_rad_s=self._hint(step),
             )
         noise = self.turn.noise_rad_s if self.turn.by == "gyros" else self.turn.sigma_rad_s
@@ -320,8 +311,8 @@ class TurnWatch:
         return words
 
     @staticmethod
-    def _slope(headings: Floats) -> _Seen | None:
-        """Of the heading in rad/s."""
+    def _slope(headings: Floats) -> Turn | None:
+        """By the compass alone; even if the heading goes on from beginning to end, as in a turn and after no jump."""
         if len(headings) < FEWEST:
             return None
         slots, values, white = headings[:, _SLOT].astype(np.int64), headings[:, _DEG], headings[:, _WHITE]
@@ -337,15 +328,16 @@ class TurnWatch:
         half = len(slots) // 2
         parts = [plain_slope(slots[part], turned[part, 0]) for part in (slice(None, -half), slice(half, None))]
         is_even = all(part * rate > EVEN * rate**2 for part in parts)
-        return _Seen(rate * DEG, float(found.variance[0]) * DEG**2, is_even)
+        sigma = math.sqrt(float(found.variance[0]))
+        return Turn(rate_rad_s=rate * DEG, sigma_rad_s=sigma * DEG, by="compass", is_even=is_even)
 
     @staticmethod
-    def _contradicts(common: Common | None, seen: _Seen) -> bool:
+    def _contradicts(common: Common | None, seen: Turn) -> bool:
         if common is None or not common.is_vouched:
             return False
-        return abs(common.rate - seen.rate) > SIGNIFICANT * math.sqrt(common.variance + seen.variance)
+        return abs(common.rate - seen.rate_rad_s) > SIGNIFICANT * math.sqrt(common.variance + seen.sigma_rad_s**2)
 
-    def _weigh(self, common: Common | None, seen: _Seen | None, changes: Mapping[str, Change]) -> tuple[Turn, set[str]]:
+    def _weigh(self, common: Common | None, seen: Turn | None, changes: Mapping[str, Change]) -> tuple[Turn, set[str]]:
         """The turn by both witnesses, and the IMUs that have changed by themselves."""
         changed = {name for name, change in changes.items() if change.is_across}
         if common is not None:
@@ -358,20 +350,17 @@ class TurnWatch:
             changed = set(changes)
         if seen is None:
             return (Turn() if common is None else _by_gyros(common)), changed
-        by_compass = Turn(
-            rate_rad_s=seen.rate, sigma_rad_s=math.sqrt(seen.variance), by="compass", is_even=seen.is_even
-        )
         if common is None or not common.is_vouched:
-            return by_compass, changed
+            return seen, changed
         if self._contradicts(common, seen):
             if abs(common.rate) <= SIGNIFICANT * math.sqrt(common.variance):
                 return _by_gyros(common, gyros_stay=True), changed
-            if abs(seen.rate) <= SIGNIFICANT * math.sqrt(seen.variance):
+            if abs(seen.rate_rad_s) <= SIGNIFICANT * seen.sigma_rad_s:
                 changed = set(changes)
-            return by_compass, changed
-        share = seen.variance / (common.variance + seen.variance)
+            return seen, changed
+        share = seen.sigma_rad_s**2 / (common.variance + seen.sigma_rad_s**2)
         both = Turn(
-            rate_rad_s=share * common.rate + (1.0 - share) * seen.rate,
+            rate_rad_s=share * common.rate + (1.0 - share) * seen.rate_rad_s,
             sigma_rad_s=math.sqrt(share * common.variance),
             by="compass and gyros",
         )

@@ -129,7 +129,7 @@ class InForce:
                 present=self._present.get((name, triad)),
                 drift=self._memory.curves.drift(name, triad, held.temperature_degc, degc),
             )
-            model = profile.gyro if triad == "gyro" else profile.accel
+            model = profile.of(triad)
             against = judge(triad, name, held, model, self._limits, seen)
             found += self._held_back.left_of((name, triad), against)
         return found

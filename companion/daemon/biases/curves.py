@@ -53,7 +53,7 @@ class Curves:
         if curve is None or path is None:
             return None
         profile = noise_profile(self._profiles.of(name))
-        found = follow(curve, path, self._settling.get(name), profile.gyro if triad == "gyro" else profile.accel)
+        found = follow(curve, path, self._settling.get(name), profile.of(triad))
         start, _, end = path.degc
         return found.less(
             self.taken_off(name, triad, path.mean_degc, end), self.taken_off(name, triad, start, end) / path.span_s

@@ -18,7 +18,7 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for, whole_bias, whole_of
 from companion.autopilot.parameters.change import Change
-from companion.calibration.noise.allan import AllanModel, noise_profile
+from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.history import Point, kept
 from companion.calibration.records.validity import WORTH_SIGMAS
 from companion.calibration.solution.doubt import Doubt
@@ -187,26 +187,23 @@ class BiasMemory:
         earlier = self._known[name].points if name in self._known else ()
         profile = noise_profile(self._profiles.of(name))
 
-        def by_earlier(triad: Triad, model: AllanModel) -> Expected | None:
+        def by_earlier(triad: Triad) -> Expected | None:
             if self.models is None:
-                return expect(earlier, triad, now, effect, model)
-            found = expect(earlier, triad, now, effect, model, self.models.of(name, triad))
+                return expect(earlier, triad, now, effect, profile.of(triad))
+            found = expect(earlier, triad, now, effect, profile.of(triad), self.models.of(name, triad))
             self.models.judged(name, triad, found)
             return found
 
-        def today(triad: Triad, model: AllanModel) -> Expected | None:
+        def today(triad: Triad) -> Expected | None:
             last, curve = self._reference(name, triad), self.curves.of(name, triad)
-            return None if last is None else expect_today(last, triad, now, effect, model, curve)
+            return None if last is None else expect_today(last, triad, now, effect, profile.of(triad), curve)
 
         return ExpectedImu(
             name=name,
-            gyro=by_earlier("gyro", profile.gyro),
-            accel=by_earlier("accel", profile.accel),
-            gyro_today=today("gyro", profile.gyro),
-            accel_today=today("accel", profile.accel),
+            earlier={triad: by_earlier(triad) for triad in TRIADS},
+            today={triad: today(triad) for triad in TRIADS},
+            along={triad: self.curves.along(name, triad, imu.warming) for triad in TRIADS},
             effect=effect,
-            gyro_along=self.curves.along(name, "gyro", imu.warming),
-            accel_along=self.curves.along(name, "accel", imu.warming),
         )
 
     def foretold(self, name: str, degc: float) -> Foretold | None:
