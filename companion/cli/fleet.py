@@ -7,7 +7,7 @@ import asyncio
 import contextlib
 import signal
 import tempfile
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -81,8 +81,7 @@ async def _run(options: argparse.Namespace) -> int:
     logs.set_up("info")
     collector = Collector(mqtt, Store(options.database))
     pages = [] if options.page == "off" else [_server(options, options.database, collector.metrics).run()]
-    async with _until_stopped():
-        await _beside(collector.run(), *pages)
+    await _until_stopped(collector.run(), *pages)
     return DONE
 
 
@@ -108,8 +107,7 @@ async def _demo(options: argparse.Namespace) -> int:
         beside = "Mosquitto" if mosquitto else "a broker of its own"
         print_lines(f"{demo.AIRCRAFT} simulated aircraft, {beside}, and an SQLite file in {folder}, until Ctrl-C")
         print_lines(f"look at {server.url}")
-        async with _until_stopped():
-            await _beside(demo.play(database, mosquitto), server.run())
+        await _until_stopped(demo.play(database, mosquitto), server.run())
     return DONE
 
 
@@ -132,13 +130,17 @@ def _server(options: argparse.Namespace, database: str, counts: Metrics | None =
     return Server(options.page, database, password, certificate, counts)
 
 
-async def _beside(*runs: Coroutine[Any, Any, None]) -> None:
-    """Until the first of them fails, with what it raised, or all are cancelled."""
+async def _until_stopped(*runs: Coroutine[Any, Any, None]) -> None:
+    """Until Ctrl-C or SIGTERM, or the first of them fails, with what it raised; all have ended then."""
     from companion.fleet.collector import stop
 
     tasks = [asyncio.ensure_future(run) for run in runs]
+    together = asyncio.gather(*tasks)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, together.cancel)
     try:
-        await asyncio.gather(*tasks)
+        with contextlib.suppress(asyncio.CancelledError):
+            await together
     finally:
         await stop(tasks)
 
@@ -150,26 +152,3 @@ def _check_installed() -> None:
         import sqlalchemy  # noqa: F401
     except ImportError as error:
         raise ConfigError(f"{_NEEDS_MORE} ({error})") from None
-
-
-@contextlib.asynccontextmanager
-async def _until_stopped() -> AsyncIterator[None]:
-    """Ctrl-C and SIGTERM end what is inside, in order."""
-    loop, task = asyncio.get_running_loop(), asyncio.current_task()
-    stopped = False
-
-    def stop() -> None:
-        nonlocal stopped
-        if task is not None:
-            stopped = task.cancel()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop)
-    try:
-        yield
-    except asyncio.CancelledError:
-        if not stopped:
-            raise
-    finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.remove_signal_handler(number)

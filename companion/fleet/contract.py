@@ -165,6 +165,7 @@ class Curve(msgspec.Struct, frozen=True):
 
 _FIRMWARES: Final = {"INS": "ardupilot", "CAL": "px4", "TC": "px4"}
 """By what the names of their parameters begin with."""
+_ABOUT: Final = ("gyro_id", "accel_id", "temperature_degc", "samples")
 _TRIADS: Final = tuple(name for name in _Imu.__struct_fields__ if name.endswith(("_rad_s", "_m_s2")))
 
 
@@ -172,12 +173,11 @@ def _calibration(body: bytes) -> Rows:
     told = msgspec.json.decode(body, type=_Calibration)
     biases: list[Row] = []
     for imu in {imu.name: imu for imu in told.imus}.values():
+        about = {"imu": imu.name} | {name: getattr(imu, name) for name in _ABOUT}
+        triads = {name: getattr(imu, name) for name in _TRIADS} | _by_readings(imu)
         for number, axis in enumerate("xyz"):
-            figures = {name: value and value[number] for name in _TRIADS for value in [getattr(imu, name)]}
-            which = {"imu": imu.name, "axis": axis, "gyro_id": imu.gyro_id, "accel_id": imu.accel_id}
-            found = {name: value and value[number] for name, value in _by_readings(imu).items()}
-            how = {"temperature_degc": imu.temperature_degc, "samples": imu.samples}
-            biases.append({**which, **how, **figures, **found})
+            figures = {name: value and value[number] for name, value in triads.items()}
+            biases.append({**about, "axis": axis, **figures})
     held = [f"{imu.name} {triad}" for imu in told.imus for triad in imu.held_back]
     zero = told.alignment
     row = {
@@ -186,7 +186,7 @@ def _calibration(body: bytes) -> Rows:
         "state": told.state,
         "reason": told.reason,
         "held_back": ", ".join(held),
-        "undone_at": None if told.undone_at is None else moment(told.undone_at),
+        "undone_at": _at(told.undone_at),
         "firmware": _firmware(told.imus),
         "heading_bound_deg": told.magnetic and told.magnetic.heading_bound_deg,
         "zero_at": zero and moment(zero.measured_at),
@@ -211,16 +211,9 @@ def _firmware(imus: Iterable[_Imu]) -> str | None:
 
 
 def _arming(body: bytes) -> Rows:
-    told = msgspec.json.decode(body, type=_Arming)
-    row = {
-        "armed_at": moment(told.armed_at),
-        "state": told.state,
-        "reason": told.reason,
-        "calibration_at": None if told.calibration is None else moment(told.calibration),
-        "gyro_sigma_use_rad_s": told.gyro_sigma_use_rad_s,
-        "accel_sigma_use_m_s2": told.accel_sigma_use_m_s2,
-    }
-    return {"armings": [row]}
+    row = msgspec.structs.asdict(msgspec.json.decode(body, type=_Arming))
+    of = row.pop("calibration")
+    return {"armings": [{**row, "armed_at": moment(row["armed_at"]), "calibration_at": _at(of)}]}
 
 
 def _undo(body: bytes) -> Rows:
@@ -229,10 +222,8 @@ def _undo(body: bytes) -> Rows:
 
 
 def _alignment(body: bytes) -> Rows:
-    told = msgspec.json.decode(body, type=_Alignment)
-    measured_at = moment(told.measured_at)
-    row = {"what": told.what, "state": told.state, "measured_at": measured_at, "reason": told.reason}
-    return {"alignments": [row]}
+    row = msgspec.structs.asdict(msgspec.json.decode(body, type=_Alignment))
+    return {"alignments": [{**row, "measured_at": moment(row["measured_at"])}]}
 
 
 def _event(body: bytes) -> Rows:
@@ -249,22 +240,21 @@ def _curve(body: bytes) -> Rows:
         for triad, degc, bias, sigma, unit in found
         for k, axis in enumerate("xyz")
     ]
-    return {"curves": rows}
+    return {"curves": _within(rows)}
 
 
 def _flight(body: bytes) -> Rows:
     flight = msgspec.json.decode(body, type=KeptFlight).flight
     rows: list[Row] = []
     for imu in flight.imus:
-        msgspec.convert((imu.imu, imu.gyro_id, imu.accel_id), tuple[_Device, _Device, _Device])
         flown = min(imu.drift.get("flown", ()), key=lambda each: abs(each.seconds - 30.0), default=None)
         which = {
             "flight": flight.key,
-            "began_at": flight.began_at and moment(flight.began_at),
+            "began_at": _at(flight.began_at),
             "instance": imu.imu,
             "gyro_id": imu.gyro_id,
             "accel_id": imu.accel_id,
-            "calibration_at": imu.calibration and moment(imu.calibration),
+            "calibration_at": _at(imu.calibration),
             "drift_s": flown and flown.seconds,
             "drift_m": flown and flown.median_m,
         }
@@ -275,7 +265,15 @@ def _flight(body: bytes) -> Rows:
                 term = getattr(split, name)
                 row |= {name: term and term.value, f"{name}_sigma": term and term.sigma}
             rows.append(row)
-    return {"flights": rows}
+    return {"flights": _within(rows)}
+
+
+def _within(rows: list[Row]) -> list[Row]:
+    """Of figures that their own types do not bound."""
+    for name, value in (each for row in rows for each in row.items()):
+        if isinstance(value, int | float) and abs(value) > _MOST:
+            raise NotTakenError(f"{name}: found {value:g}; allowed: up to {_MOST:g}")
+    return rows
 
 
 def _kept_raw(body: bytes) -> Rows:
@@ -307,6 +305,10 @@ def moment(words: str) -> datetime.datetime:
         return found.replace(tzinfo=datetime.UTC) if found.tzinfo is None else found.astimezone(datetime.UTC)
     except (ValueError, OverflowError):
         raise NotTakenError(f"found {words[:40]!r}; allowed: a time such as 2026-11-23T06:12:00.000Z") from None
+
+
+def _at(words: str | None) -> datetime.datetime | None:
+    return None if words is None else moment(words)
 
 
 def addressed(topic: str) -> tuple[str, str] | None:

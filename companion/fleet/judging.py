@@ -25,8 +25,6 @@ from companion.physics.units import DEG, MG, G
 
 MOST_CALIBRATIONS: Final = 2000
 """Of an aircraft, the latest: five years of one a day."""
-MOST_PARTS: Final = 300
-"""Of a model."""
 SAME_POWER_UP: Final = datetime.timedelta(minutes=30)
 """Calibrations that follow one another sooner and agree are of one power-up."""
 MOST_DEGC: Final = 150.0
@@ -79,7 +77,8 @@ def judged(connection: sa.Connection, aircraft: str) -> Judged:
         ids = calibrations[-1].axes[0]
         model = model_of(firmware, ids.gyro_id, ids.accel_id)
         parts += _part(aircraft, imu, model, scatter_of_part(history.biases, history.temperature_degc))
-        found += [(imu, history.at, each) for each in judge(history, _model(connection, aircraft, model))]
+        others = None if model is None else scatter_of_model([*parts_of(connection, model, but=aircraft).values()])
+        found += [(imu, history.at, each) for each in judge(history, others)]
     found = _of_the_gradienter(found, len(imus))
     rows = list(done.values())
     bounds = [row for row in rows if row.heading_bound_deg is not None]
@@ -164,13 +163,6 @@ def _history(calibrations: Sequence[_Calibration]) -> History:
 
 def _matrix(calibrations: Sequence[_Calibration], name: str) -> Floats:
     return np.array([one.figures(name) for one in calibrations])
-
-
-def _model(connection: sa.Connection, aircraft: str, model: str | None) -> Scatter | None:
-    """Of the parts in other aircraft."""
-    if model is None:
-        return None
-    return scatter_of_model(list(parts_of(connection, model, but=aircraft, most=MOST_PARTS).values()))
 
 
 def _part(aircraft: str, imu: str, model: str | None, scatter: Scatter) -> list[Row]:

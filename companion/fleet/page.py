@@ -233,7 +233,7 @@ def _notes(connection: sa.Connection, which: str) -> list[Child]:
         WHERE aircraft = :which AND state <> 'done'
         UNION SELECT undone_at, what || ' put back', '' FROM undos WHERE aircraft = :which
         UNION SELECT at, what, body FROM events WHERE aircraft = :which
-        UNION SELECT began_at, 'flight, ' || CAST(MAX(drift_s) AS INTEGER) || ' s without GNSS',
+        UNION SELECT began_at, 'flight, ' || CAST(MAX(drift_s) AS BIGINT) || ' s without GNSS',
                      'off by ' || ROUND(CAST(MAX(drift_m) AS NUMERIC), 1) || ' m'
               FROM flight_history WHERE aircraft = :which AND drift_m IS NOT NULL GROUP BY flight, began_at
         ORDER BY at DESC NULLS LAST LIMIT :most"""

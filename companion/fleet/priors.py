@@ -15,7 +15,7 @@ from companion.fleet.schema import parts
 from companion.physics.frames import Floats
 from companion.samples import Vector
 
-MOST_PARTS: Final = 1000
+MOST_PARTS: Final = 300
 """Of a model, that are asked."""
 _ALIKE: Final = 0.05
 """The least share by which parts are said to differ."""
@@ -33,11 +33,11 @@ def models(connection: sa.Connection) -> dict[str, int]:
     return {row[0]: row[1] for row in connection.execute(query)}
 
 
-def parts_of(connection: sa.Connection, model: str, *, but: str = "", most: int = MOST_PARTS) -> dict[Part, Scatter]:
+def parts_of(connection: sa.Connection, model: str, *, but: str = "") -> dict[Part, Scatter]:
     """How each scatters, of those that are in aircraft now; `but` in this one."""
     query = sa.select(parts).where(parts.c.model == model, parts.c.aircraft != but)
     found: dict[Part, Scatter] = {}
-    for row in connection.execute(query.order_by(parts.c.aircraft, parts.c.imu).limit(6 * most)):
+    for row in connection.execute(query.order_by(parts.c.aircraft, parts.c.imu).limit(6 * MOST_PARTS)):
         one = found.setdefault((row.aircraft, row.imu), Scatter(row.power_ups, 1, *np.full((3, 6), np.nan)))
         place = "xyz".index(row.axis) + 3 * (row.triad == "accel")
         for name in ("turn_on", "wander", "per_k"):

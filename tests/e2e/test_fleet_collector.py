@@ -120,7 +120,7 @@ def test_a_new_database_asks_for_all_that_was_confirmed_long_ago(database: str, 
 def test_tables_of_years_may_take_long_to_be_brought_up_to_date(
     server: Postgres, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("companion.fleet.store._STATEMENT_MS", 200)
+    monkeypatch.setattr("companion.fleet.database._STATEMENT_MS", 200)
     store = Store(server.create(f"fleet-{tmp_path.name}"))
     store.prepare()
     monkeypatch.setattr(schema, "STEPS", (*schema.STEPS, lambda connection: connection.execute(sa.func.pg_sleep(0.5))))

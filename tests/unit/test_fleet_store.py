@@ -24,7 +24,6 @@ from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Outcome, Store
 from tests.support.collecting import NOW, items_in, rows_of, told_by
 from tests.support.fleet import check
-from tests.support.flights import kept_flight
 
 
 @pytest.fixture
@@ -250,6 +249,10 @@ BAD: dict[str, dict[str, Any]] = {
     "a time beyond all years": {"at": "9999-12-31T23:59:59-12:00"},
     "a bias of infinity": {"body": {"bias": 1e13}},
     "a format that is none": {"format_version": "1"},
+    "a time that is empty": {
+        "kind": "arming",
+        "body": {"armed_at": "2026-11-20", "state": "", "reason": "", "calibration": ""},
+    },
 }
 
 
@@ -271,20 +274,28 @@ def test_a_bad_item_is_kept_aside_with_its_reason_and_stops_nothing(store: Store
     assert reason == outcome.rejected[0][1]
     assert {2, 3} <= {row[2] for row in items_in(database)}
     # Of one whose number can be read no more is to be heard; it takes no other's place.
-    readable = what in ("no body", "no time", "a time beyond all years", "a bias of infinity")
+    readable = what in ("no body", "no time", "a time beyond all years", "a bias of infinity", "a time that is empty")
     assert outcome.confirmed == {(one.id, one.epoch): [2, 1, 3] if readable else [2, 3]}
     assert query(database, "SELECT * FROM biases WHERE sequence = 1") == []
 
 
-@pytest.mark.parametrize("which", ["imu", "gyro_id", "accel_id"])
-def test_a_flight_with_a_number_that_no_database_holds_stops_nothing(store: Store, which: str) -> None:
+@pytest.mark.parametrize("which", ["instance", "gyro_id", "drift_m", "sigma"])
+def test_a_number_that_no_database_holds_stops_nothing(store: Store, which: str) -> None:
+    """2^63 is no integer of theirs; views turn others into units in which they are no numbers any more."""
     one = aircraft(1)
-    flight = json.loads(msgspec.json.encode(kept_flight()))
-    flight["flight"]["imus"][0][which] = 2**63
-    bad = changed(items_of(one)[0], kind="flight", sequence=100, body=flight)
-    ((message, reason),) = store.take([*items_of(one), bad]).rejected
+    one.fly(NOW)
+    one.learn(NOW)
+    *good, flight, curve, _ = items_of(one)
+    body, of_curve = (json.loads(each.payload)["body"] for each in (flight, curve))
+    (imu, *_), (node, *_) = body["flight"]["imus"], of_curve["curve"]
+    imu |= {"imu": 2**63} if which == "instance" else {"gyro_id": 2**63} if which == "gyro_id" else {}
+    imu["drift"]["flown"][0]["median_m"] = 1e305 if which == "drift_m" else 2.5
+    node["sigma_deg_h"] = [1.0, 1e305, 1.0] if which == "sigma" else [1.0, 1.0, 1.0]
+    changes = {"kind": "curve", "body": of_curve} if which == "sigma" else {"kind": "flight", "body": body}
+    bad = changed(good[0], sequence=100, **changes)
+    ((message, reason),) = store.take([*good, bad]).rejected
     assert message == bad
-    assert "9223372036854775807" in reason
+    assert reason.startswith(f"{which}: found ")
 
 
 def test_the_liar_is_named(store: Store) -> None:
