@@ -132,8 +132,7 @@ def imu_solution(name: str, gyro: Array, accel: Array, stat: Array, covariance: 
         temperature_degc=None,
         gyro_rad_s=gyro,
         accel_m_s2=accel,
-        gyro_sigma_stat_rad_s=stat[:3],
-        accel_sigma_stat_m_s2=stat[3:],
+        sigma_stat=stat,
         covariance=covariance,
         warnings=(),
     )

@@ -28,8 +28,6 @@ GAUSS_PER_NT: Final = 1e-5
 CompassUse = Literal["good", "poor", "none"]
 
 _LEAST_HORIZONTAL_NT: Final = 1.0
-_INCLINATION_SIGMA_DEG: Final = 0.2
-_STRENGTH_SIGMA_NT: Final = 138.0
 
 
 def gravity_m_s2(latitude_deg: float, height_m: float) -> float:
@@ -93,17 +91,17 @@ def magnetic_field(latitude_deg: float, longitude_deg: float, height_m: float, d
     result = _world_magnetic_model().calculate(
         glat=latitude_deg, glon=longitude_deg, alt=height_m / 1000.0, time=min(max(year, first), last)
     )
-    none = float(result.h) <= _LEAST_HORIZONTAL_NT
-    # At the very pole the declination's error has no end; where the model itself says "no compass" it is 180 degrees.
-    errors = None if none else result.calculate_uncertainty()
+    # At the very pole the declination's error has no end.
+    result.h = max(result.h, _LEAST_HORIZONTAL_NT)
+    errors = result.calculate_uncertainty()
     return MagneticField(
         declination_deg=float(result.d),
         inclination_deg=float(result.i),
         strength_gauss=float(result.f) * GAUSS_PER_NT,
-        declination_sigma_deg=180.0 if errors is None else float(errors.d),
-        inclination_sigma_deg=_INCLINATION_SIGMA_DEG if errors is None else float(errors.i),
-        strength_sigma_gauss=(_STRENGTH_SIGMA_NT if errors is None else float(errors.f)) * GAUSS_PER_NT,
-        compass_use="none" if result.in_blackout_zone or none else "poor" if result.in_caution_zone else "good",
+        declination_sigma_deg=min(float(errors.d), 180.0),
+        inclination_sigma_deg=float(errors.i),
+        strength_sigma_gauss=float(errors.f) * GAUSS_PER_NT,
+        compass_use="none" if result.in_blackout_zone else "poor" if result.in_caution_zone else "good",
     )
 
 

@@ -293,7 +293,7 @@ def biases(found: ImuSolution) -> Array:
 
 def sigmas_stat(found: ImuSolution) -> Array:
     """(6,) sigma_stat."""
-    return np.concatenate([found.gyro_sigma_stat_rad_s, found.accel_sigma_stat_m_s2])
+    return found.sigma_stat
 
 
 def sigmas_use(found: ImuSolution) -> Array:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 
@@ -25,7 +25,7 @@ MAX_SECONDS: Final = 600
 some 1 MB in memory, 100 kB on disk with three IMUs."""
 
 MAX_WORDS: Final = 100
-_FARTHEST: Final = 100_000_000
+_Second = Annotated[int, msgspec.Meta(ge=-100_000_000, le=100_000_000)]
 
 
 class VerdictTrace(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,11 +45,11 @@ class Trace(msgspec.Struct, frozen=True, kw_only=True):
     format_version: int = FORMAT_VERSION
     started_at: str
     """Of the record that it belongs to."""
-    second: tuple[int, ...]
+    second: Annotated[tuple[_Second, ...], msgspec.Meta(max_length=MAX_SECONDS)]
     """Since the calibration was asked for; negative before it. Ascending, with gaps where nothing was judged."""
     good: tuple[bool, ...]
     """Still for all sources."""
-    measured: tuple[int, int] | None
+    measured: tuple[_Second, _Second] | None
     """The result is the mean of the good seconds from the first up to, without, the last; None: no result."""
     cut: bool
     """The calibration took longer than what is kept: its beginning is missing."""
@@ -74,8 +74,6 @@ def from_json(data: bytes) -> Trace:
         columns += [verdict.words, verdict.fault]
     if any(len(column) != length for column in columns):
         raise msgspec.ValidationError(f"not every column has {length} seconds")
-    if length > MAX_SECONDS or any(abs(second) > _FARTHEST for second in (*trace.second, *(trace.measured or ()))):
-        raise msgspec.ValidationError(f"more than {MAX_SECONDS} seconds, or seconds farther than {_FARTHEST}")
     if any(later <= earlier for earlier, later in zip(trace.second, trace.second[1:], strict=False)):
         raise msgspec.ValidationError("seconds do not ascend")
     return trace

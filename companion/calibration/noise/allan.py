@@ -156,22 +156,15 @@ def allan_variance(slots: NDArray[np.int64], values: Floats, span: int) -> tuple
     length = int(slots[-1] - slots[0]) + 1
     if length < 2 * span:
         return np.zeros(values.shape[1]), 0.0
-    sums = np.zeros((length + 1, values.shape[1]))
-    centred = values - np.add.reduce(values) / len(values)
-    if length == len(slots):
-        np.cumsum(centred, axis=0, out=sums[1:])
-        mean = (sums[span:] - sums[:-span]) / span
-        apart = mean[span:] - mean[:-span]
-    else:
-        place = slots - slots[0]
-        counts = np.zeros(length + 1)
-        sums[place + 1] = centred
-        counts[place + 1] = 1.0
-        sums, counts = np.cumsum(sums, axis=0), np.cumsum(counts)
-        count = counts[span:] - counts[:-span]
-        mean = (sums[span:] - sums[:-span]) / np.maximum(count, 1.0)[:, None]
-        usable = count >= 0.5 * span
-        apart = (mean[span:] - mean[:-span])[usable[span:] & usable[:-span]]
+    place = slots - slots[0] + 1
+    sums, counts = np.zeros((length + 1, values.shape[1])), np.zeros(length + 1)
+    sums[place] = values - np.add.reduce(values) / len(values)
+    counts[place] = 1.0
+    sums, counts = np.cumsum(sums, axis=0), np.cumsum(counts)
+    count = counts[span:] - counts[:-span]
+    mean = (sums[span:] - sums[:-span]) / np.maximum(count, 1.0)[:, None]
+    usable = count >= 0.5 * span
+    apart = (mean[span:] - mean[:-span])[usable[span:] & usable[:-span]]
     pairs = len(apart)
     if pairs == 0:
         return np.zeros(values.shape[1]), 0.0

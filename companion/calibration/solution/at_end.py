@@ -40,7 +40,7 @@ def at_end(
     found: list[Array | None] = [imu.gyro_rad_s, imu.accel_m_s2]
     moved, covariance = list(whole), imu.covariance.copy()
     warm_up = imu.warm_up_variance.copy()
-    stat = [imu.gyro_sigma_stat_rad_s, imu.accel_sigma_stat_m_s2]
+    stat = imu.sigma_stat.copy()
     followed: list[Triad] = []
     for k, triad in enumerate(TRIADS):
         along, bias = expected.along.get(triad), found[k]
@@ -53,7 +53,7 @@ def at_end(
         before = moved[k]
         moved[k] = None if before is None else before + shift
         covariance[at, at] = shared.covariance[at, at] + level_variance + variance
-        stat[k] = np.sqrt(np.square(stat[k]) * np.where(ramps, _OF_END, 1.0) + variance)
+        stat[at] = np.sqrt(np.square(stat[at]) * np.where(ramps, _OF_END, 1.0) + variance)
         warm_up[at] = slope_variance * (NEXT_S / 2.0) ** 2
         followed.append(triad)
     same = dataclasses.replace(
@@ -61,8 +61,7 @@ def at_end(
         gyro_rad_s=found[0],
         accel_m_s2=found[1],
         covariance=covariance,
-        gyro_sigma_stat_rad_s=stat[0],
-        accel_sigma_stat_m_s2=stat[1],
+        sigma_stat=stat,
         warm_up_variance=warm_up,
     )
     return same, (moved[0], moved[1]), tuple(followed)

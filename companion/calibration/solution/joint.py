@@ -85,15 +85,15 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
     solution = dataclasses.replace(
         solution, imus=tuple(_with_effect(imu, expected.get(imu.name), solution.shared) for imu in solution.imus)
     )
-    found = Weighed(solution, tuple(_doubts(solution, whole, expected)))
-    known = [one for triad in TRIADS for one in _known(solution, whole, expected, triad, today=False)]
+    known, of_today = (_known(solution, whole, expected, today=today) for today in (False, True))
+    found = Weighed(solution, tuple(_doubts(solution, known, of_today)))
     used = [
         one
         for one in known
         if one.expected.weighs and (one.witness.name, one.triad) not in found.doubted and _agrees(one.witness)
     ]
     weighed = _estimate(solution, used, zero_is_known=expectation.zero_is_known) if used else solution
-    weighed = _grounded(weighed, known, _known(solution, whole, expected, "gyro", today=True))
+    weighed = _grounded(weighed, known, of_today)
     imus = []
     for k, imu in enumerate(weighed.imus):
         own = [doubt.words for doubt in found.doubts if not doubt.of_all and imu.name in doubt.names]
@@ -132,13 +132,13 @@ def _shifted_by(whole: Pair, before: ImuSolution, after: ImuSolution) -> Pair:
     return gyro, accel
 
 
-def _doubts(solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu]) -> list[Doubt]:
+def _doubts(solution: Solution, earlier: Sequence[_Known], of_today: Sequence[_Known]) -> list[Doubt]:
     """What contradicts what was known."""
     found: list[Doubt] = []
     for triad in TRIADS:
         # What was measured in this power-up says most; where it is content, nothing older has to be asked.
-        for today in (True, False):
-            witnesses = [one.witness for one in _known(solution, whole, expected, triad, today=today)]
+        for known, today in ((of_today, True), (earlier, False)):
+            witnesses = [one.witness for one in known if one.triad == triad]
             said = doubts(triad, witnesses, solution.shared.up, solution.shared.by_reading, today=today)
             if said or (today and len(witnesses) == len(solution.imus)):
                 found += said
@@ -203,7 +203,7 @@ def points(
         part = rows_of(triad)
         return Measured(
             bias=_short(bias if imu.warming is None else bias - imu.warming.ahead(triad)),
-            sigma_stat=_short(imu.gyro_sigma_stat_rad_s if triad == "gyro" else imu.accel_sigma_stat_m_s2),
+            sigma_stat=_short(imu.sigma_stat[part]),
             sigma_use=_short(np.sqrt(_own_variance(imu, shared)[part])),
             sigma_shared=_short(np.sqrt(common[part])),
             suspect=(triad, imu.name) in doubted,
@@ -245,13 +245,10 @@ def _with_effect(imu: ImuSolution, expected: ExpectedImu | None, shared: Shared)
     )
 
 
-def _known(
-    solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu], triad: Triad, *, today: bool
-) -> list[_Known]:
+def _known(solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu], *, today: bool) -> list[_Known]:
     found: list[_Known] = []
-    for k, imu in enumerate(solution.imus):
-        measured = whole[imu.name][TRIADS.index(triad)] if imu.name in whole else None
-        said = expected.get(imu.name)
+    for triad, (k, imu) in itertools.product(TRIADS, enumerate(solution.imus)):
+        said, measured = expected.get(imu.name), whole[imu.name][TRIADS.index(triad)] if imu.name in whole else None
         known = None if said is None else (said.today if today else said.earlier).get(triad)
         if measured is not None and known is not None:
             witness = _witness(imu, solution.shared, triad, known, measured)
@@ -315,9 +312,7 @@ def _estimate(solution: Solution, used: Sequence[_Known], *, zero_is_known: bool
     s_p = s_p + zero_in_p @ zero_in_p.T + other_in_p @ other_in_p.T
     both = zero_in_d @ zero_in_p.T
     of_difference = s_d[np.ix_(index, index)] + s_p - both[index] - both[index].T
-    stat = np.concatenate(
-        [np.concatenate([imu.gyro_sigma_stat_rad_s, imu.accel_sigma_stat_m_s2]) for imu in solution.imus]
-    )
+    stat = np.concatenate([imu.sigma_stat for imu in solution.imus])
     known = np.diag(np.minimum(np.square(stat), np.diag(s_d))) + noise_in_d @ noise_in_d.T
     turn = np.zeros((6, 6))
     turn[:3, :3] = solution.turn.covariance(shared.up)
@@ -347,8 +342,7 @@ def _shifted(imu: ImuSolution, shift: Array, covariance: Matrix, stat: Array) ->
         gyro_rad_s=None if imu.gyro_rad_s is None else imu.gyro_rad_s + shift[:3],
         accel_m_s2=None if imu.accel_m_s2 is None else imu.accel_m_s2 + shift[3:],
         covariance=covariance,
-        gyro_sigma_stat_rad_s=np.minimum(stat[:3], np.sqrt(np.diag(covariance)[:3])),
-        accel_sigma_stat_m_s2=np.minimum(stat[3:], np.sqrt(np.diag(covariance)[3:])),
+        sigma_stat=np.minimum(stat, np.sqrt(np.diag(covariance))),
     )
 
 

@@ -63,8 +63,8 @@ class ImuSolution:
     """At the end of the window, where it is known to have changed."""
     gyro_rad_s: Array | None
     accel_m_s2: Array | None
-    gyro_sigma_stat_rad_s: Array
-    accel_sigma_stat_m_s2: Array
+    sigma_stat: Array
+    """(6,) as the covariance; what averaging left."""
     covariance: Matrix
     warnings: tuple[str, ...]
     drifting: tuple[str, ...] = ()
@@ -299,8 +299,7 @@ def _estimate(
         temperature_degc=imu.temperature_degc if path is None else path.degc[2],
         gyro_rad_s=gyro,
         accel_m_s2=accel,
-        gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
-        accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
+        sigma_stat=np.array([*imu.gyro_sigma_stat_rad_s, *imu.accel_sigma_stat_m_s2]),
         covariance=covariance,
         warm_up_variance=unseen,
         k_s=0.0 if imu.warming is None else imu.warming.rate_k_s,

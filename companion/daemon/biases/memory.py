@@ -313,7 +313,7 @@ class BiasMemory:
             if point.gyro is not None and point.power_up.is_same(power_up) and _is_near(point, imu.mean_degc)
         ]
         best = min((max(one.sigma_stat) for one in same), default=math.inf)
-        return not self._changed(imu.name) and imu.gyro_sigma_stat_rad_s.max() < _MUCH_BETTER * best
+        return not self._changed(imu.name) and imu.sigma_stat[:3].max() < _MUCH_BETTER * best
 
     async def forget(self, started: Collection[str]) -> None:
         """Forget calibrations that were undone, by when they had begun."""

@@ -215,8 +215,7 @@ def left_in(imu: ImuWindow, gyro_rad_s: Array | None, accel_m_s2: Array | None) 
         temperature_degc=imu.temperature_degc,
         gyro_rad_s=gyro_rad_s,
         accel_m_s2=accel_m_s2,
-        gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
-        accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
+        sigma_stat=np.array([*imu.gyro_sigma_stat_rad_s, *imu.accel_sigma_stat_m_s2]),
         covariance=np.diag(sigma**2),
         warnings=(),
     )
