@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
-import logging
 import os
 import re
 import shutil
@@ -23,8 +22,6 @@ import msgspec
 from companion.errors import StorageError
 from companion.recording import topics
 from companion.recording.past import Message, Past, breathing
-
-logger = logging.getLogger(__name__)
 
 CHUNK_BYTES: Final = 256 * 1024
 """A second of a busy aircraft has less."""

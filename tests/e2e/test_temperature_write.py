@@ -111,6 +111,7 @@ def test_a_curve_is_written_takes_the_warming_off_and_is_undone_to_the_bit(
             before, left, forces = rig.parameters(), rig.left_deg_h(), rig.left_mg()
             reply = await rig.ask(action="write")
             assert (reply["state"], reply["reason"]) == ("done", "written: fc, 13 to 34 degC"), reply
+            assert "no IMU of the autopilot was measured" not in reply["written"]["warnings"]
             now = rig.parameters()
             # By hand: about 35 degC instead of 25, in the board's axes, millionths of a rad/s.
             board = rig.model.mounting.T

@@ -13,7 +13,7 @@ from typing import Final
 from companion.autopilot.firmware.ardupilot_tcal import TcalParameters, names_of, read_thermal
 from companion.autopilot.firmware.imu_calibration import ACCEL_SCALE_RANGE, ImuCalibration, ImuParameters, read_rivals
 from companion.autopilot.parameters.reading import SCALES, Parameters, read_integer, read_vector
-from companion.errors import AutopilotError, AutopilotRebootedError
+from companion.errors import AutopilotError
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.rotations import ROTATION_NAMES
 
@@ -58,11 +58,9 @@ async def read_calibration(parameters: Parameters, instance: int) -> ImuCalibrat
 
     Raises:
         AutopilotError: no such IMU, its temperature calibration is learning, an orientation or a value that cannot be
-            worked with; or no answer (ParameterTimeoutError), or a restart meanwhile (AutopilotRebootedError).
+            worked with; or no answer (ParameterTimeoutError).
     """
-    vehicle = parameters.vehicle
     names = parameters_of(instance)
-    boots = vehicle.boots
     if await parameters.read_optional(names.gyro_offset[0]) is None:
         raise AutopilotError(f"the autopilot has no IMU {instance}: {names.gyro_offset[0]} does not exist")
     gyro_id = await read_integer(parameters, names.gyro_id)
@@ -85,9 +83,6 @@ async def read_calibration(parameters: Parameters, instance: int) -> ImuCalibrat
         rivals=await read_rivals(parameters),
     )
     used = await read_integer(parameters, names.use)
-    await vehicle.hear_boot_time()
-    if vehicle.boots != boots:
-        raise AutopilotRebootedError(f"{vehicle.name} restarted while the parameters of IMU {instance} were read")
     return dataclasses.replace(calibration, warnings=_warnings(calibration, names, used=used != 0))
 
 

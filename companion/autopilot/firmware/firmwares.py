@@ -28,7 +28,7 @@ from companion.autopilot.vehicle.vehicle import Firmware
 from companion.calibration.records.record import Outcome, WrittenParameter
 from companion.calibration.temperature.polynomial import Polynomial
 from companion.config.sections import Profile
-from companion.errors import AutopilotError
+from companion.errors import AutopilotError, AutopilotRebootedError
 from companion.samples import Triad
 
 _SETTLE_S: Final[dict[Firmware, float]] = {
@@ -45,18 +45,25 @@ async def read_calibration(parameters: Parameters, instance: int, memory: SlotMe
     `memory`: what earlier writes have shown about PX4's slots.
 
     Raises:
-        AutopilotError: a firmware that is not known, or as the firmware's own `read_calibration`.
+        AutopilotError: a firmware that is not known, or as the firmware's own `read_calibration`; or it has restarted
+            meanwhile (AutopilotRebootedError).
     """
-    firmware = parameters.vehicle.firmware
-    if firmware == "ardupilot":
-        return await ardupilot.read_calibration(parameters, instance)
-    if firmware == "px4":
+    vehicle = parameters.vehicle
+    boots = vehicle.boots
+    if vehicle.firmware == "ardupilot":
+        found = await ardupilot.read_calibration(parameters, instance)
+    elif vehicle.firmware == "px4":
         # Not before the autopilot is heard.
         from companion.autopilot.firmware.px4_thermal import read_thermal
 
         found = await px4.read_calibration(parameters, instance, memory or SlotMemory())
-        return dataclasses.replace(found, thermal=await read_thermal(parameters, found.gyro_id))
-    raise AutopilotError("this autopilot is neither ArduPilot nor PX4; it is not supported")
+        found = dataclasses.replace(found, thermal=await read_thermal(parameters, found.gyro_id))
+    else:
+        raise AutopilotError("this autopilot is neither ArduPilot nor PX4; it is not supported")
+    await vehicle.hear_boot_time()
+    if vehicle.boots != boots:
+        raise AutopilotRebootedError(f"{vehicle.name} restarted while the parameters of IMU {instance} were read")
+    return found
 
 
 async def thermal_changes(

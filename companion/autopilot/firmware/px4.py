@@ -31,7 +31,7 @@ from companion.autopilot.firmware.imu_calibration import (
 )
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import SCALES, Parameters, read_integer, read_vector
-from companion.errors import AutopilotError, AutopilotRebootedError
+from companion.errors import AutopilotError
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.physics.units import MG
 from companion.rotations import ROTATION_NAMES
@@ -194,10 +194,9 @@ async def read_calibration(parameters: Parameters, instance: int, memory: SlotMe
 
     Raises:
         AutopilotError: no slot for such an IMU, or it is switched off, or a value that cannot be worked with; or no
-            answer (ParameterTimeoutError), or a restart meanwhile (AutopilotRebootedError).
+            answer (ParameterTimeoutError).
     """
-    vehicle = parameters.vehicle
-    boots = vehicle.boots
+    boots = parameters.vehicle.boots
     accel = memory.choose("accel", instance, await read_slots(parameters, "accel"))
     gyro = memory.choose("gyro", instance, await read_slots(parameters, "gyro"), like=accel.device_id)
     names = parameters_of(gyro.number, accel.number)
@@ -224,9 +223,6 @@ async def read_calibration(parameters: Parameters, instance: int, memory: SlotMe
         accel_offset_may_be_unused=small and not memory.in_use(names.accel_offset, offset, boots),
         rivals=await read_rivals(parameters, memory.rivals),
     )
-    await vehicle.hear_boot_time()
-    if vehicle.boots != boots:
-        raise AutopilotRebootedError(f"{vehicle.name} restarted while the parameters of IMU {instance} were read")
     return dataclasses.replace(calibration, warnings=_warnings(calibration))
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import logging
 import math
 from collections import Counter, deque
 from collections.abc import Callable
@@ -19,8 +18,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.heartbeats import Firmware
 from companion.links.mavlink.link import MavlinkLink, Message
-
-logger = logging.getLogger(__name__)
 
 _COPY_S: Final = 0.5
 MAX_WAITING: Final = 16

@@ -134,7 +134,6 @@ class Readiness:
         self._said = -math.inf, math.inf
         """When it was said last how long to hold still until it is calibrated, and how long."""
         self._has_gated = False
-        self._woken = asyncio.Event()
         self.turns = 0
         """Looks that came to their end, so that it is seen to go on."""
 

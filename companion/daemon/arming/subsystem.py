@@ -30,8 +30,7 @@ class Arming(Subsystem):
     """May it arm, and what happens when it does."""
 
     def __init__(self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating) -> None:
-        self._core, self._store, self._conductor = core, calibrating.store, calibrating.conductor
-        self._by_hand = calibrating.by_hand
+        self._core, self._store, self._by_hand = core, calibrating.store, calibrating.by_hand
         # In this order they hear of a calibration's end: who starts the next one asks what is in force.
         self.in_force = InForce(core, devices.imus, calibrating.conductor, calibrating.solver, calibrating.memory)
         self.automatic = Automatic(core, devices.imus, calibrating.conductor, self.in_force, calibrating.memory)

@@ -6,7 +6,6 @@ The output at the temperature of that moment stays as it is, and that is what is
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,16 +28,6 @@ from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.measuring import Measuring
 from companion.errors import CalibrationRefusedError
 from companion.storage.changes import BY_TEMPERATURE
-
-
-class _Found(NamedTuple):
-    """What is to be written."""
-
-    targets: tuple[Target, ...]
-    words: tuple[str, ...]
-    """By IMU."""
-    left: tuple[str, ...]
-    """Why others are left as they are."""
 
 
 class IntoAutopilot:
@@ -89,27 +78,29 @@ class IntoAutopilot:
         if not await self._pusher.offsets_still_hold():
             raise CalibrationRefusedError("the autopilot's values were changed in between: try again")
         job.progress(MEASURED_PERCENT, "reading the autopilot's temperature calibration")
-        found = await self._find(window, overwrite=overwrite)
-        if not found.targets:
-            raise CalibrationRefusedError("; ".join(found.left))
-        draft.warnings += found.left
-        if not any(target.all for target in found.targets):
+        targets, words, left = await self._find(window, overwrite=overwrite)
+        if not targets:
+            raise CalibrationRefusedError("; ".join(left or ["no IMU of the autopilot was measured"]))
+        draft.warnings += left
+        if not any(target.all for target in targets):
             self._core.machine.on(Event.NOTHING_TO_WRITE)
             return "already in force"
-        plan = await self._pusher.push(job, Plan(found.targets, self._core.vehicle.boots), window, draft)
+        plan = await self._pusher.push(job, Plan(tuple(targets), self._core.vehicle.boots), window, draft)
         await self._conclusion.conclude(job, plan, window, draft)
         warnings = (*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each))
         job.deliver(CurvesWritten(draft.written, warnings))
-        calibrations = [target.calibration for target in found.targets if target.all]
+        calibrations = [target.calibration for target in targets if target.all]
         if any(one.far_step is not None and not one.thermal.gyro_constant for one in calibrations):
             return f"{THERMAL_ENABLE} is on now: reboot PX4, then companion temperature --write once more"
-        return f"written: {'; '.join(found.words)}"
+        return f"written: {'; '.join(words)}"
 
-    async def _find(self, window: Window, *, overwrite: bool) -> _Found:
+    async def _find(self, window: Window, *, overwrite: bool) -> tuple[list[Target], list[str], list[str]]:
+        """What is to be written, the same in words, and why other IMUs are left as they are."""
         # The curve of an IMU that is another one now must not be written.
         exchanged = self._memory.forgotten()
         targets: list[Target] = []
-        words, left = [], []
+        words: list[str] = []
+        left: list[str] = []
         for means in window.imus:
             if means.name not in self._imus:
                 continue
@@ -143,7 +134,7 @@ class IntoAutopilot:
                 )
                 low, high = curve.span_degc
                 words.append(f"{name}, {low:.0f} to {high:.0f} degC")
-        return _Found(tuple(targets), tuple(words), tuple(left or ["no IMU of the autopilot was measured"]))
+        return targets, words, left
 
     def _of_accelerometers(self, name: str, gyro: Curve) -> Polynomial | None:
         """Their curve, where it has seen what that of the gyros has: an autopilot has one span for both."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
+from functools import partial
 from typing import Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -104,7 +105,7 @@ class Conductor:
         reboot: bool = False,
     ) -> Job | Refusal:
         """Start a calibration, or say why not; one that runs by itself and does all of this becomes the requester's."""
-        deadline_s = None if timeout_s is None else asyncio.get_running_loop().time() + timeout_s
+        deadline_s = _deadline_s(timeout_s)
         running = self._by_itself()
         whole = running is not None and not running.cancelled and not running.held_back
         if running is not None and whole and running.kind == AUTOMATIC and running.what in (what, What.BOTH):
@@ -120,33 +121,34 @@ class Conductor:
 
     def start_prediction(self, foretold: Mapping[str, Foretold], requester: str) -> Job | Refusal:
         """Start writing the gyro offsets that earlier power-ups foretell, by IMU, or say why not."""
-        if (refusal := self._refusal(requester, None)) is not None:
-            return refusal
-        job = Job(PREDICTION, What.GYROS, requester, None, automatic=True)
-        return self._start(job, Event.REQUEST, self._keep_by_hand(job, lambda job: self._course.predict(job, foretold)))
+        run = partial(self._course.predict, foretold=foretold)
+        return self.start_job(PREDICTION, What.GYROS, requester, None, None, run, automatic=True)
 
     def start_job(
         self,
         kind: str,
         what: What,
         requester: str,
-        timeout_s: float,
+        timeout_s: float | None,
         missing: str | None,
         run: Callable[[Job], Awaitable[str]],
+        *,
+        automatic: bool = False,
     ) -> Job | Refusal:
         """Start what is no calibration, or say why not.
 
         Args:
-            kind: one of `NO_CALIBRATION`.
+            kind: one of `NO_CALIBRATION`, or a prediction.
             what: which biases it is about.
             requester: for the log.
             timeout_s: for what waits for stillness.
             missing: why it cannot be done on this aircraft, if so.
             run: does it, and says in words what came of it.
+            automatic: nobody asked for it.
         """
         if (refusal := self._refusal(requester, missing)) is not None:
             return refusal
-        job = Job(kind, what, requester, asyncio.get_running_loop().time() + timeout_s)
+        job = Job(kind, what, requester, _deadline_s(timeout_s), automatic=automatic)
         return self._start(job, Event.REQUEST, self._keep_by_hand(job, run))
 
     async def _keep_by_hand(self, job: Job, run: Callable[[Job], Awaitable[str]]) -> None:
@@ -284,6 +286,10 @@ class Conductor:
             return f"{len(written)} old values back{step.origin.what and f': {step.origin.what}'}"
 
         self._end(job, await _result(job, run()))
+
+
+def _deadline_s(timeout_s: float | None) -> float | None:
+    return None if timeout_s is None else asyncio.get_running_loop().time() + timeout_s
 
 
 async def _result(job: Job, work: Awaitable[str]) -> JobResult:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from typing import Final
 
@@ -31,8 +30,6 @@ from companion.daemon.offsets.px4_writes import Px4Writes
 from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.errors import AutopilotError, NotDisarmedError, StorageError
 from companion.storage.changes import ChangeSet, Origin
-
-logger = logging.getLogger(__name__)
 
 DISARMED_WITHIN_S: Final = 10.0
 """How long a heartbeat lost just before the write is waited for."""

@@ -105,8 +105,7 @@ class Recorder(Subsystem):
         config, collector, link = core.config, core.collector, core.link
         self.fault: str | None = None
         """Why the ring is not written, in one line; None while all is well."""
-        self._config, self._collector, self._journal = config, collector, collector.journal
-        self._offload = core.offload
+        self._collector, self._journal, self._offload = collector, collector.journal, core.offload
         self._alignment, self._conductor = calibrating.alignment, calibrating.conductor
         autopilots = (imu.name for imu in config.imu if imu.source == "autopilot")
         self._past = Past(models.longest_window_s(config), autopilots)

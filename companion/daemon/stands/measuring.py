@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 
@@ -33,15 +33,6 @@ MOST_UPSETS: Final = 5
 """How often, within one calibration, other offsets may come into force, or the autopilot restart."""
 
 
-class Stand(NamedTuple):
-    """How the aircraft stands at this moment."""
-
-    status: Status
-    waiting_for: str | None
-    hold_still_s: int | None
-    """For how long to hold still, where nothing else is."""
-
-
 class Measuring:
     """Of one aircraft, for one job at a time."""
 
@@ -56,8 +47,8 @@ class Measuring:
         self._said, self._said_s = "", -math.inf
         self._upsets = {name: imu.upsets for name, imu in self._imus.items()}
 
-    async def read_state(self, job: Job, if_armed: str | None) -> Stand:
-        """How it stands now.
+    async def read_state(self, job: Job, if_armed: str | None) -> tuple[Status, str | None, int | None]:
+        """How it stands now, what is waited for, and for how many seconds to hold still where that is all.
 
         `if_armed` is why the job fails where it was armed since it began; None: it goes on once it is disarmed.
 
@@ -71,11 +62,11 @@ class Measuring:
         await self._core.catch_up()
         status = self._core.collector.status(asyncio.get_running_loop().time())
         if armed:
-            return Stand(status, "armed: it goes on once it is disarmed", None)
+            return status, "armed: it goes on once it is disarmed", None
         other = not_ready(self._core.vehicle, self._imus) or models.place_doubt(self._core.config, self._core.vehicle)
         if other is not None or status.obstacle is None:
-            return Stand(status, other, None)
-        return Stand(status, status.obstacle.words, status.obstacle.hold_still_s)
+            return status, other, None
+        return status, status.obstacle.words, status.obstacle.hold_still_s
 
     def show(self, *, measuring: bool) -> None:
         """Let the state table follow."""

@@ -11,7 +11,6 @@ developer guide, "Packet Serialization".
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Final, Literal, TypeVar
@@ -21,8 +20,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.links.mavlink.signing import NEVER_SIGNED, Signing
 from companion.links.system.listeners import Listeners, Unsubscribe
 from companion.links.system.together import Take, Together
-
-logger = logging.getLogger(__name__)
 
 Codec = mavlink.MAVLink
 Message = mavlink.MAVLink_message

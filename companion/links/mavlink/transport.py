@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import errno
 import functools
-import logging
 import re
 from typing import Any
 
@@ -18,8 +17,6 @@ from companion.errors import LinkError
 from companion.links.mavlink.link import MavlinkLink, Sender
 from companion.links.serial.bytestream import ByteLink, PortSettings
 from companion.links.system.connection import Backoff, OnState, Reconnection
-
-logger = logging.getLogger(__name__)
 
 PEER_SILENCE_S = 10.0
 MAX_PEERS = 8

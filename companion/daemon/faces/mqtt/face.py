@@ -23,6 +23,7 @@ from companion.daemon.heading.subsystem import PoseNow
 from companion.formats import Object
 from companion.links.mqtt.client import Incoming, MqttLink
 from companion.links.system.listeners import Listeners
+from companion.links.system.waiting import comes
 
 logger = logging.getLogger(__name__)
 _json: Final = msgspec.json.encode
@@ -152,19 +153,14 @@ class MqttFace:
 
     async def run(self) -> None:
         """Speak to the broker until cancelled; never raises anything else."""
-        await self._wait_for_vehicle()
+        if self._settings.base_topic is None and self._known_system_id is None and not self._only_listening:
+            await comes(self._vehicle.found, FOUND_WITHIN_S)
         while True:
             try:
                 await self._speak_as(self._base())
             except Exception:
                 logger.exception("MQTT met a fault of the program; it begins again in %.0f s", AFTER_FAULT_S)
                 await asyncio.sleep(AFTER_FAULT_S)
-
-    async def _wait_for_vehicle(self) -> None:
-        deadline_s = asyncio.get_running_loop().time() + FOUND_WITHIN_S
-        named = self._settings.base_topic is not None or self._only_listening
-        while not named and self._known_system_id is None and asyncio.get_running_loop().time() < deadline_s:
-            await asyncio.sleep(LOOK_S)
 
     @property
     def _known_system_id(self) -> int | None:
