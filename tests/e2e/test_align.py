@@ -68,11 +68,8 @@ async def follow(rig: Rig, hands: Hands, job: Job) -> JobResult:
 
 
 async def aligned(rig: Rig, hands: Hands, plan: Plan) -> JobResult:
-    return await follow(
-        rig,
-        hands,
-        started(rig.service.calibrating.start_alignment({"action": plan.kind, "headings": plan.headings}, "test")),
-    )
+    wanted = {"action": plan.kind, "headings": plan.headings}
+    return await follow(rig, hands, started(rig.service.calibrating.start_alignment(wanted, "test")))
 
 
 @pytest.mark.parametrize("plan", [Plan("zero"), Plan("zero", headings=4)], ids=["there-and-back", "four"])

@@ -36,9 +36,8 @@ def rig(folder: Path, **more: Any) -> tuple[Rig, Hands]:
 
 
 def faced(rig: Rig, *, write: bool) -> Job:
-    return started(
-        rig.service.calibrating.start_alignment({"action": "faces", "write": write, "timeout_s": 2000.0}, "test")
-    )
+    wanted = {"action": "faces", "write": write, "timeout_s": 2000.0}
+    return started(rig.service.calibrating.start_alignment(wanted, "test"))
 
 
 def read(rig: Rig, what: str) -> np.ndarray[Any, Any]:

@@ -32,10 +32,12 @@ def rig(folder: Path, pose: Pose, firmware: str = "ardupilot", **more: Any) -> t
     return alone(folder, placement_deg=0.02, pose=pose, firmware=firmware, **{"imu_rate_hz": 25.0} | more)
 
 
+FACES = {"action": "faces", "write": True, "timeout_s": 2000.0}
+
+
 def turn(rig: Rig, headings: int, *, write: bool) -> Job:
-    return started(
-        rig.service.calibrating.start_alignment({"action": "turn", "headings": headings, "write": write}, "test")
-    )
+    wanted = {"action": "turn", "headings": headings, "write": write}
+    return started(rig.service.calibrating.start_alignment(wanted, "test"))
 
 
 async def turned(rig: Rig, hands: Hands, headings: int, *, write: bool, meddle: Meddle = NOTHING) -> TurnRecord:
@@ -176,11 +178,7 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
             refused = first.service.calibrating.start_alignment({"action": "turn", "level": True}, "test")
             assert isinstance(refused, Refusal)
             assert "align faces --write first" in refused.reason
-            job = started(
-                first.service.calibrating.start_alignment(
-                    {"action": "faces", "write": True, "timeout_s": 2000.0}, "test"
-                )
-            )
+            job = started(first.service.calibrating.start_alignment(FACES, "test"))
             result = await follow(first, hand, job)
             assert result.outcome == "done", result
 
@@ -234,15 +232,7 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
         async with made.running():
             await made.ready()
             old = {name: made.autopilot.parameter(name) for name in ("CAL_ACC0_XOFF", "CAL_ACC0_YOFF", "CAL_ACC0_ZOFF")}
-            result = await follow(
-                made,
-                hands,
-                started(
-                    made.service.calibrating.start_alignment(
-                        {"action": "faces", "write": True, "timeout_s": 2000.0}, "test"
-                    )
-                ),
-            )
+            result = await follow(made, hands, started(made.service.calibrating.start_alignment(FACES, "test")))
             assert result.outcome == "done", result
             hands.spot(made.aircraft.time_at(made.now_s), STEEP.pitch_deg, STEEP.roll_deg)
             await asyncio.sleep(15.0)

@@ -118,9 +118,7 @@ def test_alignments_have_the_same_limit(tmp_path: Path) -> None:
             await rig.ready()
             answers = []
             for _ in range(30):
-                answers.append(
-                    rig.service.calibrating.start_alignment({"action": "zero", "timeout_s": 60.0}, "a script")
-                )
+                answers.append(rig.service.calibrating.start_alignment({"action": "zero"}, "a script"))
                 rig.service.calibrating.conductor.cancel("a script")
                 if isinstance(job := answers[-1], Job):
                     await job.finished

@@ -250,21 +250,19 @@ class ImuCalibration:
 
 def gyro_offset_after(calibration: ImuCalibration, residual_rad_s: Vector) -> Vector:
     """The offset that takes a residual (mean output minus truth, FRD) out: gyro_offset + R^-1 residual, as float32."""
-    _require_plausible("gyro residual", residual_rad_s, MAX_GYRO_RESIDUAL_RAD_S, DEG, "deg/s", calibration.instance)
+    _require_plausible(calibration, "gyro residual", residual_rad_s, MAX_GYRO_RESIDUAL_RAD_S)
     step = calibration.orientation.T @ np.asarray(residual_rad_s)
     after = _vector(np.asarray(calibration.gyro_offset_rad_s) + step)
-    _require_plausible("gyro offset", after, MAX_GYRO_OFFSET_RAD_S, DEG, "deg/s", calibration.instance)
+    _require_plausible(calibration, "gyro offset", after, MAX_GYRO_OFFSET_RAD_S)
     return after
 
 
 def accel_offset_after(calibration: ImuCalibration, residual_m_s2: Vector) -> Vector:
     """The same: accel_offset + diag(1/accel_scale) R^-1 residual."""
-    _require_plausible(
-        "accelerometer residual", residual_m_s2, MAX_ACCEL_RESIDUAL_M_S2, 1.0, "m/s^2", calibration.instance
-    )
+    _require_plausible(calibration, "accelerometer residual", residual_m_s2, MAX_ACCEL_RESIDUAL_M_S2)
     step = (calibration.orientation.T @ np.asarray(residual_m_s2)) / np.asarray(calibration.accel_scale)
     after = _vector(np.asarray(calibration.accel_offset_m_s2) + step)
-    _require_plausible("accelerometer offset", after, MAX_ACCEL_OFFSET_M_S2, 1.0, "m/s^2", calibration.instance)
+    _require_plausible(calibration, "accelerometer offset", after, MAX_ACCEL_OFFSET_M_S2)
     if calibration.zero_is_uncalibrated and not any(after):
         return float32(NOT_ZERO_M_S2), 0.0, 0.0
     return after
@@ -308,19 +306,18 @@ def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: V
     Raises:
         CalibrationRefusedError: a value that is not plausible, see the limits at the top.
     """
-    names, number = calibration.parameters, calibration.instance
-    before = calibration.in_use()
+    names, before = calibration.parameters, calibration.in_use()
     right = before / (1.0 + np.asarray(scale))
     after = _vector(calibration.in_use(_vector(right)))
     level = calibration.orientation.T @ (0.0, 0.0, -1e3 * MG)
     left = level * (1.0 / right - 1.0 / np.asarray(after)) if calibration.scale_unused_within else np.zeros(3)
     offset = _vector(np.asarray(calibration.accel_offset_m_s2) + np.asarray(bias_m_s2) / before + left)
-    _require_plausible("accelerometer offset", offset, MAX_ACCEL_OFFSET_M_S2, 1.0, "m/s^2", number)
+    _require_plausible(calibration, "accelerometer offset", offset, MAX_ACCEL_OFFSET_M_S2)
     low, high = ACCEL_SCALE_RANGE
     for axis, value in zip(_AXES, after, strict=True):
         if not low <= value <= high:
             raise CalibrationRefusedError(
-                f"IMU {number}: accelerometer scale {axis} is {value:.3g}, allowed are {low} to {high}"
+                f"IMU {calibration.instance}: accelerometer scale {axis} is {value:.3g}, allowed are {low} to {high}"
             )
     far = calibration.far_step
     by = (None, None) if far is None else (far.accel_m_s2, far.scale)
@@ -382,7 +379,8 @@ def accel_taken_off(calibration: ImuCalibration) -> Array:
     return scaled
 
 
-def _require_plausible(what: str, vector: Vector, limit: float, unit: float, words: str, instance: int) -> None:
+def _require_plausible(calibration: ImuCalibration, what: str, vector: Vector, limit: float) -> None:
+    instance, (unit, words) = calibration.instance, (DEG, "deg/s") if "gyro" in what else (1.0, "m/s^2")
     for axis, value in zip(_AXES, vector, strict=True):
         if not math.isfinite(value):
             raise CalibrationRefusedError(f"IMU {instance}: {what} {axis} is {value}")

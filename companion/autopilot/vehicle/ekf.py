@@ -25,6 +25,7 @@ SETTLED_RAD_S: Final = 0.02 * DEG
 """Per axis: 72 deg/h. An EKF whose bias has just been reset wanders up to 52 deg/h on the ground (9.3.1); and 72 deg/h
 for the 40 s that it lasts turn the heading by 0.8 deg, less than a compass knows."""
 
+_AHRS: Final[int] = mavlink.MAVLINK_MSG_ID_AHRS
 _RATE_HZ: Final = 4.0
 _MEAN_S: Final = 2.0
 _OLDEST_S: Final = 10.0
@@ -93,13 +94,11 @@ class EkfWatch:
         """No more AHRS on our account: back to the autopilot's own rate."""
         if self._asked and self._vehicle.alive:
             self._asked = False
-            message_id: int = mavlink.MAVLINK_MSG_ID_AHRS
-            self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 0.0)
+            self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _AHRS, 0.0)
 
     def _ask(self) -> None:
         self._asked = True
-        message_id: int = mavlink.MAVLINK_MSG_ID_AHRS
-        self._vehicle.commands.request_message_interval(message_id, _RATE_HZ)
+        self._vehicle.commands.request_message_interval(_AHRS, _RATE_HZ)
 
     def _mean(self, at_least_s: float) -> float | None:
         """Of the last 2 s, or of as much more as it takes on a busy line to see so long; None when it was not."""

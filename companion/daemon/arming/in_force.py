@@ -228,13 +228,9 @@ class InForce:
     def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Doubt]) -> None:
         """Hold what a calibration has found in one IMU, save what it has not written for doubt."""
         corrected = imu.name in self._imus
-        halves: tuple[tuple[Triad, Vector | None, Vector | None, Vector | None], ...] = (
-            ("gyro", imu.sigma_in_force("gyro"), imu.gyro_bias_rad_s, imu.residual_gyro_rad_s),
-            ("accel", imu.sigma_in_force("accel"), imu.accel_bias_m_s2, imu.residual_accel_m_s2),
-        )
-        for triad, sigma, bias, residual in halves:
-            key = (imu.name, triad)
-            settled = imu.settled_sigma(triad)
+        biases = (imu.gyro_bias_rad_s, imu.residual_gyro_rad_s), (imu.accel_bias_m_s2, imu.residual_accel_m_s2)
+        for triad, (bias, residual) in zip(TRIADS, biases, strict=True):
+            key, sigma, settled = (imu.name, triad), imu.sigma_in_force(triad), imu.settled_sigma(triad)
             if key not in self._held or sigma is None or settled is None or bias is None:
                 continue
             found = Held(

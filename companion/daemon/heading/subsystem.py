@@ -17,7 +17,7 @@ from companion.autopilot.firmware.heading_parameters import (
     without_compass,
 )
 from companion.autopilot.firmware.imu_calibration import read_rivals
-from companion.autopilot.firmware.port_parameters import PortRow, baud_of, port_names, port_rows
+from companion.autopilot.firmware.port_parameters import baud_of, port_names, port_rows
 from companion.calibration.means.pose import up_in_vehicle, vehicle_heading_rad
 from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.configured import models
@@ -61,6 +61,7 @@ class Heading(Subsystem):
         """What is set, what should be, and what to do: for our heading, the gate, the offsets, and the port."""
         firmware = self._core.vehicle.firmware
         found = await self._core.parameters.read_many(read_for(firmware), optional=True)
+        port = await self._core.parameters.read_many(port_names(firmware), optional=True)
         changes = changes_for(firmware, found)
         assert firmware is not None  # or it would have been refused
         net = net_of(firmware, found)
@@ -93,13 +94,8 @@ class Heading(Subsystem):
             "risks": list(RISKS.get(firmware, ())),
             "gate": {"at_arm": self._core.wanted.at_arm, "problem": await self._gate.find_missing(0.0)},
             "rivals": [rival.words for rival in await read_rivals(self._core.parameters)],
-            "port": [row._asdict() for row in await self._port()],
+            "port": [row._asdict() for row in port_rows(firmware, port, baud_of(self._core.config.mavlink.url))],
         }
-
-    async def _port(self) -> list[PortRow]:
-        firmware = self._core.vehicle.firmware
-        found = await self._core.parameters.read_many(port_names(firmware), optional=True)
-        return port_rows(firmware, found, baud_of(self._core.config.mavlink.url))
 
     def status(self) -> Object:  # noqa: D102
         attitude = self.attitude

@@ -19,7 +19,7 @@ from companion.autopilot.firmware.gyro_calibration import wait_until_over
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.parameters.writer import ParameterWriter
-from companion.autopilot.vehicle.vehicle import ArmState, Firmware
+from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.records.record import WrittenParameter
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core, Offload
@@ -27,7 +27,7 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
 from companion.links.system.listeners import Listeners
-from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
+from companion.storage.changes import ChangeLog, ChangeSet, Undoable
 
 logger = logging.getLogger(__name__)
 
@@ -164,11 +164,6 @@ class Ledger:
         self._open = None
         self._orphaned.clear()
 
-    def strange_to(self, firmware: Firmware | None, changes: ChangeSet) -> list[str]:
-        """The parameters among them that we never write on this firmware."""
-        known = CALIBRATION.get(firmware or "other", {})
-        return [name for name in changes.names if name not in known]
-
 
 class Recovery:
     """Puts values back, guarded like every write."""
@@ -208,8 +203,8 @@ class Recovery:
 
     async def _recover(self, open_set: ChangeSet) -> None:
         await self._vehicle.found.wait()
-        strange = self.ledger.strange_to(self._vehicle.firmware, open_set)
-        if strange or open_set.system_id != self._vehicle.system_id:
+        ever_written = CALIBRATION.get(self._vehicle.firmware or "other", {})
+        if not ever_written.keys() >= set(open_set.names) or open_set.system_id != self._vehicle.system_id:
             names = ", ".join(open_set.names)
             words = f"Interrupted write on system {open_set.system_id}, not on this aircraft: check there {names}"
             logger.warning("%s", words)
@@ -272,21 +267,19 @@ class Recovery:
         foreign: list[str] = []
         found = await self._read(changes.names)
         for changed in changes.changes:
-            now, change = found.get(changed.parameter), _change(changed)
+            name, before, after = changed.parameter, changed.before, changed.after
+            now = found.get(name)
             if now is None:
-                foreign.append(f"{changed.parameter} cannot be read any more (before: {changed.before:.6g})")
-                continue
-            if changed.after is None:
-                if not same_float32(now, changed.before):
-                    ours.append(Change(changed.parameter, changed.before, now))
-            elif any(same_float32(now, own) for own in change.ours):
-                ours.append(change)
+                foreign.append(f"{name} cannot be read any more (before: {before:.6g})")
+            elif after is None:
+                if not same_float32(now, before):
+                    ours.append(Change(name, before, now))
+            elif any(same_float32(now, own) for own in (after, changed.via) if own is not None):
+                ours.append(Change(name, before, after, changed.via))
             elif any(same_float32(now, own) for own in changed.also):
-                ours.append(Change(changed.parameter, changed.before, now, changed.via))
-            elif not same_float32(now, changed.before):
-                foreign.append(
-                    f"{changed.parameter} is {now:.6g}, we had set {changed.after:.6g} (before: {changed.before:.6g})"
-                )
+                ours.append(Change(name, before, now, changed.via))
+            elif not same_float32(now, before):
+                foreign.append(f"{name} is {now:.6g}, we had set {after:.6g} (before: {before:.6g})")
         return ours, foreign
 
     async def _read(self, names: Sequence[str]) -> dict[str, float]:
@@ -298,8 +291,3 @@ class Recovery:
             with contextlib.suppress(ParameterRefusedError):
                 found[name] = await self._parameters.read(name)
         return found
-
-
-def _change(changed: Changed) -> Change:
-    after = changed.before if changed.after is None else changed.after
-    return Change(changed.parameter, changed.before, after, changed.via)
