@@ -7,6 +7,7 @@ import datetime
 import hashlib
 import logging
 from collections.abc import Iterable, Iterator, Sequence
+from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -41,6 +42,7 @@ _SHOWN_BYTES: Final = 4096
 _REJECTED: Final[Row] = {"state": "rejected", "kind": None, "at": None, "clock": None, "same": None}
 _AGAIN: Final = 500
 """Items of a newer aircraft that are looked at anew in one transaction after an update."""
+_CURVE: Final = itemgetter("aircraft", "epoch", "imu")
 
 
 class Message(NamedTuple):
@@ -199,14 +201,16 @@ class Store:
 
     def _put_made(self, connection: sa.Connection, made: Rows) -> None:
         """What was made of items; an aircraft of which there is something new to be judged by is noted."""
+        # Each power-up makes another curve, of hundreds of rows: only those of the latest stay.
+        curves = sorted(made.get("curves", ()), key=itemgetter("sequence"))
+        latest, each = {_CURVE(row): row["sequence"] for row in curves}, schema.curves.c
+        made = {**made, "curves": [row for row in curves if row["sequence"] == latest[_CURVE(row)]]}
         for name, rows in sorted(made.items()):
             self._put(connection, schema.tables.tables[name], rows)
-        if "curves" in made:  # a new one at each power-up, of hundreds of rows: only the latest is asked for
-            older, later = schema.curves, schema.curves.alias()
-            same = (older.c[name] == later.c[name] for name in ("aircraft", "epoch", "imu"))
-            of = older.c.aircraft.in_({row["aircraft"] for row in made["curves"]})
-            gone = sa.delete(older).where(of, sa.exists().where(*same, later.c.sequence > older.c.sequence))
-            connection.execute(gone)
+        for aircraft, epoch, imu in sorted(latest):
+            of = each.aircraft == aircraft, each.epoch == epoch, each.imu == imu
+            newest = connection.execute(sa.select(sa.func.max(each.sequence)).where(*of)).scalar()
+            connection.execute(sa.delete(schema.curves).where(*of, each.sequence < newest))
         table = schema.judgements
         which = {row["aircraft"] for name in ("calibrations", "undos") for row in made.get(name, ())}
         if which:

@@ -152,8 +152,9 @@ def test_rows_of_former_curves_go(told: str) -> None:
     before = asked(told, counted)
     assert {row["sequence"] for row in before} == latest
     store = Store(told)
-    for payload in reversed(ONE.told.values()):
-        store.take([Message(f"fleet/{ONE.id}/item", payload)])
+    again = [Message(f"fleet/{ONE.id}/item", payload) for payload in reversed(ONE.told.values())]
+    for batch in (*([each] for each in again), again):
+        store.take(batch)
     store.close()
     assert sorted(map(str, asked(told, counted))) == sorted(map(str, before))
 
