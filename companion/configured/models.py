@@ -20,7 +20,7 @@ from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.record import AlignmentUsed
 from companion.calibration.solution.site import Whereabouts
-from companion.calibration.stillness.stretch import AT_ONCE, Lag
+from companion.calibration.stillness.stretch import Lag
 from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu
 from companion.links.serial.bytestream import PortSettings
 from companion.physics.frames import rotation_matrix
@@ -124,11 +124,13 @@ def gradienter_model(gradienter: Gradienter | None) -> GradienterModel | None:
     """How the gradienter's readings become the direction of up."""
     if gradienter is None:
         return None
+    info = PROTOCOLS["gradienter"][gradienter.protocol]
     return GradienterModel(
         law=gradienter.law,
         vehicle_from_sensor=rotation_matrix(gradienter.mounting),
         offset_deg=gradienter.offset_deg,
         sigma_deg=gradienter.sigma_deg or tilt_sigma_deg(gradienter.protocol),
+        lag_s=info.lag_s if gradienter.lag_s is None else gradienter.lag_s,
     )
 
 
@@ -153,25 +155,17 @@ def compass_model(compass: Compass | None) -> CompassModel | None:
         tilted_sigma_deg=info.tilted_sigma_deg if said_deg is None else None,
         counts_per_gauss=compass.counts_per_gauss,
         prefers_field=compass.heading == "field",
+        lag_s=info.lag_s if compass.lag_s is None else compass.lag_s,
     )
-
-
-def lag(kind: Literal["gradienter", "compass"], device: Gradienter | Compass | None) -> Lag:
-    """How a pose sensor follows the truth: as configured, else as its protocol's device does."""
-    model = gradienter_model(device) if isinstance(device, Gradienter) else compass_model(device)
-    if device is None or model is None:
-        return AT_ONCE
-    lag_s = PROTOCOLS[kind][device.protocol].lag_s if device.lag_s is None else device.lag_s
-    return Lag(lag_s, model.sigma_deg)
 
 
 def pose_sources(config: Config) -> PoseSources:
     """How tilt and heading come."""
-    compass = compass_model(config.compass)
+    gradienter, compass = gradienter_model(config.gradienter), compass_model(config.compass)
     return PoseSources(
-        gradienter=None if config.gradienter is None else lag("gradienter", config.gradienter),
-        compass=None if config.compass is None else lag("compass", config.compass),
-        field_by=None if compass is None else (compass, gradienter_model(config.gradienter)),
+        gradienter=None if gradienter is None else Lag(gradienter.lag_s, gradienter.sigma_deg),
+        compass=None if compass is None else Lag(compass.lag_s, compass.sigma_deg),
+        field_by=None if compass is None else (compass, gradienter),
     )
 
 
@@ -179,14 +173,7 @@ def deck(config: Config) -> Deck | None:
     """What collects where the platform moves; None on the ground."""
     if config.vehicle.platform != "deck":
         return None
-    return Deck(
-        Surroundings(
-            gradienter=gradienter_model(config.gradienter),
-            gradienter_lag_s=lag("gradienter", config.gradienter).lag_s,
-            compass=compass_model(config.compass),
-            compass_lag_s=lag("compass", config.compass).lag_s,
-        )
-    )
+    return Deck(Surroundings(gradienter=gradienter_model(config.gradienter), compass=compass_model(config.compass)))
 
 
 def longest_window_s(config: Config) -> float:

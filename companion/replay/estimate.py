@@ -138,7 +138,7 @@ class _Streams:
         self.gradienter = self.compass = None
         if tilt_given or self.tilt is not None:
             law: Law = "euler" if tilt_given else given.law
-            self.gradienter = GradienterModel(law, np.eye(3), (0.0, 0.0), given.sigma_deg)
+            self.gradienter = GradienterModel(law, np.eye(3), (0.0, 0.0), given.sigma_deg, given.tilt_lag_s)
         elif self.field is not None:
             self.notes.append("magnetic field left out: without a tilt it tells no heading")
             self.field = None
@@ -151,17 +151,8 @@ class _Streams:
                 prefers_field=self.heading is None,
             )
         self._poses = (self.tilt, self.heading, self.field)
-        self._lag = Lag(given.tilt_lag_s, given.sigma_deg)
-        self._deck: Deck | None = None
-        if given.platform == "deck":
-            self._deck = Deck(
-                Surroundings(
-                    gradienter=self.gradienter,
-                    gradienter_lag_s=given.tilt_lag_s,
-                    compass=self.compass,
-                    compass_lag_s=0.0,
-                )
-            )
+        around = Surroundings(gradienter=self.gradienter, compass=self.compass)
+        self._deck = Deck(around) if given.platform == "deck" else None
         # A tilt of the command line is the field's, too.
         self._constant = TiltSample(0.0, given.roll_deg or 0.0, given.pitch_deg or 0.0) if tilt_given else None
 
@@ -173,9 +164,10 @@ class _Streams:
 
     def collector(self, settings: Settings, imu: ImuInput) -> RollingCollector:
         """One that expects what comes."""
-        field_by = None if self.field is None or self.compass is None else (self.compass, self.gradienter)
+        tilt, compass = self.gradienter, self.compass
+        field_by = None if self.field is None or compass is None else (compass, tilt)
         sources = PoseSources(
-            gradienter=None if self.tilt is None else self._lag,
+            gradienter=None if self.tilt is None or tilt is None else Lag(tilt.lag_s, tilt.sigma_deg),
             compass=None if self.heading is None and self.field is None else AT_ONCE,
             field_by=field_by,
         )

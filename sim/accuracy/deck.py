@@ -96,11 +96,11 @@ def sail(voyage: Voyage, spans_s: Sequence[int], seed: int, made: Callable[[Surr
         gyro_scale=axes[:3].tolist(),
         gyro_misalignment_rad=axes[3:].tolist(),
     )
-    tilt = GradienterModel("axis", np.eye(3), (0.0, 0.0), TILT_SIGMA_DEG)
+    tilt = GradienterModel("axis", np.eye(3), (0.0, 0.0), TILT_SIGMA_DEG, LAG_S)
     compass = CompassModel(
         magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=voyage.compass_sigma_deg
     )
-    around = Surroundings(gradienter=tilt, gradienter_lag_s=LAG_S, compass=compass, compass_lag_s=0.0)
+    around = Surroundings(gradienter=tilt, compass=compass)
     deck = made(around)
     taken = ImuInput(
         name="imu", rotation=np.eye(3), profile=noise_profile(voyage.part if voyage.part in PROFILES else "icm42688p")

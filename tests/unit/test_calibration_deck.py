@@ -30,10 +30,8 @@ from sim.sea import DAY_S, Sea, Wave
 
 UNITS = np.array([DEG_H] * 3 + [MG] * 3)
 AROUND = Surroundings(
-    gradienter=GradienterModel("axis", np.eye(3), (0.0, 0.0), 0.01),
-    gradienter_lag_s=0.4,
+    gradienter=GradienterModel("axis", np.eye(3), (0.0, 0.0), 0.01, lag_s=0.4),
     compass=CompassModel(magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=1.0),
-    compass_lag_s=0.0,
 )
 
 
@@ -72,11 +70,11 @@ def test_running_products_are_products() -> None:
 
 
 def test_the_fluid_follows_as_a_first_order_lag_does() -> None:
-    model = GradienterModel("axis", np.eye(3), (0.0, 0.0), 0.01)
+    model = GradienterModel("axis", np.eye(3), (0.0, 0.0), 0.01, lag_s=0.4)
     times = np.arange(4000) / 200.0
     roll = np.radians(5.0) * np.sin(2.0 * math.pi * 0.2 * times)
     forces = 9.8 * np.column_stack([np.zeros_like(roll), -np.sin(roll), -np.cos(roll)])
-    shown = Fluid(model, 0.4).follow(times, forces)[:, 0]
+    shown = Fluid(model).follow(times, forces)[:, 0]
     phase = 2.0 * math.pi * 0.2 * 0.4
     expected = 5.0 / math.hypot(1.0, phase) * np.sin(2.0 * math.pi * 0.2 * times - math.atan(phase))
     assert np.abs(shown - expected)[1000:].max() < 0.01
@@ -169,7 +167,7 @@ def test_a_sensor_that_repeats_itself_on_a_swaying_deck_is_named(stuck: str) -> 
 
 
 def test_windows_end_the_more_rarely_the_longer_they_are() -> None:
-    deck = Deck(Surroundings(gradienter=None, gradienter_lag_s=0.0, compass=None, compass_lag_s=0.0))
+    deck = Deck(Surroundings(gradienter=None, compass=None))
     deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["unknown"]))
     ends = []
     for slot in range(1500):
@@ -192,7 +190,7 @@ def quiet_second(slot: int, begin: float = 0.0) -> tuple[Array, Array]:
 
 
 def test_a_gap_begins_the_seconds_anew() -> None:
-    deck = Deck(Surroundings(gradienter=None, gradienter_lag_s=0.0, compass=None, compass_lag_s=0.0))
+    deck = Deck(Surroundings(gradienter=None, compass=None))
     deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["unknown"]))
     for slot in range(25):
         times, rows = quiet_second(slot)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.alignment.faces import BIAS, Accelerometer, Face, faces
+from companion.calibration.alignment.faces import BIAS, Face, Sides, faces
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.noise.allan import floor_variance, noise_profile
 from companion.calibration.request import What
-from companion.calibration.solution.otherwise import Otherwise, OwnHeading, Sides, aged_m_s2
+from companion.calibration.solution.otherwise import Otherwise, OwnHeading, aged_m_s2
 from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import Solution, solve
 from companion.errors import CalibrationRefusedError
@@ -59,21 +59,21 @@ class Wandering(Sensor):
             self.response @ force_m_s2 + self.truth[BIAS] + wander + self.rng.normal(size=3) * self.stat[0]
         )
 
-    def known(self) -> Accelerometer:
+    def known(self) -> Sides:
         stands = [Face(self.mean(EVERY_S * k, self.up(*pose)), self.use) for k, pose in enumerate(TWELVE)]
         found = faces(stands, SITE.gravity_m_s2, 3e-4, self.wander)
-        return Accelerometer(found.figures, found.covariance)
+        return Sides(found.figures, found.sigma, TURN)
 
-    def later(self, known: Accelerometer, gap_s: float, step_m_s2: Floats, aged_m_s2: float) -> Later:
+    def later(self, known: Sides, gap_s: float, step_m_s2: Floats, aged_m_s2: float) -> Later:
         """On some ground, with a bias that has stepped besides."""
         pitch, roll = map(float, self.rng.uniform(-8.0, 8.0, 2))
         pose = Pose(pitch, roll, float(self.rng.uniform(0.0, 360.0)))
         truth = VirtualAircraft(pose, SITE).truth_at(0.0)
         force = TURN.T @ np.asarray(truth.force_m_s2)
         read = self.mean(EVERY_S * len(TWELVE) + gap_s, force) + step_m_s2
-        widened = known.covariance.copy()
-        widened[BIAS, BIAS] += np.eye(3) * aged_m_s2**2
-        sides = Sides.of(Accelerometer(known.figures, widened), TURN)
+        widened = known.sigma.copy()
+        widened[BIAS] = np.hypot(widened[BIAS], aged_m_s2)
+        sides = Sides(known.figures, widened, TURN)
         window = still(TURN @ read, np.asarray(truth.rate_rad_s) + GYRO_BIAS, self.stat, self.use)
         return Later(pose, solve(window, LOCAL, None, None, What.BOTH, otherwise=Otherwise(sides={"fc": sides})))
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from companion.calibration.alignment.align import Alignment, Complaint, in_words
 from companion.calibration.alignment.align_model import Ground, ImuStand, Row, Stand
-from companion.calibration.alignment.faces import Accelerometer, Face, faces
+from companion.calibration.alignment.faces import Face, Sides, faces
 from companion.calibration.alignment.spot import ALONE, mounting, turned
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG, DEG_H, MG
@@ -139,19 +140,19 @@ def test_a_spot_that_moved_is_named_in_words_that_know_no_gradienter(headings: t
     assert "gradienter" not in words
 
 
-def held(board_deg: tuple[float, float, float], orientation: str = "ROTATION_NONE") -> Accelerometer:
+def held(board_deg: tuple[float, float, float], orientation: str = "ROTATION_NONE") -> Sides:
     stands = []
     for k, (pitch, roll) in enumerate(TWELVE):
         aircraft = VirtualAircraft(Pose(pitch + 3.0 * math.sin(k), roll + 4.0 * math.cos(k), 30.0 * k), SITE)
         # In the sensor's axes, as `ImuModel` gives them.
         stands.append(Face(model(aircraft, board_deg).expected(0.0)[3:], np.full(3, SIGMA)))
     found = faces(stands, G, 0.0)
-    return Accelerometer(found.figures, found.covariance)
+    return Sides(found.figures, found.sigma, rotation_matrix(orientation))
 
 
 def test_the_boards_tilt_is_found_on_a_slope() -> None:
     found = solved(on_spot((3.0, -4.0), QUARTERS))
-    board = mounting(found.imus[0], held(BOARD_DEG), G, np.eye(3))
+    board = mounting(found.imus[0], held(BOARD_DEG), G)
     # The board is turned against the base: level looks as if the aircraft were tilted the other way round.
     level = rotation_matrix(BOARD_DEG).T @ np.array([0.0, 0.0, -1.0])
     assert board.roll_rad / DEG == pytest.approx(math.degrees(math.atan2(-level[1], -level[2])), abs=0.003)
@@ -168,7 +169,7 @@ def test_the_orientation_of_a_turned_board_is_taken_off() -> None:
     tilt = np.array([math.sin(2.0 * DEG), 0.0, -math.cos(2.0 * DEG)])
     read = orientation @ ((1.0 + scale) * (orientation.T @ tilt * G) + bias)
     nose_up = dataclasses.replace(level, level_bias_m_s2=read + np.array([0.0, 0.0, G]))
-    board = mounting(nose_up, known, G, orientation)
+    board = mounting(nose_up, msgspec.structs.replace(known, vehicle_from_sensor=orientation), G)
     assert board.pitch_rad / DEG == pytest.approx(2.0, abs=1e-3)
     assert board.roll_rad / DEG == pytest.approx(0.0, abs=1e-3)
 
@@ -176,14 +177,14 @@ def test_the_orientation_of_a_turned_board_is_taken_off() -> None:
 def test_the_covariance_of_the_tilt_is_that_of_what_it_is_made_of() -> None:
     """Against drawing biases and readings at random."""
     level, known = solved(on_spot((0.5, 0.0), QUARTERS)).imus[0], held(BOARD_DEG)
-    said = mounting(level, known, G, np.eye(3)).sigma_rad
+    said = mounting(level, known, G).sigma_rad
     rng = np.random.default_rng(4)
     drawn = []
     for _ in range(400):
-        figures = rng.multivariate_normal(known.figures, known.covariance)
+        figures = rng.normal(known.figures, known.sigma)
         bias = rng.multivariate_normal(level.level_bias_m_s2, level.level_covariance_m2_s4)
         one = mounting(
-            dataclasses.replace(level, level_bias_m_s2=bias), dataclasses.replace(known, figures=figures), G, np.eye(3)
+            dataclasses.replace(level, level_bias_m_s2=bias), msgspec.structs.replace(known, figures=figures), G
         )
         drawn.append([one.roll_rad, one.pitch_rad])
     np.testing.assert_allclose(np.std(drawn, axis=0), said, rtol=0.15)

@@ -20,6 +20,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from companion.calibration.alignment.align import widened_by
@@ -53,12 +54,14 @@ class Face:
     sigma_m_s2: Array
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Accelerometer:
-    """Figures (9,), as in `Faces`, and their covariance (9, 9)."""
+class Sides(msgspec.Struct, frozen=True):
+    """Accelerometers of one IMU as all sides have told of them, under the offsets and scales in force."""
 
     figures: Array
-    covariance: Matrix
+    """(9,), as in `Faces`, in the sensor's axes; m/s^2 and no unit."""
+    sigma: Array
+    """One sigma of each, with what time and temperature have added to the biases."""
+    vehicle_from_sensor: Matrix
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

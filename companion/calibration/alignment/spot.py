@@ -26,7 +26,7 @@ from companion.calibration.alignment.faces import (
     PRIOR_SCALE,
     PRIOR_SHEAR,
     SCALE,
-    Accelerometer,
+    Sides,
 )
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, roll_pitch_from_up
@@ -64,12 +64,13 @@ class Mounting:
         return np.sqrt(np.diag(self.covariance_rad2))
 
 
-def mounting(level: ImuAlignment, known: Accelerometer, gravity_m_s2: float, vehicle_from_sensor: Matrix) -> Mounting:
+def mounting(level: ImuAlignment, known: Sides, gravity_m_s2: float) -> Mounting:
     """How the board sits against the base, from its level bias and the bias and scale of its accelerometers.
 
     Shear is not taken off, for no firmware does; so the attitude that is corrected by this is right when level. Both
-    are of the output as it comes; `known`, in the sensor's axes, has in its covariance what came since.
+    are of the output as it comes.
     """
+    vehicle_from_sensor = known.vehicle_from_sensor
     read = vehicle_from_sensor.T @ (level.level_bias_m_s2 + gravity_m_s2 * LEVEL)
     stretch = 1.0 + known.figures[SCALE]
     corrected = (read - known.figures[BIAS]) / stretch
@@ -77,7 +78,7 @@ def mounting(level: ImuAlignment, known: Accelerometer, gravity_m_s2: float, veh
     by[:, BIAS] = np.diag(-1.0 / stretch)
     by[:, SCALE] = np.diag(-corrected / stretch)
     turn = vehicle_from_sensor.T / stretch[:, None]
-    inside = turn @ level.level_covariance_m2_s4 @ turn.T + by @ known.covariance @ by.T
+    inside = turn @ level.level_covariance_m2_s4 @ turn.T + by @ np.diag(np.square(known.sigma)) @ by.T
     up = vehicle_from_sensor @ corrected
     roll, pitch = roll_pitch_from_up(up)
     # A change d of the reading turns it by up x d / |up|^2, and by as much do roll and pitch, to first order in them.

@@ -252,7 +252,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             gyro_white=white,
             gyro_walk=followed_walk(model, float(len(seconds))),
             gyro_slope=math.sqrt(float(slope)),
-            compass_lag_s=self.around.compass_lag_s,
+            compass_lag_s=0.0 if compass is None else compass.lag_s,
             accel_white=imu.profile.accel.white,
         )
 

@@ -40,18 +40,18 @@ class Compared(NamedTuple):
 class Fluid:
     """What the gradienter would show of one IMU's specific force."""
 
-    def __init__(self, model: GradienterModel, lag_s: float) -> None:
-        self._law, self._turn, self._lag_s = model.law, model.vehicle_from_sensor, lag_s
+    def __init__(self, model: GradienterModel) -> None:
+        self._law, self._turn, self.lag_s = model.law, model.vehicle_from_sensor, model.lag_s
         self._last: tuple[float, float, float] | None = None
         self._shown = (0.0, 0.0)
 
     def follow(self, times_s: Floats, forces_m_s2: Floats) -> Floats:
         """(n, 2) after its lag, for forces (n, 3) in the vehicle's axes; exact for a tilt that changes evenly."""
         felt = readings_from_up(self._law, forces_m_s2 @ self._turn)
-        if self._lag_s <= 0.0:
+        if self.lag_s <= 0.0:
             return felt
         found = np.empty_like(felt)
-        lag_s = self._lag_s
+        lag_s = self.lag_s
         if self._last is None:
             self._last = float(times_s[0]), float(felt[0, 0]), float(felt[0, 1])
             self._shown = self._last[1], self._last[2]

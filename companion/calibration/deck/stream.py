@@ -30,9 +30,7 @@ class Surroundings(msgspec.Struct, frozen=True, kw_only=True):
     """What is known of gradienter and compass; None where there is none."""
 
     gradienter: GradienterModel | None
-    gradienter_lag_s: float
     compass: CompassModel | None
-    compass_lag_s: float
 
 
 class ImuSecond(msgspec.Struct, frozen=True):
@@ -66,8 +64,8 @@ class Stream:
         self.levels.clear()
         self._last: Floats | None = None
         self._shown: dict[int, tuple[Floats, Floats]] = {}
-        around = self._around
-        self._fluid = None if around.gradienter is None else Fluid(around.gradienter, around.gradienter_lag_s)
+        gradienter = self._around.gradienter
+        self._fluid = None if gradienter is None else Fluid(gradienter)
         self._settled_s = math.inf
 
     def take(self, batch: Batch, times: Floats, rows: Floats) -> None:
@@ -81,7 +79,7 @@ class Stream:
         self._last = own[-1]
         if self._fluid is not None:
             if last is None:
-                self._settled_s = float(times[0]) + _SETTLED_LAGS * self._around.gradienter_lag_s
+                self._settled_s = float(times[0]) + _SETTLED_LAGS * self._fluid.lag_s
             self._shown[batch.slot] = times, self._fluid.follow(times, own[:, 4:])
             while len(self._shown) > KEPT_SHOWN:
                 del self._shown[next(iter(self._shown))]

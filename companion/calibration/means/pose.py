@@ -37,6 +37,8 @@ class GradienterModel:
     vehicle_from_sensor: Matrix
     offset_deg: tuple[float, float]
     sigma_deg: float
+    lag_s: float = 0.0
+    """By which it follows the truth."""
 
     def up(self, x_deg: float, y_deg: float) -> Array:
         """Up in the vehicle's axes, (3,), by readings without an offset: which zero is in force may be known later.
@@ -61,6 +63,8 @@ class CompassModel:
     """The heading is worked out from the field even where the device gives one of its own."""
     tilted_sigma_deg: float | None = None
     """Where it does not stand level; None: as `sigma_deg`."""
+    lag_s: float = 0.0
+    """By which it follows the truth."""
 
     def sigma_at(self, up: Array) -> float:
         """Its sigma in degrees where `up`, shape (3,), is up in the vehicle's axes."""

@@ -15,14 +15,13 @@ import msgspec
 import numpy as np
 
 from companion.calibration.alignment.align_model import response
-from companion.calibration.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Accelerometer
+from companion.calibration.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Sides
 from companion.calibration.means.windows import ImuWindow
 from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.calibration.solution.prior import CATALOGUE_PER_K, CATALOGUE_SCATTER
 from companion.calibration.solution.site import LocalEarth
-from companion.physics.frames import Array, Matrix, symmetric_by, vector
+from companion.physics.frames import Array, Matrix, symmetric_by
 from companion.physics.units import DEG, MG
-from companion.samples import Vector
 
 UNKNOWN_K: Final = 5.0
 """Change of temperature that is assumed where it is not known."""
@@ -30,23 +29,6 @@ _MEAN_S: Final = 12.0
 _SOON_S: Final = 180.0
 LENGTH_SIGMAS: Final = 4.0
 """By how much the corrected reading may miss gravity before the figures are taken for outdated."""
-
-
-class Sides(msgspec.Struct, frozen=True, kw_only=True):
-    """Accelerometers of one IMU as all sides have told of them, under the offsets and scales in force."""
-
-    figures: tuple[float, ...]
-    """As in `Accelerometer`, in the sensor's axes; m/s^2 and no unit."""
-    sigma: tuple[float, ...]
-    """One sigma of each, with what time and temperature have added to the biases."""
-    vehicle_from_sensor: tuple[Vector, Vector, Vector]
-
-    @classmethod
-    def of(cls, known: Accelerometer, vehicle_from_sensor: Matrix) -> Sides:
-        """From arrays."""
-        x, y, z = (vector(row) for row in vehicle_from_sensor)
-        sigma = np.sqrt(np.diag(known.covariance))
-        return cls(figures=tuple(known.figures.tolist()), sigma=tuple(sigma.tolist()), vehicle_from_sensor=(x, y, z))
 
 
 def aged_m_s2(noise: AllanModel, gap_s: float | None, kelvin: float | None) -> float:
@@ -126,8 +108,7 @@ def tilt_in_words(found: Up) -> str:
 
 def _force(imu: ImuWindow, known: Sides) -> tuple[Array, Matrix]:
     """The specific force in the vehicle's axes, (3,), and its covariance, (3, 3)."""
-    figures, sigma = np.array(known.figures), np.array(known.sigma)
-    turn = np.array(known.vehicle_from_sensor)
+    figures, turn = known.figures, known.vehicle_from_sensor
     inverse = np.linalg.inv(response(figures[SCALE], figures[SHEAR]))
     force = inverse @ (turn.T @ np.array(imu.accel_m_s2) - figures[BIAS])
     by = np.zeros((3, FIGURES))
@@ -135,5 +116,5 @@ def _force(imu: ImuWindow, known: Sides) -> tuple[Array, Matrix]:
     by[:, SCALE] = np.diag(force)
     by[:, SHEAR] = symmetric_by(force)
     mean = turn.T @ np.diag(np.square(imu.accel_sigma_stat_m_s2)) @ turn
-    inside = inverse @ (by @ np.diag(np.square(sigma)) @ by.T + mean) @ inverse.T
+    inside = inverse @ (by @ np.diag(np.square(known.sigma)) @ by.T + mean) @ inverse.T
     return turn @ force, turn @ inside @ turn.T

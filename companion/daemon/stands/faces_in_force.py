@@ -8,15 +8,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.calibration.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Accelerometer
+from companion.calibration.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Sides
 from companion.calibration.means.windows import Window
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.align_record import FacesImuRecord, FacesRecord, Running
-from companion.calibration.solution.otherwise import Sides, aged_m_s2
+from companion.calibration.solution.otherwise import aged_m_s2
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.formats import Object
-from companion.physics.frames import Array, Matrix
+from companion.physics.frames import Array
 from companion.physics.units import MG
 from companion.storage.learned import faces_in, this_boot
 
@@ -51,16 +51,15 @@ class FacesInForce:
             now = self._now(kept.name, kept.temperature_degc)
             if record is None or now is None:
                 continue
-            known, sigma = now[0], np.sqrt(np.diag(now[0].covariance))
             found.append(
                 {
                     "name": kept.name,
                     "measured_at": record.measured_at,
                     "temperature_degc": kept.temperature_degc,
-                    "bias_left_mg": (known.figures[BIAS] / MG).round(4).tolist(),
-                    "bias_sigma_mg": (sigma[BIAS] / MG).round(4).tolist(),
-                    "scale_left": known.figures[SCALE].round(7).tolist(),
-                    "scale_sigma": sigma[SCALE].round(7).tolist(),
+                    "bias_left_mg": (now.figures[BIAS] / MG).round(4).tolist(),
+                    "bias_sigma_mg": (now.sigma[BIAS] / MG).round(4).tolist(),
+                    "scale_left": now.figures[SCALE].round(7).tolist(),
+                    "scale_sigma": now.sigma[SCALE].round(7).tolist(),
                 }
             )
         return found
@@ -75,15 +74,14 @@ class FacesInForce:
     def sides(self, window: Window) -> dict[str, Sides]:
         """By IMU, for a tilt from these means."""
         found = {imu.name: self._now(imu.name, imu.temperature_degc) for imu in window.imus}
-        return {name: Sides.of(*now) for name, now in found.items() if now is not None}
+        return {name: now for name, now in found.items() if now is not None}
 
-    def _now(self, name: str, temperature_degc: float | None) -> tuple[Accelerometer, Matrix] | None:
-        """As `known`, under what is in force, and how it sits; None also where that is not known."""
+    def _now(self, name: str, temperature_degc: float | None) -> Sides | None:
+        """As `known`, under what is in force; None also where that is not known."""
         calibration = self._imus[name].calibration if name in self._imus else None
-        known = None if calibration is None else self.known(name, calibration, temperature_degc)
-        return None if known is None or calibration is None else (known, calibration.orientation)
+        return None if calibration is None else self.known(name, calibration, temperature_degc)
 
-    def known(self, name: str, calibration: ImuCalibration, temperature_degc: float | None) -> Accelerometer | None:
+    def known(self, name: str, calibration: ImuCalibration, temperature_degc: float | None) -> Sides | None:
         """Of one IMU's output under what corrects it now, in its own axes; None where nothing is known of this part."""
         if self.record is None:
             return None
@@ -113,7 +111,7 @@ def _under(
     offset: Array,
     scale: Array,
     widened_m_s2: float,
-) -> Accelerometer:
+) -> Sides:
     """Figures under other offsets and scales: output = scale (raw - offset), then and now."""
     bias, error = np.array(kept.accel_bias_mg.value) * MG, np.array(kept.accel_scale.value)
     right_offset, right_scale = offset + bias / scale, scale / (1.0 + error)
@@ -123,4 +121,4 @@ def _under(
     figures[SHEAR] = kept.accel_shear.value
     sigma[BIAS] = np.hypot(np.array(kept.accel_bias_mg.sigma) * MG, widened_m_s2)
     sigma[SCALE], sigma[SHEAR] = kept.accel_scale.sigma, kept.accel_shear.sigma
-    return Accelerometer(figures, np.diag(sigma**2))
+    return Sides(figures, sigma, calibration.orientation)

@@ -130,7 +130,7 @@ class Turning:
         calibration = self._imus[imu.name].in_force
         degrees = {one.name: one.temperature_degc for one in last.imus}
         known = self._known.known(imu.name, calibration, degrees.get(imu.name))
-        return None if known is None else mounting(imu, known, local.gravity_m_s2, calibration.orientation)
+        return None if known is None else mounting(imu, known, local.gravity_m_s2)
 
     def _as_record(
         self, found: Alignment, board: Mounting | None, written: dict[str, WrittenParameter]

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from companion.calibration.alignment.align_model import Ground, ImuStand, Stand
-from companion.calibration.alignment.faces import Accelerometer, Face, faces
+from companion.calibration.alignment.faces import Face, Sides, faces
 from companion.calibration.alignment.spot import mounting, turned
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
@@ -235,7 +235,7 @@ def by_hand(part: str, seed: int, number: int) -> HandRun:
     turns = {(headings, slope): turned(spots[slope].chosen(headings), ground) for headings, slope in TURNS}
     steepest = turns[4, max(SLOPES_DEG)]
     board, true_board = (
-        mounting(steepest.imus[0], Accelerometer(known.figures, known.covariance), local.gravity_m_s2, np.eye(3)),
+        mounting(steepest.imus[0], Sides(known.figures, known.sigma, np.eye(3)), local.gravity_m_s2),
         _tilt((read - bias) / (1.0 + here.scale)),
     )
     first = spots[max(SLOPES_DEG)].stood[0].rows[: rivals.ARDUPILOT_READINGS].mean(axis=0)
