@@ -19,7 +19,7 @@ from companion.attitude.quaternion import (
     IDENTITY,
     Quaternion,
     Triple,
-    about_down,
+    from_rotation_vector,
     multiply,
     normalised,
     rotate,
@@ -78,7 +78,7 @@ class Leveller:
 
     def turn_heading(self, angle_rad: float) -> None:
         """Turn everything clockwise by so much about the vertical."""
-        self.ned_from_e = normalised(multiply(about_down(angle_rad), self.ned_from_e))
+        self.ned_from_e = normalised(multiply(from_rotation_vector((0.0, 0.0, angle_rad)), self.ned_from_e))
 
 
 TAU_S: Final = 9.0

@@ -65,11 +65,6 @@ def from_rotation_vector(v: Triple) -> Quaternion:
     return (math.cos(0.5 * angle), scale * x, scale * y, scale * z)
 
 
-def about_down(angle_rad: float) -> Quaternion:
-    """A turn about the third axis; in NED, clockwise as a heading counts."""
-    return (math.cos(0.5 * angle_rad), 0.0, 0.0, math.sin(0.5 * angle_rad))
-
-
 def shortest_arc(a: Triple, b: Triple) -> Quaternion:
     """The smallest turn that takes direction `a` to direction `b`; the identity where either has no length."""
     length_a, length_b = math.hypot(*a), math.hypot(*b)

@@ -14,7 +14,6 @@ from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.deck.deck import KEPT_S, Deck
-from companion.calibration.deck.stream import Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
@@ -173,7 +172,7 @@ def deck(config: Config) -> Deck | None:
     """What collects where the platform moves; None on the ground."""
     if config.vehicle.platform != "deck":
         return None
-    return Deck(Surroundings(gradienter=gradienter_model(config.gradienter), compass=compass_model(config.compass)))
+    return Deck(gradienter_model(config.gradienter), compass_model(config.compass))
 
 
 def longest_window_s(config: Config) -> float:

@@ -17,7 +17,6 @@ from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.deck.deck import EVERY_S, Deck
 from companion.calibration.deck.estimate import MAX_S, MIN_S
-from companion.calibration.deck.stream import Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import noise_profile
@@ -151,8 +150,7 @@ class _Streams:
                 prefers_field=self.heading is None,
             )
         self._poses = (self.tilt, self.heading, self.field)
-        around = Surroundings(gradienter=self.gradienter, compass=self.compass)
-        self._deck = Deck(around) if given.platform == "deck" else None
+        self._deck = Deck(self.gradienter, self.compass) if given.platform == "deck" else None
         # A tilt of the command line is the field's, too.
         self._constant = TiltSample(0.0, given.roll_deg or 0.0, given.pitch_deg or 0.0) if tilt_given else None
 

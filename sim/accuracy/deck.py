@@ -15,7 +15,6 @@ from typing import Final
 import numpy as np
 
 from companion.calibration.deck.deck import Deck
-from companion.calibration.deck.stream import Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import PROFILES, floor_variance, noise_profile
@@ -78,7 +77,9 @@ class DeckRun:
     sigma: Array
 
 
-def sail(voyage: Voyage, spans_s: Sequence[int], seed: int, made: Callable[[Surroundings], Deck] = Deck) -> DeckRun:
+def sail(
+    voyage: Voyage, spans_s: Sequence[int], seed: int, made: Callable[[GradienterModel, CompassModel], Deck] = Deck
+) -> DeckRun:
     """One aircraft with one IMU, calibrated after so many seconds each (ascending) by the deck that is `made`."""
     random = np.random.default_rng([seed, 51])
     pitch, roll = random.normal(size=2) * 2.0
@@ -100,8 +101,7 @@ def sail(voyage: Voyage, spans_s: Sequence[int], seed: int, made: Callable[[Surr
     compass = CompassModel(
         magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=voyage.compass_sigma_deg
     )
-    around = Surroundings(gradienter=tilt, compass=compass)
-    deck = made(around)
+    deck = made(tilt, compass)
     taken = ImuInput(
         name="imu", rotation=np.eye(3), profile=noise_profile(voyage.part if voyage.part in PROFILES else "icm42688p")
     )
@@ -112,7 +112,7 @@ def sail(voyage: Voyage, spans_s: Sequence[int], seed: int, made: Callable[[Surr
         found = deck.work(range(1, 1 + span), NEXT_S).run()
         if isinstance(found, CalibrationRefusedError):
             raise found
-        error, sigma = _against_the_truth(found.window, imu, around)
+        error, sigma = _against_the_truth(found.window, imu, tilt, compass)
         errors.append(error)
         sigmas.append(sigma)
     return DeckRun(np.array(errors), np.array(sigmas))
@@ -165,10 +165,10 @@ def _tilts(aircraft: VirtualAircraft, seconds: int, random: np.random.Generator)
     return np.asarray(np.round(found + zero + random.normal(size=found.shape) * TILT_NOISE_DEG, 3))
 
 
-def _against_the_truth(window: Window, imu: ImuModel, around: Surroundings) -> tuple[Array, Array]:
-    solution = solve(
-        window, local_earth(whereabouts(imu.aircraft.site)), around.gradienter, around.compass, What.BOTH, "deck"
-    )
+def _against_the_truth(
+    window: Window, imu: ImuModel, tilt: GradienterModel, compass: CompassModel
+) -> tuple[Array, Array]:
+    solution = solve(window, local_earth(whereabouts(imu.aircraft.site)), tilt, compass, What.BOTH, "deck")
     found = solution.imus[0]
     assert found.gyro_rad_s is not None
     assert found.accel_m_s2 is not None

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from companion.attitude.quaternion import Quaternion, about_down, multiply, roll_pitch_yaw
+from companion.attitude.quaternion import Quaternion, from_rotation_vector, multiply, roll_pitch_yaw
 from companion.attitude.strapdown import Strapdown
 from companion.samples import ImuSample
 from sim.earth import Array
@@ -40,7 +40,7 @@ def _back(start: Quaternion, quaternions: Array) -> list[Quaternion]:
     for w, x, y, z in quaternions.tolist():
         q = multiply(_P, multiply((w, x, y, z), _P))
         if turn is None:
-            turn = about_down(roll_pitch_yaw(start)[2] - roll_pitch_yaw(q)[2])
+            turn = from_rotation_vector((0.0, 0.0, roll_pitch_yaw(start)[2] - roll_pitch_yaw(q)[2]))
         found.append(multiply(turn, q))
     return found
 

@@ -14,7 +14,6 @@ from companion.attitude.quaternion import (
     IDENTITY,
     Quaternion,
     Triple,
-    about_down,
     conjugate,
     from_matrix,
     from_roll_pitch_yaw,
@@ -96,7 +95,9 @@ def test_opposite_directions_and_none() -> None:
 
 
 def test_clockwise_is_a_positive_turn_about_down() -> None:
-    assert rotate(about_down(math.radians(90)), (1.0, 0.0, 0.0)) == pytest.approx((0.0, 1.0, 0.0), abs=1e-15)
+    assert rotate(from_rotation_vector((0.0, 0.0, math.radians(90))), (1.0, 0.0, 0.0)) == pytest.approx(
+        (0.0, 1.0, 0.0), abs=1e-15
+    )
 
 
 @pytest.mark.parametrize("bad", [(0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0), (math.inf, 0.0, 0.0, 1.0)])

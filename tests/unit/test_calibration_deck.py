@@ -13,7 +13,6 @@ from companion.calibration.deck.deck import Deck
 from companion.calibration.deck.estimate import DeckFound
 from companion.calibration.deck.fluid import Fluid, Level
 from companion.calibration.deck.smoother import passage
-from companion.calibration.deck.stream import Surroundings
 from companion.calibration.deck.waves import Wander, Waves, fit_waves, whitened
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
@@ -29,9 +28,9 @@ from sim.motions import SlowTurn
 from sim.sea import DAY_S, Sea, Wave
 
 UNITS = np.array([DEG_H] * 3 + [MG] * 3)
-AROUND = Surroundings(
-    gradienter=GradienterModel("axis", np.eye(3), (0.0, 0.0), 0.01, lag_s=0.4),
-    compass=CompassModel(magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=1.0),
+AROUND = (
+    GradienterModel("axis", np.eye(3), (0.0, 0.0), 0.01, lag_s=0.4),
+    CompassModel(magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=1.0),
 )
 
 
@@ -147,7 +146,7 @@ def test_what_goes_up_comes_down_and_the_vertical_accelerometer_is_known_by_it()
 
 @pytest.mark.parametrize("stuck", ["gradienter", "compass"])
 def test_a_sensor_that_repeats_itself_on_a_swaying_deck_is_named(stuck: str) -> None:
-    deck = Deck(AROUND)
+    deck = Deck(*AROUND)
     deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["icm42688p"]))
     aircraft = VirtualAircraft(Pose(), Site(latitude_deg=45.0), motions=Voyage().motions(8))
     imu = ImuModel(aircraft, "icm42688p", seed=8)
@@ -167,7 +166,7 @@ def test_a_sensor_that_repeats_itself_on_a_swaying_deck_is_named(stuck: str) -> 
 
 
 def test_windows_end_the_more_rarely_the_longer_they_are() -> None:
-    deck = Deck(Surroundings(gradienter=None, compass=None))
+    deck = Deck(None, None)
     deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["unknown"]))
     ends = []
     for slot in range(1500):
@@ -190,7 +189,7 @@ def quiet_second(slot: int, begin: float = 0.0) -> tuple[Array, Array]:
 
 
 def test_a_gap_begins_the_seconds_anew() -> None:
-    deck = Deck(Surroundings(gradienter=None, compass=None))
+    deck = Deck(None, None)
     deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["unknown"]))
     for slot in range(25):
         times, rows = quiet_second(slot)
@@ -237,8 +236,8 @@ class OfPairs(Deck):
     rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     sigma = np.array([100.0, 0.0, 30.0, 5.0, 0.0, 2.0]) * UNITS
 
-    def __init__(self, around: Surroundings, seed: int) -> None:
-        super().__init__(around)
+    def __init__(self, gradienter: GradienterModel, compass: CompassModel, seed: int) -> None:
+        super().__init__(gradienter, compass)
         self.off = self.sigma * np.random.default_rng([seed, 8]).standard_normal(6)
 
     def set_imu(self, imu: ImuInput) -> None:

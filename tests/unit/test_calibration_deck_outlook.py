@@ -27,7 +27,7 @@ from tests.unit.test_calibration_deck import AROUND
 def test_the_time_that_is_said_is_the_time_it_takes(voyage: Voyage, goal_deg_h: float, least_s: int) -> None:
     """Within a factor of 1.5, or a window."""
     aircraft = VirtualAircraft(Pose(2.0, -1.0, 70.0), Site(latitude_deg=45.0), motions=voyage.motions(5))
-    deck = Deck(AROUND)
+    deck = Deck(*AROUND)
     deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["icm42688p"]))
     feed(deck, ImuModel(aircraft, "icm42688p", seed=5), 212, np.random.default_rng(5), 1.0)
     past: list[Past] = []

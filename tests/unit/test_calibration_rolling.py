@@ -16,6 +16,7 @@ from companion.calibration.noise.allan import AllanModel, NoiseProfile
 from companion.calibration.stillness.stretch import AT_ONCE
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG, DEG_H, MG
+from companion.recording.journal import encode
 from companion.samples import ImuSample, TiltSample
 from tests.support.still_aircraft import (
     BIAS,
@@ -529,7 +530,7 @@ def test_an_estimate_worked_out_elsewhere_is_the_window_that_would_have_been(mon
     there.collector.accept(work, found)
     assert there.collector.pending(there.now_s) is None
     monkeypatch.setattr(measurement, "imu_estimates", lambda *_, **__: pytest.fail("worked out on the spot"))
-    assert there.collector.window(there.now_s) == expected
+    assert encode(there.collector.window(there.now_s)) == encode(expected)
     assert there.collector.status(there.now_s).waiting_for is None
 
 

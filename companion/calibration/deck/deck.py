@@ -6,7 +6,8 @@ import math
 from typing import Final
 
 from companion.calibration.deck.estimate import MAX_S, DeckWork
-from companion.calibration.deck.stream import KEPT_SHOWN, Stream, Surroundings
+from companion.calibration.deck.stream import KEPT_SHOWN, Stream
+from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
@@ -22,15 +23,15 @@ KEPT_S: Final = MAX_S + 2 * max(EVERY_S.values())
 class Deck:
     """Collects what `DeckWork` needs. Pure: time comes in with the samples."""
 
-    def __init__(self, around: Surroundings) -> None:
-        self._around = around
+    def __init__(self, gradienter: GradienterModel | None, compass: CompassModel | None) -> None:
+        self._gradienter, self._compass = gradienter, compass
         self._streams: dict[str, Stream] = {}
         self._headings: dict[int, float] = {}
         self._tilts: dict[int, tuple[Floats, Floats]] = {}
 
     def set_imu(self, imu: ImuInput) -> None:
         """Add an IMU, or begin anew with one whose stream is another now."""
-        self._streams[imu.name] = Stream(imu, self._around, KEPT_S)
+        self._streams[imu.name] = Stream(imu, self._gradienter, KEPT_S)
 
     def forget(self, imu: str | None) -> None:
         """Drop what was measured, of one IMU or of all."""
@@ -95,7 +96,8 @@ class Deck:
             levels=[{slot: one for slot, one in stream.levels.items() if slot in slots} for stream in streams],
             headings={slot: heading for slot, heading in self._headings.items() if slot in slots},
             slots=slots,
-            around=self._around,
+            gradienter=self._gradienter,
+            compass=self._compass,
             horizon_s=horizon_s,
             reference_deg=reference_deg,
             since_s=since_s,

@@ -15,7 +15,7 @@ import numpy as np
 
 from companion.calibration.deck.fluid import Compared, Level, compare
 from companion.calibration.deck.smoother import Believed, Found, smooth
-from companion.calibration.deck.stream import ImuSecond, Surroundings
+from companion.calibration.deck.stream import ImuSecond
 from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.calibration.means.warming import drifting
 from companion.calibration.means.windows import ImuInput, ImuWindow, Window
@@ -91,7 +91,8 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
     levels: Sequence[Mapping[int, Level]]
     headings: Mapping[int, float]
     slots: range
-    around: Surroundings
+    gradienter: GradienterModel | None
+    compass: CompassModel | None
     horizon_s: float
     reference_deg: tuple[float, float] | None
     """The tilt to give the accelerometers' means at, as the gradienter reads it; None: the mean of the window."""
@@ -106,14 +107,13 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             return CalibrationRefusedError(str(error))
 
     def _run(self) -> DeckFound:
-        around = self.around
         readings = {slot: level.reading for levels in self.levels[:1] for slot, level in levels.items()}
         frozen = self._frozen("gradienter", readings)
         all_levels = [[one for slot, one in levels.items() if slot not in frozen] for levels in self.levels]
         frozen = self._frozen("compass", {slot: np.array([heading]) for slot, heading in self.headings.items()})
         headings = np.array([math.nan if slot in frozen else self.headings.get(slot, math.nan) for slot in self.slots])
         reference = self.reference_deg
-        if around.gradienter is not None:
+        if self.gradienter is not None:
             if any(len(levels) < MIN_LOOK_S // 2 for levels in all_levels):
                 raise CalibrationRefusedError(f"no reading from gradienter in {len(self.slots)} s")
             if reference is None:
@@ -133,7 +133,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             else TiltWindow(
                 x_deg=reference[0], y_deg=reference[1], x_sigma_deg=0.0, y_sigma_deg=0.0, temperature_degc=None
             ),
-            heading=None if around.compass is None or last is None else self._heading(last, around.compass),
+            heading=None if self.compass is None or last is None else self._heading(last, self.compass),
             turn_rad_s=None if last is None else vector(last.turn_rad_s),
         )
         return DeckFound(window, tuple(known for _, triads, _ in found for known in triads))
@@ -165,11 +165,11 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         headings: Floats,
         reference: tuple[float, float] | None,
     ) -> tuple[ImuWindow, tuple[Known, Known], Found]:
-        around, gradienter = self.around, self.around.gradienter
+        gradienter = self.gradienter
         span_s = float(len(seconds))
         compared = None if gradienter is None else compare(levels)
         believed = self._believed(imu, seconds, reference, compared)
-        forward = np.array([1.0, 0.0, 0.0]) if around.compass is None else around.compass.vehicle_from_sensor[:, 0]
+        forward = np.array([1.0, 0.0, 0.0]) if self.compass is None else self.compass.vehicle_from_sensor[:, 0]
         found = smooth([one.passage for one in seconds], headings, forward, believed)
         direction, own = _felt(found, gradienter, reference, compared)
         gyro_own = found.gyro_covariance
@@ -217,7 +217,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
 
     def _by_heading(self, found: Found, worst: int, believed: Believed, gyro: AllanModel) -> ByHeading | None:
         down = found.body_to_ned[-1][2]
-        if self.around.compass is None or down[worst] ** 2 < _UPRIGHT:
+        if self.compass is None or down[worst] ** 2 < _UPRIGHT:
             return None
         headings = np.unwrap(np.arctan2(found.body_to_ned[:, 1, 0], found.body_to_ned[:, 0, 0]))
         return ByHeading(
@@ -234,7 +234,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         reference: tuple[float, float] | None,
         compared: Compared | None,
     ) -> Believed:
-        gradienter, compass = self.around.gradienter, self.around.compass
+        gradienter, compass = self.gradienter, self.compass
         accel, accel_sigma = np.zeros(3), _UNKNOWN_ACCEL_M_S2
         if gradienter is not None and compared is not None and reference is not None:
             off = np.array(reference) - compared.difference_deg

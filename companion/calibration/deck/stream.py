@@ -14,7 +14,7 @@ import numpy as np
 
 from companion.calibration.deck.fluid import Fluid, Level, level
 from companion.calibration.deck.smoother import Passage, passage
-from companion.calibration.means.pose import CompassModel, GradienterModel
+from companion.calibration.means.pose import GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.robust import median
 from companion.calibration.seconds.batch import Batch
@@ -24,13 +24,6 @@ LONGEST_GAP_S: Final = 0.5
 _SETTLED_LAGS: Final = 10.0
 KEPT_SHOWN: Final = 4
 """Seconds that wait for the gradienter's readings."""
-
-
-class Surroundings(msgspec.Struct, frozen=True, kw_only=True):
-    """What is known of gradienter and compass; None where there is none."""
-
-    gradienter: GradienterModel | None
-    compass: CompassModel | None
 
 
 class ImuSecond(msgspec.Struct, frozen=True):
@@ -52,8 +45,8 @@ class ImuSecond(msgspec.Struct, frozen=True):
 class Stream:
     """One IMU's seconds without a gap."""
 
-    def __init__(self, imu: ImuInput, around: Surroundings, keep: int) -> None:
-        self.imu, self._around = imu, around
+    def __init__(self, imu: ImuInput, gradienter: GradienterModel | None, keep: int) -> None:
+        self.imu, self._gradienter = imu, gradienter
         self.seconds: deque[ImuSecond] = deque(maxlen=keep)
         self.levels: dict[int, Level] = {}
         self.clear()
@@ -64,8 +57,7 @@ class Stream:
         self.levels.clear()
         self._last: Floats | None = None
         self._shown: dict[int, tuple[Floats, Floats]] = {}
-        gradienter = self._around.gradienter
-        self._fluid = None if gradienter is None else Fluid(gradienter)
+        self._fluid = None if self._gradienter is None else Fluid(self._gradienter)
         self._settled_s = math.inf
 
     def take(self, batch: Batch, times: Floats, rows: Floats) -> None:
