@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 import msgspec
 
 from companion.calibration.records.flight_record import KeptFlight
-from companion.calibration.solution.by_temperature import Expected, ExpectedForces
+from companion.calibration.solution.by_temperature import ByTemperature
 from companion.physics.units import DEG_H, MG
 
 FORMAT_VERSION: Final = 1
@@ -153,16 +153,6 @@ class _Event(msgspec.Struct, frozen=True):
     what: str
 
 
-class Curve(msgspec.Struct, frozen=True):
-    """How the biases of an IMU follow the temperature."""
-
-    imu: Annotated[str, msgspec.Meta(max_length=64)]
-    power_ups: Annotated[int, msgspec.Meta(ge=0, le=MOST_SEQUENCE)]
-    days: int
-    curve: tuple[Expected, ...]
-    accel_curve: tuple[ExpectedForces, ...]
-
-
 _FIRMWARES: Final = {"INS": "ardupilot", "CAL": "px4", "TC": "px4"}
 """By what the names of their parameters begin with."""
 _ABOUT: Final = ("gyro_id", "accel_id", "temperature_degc", "samples")
@@ -231,10 +221,10 @@ def _event(body: bytes) -> Rows:
 
 
 def _curve(body: bytes) -> Rows:
-    told = msgspec.json.decode(body, type=Curve)
+    told = msgspec.json.decode(body, type=ByTemperature)
     found = [("gyro", node.degc, node.gyro_deg_h, node.sigma_deg_h, DEG_H) for node in told.curve]
     found += [("accel", node.degc, node.accel_mg, node.sigma_mg, MG) for node in told.accel_curve]
-    which = {"imu": told.imu, "power_ups": told.power_ups}
+    which = {"imu": told.imu[:64], "power_ups": told.power_ups}
     rows: list[Row] = [
         {**which, "triad": triad, "axis": axis, "degc": degc, "bias": bias[k] * unit, "sigma": sigma[k] * unit}
         for triad, degc, bias, sigma, unit in found

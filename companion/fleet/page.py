@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
@@ -16,7 +17,7 @@ from companion.fleet.schema import aircraft as known
 from companion.physics.frames import vector
 from companion.physics.units import DEG_H, MG
 from companion.report.markup import Child, Markup, row, tag
-from companion.report.page import NAMES, TRIADS, Point, arming_items, card, drift, page, with_sigma
+from companion.report.page import NAMES, TRIADS, UNITS, Point, arming_items, card, drift, page, with_sigma
 from companion.samples import Triad, Vector
 
 STALE: Final = datetime.timedelta(days=30)
@@ -29,7 +30,6 @@ MOST_LISTED: Final = 25
 MOST_REFUSED: Final = 5
 MOST_FINDINGS: Final = 8
 """The worst."""
-_UNITS: Final[dict[Triad, tuple[float, str, str]]] = {"gyro": (DEG_H, "deg_h", "deg/h"), "accel": (MG, "mg", "mg")}
 
 
 class Standing(NamedTuple):
@@ -40,7 +40,9 @@ class Standing(NamedTuple):
     why: str
 
 
-_ORDER: Final = ("alarm", "caution", "fine")
+_CLASSES: Final = {"alarm": "bad", "caution": "warn", "fine": "ok"}
+"""The worst first."""
+SOURCE: Final = "from the fleet's database"
 
 
 def standing(one: Any, now: datetime.datetime) -> Standing:
@@ -62,10 +64,8 @@ def standing(one: Any, now: datetime.datetime) -> Standing:
 def glance(connection: sa.Connection, now: datetime.datetime) -> str:
     """The whole fleet."""
     found = _rows(connection, "SELECT * FROM fleet ORDER BY name, aircraft LIMIT :most", most=MOST_AIRCRAFT)
-    each = sorted(((standing(one, now), one) for one in found), key=lambda pair: _ORDER.index(pair[0].kind))
-    counts: dict[str, int] = {}
-    for stands, _ in each:
-        counts[stands.word] = counts.get(stands.word, 0) + 1
+    each = sorted(((standing(one, now), one) for one in found), key=lambda pair: [*_CLASSES].index(pair[0].kind))
+    counts = Counter(stands.word for stands, _ in each)
     silent = sum(_is_silent(one, now) for one in found)
     words = [f"{number} {word}" for word, number in counts.items()] + [f"{silent} silent for a week"] * (silent > 0)
     rows = [
@@ -95,10 +95,6 @@ def glance(connection: sa.Connection, now: datetime.datetime) -> str:
         _refused(connection, now),
         source=SOURCE,
     )
-
-
-SOURCE: Final = "from the fleet's database"
-_CLASSES: Final = {"alarm": "bad", "caution": "warn", "fine": "ok"}
 
 
 def aircraft(connection: sa.Connection, which: str, now: datetime.datetime) -> str | None:
@@ -164,7 +160,7 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
             points = _points(of_it, triad)
             if not points:
                 continue
-            unit, _, unit_name = _UNITS[triad]
+            unit, unit_name = UNITS[triad]
             last = points[-1]
             pairs = (with_sigma(last.bias[k], last.sigma_use[k], unit) for k in range(3))
             cells = [tag("td", value, " ± ", sigma) for value, sigma in pairs]
@@ -199,7 +195,8 @@ def _seen(rows: Sequence[Any]) -> list[Seen]:
 
 def _points(rows: Sequence[Any], triad: Triad) -> list[Point]:
     """The latest ones, in the order of time, SI units."""
-    unit, suffix, _ = _UNITS[triad]
+    unit, name = UNITS[triad]
+    suffix = name.replace("/", "_")
     found: dict[tuple[str, int], dict[str, Any]] = {}
     for each in rows:
         found.setdefault((each.epoch, each.sequence), {})[each.axis] = each

@@ -73,7 +73,7 @@ class Store:
     @property
     def where(self) -> str:
         """The database, without a password."""
-        return self._engine.url.render_as_string()
+        return self._engine.url.set(drivername=self._engine.dialect.name).render_as_string()
 
     def close(self) -> None:
         """Leave the connections; the next call opens one anew."""
