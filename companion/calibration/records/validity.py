@@ -32,6 +32,7 @@ WORTH_SIGMAS: Final = 2.0
 """A new write must be worth more than this many sigma_use: below, it would mostly write the noise of today."""
 
 _LONGEST_S: Final = 24 * 3600.0
+_NONE: Final[Vector] = (0.0, 0.0, 0.0)
 _UNITS: Final = {"gyro": (DEG_H, "deg/h", ".0f"), "accel": (MG, "mg", ".2f")}
 
 
@@ -156,22 +157,23 @@ def judge(triad: Triad, name: str, held: Held, model: AllanModel, limits: Limits
     return found
 
 
+def _off(present: Present, expected: Vector, then: Vector, sigmas: float, floor: float = 0.0) -> list[float]:
+    """By how much the axes are off that are so by more than so many sigmas of what both sides were known with."""
+    return [
+        residual - wanted
+        for residual, wanted, was, now in zip(present.residual, expected, then, present.sigma, strict=True)
+        if abs(residual - wanted) > max(sigmas * math.hypot(was, now), floor)
+    ]
+
+
 def worst_axis(held: Held, present: Present) -> float | None:
     """The largest difference, signed, beyond RESIDUAL_SIGMAS of what both sides were known with; None: all agree."""
-    beyond = [
-        residual - expected
-        for residual, expected, then, now in zip(
-            present.residual, held.expected, held.sigma, present.sigma, strict=True
-        )
-        if abs(residual - expected) > RESIDUAL_SIGMAS * math.hypot(then, now)
-    ]
-    return max(beyond, key=abs, default=None)
+    return max(_off(present, held.expected, held.sigma, RESIDUAL_SIGMAS), key=abs, default=None)
 
 
 def contradicts(present: Present, sigma: float) -> bool:
     """Whether the output is off by more than what was known of it with this sigma lets expect."""
-    off = zip(present.residual, present.sigma, strict=True)
-    return any(abs(residual) > RESIDUAL_SIGMAS * math.hypot(sigma, now) for residual, now in off)
+    return bool(_off(present, _NONE, (sigma, sigma, sigma), RESIDUAL_SIGMAS))
 
 
 def worth_writing(present: Present, held: Held | None, floor: float) -> bool:
@@ -179,9 +181,5 @@ def worth_writing(present: Present, held: Held | None, floor: float) -> bool:
 
     The calibration in force was not known better than its own sigma; the floor is in the same unit.
     """
-    expected = held.expected if held is not None else (0.0, 0.0, 0.0)
-    then = held.sigma if held is not None else (0.0, 0.0, 0.0)
-    return any(
-        abs(residual - wanted) > max(WORTH_SIGMAS * math.hypot(was, now), floor)
-        for residual, wanted, was, now in zip(present.residual, expected, then, present.sigma, strict=True)
-    )
+    expected, then = (_NONE, _NONE) if held is None else (held.expected, held.sigma)
+    return bool(_off(present, expected, then, WORTH_SIGMAS, floor))

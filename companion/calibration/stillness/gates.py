@@ -29,7 +29,7 @@ from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.seconds.recent import Recent
 from companion.calibration.stillness.coarse import Steps
-from companion.calibration.stillness.own_noise import OwnNoise
+from companion.calibration.stillness.own_noise import OwnNoise, variance_ratio
 from companion.calibration.stillness.plausible import MOST_GYRO_RAD_S, unit_of_force
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, MG
@@ -87,6 +87,8 @@ _LEARNED_ENOUGH: Final = 3
 _RECENT: Final = 10
 _REFERENCE: Final = 5
 _CHANCE: Final = 3.0
+_LOWER_QUARTILE: Final = -0.6745
+"""Sigmas."""
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -145,12 +147,6 @@ def _beyond(values: list[float], reference: Sequence[list[float]], chance: list[
 
 def _is_within(batch: Batch) -> bool:
     return bool((np.maximum(np.abs(batch.low), np.abs(batch.high)) < _NO_END).all())
-
-
-def _lower_quartile(freedom: int) -> float:
-    """Lower quartile of a variance estimate over the variance (Wilson and Hilferty's chi-square)."""
-    spread = 2.0 / (9.0 * freedom)
-    return (1.0 - spread - 0.6745 * math.sqrt(spread)) ** 3
 
 
 class ImuGate:
@@ -250,7 +246,7 @@ class ImuGate:
             ordered = np.sort(self._learned.rows, axis=0)
             below, share = divmod(0.25 * (len(ordered) - 1), 1.0)
             low, high = ordered[int(below)], ordered[int(below) + 1]
-            learned[:] = ((low + (high - low) * share) / _lower_quartile(n - 1)).tolist()
+            learned[:] = ((low + (high - low) * share) / variance_ratio(n - 1, _LOWER_QUARTILE)).tolist()
         for (_, triad, *_), own in zip(_TRIADS, self._own.known, strict=True):
             if own is not None:
                 learned[triad] = own.variance
