@@ -123,7 +123,7 @@ class RecordStore:
         """The latest records, newest first; a file that cannot be read is logged and passed over."""
         return list(self.numbered(limit).values())
 
-    def numbered(self, limit: int | None = None) -> dict[int, Record]:
+    def numbered(self, limit: int | None) -> dict[int, Record]:
         """The same by their numbers, by which people ask for one."""
         records: dict[int, Record] = {}
         entries = self.entries()

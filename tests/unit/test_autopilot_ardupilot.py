@@ -239,7 +239,7 @@ def test_residuals_turn_into_the_boards_axes_and_scale_is_divided_out() -> None:
     assert gyro == pytest.approx((0.001 + 0.02, 0.002 - 0.01, 0.003 + 0.03), rel=1e-6)
     assert accel == pytest.approx((0.1 + 0.22 / 1.1, 0.2 - 0.11 / 0.9, 0.3 + 0.33), rel=1e-6)
     assert all(value == f32(value) for value in (*gyro, *accel))
-    gyro_bias, accel_bias = whole_bias(calibration, (0.01, 0.02, 0.03), (0.11, 0.22, 0.33))
+    gyro_bias, accel_bias = whole_bias(calibration, (0.01, 0.02, 0.03), (0.11, 0.22, 0.33), None)
     assert gyro_bias == pytest.approx((0.01 - 0.002, 0.02 + 0.001, 0.03 + 0.003))
     assert accel_bias == pytest.approx((0.11 - 0.9 * 0.2, 0.22 + 1.1 * 0.1, 0.33 + 0.3))
 

@@ -48,7 +48,7 @@ def test_what_is_taken_off_at_a_temperature(
     assert (y, -x, z) == pytest.approx((0.001 + gyro[0], 0.002 + gyro[1], 0.003 + gyro[2]), abs=1e-9)
     assert force[2] == pytest.approx(1.1 * (0.3 + accel[2]), abs=1e-6)
     # Without a thermometer it is that at CALTEMP.
-    assert whole_bias(calibration, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))[0] == pytest.approx((-0.002, 0.001, 0.003))
+    assert whole_bias(calibration, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), None)[0] == pytest.approx((-0.002, 0.001, 0.003))
 
 
 def test_switched_off_it_takes_nothing_off_whatever_the_rest_says() -> None:

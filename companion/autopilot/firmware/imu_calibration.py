@@ -349,10 +349,7 @@ def output_step(
 
 
 def whole_bias(
-    calibration: ImuCalibration,
-    gyro_residual_rad_s: Vector,
-    accel_residual_m_s2: Vector,
-    degc: float | None = None,
+    calibration: ImuCalibration, gyro_residual_rad_s: Vector, accel_residual_m_s2: Vector, degc: float | None
 ) -> tuple[Vector, Vector]:
     """The sensor's whole bias: what it would show without any correction (its scale kept) minus truth, vehicle FRD.
 

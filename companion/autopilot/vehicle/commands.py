@@ -179,7 +179,7 @@ class StandingRequests:
             if wanted.rate_hz is None:
                 wanted.heard_s = -math.inf
 
-    def ask_for_missing(self, now_s: float, firmware: Firmware | None = None) -> None:
+    def ask_for_missing(self, now_s: float, firmware: Firmware | None) -> None:
         """Ask for what has stayed away, unless it was asked for a short time ago."""
         for wanted in self._wanted:
             if wanted.of not in (None, firmware):

@@ -61,9 +61,7 @@ class Obstacle(NamedTuple):
         return Refusal(_KINDS[self.rung], self.words)
 
 
-def obstacle(
-    vehicle: Vehicle, ledger: Ledger, job: Job | None, rungs: Collection[Rung] = tuple(Rung)
-) -> Obstacle | None:
+def obstacle(vehicle: Vehicle, ledger: Ledger, job: Job | None, rungs: Collection[Rung]) -> Obstacle | None:
     """The first of these that stands in the way; None where nothing does."""
     return next((found for found in _obstacles(vehicle, ledger, job) if found.rung in rungs), None)
 

@@ -28,7 +28,7 @@ from companion.samples import Sample
 class Devices(Subsystem):
     """Where samples come from; without `imu_rate_hz` each IMU is asked for as many as the connection can carry."""
 
-    def __init__(self, core: Core, imu_rate_hz: float | None = None) -> None:
+    def __init__(self, core: Core, imu_rate_hz: float | None) -> None:
         self._core = core
         self.slots = SlotMemory()
         rate_hz = models.imu_rate_hz(core.config) if imu_rate_hz is None else imu_rate_hz

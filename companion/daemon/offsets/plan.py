@@ -112,7 +112,7 @@ class Planner:
         self._memory, self._rivalry, self._wanted = memory, rivalry, core.wanted
         self._sources = {imu.name: imu for imu in core.config.imu}
 
-    async def plan(self, solution: Solution, draft: Draft, *, anyway: bool = False) -> Plan:
+    async def plan(self, solution: Solution, draft: Draft, *, anyway: bool) -> Plan:
         """Work out which parameter gets which value; fills the draft's whole biases and warnings.
 
         Offsets of a calibration as good, under which the output is right, are not written again, unless `anyway`.
