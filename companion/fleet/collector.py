@@ -14,7 +14,7 @@ import math
 import secrets
 import socket
 import time
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Iterable
 from typing import TYPE_CHECKING, Final
 
 from companion.config.sections import Mqtt
@@ -89,26 +89,17 @@ async def stop(tasks: Iterable[asyncio.Task[None]]) -> list[BaseException]:
 
 
 class Collector:
-    """One of as many as are wanted at one broker; `run` it as a task. `on_state` is told of connections and losses.
+    """One of as many as are wanted at one broker; `run` it as a task.
 
     Without `mqtt_5` it tries MQTT 3.1.1 first, for a broker that says nothing to MQTT 5.
     """
 
-    def __init__(
-        self,
-        settings: Mqtt,
-        store: Store,
-        on_state: Callable[[bool, str], object] | None = None,
-        *,
-        mqtt_5: bool = True,
-    ) -> None:
+    def __init__(self, settings: Mqtt, store: Store, *, mqtt_5: bool = True) -> None:
         self.settings, self.store = settings, store
         self.metrics = Metrics()
         self.client_id = settings.client_id or f"collector-{socket.gethostname()[:40]}-{secrets.token_hex(4)}"
         self._protocol = _MQTT_5 if mqtt_5 else _MQTT_3_1_1
-        self._reconnection = Reconnection(
-            "fleet", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S, on_state=on_state
-        )
+        self._reconnection = Reconnection("fleet", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S)
 
     @property
     def where(self) -> str:

@@ -35,12 +35,11 @@ _MOST_HEIGHT: Final = 180.0
 
 def model_links(connection: sa.Connection) -> Markup | None:
     """To the page of each model."""
-    links = [join(_link(model), f" ({count} parts) ") for model, count in models(connection).items()]
+    links = [
+        join(tag("a", model, href=f"/model/{model}"), f" ({count} parts) ")
+        for model, count in models(connection).items()
+    ]
     return tag("p", "IMU models: ", *links) if links else None
-
-
-def _link(model: str) -> Markup:
-    return tag("a", model, href=f"/model/{model}")
 
 
 def model_page(connection: sa.Connection, model: str, now: datetime.datetime, source: str) -> str | None:
