@@ -16,7 +16,7 @@ import msgspec
 from companion.calibration.records.record import Record, to_json
 from companion.samples import ImuSample
 
-FORMAT_VERSION: Final = "2"
+FORMAT_VERSION: Final = "3"
 METADATA: Final = "companion"
 """Name of the metadata record with versions and times."""
 CONFIG: Final = "configuration.json"

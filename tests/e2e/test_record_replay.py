@@ -785,10 +785,10 @@ def test_another_version_is_named_and_another_format_refused(
     (note,) = replayed(usual[0]).notes
     assert f"numpy {ours['numpy']}, here 99.0" in note
     assert "pdp11: the last digits may differ" in note
-    for other in (b"1", b"3"):
+    for other in (b"2", b"4"):
         path = tmp_path / "other.mcap"
-        path.write_bytes(usual[0].read_bytes().replace(b"format\x01\x00\x00\x002", b"format\x01\x00\x00\x00" + other))
-        with pytest.raises(StorageError, match=f"found format {other.decode()}; allowed: 2 .recorded by companion"):
+        path.write_bytes(usual[0].read_bytes().replace(b"format\x01\x00\x00\x003", b"format\x01\x00\x00\x00" + other))
+        with pytest.raises(StorageError, match=f"found format {other.decode()}; allowed: 3 .recorded by companion"):
             replayed(path)
 
 
