@@ -219,9 +219,9 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
     run_virtual(level())
 
 
-@pytest.mark.parametrize("follows", [True, False])
+@pytest.mark.parametrize(("follows", "arms"), [(True, False), (False, False), (False, True)])
 def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, follows: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, follows: bool, arms: bool
 ) -> None:
     """A board that sits 1.2 deg to the right and 0.8 deg nose down; its attitude follows only after a restart."""
     board_deg = (1.2, -0.8, 0.0)
@@ -239,7 +239,18 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
             if not follows:
                 monkeypatch.setattr(SensorCalibration, "_set_rotation", lambda *_: None)
             job = started(made.service.calibrating.start_alignment({"action": "turn", "level": True}, "test"))
-            result = await follow(made, hands, job)
+            following = asyncio.ensure_future(follow(made, hands, job))
+            if arms:
+                await made.until(lambda: job.words.startswith("watching the attitude"), 600.0)
+                made.autopilot.arm()
+            result = await following
+            if arms:
+                assert result.reason.endswith(f"old values NOT back in {', '.join(names)}: will be once disarmed"), (
+                    result
+                )
+                made.autopilot.disarm()
+                await made.until(lambda: made.autopilot.parameter(names[0]) == pytest.approx(0.3), 60.0)
+                return
             if not follows:
                 assert result.outcome == "failed"
                 assert result.reason == "the attitude did not follow the new level, or it moved; old values back"

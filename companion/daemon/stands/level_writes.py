@@ -17,7 +17,7 @@ import numpy as np
 
 from companion.autopilot.firmware.ardupilot import TRIM
 from companion.autopilot.firmware.px4 import LEVEL, read_level
-from companion.autopilot.parameters.change import Change, WriteFailedError
+from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
 from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.calibration.alignment.spot import Mounting
 from companion.calibration.machine import Event
@@ -158,8 +158,9 @@ class LevelWrites:
         with changing(self._imus.values() if self._turns_imus else ()):
             try:
                 await self._writer.restore(plan.changes)
-            except WriteFailedError as error:
-                return f"{reason}; old values NOT back in {', '.join(error.left_changed)}: will be once disarmed"
+            except (NothingWrittenError, WriteFailedError) as error:
+                left = error.left_changed or [change.parameter for change in plan.changes]
+                return f"{reason}; old values NOT back in {', '.join(left)}: will be once disarmed"
         await self._ledger.undone()
         return f"{reason}; old values back"
 
