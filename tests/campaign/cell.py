@@ -35,8 +35,8 @@ MOST_VIRTUAL_S = 1500.0
 DRAWS = 4
 SETTLES = 10
 CONNECTS = 80
-REFUSALS = 3
-"""So often a request may be refused after the fault, before one is taken."""
+REFUSALS = 4
+"""So often a request, one each 4 s, may be refused after the fault: a contradiction of heartbeats counts for 10 s."""
 
 
 @dataclasses.dataclass
@@ -330,7 +330,7 @@ class _Course:
             result = await self._operator.ask(CALIBRATE, within_s=RECOVERED_WITHIN_S)
             if result not in (TEMPORARILY_REJECTED, DENIED):
                 break
-            await asyncio.sleep(4.0)  # what has been heard of a second autopilot, say, counts for seconds
+            await asyncio.sleep(4.0)
         if result != ACCEPTED:
             last = stage.service.calibrating.conductor.results.last
             self._wrong(
