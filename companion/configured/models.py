@@ -10,16 +10,14 @@ from typing import Final, Literal
 from companion.autopilot.firmware.port_parameters import baud_of
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.deck.deck import KEPT_S, Deck
+from companion.calibration.deck.deck import KEPT_S
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.record import AlignmentUsed
 from companion.calibration.solution.site import Whereabouts
-from companion.calibration.stillness.stretch import Lag
 from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu
 from companion.links.serial.bytestream import PortSettings
 from companion.physics.frames import rotation_matrix
@@ -156,23 +154,6 @@ def compass_model(compass: Compass | None) -> CompassModel | None:
         prefers_field=compass.heading == "field",
         lag_s=info.lag_s if compass.lag_s is None else compass.lag_s,
     )
-
-
-def pose_sources(config: Config) -> PoseSources:
-    """How tilt and heading come."""
-    gradienter, compass = gradienter_model(config.gradienter), compass_model(config.compass)
-    return PoseSources(
-        gradienter=None if gradienter is None else Lag(gradienter.lag_s, gradienter.sigma_deg),
-        compass=None if compass is None else Lag(compass.lag_s, compass.sigma_deg),
-        field_by=None if compass is None else (compass, gradienter),
-    )
-
-
-def deck(config: Config) -> Deck | None:
-    """What collects where the platform moves; None on the ground."""
-    if config.vehicle.platform != "deck":
-        return None
-    return Deck(gradienter_model(config.gradienter), compass_model(config.compass))
 
 
 def longest_window_s(config: Config) -> float:

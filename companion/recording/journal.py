@@ -272,8 +272,9 @@ class RecordedCollector(RollingCollector):
         super().__init__(
             models.settings(config),
             [models.imu_input(imu, None) for imu in config.imu],
-            models.pose_sources(config),
-            models.deck(config),
+            models.gradienter_model(config.gradienter),
+            models.compass_model(config.compass),
+            on_deck=config.vehicle.platform == "deck",
         )
 
     def number_of(self, window: Window) -> int | None:

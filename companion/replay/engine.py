@@ -224,8 +224,9 @@ class Replay:
         self._collector = RollingCollector(
             models.settings(config),
             (),
-            models.pose_sources(config),
-            models.deck(config),
+            models.gradienter_model(config.gradienter),
+            models.compass_model(config.compass),
+            on_deck=config.vehicle.platform == "deck",
         )
         self._decoders = {
             device.name: device.info.decoder(device.settings.seconds_per_byte) for device in self._devices

@@ -11,11 +11,10 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.measurement import Measurement
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.deck.deck import EVERY_S, Deck
+from companion.calibration.deck.deck import EVERY_S
 from companion.calibration.deck.estimate import MAX_S, MIN_S
 from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.calibration.means.windows import ImuInput, Window
@@ -25,7 +24,6 @@ from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.site import Remedies, Whereabouts, local_earth
 from companion.calibration.solution.solve import solve
-from companion.calibration.stillness.stretch import AT_ONCE, Lag
 from companion.config.sections import Mounting, Noise, Platform
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats, Matrix, rotation_matrix
@@ -150,7 +148,7 @@ class _Streams:
                 prefers_field=self.heading is None,
             )
         self._poses = (self.tilt, self.heading, self.field)
-        self._deck = Deck(self.gradienter, self.compass) if given.platform == "deck" else None
+        self._on_deck = given.platform == "deck"
         # A tilt of the command line is the field's, too.
         self._constant = TiltSample(0.0, given.roll_deg or 0.0, given.pitch_deg or 0.0) if tilt_given else None
 
@@ -162,14 +160,9 @@ class _Streams:
 
     def collector(self, settings: Settings, imu: ImuInput) -> RollingCollector:
         """One that expects what comes."""
-        tilt, compass = self.gradienter, self.compass
-        field_by = None if self.field is None or compass is None else (compass, tilt)
-        sources = PoseSources(
-            gradienter=None if self.tilt is None or tilt is None else Lag(tilt.lag_s, tilt.sigma_deg),
-            compass=None if self.heading is None and self.field is None else AT_ONCE,
-            field_by=field_by,
-        )
-        return RollingCollector(settings, [imu], sources, self._deck)
+        collector = RollingCollector(settings, [imu], self.gradienter, self.compass, on_deck=self._on_deck)
+        collector.expect(gradienter=self.tilt is not None, compass=self.heading is not None or self.field is not None)
+        return collector
 
     def feed(self, collector: RollingCollector, at: int, now_s: float) -> None:
         """What stands in line `at` of the log."""

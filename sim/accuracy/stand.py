@@ -16,7 +16,6 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.pose import CompassModel, GradienterModel
@@ -24,7 +23,6 @@ from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.request import What
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.calibration.solution.solve import ImuSolution, Solution, solve
-from companion.calibration.stillness.stretch import AT_ONCE
 from companion.physics.gradienter import Law
 from companion.samples import CompassSample, ImuSample, TiltSample
 from sim.aircraft import Pose, Site, VirtualAircraft
@@ -192,7 +190,7 @@ def collected(
         target_accel_sigma_m_s2=0.0,
         horizon_s=horizon_s,
     )
-    collector = RollingCollector(wanted, [taken], PoseSources(gradienter=AT_ONCE, compass=AT_ONCE))
+    collector = RollingCollector(wanted, [taken], *_models(standing, EXACT))
     tilts, headings = _tilts(standing, float(times[-1])), _headings(standing, float(times[-1]))
     found: list[Window] = []
     spans = list(spans_s)
@@ -264,11 +262,14 @@ EXACT: Final = References()
 def solved(standing: Stand, window: Window, references: References = EXACT) -> Solution:
     """The solution of one window.
 
-    A reading that is wrong by e and taken as it is does what a right one does from which -e is taken off.
-
     Raises:
         CalibrationRefusedError: as `solve`.
     """
+    return solve(window, _local(standing.site), *_models(standing, references), What.BOTH)
+
+
+def _models(standing: Stand, references: References) -> tuple[GradienterModel, CompassModel]:
+    """A reading that is wrong by e and taken as it is does what a right one does from which -e is taken off."""
     x, y = references.tilt_error_deg
     tilt = GradienterModel(standing.posture.law, np.eye(3), (-x, -y), references.tilt_sigma_deg)
     heading = CompassModel(
@@ -277,7 +278,7 @@ def solved(standing: Stand, window: Window, references: References = EXACT) -> S
         offset_deg=references.heading_error_deg,
         sigma_deg=references.heading_sigma_deg,
     )
-    return solve(window, _local(standing.site), tilt, heading, What.BOTH)
+    return tilt, heading
 
 
 def biases(found: ImuSolution) -> Array:

@@ -16,7 +16,6 @@ from typing import Final, Literal
 
 import numpy as np
 
-from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.pose import CompassModel, GradienterModel
@@ -25,7 +24,6 @@ from companion.calibration.noise.allan import NoiseProfile, allan_model, noise_p
 from companion.calibration.request import What
 from companion.calibration.solution.site import local_earth
 from companion.calibration.solution.solve import solve
-from companion.calibration.stillness.stretch import AT_ONCE
 from companion.physics.units import DEG_H, MG
 from companion.samples import CompassSample, ImuSample, TiltSample
 from sim.accuracy.experiments import many
@@ -154,9 +152,7 @@ class Platform:
             horizon_s=NEXT_S,
         )
         taken = ImuInput(name="fc", rotation=np.eye(3), profile=_profile(case))
-        self.collector = RollingCollector(
-            wanted, [taken], PoseSources(gradienter=AT_ONCE, compass=AT_ONCE if self.compass is not None else None)
-        )
+        self.collector = RollingCollector(wanted, [taken], self.level, self.model if self.compass is not None else None)
 
     def errors(self, now_s: float) -> tuple[Array, Array, Array]:
         """Of a calibration now: gyro errors against the window's bias and that of the next minutes, and sigma_use.

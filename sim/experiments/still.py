@@ -8,7 +8,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.pose import CompassModel, GradienterModel
@@ -17,7 +16,6 @@ from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.calibration.solution.solve import ImuSolution, Solution, solve
-from companion.calibration.stillness.stretch import AT_ONCE
 from companion.physics.gradienter import Law
 from companion.protocols.decoding.base import Decoder
 from companion.protocols.registry import PROTOCOLS, Kind
@@ -82,7 +80,9 @@ def calibrate(
         min_still_s=seconds, max_s=seconds, target_gyro_sigma_rad_s=0.0, target_accel_sigma_m_s2=0.0, horizon_s=180.0
     )
     taken = ImuInput(name="own", rotation=np.eye(3), profile=noise_profile(profile))
-    collector = RollingCollector(wanted, [taken], PoseSources(gradienter=AT_ONCE, compass=AT_ONCE))
+    tilt = GradienterModel(law, np.eye(3), (0.0, 0.0), tilt_sigma_deg)
+    heading = CompassModel(magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=heading_sigma_deg)
+    collector = RollingCollector(wanted, [taken], tilt, heading)
     now_s = 0.0
     while now_s < seconds + 2.0:
         now_s += 0.5
@@ -91,8 +91,6 @@ def calibrate(
         feed(collector, compass.samples_until(now_s))
     collector.tick(now_s)
     local = local_earth(whereabouts(site))
-    tilt = GradienterModel(law, np.eye(3), (0.0, 0.0), tilt_sigma_deg)
-    heading = CompassModel(magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=heading_sigma_deg)
     return Still(solve(collector.window(now_s), local, tilt, heading, What.BOTH), local)
 
 

@@ -9,12 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.outlook import Status
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.noise.robust import huber_line, huber_mean
 from companion.calibration.seconds.batch import BatchSource
-from companion.calibration.stillness.stretch import AT_ONCE
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import rotation_matrix
 from companion.rotations import ROTATION_NAMES
@@ -39,9 +37,7 @@ EVENTS = st.one_of(
 @settings(max_examples=150)
 @given(st.lists(EVENTS, max_size=25))
 def test_nothing_that_arrives_raises(events: list[object]) -> None:
-    collector = RollingCollector(
-        still.settings(max_s=20.0), [still.imu()], PoseSources(gradienter=AT_ONCE, compass=AT_ONCE)
-    )
+    collector = RollingCollector(still.settings(max_s=20.0), [still.imu()], still.TILT, still.HEADING)
     feed = still.Feeder(collector, rate_hz=8)
     feed.tilt = lambda _t: (1.0, -1.0)
     feed.heading = lambda _t: 0.1

@@ -11,9 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.stillness.stretch import AT_ONCE
 from companion.configured.models import Role, SerialDevice
 from companion.daemon.devices.sensor_watch import SensorWatch
 from companion.daemon.devices.sensors import SerialSensor
@@ -22,7 +20,7 @@ from companion.samples import Sample
 from sim.devices import nmea
 from sim.pty_device import reader_setting
 from sim.uart import Setting, heard
-from tests.support.still_aircraft import imu, settings
+from tests.support.still_aircraft import HEADING, TILT, imu, settings
 
 RECOVERY_S = 3.0
 """So soon after a cause has ended there must be data again."""
@@ -158,4 +156,4 @@ async def listening(kind: Any, protocol: str, url: str | Path, **line: Any) -> A
 
 
 def still_collector() -> RollingCollector:
-    return RollingCollector(settings(), [imu("fc")], PoseSources(gradienter=AT_ONCE, compass=AT_ONCE))
+    return RollingCollector(settings(), [imu("fc")], TILT, HEADING)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import AllanModel, NoiseProfile, noise_profile
 from companion.physics.units import DEG, DEG_H, MG
@@ -25,6 +26,9 @@ RATE_HZ = 50
 
 QUIET = NoiseProfile("quiet", AllanModel(1e-9, 1e-9, 1e-12), AllanModel(1e-9, 1e-9, 1e-12))
 """Adds nothing, so that what is measured shows."""
+
+TILT = GradienterModel("axis", np.eye(3), (0.0, 0.0), 1.0)
+HEADING = CompassModel(magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=1.0)
 
 
 def settings(**more: float) -> Settings:

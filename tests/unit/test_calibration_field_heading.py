@@ -7,10 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.pose import CompassModel, FieldHeading, GradienterModel, vehicle_heading_rad
-from companion.calibration.stillness.stretch import AT_ONCE, HeadingWatch
+from companion.calibration.stillness.stretch import HeadingWatch
 from companion.physics.frames import wrap_deg
 from companion.physics.units import DEG
 from companion.samples import CompassSample, MagSample, TiltSample
@@ -130,9 +129,7 @@ class Stand:
 
     def __init__(self) -> None:
         self.model = compass()
-        self.collector = RollingCollector(
-            settings(), [imu()], PoseSources(gradienter=AT_ONCE, compass=AT_ONCE, field_by=(self.model, PLAIN))
-        )
+        self.collector = RollingCollector(settings(), [imu()], PLAIN, self.model)
         self.feed = Feeder(self.collector)
         self.iron = np.zeros(3)
         self.noise = np.random.default_rng(5)
@@ -213,7 +210,7 @@ def test_a_turn_of_the_aircraft_is_no_wandering() -> None:
 
 
 def test_without_a_gradienter_the_field_alone_says_what_is_missing() -> None:
-    collector = RollingCollector(settings(), [imu()], PoseSources(compass=AT_ONCE, field_by=(compass(), None)))
+    collector = RollingCollector(settings(), [imu()], compass=compass())
     feed = Feeder(collector)
 
     def give(t_s: float) -> None:

@@ -9,11 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.calibration.collector import measurement
-from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.noise.allan import AllanModel, NoiseProfile
-from companion.calibration.stillness.stretch import AT_ONCE
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG, DEG_H, MG
 from companion.recording.journal import encode
@@ -22,8 +20,10 @@ from tests.support.still_aircraft import (
     BIAS,
     FORCE,
     GYRO_NOISE,
+    HEADING,
     QUIET,
     RATE_HZ,
+    TILT,
     Feeder,
     imu,
     settings,
@@ -40,7 +40,8 @@ def feeder(asked: Settings | None = None, *names: str, gradienter: bool = False,
     collector = RollingCollector(
         asked or settings(),
         [imu(name) for name in names],
-        PoseSources(gradienter=AT_ONCE if gradienter else None, compass=AT_ONCE if compass else None),
+        TILT if gradienter else None,
+        HEADING if compass else None,
     )
     made = Feeder(collector, names)
     if gradienter:
@@ -297,7 +298,7 @@ def test_a_slow_gradienter_need_not_speak_every_second() -> None:
 
 
 def test_no_imu_at_all_still_gives_the_pose() -> None:
-    collector = RollingCollector(settings(), [], PoseSources(gradienter=AT_ONCE))
+    collector = RollingCollector(settings(), [], TILT)
     for tick in range(150):
         collector.add_tilt(TiltSample(10.05 + 0.1 * tick, 1.0, 2.0))
     assert collector.status(25.0).enough

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 from dataclasses import dataclass, field
@@ -10,15 +11,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.pose import GradienterModel
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.seconds.batch import Batch
-from companion.calibration.stillness.stretch import AT_ONCE, UNKNOWN_DEG, Lag, Settling
+from companion.calibration.stillness.stretch import UNKNOWN_DEG, Settling
 from companion.config.sections import Compass, Config, Imu, Mavlink
 from companion.config.sections import Gradienter as Section
-from companion.configured.models import gradienter_model, pose_sources
+from companion.configured.models import compass_model, gradienter_model
 from companion.errors import CalibrationRefusedError
 from companion.physics.gradienter import attitude_from_readings
 from companion.protocols.registry import PROTOCOLS
@@ -30,11 +31,19 @@ from sim.imu_model import ImuModel
 from sim.motions import Knock, Motion, Turn
 from sim.scenario import site_at
 from tests.support.decoders import make_decoder
-from tests.support.still_aircraft import Feeder, Floats, imu, settings
+from tests.support.still_aircraft import HEADING, Feeder, Floats, imu, settings
 
 SET_DOWN_S = 12.0
 STEP_S = 0.05
 SIGMA_DEG = 0.005
+
+Lag = tuple[float, float]
+"""Time constant and sigma, s and deg."""
+AT_ONCE: Lag = (0.0, 1.0)
+
+
+def gradienter(lag_s: float, sigma_deg: float) -> GradienterModel:
+    return GradienterModel("axis", np.eye(3), (0.0, 0.0), sigma_deg, lag_s)
 
 
 @dataclass
@@ -70,7 +79,7 @@ def fly(motions: list[Motion], *, device_lag_s: float, known: Lag, until_s: floa
     }
     asked = settings(min_still_s=10.0, max_s=10.0)
     own = ImuInput(name="own", rotation=np.eye(3), profile=noise_profile("icm42688p"))
-    collector = RollingCollector(asked, [own], PoseSources(gradienter=known))
+    collector = RollingCollector(asked, [own], gradienter(*known))
     seen = Seen()
     for device, _ in devices.values():
         device.power_on(0.0)
@@ -110,7 +119,7 @@ def set_down(device_lag_s: float, known: Lag) -> Seen:
 )
 def test_what_the_fluid_leaves_in_the_mean(lag_s: float, sigma_deg: float, without_deg: float, longer_s: float) -> None:
     without = set_down(lag_s, AT_ONCE)
-    within = set_down(lag_s, Lag(lag_s, sigma_deg))
+    within = set_down(lag_s, (lag_s, sigma_deg))
     assert without.error_deg() > without_deg
     assert within.error_deg() < min(0.1 * sigma_deg, 0.5 * without.error_deg())
     assert within.first_after_s(SET_DOWN_S) <= without.first_after_s(SET_DOWN_S) + longer_s
@@ -120,7 +129,7 @@ def test_what_the_fluid_leaves_in_the_mean(lag_s: float, sigma_deg: float, witho
 
 
 def test_the_wait_is_told_in_words_and_counts_down_to_nothing() -> None:
-    told = set_down(3.0, Lag(3.0, 0.02)).words
+    told = set_down(3.0, (3.0, 0.02)).words
     lines = [after for before, after in pairwise([None, *told]) if before != after]
     waits = [line for line in lines if line is not None and "settles" in line]
     assert re.fullmatch(r"gradienter settles: \d+ s more", waits[0])
@@ -133,7 +142,7 @@ def test_the_wait_is_told_in_words_and_counts_down_to_nothing() -> None:
 
 def test_an_aircraft_that_stands_still_waits_no_longer() -> None:
     at_once = fly([], device_lag_s=0.43, known=AT_ONCE, until_s=20.0)
-    lagging = fly([], device_lag_s=0.43, known=Lag(3.0, SIGMA_DEG), until_s=20.0)
+    lagging = fly([], device_lag_s=0.43, known=(3.0, SIGMA_DEG), until_s=20.0)
     assert [t_s for t_s, _ in lagging.windows] == [t_s for t_s, _ in at_once.windows]
     assert [encode(window) for _, window in lagging.windows] == [encode(window) for _, window in at_once.windows]
     assert lagging.words == at_once.words
@@ -142,7 +151,7 @@ def test_an_aircraft_that_stands_still_waits_no_longer() -> None:
 def test_a_knock_in_a_still_stretch_costs_no_more_seconds_than_before() -> None:
     knock = Knock(start_s=20.3)
     at_once = fly([knock], device_lag_s=0.43, known=AT_ONCE, until_s=40.0)
-    lagging = fly([knock], device_lag_s=0.43, known=Lag(0.43, SIGMA_DEG), until_s=40.0)
+    lagging = fly([knock], device_lag_s=0.43, known=(0.43, SIGMA_DEG), until_s=40.0)
     assert [t_s for t_s, _ in lagging.windows] == [t_s for t_s, _ in at_once.windows]
     for (_, one), (_, other) in zip(lagging.windows, at_once.windows, strict=True):
         assert encode(one.imus) == encode(other.imus)
@@ -150,15 +159,16 @@ def test_a_knock_in_a_still_stretch_costs_no_more_seconds_than_before() -> None:
     assert max(errors) < 0.1 * SIGMA_DEG
 
 
-def turned(known: Lag, gradienter: bool = False) -> tuple[float, float]:
+def turned(known: Lag, tilted: bool) -> tuple[float, float]:
     """Error of the mean heading (or tilt) after a turn of 20 degrees (2 degrees) seen through a filter of 2 s."""
     collector = RollingCollector(
         settings(),
         [imu()],
-        PoseSources(gradienter=known if gradienter else None, compass=None if gradienter else known),
+        gradienter(*known) if tilted else None,
+        None if tilted else dataclasses.replace(HEADING, lag_s=known[0], sigma_deg=known[1]),
     )
     feed = Feeder(collector)
-    size, end_s = 2.0 if gradienter else 20.0, 1006.0
+    size, end_s = 2.0 if tilted else 20.0, 1006.0
 
     def off(t_s: float) -> float:
         return size if t_s < end_s else size * math.exp(-(t_s - end_s) / 2.0)
@@ -168,7 +178,7 @@ def turned(known: Lag, gradienter: bool = False) -> tuple[float, float]:
         return rows
 
     feed.change = change
-    if gradienter:
+    if tilted:
         feed.tilt = lambda t_s: (1.0 + off(t_s), 2.0)
     else:
         feed.heading = lambda t_s: (359.0 + off(t_s)) % 360.0
@@ -182,11 +192,11 @@ def turned(known: Lag, gradienter: bool = False) -> tuple[float, float]:
     return abs(window.tilt.x_deg - 1.0), feed.now_s
 
 
-@pytest.mark.parametrize("gradienter", [False, True])
-def test_a_filter_of_either_sensor_is_waited_for(gradienter: bool) -> None:
-    sigma_deg = 0.05 if gradienter else 1.0
-    without_deg, at_s = turned(AT_ONCE, gradienter)
-    within_deg, later_s = turned(Lag(2.0, sigma_deg), gradienter)
+@pytest.mark.parametrize("tilted", [False, True])
+def test_a_filter_of_either_sensor_is_waited_for(tilted: bool) -> None:
+    sigma_deg = 0.05 if tilted else 1.0
+    without_deg, at_s = turned(AT_ONCE, tilted)
+    within_deg, later_s = turned((2.0, sigma_deg), tilted)
     assert without_deg > 0.2 * sigma_deg
     assert within_deg < 0.1 * sigma_deg
     assert later_s < at_s + 12.0
@@ -213,7 +223,7 @@ def test_what_is_left_is_below_a_tenth_of_sigma_and_never_long_before(
     """Against the exponential itself; the step comes at any time of second 0."""
     sigma_deg = 0.02
     for at_s in (0.0, 0.37, 0.9, 0.999):
-        settling = Settling(Lag(lag_s, sigma_deg), circle=True)
+        settling = Settling(lag_s, sigma_deg, circle=True)
         counts = None
         for slot in range(120):
             t_s = slot + (np.arange(rate_hz) + 0.5) / rate_hz
@@ -233,7 +243,7 @@ def test_what_is_left_is_below_a_tenth_of_sigma_and_never_long_before(
 
 
 def test_after_a_silence_the_most_is_assumed() -> None:
-    settling = Settling(Lag(0.43, 0.005))
+    settling = Settling(0.43, 0.005)
     settling.judge(0, None, moved=True)
     counted = [settling.judge(slot, batch(slot, 1.0, 1.0, 1.0), moved=False) for slot in range(1, 8)]
     n = math.ceil(0.43 * math.log(5.0 / 0.0005))
@@ -242,7 +252,7 @@ def test_after_a_silence_the_most_is_assumed() -> None:
 
 
 def test_what_follows_at_once_always_counts() -> None:
-    settling = Settling(AT_ONCE)
+    settling = Settling(*AT_ONCE)
     assert settling.judge(0, batch(0, 0.0, 9.0, 5.0), moved=True)
 
 
@@ -256,5 +266,5 @@ def test_the_protocols_lag_is_the_default_and_the_configuration_comes_first() ->
         gradienter=Section(port="/dev/x", protocol="inclinometer_xy", law="slope", lag_s=2.5, sigma_deg=0.02),
         compass=Compass(port="/dev/x", protocol="hmr3300", lag_s=0.288, sigma_deg=1.5),
     )
-    sources = pose_sources(config)
-    assert (sources.gradienter, sources.compass) == (Lag(2.5, 0.02), Lag(0.288, 1.5))
+    models = gradienter_model(config.gradienter), compass_model(config.compass)
+    assert [(one.lag_s, one.sigma_deg) for one in models if one is not None] == [(2.5, 0.02), (0.288, 1.5)]

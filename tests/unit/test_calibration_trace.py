@@ -9,18 +9,16 @@ import numpy as np
 import pytest
 
 from companion.calibration.collector import trace as traces
-from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.collector.trace import MAX_SECONDS, Trace
-from companion.calibration.stillness.stretch import AT_ONCE
-from tests.support.still_aircraft import BIAS, GYRO_NOISE, RATE_HZ, Feeder, imu, settings
+from tests.support.still_aircraft import BIAS, GYRO_NOISE, HEADING, RATE_HZ, TILT, Feeder, imu, settings
 
 YAW_90 = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _feeder() -> Feeder:
     inputs = [imu("fc"), imu("own", rotation=YAW_90)]
-    feed = Feeder(RollingCollector(settings(), inputs, PoseSources(gradienter=AT_ONCE, compass=AT_ONCE)), ("fc", "own"))
+    feed = Feeder(RollingCollector(settings(), inputs, TILT, HEADING), ("fc", "own"))
     feed.tilt = lambda _t: (1.25, -0.5)
     feed.heading = lambda _t: 12.0
     return feed

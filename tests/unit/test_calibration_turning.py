@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.collector.intake import PoseSources
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.pose import CompassModel
 from companion.calibration.noise.allan import noise_profile
@@ -17,12 +16,11 @@ from companion.calibration.noise.slope import fit_slope, hidden_by_steps
 from companion.calibration.request import What
 from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import solve
-from companion.calibration.stillness.stretch import AT_ONCE
 from companion.calibration.turning.watch import Turn
 from companion.physics.units import DEG, DEG_H
 from sim.accuracy import turning
 from tests.support.extent import extent
-from tests.support.still_aircraft import Feeder, imu, settings
+from tests.support.still_aircraft import HEADING, Feeder, imu, settings
 
 Floats = NDArray[np.float64]
 FOREVER = settings(target_gyro_sigma_rad_s=1e-9, target_accel_sigma_m_s2=1e-9)
@@ -34,7 +32,7 @@ class Stand:
     def __init__(self, *names: str, compass: bool = False) -> None:
         names = names or ("fc",)
         parts = [imu(name, noise_profile("icm42688p")) for name in names]
-        self.collector = RollingCollector(FOREVER, parts, PoseSources(compass=AT_ONCE if compass else None))
+        self.collector = RollingCollector(FOREVER, parts, compass=HEADING if compass else None)
         self.feed = Feeder(self.collector, names)
         self.noise = np.random.default_rng(5)
         self.heading: Callable[[float], float] = lambda _t: 350.0

@@ -17,7 +17,7 @@ from companion.calibration.means.windows import ImuInput, integer_steps
 from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.calibration.seconds.counting import Counted, TurnCounter
 from companion.calibration.stillness.gates import STILL, ImuGate, PoseGate, Verdict
-from companion.calibration.stillness.stretch import AT_ONCE, Lag, Settling
+from companion.calibration.stillness.stretch import Settling
 from companion.calibration.turning.watch import Turn, TurnWatch
 from companion.physics.frames import Array
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
@@ -137,38 +137,22 @@ class Source:
         )
 
 
-class PoseSources(msgspec.Struct, frozen=True, kw_only=True):
-    """How the pose sensors follow the truth; None: there is none of the kind."""
-
-    gradienter: Lag | None = None
-    compass: Lag | None = None
-    field_by: tuple[CompassModel, GradienterModel | None] | None = None
-    """By what a heading comes of the compass' field."""
-
-
-NO_POSE_SOURCES: Final = PoseSources()
-
-
 class Intake(ABC):
     """The streams, and what is known of each. Nothing that a sample holds makes it raise."""
 
     def __init__(
-        self,
-        keep: int,
-        poses: PoseSources,
-        deck: Deck | None,
-        span: int,
+        self, keep: int, gradienter: GradienterModel | None, compass: CompassModel | None, deck: Deck | None, span: int
     ) -> None:
-        self._keep, self._poses, self._deck = keep, poses, deck
+        self._keep, self._gradienter, self._compass, self._deck = keep, gradienter, compass, deck
         self._inputs: dict[str, ImuInput] = {}
         self._imus: dict[str, Source] = {}
-        self._tilt = None if poses.gradienter is None else self._pose_source("gradienter")
-        self._heading = None if poses.compass is None else self._pose_source("compass")
+        self._tilt = None if gradienter is None else self._pose_source("gradienter")
+        self._heading = None if compass is None else self._pose_source("compass")
         self._breaks: dict[str, int] = {}
         self._restarted_s: dict[str, float] = {}
         self._up: dict[str, tuple[float, float]] = {}
         """By IMU whose device tells: a time, and for how long it had been on by then."""
-        self._field = None if poses.field_by is None else FieldHeading(*poses.field_by, keep)
+        self._field = None if compass is None else FieldHeading(compass, gradienter, keep)
         self._turns = TurnWatch(span)
         self._counters: dict[str, TurnCounter] = {}
         """By IMU, while turns on a spot are counted."""
@@ -282,9 +266,10 @@ class Intake(ABC):
     def _pose_source(self, name: Literal["gradienter", "compass"]) -> Source:
         """A gradienter's two channels, or a compass' heading, in degrees."""
         circle = name == "compass"
-        lag = (self._poses.compass if circle else self._poses.gradienter) or AT_ONCE
+        model = self._compass if circle else self._gradienter
+        settling = None if model is None else Settling(model.lag_s, model.sigma_deg, circle=circle)
         batches = BatchSource(_LIMITS_HEADING if circle else _LIMITS_TILT, self._keep, circle=circle)
-        source = Source(name, name, batches, PoseGate(name), Settling(lag, circle=circle), self._keep)
+        source = Source(name, name, batches, PoseGate(name), settling, self._keep)
         if self._deck is not None:
             source.may_move = True
             batches.on_second = self._deck.take_heading if circle else self._deck.take_tilt

@@ -13,13 +13,14 @@ from typing import Any, Final
 import msgspec
 
 from companion.calibration.collector.afloat import Afloat
-from companion.calibration.collector.intake import NO_POSE_SOURCES, Intake, PoseSources, Source
+from companion.calibration.collector.intake import Intake, Source
 from companion.calibration.collector.measurement import Estimates, Found, Measurement, PoseSeconds, Work
 from companion.calibration.collector.outlook import Glance, Obstacle, Settings, Status, expected_s, is_enough
 from companion.calibration.collector.swell import Swell
 from companion.calibration.collector.trace import Snapshot, TraceLog
 from companion.calibration.deck.deck import Deck
 from companion.calibration.deck.estimate import DeckWork
+from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.stillness.stretch import HeadingWatch, Stretch
 from companion.errors import CalibrationRefusedError
@@ -37,7 +38,7 @@ class RollingCollector(Intake):
     """Collects batches of all sources, judges stillness, and gives means of the still stretch.
 
     Pure: no clock and no I/O. Nothing that a sample holds makes it raise; what is dropped is counted by reason.
-    Memory is bounded: `max_s` and a margin of one-second batches a source.
+    Memory is bounded: `max_s` and a margin of one-second batches a source. None: there is no gradienter, no compass.
 
     Raises:
         ValueError: two IMUs of one name.
@@ -47,15 +48,18 @@ class RollingCollector(Intake):
         self,
         settings: Settings,
         imus: Sequence[ImuInput],
-        poses: PoseSources = NO_POSE_SOURCES,
-        deck: Deck | None = None,
+        gradienter: GradienterModel | None = None,
+        compass: CompassModel | None = None,
+        *,
+        on_deck: bool = False,
     ) -> None:
         if len({imu.name for imu in imus}) != len(imus):
             raise ValueError("two IMUs have one name")
         self._settings = settings
         self._min_good, self._max_slots = settings.min_slots, settings.max_slots
         self._least = min(MIN_BATCHES, self._min_good)
-        super().__init__(self._max_slots + _MARGIN, poses, deck, span=self._max_slots)
+        deck = Deck(gradienter, compass) if on_deck else None
+        super().__init__(self._max_slots + _MARGIN, gradienter, compass, deck, span=self._max_slots)
         self._afloat = None if deck is None else Afloat(deck, settings.horizon_s)
         self._watch = HeadingWatch()
         self._stretch = Stretch(self._min_good, self._max_slots)

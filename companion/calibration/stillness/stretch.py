@@ -21,7 +21,6 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final
 
-import msgspec
 import numpy as np
 
 from companion.calibration.seconds.batch import Batch
@@ -89,25 +88,16 @@ _CHANCE: Final = 4.0
 """Standard deviations that the lowest or highest of a second's readings may lie off by chance."""
 
 
-class Lag(msgspec.Struct, frozen=True):
-    """How a pose sensor follows the truth."""
-
-    lag_s: float
-    """Time constant; 0: at once."""
-    sigma_deg: float
-    """What it is trusted to; a tenth of that may be left."""
-
-
-AT_ONCE: Final = Lag(0.0, 1.0)
-
-
 class Settling:
-    """Knows which of a pose sensor's seconds are still the tail of a movement."""
+    """Knows which of a pose sensor's seconds are still the tail of a movement.
 
-    def __init__(self, lag: Lag, *, circle: bool = False) -> None:
+    It follows the truth with the time constant `lag_s`, 0 being at once, and a tenth of `sigma_deg` may be left.
+    """
+
+    def __init__(self, lag_s: float, sigma_deg: float, *, circle: bool = False) -> None:
         self.left_s = 0
         """Seconds until its readings count again, as of the last second judged."""
-        self._lag = lag
+        self._lag_s, self._sigma_deg = lag_s, sigma_deg
         self._circle = circle
         self._moved: int | None = None
         """The last second in which the aircraft moved, while its tail may last."""
@@ -118,7 +108,7 @@ class Settling:
 
     def judge(self, slot: int, batch: Batch | None, *, moved: bool) -> bool:
         """Whether what the sensor said in that second, after those before, counts; `moved`: the IMUs were not still."""
-        if self._lag.lag_s <= 0.0:
+        if self._lag_s <= 0.0:
             return True
         if moved:
             self._moved, self._after = slot, None
@@ -129,7 +119,7 @@ class Settling:
             return True
         if slot == self._moved + 1 and batch is not None:
             # What its first reading shows had a pause between two readings to decay.
-            self._after = (batch.low, batch.high, math.exp(min(1.0 / (batch.n * self._lag.lag_s), 50.0)))
+            self._after = (batch.low, batch.high, math.exp(min(1.0 / (batch.n * self._lag_s), 50.0)))
         self.left_s = max(self._seconds(self._off_deg(batch)) - (slot - self._moved - 1), 0)
         if self.left_s == 0 and batch is not None:
             self._moved = None
@@ -137,8 +127,8 @@ class Settling:
 
     def _seconds(self, off_deg: float) -> int:
         """Whole seconds until so much has died away."""
-        remains = off_deg / (_SHARE * self._lag.sigma_deg)
-        return math.ceil(self._lag.lag_s * math.log(remains)) if remains > 1.0 else 0
+        remains = off_deg / (_SHARE * self._sigma_deg)
+        return math.ceil(self._lag_s * math.log(remains)) if remains > 1.0 else 0
 
     def _off_deg(self, batch: Batch | None) -> float:
         """What it was off by when the aircraft stopped, from where it is now; beyond its own noise."""
