@@ -60,20 +60,20 @@ async def status(options: argparse.Namespace) -> int:
 
 
 async def calibrate(options: argparse.Namespace) -> int:
-    """`companion calibrate`."""
+    """`companion calibrate`; Ctrl-C cancels what is waited for."""
     what = "gyros" if options.gyros else "accelerometers" if options.accelerometers else "both"
     wanted = {"command": "calibrate", "what": what, "wait": options.wait}
     wanted |= {"timeout_s": options.timeout, "reboot": options.reboot}
-    reply = await request(options, wanted)
+    reply = await request(options, wanted, {"command": "cancel"} if options.wait else None)
     if "record" in reply:
         record = reply["record"]
         return finish(options, reply, record, show.record_lines(record), good=record["state"] == "done")
-    return _finish_briefly(options, reply)
+    return _finish_briefly(options, reply, good=not options.wait)
 
 
-def _finish_briefly(options: argparse.Namespace, reply: Object) -> int:
+def _finish_briefly(options: argparse.Namespace, reply: Object, *, good: bool = True) -> int:
     answer = {key: reply.get(key) for key in ("state", "reason")}
-    return finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=True)
+    return finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=good)
 
 
 async def cancel(options: argparse.Namespace) -> int:

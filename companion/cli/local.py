@@ -218,6 +218,7 @@ async def check(options: argparse.Namespace) -> int:
     from companion.daemon.process.check import run_check
 
     config = load_config(options, profiles=True)
+    print_lines(f"checking: {options.seconds:g} s, half a minute more for a sensor not understood", error=True)
     findings = await run_check(config, options.seconds)
     good = all(finding.good for finding in findings)
     reason = "; ".join(f"{finding.name}: {finding.words}" for finding in findings if not finding.good)

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import os
+import re
 import signal
 import stat
 import sys
@@ -239,6 +240,29 @@ def _check_record(record: Any) -> None:
     assert own["written"] == {}
 
 
+def test_ctrl_c_cancels_the_calibration_that_is_watched(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight_line(tmp_path, still_s=(600.0, 600.0)) as line:
+            config = str(line.config)
+            watched = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-m", "companion", "-c", config, "calibrate", "--wait"),
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.PIPE,
+            )
+            assert watched.stderr is not None
+            async with asyncio.timeout(40.0):
+                await watched.stderr.readuntil(b"hold still")
+                watched.send_signal(signal.SIGINT)
+                out, _ = await watched.communicate()
+            assert watched.returncode == FAILED
+            assert out.decode().startswith("cancelled: ")
+            status = (await companion("-c", config, "status", "--json")).json
+            assert status["state"] not in ("waiting", "measuring")
+            assert line.scenario.autopilot.writes == []
+
+    asyncio.run(main())
+
+
 def test_kill_9_and_a_second_daemon(tmp_path: Path) -> None:
     async def main() -> None:
         async with flight_line(tmp_path) as line:
@@ -270,7 +294,8 @@ def test_check_without_a_daemon_says_what_is_wrong(tmp_path: Path) -> None:
             assert "not running" in good.out
             assert line.scenario.autopilot.writes == []
             broken = line.config.with_name("broken.toml")
-            broken.write_text(line.config.read_text().replace(str(tmp_path / "compass"), str(tmp_path / "nothing")))
+            text = line.config.read_text().replace(str(tmp_path / "compass"), str(tmp_path / "nothing"))
+            broken.write_text(re.sub('url = ".*"', 'url = "tcp:127.0.0.1:9"', text))
             bad = await companion("-c", str(broken), "check", "--seconds", "1.5", "--json")
             assert bad.code == FAILED
             # On a busy machine others may have said nothing in so short a time.
@@ -278,6 +303,9 @@ def test_check_without_a_daemon_says_what_is_wrong(tmp_path: Path) -> None:
             assert not finding["good"]
             assert "nothing" in finding["words"]
             assert "compass" in bad.json["reason"]
+            (finding,) = [each for each in bad.json["findings"] if each["name"] == "autopilot"]
+            assert "companion setup looks for it elsewhere" in finding["words"]
+            assert bad.err.startswith("checking: 1.5 s")
 
     asyncio.run(main())
 

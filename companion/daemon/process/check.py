@@ -226,13 +226,15 @@ async def answering_imus(config: Config, imus: Sequence[Imu], seconds: float) ->
 
 
 def _autopilot(config: Config, vehicle: Object) -> Finding:
-    """Whether it is heard; where not on a serial line, what its end of that needs."""
+    """Whether it is heard; where not, what its end of the line needs."""
     if vehicle["system_id"] is not None:
         return Finding("autopilot", good=True, words=vehicle["summary"])
     baud = baud_of(config.mavlink.url)
-    remedy = "" if baud is None else f"{port_needs(None, baud)}; TX to RX; companion setup looks for it elsewhere"
-    words = f"{vehicle['summary']}: {remedy}" if remedy else vehicle["summary"]
-    return Finding("autopilot", good=False, words=words, remedy=remedy)
+    needs = "switched on, and sent there (MAVProxy --out, mavlink-router)?"
+    if baud is not None:
+        needs = f"{port_needs(None, baud)}; TX to RX"
+    remedy = f"{needs}; companion setup looks for it elsewhere"
+    return Finding("autopilot", good=False, words=f"{vehicle['summary']}: {remedy}", remedy=remedy)
 
 
 def _device(device: Object, elsewhere: Finding | None) -> Finding:
