@@ -14,6 +14,9 @@ from companion.cli.terminal import AddCommand, conclude, load_config, print_line
 from companion.daemon.faces.control import ask
 from companion.formats import Object
 
+SILENT_S: Final = 2.0
+"""After so long without an answer it is said that one is waited for."""
+
 
 async def request(
     options: argparse.Namespace, wanted: Object, at_interrupt: Object | None = None, *, in_place: bool = False
@@ -25,8 +28,11 @@ async def request(
     """
     reply: Object = {}
     shown = ""
+    waiting = "waiting for the daemon's answer; Ctrl-C ends the waiting alone"
+    silent = asyncio.get_running_loop().call_later(SILENT_S, lambda: print_lines(waiting, error=True))
     try:
         async for reply in ask(load_config(options).control.path, wanted):
+            silent.cancel()
             if reply["kind"] == "progress" and reply["text"] != shown:
                 shown = reply["text"]
                 if in_place:
@@ -39,6 +45,7 @@ async def request(
             raise
         return await request(options, at_interrupt)
     finally:
+        silent.cancel()
         if in_place and shown:
             print_lines("", error=True)
     return reply

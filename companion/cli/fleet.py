@@ -98,11 +98,13 @@ async def _demo(options: argparse.Namespace) -> int:
     """`companion fleet demo`."""
     _check_installed()
     from companion.fleet import demo
+    from companion.fleet.store import Store
 
     logs.set_up("warning")
     with tempfile.TemporaryDirectory(prefix="companion-fleet-") as folder:
         database = Path(folder) / "fleet.sqlite"
         server = _server(options, str(database))
+        Store(str(database)).prepare()  # whoever looks at once sees an empty fleet
         mosquitto = demo.find_mosquitto()
         beside = "Mosquitto" if mosquitto else "a broker of its own"
         print_lines(f"{demo.AIRCRAFT} simulated aircraft, {beside}, and an SQLite file in {folder}, until Ctrl-C")

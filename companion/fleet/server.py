@@ -30,6 +30,8 @@ LEAST_PASSWORD: Final = 12
 WRONG_PASSWORD_S: Final = 2.0
 AGAIN_S: Final = 30
 """After so long a browser looks again."""
+SOON_S: Final = 2
+"""The same, where there was nothing to be seen."""
 CERTIFICATE_S: Final = 60.0
 """How often its files are looked at."""
 HANDSHAKE_S: Final = 10.0
@@ -166,7 +168,8 @@ class Server:
             if request.path == "/metrics" and self._counts is not None:
                 return Response(200, self._counts.text(None), metrics.CONTENT_TYPE)
             logger.warning("page: the database cannot be read: %s", why(error))
-            return _text(503, "the database cannot be read at the moment; the collector's log says why")
+            words = "the database cannot be read at the moment; the collector's log says why"
+            return _text(503, words, ("Refresh", str(SOON_S)))
 
     def _knows(self, request: Request) -> bool:
         scheme, _, given = request.headers.get("authorization", "").partition(" ")

@@ -263,6 +263,28 @@ def test_ctrl_c_cancels_the_calibration_that_is_watched(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
+def test_a_daemon_that_hangs_is_waited_for_in_words(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight_line(tmp_path) as line:
+            assert line.daemon is not None
+            line.daemon.send_signal(signal.SIGSTOP)
+            asking = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-m", "companion", "-c", str(line.config), "status"),
+                stdout=asyncio.subprocess.DEVNULL,
+                stderr=asyncio.subprocess.PIPE,
+            )
+            assert asking.stderr is not None
+            try:
+                async with asyncio.timeout(40.0):
+                    assert b"waiting for the daemon's answer" in await asking.stderr.readline()
+            finally:
+                line.daemon.send_signal(signal.SIGCONT)
+            async with asyncio.timeout(40.0):
+                assert await asking.wait() == DONE
+
+    asyncio.run(main())
+
+
 def test_kill_9_and_a_second_daemon(tmp_path: Path) -> None:
     async def main() -> None:
         async with flight_line(tmp_path) as line:

@@ -43,7 +43,9 @@ def test_one_command_shows_a_fleet(tmp_path: Path, there_is: str) -> None:
                 while len(found) < AIRCRAFT:
                     assert process.returncode is None, (tmp_path / "log").read_text()
                     with contextlib.suppress(OSError, ConnectionError):
-                        found = set(re.findall(r'href="(/aircraft/\w+)"', (await get(port))[1]))
+                        status, text = await get(port)
+                        assert status == 200, text
+                        found = set(re.findall(r'href="(/aircraft/\w+)"', text))
                     await asyncio.sleep(0.2)
             process.send_signal(signal.SIGINT)
             assert await asyncio.wait_for(process.wait(), 60.0) == 0, (tmp_path / "log").read_text()
