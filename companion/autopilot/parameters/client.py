@@ -44,6 +44,8 @@ _DOES_NOT_EXIST: Final = 1
 _REMEMBERED_TYPES: Final = 4096
 """More parameters than any firmware has; what is not remembered is asked for."""
 
+_TIMEOUT_S: Final = 1.0
+"""Of each request."""
 _TRIES: Final = 4
 _TRIES_MORE: Final = 8
 """While the autopilot's heartbeats come, or the line is known to lose packets: with a fifth of them lost both ways
@@ -59,12 +61,11 @@ _AT_ONCE: Final = 6
 class ParameterClient:
     """The parameters of one autopilot."""
 
-    def __init__(self, link: MavlinkLink, vehicle: Vehicle, *, timeout_s: float = 1.0) -> None:
+    def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
         self.writes = 0
         """How many PARAM_SET have left, repetitions included."""
         self._link = link
-        self._timeout_s = timeout_s
         self._repeated = 0.0
         """Share of requests that were answered only after a repetition, of late."""
         self._inboxes: list[Inbox] = []
@@ -93,7 +94,7 @@ class ParameterClient:
         if answer is not None:
             raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.text}")
         raise ParameterTimeoutError(
-            f"{self.vehicle.name} does not answer for {name} ({tries} requests, {self._timeout_s:g} s each)"
+            f"{self.vehicle.name} does not answer for {name} ({tries} requests, {_TIMEOUT_S:g} s each)"
             f"{self.vehicle.why_silent}"
         )
 
@@ -132,7 +133,7 @@ class ParameterClient:
             return answer
         if name in self._types:
             raise ParameterTimeoutError(
-                f"{self.vehicle.name} does not answer for {name} any more ({tries + 1} requests, {self._timeout_s:g} s"
+                f"{self.vehicle.name} does not answer for {name} any more ({tries + 1} requests, {_TIMEOUT_S:g} s"
                 f" each){self.vehicle.why_silent}"
             )
         if self.vehicle.boots == boots:
@@ -195,7 +196,7 @@ class ParameterClient:
                 message = mavlink.MAVLink_param_set_message(*self._target(), _wire_name(name), carried, kind)
                 # Nothing may be awaited between the guard and this.
                 self.writes += self._link.send(message)
-                deadline_s = self._deadline_s()
+                deadline_s = asyncio.get_running_loop().time() + _TIMEOUT_S
                 while (answer := await self._next(inbox, deadline_s)) is not None:
                     if isinstance(answer, Refusal):
                         raise ParameterRefusedError(f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer.text}")
@@ -207,7 +208,7 @@ class ParameterClient:
         if other is not None:
             raise ParameterMismatchError(f"{name} was set to {wanted:.9g}, {self.vehicle.name} answers {other:.9g}")
         raise ParameterTimeoutError(
-            f"{self.vehicle.name} does not answer to setting {name} ({tries} times, {self._timeout_s:g} s each)"
+            f"{self.vehicle.name} does not answer to setting {name} ({tries} times, {_TIMEOUT_S:g} s each)"
             f"{self.vehicle.why_silent}"
         )
 
@@ -243,9 +244,6 @@ class ParameterClient:
     def _learn_loss(self, tries: int) -> None:
         self._repeated += _LOSS_MEMORY * (float(tries > 1) - self._repeated)
 
-    def _deadline_s(self) -> float:
-        return asyncio.get_running_loop().time() + self._timeout_s
-
     async def _next(self, inbox: Inbox, deadline_s: float) -> float | Refusal | None:
         answer = await inbox.get(deadline_s)
         if isinstance(answer, Rebooted):
@@ -256,7 +254,7 @@ class ParameterClient:
         """One PARAM_REQUEST_READ and the first answer to it."""
         message = mavlink.MAVLink_param_request_read_message(*self._target(), _wire_name(name), index)
         self._link.send(message)
-        answer = await self._next(inbox, self._deadline_s())
+        answer = await self._next(inbox, asyncio.get_running_loop().time() + _TIMEOUT_S)
         if isinstance(answer, float):
             self._answering = inbox.name if index < 0 else self._answering
         return answer

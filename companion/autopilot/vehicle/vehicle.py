@@ -185,7 +185,7 @@ class Vehicle:
         finally:
             request.cancel()
 
-    async def fresh_heartbeat(self, within_s: float = FRESH_WITHIN_S) -> bool:
+    async def fresh_heartbeat(self) -> bool:
         """Ask for a heartbeat and wait for it, so that an arming is known at once and not at the next beat.
 
         The heartbeat that comes first may be another's than the one asked for: waited for is the autopilot's answer to
@@ -197,7 +197,7 @@ class Vehicle:
         self._heartbeat_waiters.append(heard)
         request = self.commands.request_message(_HEARTBEAT_ID)
         try:
-            async with asyncio.timeout(within_s):
+            async with asyncio.timeout(FRESH_WITHIN_S):
                 await request
                 await asyncio.sleep(_BEHIND_ANSWER_S)
                 await heard.wait()

@@ -33,7 +33,7 @@ class HeardUdp:
         return next((one for one in self.senders if one.is_autopilot), None)
 
 
-async def listen_udp(port: int, *, host: str = "0.0.0.0", seconds: float = LISTEN_S) -> HeardUdp:  # noqa: S104
+async def listen_udp(port: int) -> HeardUdp:
     """Take what comes to a port until an autopilot is heard, or the time is over; nothing is sent.
 
     Raises:
@@ -41,11 +41,14 @@ async def listen_udp(port: int, *, host: str = "0.0.0.0", seconds: float = LISTE
     """
     heard = _Heard()
     try:
-        transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(lambda: heard, local_addr=(host, port))
+        transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
+            lambda: heard,
+            local_addr=("0.0.0.0", port),  # noqa: S104
+        )
     except OSError as error:
         raise LinkError(f"UDP {port}: {error.strerror or error}") from None
     try:
-        await comes(heard.enough, seconds)
+        await comes(heard.enough, LISTEN_S)
     finally:
         transport.close()
     return HeardUdp(

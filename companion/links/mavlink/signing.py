@@ -120,10 +120,8 @@ class Signing:
     Without a key nothing can be signed or believed. The clock is that of all links that have the key.
     """
 
-    def __init__(
-        self, *, required: bool, key: bytes | None = None, clock: SigningClock | None = None, link_id: int = 0
-    ) -> None:
-        self.required, self.key, self.link_id = required, key, link_id
+    def __init__(self, *, required: bool, key: bytes | None = None, clock: SigningClock | None = None) -> None:
+        self.required, self.key = required, key
         self.clock = clock or SigningClock()
         self.verified = 0
         """Messages that were signed with our key."""
@@ -150,7 +148,7 @@ class Signing:
         """What is to be sent for a MAVLink 2 packet; the packet itself as long as there is no key."""
         if self.key is None:
             return frame
-        return sign(frame, crc_extra, self.key, self.link_id, self.clock.next())
+        return sign(frame, crc_extra, self.key, link_id=0, ticks=self.clock.next())
 
     def admits(self, frame: bytes | bytearray) -> bool:
         """Whether a whole packet with a right checksum may have any effect."""
