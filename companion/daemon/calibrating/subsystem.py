@@ -156,15 +156,8 @@ class Calibrating(Subsystem):
                     lambda job: into.run(job, overwrite=request.get("overwrite") is True),
                 )
             )
-            async for reply in self._progress(job):
+            async for reply in self._to_end(job, "written"):
                 yield reply
-            result = job.finished.result()
-            yield {
-                "kind": "result",
-                "state": result.outcome,
-                "reason": result.reason,
-                "written": msgspec.to_builtins(job.product),
-            }
         else:
             yield {"kind": "result", "imus": await self._core.offload(self.memory.temperature)}
 
@@ -209,15 +202,8 @@ class Calibrating(Subsystem):
             if request.get("wait") is False:
                 yield {"kind": "result", "state": self.conductor.state.shown, "reason": f"{job.kind} started"}
                 return
-            async for reply in self._progress(job):
-                yield {**reply, "job": job.kind}
-            result = job.finished.result()
-            yield {
-                "kind": "result",
-                "state": result.outcome,
-                "reason": result.reason,
-                "alignment": msgspec.to_builtins(job.product),
-            }
+            async for reply in self._to_end(job, "alignment"):
+                yield reply
 
     def _shown(self) -> Object:
         alignment, sides = self.alignment, self.faces.status()
@@ -257,6 +243,18 @@ class Calibrating(Subsystem):
                 return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
             return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
         return self.conductor.start_job(kind, what, by, timeout_s, missing, run)
+
+    async def _to_end(self, job: Job, product: str) -> AsyncIterator[Object]:
+        """How it goes, and at its end the result, with what came of it under this key."""
+        async for reply in self._progress(job):
+            yield reply
+        result = job.finished.result()
+        yield {
+            "kind": "result",
+            "state": result.outcome,
+            "reason": result.reason,
+            product: msgspec.to_builtins(job.product),
+        }
 
     async def _progress(self, job: Job) -> AsyncIterator[Object]:
         while job.is_running:
