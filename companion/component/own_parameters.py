@@ -15,19 +15,24 @@ import dataclasses
 import logging
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.parameters.wire import float32
 from companion.component.commands import Permission
 from companion.component.statustext import Say, Severity, Weight
+from companion.config.sections import AtArm
 from companion.errors import CompanionError
 from companion.links.mavlink.link import MavlinkLink
 
 logger = logging.getLogger(__name__)
 
 VALUES_PER_S = 40.0
+AT_ARM: Final[tuple[AtArm, ...]] = ("off", "warn", "gate")
+"""CMP_AT_ARM."""
+RESULTS: Final = ("none", "done", "failed", "cancelled")
+"""CMP_STATE: how the last calibration since the start has ended."""
 _REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 
 

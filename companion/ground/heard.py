@@ -145,15 +145,6 @@ def _firmware(beat: Heartbeat) -> str:
     return FIRMWARES.get(beat.said.autopilot, f"autopilot type {beat.said.autopilot}")
 
 
-RESULTS: Final[dict[float, Literal["done", "failed", "cancelled"] | None]] = {
-    0.0: None,
-    1.0: "done",
-    2.0: "failed",
-    3.0: "cancelled",
-}
-"""CMP_STATE: how the last calibration ended; None: there was none since the companion started."""
-AT_ARM: Final = ("off", "warn", "gate")
-"""CMP_AT_ARM."""
 MEANINGS: Final = {
     "CMP_GYR_TGT": "deg/h: gyro sigma that is good enough",
     "CMP_ACC_TGT": "mg: accelerometer sigma that is good enough",

@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.calibration.request import What
 from companion.component.commands import MAV_RESULT_CANCELLED, NOTHING_RAN
+from companion.component.own_parameters import AT_ARM, RESULTS
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.errors import ConfigError, NobodyHeardError
@@ -174,7 +175,7 @@ class Station:
         }.get(beat.said.system_status, "unknown")  # type: ignore[assignment] # mypy widens the literals
         found = await self._own_parameters()
         vehicle = self.vehicle
-        last = heard.RESULTS.get(found.get("CMP_STATE", -1.0))
+        last = _result(found.get("CMP_STATE"))
         reason = {
             "busy": "calibrating or writing",
             "idle": "nothing is running",
@@ -196,7 +197,7 @@ class Station:
                          if last else "last calibration: none since the companion started")  # fmt: skip
             at_arm = found.get("CMP_AT_ARM", -1.0)
             lines.append(
-                f"at arming: {heard.AT_ARM[int(at_arm)] if at_arm in (0.0, 1.0, 2.0) else 'unknown'};"
+                f"at arming: {AT_ARM[int(at_arm)] if at_arm in (0.0, 1.0, 2.0) else 'unknown'};"
                 f" results are {'written to the autopilot' if found.get('CMP_PUSH') else 'NOT written (CMP_PUSH = 0)'}"
             )
         more = {**self._more(0.0), "last": last, **sigma, "parameters": found}
@@ -315,8 +316,7 @@ class Station:
         return self._heard.busy(self._target.system_id, since_s)
 
     async def _last_result(self) -> str | None:
-        last = await self._link.get_parameter(self._target, "CMP_STATE")
-        return heard.RESULTS.get(-1.0 if last is None else last)
+        return _result(await self._link.get_parameter(self._target, "CMP_STATE"))
 
     async def _own_parameters(self) -> dict[str, float]:
         found = await self._link.parameters(self._target)
@@ -359,3 +359,8 @@ class Station:
 
     def _name(self) -> str:
         return f"component {self._target.component_id} of system {self._target.system_id}"
+
+
+def _result(state: float | None) -> str | None:
+    """How the last calibration has ended, by CMP_STATE; None: there was none, or it is not told."""
+    return RESULTS[int(state)] if state in (1.0, 2.0, 3.0) else None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.daemon.faces import subsystem as faces
 from companion.ground import heard as ground_heard
 from companion.ground.heard import Heard, Target, Vehicle
 from tests.support.ground_wire import said_by
@@ -101,10 +100,3 @@ def test_nobody_there_is_one_line_with_what_was_heard_and_what_to_try() -> None:
 )  # fmt: skip
 def test_figures(gyro: float | None, accel: float | None, expected: str) -> None:
     assert ground_heard.figures(gyro, accel) == expected
-
-
-def test_the_numbers_mean_on_the_ground_what_they_mean_in_the_daemon() -> None:
-    assert faces.AT_ARM == ground_heard.AT_ARM
-    assert {value: state for state, value in faces.STATE_NUMBER.items()} == {
-        value: state for value, state in ground_heard.RESULTS.items() if state is not None
-    }

@@ -13,7 +13,7 @@ import msgspec
 
 from companion.calibration.records.record import ImuRecord
 from companion.component.component import Component
-from companion.component.own_parameters import Parameter
+from companion.component.own_parameters import AT_ARM, RESULTS, Parameter
 from companion.component.service import JobResult
 from companion.config.sections import AtArm, Senders
 from companion.daemon.arming.subsystem import Arming
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from companion.web.server import Page
 
 
-AT_ARM: Final[tuple[AtArm, ...]] = ("off", "warn", "gate")
-STATE_NUMBER: Final = {"done": 1.0, "failed": 2.0, "cancelled": 3.0}
 LARGEST: Final = 1e6
 MONITOR_EVERY_S: Final = 0.5
 FLEET_AFTER_S: Final = 10.0
@@ -123,7 +121,7 @@ class Faces(Subsystem):
     def _show_result(self, job: Job, _result: JobResult) -> None:
         if (record := job.record) is not None:
             parameters = self.component.parameters
-            parameters.set("CMP_STATE", STATE_NUMBER[record.state])
+            parameters.set("CMP_STATE", RESULTS.index(record.state))
             parameters.set("CMP_GYR_SIG", _worst(record.imus, "gyro", DEG_H))
             parameters.set("CMP_ACC_SIG", _worst(record.imus, "accel", MG))
 

@@ -15,11 +15,11 @@ from typing import Any, Final
 
 import msgspec
 
+from companion.component.own_parameters import AT_ARM
 from companion.config import load
 from companion.config.sections import Config, Senders
 from companion.config.words import shown
 from companion.daemon.core import Offload
-from companion.daemon.faces.subsystem import AT_ARM
 from companion.daemon.process import footprint
 from companion.daemon.process.service import Service
 from companion.daemon.process.supervisor import Supervisor
