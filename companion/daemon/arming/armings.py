@@ -41,17 +41,15 @@ class Armings:
         """Keep every arming until cancelled; what is still waiting then is written as well."""
         try:
             while True:
-                await self._keep(await self._queue.get())
+                arming = await self._queue.get()
+                try:
+                    await self._offload(self._file.append, arming)
+                except StorageError as error:
+                    logger.warning("arming not kept: %s", error)
         finally:
             while not self._queue.empty():
                 with contextlib.suppress(StorageError):
                     self._file.append(self._queue.get_nowait())
-
-    async def _keep(self, arming: Arming) -> None:
-        try:
-            await self._offload(self._file.append, arming)
-        except StorageError as error:
-            logger.warning("arming not kept: %s", error)
 
     def _on_event(self, event: VehicleEvent) -> None:
         self.seen_disarmed |= event == "disarmed"

@@ -144,7 +144,8 @@ class Automatic:
             return
         if self._in_force.offsets.foreign is not None and self.stopped is None:
             self._stop(self._in_force.offsets.foreign)
-        if self.why_not() is not None or not self._is_needed():
+        in_force, now_s = self._in_force, asyncio.get_running_loop().time()
+        if self.why_not() is not None or not (in_force.findings(now_s) or in_force.worth_writing_s >= WORTH_FOR_S):
             return
         if foretold := await self._foretold():
             if await self._still_ours() and self._may_write():
@@ -189,10 +190,6 @@ class Automatic:
             return False
         status = self._collector.status(asyncio.get_running_loop().time())
         return status.waiting_for is None and status.enough and self._in_force.measured
-
-    def _is_needed(self) -> bool:
-        findings = self._in_force.findings(asyncio.get_running_loop().time())
-        return bool(findings) or self._in_force.worth_writing_s >= WORTH_FOR_S
 
     def _stop(self, why: str) -> None:
         self.stopped = why

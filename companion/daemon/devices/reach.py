@@ -40,11 +40,6 @@ class Reach:
         link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
 
     @property
-    def heard(self) -> bool:
-        """Whether a ground station is being heard."""
-        return asyncio.get_running_loop().time() - self._heard_s < SILENT_S
-
-    @property
     def answered(self) -> bool:
         """Whether the autopilot has answered anything, so that it hears us."""
         results = self._vehicle.commands.results
@@ -63,7 +58,7 @@ class Reach:
                 " companion through it; check the wire to the autopilot's RX, the baud rate and the port's protocol"
                 f"{needs}{self._vehicle.why_silent}"
             )
-        if self.heard:
+        if asyncio.get_running_loop().time() - self._heard_s < SILENT_S:
             return True, "a ground station is heard; it reaches the companion as component 191 of this vehicle"
         if self._vehicle.firmware == "px4":
             return self._px4_words()
