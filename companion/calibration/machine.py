@@ -1,7 +1,7 @@
 """The life of one calibration, as one table.
 
 No clock, no I/O, no device is known here: whoever conducts a calibration reports events and obeys the state.
-The diagram in docs/calibration.md is generated from this table.
+The diagram in docs/calibration.md is this table.
 """
 
 from __future__ import annotations
@@ -131,10 +131,3 @@ class Machine:
         except KeyError:
             raise IllegalEventError(f"{event.name} cannot happen while {self.state.value}") from None
         return self.state
-
-
-def diagram() -> str:
-    """The table as a Mermaid state diagram."""
-    lines = ["stateDiagram-v2", "    [*] --> idle"]
-    lines += [f"    {old.value} --> {new.value}: {event.value}" for (old, event), new in TRANSITIONS.items()]
-    return "\n".join(lines) + "\n"

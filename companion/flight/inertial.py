@@ -175,10 +175,8 @@ def drift(
     within_s: tuple[float, float],
     spans_s: Sequence[float],
     offsets: Mapping[str, tuple[Floats, Floats]],
-    *,
-    every_s: float = 1.0,
 ) -> dict[str, list[Drift]]:
-    """Free inertial navigation from many starts within a time, by offsets.
+    """Free inertial navigation from a start each second within a time, by offsets.
 
     Args:
         found: readings, corrected by the firmware, on the solution's clock.
@@ -187,7 +185,6 @@ def drift(
         within_s: first start and last end.
         spans_s: how long each is without aid.
         offsets: by name, what the output has more with those offsets, rad/s and m/s^2.
-        every_s: between two starts.
 
     Returns:
         By name, one of each span that fits in without a gap in the readings.
@@ -205,7 +202,7 @@ def drift(
         carried = _carry(clean.shifted(gyro, accel))
         rows = []
         for span_s in spans_s:
-            k = np.searchsorted(nodes, np.arange(first, last - span_s + 1e-9, every_s))
+            k = np.searchsorted(nodes, np.arange(first, last - span_s + 1e-9))
             j = np.minimum(np.searchsorted(nodes, nodes[k] + span_s), len(nodes) - 1)
             good = (holes[j] == holes[k]) & ~stale[k] & ~stale[j] & (j > k)
             k, j = k[good], j[good]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.calibration.machine import RESTING, TRANSITIONS, Event, IllegalEventError, Machine, State, diagram
+from companion.calibration.machine import RESTING, TRANSITIONS, Event, IllegalEventError, Machine, State
 
 
 def test_the_main_road() -> None:
@@ -65,6 +65,12 @@ def test_nothing_counts_as_right_from_the_first_write_until_it_is_concluded() ->
 def test_an_event_out_of_place_is_a_programs_fault() -> None:
     with pytest.raises(IllegalEventError, match="VERIFIED cannot happen while idle"):
         Machine().on(Event.VERIFIED)
+
+
+def diagram() -> str:
+    lines = ["stateDiagram-v2", "    [*] --> idle"]
+    lines += [f"    {old.value} --> {new.value}: {event.value}" for (old, event), new in TRANSITIONS.items()]
+    return "\n".join(lines) + "\n"
 
 
 def test_the_documented_diagram_is_the_table() -> None:

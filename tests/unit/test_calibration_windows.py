@@ -235,7 +235,7 @@ def test_a_gradienter_that_shows_one_value_has_the_sigma_of_its_last_decimal() -
 def test_heading_is_averaged_across_north() -> None:
     rng = np.random.default_rng(12)
     readings = np.mod(359.9 + rng.normal(0.0, 0.5, (40, 1)), 360.0)
-    window = heading_window(batches_of(readings, n=8))
+    window = heading_window(batches_of(readings, n=8), from_field=False, wander_deg=None)
     assert abs((window.heading_deg - 359.9 + 180.0) % 360.0 - 180.0) < 0.3
     assert 0.0 <= window.heading_deg < 360.0
     assert window.sigma_deg == pytest.approx(0.5 / math.sqrt(40.0), rel=0.4)

@@ -66,27 +66,6 @@ class Estimates:
         self._kept[work.since_s] = (work.slots[-1], found)
 
 
-class PoseSeconds(msgspec.Struct, frozen=True):
-    """The seconds of a pose sensor that count for a window."""
-
-    label: str
-    batches: list[Batch]
-    among: int
-    """Seconds of the window."""
-    from_field: bool = False
-    wander_deg: float | None = None
-
-    def some(self) -> list[Batch]:
-        """Its batches.
-
-        Raises:
-            CalibrationRefusedError: there is none.
-        """
-        if not self.batches:
-            raise CalibrationRefusedError(f"no reading from {self.label} in {self.among} s")
-        return self.batches
-
-
 class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     """Everything that a window is made of; holds nothing that changes later."""
 
@@ -95,8 +74,12 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     estimate: Callable[[], Found]
     settling: str | None = None
     """What a pose sensor's mean has to wait for."""
-    tilt: PoseSeconds | None = None
-    heading: PoseSeconds | None = None
+    tilt: list[Batch] | None = None
+    """The seconds of the gradienter that count; None: there is none. Likewise the next."""
+    heading: list[Batch] | None = None
+    from_field: bool = False
+    wander_deg: float | None = None
+    """Of the heading, both as in its window."""
     field: FieldWindow | None = None
     begun_s: dict[str, float] = {}
     """By IMU, since when it has been switched on, as far as that is known."""
@@ -113,15 +96,17 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
             raise estimates
         if self.settling is not None:
             raise CalibrationRefusedError(self.settling)
-        tilt, heading = self.tilt, self.heading
+        for name, batches in (("gradienter", self.tilt), ("compass", self.heading)):
+            if batches == []:
+                raise CalibrationRefusedError(f"no reading from {name} in {len(self.slots)} s")
         return Window(
             start_s=float(self.slots[0]),
             end_s=self.slots[-1] + 1.0,
             imus=tuple(item.window for item in estimates),
-            tilt=None if tilt is None else tilt_window(tilt.some()),
+            tilt=None if self.tilt is None else tilt_window(self.tilt),
             heading=None
-            if heading is None
-            else heading_window(heading.some(), from_field=heading.from_field, wander_deg=heading.wander_deg),
+            if self.heading is None
+            else heading_window(self.heading, from_field=self.from_field, wander_deg=self.wander_deg),
             field=self.field,
             powered_s={name: self.slots[-1] + 1.0 - since_s for name, since_s in self.begun_s.items()},
             turn=self.turn,
@@ -129,5 +114,4 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
 
     def watched_longer(self, wander_deg: float | None, begun_s: dict[str, float], turn: Turn | None) -> Measurement:
         """The same where heading and IMUs were watched for longer than their readings are known."""
-        heading = None if self.heading is None else msgspec.structs.replace(self.heading, wander_deg=wander_deg)
-        return msgspec.structs.replace(self, heading=heading, begun_s=begun_s, turn=turn or self.turn)
+        return msgspec.structs.replace(self, wander_deg=wander_deg, begun_s=begun_s, turn=turn or self.turn)

@@ -14,7 +14,7 @@ import msgspec
 
 from companion.calibration.collector.afloat import Afloat
 from companion.calibration.collector.intake import Intake, Source
-from companion.calibration.collector.measurement import Estimates, Found, Measurement, PoseSeconds, Work
+from companion.calibration.collector.measurement import Estimates, Found, Measurement, Work
 from companion.calibration.collector.outlook import Glance, Obstacle, Settings, Status, expected_s, is_enough
 from companion.calibration.collector.swell import Swell
 from companion.calibration.collector.trace import Snapshot, TraceLog
@@ -193,16 +193,15 @@ class RollingCollector(Intake):
         if not self._are_enough(slots, since_s):
             needed = self._min_good if since_s is None else self._least
             raise CalibrationRefusedError(f"still for {len(slots)} s only, needs {needed} s")
-        tilt, heading, from_field = self._tilt, self._heading, self._field is not None and self._field.from_field
         return Measurement(
             slots=slots,
             estimate=self._estimate_later(slots, since_s),
             settling=self._settles(slots, 0),
-            tilt=None if tilt is None else PoseSeconds(tilt.label, tilt.settled(slots), len(slots)),
-            heading=None
-            if heading is None
-            else PoseSeconds(heading.label, heading.settled(slots), len(slots), from_field, self.wander_deg),
-            field=self._field.window(slots) if self._field and heading else None,
+            tilt=None if self._tilt is None else self._tilt.settled(slots),
+            heading=None if self._heading is None else self._heading.settled(slots),
+            from_field=self._field is not None and self._field.from_field,
+            wander_deg=self.wander_deg,
+            field=self._field.window(slots) if self._field and self._heading else None,
             begun_s=self.begun_s,
             turn=self.turn,
         )

@@ -16,9 +16,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
-import msgspec
 import numpy as np
 
 from companion.calibration.deck.waves import Wander, Waves, fit_waves, whitened
@@ -88,25 +87,12 @@ class Found:
     """Of the heading at the end, as far as averaging goes."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Stretch:
     """The passages as arrays."""
 
-    spans: Floats
-    turn: Floats
-    turned: Floats
-    velocity: Floats
-    by_bias: Floats
-
-    @classmethod
-    def of(cls, passages: Sequence[Passage]) -> _Stretch:
-        return cls(
-            np.array([one.span_s for one in passages]),
-            np.array([one.turn for one in passages]),
-            np.array([one.turned for one in passages]),
-            np.array([one.velocity_m_s for one in passages]),
-            np.array([one.velocity_by_bias for one in passages]),
-        )
+    def __init__(self, passages: Sequence[Passage]) -> None:
+        columns = zip(*passages, strict=True)
+        self.spans, self.turn, self.turned, self.velocity, self.by_bias = map(np.array, columns)
 
     @property
     def ends(self) -> Floats:
@@ -140,7 +126,7 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
     `headings_rad` (n,) are the compass' over the middle of each, NaN where there is none; `compass_forward` (3,) is its
     forward axis in the vehicle's.
     """
-    stretch = _Stretch.of(passages)
+    stretch = _Stretch(passages)
     known = headings_rad[np.isfinite(headings_rad)]
     up = stretch.velocity[: len(passages) // 4 + 1].sum(axis=0)
     start = body_from_ned(*roll_pitch_from_up(up), float(known[0]) if len(known) else 0.0).T
@@ -292,7 +278,7 @@ def _mean_up(up: Floats, spans: Floats, white: float) -> tuple[float, float]:
     return float(covariance[2] @ (rows[:, :3].T @ rows[:, 3])), math.sqrt(covariance[2, 2])
 
 
-class Passage(msgspec.Struct, frozen=True):
+class Passage(NamedTuple):
     """A second of a moving IMU, from one knot to the next; "start" is the body's frame (FRD) at its beginning."""
 
     span_s: float

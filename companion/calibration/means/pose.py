@@ -136,9 +136,7 @@ def tilt_window(batches: Sequence[Batch]) -> TiltWindow:
     )
 
 
-def heading_window(
-    batches: Sequence[Batch], *, from_field: bool = False, wander_deg: float | None = None
-) -> HeadingWindow:
+def heading_window(batches: Sequence[Batch], *, from_field: bool, wander_deg: float | None) -> HeadingWindow:
     """The compass' window from its good batches, at least one."""
     first = batches[0].mean
     turned = np.array([np.mod(batch.mean - first + 180.0, 360.0) - 180.0 for batch in batches])

@@ -118,7 +118,9 @@ def fit(cells: Cells, sigma: Floats | None = None) -> Fit:
     a = np.zeros_like(centre)
     state = _state(edges, counts, a, h)
     for _ in range(_ROUNDS):
-        step_a, step_h = _newton(state, known)
+        aa, ah, hh = _inverse(state.information, known)
+        by_a, by_h = state.gradient
+        step_a, step_h = aa * by_a + ah * by_h, ah * by_a + hh * by_h
         # The likelihood is concave, so a short enough step is one upwards.
         size = np.where(step_h < 0.0, np.minimum(1.0, 0.9 * h / np.maximum(-step_h, 1e-300)), 1.0)
         better = _state(edges, counts, a + size * step_a, h + size * step_h)
@@ -131,7 +133,21 @@ def fit(cells: Cells, sigma: Floats | None = None) -> Fit:
         a, h, state = a + size * step_a, h + size * step_h, better
         if bool(np.all(np.abs(size * step_a) + np.abs(size * step_h) * spread <= _CONVERGED * (1.0 + np.abs(a)))):
             break
-    return _result(centre, a, h, state, identified, known, counts)
+    aa, ah, hh = _inverse(state.information, known)
+    # The mean is a / h.
+    by_a, by_h = 1.0 / h, -a / np.square(h)
+    towards_a, towards_h = by_a * aa + by_h * ah, by_a * ah + by_h * hh
+    influence = total * (towards_a * state.slopes[0] + towards_h * state.slopes[1])
+    return Fit(
+        mean=np.asarray(centre + a / h),
+        sigma=np.asarray(1.0 / h),
+        variance=np.asarray(np.maximum(towards_a * by_a + towards_h * by_h, 0.0)),
+        identified=np.asarray(identified),
+        influence=np.asarray(influence),
+        probability=np.exp(state.log_probability),
+        density=state.density,
+        slopes=state.slopes,
+    )
 
 
 class _State(msgspec.Struct, frozen=True):
@@ -206,38 +222,6 @@ def _inverse(information: Floats, known: NDArray[np.bool_]) -> Floats:
             np.where(known, 0.0, -ah / determinant),
             np.where(known, 0.0, aa / determinant),
         ]
-    )
-
-
-def _newton(state: _State, known: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    aa, ah, hh = _inverse(state.information, known)
-    by_a, by_h = state.gradient
-    return np.asarray(aa * by_a + ah * by_h), np.asarray(ah * by_a + hh * by_h)
-
-
-def _result(
-    centre: Floats,
-    a: Floats,
-    h: Floats,
-    state: _State,
-    identified: NDArray[np.bool_],
-    known: NDArray[np.bool_],
-    counts: Floats,
-) -> Fit:
-    aa, ah, hh = _inverse(state.information, known)
-    # The mean is a / h.
-    by_a, by_h = 1.0 / h, -a / np.square(h)
-    towards_a, towards_h = by_a * aa + by_h * ah, by_a * ah + by_h * hh
-    influence = counts.sum(axis=0) * (towards_a * state.slopes[0] + towards_h * state.slopes[1])
-    return Fit(
-        mean=np.asarray(centre + a / h),
-        sigma=np.asarray(1.0 / h),
-        variance=np.asarray(np.maximum(towards_a * by_a + towards_h * by_h, 0.0)),
-        identified=np.asarray(identified),
-        influence=np.asarray(influence),
-        probability=np.exp(state.log_probability),
-        density=state.density,
-        slopes=state.slopes,
     )
 
 

@@ -119,7 +119,9 @@ def huber_line(
     for _ in range(_ROUNDS):
         residual = values - level - slope * time
         weight = _weights(residual, scale, c)
-        total, centre, spread = _moments(weight, time)
+        total = weight.sum(axis=0)
+        centre = (weight * time).sum(axis=0) / total
+        spread = (weight * np.square(time - centre)).sum(axis=0)
         turn = (weight * (time - centre) * residual).sum(axis=0) / spread
         shift = (weight * residual).sum(axis=0) / total - turn * centre
         slope = slope + turn
@@ -137,12 +139,6 @@ def huber_line(
         t_statistic=np.asarray(slope / error),
         end_leverage=np.asarray(1.0 / total + np.square(at_end - centre) / spread),
     )
-
-
-def _moments(weight: Floats, time: Floats) -> tuple[Floats, Floats, Floats]:
-    total = weight.sum(axis=0)
-    centre = (weight * time).sum(axis=0) / total
-    return total, centre, (weight * np.square(time - centre)).sum(axis=0)
 
 
 RAMP_T: Final = 5.0
