@@ -46,10 +46,10 @@ class Means(msgspec.Struct, frozen=True):
     number: int
     wander_deg: float | None
     """How far the heading has wandered since the aircraft last moved, which may be before the recording."""
-    begun_s: dict[str, float] = {}
+    begun_s: dict[str, float]
     """By IMU, since when it has been on, which may be likewise."""
-    turn: Turn | None = None
-    """What was known of the platform's own rate, likewise; None: of an older version."""
+    turn: Turn
+    """What was known of the platform's own rate, likewise."""
 
 
 class Solved(msgspec.Struct, frozen=True, kw_only=True):

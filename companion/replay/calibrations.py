@@ -97,8 +97,6 @@ def record_again(recorded: Record, solution: Solution, solved_with: Mapping[str,
         again,
         started_at=recorded.started_at,
         alignment=recorded.alignment,
-        # Records of earlier versions have none.
-        cross_covariance=again.cross_covariance if recorded.cross_covariance else (),
         duration_s=recorded.duration_s,
         warnings=_with_rest(again.warnings, recorded.warnings),
         imus=tuple(

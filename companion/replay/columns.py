@@ -165,7 +165,7 @@ def meaning(name: str, below: str = "") -> tuple[str, str | None] | None:
     text = _plain(name)
     bracket = _BRACKETS.search(text)
     written = bracket["unit"] if bracket is not None else _plain(below)
-    text = _key(text[: bracket.start()] if bracket is not None else text)
+    text = re.sub(r"[^a-z0-9]+", "_", text[: bracket.start()] if bracket is not None else text).strip("_")
     if text in _TIME_NAMES:
         return "t", _TIME_NAMES[text]
     if text in _ALIASES:
@@ -186,10 +186,6 @@ def _plain(text: str) -> str:
     for odd, usual in _ODD_LETTERS:
         text = text.replace(odd, usual)
     return text
-
-
-def _key(text: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "_", text).strip("_")
 
 
 def _unit(what: str, text: str) -> str | None:

@@ -287,9 +287,9 @@ class Replay:
                 except CalibrationRefusedError as error:
                     self._calibrations.measured(detail.number, error)
                 else:
-                    self._calibrations.measured(
-                        detail.number, measurement.watched_longer(detail.wander_deg, detail.begun_s, detail.turn)
-                    )
+                    # Heading and IMUs were watched for longer than their readings are known.
+                    longer = {"wander_deg": detail.wander_deg, "begun_s": detail.begun_s, "turn": detail.turn}
+                    self._calibrations.measured(detail.number, msgspec.structs.replace(measurement, **longer))
             case "reset":
                 collector.reset(*detail)
             case "imu":

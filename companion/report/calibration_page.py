@@ -64,7 +64,7 @@ class Material(msgspec.Struct, frozen=True, kw_only=True):
 def calibration_page(material: Material, now: datetime.datetime) -> str:
     """The file's content."""
     record = material.record
-    imus = record.imus[:MAX_IMUS]
+    imus, warmth = record.imus[:MAX_IMUS], material.by_temperature[:MAX_IMUS]
     return page(
         f"Calibration {material.number}, {moment(record.started_at)}",
         now,
@@ -80,7 +80,9 @@ def calibration_page(material: Material, now: datetime.datetime) -> str:
         _pose(record),
         stillness(material.trace, material.no_trace),
         _drift(material),
-        _temperatures(material.by_temperature[:MAX_IMUS]),
+        tag("section", tag("h2", "Biases by temperature"), biases_by_temperature(warmth, looking_back=True))
+        if warmth
+        else None,
     )
 
 
@@ -288,11 +290,3 @@ def _drift(material: Material) -> Markup:
     elif record.state == "done":
         parts.append(tag("p", "The ring is this calibration.", class_="soft"))
     return tag("section", *parts)
-
-
-def _temperatures(imus: Sequence[ByTemperature]) -> Markup | None:
-    return (
-        tag("section", tag("h2", "Biases by temperature"), biases_by_temperature(imus, looking_back=True))
-        if imus
-        else None
-    )

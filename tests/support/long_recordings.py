@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.solution.site import Whereabouts
+from companion.calibration.turning.watch import Turn
 from companion.config import parse
 from companion.config.sections import Config
 from companion.configured import models
@@ -148,7 +149,7 @@ def _ticks(seconds: float) -> Iterator[Entry]:
     for k in range(1, int(seconds)):
         t_s = START_S + k + 0.4
         yield topics.JOURNAL, t_s, journal._event, (t_s, "tick", None)
-        yield topics.JOURNAL, t_s, journal._event, (t_s, "window", Means(k, None))
+        yield topics.JOURNAL, t_s, journal._event, (t_s, "window", Means(k, None, {}, Turn()))
 
 
 def write_recording(path: Path, *, seconds: float, rate_hz: float = 1000.0, imus: int = 1, read_s: float = 0.0) -> int:

@@ -258,10 +258,11 @@ def _imu(model: Model, at: Unknowns, covariance: Matrix, k: int) -> ImuAlignment
         before = model.sigma[place]
         return Figures(at.imus[k, part].copy(), sigma, (before > 0.0) & (sigma < DETERMINED * before))
 
-    level, by = _level_bias(model, at, k)
+    by = model.reading_by(at, k, LEVEL)
     return ImuAlignment(
         name=model.names[k],
-        level_bias_m_s2=level,
+        # Gravity is what the place says, as in a calibration: where it is off, so is that.
+        level_bias_m_s2=model.reading(at, k, LEVEL) - model.ground.gravity_m_s2 * LEVEL,
         level_covariance_m2_s4=by @ covariance @ by.T,
         accel_bias_m_s2=figures(Part.ACCEL_BIAS),
         scale=figures(Part.SCALE),
@@ -269,11 +270,3 @@ def _imu(model: Model, at: Unknowns, covariance: Matrix, k: int) -> ImuAlignment
         misalignment_rad=figures(Part.MISALIGNMENT),
         gyro_bias_rad_s=figures(Part.GYRO_BIAS),
     )
-
-
-def _level_bias(model: Model, at: Unknowns, k: int) -> tuple[Array, Matrix]:
-    """Reading minus gravity of a level aircraft, and its derivatives.
-
-    Gravity is what the place says, as in a calibration: where it is off, so is that.
-    """
-    return model.reading(at, k, LEVEL) - model.ground.gravity_m_s2 * LEVEL, model.reading_by(at, k, LEVEL)

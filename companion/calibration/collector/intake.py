@@ -192,13 +192,10 @@ class Intake(ABC):
         stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
         row = sample.gyro_rad_s + sample.accel_m_s2
         if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp, sample.shared_variance):
-            self._note_up(name, sample)
+            up_s = sample.t_device_s
+            if self._inputs[name].clock_from_start and up_s is not None and 0.0 <= up_s < _LONGEST_UP_S:
+                self._up[name] = (sample.t_s, up_s)
             self._evaluate()
-
-    def _note_up(self, name: str, sample: ImuSample) -> None:
-        up_s = sample.t_device_s
-        if self._inputs[name].clock_from_start and up_s is not None and 0.0 <= up_s < _LONGEST_UP_S:
-            self._up[name] = (sample.t_s, up_s)
 
     def add_tilt(self, sample: TiltSample) -> None:
         """Take one reading of the gradienter; dropped when none is expected."""

@@ -111,7 +111,3 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
             powered_s={name: self.slots[-1] + 1.0 - since_s for name, since_s in self.begun_s.items()},
             turn=self.turn,
         )
-
-    def watched_longer(self, wander_deg: float | None, begun_s: dict[str, float], turn: Turn | None) -> Measurement:
-        """The same where heading and IMUs were watched for longer than their readings are known."""
-        return msgspec.structs.replace(self, wander_deg=wander_deg, begun_s=begun_s, turn=turn or self.turn)

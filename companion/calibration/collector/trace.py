@@ -107,7 +107,7 @@ class Snapshot(msgspec.Struct, frozen=True):
                 VerdictTrace(
                     kind=kind,
                     name=name,
-                    words=tuple(_words(one) for one in column),
+                    words=tuple("" if one is None else None if one.still else one.words[:MAX_WORDS] for one in column),
                     fault=tuple(one is not None and one.fault for one in column),
                 )
                 for (kind, name), column in columns.items()
@@ -136,7 +136,3 @@ class TraceLog:
         cut = full and self._seconds[0][0] > first
         kept = tuple(second for second in self._seconds if second[0] >= first)
         return Snapshot(kept, started_s, measured_s, cut)
-
-
-def _words(said: Verdict | None) -> str | None:
-    return "" if said is None else None if said.still else said.words[:MAX_WORDS]

@@ -150,7 +150,8 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
         if self.rate_k_s:
             k_min = abs(self.rate_k_s) * 60.0
             return f"gyro {name}: its temperature moves by {k_min:.1f} K a minute, sigma allows for that"
-        words = f"gyro {name}: on for {_age(powered_s)}, may still be warming, sigma allows for that"
+        age = f"{powered_s:.0f} s" if powered_s < 120.0 else f"{powered_s / 60.0:.0f} min"
+        words = f"gyro {name}: on for {age}, may still be warming, sigma allows for that"
         at_s, sigma = self._better(powered_s, other_variance)
         return words if at_s is None else f"{words}; after {at_s / 60.0:.0f} min about {sigma / DEG_H:.0f} deg/h"
 
@@ -170,10 +171,6 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
             return prior
         share = prior / (prior + self.k_s_variance)
         return (share * self.k_s) ** 2 + share * self.k_s_variance
-
-
-def _age(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"
 
 
 def likely_k_s(powered_s: float) -> float:

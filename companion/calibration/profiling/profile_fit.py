@@ -198,7 +198,8 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Fin
     axes: list[AxisFinding] = []
     for column in range(CHANNELS):
         if not any(each.variance[0, column] > 0.0 for each in curves):
-            raise CalibrationRefusedError(f"{_axis(column)} never changes: its noise is below its last digit")
+            axis = f"{'gyro' if column < 3 else 'accel'} {_AXES[column % 3]}"
+            raise CalibrationRefusedError(f"{axis} never changes: its noise is below its last digit")
         fit, drift = fit_axis(curves, column), 0.0
         without = fit_axis(level_curves, column)
         for rest, (_, slopes) in zip(rests, level, strict=True):
@@ -220,10 +221,6 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Fin
         kept=tuple(kept),
         still_s=still_s,
     )
-
-
-def _axis(column: int) -> str:
-    return f"{'gyro' if column < 3 else 'accel'} {_AXES[column % 3]}"
 
 
 def _triad(axes: Sequence[AxisFinding], fallback: AllanModel) -> tuple[AllanModel, list[int]]:

@@ -254,7 +254,8 @@ def _expect(
     told = now.temperature_degc is not None and _told(groups)
     slope, per_k = np.zeros(3), CATALOGUE_PER_K[triad]
     if known is not None and told:
-        slope, per_k = known.line(per_k, tested=_spans(groups) >= _TESTED_K)
+        degcs = [point.temperature_degc or 0.0 for group in groups for point in group]
+        slope, per_k = known.line(per_k, tested=max(degcs) - min(degcs) >= _TESTED_K)
     seen = [[_of(point, triad) for point in group] for group in groups]
     here = [_here(group, found, triad, now, effect) for group, found in zip(groups, seen, strict=True)]
     zeros = [group[-1].zero_sigma_rad * now.gravity_m_s2 if triad == "accel" else 0.0 for group in groups]
@@ -320,11 +321,6 @@ def follow(curve: Curve, path: Path, settles: Settling | None, model: AllanModel
     """What a curve says of a window, and of the time when it is warm."""
     wander = 0.0 if settles is None else _in_run(model, max(WARM_AFTER * settles.tau_s, _SHORTEST_GAP_S))
     return along(curve, path.states, path.span_s, path.variance, settles, wander)
-
-
-def _spans(groups: Sequence[Sequence[Point]]) -> float:
-    degc = [point.temperature_degc or 0.0 for group in groups for point in group]
-    return max(degc) - min(degc)
 
 
 def _warmer(degc: float | None) -> float:

@@ -55,7 +55,8 @@ class Steps:
 
     def _add(self, channel: int, step: float) -> None:
         seen = self._seen[channel]
-        if self._times[channel] == 0 or not _is_multiple(max(step, seen) / min(step, seen)):
+        ratio = max(step, seen) / min(step, seen)
+        if self._times[channel] == 0 or not abs(ratio - round(ratio)) <= _ROUNDED:
             self._seen[channel], self._times[channel] = step, 1
         else:
             self._seen[channel] = min(step, seen)
@@ -64,7 +65,3 @@ class Steps:
     def excuse(self, batch: Batch, triad: int) -> bool:
         """Whether a second without any change of a triad (0 gyro, 1 accelerometer) may be rest."""
         return 0 <= batch.slot - self._changed[triad] <= STUCK_S
-
-
-def _is_multiple(ratio: float) -> bool:
-    return abs(ratio - round(ratio)) <= _ROUNDED
