@@ -122,12 +122,5 @@ def roll_pitch_yaw(q: Quaternion) -> Triple:
 
 def from_roll_pitch_yaw(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
     """Body FRD to NED from aerospace angles."""
-    sr, cr = math.sin(0.5 * roll_rad), math.cos(0.5 * roll_rad)
-    sp, cp = math.sin(0.5 * pitch_rad), math.cos(0.5 * pitch_rad)
-    sy, cy = math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
+    roll, pitch = from_rotation_vector((roll_rad, 0.0, 0.0)), from_rotation_vector((0.0, pitch_rad, 0.0))
+    return multiply(from_rotation_vector((0.0, 0.0, yaw_rad)), multiply(pitch, roll))

@@ -55,7 +55,7 @@ def split(
     """
     found = []
     for k, axis in enumerate(AXES):
-        ground, air = (np.array([_value(one, k) for one in each]) for each in (before, flight))
+        ground, air = (np.array([[*one.gyro_rad_s, one.down_m_s2][k] for one in each]) for each in (before, flight))
         end = _ATTITUDE_RAD[k] if k < 3 else _VELOCITY_M_S
         constant = 0.0 if k < 3 else _GRAVITY_M_S2
         aside = 0.0 if k < 3 else _LEVEL_M_S2
@@ -76,10 +76,6 @@ def split(
             )
         )  # fmt: skip
     return found
-
-
-def _value(window: Window, k: int) -> float:
-    return float(window.gyro_rad_s[k]) if k < 3 else window.down_m_s2
 
 
 def _tilt(windows: Sequence[Window]) -> float:

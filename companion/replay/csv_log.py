@@ -52,28 +52,20 @@ _WRAPS: Final = 2.0**32
 _DECIMAL_COMMA: Final = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?")
 
 
-class _Lines:
-    """The lines of a file, with the number of the one read last; a last one that is cut is left out."""
-
-    def __init__(self, file: TextIO, path: Path) -> None:
-        self.number = 0
-        self._file = file
-        self._path = path
-
-    def __iter__(self) -> Iterator[str]:
-        some, readline = False, self._file.readline
-        while line := readline(_LONGEST):
-            self.number += 1
-            if len(line) == _LONGEST:
-                raise StorageError(f"{self._path}, line {self.number}: found no line end within {_LONGEST} characters")
-            if some and not line.endswith(("\n", "\r")):
-                return  # in the middle of a number, perhaps, which then still looks like one
-            text = line.strip(" \r\n")
-            if text[:1].isdigit() or (
-                text.strip() and not text.startswith(_REMARKS) and not text.lower().startswith("sep=")
-            ):
-                some = True
-                yield text
+def _lines(file: TextIO, path: Path) -> Iterator[tuple[int, str]]:
+    """The lines of a file with their numbers; a last one that is cut is left out."""
+    some, readline = False, lambda: file.readline(_LONGEST)
+    for number, line in enumerate(iter(readline, ""), 1):
+        if len(line) == _LONGEST:
+            raise StorageError(f"{path}, line {number}: found no line end within {_LONGEST} characters")
+        if some and not line.endswith(("\n", "\r")):
+            return  # in the middle of a number, perhaps, which then still looks like one
+        text = line.strip(" \r\n")
+        if text[:1].isdigit() or (
+            text.strip() and not text.startswith(_REMARKS) and not text.lower().startswith("sep=")
+        ):
+            some = True
+            yield number, text
 
 
 def read(path: Path, columns: str | None = None, rate_hz: float | None = None, name: str = NAME) -> StillLog:
@@ -105,42 +97,41 @@ class _Table:
         self._rate_hz = rate_hz
         self._left_out: Counter[str] = Counter()
         self._notes: list[str] = []
-        self._lines = _Lines(file, path)
-        lines = iter(self._lines)
-        texts, first = self._beginning(lines)
+        lines = _lines(file, path)
+        texts, (number, first) = self._beginning(lines)
         self._separator = _separator(first, [text for _, text in texts])
         self._comma = self._separator != "," and any(map(_DECIMAL_COMMA.fullmatch, self._split(first)))
-        self._columns, self._again = self._named(texts, names)
+        self._columns, self._again = self._named(texts, names, number)
         self._width = len(self._columns.names)
         self._dates = False
-        self._data = itertools.chain((first,), lines)
+        self._data = itertools.chain(((number, first),), lines)
 
     # --- the beginning
 
-    def _beginning(self, lines: Iterator[str]) -> tuple[list[tuple[int, str]], str]:
-        """The lines of text before the first one of numbers, with their numbers; and that one."""
+    def _beginning(self, lines: Iterator[tuple[int, str]]) -> tuple[list[tuple[int, str]], tuple[int, str]]:
+        """The lines of text before the first one of numbers, and that one."""
         texts: list[tuple[int, str]] = []
         for line in lines:
-            if any(_is_data(_fields(line, separator)) for separator in _SEPARATORS):
+            if any(_is_data(_fields(line[1], separator)) for separator in _SEPARATORS):
                 return texts, line
-            texts.append((self._lines.number, line))
+            texts.append(line)
             if len(texts) > _MOST_TEXTS:
                 raise StorageError(f"{self._path}: no line of numbers among the first {_MOST_TEXTS}")
         if not texts:
             raise StorageError(f"{self._path}: the file is empty")
-        return texts, ""
+        return texts, (0, "")
 
     def _split(self, text: str) -> list[str]:
         return _fields(text, self._separator)
 
-    def _named(self, texts: Sequence[tuple[int, str]], names: str | None) -> tuple[Columns, list[str]]:
-        """The columns, and their names as they may come again further down."""
+    def _named(self, texts: Sequence[tuple[int, str]], names: str | None, first: int) -> tuple[Columns, list[str]]:
+        """The columns, and their names as they may come again further down; numbers begin in line `first`."""
         timed = self._rate_hz is None
         if names is not None:
             return columns_of(names.split(","), "--columns", timed=timed), []
         if not texts:
             raise StorageError(
-                f"{self._path}, line {self._lines.number}: no names of columns; name them: --columns t_s,gx_rad_s,..."
+                f"{self._path}, line {first}: no names of columns; name them: --columns t_s,gx_rad_s,..."
             )
         rows = [self._split(text) for _, text in texts]
         known = [sum(meaning(name) is not None for name in row) for row in rows]
@@ -192,9 +183,9 @@ class _Table:
     def _blocks(self, places: Sequence[int]) -> Iterator[tuple[list[int], Floats]]:
         """Some thousand lines at a time: their numbers, and what stands in the columns."""
         texts, numbers = [], []
-        for text in self._data:
+        for number, text in self._data:
             texts.append(text)
-            numbers.append(self._lines.number)
+            numbers.append(number)
             if len(texts) == _AT_ONCE:
                 yield self._block(texts, numbers, places)
                 texts, numbers = [], []

@@ -147,8 +147,6 @@ class _Streams:
                 sigma_deg=given.heading_sigma_deg,
                 prefers_field=self.heading is None,
             )
-        self._poses = (self.tilt, self.heading, self.field)
-        self._on_deck = given.platform == "deck"
         # A tilt of the command line is the field's, too.
         self._constant = TiltSample(0.0, given.roll_deg or 0.0, given.pitch_deg or 0.0) if tilt_given else None
 
@@ -157,12 +155,6 @@ class _Streams:
             self.notes.append(f"{what} in the log left out: it is given on the command line")
             return None
         return values
-
-    def collector(self, settings: Settings, imu: ImuInput) -> RollingCollector:
-        """One that expects what comes."""
-        collector = RollingCollector(settings, [imu], self.gradienter, self.compass, on_deck=self._on_deck)
-        collector.expect(gradienter=self.tilt is not None, compass=self.heading is not None or self.field is not None)
-        return collector
 
     def feed(self, collector: RollingCollector, at: int, now_s: float) -> None:
         """What stands in line `at` of the log."""
@@ -180,9 +172,9 @@ class _Streams:
                 collector.add_field(MagSample(now_s, (x, y, z)))
 
     @property
-    def any(self) -> bool:
-        """Whether there is anything to feed."""
-        return any(each is not None for each in self._poses)
+    def has_heading(self) -> bool:
+        """Whether one comes, or of a field."""
+        return self.heading is not None or self.field is not None
 
 
 class _Pass:
@@ -201,7 +193,9 @@ class _Pass:
         )
         self._least_s = MIN_STILL_S if given.platform == "ground" else float(MIN_S)
         imu = ImuInput(name=log.imu, rotation=rotation, profile=noise_profile(given.profile or log.profile))
-        self._collector = self._streams.collector(settings, imu)
+        tilt, compass = self._streams.gradienter, self._streams.compass
+        self._collector = RollingCollector(settings, [imu], tilt, compass, on_deck=given.platform == "deck")
+        self._collector.expect(gradienter=self._streams.tilt is not None, compass=self._streams.has_heading)
         self._found: list[Measurement] = []
         self._still_s = 0.0
         self._obstacle = ""
@@ -217,7 +211,7 @@ class _Pass:
         offset_s = _FIRST_S - float(log.t_s[0])
         end_s = float(log.t_s[-1]) + offset_s
         looked_s = _FIRST_S
-        add, feed, name = collector.add_imu, self._streams.feed if self._streams.any else None, log.imu
+        add, feed, name = collector.add_imu, self._streams.feed if log.poses is not None else None, log.imu
         for at, (now_s, gyro, accel, degc) in enumerate(_rows(log, offset_s)):
             # Whoever looks has not seen the sample yet that tells him that it is time to.
             if now_s - looked_s >= 1.0:

@@ -37,11 +37,12 @@ def flight_page(number: int, kept: KeptFlight, flights: Sequence[Flight], now: d
     imus = flight.imus[:MAX_IMUS]
     notes = [*flight.notes, *(f"IMU {imu.imu}: {words}" for imu in flight.imus for words in imu.notes)]
     hint = next_flight(flight)
+    whose = "vehicle unknown" if flight.system_id is None else f"vehicle {flight.system_id}"
     return page(
         f"Flight {number}, {_when(flight)}",
         now,
         tag("h1", f"Flight {number}"),
-        tag("p", f"{_when(flight)}, {_whose(flight)}{_how_long(flight)}, log {kept.log}"),
+        tag("p", f"{_when(flight)}, {whose}{_how_long(flight)}, log {kept.log}"),
         tag("p", figure(flight.imus) or "It did not fly, or too shortly to tell anything.", class_="lead"),
         card("fine" if hint.startswith("nothing") else "caution", tag("p", f"Next flight: {hint}.")),
         *(card("caution", tag("p", f"{one.words}.")) for one in surely_moved(flights, flight)),
@@ -57,10 +58,6 @@ def flight_page(number: int, kept: KeptFlight, flights: Sequence[Flight], now: d
 
 def _when(flight: Flight) -> str:
     return "time unknown" if flight.began_at is None else moment(flight.began_at)
-
-
-def _whose(flight: Flight) -> str:
-    return "vehicle unknown" if flight.system_id is None else f"vehicle {flight.system_id}"
 
 
 def _how_long(flight: Flight) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from companion.calibration.noise.allan import PROFILES, NoiseProfile
+from companion.calibration.noise.allan import PROFILES
 from companion.calibration.records.flight_evidence import moved
 from companion.calibration.records.flight_record import AXES, Flight, KeptFlight
 from companion.calibration.records.record import Arming, Record
@@ -129,7 +129,8 @@ def _by_temperature(directory: Path, record: Record, every: Mapping[str, KnownIm
         ):
             continue
         this = next((point for point in points if point.started_at == record.started_at), None)
-        noise = _noise(directory, identity.get("profile", "unknown"))
+        part = identity.get("profile", "unknown")
+        noise = PROFILES[part] if part in PROFILES else ProfileStore(directory).read(part).profile
         found.append(
             by_temperature(
                 name,
@@ -141,10 +142,6 @@ def _by_temperature(directory: Path, record: Record, every: Mapping[str, KnownIm
             )
         )
     return found
-
-
-def _noise(directory: Path, name: str) -> NoiseProfile:
-    return PROFILES[name] if name in PROFILES else ProfileStore(directory).read(name).profile
 
 
 def _find(entries: Sequence[Entry], wanted: str | None) -> tuple[Entry, Record]:

@@ -104,11 +104,13 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     hidden: dict[Triad, Hidden] = {}
     """By triad, where the noise spreads the integers too little for a mean."""
     dithered: bool = False
+    """Its means come from a dither, in which the telemetry followed every step of the offsets."""
     named: bool = True
-    """Its means come from a dither, in which the telemetry followed every step of the offsets; its part is known."""
+    """Its part is known."""
     covariance: NDArray[np.float64] | None = None
+    """Of a deck: 6x6 of all axes. Likewise the next."""
     by_earth: NDArray[np.float64] | None = None
-    """Of a deck: 6x6 of all axes; and 3x3, what the gyro means hold of the Earth's rate (ahead, right, down)."""
+    """3x3, what the gyro means hold of the Earth's rate (ahead, right, down)."""
     mounting: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     """Rows of the rotation from the sensor's axes."""
     warming: Warming | None = None

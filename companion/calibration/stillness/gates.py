@@ -262,12 +262,9 @@ class ImuGate:
         # T / (6 (W - 1) / W), the variances having n - 1 in their denominators.
         if _mean(ratio) <= allowed:
             return None
-        gyro, accel = _mean(ratio[:3]), _mean(ratio[3:])
-        if gyro >= accel:
-            found = math.sqrt(_mean(variance[:3])) / DEG
-            return _words(f"gyro {self._name} moves", found, found * math.sqrt(allowed / gyro), "deg/s")
-        found = math.sqrt(_mean(variance[3:])) / MG
-        return _words(f"accel {self._name} moves", found, found * math.sqrt(allowed / accel), "mg")
+        part, triad, _, _, unit, unit_name = max(_TRIADS, key=lambda each: _mean(ratio[each[1]]))
+        found = math.sqrt(_mean(variance[triad])) / unit
+        return _words(f"{part} {self._name} moves", found, found * math.sqrt(allowed / _mean(ratio[triad])), unit_name)
 
     def _displaced(self, batch: Batch) -> Verdict | None:
         name, mean = self._name, batch.mean.tolist()
