@@ -59,7 +59,10 @@ def stillness(trace: Trace | None, no_trace: str) -> Markup:
     sources = [(verdict, runs(trace, verdict)) for verdict in trace.verdicts[:MAX_SOURCES]]
     across = svg.linear([float(trace.second[0]), trace.second[-1] + 1.0], least=5.0)
     last = len(sources)
-    ticks = [(last - 1.0 - k, _short(verdict.name)) for k, (verdict, _) in enumerate(sources)]
+    ticks = [
+        (last - 1.0 - k, verdict.name if len(verdict.name) <= 10 else f"{verdict.name[:9]}…")
+        for k, (verdict, _) in enumerate(sources)
+    ]
     plot = svg.Plot(
         across,
         svg.Axis(-0.6, last + 0.2, (*ticks, (float(last) - 0.15, "used"))),
@@ -135,7 +138,3 @@ def _said(run: Run) -> str:
 
 def _when(run: Run) -> str:
     return f"{run.first} s: " if run.first == run.last else f"{run.first} s to {run.last + 1} s: "
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= 10 else name[:9] + "…"

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import Counter
+import re
 from collections.abc import Sequence
 from typing import Final
 
@@ -90,8 +90,7 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
     gate, stretch = ImuGate(name, profile, own=own), Stretch(_MIN_GOOD, max(len(batches), 1))
     stretches: list[Rest] = []
     kept: list[Batch] = []
-    obstacles: Counter[str] = Counter()
-    words: dict[str, str] = {}
+    obstacles: dict[str, list[str]] = {}
     before: int | None = None
 
     def end() -> None:
@@ -112,12 +111,13 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
             gate.accept(batch)
             kept.append(batch)
         else:
-            obstacles[verdict.what] += 1
-            words.setdefault(verdict.what, verdict.words)
+            # Movements are of one kind whatever their figures.
+            kind = verdict.words if verdict.fault else re.sub(r"[\d.]+", "", verdict.words)
+            obstacles.setdefault(kind, []).append(verdict.words)
             if stretch.start is None:
                 end()
     end()
-    obstacle = words[obstacles.most_common(1)[0][0]] if obstacles else ""
+    obstacle = max(obstacles.values(), key=len, default=[""])[0]
     return Rests(tuple(stretches), len(batches), obstacle)
 
 

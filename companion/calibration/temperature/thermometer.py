@@ -94,7 +94,8 @@ class Thermometers:
             return f"shows {degc:.2f}, allowed {LOWEST_DEGC:g} to {HIGHEST_DEGC:g} degC{_unit(degc)}"
         if len(one.jumps) == _JUMPS and one.slot - one.jumps[0] <= _WITHIN_S:
             return f"jumps: more than {JUMP_K:g} K within a second, again and again"
-        lasts_s, fine = one.slot - one.since, _is_fine(degc)
+        lasts_s = one.slot - one.since
+        fine = all(abs(degc * steps - round(degc * steps)) > _FINE_K * steps for steps in (8, 10))
         if lasts_s >= _STUCK_S and (fine or degc < _HEATED_DEGC):
             for other, then_degc in one.beside.items():
                 moved_k = abs((self._of[other].degc or 0.0) - then_degc)
@@ -115,7 +116,3 @@ def _unit(shown: float) -> str:
     }
     likely = [unit for unit, degc in units.items() if low <= degc <= high]
     return f" (in {' or '.join(likely)}?)" if likely else ""
-
-
-def _is_fine(degc: float) -> bool:
-    return all(abs(degc * steps - round(degc * steps)) > _FINE_K * steps for steps in (8, 10))
