@@ -21,7 +21,7 @@ ROWS = dict(re.findall(r"^\| `([a-z/]+)` \|(.*)\|$", DOCS, re.MULTILINE))
 def test_every_topic_has_its_row_and_no_other() -> None:
     topics = Topics("x")
     ours = {topics.status, topics.state, topics.record, topics.progress, topics.attitude}
-    ours |= {topics.request(command) for command in KEYS} | {topics.response(command) for command in KEYS}
+    ours |= {topics.request + command for command in KEYS} | {topics.response + command for command in KEYS}
     assert {f"x/{row}" for row in ROWS} == ours
 
 

@@ -102,25 +102,10 @@ class Topics:
         self.record = f"{base}/calibration/state"
         self.progress = f"{base}/calibration/progress"
         self.attitude = f"{base}/attitude"
-        self.requests = f"{base}/request/+"
-
-    @property
-    def kept(self) -> tuple[str, ...]:
+        self.kept = (self.status, self.state, self.record)
         """Those that the broker keeps."""
-        return self.status, self.state, self.record
-
-    def request(self, command: str) -> str:
-        """Where a command is asked for."""
-        return f"{self.base}/request/{command}"
-
-    def response(self, command: str) -> str:
-        """Where a command is answered."""
-        return f"{self.base}/response/{command}"
-
-    def command_in(self, topic: str) -> str | None:
-        """The command that a request's topic names; None for another topic."""
-        prefix = f"{self.base}/request/"
-        return topic.removeprefix(prefix) if topic.startswith(prefix) else None
+        self.request, self.response = f"{base}/request/", f"{base}/response/"
+        """Where a command is asked for and answered: its name follows."""
 
 
 class MqttFace:
@@ -181,7 +166,7 @@ class MqttFace:
             self._settings,
             client_id=client_id,
             will=(topics.status, OFFLINE),
-            subscriptions=(topics.requests, topics.status),
+            subscriptions=(f"{topics.request}+", topics.status),
             on_message=self._on_message,
             offload=self._offload,
         )
@@ -273,19 +258,19 @@ class MqttFace:
                 # The last will of an earlier connection, come late.
                 self.link.outbox.send_again(message.topic)
             return
-        command = self.topics.command_in(message.topic)
-        if command is not None:
+        if message.topic.startswith(self.topics.request):
+            command = message.topic.removeprefix(self.topics.request)
             self._requests.accept(command, message.payload, retained=message.retained)
         else:
             self.on_other.tell(message)
 
     def _on_retained(self, command: str) -> None:
         if self.topics is not None:
-            topic = self.topics.request(command)
+            topic = self.topics.request + command
             logger.warning(
                 "mqtt: the retained request at %s is not obeyed; delete it: mosquitto_pub -r -n -t %s", topic, topic
             )
 
     def _respond(self, command: str, response: Object, *, droppable: bool) -> None:
         if self.topics is not None and self.link is not None:
-            self.link.outbox.answer(self.topics.response(command), _json(response), droppable=droppable)
+            self.link.outbox.answer(self.topics.response + command, _json(response), droppable=droppable)
