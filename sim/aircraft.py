@@ -6,6 +6,7 @@ Frames: navigation NED, body FRD. Angles: heading clockwise from true north, pit
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.earth import Array, angles_of, body_from_ned, earth_rate_ned_rad_s, normal_gravity_m_s2
+from sim.earth import Array, angles_of, bodies_from_ned, earth_rate_ned_rad_s, normal_gravity_m_s2
 from sim.motions import Motion
 
 _EARTH_M_PER_DEG = 111_320.0
@@ -28,7 +29,7 @@ class Pose:
     heading_deg: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Site:
     """Where it stands. The height is above the ellipsoid, and taken as above sea level too: no geoid is modelled."""
 
@@ -41,7 +42,7 @@ class Site:
     """Of the magnetic field, down +; 450 mG down over 280 mG across unless a model says better (`scenario.site_at`)."""
     field_gauss: float = 0.53
 
-    @property
+    @functools.cached_property
     def field_ned_gauss(self) -> Array:
         """The Earth's magnetic field (3,), north, east, down."""
         declination, inclination = math.radians(self.declination_deg), math.radians(self.inclination_deg)
@@ -66,7 +67,7 @@ class Site:
         return self.latitude_deg + north_m / _EARTH_M_PER_DEG, self.longitude_deg + east_deg
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Iron:
     """What disturbs the magnetic field at the compass."""
 
@@ -77,7 +78,7 @@ class Iron:
     dipole_at_m: tuple[float, float, float] = (0.0, 1.0, 0.0)
     """Where that lies, seen from the compass, likewise."""
 
-    @property
+    @functools.cached_property
     def ground_ned_gauss(self) -> Array:
         """The ground magnet's field at the compass (3,): mu0 / 4 pi (3 (m r) r - m) / |r|^3, 1 T = 1e4 gauss."""
         moment, place = np.array(self.dipole_a_m2), np.array(self.dipole_at_m)
@@ -129,6 +130,11 @@ class VirtualAircraft:
         """May be changed at any time: a car parks, a tool is laid down."""
         self._epoch_s: float | None = None
         self._still: tuple[float, float, Array, Truth] | None = None
+        self._stands_until_s = math.inf
+        self._pose_rad = np.radians([pose.roll_deg, pose.pitch_deg, pose.heading_deg])
+        # What was asked last, while it moves: IMUs and compass ask for the same times, one after another.
+        self._posed: tuple[float, Array] | None = None
+        self._moved: tuple[bytes, Truth] | None = None
 
     def begin(self, loop_s: float) -> None:
         """Let aircraft time 0 be this instant of the loop's clock, unless it has begun already."""
@@ -150,11 +156,11 @@ class VirtualAircraft:
     def add(self, motion: Motion) -> None:
         """Let something happen; `motion.start_s` is aircraft time and should not lie in the past."""
         self._motions.append(motion)
-        self._still = None
+        self._still = self._posed = self._moved = None
 
     def still_at(self, t_s: float) -> bool:
         """Whether no motion acts at that time."""
-        return all(not motion.start_s <= t_s < motion.end_s for motion in self._motions)
+        return t_s < self._stands_until_s and all(not motion.start_s <= t_s < motion.end_s for motion in self._motions)
 
     def temperature_degc(self, t_s: float) -> float:
         """Temperature of the aircraft and everything on it."""
@@ -180,10 +186,18 @@ class VirtualAircraft:
         roll, pitch, heading = self.angles_rad(t_s)
         return Pose(math.degrees(pitch), math.degrees(roll), math.degrees(heading) % 360.0)
 
+    def matrices(self, t_s: Array) -> Array:
+        """NED to body at times (n), ascending: (n, 3, 3)."""
+        return bodies_from_ned(self.angles_over(t_s))
+
     def body_from_ned(self, t_s: float) -> Array:
         """The attitude matrix (3, 3)."""
         still = self._still_at(t_s)
-        return still[2] if still is not None else body_from_ned(*self.angles_rad(t_s))
+        if still is not None:
+            return still[2]
+        if self._posed is None or self._posed[0] != t_s:
+            self._posed = (t_s, self.matrices(np.array([t_s]))[0])
+        return self._posed[1]
 
     def field_gauss(self, t_s: float) -> Array:
         """The magnetic field at the compass in body axes (3,), with all that disturbs it."""
@@ -201,20 +215,23 @@ class VirtualAircraft:
         return angles_of(mounting.T @ self.body_from_ned(t_s))
 
     def truth(self, t_s: Array) -> Truth:
-        """Rates and specific forces in body axes at times (n)."""
+        """Rates and specific forces in body axes at times (n). Do not change them: they may be asked for again."""
         count = len(t_s)
         if count:
             still = self._still_at(float(t_s[0]))
             if still is not None and t_s[-1] < still[1]:
-                return Truth(np.tile(still[3].rate_rad_s, (count, 1)), np.tile(still[3].force_m_s2, (count, 1)))
-        return self._moving(t_s)
+                return Truth(still[3].rate_rad_s[None].repeat(count, 0), still[3].force_m_s2[None].repeat(count, 0))
+        key = t_s.tobytes()
+        if self._moved is None or self._moved[0] != key:
+            self._moved = (key, self._moving(t_s))
+        return self._moved[1]
 
     def truth_at(self, t_s: float) -> Truth:
         """The same at one time; arrays of shape (3,). Do not change them: they are shared while the aircraft stands."""
         still = self._still_at(t_s)
         if still is not None:
             return still[3]
-        rate, force = self._moving(np.array([t_s]))
+        rate, force = self.truth(np.array([t_s]))
         return Truth(rate[0], force[0])
 
     def _still_at(self, t_s: float) -> tuple[float, float, Array, Truth] | None:
@@ -225,13 +242,14 @@ class VirtualAircraft:
             return None
         since = max((motion.end_s for motion in self._motions if motion.end_s <= t_s), default=-math.inf)
         until = min((motion.start_s for motion in self._motions if motion.start_s > t_s), default=math.inf)
+        until = min(until, self._stands_until_s)
         rate, force = self._moving(np.array([t_s]))
-        self._still = (since, until, body_from_ned(*self.angles_rad(t_s)), Truth(rate[0], force[0]))
+        self._still = (since, until, self.matrices(np.array([t_s]))[0], Truth(rate[0], force[0]))
         return self._still
 
     def _euler(self, t_s: Array) -> tuple[Array, Array]:
         """Roll, pitch, heading (n, 3) in rad and their derivatives."""
-        angles = np.tile(np.radians([self.pose.roll_deg, self.pose.pitch_deg, self.pose.heading_deg]), (len(t_s), 1))
+        angles = self._pose_rad[None].repeat(len(t_s), 0)
         rates = np.zeros_like(angles)
         for motion in self._motions:
             if len(t_s) == 0 or t_s[-1] < motion.start_s:
@@ -253,23 +271,23 @@ class VirtualAircraft:
 
     def _moving(self, t_s: Array) -> Truth:
         angles, slopes = self._euler(t_s)
-        roll, pitch, yaw = angles.T
-        sr, cr, sp, cp, sy, cy = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch), np.sin(yaw), np.cos(yaw)
-        to_body = np.empty((len(t_s), 3, 3))
-        to_body[:, 0] = np.array([cp * cy, cp * sy, -sp]).T
-        to_body[:, 1] = np.array([sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp]).T
-        to_body[:, 2] = np.array([cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp]).T
+        to_body = bodies_from_ned(angles)
         rolling, pitching, yawing = slopes.T
-        turning = np.array(
-            [rolling - sp * yawing, cr * pitching + sr * cp * yawing, -sr * pitching + cr * cp * yawing]
-        ).T
+        # The turn about the vertical, seen from the body, and that about its own axes.
+        turning = to_body[:, :, 2] * yawing[:, None]
+        turning[:, 0] += rolling
+        turning[:, 1] += np.cos(angles[:, 0]) * pitching
+        turning[:, 2] -= np.sin(angles[:, 0]) * pitching
         force = -(to_body @ self._gravity_ned)
         for motion in self._motions:
             acting = (t_s >= motion.start_s) & (t_s < motion.end_s)
-            if acting.any():
-                force[acting] += motion.acceleration_m_s2(t_s[acting])
-                forward, right, down = motion.level_acceleration_m_s2(t_s[acting]).T
-                c, s = cy[acting], sy[acting]
+            if not acting.any():
+                continue
+            if (shaking := motion.acceleration_m_s2(t_s[acting])) is not None:
+                force[acting] += shaking
+            if (level := motion.level_acceleration_m_s2(t_s[acting])) is not None:
+                c, s = np.cos(angles[acting, 2]), np.sin(angles[acting, 2])
+                forward, right, down = level.T
                 ned = np.array([c * forward - s * right, s * forward + c * right, down]).T
                 force[acting] += np.einsum("nij,nj->ni", to_body[acting], ned)
         return Truth(turning + to_body @ self._earth_rate_ned, force)

@@ -95,8 +95,8 @@ class SerialDevice(ABC):
         if not self.streaming:
             return []
         return [
-            Frame(float(time), float(time) + self.line_time_s(len(data)), data)
-            for time, data in zip(times, encoded, strict=True)
+            Frame(time, time + self.line_time_s(len(data)), data)
+            for time, data in zip(times.tolist(), encoded, strict=True)
         ]
 
     @abstractmethod

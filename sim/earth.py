@@ -71,6 +71,18 @@ def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
     return axis_rotation(0, -roll_rad) @ axis_rotation(1, -pitch_rad) @ axis_rotation(2, -yaw_rad)
 
 
+def bodies_from_ned(angles_rad: Array) -> Array:
+    """The same of many roll, pitch, yaw (n, 3): (n, 3, 3)."""
+    sr, sp, sy = np.sin(angles_rad).T
+    cr, cp, cy = np.cos(angles_rad).T
+    rows = [
+        [cp * cy, cp * sy, -sp],
+        [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp],
+        [cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
 def angles_of(body_from_ned_matrix: Array) -> tuple[float, float, float]:
     """Roll, pitch, yaw in rad of a matrix made by `body_from_ned`."""
     c = body_from_ned_matrix

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from sim.aircraft import DEFAULT_SITE, Pose, Site, Truth, VirtualAircraft
-from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.earth import STANDARD_GRAVITY_M_S2, Array, bodies_from_ned
 from sim.motions import Motion
 
 _STEP_S: Final = 2e-3
@@ -190,20 +190,17 @@ class MovingAircraft(VirtualAircraft):
     ) -> None:
         super().__init__(pose, site, motions=motions)
         self.route = route
+        self._stands_until_s = route.start_s - 2.0 * _STEP_S
         self._known: dict[bytes, Truth] = {}
-        self._box = _matrices(np.radians([[pose.roll_deg, pose.pitch_deg, 0.0]]))[0]
+        self._box = bodies_from_ned(np.radians([[pose.roll_deg, pose.pitch_deg, 0.0]]))[0]
         """Vehicle to box."""
         self._coriolis = 2.0 * np.cross(self._earth_rate_ned, np.eye(3))
         """(3, 3), what each component of a velocity, north, east and down, is accelerated by."""
 
-    def still_at(self, t_s: float) -> bool:
-        """Before the route, and while no motion acts."""
-        return t_s < self.route.start_s and super().still_at(t_s)
-
     def matrices(self, t_s: Array) -> Array:
         """NED to box at times (n): (n, 3, 3)."""
         angles = self.route.angles_rad(t_s) + np.array([0.0, 0.0, math.radians(self.pose.heading_deg)])
-        vehicle: Array = self._box @ _matrices(angles)
+        vehicle: Array = self._box @ bodies_from_ned(angles)
         return vehicle
 
     def angles_over(self, t_s: Array) -> Array:
@@ -212,34 +209,22 @@ class MovingAircraft(VirtualAircraft):
         pitch = -np.arcsin(np.clip(c[0, 2], -1.0, 1.0))
         return np.column_stack([np.arctan2(c[1, 2], c[2, 2]), pitch, np.arctan2(c[0, 1], c[0, 0])])
 
-    def body_from_ned(self, t_s: float) -> Array:
-        """The attitude matrix (3, 3)."""
-        result: Array = self.matrices(np.array([t_s]))[0]
-        return result
-
-    def truth(self, t_s: Array) -> Truth:
-        """Rates and specific forces of the box at times (n); those asked for again (another seed) are remembered."""
-        if len(t_s) and not self._motions and float(t_s.max()) < self.route.start_s - 2.0 * _STEP_S:
-            return super().truth(t_s)  # it stands: worked out once
-        key = t_s.tobytes()
-        found = self._known.get(key)
-        if found is None:
-            found = self._moving(t_s)
-            if len(self._known) < _REMEMBERED:
-                self._known[key] = found
-        return found
-
-    def truth_at(self, t_s: float) -> Truth:
-        """The same at one time."""
-        rate, force = self.truth(np.array([t_s]))
-        return Truth(rate[0], force[0])
-
     def add(self, motion: Motion) -> None:
         """Let something happen besides; `motion.start_s` is aircraft time."""
         super().add(motion)
         self._known.clear()
 
     def _moving(self, t_s: Array) -> Truth:
+        """Those asked for again (another seed) are remembered."""
+        key = t_s.tobytes()
+        found = self._known.get(key)
+        if found is None:
+            found = self._flown(t_s)
+            if len(self._known) < _REMEMBERED:
+                self._known[key] = found
+        return found
+
+    def _flown(self, t_s: Array) -> Truth:
         turn = self.matrices(t_s)
         # [w x] = -C' C^T for C from NED to body.
         turning = -_derivative(lambda t: self.matrices(t).reshape(len(t), 9), t_s).reshape(-1, 3, 3)
@@ -252,7 +237,8 @@ class MovingAircraft(VirtualAircraft):
         for motion in self._motions:
             acting = (t_s >= motion.start_s) & (t_s < motion.end_s)
             if acting.any():
-                force[acting] += motion.acceleration_m_s2(t_s[acting])
+                if (shaking := motion.acceleration_m_s2(t_s[acting])) is not None:
+                    force[acting] += shaking
                 rate[acting] += motion.euler_rad(t_s[acting])[1]
         return Truth(rate, force)
 
@@ -261,15 +247,3 @@ class MovingAircraft(VirtualAircraft):
         c, s = math.cos(heading), math.sin(heading)
         result: Array = self.route.velocity_m_s(t_s) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         return result
-
-
-def _matrices(angles_rad: Array) -> Array:
-    """NED to body of Euler angles (n, 3): (n, 3, 3)."""
-    sr, sp, sy = np.sin(angles_rad).T
-    cr, cp, cy = np.cos(angles_rad).T
-    rows = [
-        [cp * cy, cp * sy, -sp],
-        [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp],
-        [cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp],
-    ]
-    return np.array(rows).transpose(2, 0, 1)

@@ -272,6 +272,7 @@ class ImuModel:
         gyro, accel = self.spec.gyro, self.spec.accel
         self.curve = curve or Curve((np.repeat([gyro.per_kelvin, accel.per_kelvin], 3),))
         self._white = np.repeat([gyro.white, accel.white], 3)
+        self._limit = np.repeat([gyro.limit, accel.limit], 3)
         self._slow = _SlowPath(
             np.repeat([gyro.flicker, accel.flicker], 3), np.repeat([gyro.walk, accel.walk], 3), [seed, 1]
         )
@@ -346,7 +347,10 @@ class ImuModel:
     def expected_block(self, t_s: Array) -> Array:
         """The same at times (n), ascending: (n, 6)."""
         rate, force = self.aircraft.truth(t_s)
-        return np.hstack((rate @ self._gyro_matrix.T, force @ self._accel_matrix.T)) + self._bias(t_s)
+        out = self._bias(t_s)
+        out[:, :3] += rate @ self._gyro_matrix.T
+        out[:, 3:] += force @ self._accel_matrix.T
+        return out
 
     def read(self, t_s: Array, interval_s: float) -> Array:
         """Readings (n, 6) at ascending times of samples that each average over `interval_s`.
@@ -359,7 +363,8 @@ class ImuModel:
             if triad.step > 0.0:
                 np.rint(part / triad.step, out=part)
                 part *= triad.step
-            np.clip(part, -triad.limit, triad.limit, out=part)
+        np.maximum(out, -self._limit, out=out)
+        np.minimum(out, self._limit, out=out)
         return out
 
     def _draw(self, count: int) -> Array:
@@ -370,7 +375,9 @@ class ImuModel:
 
     def _bias(self, t_s: Array) -> Array:
         thin = _thin(t_s)
-        degc = np.interp(t_s, thin, self.aircraft.temperatures_degc(thin - self.curve.lag_s))
+        degc = self.aircraft.temperatures_degc(thin - self.curve.lag_s)
+        if thin is not t_s:
+            degc = np.interp(t_s, thin, degc)
         out = self._turn_on + self.curve.at((degc - self.spec.reference_degc)[:, None])
         result: Array = out if self._slow.silent else out + self._slow.at(t_s)
         return result

@@ -41,13 +41,15 @@ class Motion(ABC):
     def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
         """Added roll, pitch, heading (n, 3) in rad, and their derivatives in rad/s."""
 
-    def acceleration_m_s2(self, t_s: Array) -> Array:
-        """Added acceleration (n, 3) of the IMU, in body axes."""
-        return np.zeros((len(t_s), 3))
+    def acceleration_m_s2(self, t_s: Array) -> Array | None:
+        """Added acceleration (n, 3) of the IMU, in body axes; None: never any."""
+        del t_s
+        return None
 
-    def level_acceleration_m_s2(self, t_s: Array) -> Array:
-        """The same (n, 3) along the heading, to the right of it, and down: of what goes up and down as a whole."""
-        return np.zeros((len(t_s), 3))
+    def level_acceleration_m_s2(self, t_s: Array) -> Array | None:
+        """The same along the heading, to the right of it, and down: of what goes up and down as a whole."""
+        del t_s
+        return None
 
     @functools.cached_property
     def leaves_rad(self) -> Array:

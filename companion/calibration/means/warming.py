@@ -227,13 +227,13 @@ def _fitted(batches: Sequence[Batch], degree: int) -> tuple[Vector, Vector] | No
 
 def _resolution_k(degc: Floats) -> float:
     """The step of a thermometer that shows a few values only; zero where it shows many."""
-    values = np.unique(degc)
+    values = sorted(set(degc.tolist()))
     if len(values) > _FEWEST:
         return 0.0
     if len(values) > 1:
         return float(np.diff(values).min())
     # One value: as coarse as its digits allow.
-    value = float(values[0])
+    (value,) = values
     return next((step for step in _STEPS_K if abs(value / step - round(value / step)) < 1e-6), 0.0)
 
 
