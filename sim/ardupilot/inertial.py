@@ -48,7 +48,6 @@ class InertialPath:
         self._random = np.random.default_rng([seed, 3, instance])
         self._noise: list[Array] = []
         self._noise_key = (0.0, 0.0)
-        self._transition = np.eye(2)
         steps = np.repeat([model.spec.gyro.step, model.spec.accel.step], 3)
         self._density = np.sqrt(model.white**2 + steps**2 / 12.0 / RAW_RATE_HZ)
         self._state = np.zeros((2, 6))
@@ -80,13 +79,12 @@ class InertialPath:
             return self._value()
         aircraft = self.model.aircraft
         if aircraft.still_at(t_s) and aircraft.still_at(self._time_s):
-            self._advance(self._correct(self.model.expected(t_s), t_s, armed=armed), span)
+            self._advance(self._correct(self.model.expected(t_s)[None], t_s, armed=armed), span)
         else:
             steps = min(math.ceil(span / _MOVING_STEP_S), 400)  # the last second is all that the filter remembers
             begin = max(self._time_s, t_s - steps * _MOVING_STEP_S)
             times = np.linspace(begin, t_s, steps + 1)[1:]
-            for expected, time in zip(self.model.expected_block(times), times, strict=True):
-                self._advance(self._correct(expected, float(time), armed=armed), (t_s - begin) / steps)
+            self._advance(self._correct(self.model.expected_block(times), t_s, armed=armed), (t_s - begin) / steps)
         self._time_s = t_s
         return self._value()
 
@@ -105,6 +103,7 @@ class InertialPath:
         return max(self._store.effective["INS_GYRO_FILTER"], 1.0)
 
     def _correct(self, raw: Array, t_s: float, *, armed: bool) -> Array:
+        """Readings (6) or (n, 6) as they come out, with the parameters and the temperature of this time."""
         store = self._store
         if self._revision != store.revision:
             self._revision = store.revision
@@ -116,7 +115,7 @@ class InertialPath:
             self._board = orientation_matrix(store)
             self._board_checked_s = t_s
         board_axes = (raw - self._warm(t_s) - self._offset) * self._scale
-        result: Array = (board_axes.reshape(2, 3) @ self._board.T).ravel()
+        result: Array = (board_axes.reshape(-1, 3) @ self._board.T).reshape(raw.shape)
         return result
 
     def _warm(self, t_s: float) -> Array:
@@ -142,19 +141,20 @@ class InertialPath:
         """The orientation in use, board to vehicle."""
         return self._board
 
-    def _advance(self, target: Array, span_s: float) -> None:
-        key = (round(span_s, 6), self._cutoff_hz())
-        if key != self._noise_key or not self._noise:
-            transition, root = self._kernel(key)
-            count = 128 if key == self._noise_key else 1  # a block once the same span has come twice
-            kicks = (root @ self._random.standard_normal((count, 2, 6))) * self._density
-            self._noise_key, self._transition, self._noise = key, transition, list(kicks)
-        state = self._state
-        state[0] -= target
-        state = self._transition @ state
-        state += self._noise.pop()
-        state[0] += target
-        self._state = state
+    def _advance(self, targets: Array, step_s: float) -> None:
+        """Let the filter follow targets (n, 6), each for a step."""
+        key = (round(step_s, 6), self._cutoff_hz())
+        transition, root = self._kernel(key)
+        if key != self._noise_key:
+            self._noise_key, self._noise = key, self._kicks(root, 1)  # a block once the same step has come twice
+        follows = np.array([1.0, 0.0]) - transition[:, 0]
+        for towards in follows[:, None] * targets[:, None]:
+            if not self._noise:
+                self._noise = self._kicks(root, 128)
+            self._state = transition @ self._state + towards + self._noise.pop()
+
+    def _kicks(self, root: Array, count: int) -> list[Array]:
+        return list((root @ self._random.standard_normal((count, 2, 6))) * self._density)
 
     def _kernel(self, key: tuple[float, float]) -> tuple[Array, Array]:
         """Transition matrix, and square root of the covariance that unit white noise adds, over a span."""
