@@ -6,10 +6,10 @@ import argparse
 import asyncio
 import datetime
 import os
-import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -31,8 +31,6 @@ from companion.errors import CompanionError, ConfigError, StorageError
 if TYPE_CHECKING:
     from companion.flight.flight import Knowledge
     from companion.storage.flights import FlightStore
-
-_TOLD_BYTES: Final = 1 << 25
 
 
 def add_commands(add: AddCommand) -> None:
@@ -64,7 +62,7 @@ async def flight(options: argparse.Namespace) -> int:
     path = await _fetched(options) if options.fetch else Path(options.file)
     known, store = _knowledge(options)
     starts, imus, lines, found = 0, 0, [], []
-    for boot in read(path, _Progress(path)):
+    for boot in read(path, _Progress()):
         starts, imus = starts + 1, imus + len(boot.imus)
         for each in await flights(boot, known):
             found.append(each)
@@ -103,17 +101,15 @@ async def _fetched(options: argparse.Namespace) -> Path:
 
 
 class _Progress:
-    """Of a large file, a line that counts."""
+    """Once a second, where reading takes so long, how far it is."""
 
-    def __init__(self, path: Path) -> None:
-        self._shown, self._stream = -1, sys.stderr
-        self._large = path.is_file() and path.stat().st_size > _TOLD_BYTES
+    def __init__(self) -> None:
+        self._next_s = time.monotonic() + 1.0
 
     def __call__(self, share: float) -> None:
-        if self._large and (now := int(share * 20.0) * 5) != self._shown:
-            self._shown = now
-            self._stream.write(f"reading: {now} %\n")
-            self._stream.flush()
+        if (now_s := time.monotonic()) >= self._next_s:
+            self._next_s = now_s + 1.0
+            print_lines(f"reading: {share:.0%}", error=True)
 
 
 def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | None]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import struct
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -117,6 +119,14 @@ def test_a_flight_is_told_with_what_its_calibration_was_worth(
     assert at_30["before"]["median_m"] > 2.0 * at_30["flown"]["median_m"]
     # White noise of 20 deg/h/rtHz: some metres.
     assert at_30["right"]["median_m"] < 8.0
+
+
+def test_slow_reading_is_counted(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # As on a board whose processor has other work: each look at the clock is a second later.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("companion.cli.flight.time", SimpleNamespace(monotonic=itertools.count().__next__))
+        assert companion(["flight", str(log), *storage(tmp_path)]) == 0
+    assert "reading: 100%\n" in capsys.readouterr().err
 
 
 def test_people_read_the_figure_that_counts(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
