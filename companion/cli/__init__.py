@@ -35,8 +35,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(logs.OneLineFormatter())
-    options = _options(arguments)
     try:
+        options = _options(arguments)
         return asyncio.run(_dispatch(options))
     except ConfigError as error:
         print_lines(error, error=True)

@@ -215,10 +215,10 @@ async def web_token(options: argparse.Namespace) -> int:
 
 async def check(options: argparse.Namespace) -> int:
     """`companion check`."""
-    from companion.daemon.process.check import run_check
-
     config = load_config(options, profiles=True)
     print_lines(f"checking: {options.seconds:g} s, half a minute more for a sensor not understood", error=True)
+    from companion.daemon.process.check import run_check  # takes seconds on a small board
+
     findings = await run_check(config, options.seconds)
     good = all(finding.good for finding in findings)
     reason = "; ".join(f"{finding.name}: {finding.words}" for finding in findings if not finding.good)

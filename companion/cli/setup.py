@@ -300,12 +300,12 @@ class _Session:
 
     async def _take_other_imus(self, draft: Draft, parsed: Config, *, by_default: bool) -> None:
         """Those that the autopilot has besides; it is asked, and nothing is written to it."""
-        from companion.daemon.process.check import answering_imus
-
         others = draft.other_imus()
         if not others:
             return
         self.asking.say("", "Asking the autopilot which IMUs it has:")
+        from companion.daemon.process.check import answering_imus  # takes seconds on a small board
+
         logging.disable(logging.WARNING)  # what is wrong with an IMU that there is not
         try:
             there = await answering_imus(parsed, [Imu(**one) for one in others], IMUS_S)

@@ -40,7 +40,7 @@ EVERYTHING: dict[str, Any] = {
         ((), Rung.FAULT, "the disk is full", "other"),
         (("fault",), Rung.CONFLICT, "two autopilots", "unknown"),
         (("fault", "conflict"), Rung.BUSY, "a calibration is running (hold still 3 s more)", "busy"),
-        (("fault", "conflict", "job"), Rung.UNKNOWN, "no heartbeat for 7 s: armed?", "unknown"),
+        (("fault", "conflict", "job"), Rung.UNKNOWN, "no heartbeat for 7 s: power? cable?", "unknown"),
         (("fault", "conflict", "job", "arm_state"), Rung.PENDING, "putting old values back first", "busy"),
     ],
 )

@@ -1,4 +1,4 @@
-"""What a start costs, without a clock: what is imported up to the first heartbeat."""
+"""What a start costs, without a clock: what is imported up to the first heartbeat; and one that is broken off."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from companion import cli
 from companion.calibration.request import What
 from companion.config import parse
 from companion.daemon.job import Job, JobCancelledError
@@ -126,3 +128,8 @@ def test_a_pause_ends_when_there_is_something_to_look_at() -> None:
             await job.pause(1.0)
 
     run_virtual(main())
+
+
+def test_ctrl_c_before_the_command_line_is_read_leaves_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli, "_parser", Mock(side_effect=KeyboardInterrupt))
+    assert cli.main(["status"]) == 1

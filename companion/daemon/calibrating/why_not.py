@@ -77,7 +77,7 @@ def _obstacles(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[Ob
         yield Obstacle(Rung.ARMED, "armed: disarm first")
     if vehicle.arm_state is ArmState.UNKNOWN:
         age_s = vehicle.heartbeat_age_s
-        words = "no autopilot heard yet" if age_s is None else f"no heartbeat for {age_s:.0f} s: armed?"
+        words = "no autopilot heard yet" if age_s is None else f"no heartbeat for {age_s:.0f} s: power? cable?"
         yield Obstacle(Rung.UNKNOWN, words)
     if ledger.pending:
         yield Obstacle(Rung.PENDING, "putting old values back first")

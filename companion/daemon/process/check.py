@@ -29,6 +29,8 @@ from companion.protocols.registry import PROTOCOLS, main_kind
 
 STOP_FIRST: Final = "to try other speeds: sudo systemctl stop companion, then companion check again"
 ONLY_CHECKING: Final = "only a check is running: start companion run"
+LOST_S: Final = 5.0
+"""So long after its last heartbeat, of which there is one a second, an autopilot is gone."""
 _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
 
@@ -227,8 +229,11 @@ async def answering_imus(config: Config, imus: Sequence[Imu], seconds: float) ->
 
 def _autopilot(config: Config, vehicle: Object) -> Finding:
     """Whether it is heard; where not, what its end of the line needs."""
-    if vehicle["system_id"] is not None:
-        return Finding("autopilot", good=True, words=vehicle["summary"])
+    if (age_s := vehicle["heartbeat_age_s"]) is not None:
+        if age_s < LOST_S:
+            return Finding("autopilot", good=True, words=vehicle["summary"])
+        remedy = "power? cable?"
+        return Finding("autopilot", good=False, words=f"no heartbeat for {age_s:.0f} s: {remedy}", remedy=remedy)
     baud = baud_of(config.mavlink.url)
     needs = "switched on, and sent there (MAVProxy --out, mavlink-router)?"
     if baud is not None:
