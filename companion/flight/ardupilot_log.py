@@ -60,7 +60,8 @@ def read(path: Path, progress: Progress) -> Iterator[Boot]:
 
 def _boot(start: Start) -> Boot:
     parameters = {name: value for _, name, value in start.parameters}
-    cores = _cores(parameters)
+    mask = round(parameters.get("EK3_IMU_MASK", 3.0))
+    cores = [k for k in range(_IMUS) if mask >> k & 1]  # by EKF core, its IMU from 0
     lanes = _lanes(start)
     simulated = bool(start.instances("SIM"))
     return Boot(
@@ -82,12 +83,6 @@ def _boot(start: Start) -> Boot:
             *(("the EKF has changed its lane: measured from the one in use",) if np.ptp(lanes[:, 1]) else ()),
         ),
     )
-
-
-def _cores(parameters: dict[str, float]) -> list[int]:
-    """By EKF core, its IMU from 0."""
-    mask = round(parameters.get("EK3_IMU_MASK", 3.0))
-    return [k for k in range(_IMUS) if mask >> k & 1]
 
 
 def _lanes(start: Start) -> Floats:

@@ -79,21 +79,18 @@ class Source:
         """As a pilot calls it."""
         return f"imu {self.name}" if self.kind == "imu" else self.name
 
-    def batch_for(self, slot: int) -> Batch | None:
-        """The batch of that second; of a slow pose sensor the last one, for a short while."""
-        first, batches = slot if self.kind == "imu" else slot - _CARRY, self.batches.batches
-        return next((batches[at] for at in range(slot, first - 1, -1) if at in batches), None)
-
     def judge(self, slot: int, *, moved: bool = False) -> bool:
         """Whether this source was still in that second, in which by the IMUs the aircraft `moved`; remembers it."""
-        batch = self.batch_for(slot)
+        # Of a slow pose sensor the last one, for a short while.
+        first, batches = slot if self.kind == "imu" else slot - _CARRY, self.batches.batches
+        batch = next((batches[at] for at in range(slot, first - 1, -1) if at in batches), None)
         if self.settling is not None:
             own = batch if batch is not None and batch.slot == slot else None
             if not self.settling.judge(slot, own, moved=moved):
                 self.unsettled.append(slot)
         if batch is None:
             # Before the first whole second there is nothing to complain about.
-            words = f"{self.label} was silent for a second" if self.batches.batches else ""
+            words = f"{self.label} was silent for a second" if batches else ""
             self.verdict = Verdict(still=False, words=words, fault=True)
         elif batch.slot == slot:
             verdict = self.gate.judge(batch)

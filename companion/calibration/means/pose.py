@@ -19,7 +19,7 @@ from companion.calibration.noise.allan import white_noise
 from companion.calibration.noise.robust import huber_mean
 from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.calibration.seconds.resolution import decimal, few_distinct
-from companion.physics.frames import Array, Floats, Matrix, body_from_ned, roll_pitch_from_up
+from companion.physics.frames import Array, Floats, Matrix, body_from_ned, roll_pitch_from_up, vector
 from companion.physics.gradienter import Law, up_in_sensor
 from companion.physics.magnetic import heading_rad
 from companion.physics.units import DEG
@@ -149,13 +149,6 @@ def heading_window(batches: Sequence[Batch], *, from_field: bool, wander_deg: fl
     )
 
 
-def field_window(batches: Sequence[Batch], unit: FieldUnit) -> FieldWindow:
-    """The field's window from the batches of good seconds, at least one."""
-    mean, sigma = _pose_mean(batches, np.array([batch.mean for batch in batches]))
-    (x, y, z), (sx, sy, sz) = mean.tolist(), sigma.tolist()
-    return FieldWindow(field=(x, y, z), sigma=(sx, sy, sz), unit=unit)
-
-
 def _pose_mean(batches: Sequence[Batch], values: Floats) -> tuple[Floats, Floats]:
     slots = np.array([batch.slot for batch in batches], dtype=np.int64)
     variance = np.square(white_noise(slots, values)) / len(values) + np.square(_resolution(batches)) / 12.0
@@ -229,7 +222,10 @@ class FieldHeading:
     def window(self, slots: Sequence[int]) -> FieldWindow | None:
         """The mean field of these seconds; None where nothing came in them."""
         found = [self.batches.batches[slot] for slot in slots if slot in self.batches.batches]
-        return field_window(found, self.unit) if found else None
+        if not found:
+            return None
+        mean, sigma = _pose_mean(found, np.array([batch.mean for batch in found]))
+        return FieldWindow(field=vector(mean), sigma=vector(sigma), unit=self.unit)
 
     def _in_unit(self, sample: MagSample) -> Array | None:
         unit: FieldUnit = "gauss"

@@ -129,7 +129,8 @@ def kept(points: Sequence[Point]) -> tuple[Point, ...]:
     """
     groups = [_thinned(group) for group in by_power_up(points)]
     while len(groups) > KEEP_POWER_UPS:
-        told = [{_step(point) for point in group} for group in groups]
+        degcs = [[point.temperature_degc for point in group] for group in groups]
+        told = [{None if degc is None else math.floor(degc / NEAR_K) for degc in group} for group in degcs]
         often = Counter(step for steps in told for step in steps)
         rarest = [min(often[step] for step in steps) for steps in told[:-_LATEST]]
         del groups[rarest.index(max(rarest))]
@@ -144,10 +145,6 @@ def _thinned(group: Sequence[Point]) -> Sequence[Point]:
         steps = [abs((b.temperature_degc or 0.0) - (a.temperature_degc or 0.0)) for a, b in itertools.pairwise(left)]
         del left[min(range(len(steps)), key=lambda k: (ranks[k], steps[k]))]
     return left
-
-
-def _step(point: Point) -> int | None:
-    return None if point.temperature_degc is None else math.floor(point.temperature_degc / NEAR_K)
 
 
 def believed(points: Sequence[Point], triad: Triad) -> list[list[Point]]:

@@ -229,9 +229,11 @@ class ImuLevel:
         step = None
         if self._steps[0] == 0.0 and len(seconds) >= RESTED_S + LEVEL_S:
             step = _step(seconds[:, _SLOT], seconds[:, _RATES] @ down, white, self._gyro, len(slots))
+        up, moves = -down, slope.per_s[3:] / _length(force)
         return Look(
             change=change,
-            tilting_rad_s=_tilting(-down, slope.per_s[3:] / _length(force)),
+            # d up / dt = -rate x up, so that the level part of the rate is (d up / dt) x up.
+            tilting_rad_s=np.cross(moves - up * (up @ moves), up),
             tilting_variance=float(slope.variance[3:].max()) / _length(force) ** 2,
             step=step,
             white=white,
@@ -282,13 +284,6 @@ class ImuLevel:
 
 def _length(vector: Floats) -> float:
     return math.sqrt(vector @ vector)
-
-
-def _tilting(up: Array, moves: Array) -> Array:
-    """The level part, (3,), of the rate at which a direction moves."""
-    moves = moves - up * (up @ moves)
-    # d up / dt = -rate x up, so that the level part of the rate is (d up / dt) x up.
-    return np.cross(moves, up)
 
 
 def _step(slots: Floats, values: Floats, white: float, model: AllanModel, window: int) -> Step | None:

@@ -24,7 +24,7 @@ from companion.calibration.noise.slope import FEWEST, fit_slope, hidden_by_steps
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.seconds.recent import Recent
 from companion.calibration.seconds.resolution import few_distinct, step
-from companion.calibration.turning.level import Change, Common, ImuLevel, Look, Step, common_change
+from companion.calibration.turning.level import Change, Common, ImuLevel, Step, common_change
 from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.physics.units import DEG
 from companion.samples import Vector
@@ -245,7 +245,8 @@ class TurnWatch:
 
     def _judge(self, slot: int) -> bool:
         looks = {name: look for name, level in self._levels.items() if (look := level.look()) is not None}
-        step = self._step(looks)
+        # By the quietest gyro: a turn is in all of them.
+        step = min(looks.values(), key=lambda look: look.white).step if looks else None
         if step is not None and step.sigmas > STEP_SIGMAS and step.beats_drift_by > STEP_CHI_SQUARE:
             for level in self._levels.values():
                 level.split(step.first, turn_variance=self._unknown)
@@ -295,11 +296,6 @@ class TurnWatch:
         if step.sigmas > SUSPECT_SIGMAS and step.beats_drift_by > SUSPECT_CHI_SQUARE:
             self._suspected_rad_s = max(abs(step.jump_rad_s), self._suspected_rad_s)
         return max(abs(step.off_rad_s), self._suspected_rad_s)
-
-    @staticmethod
-    def _step(looks: Mapping[str, Look]) -> Step | None:
-        """By the quietest gyro: a turn is in all of them."""
-        return min(looks.values(), key=lambda look: look.white).step if looks else None
 
     def _turning(self, rate_rad_s: float) -> str:
         words = f"the aircraft {Turn(rate_rad_s=rate_rad_s).in_words}"
