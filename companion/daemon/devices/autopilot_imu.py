@@ -19,7 +19,6 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, rivals_
 from companion.autopilot.firmware.px4 import SlotMemory
 from companion.autopilot.telemetry.ekf_bias import EkfBias
 from companion.autopilot.telemetry.imu_stream import ImuStream, StreamKind
-from companion.autopilot.vehicle.rereading import Rereading
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.config.sections import Imu
 from companion.configured import models
@@ -73,8 +72,8 @@ class AutopilotImu:
         self._ours = 0
         self._announced: _Announced | None = None
         self._pause_s = 0.0
-        # Somebody may have changed them while we heard nothing; if so, `refresh` voids what was collected.
-        self._rereading = Rereading(core.vehicle, self._read, self.name, retry_s=RETRY_S, level=logging.WARNING)
+        self._stale = asyncio.Event()
+        self._stale.set()
         self._grid = (0.0, 0.0)
         """The sensor's own steps, rad/s and m/s^2; 0 where they do not matter."""
         self.stream = ImuStream(
@@ -93,7 +92,7 @@ class AutopilotImu:
         """Ask for the telemetry and follow the offsets until cancelled."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self.stream.run(), name=f"{self.name} telemetry")
-            group.create_task(self._rereading.run(), name=f"{self.name} offsets")
+            group.create_task(self._follow(), name=f"{self.name} offsets")
 
     @contextlib.contextmanager
     def changing(self) -> Iterator[None]:
@@ -178,7 +177,7 @@ class AutopilotImu:
         self.calibration = None
         self.problem = f"reading its offsets again ({why})"
         self._collector.reset(why, self.name)
-        self._rereading.again()
+        self._stale.set()
 
     def _upset(self, why: str) -> None:
         self.upsets, self.upset = self.upsets + 1, why
@@ -194,7 +193,7 @@ class AutopilotImu:
         elif not self._rival_changed(known, name, value):
             return  # else what is in force is the same, but not what will become of it
         self._pause_s = REREAD_EVERY_S
-        self._rereading.again()
+        self._stale.set()
 
     def _rival_changed(self, calibration: ImuCalibration, name: str, value: float) -> bool:
         known = {rival.parameter: rival.value for rival in calibration.rivals}
@@ -203,17 +202,28 @@ class AutopilotImu:
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "rebooted":
             self._upset("the autopilot rebooted")
+        elif event == "found":
+            # Somebody may have changed them while we heard nothing; if so, `refresh` voids what was collected.
+            self._stale.set()
 
-    async def _read(self) -> None:
-        if self._ours:
-            return
-        try:
-            await self.refresh()
-        except AutopilotError as error:
-            self.problem, self.failures = str(error), self.failures + 1
-            raise
-        pause_s, self._pause_s = self._pause_s, 0.0
-        await asyncio.sleep(pause_s)
+    async def _follow(self) -> None:
+        while True:
+            await self._stale.wait()
+            self._stale.clear()
+            await self._vehicle.found.wait()
+            if self._ours:
+                continue
+            try:
+                await self.refresh()
+            except AutopilotError as error:
+                self.problem = str(error)
+                self.failures += 1
+                logger.warning("%s: %s", self.name, error)
+                self._stale.set()
+                await asyncio.sleep(RETRY_S)
+            else:
+                pause_s, self._pause_s = self._pause_s, 0.0
+                await asyncio.sleep(pause_s)
 
     def status(self) -> dict[str, object]:
         """For `companion status` and `check`."""
