@@ -291,7 +291,7 @@ def test_all_sections_are_made_of_the_same_stands(monkeypatch: pytest.MonkeyPatc
     for module in (tables, warmup_table):
         monkeypatch.setattr(module, "WARMING", extent(whole=WARMING, a_slice=WARMING[:1]))
     said: list[str] = []
-    found = report(4, 7, cli.SECTIONS, 1, said.append)
+    found = report(2, 7, cli.SECTIONS, 1, said.append)
     assert tuple(found) == cli.SECTIONS
     assert len(said) == 9
     assert all(len(line) <= 100 for section in found.values() for line in section.lines)
