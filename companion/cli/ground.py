@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import logging
 import re
 import signal
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -102,7 +102,8 @@ async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Aw
     url, key_file = getattr(options, "url", DEFAULT_URL), getattr(options, "signing_key_file", None)
     key = None if key_file is None else _key(key_file)
     heard = Heard(getattr(options, "component", 191))
-    with _quiet(), Display() as display:
+    # MAVSDK prints some of its own troubles on stdout, which is for the answer alone.
+    with contextlib.redirect_stdout(sys.stderr), Display() as display:
         async with open_link(url, heard, key) as link:
             station = Station(link, url, display)
             try:
@@ -112,16 +113,6 @@ async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Aw
             async with _interruptible(station):
                 outcome = await work(station)
     return conclude(options, outcome.answer, outcome.lines, good=outcome.good)
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """What is wrong with the link is said once, with what comes of it, and not by the log as well."""
-    logging.disable(logging.WARNING)
-    try:
-        yield
-    finally:
-        logging.disable(logging.NOTSET)
 
 
 @contextlib.asynccontextmanager

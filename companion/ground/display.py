@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Self
 
 from companion.errors import ConfigError
+from companion.ground.link import INSTALL
 from companion.printable import printable
-
-INSTALL: Final = "install it with: pip install '.[ground]' (in the folder of the companion's sources)"
 
 
 class Display:

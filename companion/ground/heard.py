@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final, Literal, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.statustext import GOES_ON, to_ascii
-from companion.links.mavlink.link import Message
 from companion.links.system.listeners import Listeners
 from companion.protocols.heartbeat import FIRMWARES
 
@@ -18,6 +18,8 @@ MAX_PEERS: Final = 64
 """The most senders that are remembered; newcomers beyond are not."""
 MAX_TEXTS: Final = 200
 
+Fields = Mapping[str, object]
+
 
 class Target(NamedTuple):
     """A component of a vehicle."""
@@ -26,15 +28,13 @@ class Target(NamedTuple):
     component_id: int
 
 
-def sender_of(message: Message) -> Target:
-    """Who says so."""
-    return Target(message.get_srcSystem(), message.get_srcComponent())
-
-
 class Heartbeat(NamedTuple):
     """The last heartbeat of a component."""
 
-    said: mavlink.MAVLink_heartbeat_message
+    kind: int
+    autopilot: int
+    base_mode: int
+    system_status: int
     at_s: float
 
 
@@ -65,7 +65,7 @@ class Vehicle(NamedTuple):
 
 
 class Heard:
-    """Takes messages as they come. What other components say is not kept."""
+    """Takes messages as they come; never raises, whatever they hold. What other components say is not kept."""
 
     def __init__(self, component_id: int) -> None:
         self.component_id = component_id
@@ -77,23 +77,12 @@ class Heard:
         self.on_text: Listeners[[int, Text]] = Listeners()
         """Told of every text, with its system id."""
 
-    def hear_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, now_s: float) -> None:
-        """Take a HEARTBEAT."""
-        if self.first_s is None:
-            self.first_s = now_s
-        source = sender_of(message)
-        if source in self.heartbeats or len(self.heartbeats) < MAX_PEERS:
-            self.heartbeats[source] = Heartbeat(message, now_s)
-
-    def hear_text(self, message: mavlink.MAVLink_statustext_message, now_s: float) -> None:
-        """Take a STATUSTEXT."""
-        source = sender_of(message)
-        if source.component_id == self.component_id:
-            # Whatever it was: on a terminal it can do nothing but be read.
-            text = Text(message.severity, to_ascii(message.text), now_s)
-            self.texts.append((source.system_id, text))
-            del self.texts[:-MAX_TEXTS]
-            self.on_text.tell(source.system_id, text)
+    def update(self, name: str, source: Target, fields: Fields, now_s: float) -> None:
+        """Take a HEARTBEAT or STATUSTEXT; others are not looked at."""
+        if name == "HEARTBEAT":
+            self._heartbeat(source, fields, now_s)
+        elif name == "STATUSTEXT" and source.component_id == self.component_id:
+            self._text(source.system_id, fields, now_s)
 
     def companions(self) -> list[int]:
         """The system ids of the vehicles whose companion was heard."""
@@ -106,15 +95,15 @@ class Heard:
             return Vehicle(system_id, None, "unknown")
         armed: Literal["armed", "disarmed", "unknown"] = "unknown"
         if now_s - beat.at_s <= FRESH_S:
-            armed = "armed" if beat.said.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED else "disarmed"
-        return Vehicle(system_id, _firmware(beat), armed)
+            armed = "armed" if beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED else "disarmed"
+        return Vehicle(system_id, FIRMWARES.get(beat.autopilot, f"autopilot type {beat.autopilot}"), armed)
 
     def busy(self, system_id: int, since_s: float) -> bool | None:
         """Whether the companion is at work, by a heartbeat later than `since_s`; None: there was none."""
         beat = self.heartbeats.get(Target(system_id, self.component_id))
         if beat is None or beat.at_s <= since_s:
             return None
-        return beat.said.system_status == mavlink.MAV_STATE_CALIBRATING
+        return beat.system_status == mavlink.MAV_STATE_CALIBRATING
 
     def texts_of(self, system_id: int, since_s: float) -> list[Text]:
         """What the vehicle's companion has said since then; a line that goes on is part of the one before it."""
@@ -133,16 +122,35 @@ class Heard:
         """Who was heard, in a few words; empty when nobody was."""
         vehicles, others = [], []
         for (system, component), beat in sorted(self.heartbeats.items()):
-            if component == mavlink.MAV_COMP_ID_AUTOPILOT1 and beat.said.type not in _NO_VEHICLES:
-                vehicles.append(f"system {system} ({_firmware(beat)})")
+            if component == mavlink.MAV_COMP_ID_AUTOPILOT1 and beat.kind not in _NO_VEHICLES:
+                vehicles.append(
+                    f"system {system} ({FIRMWARES.get(beat.autopilot, f'autopilot type {beat.autopilot}')})"
+                )
             else:
-                station = " (a ground station)" if beat.said.type == mavlink.MAV_TYPE_GCS else ""
+                station = " (a ground station)" if beat.kind == mavlink.MAV_TYPE_GCS else ""
                 others.append(f"{system}/{component}{station}")
         return ", ".join([*vehicles, *others])
 
+    def _heartbeat(self, source: Target, fields: Fields, now_s: float) -> None:
+        if self.first_s is None:
+            self.first_s = now_s
+        if source in self.heartbeats or len(self.heartbeats) < MAX_PEERS:
+            self.heartbeats[source] = Heartbeat(
+                _whole(fields, "type"), _whole(fields, "autopilot"), _whole(fields, "base_mode"),
+                _whole(fields, "system_status"), now_s,
+            )  # fmt: skip
 
-def _firmware(beat: Heartbeat) -> str:
-    return FIRMWARES.get(beat.said.autopilot, f"autopilot type {beat.said.autopilot}")
+    def _text(self, system_id: int, fields: Fields, now_s: float) -> None:
+        # Whatever it was: on a terminal it can do nothing but be read.
+        text = Text(_whole(fields, "severity"), to_ascii(str(fields.get("text", "")).rstrip("\0")), now_s)
+        self.texts.append((system_id, text))
+        del self.texts[:-MAX_TEXTS]
+        self.on_text.tell(system_id, text)
+
+
+def _whole(fields: Fields, name: str) -> int:
+    value = fields.get(name)
+    return value if isinstance(value, int) else 0
 
 
 MEANINGS: Final = {

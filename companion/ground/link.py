@@ -1,123 +1,219 @@
-"""The link from the ground: a ground station's heartbeat, commands, and the parameters of one component.
+"""The link from the ground, on MAVSDK 4.1.
 
-It is the same link as the aircraft's, from the other side; signed where there is a key.
+Of MAVSDK's parts two serve here: MavlinkDirectServer, which sends and hears any message from the start, before MAVSDK
+has found a system, and Param, a parameter client with retries. Its `send_command` would also wait for a final ACK, but
+keeps the progress to itself, repeats with confirmation 0 (which is a new request) and does not ask again when the
+final answer was lost: `exchange` does that.
+
+MAVSDK 4.1 has no signing: where there is a key it is given whole messages that were checked, over its own `raw://`
+connection, and what it sends is signed; the link itself is the companion's then.
+
+MAVSDK calls back in threads of its own; everything here goes on in the event loop.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+import contextlib
+import json
+import logging
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from typing import Final
+from typing import Any, ClassVar, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.wire import REAL32, same_float32
-from companion.errors import LinkError
-from companion.ground.heard import Ack, Heard, Target, sender_of
+from companion.errors import AutopilotError, ConfigError, LinkError
+from companion.ground.heard import Ack, Heard, Target
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.mavlink.signing import Signing
-from companion.links.mavlink.transport import run_transport
+from companion.links.mavlink.transport import parse_url, run_transport
 from companion.links.system.listeners import Listeners
-from companion.links.system.waiting import comes
 
-OWN: Final = Target(245, mavlink.MAV_COMP_ID_MISSIONPLANNER)
-"""Not 255: an ArduPilot would take us for the ground station whose loss is a failsafe."""
-HEARTBEAT_S: Final = 1.0
-ANSWER_S: Final = 1.0
-"""How long a parameter is waited for; the companion answers at once, the rest is for the radio."""
-TRIES: Final = 3
-LIST_TRIES: Final = 10
-"""Of a component that has begun to answer; each asks for the whole list: what one has lost the next one brings."""
+logger = logging.getLogger(__name__)
+
+
+class SignedLink:
+    """Between MAVSDK, with a raw connection, and the link; `own`: system and component that MAVSDK sends as."""
+
+    def __init__(self, sdk: Any, own: tuple[int, int], key: bytes) -> None:
+        self._sdk = sdk
+        self._loop = asyncio.get_running_loop()
+        self._from_sdk = mavlink.MAVLink(None)
+        self._from_sdk.robust_parsing = True
+        self.link = MavlinkLink(system_id=own[0], component_id=own[1])
+        self.signing = Signing(required=True, key=key)
+        self.link.signing = self.signing
+        for kind in mavlink.mavlink_map.values():
+            self.link.subscribe(kind, self._hand_over)
+        sdk.subscribe_raw_bytes_to_be_sent(self._in_a_thread)
+
+    def text(self) -> str:
+        """What was dropped, for people; empty when nothing was."""
+        if not self.signing.doubted:
+            return ""
+        counts = ", ".join(f"{count} {reason}" for reason, count in self.signing.doubted.most_common())
+        return f"messages dropped because of their signature: {counts}"
+
+    def _hand_over(self, message: Message, _t_s: float) -> None:
+        self._sdk.pass_received_raw_bytes(bytes(message.get_msgbuf()))
+
+    def _in_a_thread(self, data: bytes) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
+            self._loop.call_soon_threadsafe(self._send, data)
+
+    def _send(self, data: bytes) -> None:
+        for message in self._from_sdk.parse_buffer(data) or ():
+            if message.get_msgId() in mavlink.mavlink_map:
+                self.link.send(message)
+
+
+@asynccontextmanager
+async def open_signed(sdk: Any, own: tuple[int, int], url: str, key: bytes) -> AsyncIterator[SignedLink]:
+    """Carry what MAVSDK sends and hears over a url, signed, until the context ends.
+
+    Raises:
+        LinkError: the url is none.
+        mavsdk.MavsdkError: MAVSDK refuses the raw connection.
+    """
+    await asyncio.to_thread(sdk.add_any_connection_with_handle, "raw://")
+    signed = SignedLink(sdk, own, key)
+    carrying = asyncio.create_task(run_transport(signed.link, url), name="signed link")
+    try:
+        yield signed
+    finally:
+        carrying.cancel()
+        await asyncio.wait([carrying])
+
+
+INSTALL: Final = "install it with: pip install '.[ground]' (in the folder of the companion's sources)"
+_SCHEMES: Final = {"udpin": "udpin", "udpout": "udpout", "tcp": "tcpout", "serial": "serial"}
+_HEARD: Final = ("HEARTBEAT", "STATUSTEXT", "COMMAND_ACK")
 
 
 class GroundLink:
-    """A ground station on an open link; made by `open_link`."""
+    """A ground station on an open link; made by `open_link`.
 
-    def __init__(self, link: MavlinkLink, heard: Heard) -> None:
-        self.heard = heard
-        self._link = link
+    `unbelieved`: what was dropped because of its signature, in words; empty: nothing.
+    """
+
+    def __init__(
+        self, sdk: Any, direct: Any, own: Target, heard: Heard, unbelieved: Callable[[], str] = lambda: ""
+    ) -> None:
+        self.own, self.heard, self.unbelieved = own, heard, unbelieved
+        self._sdk, self._direct = sdk, direct
         self.on_ack: Listeners[[Ack]] = Listeners()
         """Told of every COMMAND_ACK to us."""
-        link.subscribe(mavlink.MAVLink_heartbeat_message, heard.hear_heartbeat)
-        link.subscribe(mavlink.MAVLink_statustext_message, heard.hear_text)
-        link.subscribe(mavlink.MAVLink_command_ack_message, self._take_ack)
-
-    def unbelieved(self) -> str:
-        """What was dropped because of its signature, for people; empty when nothing was."""
-        doubted = {} if self._link.signing is None else self._link.signing.doubted
-        if not doubted:
-            return ""
-        counts = ", ".join(f"{count} {reason}" for reason, count in doubted.items())
-        return f"messages dropped because of their signature: {counts}"
+        self._loop = asyncio.get_running_loop()
+        for name in _HEARD:
+            direct.subscribe_message(name, self._in_a_thread)
 
     def send_command(self, target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
         """Send COMMAND_LONG; a packet that cannot be sent is a lost packet."""
-        self._link.send(mavlink.MAVLink_command_long_message(*target, command, confirmation, *parameters))
+        from mavsdk.plugins.mavlink_direct_server import MavlinkDirectServerError, MavlinkMessage
+
+        # Every field is given, as a number: MAVSDK takes a wrong name or a string and puts 0 on the wire.
+        fields = {
+            "target_system": target.system_id,
+            "target_component": target.component_id,
+            "command": command,
+            "confirmation": confirmation,
+            **{f"param{number}": float(value) for number, value in enumerate(parameters, 1)},
+        }
+        message = MavlinkMessage("COMMAND_LONG", *self.own, *target, json.dumps(fields))
+        try:
+            self._direct.send_message(message)
+        except MavlinkDirectServerError as error:
+            logger.debug("not sent: %s", error)
 
     async def parameters(self, target: Target) -> dict[str, float]:
-        """All parameters of a component, as far as they come; empty when it does not answer."""
-        found: dict[str, float] = {}
-        arrived = asyncio.Event()
-        count = 1
-
-        def take(message: mavlink.MAVLink_param_value_message, _t_s: float) -> None:
-            nonlocal count
-            if sender_of(message) == target:
-                found[message.param_id], count = message.param_value, message.param_count
-                arrived.set()
-
-        stop = self._link.subscribe(mavlink.MAVLink_param_value_message, take)
-        try:
-            for tries in range(LIST_TRIES):
-                if tries == TRIES and not found:
-                    break
-                self._link.send(mavlink.MAVLink_param_request_list_message(*target))
-                while len(found) < count and await comes(arrived, ANSWER_S):
-                    arrived.clear()
-                if len(found) >= count:
-                    break
-        finally:
-            stop()
-        return found
+        """All parameters of a component; empty when it does not answer."""
+        found = await asyncio.to_thread(self._client(target).get_all_params)
+        return {one.name: one.value for one in (*found.float_params, *found.int_params)}
 
     async def get_parameter(self, target: Target, name: str) -> float | None:
         """One parameter; None when there is no answer, or no such parameter."""
-        request = mavlink.MAVLink_param_request_read_message(*target, name.encode("ascii"), -1)
-        return await self._ask(request, target, name)
+        from mavsdk.plugins.param import ParamError
+
+        try:
+            return float(await asyncio.to_thread(self._client(target).get_param_float, name))
+        except ParamError as error:
+            logger.debug("%s not read: %s", name, error)
+            return None
 
     async def set_parameter(self, target: Target, name: str, value: float) -> str | None:
-        """Set one parameter; returns why that did not work, or None."""
-        request = mavlink.MAVLink_param_set_message(*target, name.encode("ascii"), value, REAL32)
-        now = await self._ask(request, target, name, wanted=value)
-        if now is None:
-            return "no answer"
-        return None if same_float32(now, value) else f"it stays {now:g}"
+        """Set one parameter; returns why that did not work, in MAVSDK's words, or None."""
+        from mavsdk.plugins.param import ParamError
 
-    async def _ask(self, request: Message, target: Target, name: str, *, wanted: float | None = None) -> float | None:
-        """What is answered for a parameter; another value than the one wanted only where that one does not come."""
-        found: list[float] = []
-        arrived = asyncio.Event()
-
-        def take(message: mavlink.MAVLink_param_value_message, _t_s: float) -> None:
-            if sender_of(message) == target and message.param_id == name:
-                found.append(message.param_value)
-                if wanted is None or same_float32(message.param_value, wanted):
-                    arrived.set()
-
-        stop = self._link.subscribe(mavlink.MAVLink_param_value_message, take)
         try:
-            for _ in range(TRIES):
-                self._link.send(request)
-                if await comes(arrived, ANSWER_S) or found:
-                    break
-        finally:
-            stop()
-        return found[-1] if found else None
+            await asyncio.to_thread(self._client(target).set_param_float, name, value)
+        except ParamError as error:
+            return str(error.result.name)
+        return None
 
-    def _take_ack(self, ack: mavlink.MAVLink_command_ack_message, _t_s: float) -> None:
-        if ack.target_system in (0, OWN.system_id) and ack.target_component in (0, OWN.component_id):
-            self.on_ack.tell(Ack(sender_of(ack), ack.command, ack.result, ack.progress, ack.result_param2))
+    def _client(self, target: Target) -> Any:
+        from mavsdk.plugins.param import Param, ParamError, ParamResult, ProtocolVersion
+
+        for system in self._sdk.get_systems():
+            if system.get_system_id() == target.system_id:
+                client = Param(system)
+                try:
+                    client.select_component(target.component_id, ProtocolVersion.V1)
+                except ParamError as error:
+                    # 4.1.0 selects, and then reports UNKNOWN.
+                    if error.result != ParamResult.UNKNOWN:
+                        raise AutopilotError(f"component {target.component_id}: {error.result.name}") from None
+                return client
+        raise AutopilotError(f"system {target.system_id} is not heard any more")
+
+    def _in_a_thread(self, message: Any, _: object) -> None:
+        self._loop.call_soon_threadsafe(
+            self._take, message.message_name, Target(message.system_id, message.component_id), message.fields_json
+        )
+
+    def _take(self, name: str, source: Target, fields_json: str) -> None:
+        try:
+            fields = json.loads(fields_json)
+        except ValueError:
+            logger.debug("%s of %s is no JSON: %.80s", name, source, fields_json)
+            return
+        if name != "COMMAND_ACK":
+            self.heard.update(name, source, fields, self._loop.time())
+        elif fields.get("target_system") in (0, self.own.system_id) and fields.get("target_component") in (
+            0,
+            self.own.component_id,
+        ):
+            self.on_ack.tell(
+                Ack(source, *(fields.get(name, 0) for name in ("command", "result", "progress", "result_param2")))
+            )
+
+
+class _Log:
+    """Takes MAVSDK's log, which would go to the terminal otherwise.
+
+    Not by `mavsdk.log_subscribe`: that fails on a text that is not UTF-8, as any component's STATUSTEXT may be (MAVSDK
+    logs them all), and the text then does go to the terminal, with a complaint about itself.
+    """
+
+    def __init__(self) -> None:
+        from mavsdk.cmavsdk_loader import _cmavsdk_lib
+        from mavsdk.logging import LogCallback, LogLevel
+
+        self.last_error = ""
+        self._error = LogLevel.ERROR
+        # Kept as long as the library may call it: for as long as it is loaded.
+        _Log.callback = LogCallback(self._take)
+        _cmavsdk_lib.mavsdk_log_subscribe(_Log.callback, None)
+
+    callback: ClassVar[Any] = None
+
+    def _take(self, level: int, message: bytes | None, *_: object) -> bool:
+        """In one of MAVSDK's threads; True: it is not to print this itself."""
+        words = (message or b"").decode(errors="replace")
+        logger.debug("MAVSDK: %s", words)
+        if level == self._error:
+            self.last_error = words.partition(": ")[2] or words
+        return True
 
 
 @asynccontextmanager
@@ -125,35 +221,27 @@ async def open_link(url: str, heard: Heard, key: bytes | None = None) -> AsyncIt
     """Be a ground station on a link; `heard` learns what comes; with a key, only what is signed with it.
 
     Raises:
+        ConfigError: MAVSDK is not installed, or the url is none.
         LinkError: the port cannot be opened.
     """
-    link = MavlinkLink(system_id=OWN.system_id, component_id=OWN.component_id)
-    if key is not None:
-        link.signing = Signing(required=True, key=key)
-    opened: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-
-    def on_state(connected: bool, words: str) -> None:  # noqa: FBT001 - as a transport tells it
-        if not opened.done():
-            opened.set_result("" if connected else words.partition(": ")[2])
-
-    carrying = asyncio.create_task(run_transport(link, url, on_state=on_state), name="ground link")
-    beating: asyncio.Task[None] | None = None
     try:
-        if why := await opened:
-            hint = "; another ground station has it: docs/ground_stations.md" if "in use" in why else ""
-            raise LinkError(f"{url} cannot be opened: {why}{hint}")
-        beating = asyncio.create_task(_beat(link), name="ground heartbeat")
-        yield GroundLink(link, heard)
-    finally:
-        tasks = [task for task in (carrying, beating) if task is not None]
-        for task in tasks:
-            task.cancel()
-        await asyncio.wait(tasks)
-
-
-async def _beat(link: MavlinkLink) -> None:
-    """So that an autopilot sends here what is for us."""
-    beat = (mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
-    while True:
-        link.send(mavlink.MAVLink_heartbeat_message(*beat))
-        await asyncio.sleep(HEARTBEAT_S)
+        import mavsdk
+        from mavsdk.plugins.mavlink_direct_server import MavlinkDirectServer
+    except (ImportError, OSError) as error:
+        raise ConfigError(f"companion ground needs MAVSDK 4.1: {error}; {INSTALL}") from None
+    kind, where, number = parse_url(url)
+    log = _Log()
+    configuration = mavsdk.Configuration.create_with_component_type(mavsdk.ComponentType.GROUND_STATION)
+    own = Target(configuration.system_id, configuration.component_id)
+    with mavsdk.Mavsdk(configuration) as sdk:
+        direct = MavlinkDirectServer(sdk.server_component_by_id(own.component_id))
+        if key is not None:
+            async with open_signed(sdk, own, url, key) as signed:
+                yield GroundLink(sdk, direct, own, heard, signed.text)
+            return
+        try:
+            await asyncio.to_thread(sdk.add_any_connection_with_handle, f"{_SCHEMES[kind]}://{where}:{number}")
+        except mavsdk.MavsdkError as error:
+            hint = "; another ground station has it: docs/ground_stations.md" if "in use" in log.last_error else ""
+            raise LinkError(f"{url} cannot be opened: {log.last_error or error}{hint}") from None
+        yield GroundLink(sdk, direct, own, heard)

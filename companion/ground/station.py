@@ -172,7 +172,7 @@ class Station:
             mavlink.MAV_STATE_STANDBY: "idle",
             mavlink.MAV_STATE_ACTIVE: "idle",
             mavlink.MAV_STATE_CRITICAL: "fault",
-        }.get(beat.said.system_status, "unknown")  # type: ignore[assignment] # mypy widens the literals
+        }.get(beat.system_status, "unknown")  # type: ignore[assignment] # mypy widens the literals
         found = await self._own_parameters()
         vehicle = self.vehicle
         last = _result(found.get("CMP_STATE"))
@@ -319,6 +319,9 @@ class Station:
         return _result(await self._link.get_parameter(self._target, "CMP_STATE"))
 
     async def _own_parameters(self) -> dict[str, float]:
+        # MAVSDK's list waits over 10 s for its first answer, and tells nobody; one parameter is given up after 3 s.
+        if await self._link.get_parameter(self._target, "CMP_STATE") is None:
+            return {}
         found = await self._link.parameters(self._target)
         return {name: value for name, value in sorted(found.items()) if name.startswith("CMP_")}
 

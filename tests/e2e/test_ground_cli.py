@@ -1,4 +1,4 @@
-"""`companion ground ...` as a person types it: real processes, the real daemon, doubles of both firmwares.
+"""`companion ground ...` as a person types it: real processes, the real daemon, MAVSDK, doubles of both firmwares.
 
 Nearly all of the time is waiting, as a pilot would: what can go on side by side does.
 """
@@ -211,7 +211,7 @@ def test_a_port_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
     said = asyncio.run(_run("status", "--url", f"serial:{tmp_path}/radio:57600"))
     assert said.code == FAILED
     assert said.err.count("\n") == 1
-    assert "radio:57600 cannot be opened: no such device" in said.err
+    assert "radio:57600 cannot be opened: No such file" in said.err
 
 
 def test_a_port_that_another_ground_station_has_is_named() -> None:
@@ -224,7 +224,7 @@ def test_a_port_that_another_ground_station_has_is_named() -> None:
     assert f"{port} cannot be opened: Address already in use; another ground station has it" in said.err
 
 
-@pytest.mark.parametrize("missing", ["rich", "rich.progress"])
+@pytest.mark.parametrize("missing", ["mavsdk", "rich", "rich.progress"])
 def test_without_the_extra_one_line_says_how_to_get_it(missing: str) -> None:
     code = f"import sys; sys.modules[{missing!r}] = None; from companion.cli import main; sys.exit(main(sys.argv[1:]))"
 
@@ -283,13 +283,13 @@ def test_texts_that_are_no_utf_8_spoil_nothing() -> None:
             transport.close()
         assert said.code == DONE, said
         assert set(said.json["texts"]) == {"?? ???? ?[31m"}
-        assert set(said.err.splitlines()) == {"?? ???? ?[31m"}, "what the companion says, and nothing else"
+        assert set(said.err.splitlines()) == {"?? ???? ?[31m"}, "what the companion says, and nothing of MAVSDK's"
 
     asyncio.run(main())
 
 
 def test_over_a_signed_link_with_the_key_and_with_another(tmp_path: Path) -> None:
-    """What is signed here the autopilot judges by pymavlink's own signing."""
+    """MAVSDK has no signing: what it says and hears goes through ours, which the autopilot judges by pymavlink's."""
     right, wrong = tmp_path / "right.key", tmp_path / "wrong.key"
     for path, words in ((right, "a passphrase for the field"), (wrong, "another one altogether")):
         path.write_text(f"{words}\n")

@@ -1,4 +1,4 @@
-"""A ground station without a radio: what `companion.ground` needs of a link, on a wire in memory."""
+"""A ground station without MAVSDK: what `companion.ground` needs of a link, on a wire in memory."""
 
 from __future__ import annotations
 
@@ -6,18 +6,11 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.ground.heard import Ack, Heard, Target, sender_of
-from companion.links.mavlink.link import M
+from companion.ground.heard import Ack, Heard, Target
 from companion.links.system.listeners import Listeners
 from tests.support.component import Ground, command_message
 
 COMPANION = Target(1, 191)
-
-
-def said_by(source: Target, message: M) -> M:
-    """As it comes off a wire."""
-    message.pack(mavlink.MAVLink(None, *source))
-    return message
 
 
 def is_final(message: mavlink.MAVLink_message) -> bool:
@@ -43,12 +36,10 @@ class StationOnTheWire(Ground):
         for _, message in self.received[known:]:
             if self.deaf_to(message):
                 continue
-            if isinstance(message, mavlink.MAVLink_heartbeat_message):
-                self.heard.hear_heartbeat(message, t_s)
-            elif isinstance(message, mavlink.MAVLink_statustext_message):
-                self.heard.hear_text(message, t_s)
-            elif isinstance(message, mavlink.MAVLink_command_ack_message):
-                ack = Ack(sender_of(message), message.command, message.result, message.progress, message.result_param2)
+            source = Target(message.get_srcSystem(), message.get_srcComponent())
+            self.heard.update(message.get_type(), source, message.to_dict(), t_s)
+            if isinstance(message, mavlink.MAVLink_command_ack_message):
+                ack = Ack(source, message.command, message.result, message.progress, message.result_param2)
                 self.on_ack.tell(ack)
 
     def send_command(self, target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:

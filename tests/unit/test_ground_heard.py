@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from hypothesis import given
+from hypothesis import strategies as st
 
 from companion.ground import heard as ground_heard
-from companion.ground.heard import Heard, Target, Vehicle
-from tests.support.ground_wire import said_by
+from companion.ground.heard import Fields, Heard, Target, Vehicle
 
 ARDUPILOT, PX4, NO_AUTOPILOT = 3, 12, 8
 QUADROTOR, GCS, ONBOARD = 2, 6, 18
@@ -15,13 +15,12 @@ QUADROTOR, GCS, ONBOARD = 2, 6, 18
 
 def beat(heard: Heard, system: int, component: int, *, now_s: float = 10.0, **fields: int) -> None:
     defaults = {"type": ONBOARD, "autopilot": NO_AUTOPILOT, "base_mode": 0, "system_status": 3}
-    message = mavlink.MAVLink_heartbeat_message(**{**defaults, **fields}, custom_mode=0, mavlink_version=3)
-    heard.hear_heartbeat(said_by(Target(system, component), message), now_s)
+    heard.update("HEARTBEAT", Target(system, component), {**defaults, **fields}, now_s)
 
 
 def say(heard: Heard, text: str, *, component: int = 191) -> None:
-    message = mavlink.MAVLink_statustext_message(6, text.encode("latin-1"))
-    heard.hear_text(said_by(Target(1, component), message), 10.0)
+    fields: Fields = {"severity": 6, "text": text}
+    heard.update("STATUSTEXT", Target(1, component), fields, 10.0)
 
 
 def said(heard: Heard) -> list[str]:
@@ -62,8 +61,8 @@ def test_lines_that_go_on_are_one_text() -> None:
 
 def test_what_a_terminal_would_obey_is_not_passed_on() -> None:
     heard = Heard(191)
-    say(heard, "calm \x1b[31mred\x07 \xff 5\xb0")
-    assert said(heard) == ["calm ?[31mred? ? 5?"]
+    say(heard, "calm \x1b[31mred\x07 \ufffd 5\u00b0")
+    assert said(heard) == ["calm ?[31mred? ? 5 deg"]
 
 
 def test_what_never_ends_is_forgotten() -> None:
@@ -72,6 +71,24 @@ def test_what_never_ends_is_forgotten() -> None:
         say(heard, f"text {number}")
     assert len(heard.texts) <= 200
     assert said(heard)[-1] == "text 999"
+
+
+anything = st.sampled_from([None, True, -1, 0, 2**70, 1.5, float("nan"), "", "x" * 50, "\0", [1], {"a": 1}])
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["HEARTBEAT", "STATUSTEXT", "ATTITUDE"]),
+            st.dictionaries(st.sampled_from(["type", "autopilot", "base_mode", "id", "chunk_seq", "text"]), anything),
+        )
+    )
+)
+def test_nothing_on_the_wire_raises(messages: list[tuple[str, dict[str, object]]]) -> None:
+    heard = Heard(191)
+    for name, fields in messages:
+        heard.update(name, Target(1, 191), fields, 0.0)
+    heard.summary()
 
 
 def test_nobody_there_is_one_line_with_what_was_heard_and_what_to_try() -> None:

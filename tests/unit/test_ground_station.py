@@ -17,7 +17,7 @@ from companion.ground.heard import Target
 from companion.ground.link import GroundLink
 from companion.ground.station import Station
 from tests.support.component import Bench, bench
-from tests.support.ground_wire import StationOnTheWire, is_final, said_by
+from tests.support.ground_wire import StationOnTheWire, is_final
 from tests.support.virtual_time import run_virtual
 
 
@@ -42,9 +42,8 @@ def station_on(wire: StationOnTheWire, notes: Notes | None = None) -> Station:
 
 
 def beat(wire: StationOnTheWire, system_id: int, component_id: int, kind: int, autopilot: int) -> None:
-    message = mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, mavlink.MAV_STATE_STANDBY, 3)
-    source = Target(system_id, component_id)
-    wire.heard.hear_heartbeat(said_by(source, message), asyncio.get_running_loop().time())
+    fields = {"type": kind, "autopilot": autopilot, "base_mode": 0, "system_status": mavlink.MAV_STATE_STANDBY}
+    wire.heard.update("HEARTBEAT", Target(system_id, component_id), fields, asyncio.get_running_loop().time())
 
 
 async def until_started(b: Bench, jobs: int = 1) -> None:

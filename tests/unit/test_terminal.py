@@ -27,10 +27,10 @@ from companion.cli.show import finding_lines
 from companion.daemon.process.check import Finding
 from companion.errors import LinkError
 from companion.ground.display import Display
-from companion.ground.heard import Heard
+from companion.ground.heard import Heard, Target
 from companion.links.serial.ports import Holder, SerialPort
 from companion.printable import printable
-from tests.support.ground_wire import COMPANION, StationOnTheWire, said_by
+from tests.support.ground_wire import StationOnTheWire
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -246,12 +246,12 @@ def test_what_is_heard_on_the_ground(
 ) -> None:
     @contextlib.asynccontextmanager
     async def open_link(_url: str, heard: Heard, _key: bytes | None) -> AsyncIterator[StationOnTheWire]:
-        wire, now_s = StationOnTheWire(), asyncio.get_running_loop().time()
+        wire, beat = StationOnTheWire(), {"type": 18, "autopilot": 8, "base_mode": 0, "system_status": 3}
         wire.heard = heard
         wire.values = {"CMP_STATE": 1.0, f"CMP_{EVIL}": 1.0}
-        heard.hear_heartbeat(said_by(COMPANION, mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 3, 3)), now_s)
-        text = mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_CRITICAL, EVIL.encode()[:50])
-        heard.hear_text(said_by(COMPANION, text), now_s)
+        heard.update("HEARTBEAT", Target(1, 191), beat, asyncio.get_running_loop().time())
+        text = {"severity": mavlink.MAV_SEVERITY_CRITICAL, "text": EVIL, "id": 0, "chunk_seq": 0}
+        heard.update("STATUSTEXT", Target(1, 191), text, asyncio.get_running_loop().time())
         yield wire
 
     monkeypatch.setattr("companion.ground.link.open_link", open_link)
