@@ -15,8 +15,8 @@ from sim.sitl.observe import residual
 from sim.sitl.residuals import DECK, Row, ground_station
 from tests.sitl.craft import BINARIES, binary_vehicle, missing
 
-WAITS_S = 50.0
-"""A wave is a wave after forty seconds."""
+WAITS_S = 75.0
+"""Ten seconds until the readings come; a wave is a wave after forty of them."""
 CALIBRATED_WITHIN_S = 300.0
 OBSERVE_S = 20.0
 LEFT_DEG_H, LEFT_MG = 120.0, 1.0

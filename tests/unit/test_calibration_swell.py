@@ -16,13 +16,13 @@ from tests.support.recordings import shared, xsens_counts
 RATE_HZ = 20
 
 
-def hints(times: Array, rates: Array) -> list[bool]:
-    """Of every second from `WATCHED_S` on, whether it hints."""
+def hints(times: Array, rates: Array, lost: int | None = None) -> list[bool]:
+    """Of every second from `WATCHED_S` on but the lost one, whether it hints."""
     swell, found = Swell(), []
     slots = np.floor(times).astype(int)
     for slot in range(int(slots[-1])):
         here = slots == slot
-        if not here.any():
+        if not here.any() or slot == lost:
             swell.add(None)
             continue
         swell.add(summary(slot, times[here], np.hstack([rates[here], np.zeros((here.sum(), 3))])))
@@ -31,10 +31,10 @@ def hints(times: Array, rates: Array) -> list[bool]:
     return found
 
 
-def share(motions: list[Motion], seconds: int) -> float:
+def share(motions: list[Motion], seconds: int, lost: int | None = None) -> float:
     aircraft = VirtualAircraft(Pose(2.0, 1.0, 30.0), Site(latitude_deg=45.0), motions=motions)
     times = (np.arange(seconds * RATE_HZ) + 0.5) / RATE_HZ
-    return float(np.mean(hints(times, aircraft.truth(times)[0])))
+    return float(np.mean(hints(times, aircraft.truth(times)[0], lost)))
 
 
 @pytest.mark.parametrize(
@@ -42,6 +42,10 @@ def share(motions: list[Motion], seconds: int) -> float:
 )
 def test_waves_are_named(waves: tuple[Wave, ...]) -> None:
     assert np.mean([share([Sea(start_s=-30.0, waves=waves, seed=seed)], 90) for seed in range(4)]) > 0.8
+
+
+def test_a_wave_stays_one_when_a_second_is_lost() -> None:
+    assert np.mean([share([Sea(start_s=-30.0, seed=seed)], 90, lost=60) for seed in range(4)]) > 0.8
 
 
 def test_hands_are_hardly_ever_taken_for_waves() -> None:

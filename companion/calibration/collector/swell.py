@@ -30,7 +30,7 @@ class Swell:
 
     def __init__(self) -> None:
         self._rates: deque[tuple[int, Floats]] = deque(maxlen=WATCHED_S)
-        self._known: tuple[int, bool] | None = None
+        self._latest: tuple[int | None, bool] = None, False
 
     def add(self, batch: Batch | None) -> None:
         """Take a second; one that is missing begins anew."""
@@ -41,13 +41,10 @@ class Swell:
 
     @property
     def is_regular(self) -> bool:
-        """Whether it is a regular wave."""
-        if len(self._rates) < WATCHED_S:
-            return False
-        last = self._rates[-1][0]
-        if self._known is None or self._known[0] != last:
-            self._known = last, self._is_regular()
-        return self._known[1]
+        """Whether it is a regular wave; after a second that is missing as before, until there are enough again."""
+        if len(self._rates) == WATCHED_S and self._latest[0] != self._rates[-1][0]:
+            self._latest = self._rates[-1][0], self._is_regular()
+        return self._latest[1]
 
     def _is_regular(self) -> bool:
         rates = np.array([rate for _, rate in self._rates])
