@@ -284,8 +284,7 @@ def test_the_writes_of_a_day_are_bounded_also_over_restarts(tmp_path: Path, monk
                 tmp_path, at_arm="gate", max_s=12.0, **SLOW
             )  # an autopilot as it was: its offsets are wrong again
             async with rig.running():
-                # Of an IMU that it does not have the autopilot may say so by another link: that costs 5 s.
-                await asyncio.sleep(60.0)
+                await asyncio.sleep(40.0)
                 assert rig.service.arming.automatic.status()["writes_today"] == expected
                 answer = rig.service.arming.readiness.answer()
                 assert len(rig.service.calibrating.store.history()) == expected

@@ -6,10 +6,11 @@ import asyncio
 import logging
 from typing import Final
 
-from companion.autopilot.vehicle.rereading import Rereading
+from companion.autopilot.vehicle.vehicle import VehicleEvent
 from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.readiness import Readiness
 from companion.daemon.core import Core
+from companion.errors import AutopilotError
 
 logger = logging.getLogger(__name__)
 
@@ -28,28 +29,41 @@ class GateSetup:
     def __init__(self, core: Core, readiness: Readiness) -> None:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
         self._readiness = readiness
-        self._rereading = Rereading(core.vehicle, self._look, "gate-setup", retry_s=RETRY_S, level=logging.INFO)
-        self.run = self._rereading.run
-        """Look whenever there is something new, until cancelled."""
+        self._stale = asyncio.Event()
         self._said: str | None = None
         self.problem: str | None = None
         """What has to be set, for people; None while all is well or not known yet."""
+        self.known = False
+        core.vehicle.on_event.add(self._on_event)
         core.parameters.on_value.add(self._on_parameter)
 
-    @property
-    def known(self) -> bool:
-        """Whether `problem` is of now."""
-        return self._rereading.known
+    async def run(self) -> None:
+        """Look whenever there is something new, until cancelled."""
+        while True:
+            await self._stale.wait()
+            while self._readiness.at_arm != "gate":  # may be set at the flight line
+                await asyncio.sleep(POLL_S)
+            await self._vehicle.found.wait()
+            self._stale.clear()
+            try:
+                self.problem = await self.find_missing()
+            except AutopilotError as error:
+                logger.info("whether the gate is set up is not known: %s", error)
+                self._stale.set()
+                await asyncio.sleep(RETRY_S)
+            else:
+                self.known = True
+                self._tell()
 
-    async def _look(self) -> None:
-        while self._readiness.at_arm != "gate" or not self._vehicle.alive:  # may be set at the flight line
-            await asyncio.sleep(POLL_S)
-        self.problem = await self.find_missing()
-        self._tell()
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event in ("found", "rebooted"):
+            self.known = False
+            self._stale.set()
 
     def _on_parameter(self, name: str, value: float) -> None:
         if self.known and (name in _PX4 or name == _SCRIPT):
-            self._rereading.again()
+            self.known = False
+            self._stale.set()
 
     def _tell(self) -> None:
         if self.problem is None:

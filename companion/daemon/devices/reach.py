@@ -18,9 +18,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.firmware.port_parameters import baud_of, port_needs
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.reading import read_integer
-from companion.autopilot.vehicle.rereading import Rereading
-from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
+from companion.errors import AutopilotError
 from companion.links.mavlink.link import MavlinkLink
+
+logger = logging.getLogger(__name__)
 
 PX4_LINKS: Final = 3
 SILENT_S: Final = 5.0
@@ -35,9 +37,10 @@ class Reach:
         self._vehicle, self._parameters, self._baud = vehicle, parameters, baud_of(url)
         self._heard_s = -math.inf
         self._forwards: dict[int, bool] | None = None
-        self.run = Rereading(vehicle, self._read, "reach", retry_s=RETRY_S, level=logging.DEBUG).run
-        """Read what there is to know, again after every restart, until cancelled."""
+        self._stale = asyncio.Event()
+        self._stale.set()
         link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
+        vehicle.on_event.add(self._on_event)
 
     @property
     def answered(self) -> bool:
@@ -78,6 +81,19 @@ class Reach:
             " MAV_1)"
         )
 
+    async def run(self) -> None:
+        """Read what there is to know, again after every restart, until cancelled."""
+        while True:
+            await self._stale.wait()
+            self._stale.clear()
+            await self._vehicle.found.wait()
+            try:
+                await self._read()
+            except AutopilotError as error:
+                logger.debug("forwarding is not known yet: %s", error)
+                await asyncio.sleep(RETRY_S)
+                self._stale.set()
+
     async def _read(self) -> None:
         if self._vehicle.firmware != "px4":
             self._forwards = None
@@ -94,3 +110,7 @@ class Reach:
     def _on_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, t_s: float) -> None:
         if message.type == mavlink.MAV_TYPE_GCS:
             self._heard_s = t_s
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event in ("found", "rebooted"):
+            self._stale.set()

@@ -15,10 +15,12 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.heading_parameters import EXTNAV, WANTED, Net, net_of, read_for
-from companion.autopilot.vehicle.rereading import Rereading
-from companion.autopilot.vehicle.vehicle import ArmState
+from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core
+from companion.errors import AutopilotError
+
+logger = logging.getLogger(__name__)
 
 SCRIPT_STARTS_S: Final = 15.0
 """After the first heartbeat: before that nobody knows whether there is one."""
@@ -38,31 +40,40 @@ class Fallback:
 
     def __init__(self, core: Core) -> None:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
-        self._rereading = Rereading(core.vehicle, self._read, "fallback", retry_s=AGAIN_S, level=logging.INFO)
-        self.run = self._rereading.run
-        """Look at every start of the autopilot, until cancelled."""
-        self._net: Net | None = None
+        self.net: Net | None = None
+        """None: not known yet."""
         self._selected = False
+        self._stale = asyncio.Event()
         self._pushed_since_s = math.inf
         self._asked: int | None = None
         self._tried_s = -math.inf
-
-    @property
-    def net(self) -> Net | None:
-        """None: not known yet."""
-        return self._net if self._rereading.known else None
+        core.vehicle.on_event.add(self._on_event)
 
     @property
     def is_all(self) -> bool:
         """Whether the autopilot is known to have no heading but ours: what its yaw is without it means nothing."""
         return self._selected and self.net == "none"
 
-    async def _read(self) -> None:
-        firmware, self._net, self._asked = self._vehicle.firmware, None, None
-        await asyncio.sleep(SCRIPT_STARTS_S)
-        if firmware in WANTED:
-            found = await self._parameters.read_many(read_for(firmware), optional=True)
-            self._net, self._selected = net_of(firmware, found), found.get("EK3_SRC1_YAW") == EXTNAV
+    async def run(self) -> None:
+        """Look at every start of the autopilot, until cancelled."""
+        while True:
+            await self._vehicle.found.wait()
+            self._stale.clear()
+            firmware = self._vehicle.firmware
+            await asyncio.sleep(SCRIPT_STARTS_S)
+            if firmware in WANTED:
+                try:
+                    found = await self._parameters.read_many(read_for(firmware), optional=True)
+                except AutopilotError as error:
+                    logger.info("what the autopilot flies by when our heading ends is not known: %s", error)
+                    continue
+                self.net, self._selected = net_of(firmware, found), found.get("EK3_SRC1_YAW") == EXTNAV
+            await self._stale.wait()
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event in ("found", "rebooted"):
+            self.net = self._asked = None
+            self._stale.set()
 
     def step(self, now_s: float, *, pushing: bool) -> None:
         """Ask for the set that is right, if nobody else does."""
