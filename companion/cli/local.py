@@ -215,11 +215,10 @@ async def web_token(options: argparse.Namespace) -> int:
 
 async def check(options: argparse.Namespace) -> int:
     """`companion check`."""
-    config = load_config(options, profiles=True)
-    print_lines(f"checking: {options.seconds:g} s, half a minute more for a sensor not understood", error=True)
-    from companion.daemon.process.check import run_check  # takes seconds on a small board
+    from companion.daemon.process.check import run_check
 
-    findings = await run_check(config, options.seconds)
+    config = load_config(options, profiles=True)
+    findings = await run_check(config, options.seconds, lambda words: print_lines(words, error=True))
     good = all(finding.good for finding in findings)
     reason = "; ".join(f"{finding.name}: {finding.words}" for finding in findings if not finding.good)
     state, found = "good" if good else "failed", [dataclasses.asdict(finding) for finding in findings]

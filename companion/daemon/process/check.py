@@ -6,7 +6,7 @@ With a daemon running the ports are its, so it is asked; otherwise every port is
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -158,8 +158,10 @@ def _other_protocol(sensor: SerialDevice, protocol: str) -> tuple[str, str]:
     return f"this is {protocol}, a device for {main}", right
 
 
-async def run_check(config: Config, seconds: float) -> list[Finding]:
-    """Check everything the configuration names, listening for some seconds.
+async def run_check(
+    config: Config, seconds: float, say: Callable[[str], object] = lambda _words: None
+) -> list[Finding]:
+    """Check everything the configuration names, listening for some seconds, which it says before where no daemon runs.
 
     Raises:
         CompanionError: something that makes the check itself impossible.
@@ -182,6 +184,7 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     else:
         findings.append(Finding("daemon", good=True, words="not running: ports opened by this check"))
         findings.append(_storage(config.storage.path))
+        say(f"checking: {seconds:g} s, half a minute more for a sensor not understood")
         # The status that a daemon would have after some seconds; nothing is written anywhere.
         service = Service(config, only_listening=ONLY_CHECKING)
         status = await service.listen(seconds)
