@@ -28,7 +28,8 @@ async def request(
     """
     reply: Object = {}
     shown = ""
-    waiting = "waiting for the daemon's answer; Ctrl-C ends the waiting alone"
+    ends = "Ctrl-C ends the waiting alone" if at_interrupt is None else "Ctrl-C cancels"
+    waiting = f"waiting for the daemon's answer; {ends}"
     silent = asyncio.get_running_loop().call_later(SILENT_S, lambda: print_lines(waiting, error=True))
     try:
         async for reply in ask(load_config(options).control.path, wanted):

@@ -69,7 +69,7 @@ def read(path: Path, missing: str) -> str:
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file: {missing}") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
+        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
 def parse(text: str, name: str, saved: Saved = _none) -> Config:

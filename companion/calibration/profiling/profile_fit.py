@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
+from collections import Counter
 from collections.abc import Sequence
 from typing import Final
 
@@ -90,7 +90,8 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
     gate, stretch = ImuGate(name, profile, own=own), Stretch(_MIN_GOOD, max(len(batches), 1))
     stretches: list[Rest] = []
     kept: list[Batch] = []
-    obstacles: dict[str, list[str]] = {}
+    obstacles: Counter[str] = Counter()
+    words: dict[str, str] = {}
     before: int | None = None
 
     def end() -> None:
@@ -111,13 +112,12 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
             gate.accept(batch)
             kept.append(batch)
         else:
-            # Movements are of one kind whatever their figures.
-            kind = verdict.words if verdict.fault else re.sub(r"[\d.]+", "", verdict.words)
-            obstacles.setdefault(kind, []).append(verdict.words)
+            obstacles[verdict.what] += 1
+            words.setdefault(verdict.what, verdict.words)
             if stretch.start is None:
                 end()
     end()
-    obstacle = max(obstacles.values(), key=len, default=[""])[0]
+    obstacle = words[obstacles.most_common(1)[0][0]] if obstacles else ""
     return Rests(tuple(stretches), len(batches), obstacle)
 
 

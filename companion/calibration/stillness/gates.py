@@ -98,6 +98,8 @@ class Verdict(msgspec.Struct, frozen=True):
     words: str = ""
     fault: bool = False
     """Whether it is the device, not the aircraft, that is in the way."""
+    what: str = ""
+    """Of a movement the same without its figures; of a fault as it is."""
 
 
 STILL: Final = Verdict(still=True)
@@ -109,11 +111,11 @@ def _words(what: str, found: float, allowed: float, unit: str, hint: str = "") -
         left, right = f"{found:.{digits}f}", f"{allowed:.{digits}f}"
         if left != right:
             break
-    return Verdict(still=False, words=f"{what} {left} {unit}, max {right}{hint}")
+    return Verdict(still=False, words=f"{what} {left} {unit}, max {right}{hint}", what=what)
 
 
 def _fault(words: str) -> Verdict:
-    return Verdict(still=False, words=words, fault=True)
+    return Verdict(still=False, words=words, fault=True, what=words)
 
 
 def _motion(
