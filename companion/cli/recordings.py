@@ -25,7 +25,7 @@ def add_commands(add: AddCommand) -> None:
     """Add both to the parser of the command line."""
     recorder = add("record", record, "record everything to a file until Ctrl-C (the last half hour is kept anyway)")
     recorder.add_argument("file", nargs="?", type=Path, metavar="FILE", help="default: one beside the daemon's own")
-    recorder.add_argument("--seconds", type=seconds, metavar="S", help="end by itself (default: Ctrl-C or --stop)")
+    recorder.add_argument("--seconds", type=seconds, metavar="S", help="default: until Ctrl-C, --stop or 1 GB")
     recorder.add_argument("--stop", action="store_true", help="end a recording that runs")
     player = add("replay", replay, "run a recording, or anybody's log of an IMU at rest, through the same estimator")
     player.add_argument("file", type=Path, metavar="FILE", help="a recording (.mcap), or a log (CSV; .ulg, .bin)")

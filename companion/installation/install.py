@@ -225,7 +225,7 @@ def _put(target: Target, path: Path, wanted: bytes) -> Step:
 
 def _write(target: Target, path: Path, data: bytes, outcome: Outcome, words: str = "") -> Step:
     if not target.dry_run:
-        write_atomically(path, data, mode=MODE)
+        write_atomically(path, data, mode=MODE, parents=True)
     return Step(str(path), outcome, words)
 
 

@@ -27,6 +27,8 @@ CHUNK_BYTES: Final = 256 * 1024
 """A second of a busy aircraft has less."""
 RESERVE_BYTES: Final = 32 * 1024 * 1024
 """Bytes left free on the disk: the values for undo and the records are worth more than any recording."""
+LEAST_FREE: Final = 0.1
+"""Share of the disk that a recording on request leaves free, since nothing deletes its files."""
 PARTS: Final = 8
 """A ring's files are at most this part of it, so that the oldest can go without taking much along."""
 
@@ -54,6 +56,17 @@ FreeBytes = Callable[[Path], int]
 
 def _free_bytes(folder: Path) -> int:
     return shutil.disk_usage(folder).free
+
+
+def disk_shortage(folder: Path) -> str | None:
+    """Say that a recording on request must not take more of this disk; None while it may, or while nothing is known."""
+    try:
+        usage = shutil.disk_usage(folder)
+    except OSError:
+        return None
+    if usage.free >= LEAST_FREE * usage.total:
+        return None
+    return f"less than {LEAST_FREE * 100:.0f} % of the disk free ({usage.free / 1e9:.1f} of {usage.total / 1e9:.1f} GB)"
 
 
 def open_new(path: Path) -> IO[bytes]:
@@ -89,10 +102,11 @@ class RecordingFile:
         self._free_bytes = free_bytes
         self._file: IO[bytes] | None = None
         try:
-            path.parent.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
             self._file = opener(path)
         except FileExistsError:
             raise StorageError(f"{path}: exists already; nothing is overwritten") from None
+        except FileNotFoundError:
+            raise StorageError(f"{path}: there is no folder {path.parent}; make it, or name another") from None
         except OSError as error:
             raise StorageError(f"{path}: cannot be created by the companion: {error.strerror or error}") from None
         # Without an index of messages, whose size would grow with the file's and not with what is looked for.
@@ -200,6 +214,31 @@ class RecordingFile:
                 file.close()
 
 
+def unused_path(folder: Path) -> Path:
+    """Path of a recording on request that was given no name; creates the folder.
+
+    Raises:
+        StorageError: the folder cannot be used.
+    """
+    try:
+        folder.mkdir(FOLDER_MODE, exist_ok=True)
+        numbers = [int(path.stem[5:]) for path in folder.glob("kept-*.mcap") if path.stem[5:].isdecimal()]
+    except OSError as error:
+        raise StorageError(f"{folder}: {error.strerror or error}") from error
+    return folder / f"kept-{max(numbers, default=0) + 1:03d}.mcap"
+
+
+def create_on_request(path: Path) -> RecordingFile:
+    """Create the file of a recording on request.
+
+    Raises:
+        StorageError: the disk has too little room for one, or the file cannot be created.
+    """
+    if (shortage := disk_shortage(path.parent)) is not None:
+        raise StorageError(f"{path}: not recorded, with {shortage}; make room")
+    return RecordingFile(path)
+
+
 class Ring:
     """Files of limited size in all, numbered, as the wall clock may be wrong in the field; the oldest go first."""
 
@@ -257,7 +296,7 @@ class Ring:
 
     def _next(self) -> None:
         self.close()
-        self.folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
+        self.folder.mkdir(FOLDER_MODE, exist_ok=True)
         self._make_room()
         numbers = [number for number, _, _ in self._files()]
         self._current = RecordingFile(

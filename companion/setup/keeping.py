@@ -68,5 +68,5 @@ def put(path: Path, text: str, *, keep: bool = True) -> Path | None:
             names = (path.with_name(f"{path.name}.old{number}") for number in itertools.count(1))
             kept = next(name for name in names if not name.exists())
             write_atomically(kept, path.read_bytes(), mode=mode)
-    write_atomically(path, text.encode(), mode=mode)
+    write_atomically(path, text.encode(), mode=mode, parents=True)
     return kept

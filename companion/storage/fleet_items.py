@@ -225,7 +225,7 @@ class FleetItems:
     def _opened(self) -> sqlite3.Connection:
         if self.path.exists() and not self.path.is_file():
             raise StorageError(f"{self.path}: cannot be used: not a regular file")
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.parent.mkdir(exist_ok=True)
         os.close(os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o600))
         db = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False, timeout=1.0)
         try:

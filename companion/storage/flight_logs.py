@@ -55,7 +55,7 @@ class LogFile:
         """Make room for a log of that size; what is here already stays, and counts as half written from here on."""
         folder, lacks = self.path.parent, size - self.bytes
         with _on_disk(folder):
-            folder.mkdir(0o700, parents=True, exist_ok=True)
+            folder.mkdir(0o700, exist_ok=True)
             others = sorted((each for each in folder.iterdir() if each != self._at), key=lambda at: at.stat().st_mtime)
             sizes = {each: each.stat().st_size for each in others}
             going = []

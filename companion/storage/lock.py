@@ -25,7 +25,7 @@ def only_daemon(directory: Path) -> Iterator[None]:
         StorageError: another daemon holds it.
     """
     try:
-        directory.mkdir(parents=True, exist_ok=True)
+        directory.mkdir(exist_ok=True)
         descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     except OSError:
         yield  # the ledger says why nothing can be kept, and nothing is written

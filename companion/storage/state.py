@@ -25,16 +25,17 @@ from companion import formats
 from companion.errors import StorageError
 
 
-def write_atomically(path: Path, data: bytes, *, mode: int = 0o600) -> None:
+def write_atomically(path: Path, data: bytes, *, mode: int = 0o600, parents: bool = False) -> None:
     """Replace a file's content so that a power cut at any byte leaves the old or the new content.
 
-    Temporary file in the same folder, fsync, rename, fsync of the folder.
+    Temporary file in the same folder, fsync, rename, fsync of the folder. The folder is created if its parent exists:
+    a typing error in a path must not create a tree. `parents` creates the whole path.
 
     Raises:
         StorageError: one line that names the file and the operating system's reason.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=parents, exist_ok=True)
         descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
         try:
             with os.fdopen(descriptor, "wb") as file:

@@ -7,9 +7,11 @@ import json
 import logging
 import random
 import re
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, Any
 
 import jsonschema
@@ -25,7 +27,7 @@ from companion.calibration.request import What
 from companion.cli import main as companion
 from companion.config.sections import Config, Noise
 from companion.daemon.recorder import recorder as recorder_module
-from companion.errors import CompanionError, StorageError
+from companion.errors import StorageError
 from companion.formats import Object
 from companion.recording import topics
 from companion.recording.files import Ring, versions
@@ -596,7 +598,7 @@ async def asked(rig: Rig, **request: Any) -> list[Object]:
 
 
 def test_recording_on_request(tmp_path: Path) -> None:
-    path = tmp_path / "mine.mcap"
+    path, absent = tmp_path / "mine.mcap", tmp_path / "nowhere" / "at" / "all.mcap"
 
     async def main() -> None:
         async with Rig(tmp_path, own_imu=True).running() as rig:
@@ -620,9 +622,17 @@ def test_recording_on_request(tmp_path: Path) -> None:
                 await asked(rig, file=str(tmp_path / "other.mcap"))
             (stopped,) = await asked(rig, stop=True)
             assert (await running)[-1]["file"] == stopped["file"] == str(tmp_path / "recordings" / "kept-001.mcap")
-            for refused in ({"stop": True}, {"file": str(path)}, {"file": "/nowhere/at/all.mcap"}, {"seconds": "x"}):
-                with pytest.raises(CompanionError):
+            with pytest.raises(StorageError, match="nothing is being recorded"):
+                await asked(rig, stop=True)
+            # With a length, so that one that is not refused ends.
+            for refused, words in (
+                ({"file": str(path), "seconds": 5.0}, "exists already"),
+                ({"file": str(absent), "seconds": 5.0}, f"{absent}: there is no folder {absent.parent}; make it"),
+                ({"seconds": "x"}, "not understood"),
+            ):
+                with pytest.raises(StorageError, match=words):
                     await asked(rig, **refused)
+            assert not (tmp_path / "nowhere").exists()
 
     run_virtual(main())
     result = replayed(path)
@@ -642,6 +652,47 @@ def test_recording_on_request_ends_with_the_daemon_in_order(tmp_path: Path) -> N
 
     assert run_virtual(main())[-1]["reason"] == "the daemon stopped"
     assert replayed(path).cut_short is None
+
+
+def test_a_recording_without_a_length_ends_at_its_size_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_module, "MOST_OPEN_END_BYTES", 1 << 17)
+
+    async def main() -> list[Object]:
+        async with asyncio.timeout(300.0), Rig(tmp_path, own_imu=True).running() as rig:
+            return await asked(rig, file=str(tmp_path / "mine.mcap"))
+
+    began, *_, ended = run_virtual(main())
+    assert began["text"].endswith("; ends at 0 GB")
+    assert (ended["state"], ended["reason"]) == ("done", "ended at 0 GB, its size limit")
+    assert 1 << 17 <= ended["bytes"] < 1 << 18
+    assert ended["most_bytes"] == 1 << 17
+    assert replayed(tmp_path / "mine.mcap").cut_short is None
+
+
+@pytest.mark.parametrize(("seconds", "state"), [(None, "done"), (60.0, "failed")])
+def test_a_recording_leaves_a_tenth_of_the_disk_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float | None, state: str
+) -> None:
+    free = 11 << 30
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=100 << 30, free=free))
+
+    async def main() -> Object:
+        nonlocal free
+        async with asyncio.timeout(300.0), Rig(tmp_path).running() as rig:
+            running = asyncio.create_task(asked(rig, file=str(tmp_path / "mine.mcap"), seconds=seconds))
+            await asyncio.sleep(5.0)
+            assert not running.done()
+            free = 9 << 30
+            ended = (await running)[-1]
+            with pytest.raises(StorageError, match=r"other\.mcap: not recorded, with less than 10 % of the disk free"):
+                await asked(rig, file=str(tmp_path / "other.mcap"), seconds=5.0)
+        assert not (tmp_path / "other.mcap").exists()
+        return ended
+
+    ended = run_virtual(main())
+    reason = "ended with less than 10 % of the disk free (9.7 of 107.4 GB)"
+    assert (ended["state"], ended["reason"]) == (state, reason)
+    assert replayed(tmp_path / "mine.mcap").cut_short is None
 
 
 # --- what goes wrong

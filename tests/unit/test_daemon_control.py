@@ -49,6 +49,16 @@ def test_request_progress_result_and_errors(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
+def test_a_socket_below_a_missing_folder_is_refused(tmp_path: Path) -> None:
+    async def main() -> None:
+        with pytest.raises(LinkError, match=r"far/away/c.sock: cannot be opened: No such file or directory$"):
+            async with ControlServer(tmp_path / "far" / "away" / "c.sock", _echo):
+                pass
+
+    asyncio.run(main())
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_group_may_use_it_too(tmp_path: Path) -> None:
     path = tmp_path / "control.sock"
     ours = grp.getgrgid(os.getgid()).gr_name

@@ -114,7 +114,7 @@ def test_a_recording_is_its_owners_alone_whatever_the_umask(tmp_path: Path) -> N
         ring = Ring(tmp_path / "ring", 8 * MB)
         ring.write(raw(1, 10), beginning())
         ring.close()
-        asked_for = RecordingFile(tmp_path / "flights" / "mine.mcap")
+        asked_for = RecordingFile(tmp_path / "mine.mcap")
         asked_for.write([], beginning())
         asked_for.close()
     finally:
@@ -123,7 +123,6 @@ def test_a_recording_is_its_owners_alone_whatever_the_umask(tmp_path: Path) -> N
     assert modes == {
         "ring": "drwx------",
         "000001.mcap": "-rw-------",
-        "flights": "drwx------",
         "mine.mcap": "-rw-------",
     }
 

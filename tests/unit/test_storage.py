@@ -18,6 +18,7 @@ from companion.calibration.records.record import ImuRecord, Record, WrittenParam
 from companion.errors import StorageError
 from companion.storage import records as records_module
 from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
+from companion.storage.lock import only_daemon
 from companion.storage.records import RecordStore
 from companion.storage.state import remove_durably, write_atomically
 
@@ -210,6 +211,7 @@ def test_a_trace_without_its_record_is_never_taken_for_the_next_ones(tmp_path: P
 
     other = tmp_path / "records" / "000001.trace.json.gz"
     assert not other.exists()
+    (tmp_path / "elsewhere").mkdir()
     RecordStore(tmp_path / "elsewhere").save(first, msgspec.structs.replace(_trace(first), started_at="2020"))
     other.write_bytes((tmp_path / "elsewhere/records/000001.trace.json.gz").read_bytes())
     with pytest.raises(StorageError, match="belongs to the calibration of 2020"):
@@ -244,6 +246,18 @@ def test_the_record_is_kept_where_its_trace_cannot_be(
     store.save(record, _trace(record))
     assert store.history() == [record]
     assert "No space left on device; the record is kept without it" in caplog.text
+
+
+def test_a_storage_directory_below_a_missing_folder_is_refused(tmp_path: Path) -> None:
+    """A typing error, or a stick that is not mounted: a tree made silently would hide it."""
+    directory = tmp_path / "stick" / "state"
+    with only_daemon(directory), pytest.raises(StorageError, match=r"cannot be written: No such file or directory$"):
+        ChangeLog(directory).check_writable()
+    assert list(tmp_path.iterdir()) == []
+    directory.parent.mkdir()
+    with only_daemon(directory):
+        ChangeLog(directory).check_writable()
+    assert list(tmp_path.rglob("*")) == [directory.parent, directory]
 
 
 def test_journal_and_undo_outlive_the_process(tmp_path: Path) -> None:

@@ -162,7 +162,7 @@ async def _finish(writer: asyncio.StreamWriter) -> None:
 
 def _bind(path: Path) -> socket.socket:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(exist_ok=True)
         _remove_stale(path)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         # The mode must be right before anyone can connect: bind makes the file with the umask's mode.

@@ -35,7 +35,16 @@ from companion.errors import StorageError
 from companion.formats import Object
 from companion.links.mavlink.link import Direction
 from companion.recording import topics
-from companion.recording.files import FOLDER_MODE, Beginning, RecordingFile, Ring, is_available, versions
+from companion.recording.files import (
+    Beginning,
+    RecordingFile,
+    Ring,
+    create_on_request,
+    disk_shortage,
+    is_available,
+    unused_path,
+    versions,
+)
 from companion.recording.journal import Journal, KeyFilter, Offsets, Solved
 from companion.recording.past import Message, Past
 
@@ -48,6 +57,9 @@ RETRY_S: Final = 60.0
 DEFAULT_MB: Final = 64
 """Default size of the ring: some 35 minutes of a 200 Hz IMU beside 100 Hz telemetry."""
 MOST_FILE_BYTES: Final = 4 << 30
+"""Size at which a recording of a stated length ends: no more fits into a file on many USB sticks."""
+MOST_OPEN_END_BYTES: Final = 1 << 30
+"""Size at which a recording without a stated length ends: nine hours of a 200 Hz IMU beside 100 Hz telemetry."""
 PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
 """How long the daemon's end waits for the disk at most."""
@@ -96,6 +108,11 @@ class _OnRequest:
     since_s: float
     until_s: float | None
     ended: asyncio.Future[Object]
+
+    @property
+    def most_bytes(self) -> int:
+        """Size at which it ends by itself."""
+        return MOST_OPEN_END_BYTES if self.until_s is None else MOST_FILE_BYTES
 
 
 class Recorder(Subsystem):
@@ -272,13 +289,18 @@ class Recorder(Subsystem):
     async def _flush_file(self, recording: _OnRequest, messages: list[Message], beginning: Beginning) -> None:
         try:
             await self._in_thread(recording.file.write, messages, beginning)
+            shortage = await self._in_thread(disk_shortage, recording.file.path.parent)
         except StorageError as error:
             await self._end(recording, str(error), state="failed")
-        else:
-            if recording.until_s is not None and asyncio.get_running_loop().time() >= recording.until_s:
-                await self._end(recording, "recorded as long as was asked for")
-            elif recording.file.bytes_written >= MOST_FILE_BYTES:
-                await self._end(recording, f"ended at {MOST_FILE_BYTES >> 30} GB, as large as a file may be")
+            return
+        if recording.until_s is not None and asyncio.get_running_loop().time() >= recording.until_s:
+            await self._end(recording, "recorded as long as was asked for")
+            return
+        state = "done" if recording.until_s is None else "failed"
+        if recording.file.bytes_written >= recording.most_bytes:
+            await self._end(recording, f"ended at {recording.most_bytes >> 30} GB, its size limit", state)
+        elif shortage is not None:
+            await self._end(recording, f"ended with {shortage}", state)
 
     # --- on request
 
@@ -300,13 +322,14 @@ class Recorder(Subsystem):
         if not (seconds is None or is_time_limit(seconds)) or not (name is None or isinstance(name, str)):
             raise StorageError(f"record: not understood: {request}")
         recording = await self._start(name, seconds)
+        most = f"; ends at {recording.most_bytes >> 30} GB" if seconds is None else ""
         while not recording.ended.done():
             now_s = asyncio.get_running_loop().time() - recording.since_s
             yield {
                 "kind": "progress",
                 "state": "recording",
                 "percent": 0 if not seconds else min(99, int(100 * now_s / seconds)),
-                "text": f"{recording.file.path}: {now_s:.0f} s, {recording.file.bytes_written / 1e6:.1f} MB",
+                "text": f"{recording.file.path}: {now_s:.0f} s, {recording.file.bytes_written / 1e6:.1f} MB{most}",
             }
             await asyncio.wait([recording.ended], timeout=PROGRESS_S)
         yield {"kind": "result", **recording.ended.result()}
@@ -316,8 +339,8 @@ class Recorder(Subsystem):
             raise StorageError(HOW_TO_INSTALL)
         self._refuse_second()
         loop = asyncio.get_running_loop()
-        path = Path(name) if name is not None else await self._offload(_kept, self._folder)
-        file = await self._offload(RecordingFile, path)
+        path = Path(name) if name is not None else await self._offload(unused_path, self._folder)
+        file = await self._offload(create_on_request, path)
         try:
             self._refuse_second()  # somebody may have been quicker
         except StorageError:
@@ -354,6 +377,7 @@ class Recorder(Subsystem):
                 "file": str(recording.file.path),
                 "seconds": round(seconds, 1),
                 "bytes": size,
+                "most_bytes": recording.most_bytes,
                 "messages": recording.file.messages,
                 "lost": self._journal.lost_in_all - recording.lost_before,
             }
@@ -380,12 +404,3 @@ class Recorder(Subsystem):
             },
         }
         return {"recording": recording}
-
-
-def _kept(folder: Path) -> Path:
-    try:
-        folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
-        numbers = [int(path.stem[5:]) for path in folder.glob("kept-*.mcap") if path.stem[5:].isdecimal()]
-    except OSError as error:
-        raise StorageError(f"{folder}: {error.strerror or error}") from error
-    return folder / f"kept-{max(numbers, default=0) + 1:03d}.mcap"
