@@ -258,7 +258,8 @@ def test_tls_by_an_authority_of_ones_own(tmp_path: Path, kind: Kind, monkeypatch
             async with alone(tmp_path, one.section()) as service, peer(one) as watcher:
                 await until_connected(service)
                 await watcher.until(f"{BASE}/status", is_(b"online"))
-            other = Broker(tmp_path / "..", kind, tls=True)  # the authority of somebody else
+            (elsewhere := tmp_path / "elsewhere").mkdir()
+            other = Broker(elsewhere, kind, tls=True)  # the authority of somebody else
             async with alone(tmp_path, one.section(ca_file=str(other.ca_file))) as service:
                 assert "certificate is not trusted" in await until_problem(service, "certificate")
             async with alone(tmp_path, one.section(tls=False).replace("ca_file", "#")) as service:
