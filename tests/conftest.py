@@ -1,4 +1,4 @@
-"""What holds for all tests: which are quick, which wait for a clock, and how long each took."""
+"""Rules for all tests: which are quick, which wait for a clock, the time limit of each, what none may leave behind."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ import hypothesis
 import pytest
 
 from tests.support.extent import LONG
+from tests.support.outside import Outside
 
 # How long an example takes says something of the machine, not of the code. Every day the examples are the same for
 # everybody: a suite is green or red, and no matter of dice. Those of `make long` are new every time.
@@ -43,6 +44,11 @@ DURATIONS: Final = TESTS / "durations.json"
 WORTH_NOTING_S: Final = 0.5
 QUICK_S: Final = 0.5
 """The most processor time of a test that `make quick` runs."""
+LONG_LIMIT_S: Final = 7200.0
+"""Time limit of a test with a real autopilot, or of `make long`; others have that of pyproject.toml."""
+LIMIT_AGAIN_S: Final = 20.0
+"""Interval at which a test beyond its limit is interrupted again: an exception may end in a task that nobody awaits."""
+OUTSIDE: Final = pytest.StashKey[Outside]()
 QUICK_ROOMS: Final = ("unit", "property")
 WAITS: Final = re.compile(
     r"\basyncio\.run\(|\bsubprocess\.|\bcreate_subprocess|\blive_aircraft\(|\btime\.sleep\(|\bopenpty\(|\bPtyDevice\("
@@ -142,6 +148,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker("real_clock")
         if item.get_closest_marker("real_clock") is not None and not may_wait(item.path):
             raise pytest.UsageError(f"{item.nodeid} waits for the real clock, and its file does not show it: import it")
+        if LONG or item.get_closest_marker("sitl") is not None:
+            item.add_marker(pytest.mark.timeout(LONG_LIMIT_S))
     if LONG:
         _choose(config, items, lambda item: "extent" in vars(item.module) or hasattr(item.function, "hypothesis"))
     if config.getoption("quick"):
@@ -182,6 +190,27 @@ def _no_process(event: str, _arguments: object) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("quick"):
         sys.addaudithook(_no_process)
+    if not hasattr(config, "workerinput"):
+        config.stash[OUTSIDE] = Outside()
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    outside = session.config.stash.get(OUTSIDE, None)
+    if outside is not None and outside.compare():
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if (outside := config.stash.get(OUTSIDE, None)) is not None:
+        outside.close()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_timeout_set_timer(settings: Any) -> Generator[None, object, object]:
+    done = yield
+    if settings.method == "signal":
+        signal.setitimer(signal.ITIMER_REAL, settings.timeout, LIMIT_AGAIN_S)
+    return done
 
 
 def _processor_s() -> float:
@@ -217,7 +246,12 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """Name what is too slow for `make quick`; it is left out from the next time on that durations are noted."""
+    """Name what was left outside, and what is too slow for `make quick`: `--write-durations` leaves that out."""
+    outside = config.stash.get(OUTSIDE, None)
+    if outside is not None and outside.left:
+        terminalreporter.section("left outside tmp_path", red=True)
+        for path in outside.left:
+            terminalreporter.line(f"{path}: new since the start of the run; a test may write below tmp_path only")
     if config.getoption("quick"):
         slow = sorted(((took_s, name) for name, took_s in _took_s.items() if took_s > QUICK_S), reverse=True)
         if slow:
