@@ -218,11 +218,7 @@ def test_two_companions_of_one_name_are_told_apart_in_words(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_wrong_password_is_said_and_mended_without_a_restart(
-    tmp_path: Path, kind: Kind, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    hurry(monkeypatch, kind)
-
+def test_a_wrong_password_is_said_and_mended_without_a_restart(tmp_path: Path, kind: Kind) -> None:
     async def main() -> None:
         async with broker(tmp_path, kind, users=True) as one:
             section = one.section()
@@ -250,9 +246,7 @@ def test_a_password_file_that_is_missing_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_tls_by_an_authority_of_ones_own(tmp_path: Path, kind: Kind, monkeypatch: pytest.MonkeyPatch) -> None:
-    hurry(monkeypatch, kind)
-
+def test_tls_by_an_authority_of_ones_own(tmp_path: Path, kind: Kind) -> None:
     async def main() -> None:
         async with broker(tmp_path, kind, tls=True, users=True) as one:
             async with alone(tmp_path, one.section()) as service, peer(one) as watcher:
