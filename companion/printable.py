@@ -4,7 +4,10 @@ from __future__ import annotations
 
 
 def printable(text: str) -> str:
-    """The text in one line; what a terminal would obey, or nobody would see, as an escape that can be read."""
+    """Return the text in one line, with an escape for each character that moves the cursor or cannot be seen.
+
+    `ascii` and not a codec: Python loads a codec from a file at its first use, which fails without a free descriptor.
+    """
     if text.isprintable():
         return text
-    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in text)
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)

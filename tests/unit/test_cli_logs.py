@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import logging
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -65,3 +67,28 @@ def test_what_comes_now_and_then_is_written_as_it_comes() -> None:
             logger.info("calibration %d done", k)
             clock.now_s += 10.1
     assert stream.getvalue() == "".join(f"calibration {k} done\n" for k in range(1000))
+
+
+WITHOUT_DESCRIPTORS = """
+import logging, os, resource
+from companion.cli import logs
+
+logs.set_up("info")
+resource.setrlimit(resource.RLIMIT_NOFILE, (20, 20))
+try:
+    while True:
+        os.dup(2)
+except OSError:
+    logging.getLogger("companion").exception("heard %s", "\\x1b[2J")
+"""
+
+
+def test_the_log_is_written_when_no_descriptor_is_free() -> None:
+    """Run in a process of its own: another test may have loaded what is missing here."""
+    ended = subprocess.run(
+        [sys.executable, "-c", WITHOUT_DESCRIPTORS], capture_output=True, text=True, timeout=60.0, check=True
+    )
+    first, *others = ended.stderr.splitlines()
+    assert first.endswith(r"ERROR heard \x1b[2J")
+    assert others[-1].startswith("OSError: [Errno 24]")
+    assert "Logging error" not in ended.stderr
