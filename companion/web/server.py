@@ -156,6 +156,8 @@ class Page:
         self._clients.add(client)
         self._brief[client] = None
         client.add_done_callback(self._forget)
+        # Not a `finally` of the task: one that is cancelled before its first step reaches none.
+        client.add_done_callback(lambda _: writer.transport.abort())
 
     def _forget(self, client: asyncio.Task[None]) -> None:
         self._clients.discard(client)
@@ -175,8 +177,6 @@ class Page:
             pass  # gone, or too slow; what was asked for goes on
         except Exception:
             logger.exception("a request of the page failed")
-        finally:
-            writer.transport.abort()
 
     async def _exchange(self, exchange: Exchange) -> None:
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import grp
 import os
 import socket
@@ -215,6 +216,32 @@ def test_no_crowd_keeps_cancel_and_status_out(tmp_path: Path, command: str) -> N
                 writer.transport.abort()
 
     asyncio.run(main())
+
+
+def test_a_burst_of_silent_clients_leaves_no_descriptor_open(tmp_path: Path) -> None:
+    path = tmp_path / "control.sock"
+
+    async def main() -> None:
+        async with ControlServer(path, _echo), asyncio.timeout(30.0):
+            before = len(os.listdir("/proc/self/fd"))
+            silent = [socket.socket(socket.AF_UNIX) for _ in range(4 * control.MAX_CLIENTS)]
+            for client in silent:  # all are there before the loop turns, so that most are evicted at once
+                client.connect(str(path))
+            evicted = silent[: -control.MAX_CLIENTS]
+            loop = asyncio.get_running_loop()
+            for client in evicted:
+                client.setblocking(False)
+                assert await loop.sock_recv(client, 1) == b""
+            served = len(os.listdir("/proc/self/fd")) - before - len(silent)
+            assert served <= control.MAX_CLIENTS
+            for client in silent:
+                client.close()
+
+    gc.disable()  # it would close some of what is left open
+    try:
+        asyncio.run(main())
+    finally:
+        gc.enable()
 
 
 def test_who_does_not_read_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import contextlib
+import gc
 import hashlib
 import json
 import logging
@@ -357,6 +358,31 @@ def test_whoever_says_nothing_for_longest_makes_way(tmp_path: Path, monkeypatch:
             writer.close()
 
     run(tmp_path, visit)
+
+
+def test_a_burst_of_silent_connections_leaves_no_descriptor_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "MAX_CONNECTIONS", 4)
+
+    async def visit(served: Page, daemon: Daemon) -> None:
+        # All are there before the loop turns, so that most are evicted at once.
+        silent = [socket.create_connection(("127.0.0.1", port_of(served))) for _ in range(40)]
+        evicted = silent[: -server.MAX_CONNECTIONS]
+        loop = asyncio.get_running_loop()
+        async with asyncio.timeout(30.0):
+            for client in evicted:
+                client.setblocking(False)
+                with contextlib.suppress(ConnectionError):
+                    assert await loop.sock_recv(client, 1) == b""
+        for client in silent:
+            client.close()
+
+    gc.disable()  # it would close some of what is left open
+    try:
+        run(tmp_path, visit)
+    finally:
+        gc.enable()
 
 
 def test_whoever_looks_on_does_not_make_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,7 +63,11 @@ class ControlServer:
         listener = _bind(self._path)
         if self._group is not None:
             _open_to(self._path, self._group)
-        self._server = await asyncio.start_unix_server(self._accept, sock=listener, limit=REQUEST_LIMIT)
+        self._server = await asyncio.start_unix_server(
+            self._accept, sock=listener, limit=REQUEST_LIMIT, backlog=MAX_CLIENTS
+        )
+        # asyncio accepts `backlog` clients before it closes one that was evicted; the kernel may queue more.
+        listener.listen()
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -88,6 +92,8 @@ class ControlServer:
         self._clients.add(client)
         self._silent[client] = None
         client.add_done_callback(self._forget)
+        # Not a `finally` of the task: one that is cancelled before its first step reaches none.
+        client.add_done_callback(lambda _: writer.transport.abort())
 
     def _forget(self, client: asyncio.Task[None]) -> None:
         self._clients.discard(client)
@@ -100,8 +106,6 @@ class ControlServer:
                 await self._take(request, writer)
         except (ConnectionError, TimeoutError):
             pass  # the client went away, or is deaf; what it asked for goes on
-        finally:
-            writer.transport.abort()
 
     async def _request(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Object | None:
         """What a client asks; None: nothing that can be understood, which it is told; TimeoutError: not in time."""
