@@ -29,6 +29,7 @@ class Request:
     headers: Mapping[str, str]
     body: bytes = b""
     peer: str = ""
+    query: str = ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -94,9 +95,9 @@ class Exchange:
                     raise BadRequestError(413, f"more than {MAX_BODY} bytes")
             elif isinstance(event, h11.EndOfMessage) and head is not None:
                 headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in head.headers}
-                path = head.target.decode("latin-1").partition("?")[0]
+                path, _, query = head.target.decode("latin-1").partition("?")
                 peer = str((self.writer.get_extra_info("peername") or ("nobody",))[0])
-                return Request(head.method.decode("latin-1"), path, headers, body, peer)
+                return Request(head.method.decode("latin-1"), path, headers, body, peer, query)
             else:
                 return None
 

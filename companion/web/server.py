@@ -11,9 +11,10 @@ import hashlib
 import logging
 import re
 import socket
+import urllib.parse
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import Any, Final, NamedTuple, NoReturn
 
 import msgspec
 
@@ -45,6 +46,8 @@ LEAST_S: Final = 0.1
 """Between two events, whatever wakes them."""
 MAX_CONNECTIONS: Final = 48
 MAX_VIEWERS: Final = 16
+MAX_STRANGERS: Final = 4
+"""The most viewers of one address without the token; on the board itself all have the same address."""
 WRONG_TOKEN_S: Final = 2.0
 """How long the answer to a wrong token is held back."""
 MAX_WAITING: Final = 16
@@ -60,6 +63,11 @@ WORTH_S: Final = 10.0
 RECORDS: Final = 10
 FACE: Final = "the page's"
 """How the page is named as a sender, as in "cancelled by the page's cancel"."""
+
+
+class _Viewer(NamedTuple):
+    peer: str
+    has_token: bool
 
 
 class Page:
@@ -88,7 +96,8 @@ class Page:
         self._clients: set[asyncio.Task[None]] = set()
         self._brief: dict[asyncio.Task[None], None] = {}
         """Those of them that do not look on, the oldest first."""
-        self._viewers: set[Exchange] = set()
+        self._viewers: dict[Exchange, _Viewer] = {}
+        """The oldest first."""
         self._wrong_tokens = self._waiting = 0
         self._wake = asyncio.Event()
         self._reconnection = Reconnection(
@@ -188,7 +197,7 @@ class Page:
             return
         response = await self.respond(request)
         if response is None:
-            await self._view(exchange)
+            await self._view(exchange, self._viewer(request))
         else:
             await exchange.respond(response)
 
@@ -209,7 +218,7 @@ class Page:
         if (why := self.access.refuses_stranger(request.headers)) is not None:
             return _refusal(403, why)
         if request.path == "/events":
-            return None if len(self._viewers) < MAX_VIEWERS else _refusal(503, f"{MAX_VIEWERS} are looking already")
+            return await self._refuse_viewer(request)
         if request.path == "/records.json":
             found = await self._records()
             return _json(200, {"records": [{"file": file_name(record), "record": record} for record in found]})
@@ -284,19 +293,43 @@ class Page:
 
     # --- those who look
 
-    async def _view(self, exchange: Exchange) -> None:
+    def _viewer(self, request: Request) -> _Viewer:
+        # A browser's EventSource sends no header of ours.
+        (token, *_) = urllib.parse.parse_qs(request.query).get("token", [""])
+        return _Viewer(request.peer, self.access.refuses_token({TOKEN_HEADER: token}) is None)
+
+    async def _refuse_viewer(self, request: Request) -> Response | None:
+        """Refuse one more viewer where there is no room; None: there is, if need be after the oldest has made way."""
+        viewer, viewers = self._viewer(request), self._viewers
+        if viewer.has_token:
+            if len(viewers) >= MAX_VIEWERS:
+                oldest = next((each for each, other in viewers.items() if not other.has_token), next(iter(viewers)))
+                del viewers[oldest]
+                oldest.writer.transport.abort()
+            return None
+        if len(viewers) >= MAX_VIEWERS:
+            reason = f"{MAX_VIEWERS} are looking already; the token makes room: companion web-token, on the board"
+        elif not self.local and list(viewers.values()).count(viewer) >= MAX_STRANGERS:
+            reason = f"{MAX_STRANGERS} from this address are looking already without the token"
+        else:
+            return None
+        if not self.local and "token=" in request.query:
+            await self._wait_after_guess(request.peer)
+        return _refusal(503, reason)
+
+    async def _view(self, exchange: Exchange, viewer: _Viewer) -> None:
         exchange.begin_stream("text/event-stream")
         token = self.access.token if self.access.handed_out else None
         exchange.send(_event({"version": __version__, "page": self._tag, "token": token}, "hello"))
         if not self._viewers:
             self._wake.set()
-        self._viewers.add(exchange)
+        self._viewers[exchange] = viewer
         if (client := asyncio.current_task()) is not None:
             self._brief.pop(client, None)
         try:
             await exchange.left()
         finally:
-            self._viewers.discard(exchange)
+            self._viewers.pop(exchange, None)
 
     async def _broadcast(self) -> NoReturn:
         while True:

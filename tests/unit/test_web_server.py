@@ -422,10 +422,10 @@ class Viewer:
         self._text = b""
 
     @classmethod
-    async def at(cls, served: Page, **headers: str) -> Viewer:
+    async def at(cls, served: Page, *, query: str = "", **headers: str) -> Viewer:
         reader, writer = await connect(served)
         lines = "".join(f"{name.replace('_', '-')}: {value}\r\n" for name, value in headers.items())
-        writer.write(f"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\n{lines}\r\n".encode())
+        writer.write(f"GET /events{query} HTTP/1.1\r\nHost: 127.0.0.1\r\n{lines}\r\n".encode())
         return cls(reader, writer)
 
     async def head(self) -> Said:
@@ -440,6 +440,13 @@ class Viewer:
         event, _, self._text = self._text.partition(b"\n\n")
         fields = dict(line.split(": ", 1) for line in event.decode().split("\n"))
         return fields.get("event", "message"), json.loads(fields["data"])
+
+    async def is_ended(self) -> bool:
+        """Whether the other side ends it, after whatever it still says."""
+        with contextlib.suppress(ConnectionError):
+            async with asyncio.timeout(30.0):
+                await self.reader.read()
+        return True
 
 
 def test_the_state_comes_at_once_and_again_after_every_action(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -498,6 +505,49 @@ def test_too_many_viewers_are_told_so(tmp_path: Path, monkeypatch: pytest.Monkey
             viewer.writer.close()
 
     run(tmp_path, visit)
+
+
+def test_the_token_makes_room_among_viewers_without_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "MAX_VIEWERS", 3)
+    monkeypatch.setattr(server, "WRONG_TOKEN_S", 0.0)
+
+    async def visit(served: Page, daemon: Daemon) -> None:
+        async def looks(query: str = "") -> Viewer:
+            viewer = await Viewer.at(served, query=query)
+            assert (await viewer.head()).status == 200
+            await viewer.event()
+            return viewer
+
+        token = f"?token={served.access.token}"
+        strangers = [await looks() for _ in range(server.MAX_VIEWERS)]
+        wrong = await Viewer.at(served, query="?token=222222222222")
+        assert (await wrong.head()).status == 503
+        pilots = []
+        for displaced in strangers:
+            pilots.append(await looks(token))
+            assert await displaced.is_ended()
+        assert (await (await Viewer.at(served)).head()).status == 503
+        # Where all have the token the oldest makes way: one phone that reconnects leaves old connections behind.
+        pilots.append(await looks(token))
+        assert await pilots[0].is_ended()
+        for pilot in pilots[1:]:
+            await pilot.event()
+            await pilot.event()
+        assert served.status()["viewers"] == server.MAX_VIEWERS
+
+    run(tmp_path, visit, bind="0.0.0.0:0")
+
+
+@pytest.mark.parametrize(("bind", "room"), [("0.0.0.0:0", server.MAX_STRANGERS), ("127.0.0.1:0", server.MAX_VIEWERS)])
+def test_one_address_does_not_take_all_room_for_viewers(tmp_path: Path, bind: str, room: int) -> None:
+    async def visit(served: Page, daemon: Daemon) -> None:
+        viewers = [await Viewer.at(served) for _ in range(room)]
+        for viewer in viewers:
+            assert (await viewer.head()).status == 200
+            await viewer.event()
+        assert (await (await Viewer.at(served)).head()).status == 503
+
+    run(tmp_path, visit, bind=bind)
 
 
 def test_a_viewer_who_does_not_read_is_dropped_and_the_others_see_everything(

@@ -226,7 +226,8 @@ setInterval(temperature, DRAWN_MS);
 
 function listen() {
   if (source) source.close();
-  source = new EventSource("/events");
+  // With the token there is room among many who only look.
+  source = new EventSource("/events" + (token ? "?token=" + encodeURIComponent(token) : ""));
   source.addEventListener("hello", event => {
     const hello = JSON.parse(event.data);
     if (page !== null && page !== hello.page) location.reload();
