@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -143,6 +144,63 @@ def test_a_power_cut_at_any_moment_of_an_undo_costs_no_step_and_takes_back_no_se
     ends = [run_virtual(go_on(cut)) for cut in cuts]
     assert ends == sorted(ends, reverse=True)
     assert set(ends) == {2, 3}
+
+
+def arms(rig: Rig) -> None:
+    rig.double.arm()
+
+
+def refuses(rig: Rig) -> None:
+    rig.double.faults.refuse = {TRIM[0]}
+
+
+def falls_silent(rig: Rig) -> None:
+    rig.wire.cut = True
+
+
+def mended(rig: Rig) -> None:
+    rig.double.disarm()
+    rig.double.faults.refuse = set()
+    rig.wire.cut = False
+
+
+@pytest.mark.parametrize("restart", [False, True])
+@pytest.mark.parametrize(
+    ("fault", "why"),
+    [(arms, "armed"), (refuses, f"refuses {TRIM[0]}"), (falls_silent, "no answer")],
+)
+def test_an_undo_that_fails_before_its_first_write_can_be_asked_for_again(
+    tmp_path: Path, fault: Callable[[Rig], None], why: str, restart: bool
+) -> None:
+    wanted = written(tmp_path)
+    step_file = tmp_path / "undo-1.json"
+
+    async def main() -> None:
+        async with Rig(tmp_path, parameters=wanted[0]).running() as rig:
+            await rig.ready()
+            kept = step_file.read_bytes()
+            job = started(rig.service.calibrating.conductor.start_undo("test"))
+            await rig.until((tmp_path / "journal.json").exists, 5.0)
+            assert read(rig) == wanted[0]
+            fault(rig)
+            failed = await job.finished
+            assert failed.outcome == "failed"
+            assert why in failed.reason
+            assert failed.reason.endswith("level stays in force: undo again")
+            assert "old values back" not in failed.reason
+            assert read(rig) == wanted[0]
+            assert step_file.read_bytes() == kept
+            assert not rig.service.offsets.ledger.pending
+            mended(rig)
+            if restart:
+                await rig.restart()
+                await rig.ready()
+            await rig.until(lambda: rig.service.core.vehicle.arm_state.name == "DISARMED", 30.0)
+            assert steps(rig) == list(STEPS)
+            assert (await undone(rig)).reason == "2 old values back: level"
+            assert read(rig) == wanted[1]
+
+    run_virtual(main())
 
 
 def test_what_somebody_else_has_changed_stops_it_is_named_and_passed_over_by_force(tmp_path: Path) -> None:

@@ -125,6 +125,29 @@ def test_a_write_is_over_when_it_is_known_to_be_and_else_the_menders(
     asyncio.run(main())
 
 
+@pytest.mark.parametrize(
+    ("block", "kept"),
+    [(raises(ALL_BACK), True), (raises(NOTHING), True), (Ledger.undone, False), (raises(HALF_BACK), False)],
+    ids=["old values back", "nothing written", "undone", "left changed"],
+)
+def test_an_undo_that_changes_nothing_keeps_its_step_also_over_a_restart(
+    tmp_path: Path, block: Block, kept: bool
+) -> None:
+    async def main() -> None:
+        ledger = opened(tmp_path)
+        await end_of(ledger, lambda ledger: ledger.done(OLD))
+        await end_of(ledger, block)
+        if ledger.pending:  # the recovery brings the undo to its end
+            assert ledger.is_undoable(OLD)
+            await ledger.undone()
+        steps = (OLD,) if kept else ()
+        assert ledger.steps(1) == opened(tmp_path).steps(1) == steps
+        assert (tmp_path / "undo-1.json").exists() is kept
+        assert on_disk(tmp_path) is None
+
+    asyncio.run(main())
+
+
 def test_the_old_values_are_on_disk_before_the_block_and_grow_with_it(tmp_path: Path) -> None:
     async def main() -> None:
         ledger = opened(tmp_path)

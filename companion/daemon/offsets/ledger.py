@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -82,6 +82,16 @@ class Ledger:
 
     async def interrupted(self) -> ChangeSet:
         """Wait until there is an interrupted write; it stays one until `undone`."""
+    @property
+    def orphaned(self) -> ChangeSet | None:
+        """The interrupted write that waits for the recovery."""
+        return self._open if self.pending else None
+
+    def is_undoable(self, changes: ChangeSet) -> bool:
+        """Whether a step that can be undone holds these changes."""
+        kept = self._undoable.get(changes.system_id)
+        return kept is not None and kept.without(changes) is not kept
+
         while self._open is None or not self.pending:
             await self._orphaned.wait()
         return self._open
@@ -91,7 +101,8 @@ class Ledger:
         """Around a write: what happens to one that is not finished is decided here and nowhere else.
 
         The old values are on disk before the block begins. It says itself how it ended, by `done` or `undone`; and a
-        writer's error that has left nothing changed says that they are in force. After anything else (a value left
+        writer's error that has left nothing changed says that the autopilot is as it was before the block: after a
+        failed undo that means the values that were to be undone. After anything else (a value left
         changed, a cancellation, a fault of the program, no word at all) nobody knows what is, and the recovery looks.
 
         Args:
@@ -111,7 +122,7 @@ class Ledger:
         except (WriteFailedError, NothingWrittenError) as error:
             if not (error.left_changed or stepwise):
                 with contextlib.suppress(StorageError):
-                    await self.undone()
+                    await self.unchanged()
             raise
         finally:
             self._leave_to_recovery()
@@ -139,7 +150,7 @@ class Ledger:
         """
         kept = self._undoable.get(changes.system_id, Undoable(changes.system_id))
         await self._keep(kept.and_then(changes))
-        await self._close()
+        await self.unchanged()
 
     async def undone(self) -> None:
         """The end of a transaction, or of an interrupted one, or of an undo: the old values are in force.
@@ -152,14 +163,19 @@ class Ledger:
             left = kept.without(self._open)
             if left is not kept:
                 await self._keep(left)
-        await self._close()
+        await self.unchanged()
 
     async def _keep(self, undoable: Undoable) -> None:
         file = self._log.undo_of(undoable.system_id)
         await (self._offload(file.write, undoable) if undoable.steps else self._offload(file.clear))
         self._undoable[undoable.system_id] = undoable
 
-    async def _close(self) -> None:
+    async def unchanged(self) -> None:
+        """End a transaction that left the autopilot as it found it: every step that could be undone still can.
+
+        Raises:
+            StorageError: the disk refuses; the write stays open.
+        """
         await self._offload(self._log.journal.clear)
         self._open = None
         self._orphaned.clear()
@@ -237,8 +253,8 @@ class Recovery:
 
         Raises:
             AutopilotError: somebody else has changed some of them since (each named, with their value, ours and the
-                one before), or the writing failed (what could not be put back will be, as soon as the aircraft is
-                disarmed).
+                one before), or the writing failed: then the step is as it was, or, where some values could not be
+                written again, the recovery brings the undo to its end as soon as the aircraft is disarmed.
             StorageError: the disk refuses.
         """
         if (why := self.why_no_undo()) is not None:
@@ -253,11 +269,14 @@ class Recovery:
             )
         if foreign:
             logger.warning("changed by somebody else since, left alone: %s", "; ".join(foreign))
-        async with self.ledger.transaction(step):
-            with changing(self._imus.values()):
-                written = await self._writer.undo(ours)
-            await self._owed.after(ours)
-            await self.ledger.undone()
+        try:
+            async with self.ledger.transaction(step):
+                with changing(self._imus.values()):
+                    written = await self._writer.undo(ours)
+                await self._owed.after(ours)
+                await self.ledger.undone()
+        except (WriteFailedError, NothingWrittenError) as error:
+            raise AutopilotError(_why_not_undone(error, step)) from error
         self._owed.say()
         return step, written
 
@@ -291,3 +310,15 @@ class Recovery:
             with contextlib.suppress(ParameterRefusedError):
                 found[name] = await self._parameters.read(name)
         return found
+
+
+async def _nobody_notes(_step: ChangeSet, _words: str) -> None:
+    """Stand in until somebody keeps a history."""
+
+
+def _why_not_undone(error: WriteFailedError | NothingWrittenError, step: ChangeSet) -> str:
+    """The writer's "old values" are those from before the undo: say what is in force, as the pilot sees it."""
+    cause = f"{error.kind}: {error.reason}" if isinstance(error, WriteFailedError) else str(error)
+    if error.left_changed:
+        return f"{cause}; undone in part ({', '.join(error.left_changed)}): the rest follows once disarmed"
+    return f"{cause}; {step.origin.what or 'last write'} stays in force: undo again"
