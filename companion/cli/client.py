@@ -100,7 +100,8 @@ async def undo(options: argparse.Namespace, wanted: Object | None = None) -> int
 async def history(options: argparse.Namespace) -> int:
     """`companion history`."""
     reply = await request(options, {"command": "history", "limit": options.limit})
-    answer = {key: reply.get(key, []) for key in ("numbers", "records", "armings", "by_hand", "flights")}
+    keys = ("numbers", "records", "armings", "by_hand", "interrupted", "flights")
+    answer = {key: reply.get(key, []) for key in keys}
     return finish(options, reply, answer, show.history_lines(**answer), good=True)
 
 

@@ -265,8 +265,9 @@ def history_lines(
     armings: Sequence[Object],
     by_hand: Sequence[Object],
     flights: Sequence[Object] = (),
+    interrupted: Sequence[Object] = (),
 ) -> list[str]:
-    """Past calibrations, alignments, armings and flights, newest first; numbers as `companion report` takes."""
+    """History, newest first in each section; `numbers`: of the records, as `companion report` takes them."""
     lines = ["no calibrations yet"]
     if records:
         lines = [f"{'no.':>4} {'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]
@@ -278,6 +279,9 @@ def history_lines(
     if by_hand:
         lines.append(f"{'':4} {'beside these (UTC)':20} what came of it")
         lines += [f"{'':4} {one['measured_at'][:19]:20} {by_hand_words(one)}" for one in by_hand]
+    if interrupted:
+        lines.append(f"{'':4} {'interrupted (UTC)':20} what became of the old values")
+        lines += [f"{'':4} {_interrupted(one)}" for one in interrupted]
     if armings:
         lines.append(f"{'':4} {'armed (UTC)':20} in force")
         lines += [
@@ -289,6 +293,14 @@ def history_lines(
         lines.append(f"{'no.':>4} {'flown (UTC)':20} {'what its log says'}")
         lines += [f"{one['number']:4} {_flown(msgspec.convert(one['flight'], Flight))}" for one in flights]
     return lines
+
+
+def _interrupted(one: Object) -> str:
+    """An interrupted write, with the minute of the restore."""
+    ended = f", {_minute(one['ended_at'])}" if one["ended_at"] else ""
+    what, number = one["what"] or "write", len(one["parameters"])
+    began_at = (one["began_at"] or one["ended_at"] or "time unknown")[:19]
+    return f"{began_at:20} {what}, {number} parameters: {one['reason']}{ended}"
 
 
 def _flown(flight: Flight) -> str:

@@ -31,6 +31,7 @@ class Arming(Subsystem):
 
     def __init__(self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating) -> None:
         self._core, self._store, self._by_hand = core, calibrating.store, calibrating.by_hand
+        self._recovery = offsets.recovery
         # In this order they hear of a calibration's end: who starts the next one asks what is in force.
         self.in_force = InForce(core, devices.imus, calibrating.conductor, calibrating.solver, calibrating.memory)
         self.automatic = Automatic(core, devices.imus, calibrating.conductor, self.in_force, calibrating.memory)
@@ -80,6 +81,7 @@ class Arming(Subsystem):
             "records": [msgspec.to_builtins(record) for record in records],
             "armings": [msgspec.to_builtins(arming) for arming in armings[:limit]],
             "by_hand": self._by_hand.history()[:limit],
+            "interrupted": self._recovery.interruptions()[:limit],
             "flights": self._flights(limit),
         }
 

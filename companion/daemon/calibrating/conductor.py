@@ -32,7 +32,7 @@ from companion.daemon.offsets.ledger import Recovery
 from companion.daemon.stands.by_hand import ByHand
 from companion.errors import CompanionError
 from companion.links.system.listeners import Listeners
-from companion.storage.changes import AUTOMATIC, BY_HAND, PREDICTION
+from companion.storage.changes import AUTOMATIC, BY_HAND, PREDICTION, ChangeSet
 
 logger = logging.getLogger(__name__)
 
@@ -62,6 +62,7 @@ class Conductor:
         core.vehicle.on_event.add(self._on_event)
         core.wanted.on_retarget.add(self._retarget)
         recovery.on_recovered.add(self._recovered)
+        recovery.note_undone = self._undone_by_recovery
 
     # --- what others ask of it (component.service.CalibrationService)
 
@@ -277,15 +278,26 @@ class Conductor:
     async def _undo(self, job: Job, *, force: bool) -> None:
         async def run() -> str:
             step, written = await self._recovery.undo(force=force)
-            if by_hand := step.origin.what in BY_HAND:
-                await self._by_hand.undone(step)
-            else:
-                by_hand = not await self.results.undone(step)
-            job.deliver(Undone(step, written, by_hand))
+            job.deliver(Undone(step, written, await self._note_undone(step)))
             self._machine.on(Event.CONCLUDED)
             return f"{len(written)} old values back{step.origin.what and f': {step.origin.what}'}"
 
         self._end(job, await _result(job, run()))
+
+    async def _undone_by_recovery(self, step: ChangeSet, words: str) -> None:
+        """An undo that was interrupted has come to its end."""
+        job = Job("undo", What.BOTH, "recovery", None)
+        job.deliver(Undone(step, {}, await self._note_undone(step)))
+        result = JobResult("done", words)
+        self.on_ended.tell(job, result)
+        job.finish(result)
+
+    async def _note_undone(self, step: ChangeSet) -> bool:
+        """Note in the history that a step is no longer in force; whether it was no calibration's."""
+        if step.origin.what in BY_HAND:
+            await self._by_hand.undone(step)
+            return True
+        return not await self.results.undone(step)
 
 
 def _deadline_s(timeout_s: float | None) -> float | None:

@@ -24,8 +24,10 @@ from companion.calibration.records.record import WrittenParameter
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core, Offload
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
+from companion.daemon.offsets.interruptions import Interruptions
 from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
+from companion.formats import Object
 from companion.links.system.listeners import Listeners
 from companion.storage.changes import ChangeLog, ChangeSet, Undoable
 
@@ -80,8 +82,6 @@ class Ledger:
         found = self._undoable.get(system_id or 0)
         return () if found is None else found.all
 
-    async def interrupted(self) -> ChangeSet:
-        """Wait until there is an interrupted write; it stays one until `undone`."""
     @property
     def orphaned(self) -> ChangeSet | None:
         """The interrupted write that waits for the recovery."""
@@ -92,6 +92,8 @@ class Ledger:
         kept = self._undoable.get(changes.system_id)
         return kept is not None and kept.without(changes) is not kept
 
+    async def interrupted(self) -> ChangeSet:
+        """Wait until there is an interrupted write; it stays one until `undone`."""
         while self._open is None or not self.pending:
             await self._orphaned.wait()
         return self._open
@@ -194,8 +196,15 @@ class Recovery:
     ) -> None:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
         self._writer, self.ledger, self._imus, self._owed = writer, ledger, imus, owed
+        self._interruptions = Interruptions(core.config.storage.path, core.offload)
         self.on_recovered: Listeners[str] = Listeners()
         """Told, in words, of what was put in order."""
+        self.note_undone: Callable[[ChangeSet, str], Awaitable[object]] = _nobody_notes
+        """Notes, with the words for people, that a step which could be undone is no longer in force."""
+
+    def interruptions(self) -> list[Object]:
+        """Interrupted writes for the history, the latest first; blocking."""
+        return self._interruptions.history(self.ledger.orphaned)
 
     def why_no_undo(self) -> str | None:
         """Why there is nothing to undo, or None when there is."""
@@ -225,7 +234,8 @@ class Recovery:
             words = f"Interrupted write on system {open_set.system_id}, not on this aircraft: check there {names}"
             logger.warning("%s", words)
             self._say(Severity.WARNING, words, Weight.REFUSAL)
-            await self.ledger.undone()
+            await self._interruptions.keep(open_set, f"not on this aircraft: check there {names}")
+            await self.ledger.unchanged()
             return
         while self._vehicle.arm_state is not ArmState.DISARMED:
             await asyncio.sleep(POLL_S)
@@ -236,10 +246,14 @@ class Recovery:
         if ours:
             with changing(self._imus.values()):
                 await self._writer.restore(ours)
-        await self.ledger.undone()
-        words = f"Interrupted write: {f'{len(ours)} old values back' if ours else 'nothing of ours was in force'}"
+        found = f"{len(ours)} old values back" if ours else "nothing of ours was in force"
         if foreign:
-            words += f"; changed by others, left alone: {', '.join(foreign)}"
+            found += f"; changed by others, left alone: {', '.join(foreign)}"
+        words = f"Interrupted write: {found}"
+        if self.ledger.is_undoable(open_set):
+            await self.note_undone(open_set, words)
+        await self._interruptions.keep(open_set, found)
+        await self.ledger.undone()
         logger.warning("%s", words)
         self.on_recovered.tell(words)
         self._say(Severity.WARNING, words, Weight.RESULT)

@@ -1,0 +1,84 @@
+"""A write that was cut off, or an undo: the history says so, while the old values are awaited and after."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from companion.calibration.machine import State
+from companion.calibration.records.validity import Why
+from companion.calibration.request import What
+from companion.cli.show import history_lines
+from tests.e2e.test_calibration import calibrated, started
+from tests.e2e.test_faults import values
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+QUICK: dict[str, Any] = {"min_still_s": 4.0, "max_s": 8.0}
+
+
+async def history(rig: Rig) -> list[str]:
+    (reply,) = [dict(each) async for each in rig.service.faces.answer({"command": "history"}, "test")]
+    reply.pop("kind")
+    return history_lines(**reply)
+
+
+async def told(rig: Rig) -> str:
+    """The one line of an interruption."""
+    lines = await history(rig)
+    (heading,) = [at for at, line in enumerate(lines) if "interrupted (UTC)" in line]
+    return lines[heading + 1]
+
+
+def test_a_write_that_was_killed_stands_in_the_history_before_and_after_the_restore(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, **QUICK).running() as rig:
+            await rig.ready()
+            before = values(rig.double)
+            started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.conductor.state is State.WRITING, 60.0)
+            await rig.until(lambda: values(rig.double) != before, 10.0)
+            await rig.restart()
+            rig.wire.cut = True
+            await rig.until(lambda: rig.service.offsets.ledger.pending, 10.0)
+            pending = await told(rig)
+            assert pending.startswith("     20")
+            assert "calibration, 6 parameters: old values not restored yet: disarm and keep the link up" in pending
+            rig.wire.cut = False
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 30.0)
+            assert values(rig.double) == before
+            over = await told(rig)
+            assert over[:24] == pending[:24], "the begin of the calibration"
+            assert "calibration, 6 parameters: " in over
+            assert " old values back, 20" in over
+            await rig.restart()
+            await rig.ready()
+            assert await told(rig) == over
+
+    run_virtual(main())
+
+
+def test_an_undo_that_armed_in_its_middle_is_brought_to_its_end_and_told_as_one(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, **QUICK).running() as rig:
+            await rig.ready()
+            before = values(rig.double)
+            assert (await calibrated(rig))[0].outcome == "done"
+            rig.double.faults.arm_after_writes = 2
+            failed = await started(rig.service.calibrating.conductor.start_undo("test")).finished
+            assert failed.outcome == "failed"
+            assert "undone in part (" in failed.reason
+            assert failed.reason.endswith("the rest follows once disarmed")
+            assert "calibration, 11 parameters: old values not restored yet" in await told(rig)
+            rig.double.disarm()
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 30.0)
+            assert values(rig.double) == before
+            assert rig.service.status()["undoable"] == []
+            assert " old values back, 20" in await told(rig)
+            (record,) = rig.service.calibrating.store.history()
+            assert record.undone_at
+            await rig.until(
+                lambda: {each.why for each in rig.service.arming.in_force.findings(rig.now_s)} == {Why.UNDONE}, 5.0
+            )
+
+    run_virtual(main())
