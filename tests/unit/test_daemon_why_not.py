@@ -17,9 +17,11 @@ def found(rungs: Any = tuple(Rung), **what: Any) -> tuple[Rung, str] | None:
         arm_state=what.get("arm_state", ArmState.DISARMED),
         heartbeat_age_s=what.get("age_s", 0.2),
     )
-    recovery: Any = SimpleNamespace(fault=what.get("fault"), pending=what.get("pending", False))
+    ledger: Any = SimpleNamespace(
+        fault=what.get("fault"), pending=what.get("pending", False), why_yield=lambda: what.get("second")
+    )
     job: Any = what.get("job")
-    return obstacle(vehicle, recovery, job, rungs)
+    return obstacle(vehicle, ledger, job, rungs)
 
 
 RUNNING = SimpleNamespace(kind="calibration", words="hold still 3 s more", is_running=True)
@@ -30,6 +32,7 @@ EVERYTHING: dict[str, Any] = {
     "job": RUNNING,
     "arm_state": ArmState.UNKNOWN,
     "age_s": 7.0,
+    "second": "second companion",
     "pending": True,
 }
 
@@ -41,7 +44,8 @@ EVERYTHING: dict[str, Any] = {
         (("fault",), Rung.CONFLICT, "two autopilots", "unknown"),
         (("fault", "conflict"), Rung.BUSY, "a calibration is running (hold still 3 s more)", "busy"),
         (("fault", "conflict", "job"), Rung.UNKNOWN, "no heartbeat for 7 s: power? cable?", "unknown"),
-        (("fault", "conflict", "job", "arm_state"), Rung.PENDING, "putting old values back first", "busy"),
+        (("fault", "conflict", "job", "arm_state"), Rung.SECOND, "second companion", "other"),
+        (("fault", "conflict", "job", "arm_state", "second"), Rung.PENDING, "putting old values back first", "busy"),
     ],
 )
 def test_what_nobody_can_wait_for_is_told_first(without: tuple[str, ...], rung: Rung, words: str, kind: str) -> None:

@@ -50,7 +50,7 @@ _LOOKED_AT: Final[dict[Why, str]] = {
     Why.UNSEEN: _IN_THE_MIDDLE[State.VERIFYING],
 }
 """What the next look at the output tells, and nobody has to do anything about before."""
-_CLOSED: Final = (Rung.FAULT, Rung.CONFLICT, Rung.UNKNOWN, Rung.PENDING)
+_CLOSED: Final = (Rung.FAULT, Rung.CONFLICT, Rung.SECOND, Rung.UNKNOWN, Rung.PENDING)
 """What keeps the gate closed whatever is in force; the other rungs have answers of their own."""
 _WAITS: Final = {
     Rung.UNKNOWN: "no heartbeat from the autopilot",

@@ -35,6 +35,8 @@ class Rung(enum.Enum):
     ARMED = "armed"
     UNKNOWN = "unknown"
     """Whether it is armed."""
+    SECOND = "second"
+    """Another companion writes to this autopilot."""
     PENDING = "pending"
     """An interrupted write is being put back."""
 
@@ -45,6 +47,7 @@ _KINDS: Final[dict[Rung, Literal["armed", "unknown", "busy", "other"]]] = {
     Rung.BUSY: "busy",
     Rung.ARMED: "armed",
     Rung.UNKNOWN: "unknown",
+    Rung.SECOND: "other",
     Rung.PENDING: "busy",
 }
 
@@ -79,6 +82,8 @@ def _obstacles(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[Ob
         age_s = vehicle.heartbeat_age_s
         words = "no autopilot heard yet" if age_s is None else f"no heartbeat for {age_s:.0f} s: power? cable?"
         yield Obstacle(Rung.UNKNOWN, words)
+    if (why := ledger.why_yield()) is not None:
+        yield Obstacle(Rung.SECOND, why)
     if ledger.pending:
         yield Obstacle(Rung.PENDING, "putting old values back first")
 

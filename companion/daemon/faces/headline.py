@@ -83,6 +83,8 @@ class Headlines:
                     return Headline(ARMED, f"companion started in flight: {words}", "wait")
                 return Headline(ARMED, f"not calibrated: {words}", "bad")
             return Headline(ARMED, words, "good")
+        if (second := self._conductor.why_not((Rung.SECOND,))) is not None:
+            return Headline("TWO COMPANIONS", second.words, "bad")
         if self._readiness.at_arm == "gate":
             return self._gate()
         if state != "uncalibrated":

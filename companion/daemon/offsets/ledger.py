@@ -40,8 +40,9 @@ POLL_S: Final = 0.2
 class Ledger:
     """The change files of one storage folder and what they say."""
 
-    def __init__(self, log: ChangeLog, offload: Offload) -> None:
-        self._log, self._offload = log, offload
+    def __init__(self, log: ChangeLog, offload: Offload, why_yield: Callable[[], str | None] = lambda: None) -> None:
+        self._log, self._offload, self.why_yield = log, offload, why_yield
+        """`why_yield`: why another companion writes here, and this one does not."""
         self.fault: str | None = None
         """Why nothing may be written at all, for people; None while all is well."""
         self._open: ChangeSet | None = None
@@ -113,11 +114,13 @@ class Ledger:
                 has not put back what is kept here.
 
         Raises:
-            AutopilotError: an earlier write is open still; do not write.
+            AutopilotError: an earlier write is open still, or another companion writes here; do not write.
             StorageError: they could not be kept, or a name or a value is none that the companion writes; do not write.
         """
         if self._open is not None:
             raise AutopilotError("putting old values back first")
+        if (why := self.why_yield()) is not None:
+            raise AutopilotError(f"nothing is written: {why}")
         await self.widen(changes)
         try:
             yield

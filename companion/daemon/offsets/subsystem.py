@@ -9,6 +9,7 @@ from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.ekf import EkfWatch
 from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
+from companion.daemon.offsets.companions import OtherCompanions
 from companion.daemon.offsets.effect import EffectWatch
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration
 from companion.daemon.offsets.ledger import Ledger, Recovery
@@ -29,7 +30,8 @@ class Offsets(Subsystem):
     def __init__(self, core: Core, devices: Devices) -> None:
         config, vehicle, parameters, imus = core.config, core.vehicle, core.parameters, devices.imus
         self._vehicle = vehicle
-        self.ledger = Ledger(ChangeLog(config.storage.path), core.offload)
+        self.companions = OtherCompanions(core.link, core.texts.say, lambda: core.wanted.push)
+        self.ledger = Ledger(ChangeLog(config.storage.path), core.offload, self.companions.why_not)
         self.writer = ParameterWriter(parameters, vehicle)
         self.rivalry, self.owed = Rivalry(core, imus), RebootOwed(core)
         px4 = Px4Writes(core.link, vehicle, self.writer, self.ledger, devices.slots, core.say)
@@ -48,12 +50,13 @@ class Offsets(Subsystem):
             logger.error("%s", self.ledger.fault)
 
     def status(self) -> Object:  # noqa: D102
+        others = [] if (words := self.companions.warning) is None else [words]
         return {
             "fault": self.ledger.fault,
             "putting_back": self.ledger.pending,
             "why_no_undo": self.recovery.why_no_undo(),
             "undoable": self.undoable(),
-            "warnings": [*self.ledger.unusable, *self.rivalry.warnings],
+            "warnings": [*self.ledger.unusable, *others, *self.rivalry.warnings],
         }
 
     def undoable(self) -> list[Object]:
@@ -61,4 +64,8 @@ class Offsets(Subsystem):
         return [step.shown() for step in self.ledger.steps(self._vehicle.system_id)]
 
     def tasks(self) -> Sequence[Task]:  # noqa: D102
-        return [("recovery", self.recovery.run), ("reboot-owed", self.owed.run)]
+        return [
+            ("recovery", self.recovery.run),
+            ("reboot-owed", self.owed.run),
+            ("other-companions", self.companions.run),
+        ]

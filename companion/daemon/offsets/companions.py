@@ -1,0 +1,136 @@
+"""Other companions on the same link: each announces itself, and all but one refuse to write.
+
+Two companions write the same parameters and keep each other's values as "old" ones, so that no order of undos brings
+back what was there before both. They usually share system and component id, and routers do not pass on a heartbeat to
+where its ids have been heard, so each announces an instance number of its own in NAMED_VALUE_INT, which ArduPilot and
+PX4 do pass on. Rank by announced constants alone: a companion that has found itself alone goes before a new one, then
+the lower number. No clocks are compared, so both come to the same end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from collections.abc import Callable
+from typing import Final
+
+import msgspec
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.component.statustext import Say, Severity, Weight
+from companion.links.mavlink.link import MavlinkLink
+
+logger = logging.getLogger(__name__)
+
+NAME: Final = "CMP_INST"
+BEAT_S: Final = 1.0
+IDLE_BEATS: Final = 5
+"""Beats from one announcement to the next while no other companion is heard."""
+FIRST_BEATS: Final = 10
+"""Beats after the start that all carry an announcement."""
+SETTLE_S: Final = 6.0
+"""Time after the start in which a running companion makes itself heard."""
+CONFIRM_S: Final = 0.5
+"""Least time between two announcements that make a companion count: leftovers of one that has ended come at once."""
+EXPIRE_S: Final = 12.0
+"""Silence after which a companion is gone: its announcements come every second while two hear each other."""
+MOST: Final = 8
+"""Companions remembered; instance numbers can be made up."""
+INSTANCE_BITS: Final = 30
+
+
+class _Other(msgspec.Struct):
+    """One other companion."""
+
+    system_id: int
+    component_id: int
+    is_new: bool
+    instance: int
+    boot_ms: int
+    first_s: float
+    latest_s: float
+
+    @property
+    def rank(self) -> tuple[bool, int]:
+        """Lower goes first."""
+        return self.is_new, self.instance
+
+    def counts(self, now_s: float) -> bool:
+        """Whether it has been heard twice, and of late."""
+        return self.latest_s - self.first_s >= CONFIRM_S and now_s - self.latest_s < EXPIRE_S
+
+
+class OtherCompanions:
+    """Announces this companion and listens for others; `run` until cancelled."""
+
+    def __init__(self, link: MavlinkLink, say: Say, writes: Callable[[], bool]) -> None:
+        """`writes`: whether this companion writes to the autopilot at all."""
+        self._link, self._say, self._writes = link, say, writes
+        self._instance, self._is_new = secrets.randbits(INSTANCE_BITS), True
+        self._others: dict[int, _Other] = {}
+        self._told: str | None = None
+        link.subscribe(mavlink.MAVLink_named_value_int_message, self._on_value)
+
+    def why_not(self) -> str | None:
+        """Reason not to write, naming the companion that does; None without one."""
+        other = self._other()
+        if other is None or not self._writes() or other.rank > (self._is_new, self._instance):
+            return None
+        return f"second companion ({other.system_id}/{other.component_id}) on this link writes: stop one of them"
+
+    @property
+    def warning(self) -> str | None:
+        """Presence of another companion, for people; None without one."""
+        other = self._other()
+        if other is None or not self._writes():
+            return None
+        refuses = f"second companion ({other.system_id}/{other.component_id}) on this link waits: stop one of them"
+        return self.why_not() or refuses
+
+    async def run(self) -> None:
+        """Announce this companion, and tell the pilot of others."""
+        loop = asyncio.get_running_loop()
+        started_s, beats = loop.time(), 0
+        while True:
+            now_s = loop.time()
+            if self._is_new and now_s - started_s >= SETTLE_S and self.why_not() is None:
+                self._is_new = False
+            if self._writes() and (beats < FIRST_BEATS or self._hears(now_s) or beats % IDLE_BEATS == 0):
+                value = self._instance << 1 | self._is_new
+                name = NAME.encode("ascii")
+                self._link.send(mavlink.MAVLink_named_value_int_message(int(now_s * 1e3) % 2**32, name, value))
+            self._tell()
+            beats += 1
+            await asyncio.sleep(BEAT_S)
+
+    def _tell(self) -> None:
+        words = self.warning
+        if words is not None and words != self._told:
+            logger.warning("%s", words)
+            self._say(Severity.WARNING, words[:1].upper() + words[1:], Weight.NEWS)
+        self._told = words
+
+    def _hears(self, now_s: float) -> bool:
+        return any(now_s - other.latest_s < EXPIRE_S for other in self._others.values())
+
+    def _other(self) -> _Other | None:
+        """The first by rank of those that count."""
+        now_s = asyncio.get_running_loop().time()
+        present = (other for other in self._others.values() if other.counts(now_s))
+        return min(present, key=lambda other: other.rank, default=None)
+
+    def _on_value(self, message: mavlink.MAVLink_named_value_int_message, t_s: float) -> None:
+        if message.name != NAME or message.get_srcSystem() != self._link.system_id:
+            return
+        instance, is_new, boot_ms = message.value >> 1, bool(message.value & 1), message.time_boot_ms
+        if instance == self._instance:
+            return  # an echo of our own
+        known = self._others.get(instance)
+        if known is None or t_s - known.latest_s >= EXPIRE_S:
+            self._others = {number: each for number, each in self._others.items() if t_s - each.latest_s < EXPIRE_S}
+            if len(self._others) < MOST:
+                ids = message.get_srcSystem(), message.get_srcComponent()
+                self._others[instance] = _Other(*ids, is_new, instance, boot_ms, t_s, t_s)
+        elif boot_ms != known.boot_ms:  # a copy proves nothing: routers in a loop repeat one for ever
+            known.is_new, known.boot_ms, known.latest_s = is_new, boot_ms, t_s
