@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +41,12 @@ class Traffic:
     def __post_init__(self) -> None:
         send = self.rig.link.send
 
-        def noted(message: mavlink.MAVLink_message) -> bool:
+        def noted(message: mavlink.MAVLink_message, *allowed: Callable[[], bool]) -> bool:
             if isinstance(message, mavlink.MAVLink_param_set_message | mavlink.MAVLink_param_request_read_message):
                 self.names.add(message.param_id)
             elif isinstance(message, mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message):
                 self.commands.append(message.command)
-            return send(message)
+            return send(message, *allowed)
 
         self.rig.link.send = noted  # type: ignore[method-assign]
 

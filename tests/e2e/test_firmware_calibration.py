@@ -36,14 +36,14 @@ class Sent:
     def __post_init__(self) -> None:
         real_send = self.rig.link.send
 
-        def send(message: mavlink.MAVLink_message) -> bool:
+        def send(message: mavlink.MAVLink_message, *allowed: Callable[[], bool]) -> bool:
             if isinstance(message, mavlink.MAVLink_param_set_message):
                 self.log.append(message.param_id)
             elif isinstance(message, mavlink.MAVLink_command_long_message) and message.command == GYRO_CALIBRATION:
                 self.log.append(message.command)
                 if self.lose_command:
                     return True
-            return real_send(message)
+            return real_send(message, *allowed)
 
         self.rig.link.send = send  # type: ignore[method-assign]
 

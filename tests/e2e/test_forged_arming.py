@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import os
 import random
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -53,13 +54,13 @@ class Judge:
         rig.link.send = self._sent  # type: ignore[method-assign]
         rig.autopilot.arm = self._arming  # type: ignore[method-assign]
 
-    def _sent(self, message: mavlink.MAVLink_message) -> bool:
+    def _sent(self, message: mavlink.MAVLink_message, *allowed: Callable[[], bool]) -> bool:
         if isinstance(message, mavlink.MAVLink_param_set_message):
             self.writes += 1
             since_s = self._rig.now_s - self._armed_s
             if self._rig.autopilot.armed and since_s > WIRE_S:
                 self.faults.append(f"{message.param_id} was written {since_s:.3f} s after arming")
-        return self._send(message)
+        return self._send(message, *allowed)
 
     def _arming(self) -> None:
         if not self._rig.autopilot.armed:

@@ -11,6 +11,7 @@ import asyncio
 import dataclasses
 import os
 import random
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -50,9 +51,9 @@ class Witness:
         link.subscribe(mavlink.MAVLink_command_long_message, self._on_command)
         real_send = link.send
 
-        def send(message: mavlink.MAVLink_message) -> bool:
+        def send(message: mavlink.MAVLink_message, *allowed: Callable[[], bool]) -> bool:
             self._on_sent(message)
-            return real_send(message)
+            return real_send(message, *allowed)
 
         link.send = send  # type: ignore[method-assign]
 

@@ -97,10 +97,10 @@ async def stage(
     it = Stage(rig, other, network)
     real_send = rig.link.send
 
-    def send(message: mavlink.MAVLink_message) -> bool:
+    def send(message: mavlink.MAVLink_message, *allowed: Callable[[], bool]) -> bool:
         if getattr(message, "target_system", 0) == other.system_id:
             it.to_other.append(message)
-        return real_send(message)
+        return real_send(message, *allowed)
 
     rig.link.send = send  # type: ignore[method-assign]
     flying = asyncio.create_task(other.run())

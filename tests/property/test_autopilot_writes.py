@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given, settings
@@ -41,13 +42,13 @@ class WatchedLink(MavlinkLink):
             self.heartbeat = (t_s, bool(base_mode & 128))
         super().receive(data, t_s)
 
-    def send(self, message: Message) -> bool:
+    def send(self, message: Message, *allowed: Callable[[], bool]) -> bool:
         if message.get_type() == "PARAM_SET":
             self.sets += 1
             now_s = asyncio.get_running_loop().time()
             if self.heartbeat is None or now_s - self.heartbeat[0] >= 2.0 or self.heartbeat[1]:
                 self.forbidden.append(f"at {now_s} with {self.heartbeat}")
-        return super().send(message)
+        return super().send(message, *allowed)
 
 
 async def chaos(autopilot: ScriptedAutopilot, rng: random.Random, *, arming: bool, reboots: bool) -> None:

@@ -21,7 +21,7 @@ def first(self, message):
     print(json.dumps(sorted(before)), flush=True)
     os._exit(0)
 
-MavlinkLink.send = lambda self, message: (before.update(sys.modules), first(self, message))
+MavlinkLink.send = lambda self, *what: (before.update(sys.modules), first(self, *what))
 before = set()
 from companion.cli import main
 sys.exit(main())

@@ -165,6 +165,8 @@ class ScriptedAutopilot:
             self._set(message)
         elif message.get_type() == "COMMAND_LONG":
             self._command(message)
+        elif message.get_type() == "TIMESYNC" and message.tc1 == 0:
+            self.send(mavlink.MAVLink_timesync_message(int(self.uptime_s() * 1e9), message.ts1))
 
     def _refuse(self, message: Any, code: int) -> None:
         who = (message.get_srcSystem(), message.get_srcComponent())
@@ -195,6 +197,8 @@ class ScriptedAutopilot:
                 del self.intervals[int(message.param1)]
             if int(message.param1) == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
                 self.heartbeat_s = message.param2 * 1e-6
+        if message.command == mavlink.MAV_CMD_REQUEST_MESSAGE and int(message.param1) == 0 and self.beating:
+            self.beat()
         if message.command == mavlink.MAV_CMD_REQUEST_MESSAGE and int(message.param1) == 148:
             version = bytes([4, 8, 0, 0])
             self.send(

@@ -349,18 +349,44 @@ class TestUdpOut:
 
         asyncio.run(main())
 
-    def test_a_full_buffer_drops_the_newest_and_counts_it(
-        self, peer: socket.socket, speakers: list[mavlink_transport._Speaker], monkeypatch: pytest.MonkeyPatch
+    def test_what_finds_no_room_in_the_kernel_is_dropped_and_counted_and_never_leaves_later(
+        self, speakers: list[mavlink_transport._Speaker]
     ) -> None:
         async def main() -> None:
             link = MavlinkLink()
-            async with transport(link, f"udpout:127.0.0.1:{peer.getsockname()[1]}"):
+            placeholder = udp_socket()
+            async with transport(link, f"udpout:127.0.0.1:{placeholder.getsockname()[1]}"):
                 await until(lambda: link.connected)
-                transport_ = speakers[0]._transport
-                assert transport_ is not None
-                monkeypatch.setattr(transport_, "get_write_buffer_size", lambda: 65530)
-                assert not link.send(HEARTBEAT(18, 8, 0, 0, 4, 3))
+                ours, full = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+                ours.setblocking(False)
+                real, speakers[0]._socket = speakers[0]._socket, ours
+                while link.send(HEARTBEAT(18, 8, 0, 0, 4, 3)):
+                    pass
+                sent = link.sent
                 assert link.dropped == 1
+                for _ in range(sent):
+                    full.recv(2048)
+                await asyncio.sleep(0.05)
+                full.setblocking(False)
+                with pytest.raises(BlockingIOError):
+                    full.recv(2048)
+                speakers[0]._socket = real
+                ours.close()
+                full.close()
+            placeholder.close()
+
+        asyncio.run(main())
+
+    def test_all_that_waits_in_the_kernel_is_read_at_once_when_somebody_has_to_know(self, peer: socket.socket) -> None:
+        async def main() -> None:
+            link = MavlinkLink()
+            async with transport(link, f"udpout:127.0.0.1:{peer.getsockname()[1]}") as states:
+                await until(lambda: link.connected)
+                for _ in range(100):
+                    peer.sendto(packet(), ("127.0.0.1", states.port))
+                assert link.received["HEARTBEAT"] == 0
+                assert link.settled()
+                assert link.received["HEARTBEAT"] == 100
 
         asyncio.run(main())
 
@@ -430,6 +456,10 @@ class TestSerial:
                 await until(lambda: link.connected)
                 os.write(ours, packet())
                 await until(lambda: link.received["HEARTBEAT"] == 2)
+                os.write(ours, 100 * packet())
+                assert link.received["HEARTBEAT"] == 2
+                assert link.settled()
+                assert link.received["HEARTBEAT"] == 102
             os.close(theirs)
             os.close(ours)
 

@@ -20,7 +20,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.firmware.ardupilot import INSTANCES, parameters_of
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.wire import same_float32
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.errors import AutopilotError, AutopilotRebootedError, NotDisarmedError
 
 logger = logging.getLogger(__name__)
@@ -103,10 +103,11 @@ async def calibrate_gyros(
     vehicle = parameters.vehicle
     loop = asyncio.get_running_loop()
     boots = vehicle.boots
-    await vehicle.fresh_heartbeat()
-    if vehicle.arm_state is not ArmState.DISARMED:
-        raise NotDisarmedError("the firmware's gyro calibration was not started: the aircraft is not surely disarmed")
     go_on("the autopilot calibrates its gyros: keep the aircraft still")
+    try:
+        await vehicle.disarmed.ensure()
+    except NotDisarmedError as error:
+        raise NotDisarmedError(f"the firmware's gyro calibration was not started: {error}") from error
     answer = vehicle.commands.send(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 1.0, timeout_s=TIMEOUT_S)
     sent_s = loop.time()
     try:

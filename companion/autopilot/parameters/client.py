@@ -1,9 +1,9 @@
 """Single parameters over MAVLink: read by name, write one, watch what anybody writes.
 
 Every write is guarded: immediately before each PARAM_SET that leaves, the first as well as every repetition, the
-aircraft must be disarmed. Neither autopilot refuses a PARAM_SET while armed (autopilots 1.3, 4.4), so nobody else
-will. MAVLink has no transaction: between a PARAM_SET and its answer the aircraft may arm; `writer` looks again at
-the end.
+aircraft must be surely disarmed (`vehicle.disarmed`). Neither autopilot refuses a PARAM_SET while armed (autopilots
+1.3, 4.4), so nobody else will. MAVLink has no transaction: between a PARAM_SET and its answer the aircraft may arm;
+`writer` asks again at the end.
 """
 
 from __future__ import annotations
@@ -186,16 +186,14 @@ class ParameterClient:
             raise ParameterRefusedError(f"{name}: {value} is not {what} that may be written")
         other: float | None = None
         tries = 0
-        # The last heartbeat may be older than an arming; one that was asked for just now is not.
-        await self.vehicle.fresh_heartbeat()
+        await self._ensure_disarmed(name)
         with self._exchange(name) as inbox:
             for tries in self._required_tries():
                 if other is not None and tries > _TRIES:
                     break
-                self._require_disarmed(name)
                 message = mavlink.MAVLink_param_set_message(*self._target(), _wire_name(name), carried, kind)
                 # Nothing may be awaited between the guard and this.
-                self.writes += self._link.send(message)
+                self.writes += self._link.send(message, self.vehicle.disarmed.proven)
                 deadline_s = asyncio.get_running_loop().time() + _TIMEOUT_S
                 while (answer := await self._next(inbox, deadline_s)) is not None:
                     if isinstance(answer, Refusal):
@@ -204,7 +202,7 @@ class ParameterClient:
                         self._learn_loss(tries)
                         return answer
                     other = answer
-                await self.vehicle.fresh_heartbeat()
+                await self._ensure_disarmed(name)
         if other is not None:
             raise ParameterMismatchError(f"{name} was set to {wanted:.9g}, {self.vehicle.name} answers {other:.9g}")
         raise ParameterTimeoutError(
@@ -221,9 +219,11 @@ class ParameterClient:
     def _bytewise(self) -> bool:
         return integers_bytewise(self.vehicle.capabilities, self.vehicle.firmware)
 
-    def _require_disarmed(self, name: str) -> None:
-        if (why := self.vehicle.arm_state.why_not_written) is not None:
-            raise NotDisarmedError(f"{name} is not written: {why}")
+    async def _ensure_disarmed(self, name: str) -> None:
+        try:
+            await self.vehicle.disarmed.ensure()
+        except NotDisarmedError as error:
+            raise NotDisarmedError(f"{name} is not written: {error}") from error
 
     @contextlib.contextmanager
     def _exchange(self, name: str) -> Iterator[Inbox]:

@@ -240,11 +240,11 @@ class ParameterWriter:
     async def _check_end(self) -> None:
         await self._vehicle.hear_boot_time()
         self._check_boot("before all was read back")
-        state = self._vehicle.arm_state
-        if state is ArmState.ARMED:
-            raise _Failure("armed in the middle", "the aircraft armed while its parameters were written")
-        if state is ArmState.UNKNOWN:
-            raise _Failure("arm state unknown", "the autopilot's heartbeat stopped while its parameters were written")
+        try:
+            await self._vehicle.disarmed.ensure()
+        except NotDisarmedError as error:
+            kind = kind_of(error, self._vehicle, self._boots)
+            raise _Failure(kind, f"{error}, after its parameters were written") from error
 
     def _check_boot(self, when: str) -> None:
         if self._vehicle.boots != self._boots:

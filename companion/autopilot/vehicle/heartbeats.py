@@ -19,7 +19,10 @@ ARMED_HOLDS_S: Final = 3.0
 _CHANGES: Final = 4
 _CHANGES_WITHIN_S: Final = 5.0
 """Arming and disarming twice within this time is more than pilots and autopilots do."""
-_CONTRADICTION_HOLDS_S: Final = 10.0
+_ONLY_ARMED_S: Final = 10.0
+_ONLY_DISARMED_S: Final = 30.0
+"""A contradiction is over when only "armed", or only "disarmed", has been heard for so long. The other sender may have
+been silenced; "armed" is believed earlier, as it permits nothing."""
 _RESTARTS_S: Final = 1.0
 """Within this time no autopilot restarts twice; two whose times since boot alternate seem to."""
 _TWO_HOLDS_S: Final = 5.0
@@ -46,17 +49,21 @@ class ArmingWatch:
 
     def __init__(self) -> None:
         self._armed: bool | None = None
-        self._armed_s = self._contradiction_s = self._two_s = self._restarted_s = -math.inf
+        self._armed_s = self._disarmed_s = self._two_s = self._restarted_s = -math.inf
+        self._contradicted = False
         self._changes_s: deque[float] = deque(maxlen=_CHANGES)
 
     def heard(self, t_s: float, *, armed: bool) -> None:
         """One heartbeat came."""
+        self._contradicted = self.contradicts_itself(t_s)
         if armed:
             self._armed_s = t_s
+        else:
+            self._disarmed_s = t_s
         if self._armed is not None and self._armed is not armed:
             self._changes_s.append(t_s)
             if len(self._changes_s) == _CHANGES and t_s - self._changes_s[0] <= _CHANGES_WITHIN_S:
-                self._contradiction_s = t_s
+                self._contradicted = True
         self._armed = armed
 
     def restarted(self, t_s: float) -> None:
@@ -88,7 +95,8 @@ class ArmingWatch:
 
     def contradicts_itself(self, t_s: float) -> bool:
         """Whether armed and disarmed heartbeats come by turns, as of two autopilots, or of one and a forger."""
-        return t_s - self._contradiction_s < _CONTRADICTION_HOLDS_S
+        only_armed = self._armed is True and t_s - self._disarmed_s >= _ONLY_ARMED_S
+        return self._contradicted and not only_armed and t_s - self._armed_s < _ONLY_DISARMED_S
 
 
 Firmware = Literal["ardupilot", "px4", "other"]

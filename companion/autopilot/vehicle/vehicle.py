@@ -1,8 +1,8 @@
 """The autopilot as seen from outside: which one it is, whether it is armed, whether it restarted, where it stands.
 
-Whoever writes to it asks `arm_state` immediately before every message that leaves. A heartbeat tells the past: the
-state is UNKNOWN as soon as the last one is 2 s old, and after a restart until the next one. It is DISARMED only when no
-armed heartbeat has come under the vehicle's ids for 3 s, from whomever (`heartbeats`).
+`arm_state` is what its heartbeats say: UNKNOWN as soon as the last one is 2 s old, and after a restart until the next
+one; DISARMED only when no armed heartbeat has come under the vehicle's ids for 3 s, from whomever (`heartbeats`).
+Heartbeats tell the past: whoever writes to the autopilot asks `disarmed.ensure` before every message that leaves.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.boot_clock import BootClock, BootWatch
 from companion.autopilot.vehicle.commands import Commands, StandingRequests
+from companion.autopilot.vehicle.disarmed import DisarmedCheck
 from companion.autopilot.vehicle.heartbeats import (
     ArmingWatch,
     ArmState,
@@ -41,11 +42,6 @@ HEARTBEAT_TIMEOUT_S: Final = 2.0
 HEARTBEAT_RATE_HZ: Final = 5.0
 """Asked of ArduPilot on our own link: a second is a long time not to know of an arming (autopilots 5.1)."""
 
-FRESH_WITHIN_S: Final = 0.3
-"""An autopilot that sends heartbeats on request does so within 20 ms of it; slow radios need more."""
-
-_BEHIND_ANSWER_S: Final = 0.03
-"""How long after its answer to the request a heartbeat may leave ArduPilot (20 ms); PX4 sends it before the answer."""
 _HEARTBEAT_ID: Final[int] = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 _OVERDUE_S: Final = 1.1
 _TICK_S: Final = 0.5
@@ -89,6 +85,7 @@ class Vehicle:
         self.boots = 0
         self.place = TimeAndPlace(is_carried)
         self.commands = Commands(link, lambda: None if self.system_id is None else (self.system_id, self.component_id))
+        self.disarmed = DisarmedCheck(link, self.commands, lambda: self.arm_state, lambda: self.name)
         self.boot = BootWatch(link, self.sent, self._restarted)
         self._link = link
         self._latch = Latch(system_id)
@@ -98,18 +95,18 @@ class Vehicle:
         self._armed_told: bool | None = None
         self._conflict_logged = False
         self._lost = True
-        self._trusted_from_s = -math.inf
         self.on_event: Listeners[[VehicleEvent]] = Listeners()
         """Told of events, in the order in which they are seen."""
         self.found = asyncio.Event()
         """Set while the autopilot is being heard."""
-        self._heartbeat_waiters: list[asyncio.Event] = []
         self._wanted = StandingRequests(self.commands)
+        self._wanted.add(mavlink.MAVLink_heartbeat_message, HEARTBEAT_RATE_HZ, "ardupilot")
         self._lost_timer: asyncio.TimerHandle | None = None
         self._tick_timer: asyncio.TimerHandle | None = None
         self._tick_due_s = math.inf
         self._unsubscribe = link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
         self.hear(mavlink.MAVLink_system_time_message, self.place.hear_time)
+        self.hear(mavlink.MAVLink_timesync_message, self._on_timesync)
         self.hear(mavlink.MAVLink_autopilot_version_message, self._on_version)
         self.hear(mavlink.MAVLink_global_position_int_message, self.place.hear_estimate)
         self.hear(mavlink.MAVLink_gps_raw_int_message, self.place.hear_receiver)
@@ -124,9 +121,7 @@ class Vehicle:
         armed = self._arming.armed(now_s)
         if self._lost or armed is None or self._heartbeat_s is None or self.conflict is not None:
             return ArmState.UNKNOWN
-        # After a stall of our own loop the next heartbeats read are old ones that waited in a buffer.
-        stalled = now_s - self._tick_due_s > _STALL_S or self._heartbeat_s < self._trusted_from_s
-        if stalled or now_s - self._heartbeat_s >= HEARTBEAT_TIMEOUT_S:
+        if self._stalled(now_s) or now_s - self._heartbeat_s >= HEARTBEAT_TIMEOUT_S:
             return ArmState.UNKNOWN
         return ArmState.ARMED if armed else ArmState.DISARMED
 
@@ -185,29 +180,6 @@ class Vehicle:
         finally:
             request.cancel()
 
-    async def fresh_heartbeat(self) -> bool:
-        """Ask for a heartbeat and wait for it, so that an arming is known at once and not at the next beat.
-
-        The heartbeat that comes first may be another's than the one asked for: waited for is the autopilot's answer to
-        the request too, and the time that the heartbeat may be behind it.
-
-        False when none came in time (old firmware, a lossy link): then what `arm_state` says is all there is.
-        """
-        heard = asyncio.Event()
-        self._heartbeat_waiters.append(heard)
-        request = self.commands.request_message(_HEARTBEAT_ID)
-        try:
-            async with asyncio.timeout(FRESH_WITHIN_S):
-                await request
-                await asyncio.sleep(_BEHIND_ANSWER_S)
-                await heard.wait()
-        except TimeoutError:
-            return False
-        finally:
-            request.cancel()  # or unanswered ones would queue up before the next
-            self._heartbeat_waiters.remove(heard)
-        return True
-
     def close(self) -> None:
         """Hear no heartbeat any more; the arm state is UNKNOWN from here on."""
         self._lost = True
@@ -233,9 +205,10 @@ class Vehicle:
             return
         now_s = asyncio.get_running_loop().time()
         armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        ours = self._is_ours(message) and self._is_on_our_link(message)
+        ours = self._is_ours(message) and self._is_on_our_link(message) and not self._stalled(now_s)
         if ours or armed:
             self._arming.heard(now_s, armed=armed)
+            self.disarmed.heard(armed=armed)
             self._log_conflict()
         if not ours:
             return
@@ -245,14 +218,13 @@ class Vehicle:
         self.signs = bool(message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
         self._lost = False
         self.found.set()
-        for heard in self._heartbeat_waiters:
-            heard.set()
         if self._lost_timer is not None:
             self._lost_timer.cancel()
         self._lost_timer = asyncio.get_running_loop().call_later(HEARTBEAT_TIMEOUT_S, self._lose)
         if was_lost:
             self._ask_soon()
             self._tell("found")
+        self._wanted.heard(message, now_s)
         # A disarmed heartbeat within 3 s of an armed one is neither news yet.
         believed = armed == self._arming.armed(now_s) and not self._arming.contradicts_itself(now_s)
         if believed and armed is not self._armed_told:
@@ -313,9 +285,9 @@ class Vehicle:
     def _tick(self) -> None:
         loop = asyncio.get_running_loop()
         now_s = loop.time()
-        if now_s - self._tick_due_s > _STALL_S:
-            self._trusted_from_s = now_s + 0.1
+        if self._stalled(now_s):
             logger.warning("the event loop stood still for %.1f s", now_s - self._tick_due_s)
+            self._link.settled()  # what has waited is no news
         self._tick_due_s = now_s + _TICK_S
         self._tick_timer = loop.call_at(self._tick_due_s, self._tick)
         if not self._lost:
@@ -326,11 +298,13 @@ class Vehicle:
                 self.commands.request_message(_HEARTBEAT_ID)
             self._wanted.ask_for_missing(now_s, self.firmware)
 
+    def _stalled(self, now_s: float) -> bool:
+        """Whether our own loop stood still and what has waited meanwhile is not all read yet."""
+        return now_s - self._tick_due_s > _STALL_S
+
     def _ask_soon(self) -> None:
         # What was streamed before a loss is gone if the autopilot restarted meanwhile.
         self._wanted.forget_asking()
-        if self.firmware == "ardupilot":
-            self.commands.request_message_interval(_HEARTBEAT_ID, HEARTBEAT_RATE_HZ)
         self._wanted.ask_for_missing(asyncio.get_running_loop().time(), self.firmware)
 
     # --- what the other messages tell
@@ -353,6 +327,10 @@ class Vehicle:
                 handler(message, t_s)
 
         return hear
+
+    def _on_timesync(self, message: mavlink.MAVLink_timesync_message, _t_s: float) -> None:
+        if message.tc1 and self._link.signed_on(message) == self._heartbeat_link_id:
+            self.disarmed.answered(message.ts1)
 
     def _on_version(self, message: mavlink.MAVLink_autopilot_version_message, _t_s: float) -> None:
         self.version = version_text(message.flight_sw_version)

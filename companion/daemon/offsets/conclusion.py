@@ -25,7 +25,7 @@ from companion.daemon.offsets.firmware_calibration import FirmwareCalibration, s
 from companion.daemon.offsets.plan import Plan
 from companion.daemon.offsets.push import POLL_S, heartbeat, not_as_written
 from companion.daemon.offsets.reboot_owed import RebootOwed
-from companion.errors import AutopilotError, AutopilotRebootedError, ParameterTimeoutError
+from companion.errors import AutopilotError, AutopilotRebootedError, NotDisarmedError, ParameterTimeoutError
 
 logger = logging.getLogger(__name__)
 
@@ -144,9 +144,10 @@ class Conclusion:
             go_on("waiting until the autopilot has stored the new offsets")
             await asyncio.sleep(POLL_S)
         boots = self._vehicle.boots
-        await self._vehicle.fresh_heartbeat()
-        if self._vehicle.arm_state is not ArmState.DISARMED:
-            raise NotRebootedError("not rebooted: the aircraft is not surely disarmed")
+        try:
+            await self._vehicle.disarmed.ensure()
+        except NotDisarmedError as error:
+            raise NotRebootedError(f"not rebooted: {error}") from error
         logger.info("rebooting %s", self._vehicle.name)
         reboot = mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
         result = await self._vehicle.commands.send(reboot, 1.0, timeout_s=ANSWER_S)

@@ -116,6 +116,7 @@ class MavlinkLink:
         self._codec: Codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None
+        self._settled: Callable[[], bool] = lambda: True
         self._attached = 0
         self._handlers: dict[str, Listeners[Message, float]] = {}
         self.on_bytes: Listeners[Direction, bytes | None, float | None] = Listeners()
@@ -145,33 +146,41 @@ class MavlinkLink:
         """Whatever carries the link's bytes goes on."""
         self.turns += 1
 
-    def attach(self, transmit: Callable[[bytes], object] | None) -> None:
+    def attach(self, transmit: Callable[[bytes], object] | None, settled: Callable[[], bool] = lambda: True) -> None:
         """Give the function that sends bytes, or None while there is none. What was half received is forgotten.
 
-        A `transmit` that returns False has dropped the bytes because its buffer is full.
+        A `transmit` that returns False has dropped the bytes because its buffer is full. `settled` does its part of
+        our own `settled`.
         """
         self.together.drain()  # what came over the transport before this one
-        self._transmit = transmit
+        self._transmit, self._settled = transmit, settled
         self._attached += 1
         self._forget_received()
         self.on_bytes.tell("in", None, None)
 
-    def send(self, message: mavlink.MAVLink_message) -> bool:
-        """Send a message now; False (and counted) when no transport is attached or its buffer is full."""
-        if self._transmit is None:
-            self.dropped += 1
-            return False
+    def settled(self) -> bool:
+        """Receive all that has come over the wire; False: more and more comes, or something still waits to leave."""
+        return self._settled()
+
+    def send(self, message: mavlink.MAVLink_message, allowed: Callable[[], bool] = lambda: True, /) -> bool:
+        """Send a message now; False (and counted) when no transport is attached or its buffer is full.
+
+        `allowed` is asked once the bytes are ready, as the last thing before they leave; False: they do not. It sends
+        nothing itself.
+        """
         data = message.pack(self._codec)
         if self.signing is not None:
             data = self.signing.sign(data, message.crc_extra)
-        self._codec.seq = (self._codec.seq + 1) % 256
-        if self.on_bytes:
-            self.on_bytes.tell("out", data, None)
-        if self._transmit(data) is False:
+        if not allowed() or self._transmit is None:
             self.dropped += 1
             return False
-        self.sent += 1
-        return True
+        left = self._transmit(data) is not False
+        if self.on_bytes:
+            self.on_bytes.tell("out", data, None)
+        self._codec.seq = (self._codec.seq + 1) % 256
+        self.dropped += not left
+        self.sent += left
+        return left
 
     def subscribe(self, kind: type[M], handler: Handler[M]) -> Unsubscribe:
         """Call `handler(message, t_s)` for every message of a kind, whoever sent it; returns how to stop that."""

@@ -11,6 +11,7 @@ import asyncio
 import errno
 import functools
 import re
+import socket
 from typing import Any
 
 from companion.errors import LinkError
@@ -21,7 +22,8 @@ from companion.links.system.connection import Backoff, OnState, Reconnection
 PEER_SILENCE_S = 10.0
 MAX_PEERS = 8
 """Newcomers beyond these are heard but not answered; only the autopilot's own address gets the place of another."""
-OUT_BUFFER_BYTES = 65536
+MOST_WAITING = 1024
+"""Datagrams that are read at once before something may be written; the kernel keeps some 300."""
 MOST_DATAGRAM_BYTES = 65536
 """UDP carries no more; asyncio makes room for four times that, afresh for every datagram, which costs more than all the
 rest of its reading: so much memory is got from the kernel, and given back, page by page."""
@@ -30,7 +32,7 @@ RESOLVE_DEADLINE_S = 5.0
 _TURN_S = 1.0
 _URL = re.compile(r"(?P<kind>udpin|udpout|tcp|serial):(?P<where>.+):(?P<number>\d+)")
 # The target's host is up but nobody listens yet (or it restarts): keep sending, it will come.
-_PASSING_ERRORS = frozenset({errno.ECONNREFUSED, errno.ENOBUFS, errno.EAGAIN})
+_PASSING_ERRORS = frozenset({errno.ECONNREFUSED, errno.ENOBUFS})
 
 Peer = tuple[Any, ...]
 
@@ -50,7 +52,7 @@ async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None
     settings = PortSettings(f"tcp://{where}:{number}", 0) if kind == "tcp" else PortSettings(where, number)
 
     def state(connected: bool, words: str) -> None:  # noqa: FBT001 - ByteLink's own signature
-        link.attach(stream.write if connected else None)
+        link.attach(stream.write if connected else None, stream.settled)
         if on_state is not None:
             on_state(connected, words)
 
@@ -104,7 +106,7 @@ async def _run_udp(
 
 
 class _Udp(asyncio.DatagramProtocol):
-    """What both kinds of UDP share: receiving, a bounded way out, and an end."""
+    """What both kinds of UDP share: receiving, sending at once or not at all, and an end."""
 
     def __init__(self, link: MavlinkLink) -> None:
         self.link = link
@@ -112,8 +114,9 @@ class _Udp(asyncio.DatagramProtocol):
         self.now_s = loop.time
         self.closed: asyncio.Future[None] = loop.create_future()
         self._failed: asyncio.Future[str] = loop.create_future()
-        self._transport: Any = None
-        """uvloop's is no asyncio.DatagramTransport by type."""
+        self._socket: socket.socket | None = None
+        """A second descriptor of the transport's socket: asyncio reads one datagram a turn, and keeps what finds no
+        room in the kernel to send it later."""
 
     async def run(self) -> str:
         """Serve until the socket fails; returns why."""
@@ -127,12 +130,14 @@ class _Udp(asyncio.DatagramProtocol):
         """What is due once a second."""
 
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
-        self._transport = transport
+        self._socket = transport.get_extra_info("socket").dup()
         if hasattr(transport, "max_size"):
             transport.max_size = MOST_DATAGRAM_BYTES
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._transport = None
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
         self.closed.set_result(None)
         self._fail(exc)
 
@@ -141,12 +146,32 @@ class _Udp(asyncio.DatagramProtocol):
         if not (isinstance(exc, OSError) and exc.errno in _PASSING_ERRORS):
             self._fail(exc)
 
+    def settled(self) -> bool:
+        """Receive all datagrams that wait in the kernel; False: more and more come, or the socket is gone."""
+        for _ in range(MOST_WAITING):
+            if self._socket is None:
+                return False
+            try:
+                data, peer = self._socket.recvfrom(MOST_DATAGRAM_BYTES)
+            except (BlockingIOError, InterruptedError):
+                return True
+            except OSError as error:
+                self.error_received(error)
+            else:
+                self.datagram_received(data, peer)
+        return False
+
     def send_to(self, data: bytes, peer: Peer | None) -> bool:
-        """Send one datagram; False when the socket is gone or its buffer full (then the newest is what is dropped)."""
-        transport = self._transport
-        if transport is None or transport.get_write_buffer_size() + len(data) > OUT_BUFFER_BYTES:
+        """Send one datagram; False when the socket is gone or has no room."""
+        if self._socket is None:
             return False
-        transport.sendto(data, peer)
+        try:
+            self._socket.send(data) if peer is None else self._socket.sendto(data, peer)
+        except (BlockingIOError, InterruptedError):
+            return False
+        except OSError as error:
+            self.error_received(error)
+            return False
         return True
 
     def _fail(self, error: Exception | None) -> None:
@@ -159,7 +184,7 @@ class _Speaker(_Udp):
 
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self.link.attach(lambda data: self.send_to(data, None))
+        self.link.attach(lambda data: self.send_to(data, None), self.settled)
 
     def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
         self.link.arrived(data, self.now_s(), self._receive)
@@ -194,7 +219,7 @@ class _Listener(_Udp):
             self._autopilots.add(peer)
         self._heard_s[peer] = t_s
         if not self.link.connected:
-            self.link.attach(self._send_to_all)
+            self.link.attach(self._send_to_all, self.settled)
 
     def _make_room(self) -> bool:
         """Let the autopilot's own address have the place of somebody else, the one who has been silent for longest."""

@@ -43,6 +43,8 @@ BEAT_WITHIN_S = 8.0
 """An open that takes all the time it may, and the longest pause after it."""
 FLOOD_PAUSE_S = 0.05
 """How long a port that brings too much is left alone."""
+MOST_READS = 64
+"""So often a port is read before something may be written to it; the kernel keeps less than these bring."""
 DISCARD_BYTES = 65536
 DISCARD_READS = 16
 """After a pause so much is thrown away at the most, a millisecond's work; the rest waits in the kernel, not here."""
@@ -197,6 +199,12 @@ class ByteLink:
         if not waiting:
             self._flush()
         return self._descriptor is not None
+
+    def settled(self) -> bool:
+        """Hand on all that has come; False: more and more comes, something still waits to leave, or it is closed."""
+        now_s = asyncio.get_running_loop().time()
+        emptied = any(not self._read(now_s) for _ in range(MOST_READS))
+        return emptied and self._descriptor is not None and not self._out
 
     def _turn(self) -> None:
         self.turns += 1
