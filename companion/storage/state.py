@@ -217,7 +217,7 @@ class StateFile(Generic[T]):
             # What could not be read again would cost what was there before, too.
             self._of(data)
         except UNREADABLE as error:
-            raise StorageError(f"{self.path}: not written: {error}") from error
+            raise StorageError(f"{error} ({self.path.name})") from error
         write_atomically(self.path, data, mode=self._mode)
 
     def clear(self) -> None:

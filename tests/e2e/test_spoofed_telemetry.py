@@ -179,3 +179,23 @@ def test_an_arming_between_two_looks_ends_the_measurement(tmp_path: Path) -> Non
             assert result.reason == "armed; nothing written"
 
     run_virtual(main())
+
+
+@pytest.mark.parametrize(("firmware", "capability"), [("ardupilot", 16), ("px4", 131072)])
+def test_forged_versions_fail_no_calibration(tmp_path: Path, firmware: Any, capability: int) -> None:
+    """They say that integers travel in the other firmware's way: read so, each device id would be another sensor's."""
+
+    async def main() -> None:
+        nothing = [0] * 8
+        version: Any = mavlink.MAVLink_autopilot_version_message
+        async with Rig(tmp_path, firmware=firmware, imus=1, **QUICK).running() as rig:
+            await rig.ready()
+            forged = version(capability, 0x01020300, 0, 0, 0, nothing, nothing, nothing, 0, 0, 7)
+            async with spoofed(rig, 0.5, lambda: forged):
+                await asyncio.sleep(1.0)
+                job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
+                assert isinstance(job, Job)
+                result = await job.finished
+            assert result.outcome == "done", result.reason
+
+    run_virtual(main())

@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -274,6 +275,27 @@ def test_asks_for_what_it_needs_and_learns_version_time_and_place() -> None:
     run_virtual(main())
 
 
+def test_a_version_that_contradicts_the_one_before_is_asked_for_again() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot()
+        async with aboard(autopilot) as (vehicle, _):
+            told = (vehicle.version, vehicle.capabilities)
+            forged: Any = mavlink.MAVLink_autopilot_version_message
+            codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+            nothing = [0] * 8
+            data = forged(BYTEWISE, 0x01020300, 0, 0, 0, nothing, nothing, nothing, 0, 0, 7).pack(codec)
+            asked = len(autopilot.requests)
+            vehicle._link.receive(data, asyncio.get_running_loop().time())
+            assert (vehicle.version, vehicle.capabilities) != told
+            await asyncio.sleep(1.0)
+            assert (vehicle.version, vehicle.capabilities) == told
+            await asyncio.sleep(20.0)
+            again = [each for each in autopilot.requests[asked:] if getattr(each, "param1", 0) == 148]
+            assert 1 <= len(again) <= 2, "once both agree nobody asks"
+
+    run_virtual(main())
+
+
 def test_a_silent_command_server_is_asked_again_and_wedges_nothing() -> None:
     async def main() -> None:
         autopilot = ScriptedAutopilot()
@@ -433,11 +455,11 @@ def test_boot_clock_slow_simulation_and_drift_are_none() -> None:
         (PARAM_FLOAT, PX4, True),
         (PARAM_FLOAT | BYTEWISE, PX4, True),
         (PARAM_FLOAT | C_CAST, ARDUPILOT, False),
-        (PARAM_FLOAT | C_CAST, PX4, False),
-        (PARAM_FLOAT | BYTEWISE, ARDUPILOT, True),
+        (PARAM_FLOAT | C_CAST, PX4, True),
+        (PARAM_FLOAT | BYTEWISE, ARDUPILOT, False),
     ],
 )
-def test_integers_are_bytes_by_the_capability_bits_and_else_on_px4_only(
+def test_integers_are_bytes_on_px4_only_whatever_anybody_says_of_its_capabilities(
     capabilities: int | None, autopilot: int, expected: bool
 ) -> None:
     async def main() -> None:

@@ -19,6 +19,7 @@ FailureKind = Literal[
     "changed by someone else",
     "not as believed",
     "without effect",
+    "not kept",
 ]
 
 

@@ -114,7 +114,7 @@ class ParameterClient:
         if name in self._absent:
             return None
         boots = self.vehicle.boots
-        most = _TRIES_MORE if self._repeated > _LOSSY else _TRIES
+        most = _TRIES_MORE if self._repeated > _LOSSY or name in self._types else _TRIES
         answer, tries = await self._ask_repeatedly(name, range(1, most + 1))
         if isinstance(answer, float):
             return answer

@@ -54,14 +54,11 @@ REAL32: Final[int] = mavlink.MAV_PARAM_TYPE_REAL32
 def integers_bytewise(capabilities: int | None, firmware: Firmware | None) -> bool:
     """Whether integer parameters travel as the bytes of an int32 in the float field, not as a number.
 
-    By the capability bits; else by who it is: older PX4 and ArduPilot set neither bit (autopilots 7.5).
+    PX4 always does so, ArduPilot never (autopilots 7.5), whatever an AUTOPILOT_VERSION says that anybody can send.
     """
-    if capabilities is not None:
-        if capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE:
-            return True
-        if capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST:
-            return False
-    return firmware == "px4"
+    if firmware in ("ardupilot", "px4"):
+        return firmware == "px4"
+    return bool((capabilities or 0) & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE)
 
 
 def is_integer(kind: int) -> bool:

@@ -29,6 +29,7 @@ from companion.errors import (
     NotDisarmedError,
     ParameterMismatchError,
     ParameterRefusedError,
+    StorageError,
 )
 
 logger = logging.getLogger(__name__)
@@ -371,6 +372,8 @@ def kind_of(error: CompanionError, vehicle: Vehicle, boots: int) -> FailureKind:
         return "armed in the middle" if vehicle.arm_state is ArmState.ARMED else "arm state unknown"
     if isinstance(error, ParameterMismatchError):
         return "answered another value"
+    if isinstance(error, StorageError):
+        return "not kept"
     return "refused" if isinstance(error, ParameterRefusedError) else "no answer"
 
 

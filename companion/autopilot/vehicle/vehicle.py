@@ -333,9 +333,13 @@ class Vehicle:
             self.disarmed.answered(message.ts1)
 
     def _on_version(self, message: mavlink.MAVLink_autopilot_version_message, _t_s: float) -> None:
+        before = (self.version, self.capabilities, self.uid)
         self.version = version_text(message.flight_sw_version)
         self.capabilities = message.capabilities
         self.uid = unique_id(message)
+        if before[0] is not None and before != (self.version, self.capabilities, self.uid):
+            # Within one boot it does not change: one of the two is forged, and the autopilot speaks last.
+            self.commands.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 
 
 class Moment:
