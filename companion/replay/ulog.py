@@ -24,6 +24,8 @@ _FOLLOWS: Final = frozenset((b"", *(bytes((kind,)) for kind in _KNOWN)))
 """What is not followed by another message or the end is damaged."""
 _TOLD: Final = frozenset(b"FAPO")
 _LARGEST: Final = 65535
+_MAY_BEGIN: Final = re.compile(b"(?=" + re.escape(MAGIC) + b"|..D..)", re.DOTALL)
+"""Matches where a log or a data message may begin."""
 _CLOCK: Final = "timestamp"
 _TYPES: Final = {
     "int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
@@ -60,11 +62,11 @@ def ulog(path: Path, topics: Topics, progress: Progress = nobody) -> Iterator[Bl
                     log = _Log(topics, _START.unpack_from(data, at)[0] * US)
                     at += _START.size
                     continue
-                # Damage: on with the next message that can only be one.
-                found = log.again.search(data, at + 1)
-                at = max(end - len(MAGIC), at + 1) if found is None else found.start()
+                at = log.resume(data, at + 1)
                 continue
             if kept is not None:
+                if not kept.data:
+                    log.waiting.append(kept)
                 kept.data += data[at + 5 : at + 5 + kept.layout.itemsize]
             elif kind in _TOLD:
                 yield from log.take(kind, data[at + 3 : after])
@@ -79,14 +81,15 @@ class _Log:
     def __init__(self, topics: Topics, start_s: float = 0.0) -> None:
         self._topics = topics
         self._now_s = start_s
-        self._formats: dict[str, str] = {}
-        self._kept: dict[int, Kept] = {}
+        self._layouts: dict[str, tuple[np.dtype[np.void], int]] = {}
+        self._subscribed: dict[int, tuple[bytes, ...]] = {}
+        """Keys of `heads` by the number of a subscription."""
         self._parameters: list[tuple[float, str, float]] = []
         self._dropouts: list[tuple[float, float]] = []
         self.heads: dict[bytes, Kept] = {}
         """By the first five bytes of a message."""
-        self.again = re.compile(re.escape(MAGIC))
-        """Finds one of these."""
+        self.waiting: list[Kept] = []
+        """Those that hold messages; a flush visits no others, whatever a log subscribes to."""
 
     def take(self, kind: int, body: bytes) -> Iterator[Block]:
         """A format, a subscription, a parameter or a dropout; what cannot be one is passed over."""
@@ -94,10 +97,12 @@ class _Log:
             if kind == ord("F"):
                 name, _, fields = body.decode("latin-1").partition(":")
                 if name in self._topics:
-                    self._formats[name] = fields
+                    self._layouts.pop(name, None)
+                    self._layouts[name] = _layout(fields, self._topics[name])
             elif kind == ord("A"):
-                yield from self.flush()
                 instance, number = _SUBSCRIPTION.unpack_from(body)
+                if number in self._subscribed:
+                    yield from self.flush()
                 self._subscribe(number, body[_SUBSCRIPTION.size :].decode("latin-1"), instance)
             elif kind == ord("P"):
                 yield from self.flush()
@@ -111,23 +116,32 @@ class _Log:
             return
 
     def _subscribe(self, number: int, name: str, instance: int) -> None:
-        if (before := self._kept.pop(number, None)) is not None:
-            self.heads = {head: kept for head, kept in self.heads.items() if kept is not before}
-        if name in self._formats:
-            layout, padding = _layout(self._formats[name])
-            kept = self._kept[number] = Kept(name, instance, layout)
-            for more in {0, padding}:
-                self.heads[struct.pack("<HcH", layout.itemsize + more + 2, b"D", number)] = kept
-        self.again = re.compile(b"|".join(map(re.escape, (MAGIC, *self.heads))))
+        for head in self._subscribed.pop(number, ()):
+            del self.heads[head]
+        if name in self._layouts:
+            layout, padding = self._layouts[name]
+            kept = Kept(name, instance, layout)
+            sizes = {layout.itemsize, layout.itemsize + padding}
+            heads = tuple(struct.pack("<HcH", size + 2, b"D", number) for size in sizes)
+            self._subscribed[number] = heads
+            self.heads.update(dict.fromkeys(heads, kept))
+
+    def resume(self, data: bytes, start: int) -> int:
+        """Return the place after damage of the next message that is known, or where the search goes on."""
+        for found in _MAY_BEGIN.finditer(data, start):
+            at = found.start()
+            if data[at : at + 5] in self.heads or data.startswith(MAGIC, at):
+                return at
+        return max(len(data) - len(MAGIC), start)
 
     def flush(self) -> Iterator[Block]:
         """All that waits."""
         latest = []
-        for kept in self._kept.values():
-            if kept.data:
-                rows = columns(kept.taken(), _CLOCK, self._topics[kept.name])
-                latest.append(rows[-1, 0])
-                yield Block(kept.name, kept.instance, rows)
+        for kept in self.waiting:
+            rows = columns(kept.taken(), _CLOCK, self._topics[kept.name])
+            latest.append(rows[-1, 0])
+            yield Block(kept.name, kept.instance, rows)
+        self.waiting = []
         if latest:
             # One of them may be damaged.
             self._now_s = float(median(latest))
@@ -140,26 +154,35 @@ class _Log:
             self._dropouts = []
 
 
-def _layout(fields: str) -> tuple[np.dtype[np.void], int]:
-    """Of a topic without others nested in it, and how many bytes at its end need not be there.
+def _layout(fields: str, wanted: tuple[str, ...]) -> tuple[np.dtype[np.void], int]:
+    """Return the clock and the wanted fields of a topic, and how many bytes at its end need not be there.
+
+    Arrays are never spread out: a format of 20 bytes can declare an array of 65,000 elements.
 
     Raises:
-        KeyError, ValueError, TypeError: it cannot be.
+        KeyError, ValueError, TypeError: no such topic can be read.
     """
-    parts: list[tuple[str, str]] = []
+    places: dict[str, tuple[str, int, int | None]] = {}
+    padded = size = 0
     for field in filter(None, fields.split(";")):
         kind, name = field.split(" ")
-        kind, _, count = kind.rstrip("]").partition("[")
-        if count and len(parts) + int(count) > _LARGEST:
+        kind, _, length = kind.rstrip("]").partition("[")
+        count = int(length) if length else None
+        if name in places or (count or 0) < 0:
             raise ValueError(field)
-        parts += [(f"{name}[{k}]", _TYPES[kind]) for k in range(int(count))] if count else [(name, _TYPES[kind])]
-    padded = np.dtype(parts).itemsize
-    while parts and parts[-1][0].startswith("_padding"):
-        parts.pop()
-    layout = np.dtype(parts)
-    if _CLOCK not in (layout.names or ()) or padded + 2 > _LARGEST:
+        places[name] = _TYPES[kind], padded, count
+        padded += np.dtype(_TYPES[kind]).itemsize * (1 if count is None else count)
+        size = size if name.startswith("_padding") else padded
+    found: dict[str, tuple[str, int]] = {}
+    for each in (_CLOCK, *wanted):
+        name, _, element = each.rstrip("]").partition("[")
+        code, at, count = places.get(name, ("", 0, None))
+        if code and (count is None) == (not element) and int(element or 0) < (1 if count is None else count):
+            found[each] = code, at + int(element or 0) * np.dtype(code).itemsize
+    if _CLOCK not in found or padded + 2 > _LARGEST:
         raise ValueError(fields)
-    return layout, padded - layout.itemsize
+    codes, offsets = zip(*found.values(), strict=True)
+    return np.dtype({"names": [*found], "formats": codes, "offsets": offsets, "itemsize": size}), padded - size
 
 
 def _appended(path: Path) -> int | None:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import struct
+import sys
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -174,3 +178,50 @@ def test_logs_put_together_are_told_apart(tmp_path: Path, monkeypatch: pytest.Mo
     assert blocks.count(None) == 2
     second = rows_of(blocks[len(blocks) - blocks[::-1].index(None) :])
     assert len(second["gyro", 0]) == 40
+
+
+def steps(path: Path) -> int:
+    """Count the instructions of Python that reading a log takes."""
+    count = 0
+
+    def trace(frame: FrameType, event: str, _argument: Any) -> Any:
+        nonlocal count
+        frame.f_trace_opcodes = True
+        count += event == "opcode"
+        return trace
+
+    sys.settrace(trace)
+    try:
+        list(ulog(path, TOPICS))
+    finally:
+        sys.settrace(None)
+    return count
+
+
+def many(count: int, between: Callable[[int], bytes]) -> bytes:
+    """A log with that many subscriptions, and something of each between it and the next."""
+    parts = definitions()
+    for k in range(count):
+        parts += [subscribed(k, "gyro", k % 4), between(k)]
+    return b"".join(parts)
+
+
+BETWEEN: dict[str, Callable[[int], bytes]] = {
+    "nothing": lambda _: b"",
+    "data": lambda k: gyro(k, 10_000 * k, 1.0),
+    "parameters": lambda k: gyro(k, 10_000 * k, 1.0) + parameter("SOME", float(k)),
+    "damage": lambda k: b"\xff" * 30 + gyro(k // 2, 10_000 * k, 1.0),
+    "a number used again": lambda k: gyro(k, 10_000 * k, 1.0) + subscribed(k, "other"),
+    "formats": lambda k: message(b"F", b"gyro:uint64_t timestamp;uint8_t[30000] many;float x;"),
+}
+
+
+@pytest.mark.parametrize("between", BETWEEN)
+def test_the_work_of_reading_grows_as_the_log_does(tmp_path: Path, between: str) -> None:
+    """A log of 3.5 MB has room for 150,000 subscriptions: work by its square takes minutes."""
+    path, found = tmp_path / "log.ulg", []
+    for count in (100, 400):
+        path.write_bytes(many(count, BETWEEN[between]))
+        found.append(steps(path))
+    assert found[1] < 4.2 * found[0]
+    assert found[1] < 400 * 4000
