@@ -25,6 +25,9 @@ MOST_BYTES: Final = 256 * 1024
 AIRCRAFT_ID: Final = re.compile(r"[0-9a-f]{16}|[0-9a-f]{36}")
 _AIRCRAFT: Final = re.compile(rf"fleet/({AIRCRAFT_ID.pattern})/(hello|item)")
 _MOST: Final = 1e12
+_EARLIEST: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+_LATEST: Final = datetime.datetime(2200, 1, 1, tzinfo=datetime.UTC)
+"""A clock without a battery starts in 1970; nothing records a later time than this."""
 
 _Aircraft = Annotated[str, msgspec.Meta(pattern=f"^({AIRCRAFT_ID.pattern})$")]
 _Epoch = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
@@ -285,16 +288,19 @@ KINDS: Final[dict[str, Callable[[bytes], Rows]]] = {
 
 
 def moment(words: str) -> datetime.datetime:
-    """A time of ISO 8601, which is UTC if it does not say.
+    """Parse a time of ISO 8601, in UTC unless it names another zone.
 
     Raises:
-        NotTakenError: it is none.
+        NotTakenError: it is no time, or one that no clock of an aircraft shows.
     """
     try:
         found = datetime.datetime.fromisoformat(words)
-        return found.replace(tzinfo=datetime.UTC) if found.tzinfo is None else found.astimezone(datetime.UTC)
+        found = found.replace(tzinfo=datetime.UTC) if found.tzinfo is None else found.astimezone(datetime.UTC)
     except (ValueError, OverflowError):
         raise NotTakenError(f"found {words[:40]!r}; allowed: a time such as 2026-11-23T06:12:00.000Z") from None
+    if not _EARLIEST <= found < _LATEST:
+        raise NotTakenError(f"found {words[:40]!r}; allowed: a time from {_EARLIEST.year} to {_LATEST.year - 1}")
+    return found
 
 
 def _at(words: str | None) -> datetime.datetime | None:

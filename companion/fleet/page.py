@@ -17,7 +17,7 @@ from companion.fleet.schema import aircraft as known
 from companion.physics.frames import vector
 from companion.physics.units import DEG_H, MG
 from companion.report.markup import Child, Markup, row, tag
-from companion.report.page import NAMES, TRIADS, UNITS, Point, arming_items, card, drift, page, with_sigma
+from companion.report.page import NAMES, TRIADS, UNITS, Point, arming_items, card, drift, page, seconds_of, with_sigma
 from companion.samples import Triad, Vector
 
 STALE: Final = datetime.timedelta(days=30)
@@ -175,7 +175,7 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
 
 def _seen(rows: Sequence[Any]) -> list[Seen]:
     """At which temperature which bias was found."""
-    degc = {(each.sequence, each.started_at.timestamp()): each.temperature_degc for each in rows}
+    degc = {(each.sequence, seconds_of(each.started_at)): each.temperature_degc for each in rows}
     gyro, accel = ({(one.number, one.unix_s): one for one in _points(rows, triad)} for triad in TRIADS)
     return [
         Seen(
@@ -205,7 +205,7 @@ def _points(rows: Sequence[Any], triad: Triad) -> list[Point]:
         bias = _vector(axes, f"{triad}_bias_{suffix}", unit)
         sigma = _vector(axes, f"{triad}_sigma_use_{suffix}", unit)
         if bias is not None and sigma is not None:
-            points.append(Point(sequence, axes["x"].started_at.timestamp(), bias, sigma))
+            points.append(Point(sequence, seconds_of(axes["x"].started_at), bias, sigma))
     return points[::-1]
 
 

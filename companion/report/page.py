@@ -123,9 +123,14 @@ def unix_s(moment: str) -> float | None:
     """Seconds since 1970 of an ISO 8601 time, which is UTC if it does not say; None: it is none of this age."""
     try:
         parsed = datetime.datetime.fromisoformat(moment)
-        seconds = (parsed if parsed.tzinfo else parsed.replace(tzinfo=datetime.UTC)).timestamp()
+        return seconds_of(parsed if parsed.tzinfo else parsed.replace(tzinfo=datetime.UTC))
     except (ValueError, OverflowError):
         return None
+
+
+def seconds_of(moment: datetime.datetime) -> float | None:
+    """Convert a time with a zone to seconds since 1970; None: no clock of this age shows it, and no axis has it."""
+    seconds = moment.timestamp()
     return seconds if 0.0 <= seconds < _LATEST_S else None
 
 
