@@ -47,7 +47,9 @@ def model_page(connection: sa.Connection, model: str, now: datetime.datetime, so
     of_model = parts_of(connection, model)
     if not of_model:
         return None
-    names = {row.aircraft: row.name for row in connection.execute(sa.select(aircraft.c.aircraft, aircraft.c.name))}
+    of_parts = aircraft.c.aircraft.in_({one for one, _ in of_model})
+    query = sa.select(aircraft.c.aircraft, aircraft.c.name).where(of_parts)
+    names = {row.aircraft: row.name for row in connection.execute(query)}
     prior = model_prior(model, list(of_model.values()))
     all_parts = models(connection).get(model, 0)
     power_ups = sum(part.power_ups for part in of_model.values())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
@@ -16,14 +15,15 @@ from companion.fleet.schema import Moment, findings, rejected
 from companion.fleet.schema import aircraft as known
 from companion.physics.frames import vector
 from companion.physics.units import DEG_H, MG
-from companion.report.markup import Child, Markup, row, tag
+from companion.report.markup import Child, Markup, join, row, tag
 from companion.report.page import NAMES, TRIADS, UNITS, Point, arming_items, card, drift, page, seconds_of, with_sigma
 from companion.samples import Triad, Vector
 
 STALE: Final = datetime.timedelta(days=30)
 """A calibration that is older is shown as stale."""
 SILENT: Final = datetime.timedelta(days=7)
-MOST_AIRCRAFT: Final = 2000
+MOST_AIRCRAFT: Final = 500
+"""The most aircraft on one page, which has some 90 kB then."""
 MOST_CALIBRATIONS: Final = 120
 """The most of one IMU that are drawn, the latest."""
 MOST_LISTED: Final = 25
@@ -41,69 +41,113 @@ class Standing(NamedTuple):
 
 
 _CLASSES: Final = {"alarm": "bad", "caution": "warn", "fine": "ok"}
-"""The worst first."""
 SOURCE: Final = "from the fleet's database"
+_STANDINGS: Final = (
+    ("alarm", "not calibrated", "calibrated_at IS NULL"),
+    ("alarm", "held back", "held_back <> ''"),
+    ("caution", "stale", "calibrated_at < :stale"),
+    ("caution", "armed without one", "armed_state = 'uncalibrated' AND armed_at > calibrated_at"),
+    ("caution", "last try failed", "tried_state IN ('failed', 'cancelled') AND tried_reason <> ''"),
+    ("fine", "calibrated", "1 = 1"),
+)
+"""Kind, word and condition of each standing, the worst first: the first condition that holds counts."""
+_CASES: Final = " ".join(f"WHEN {holds} THEN {place}" for place, (_, _, holds) in enumerate(_STANDINGS))
+_FLEET: Final = (
+    f"SELECT f.*, CASE {_CASES} END AS standing,"  # noqa: S608 - constants
+    " CASE WHEN heard_at IS NULL OR heard_at < :silent THEN 1 ELSE 0 END AS silent,"
+    " CASE WHEN tried_at IS NULL THEN 1 ELSE 0 END AS untold FROM fleet f"
+)
+_ORDERED: Final = (
+    f"SELECT s.* FROM ({_FLEET}) s LEFT JOIN findings w ON w.aircraft = s.aircraft AND w.place = 0"  # noqa: S608 - constants
+    " ORDER BY w.size DESC NULLS LAST, s.untold, s.standing, s.heard_at DESC NULLS LAST, s.aircraft"
+    " LIMIT :most OFFSET :first"
+)
+"""An id that has told no calibration comes after all that have: nobody moves an aircraft away by inventing others."""
 
 
-def standing(one: Any, now: datetime.datetime) -> Standing:
-    """By a row of the view `fleet`; the worst first."""
+def standing(one: Any) -> Standing:
+    """Describe a row of the fleet in words."""
+    kind, word, _ = _STANDINGS[one.standing]
     why = one.tried_reason if one.tried_state in ("failed", "cancelled") else ""
-    if one.calibrated_at is None:
-        return Standing("alarm", "not calibrated", why or "no calibration stands")
-    if one.held_back:
-        return Standing("alarm", "held back", f"contradicts earlier ones, not written: {one.held_back}")
-    if now - one.calibrated_at > STALE:
-        return Standing("caution", "stale", why)
-    if one.armed_state == "uncalibrated" and one.armed_at > one.calibrated_at:
-        return Standing("caution", "armed without one", one.armed_reason)
-    if why:
-        return Standing("caution", "last try failed", why)
-    return Standing("fine", "calibrated", "")
+    if word == "not calibrated":
+        why = why or "no calibration stands"
+    elif word == "held back":
+        why = f"contradicts earlier ones, not written: {one.held_back}"
+    elif word == "armed without one":
+        why = one.armed_reason
+    return Standing(kind, word, why)
 
 
-def glance(connection: sa.Connection, now: datetime.datetime) -> str:
-    """The whole fleet."""
-    found = _rows(connection, "SELECT * FROM fleet ORDER BY name, aircraft LIMIT :most", most=MOST_AIRCRAFT)
-    each = sorted(((standing(one, now), one) for one in found), key=lambda pair: [*_CLASSES].index(pair[0].kind))
-    counts = Counter(stands.word for stands, _ in each)
-    silent = sum(_is_silent(one, now) for one in found)
-    words = [f"{number} {word}" for word, number in counts.items()] + [f"{silent} silent for a week"] * (silent > 0)
-    rows = [
-        row(
-            tag("td", tag("a", one.name or one.aircraft, href=f"/aircraft/{one.aircraft}"), _small(stands.why)),
-            tag(
-                "td",
-                stands.word,
-                _small("" if one.calibrated_at is None else _ago(one.calibrated_at, now)),
-                class_=_CLASSES[stands.kind],
-            ),
-            tag("td", _ago(one.heard_at, now), class_="warn" if _is_silent(one, now) else None),
-        )
-        for stands, one in each
-    ]
+def glance(connection: sa.Connection, now: datetime.datetime, number: int = 1) -> str | None:
+    """The fleet, `MOST_AIRCRAFT` on each numbered page; None: there is no such page."""
+    since = {"stale": now - STALE, "silent": now - SILENT}
+    counted = f"SELECT standing, COUNT(*) AS number, SUM(silent) AS silent FROM ({_FLEET}) s GROUP BY standing"  # noqa: S608 - constants
+    groups = _rows(connection, f"{counted} ORDER BY standing", **since)
+    known_in_all = sum(group.number for group in groups)
+    first = (number - 1) * MOST_AIRCRAFT
+    if number > 1 and first >= known_in_all:
+        return None
+    found = _rows(connection, _ORDERED, **since, most=MOST_AIRCRAFT, first=first)
+    found = sorted(found, key=lambda one: (one.standing, one.name or one.aircraft))
+    silent = sum(group.silent for group in groups)
+    words = [f"{group.number} {_STANDINGS[group.standing][1]}" for group in groups]
+    words += [f"{silent} silent for a week"] * (silent > 0)
     head = tag("tr", *(tag("th", words) for words in ("Aircraft", "Calibration", "Seen")))
     return page(
         "Fleet",
         now,
         tag("h1", "Fleet"),
         tag(
-            "p", f"{len(found)} aircraft: {', '.join(words)}" if found else "No aircraft was heard yet.", class_="lead"
+            "p",
+            f"{known_in_all} aircraft: {', '.join(words)}" if found else "No aircraft was heard yet.",
+            class_="lead",
         ),
         _findings(connection),
-        tag("table", head, *rows, class_="fleet") if rows else None,
+        _other_pages(number, known_in_all),
+        tag("table", head, *(_line(one, now) for one in found), class_="fleet") if found else None,
+        _other_pages(number, known_in_all),
         model_links(connection),
         _refused(connection, now),
         source=SOURCE,
     )
 
 
+def _line(one: Any, now: datetime.datetime) -> Markup:
+    """One aircraft in the table of the fleet."""
+    stands = standing(one)
+    calibrated = "" if one.calibrated_at is None else _ago(one.calibrated_at, now)
+    return row(
+        tag("td", tag("a", one.name or one.aircraft, href=f"/aircraft/{one.aircraft}"), _small(stands.why)),
+        tag("td", stands.word, _small(calibrated), class_=_CLASSES[stands.kind]),
+        tag("td", _ago(one.heard_at, now), class_="warn" if one.silent else None),
+    )
+
+
+def _other_pages(number: int, known_in_all: int) -> Markup | None:
+    """Say which part of the fleet this page lists, with links to the pages around it."""
+    last = -(-known_in_all // MOST_AIRCRAFT)
+    if last <= 1:
+        return None
+    first = (number - 1) * MOST_AIRCRAFT + 1
+    links = [
+        tag("a", words, href="/" if to == 1 else f"/page/{to}")
+        for words, to in (("Previous", number - 1), ("Next", number + 1))
+        if 1 <= to <= last
+    ]
+    words = f"{first} to {min(first + MOST_AIRCRAFT - 1, known_in_all)} of {known_in_all}, findings first, then the"
+    return tag(
+        "p", f"{words} worst and the latest heard; page {number} of {last}. ", *(join(link, " ") for link in links)
+    )
+
+
 def aircraft(connection: sa.Connection, which: str, now: datetime.datetime) -> str | None:
     """One aircraft; None: it was never heard."""
-    found = _rows(connection, "SELECT * FROM fleet WHERE aircraft = :which", which=which)
+    query = f"SELECT * FROM ({_FLEET}) s WHERE aircraft = :which"  # noqa: S608 - constants
+    found = _rows(connection, query, which=which, stale=now - STALE, silent=now - SILENT)
     if not found:
         return None
     one = found[0]
-    stands = standing(one, now)
+    stands = standing(one)
     name = one.name or one.aircraft
     calibrated = "" if one.calibrated_at is None else f", by the calibration of {_moment(one.calibrated_at)}"
     parts: list[Child] = [
@@ -268,11 +312,10 @@ def _rows(connection: sa.Connection, query: str, **values: Any) -> Sequence[Any]
     """With times as times, also where the database keeps them as texts."""
     names = [name for name in _MOMENTS if name in query.split()[1:] or "*" in query]
     columns = {name: Moment() for name in names}
-    return connection.execute(sa.text(query).columns(**columns), values).all()
-
-
-def _is_silent(one: Any, now: datetime.datetime) -> bool:
-    return one.heard_at is None or now - one.heard_at > SILENT
+    times = [
+        sa.bindparam(name, type_=Moment()) for name, value in values.items() if isinstance(value, datetime.datetime)
+    ]
+    return connection.execute(sa.text(query).bindparams(*times).columns(**columns), values).all()
 
 
 def _moment(at: datetime.datetime | None) -> str:

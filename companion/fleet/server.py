@@ -6,7 +6,6 @@ import asyncio
 import base64
 import datetime
 import logging
-import re
 import secrets
 from pathlib import Path
 from typing import Any, Final, NoReturn
@@ -15,9 +14,10 @@ import sqlalchemy as sa
 
 from companion.config.rules import bind_problem
 from companion.errors import ConfigError
-from companion.fleet import imu_pages, metrics, page
+from companion.fleet import metrics
 from companion.fleet.certificate import Certificate
 from companion.fleet.database import engine_of, why
+from companion.fleet.rendering import Renderer
 from companion.links.system.connection import Backoff, Reconnection
 from companion.storage.state import read_regular
 from companion.web.access import Access, is_loopback, page_url, split_address
@@ -36,8 +36,6 @@ CERTIFICATE_S: Final = 60.0
 """How often its files are looked at."""
 HANDSHAKE_S: Final = 10.0
 _HTML: Final = "text/html; charset=utf-8"
-_AIRCRAFT: Final = re.compile(r"/aircraft/([0-9a-f]{16,36})")
-_MODEL: Final = re.compile(r"/model/([0-9a-z-]{1,40})")
 _ALWAYS: Final = (
     ("X-Content-Type-Options", "nosniff"),
     ("X-Frame-Options", "DENY"),
@@ -90,6 +88,7 @@ class Server:
         self._password, self._certificate, self._counts = password, certificate, counts
         self._access = Access("", handed_out=True)
         self._engine = engine_of(database, reads_only=True)
+        self._pages = Renderer(self._engine)
         self._open = 0
         self._reconnection = Reconnection("page", Backoff(first_s=1.0, cap_s=30.0), worth_s=10.0)
 
@@ -162,14 +161,18 @@ class Server:
             return _text(401, "the page needs its password; any user name will do", answer)
         if request.method not in ("GET", "HEAD"):
             return _text(405, "only GET is known here", ("Allow", "GET, HEAD"))
+        if request.path == "/metrics" and self._counts is not None:
+            return Response(200, await self._metrics(), metrics.CONTENT_TYPE)
         try:
-            return await asyncio.to_thread(self._page, request.path)
+            found = await self._pages.get(request.path)
         except sa.exc.SQLAlchemyError as error:
-            if request.path == "/metrics" and self._counts is not None:
-                return Response(200, self._counts.text(None), metrics.CONTENT_TYPE)
             logger.warning("page: the database cannot be read: %s", why(error))
             words = "the database cannot be read at the moment; the collector's log says why"
             return _text(503, words, ("Refresh", str(SOON_S)))
+        if found is None:
+            return _text(404, "nothing is here")
+        again = (("Refresh", str(AGAIN_S)),) if request.path == "/" else ()
+        return Response(200, found, _HTML, again)
 
     def _knows(self, request: Request) -> bool:
         scheme, _, given = request.headers.get("authorization", "").partition(" ")
@@ -179,22 +182,16 @@ class Server:
             return False
         return scheme.lower() == "basic" and secrets.compare_digest(password, (self._password or "").encode())
 
-    def _page(self, path: str) -> Response:
-        now = datetime.datetime.now(tz=datetime.UTC)
+    async def _metrics(self) -> bytes:
+        counts = self._counts or metrics.Metrics()
+        try:
+            return counts.text(await asyncio.to_thread(self._heard))
+        except sa.exc.SQLAlchemyError:
+            return counts.text(None)
+
+    def _heard(self) -> int:
         with self._engine.begin() as connection:
-            if path == "/":
-                return Response(200, page.glance(connection, now).encode(), _HTML, (("Refresh", str(AGAIN_S)),))
-            if path == "/metrics" and self._counts is not None:
-                return Response(200, self._counts.text(metrics.heard(connection, now)), metrics.CONTENT_TYPE)
-            if (match := _AIRCRAFT.fullmatch(path)) is not None:
-                found = page.aircraft(connection, match[1], now)
-                if found is not None:
-                    return Response(200, found.encode(), _HTML)
-            if (match := _MODEL.fullmatch(path)) is not None:
-                found = imu_pages.model_page(connection, match[1], now, page.SOURCE)
-                if found is not None:
-                    return Response(200, found.encode(), _HTML)
-        return _text(404, "nothing is here")
+            return metrics.heard(connection, datetime.datetime.now(tz=datetime.UTC))
 
 
 def _text(status: int, words: str, *headers: tuple[str, str]) -> Response:

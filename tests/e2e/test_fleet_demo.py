@@ -156,7 +156,8 @@ def test_names_and_reasons_of_aircraft_are_no_markup(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-def test_who_lies_is_named(tmp_path: Path) -> None:
+def test_who_lies_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.fleet.rendering.FRESH_S", 0.0)
     liar, other = Aircraft(1), Aircraft(2)
     other.calibrate(NOW)
 
