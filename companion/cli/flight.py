@@ -21,6 +21,7 @@ from companion.calibration.records.flight_record import (
     KeptFlight,
     Term,
     drift_lines,
+    legend,
     next_flight,
     unit_of,
 )
@@ -134,14 +135,13 @@ def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | No
 def _keep(store: FlightStore, log: str, found: Sequence[Flight]) -> list[int]:
     """Those that flew, for report and history; their numbers there."""
     read_at = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="seconds")
+    flown = [each for each in found if any(imu.drift for imu in each.imus)]
+    if flown and not store.folder.parent.is_dir():
+        where = f"this computer has no companion's storage ({store.folder.parent})"
+        print_lines(f"note: not kept: {where}; on the companion flights are kept for history and report", error=True)
+        return []
     try:
-        if not store.folder.parent.is_dir():
-            raise StorageError(f"there is no {store.folder.parent}")
-        return [
-            store.save(KeptFlight(log=log, read_at=read_at, flight=each))
-            for each in found
-            if any(imu.drift for imu in each.imus)
-        ]
+        return [store.save(KeptFlight(log=log, read_at=read_at, flight=each)) for each in flown]
     except StorageError as error:
         print_lines(f"note: not kept: {error}", error=True)
         return []
@@ -165,6 +165,9 @@ def _flight_lines(number: int, found: Flight) -> list[str]:
     lines += [f"  note: {note}" for note in found.notes]
     for imu in found.imus:
         lines += _imu_lines(imu)
+    if terms := legend(found.imus):
+        lines += ["left over: bias that the offsets did not take off, ± one sigma", *(f"  {words}" for words in terms)]
+        lines.append(f"  {UNSEEN}")
     return [*lines, *([f"next flight: {next_flight(found)}"] if any(imu.drift for imu in found.imus) else [])]
 
 
@@ -192,10 +195,11 @@ def _table(imu: ImuFlight) -> list[str]:
         lines.append(f"{', '.join((axis.axis, name)):13}" + "".join(f"{each:>13}" for each in terms))
     if lacking := [head for term, head in HEADS.items() if term not in shown]:
         lines.append(f"not known: {', '.join(lacking)}")
-    return [*lines, UNSEEN]
+    return lines
 
 
 def _term(term: Term | None, unit: float, digits: int) -> str:
     if term is None:
         return "?"
-    return f"{term.value / unit:+.{digits}f} ± {term.sigma / unit:.{digits}f}"
+    # Adding zero leaves no minus sign before a zero.
+    return f"{round(term.value / unit, digits) + 0.0:+.{digits}f} ± {term.sigma / unit:.{digits}f}"

@@ -144,7 +144,7 @@ def _imu(imu: ImuRecord, flown: Sequence[str]) -> Markup:
             class_="soft",
         ),
         *(
-            card("caution", tag("p", f"{words}, more than σ use, which is of the ground: its damping."))
+            card("caution", tag("p", f"{words}, more than σ use, which is of the ground: damp the autopilot better."))
             for words in flown
         ),
         tag("div", *(_triad(imu, triad) for triad in TRIADS), class_="pairs"),

@@ -18,6 +18,7 @@ from companion.calibration.records.flight_record import (
     Split,
     Term,
     figure,
+    legend,
     next_flight,
     unit_of,
 )
@@ -149,6 +150,7 @@ def _biases(flight: Flight, imu: ImuFlight) -> list[Child]:
     return [
         tag("h3", "Biases that the offsets left"),
         tag("table", tag("tr", *(tag("th", words) for words in heads)), *rows, class_="terms") if rows else None,
+        tag("ul", *(tag("li", words) for words in legend([imu])), class_="soft") if rows else None,
         card("", tag("p", f"Not known: {', '.join(lacking)}.") if lacking else None, tag("p", f"{UNSEEN}.")),
         tag("div", *_plots(flight, imu), class_="pairs") if imu.moments else None,
         tag(

@@ -134,7 +134,13 @@ def test_people_read_the_figure_that_counts(log: Path, tmp_path: Path, capsys: p
     out = capsys.readouterr().out
     assert "IMU 1, 100 Hz: offsets of no calibration known here\n" in out
     assert "30 s without GNSS: " in out
-    assert "accel x, y: not counted, a hover does not tell them from tilt\n" in out
+    head = next(line for line in out.splitlines() if line.startswith("  left over"))
+    columns = [words.strip() for words in head.split("  ") if words.strip()][1:]
+    # Each column is explained, once.
+    _, _, below = out.partition("left over: bias that the offsets did not take off, ± one sigma\n")
+    assert [line.strip().partition(":")[0] for line in below.splitlines()[: len(columns)]] == columns
+    assert "  accel x, y: not counted, in the air nothing tells them from tilt\n" in below
+    assert "-0 ±" not in out
     assert max(map(len, out.splitlines())) <= 100
     assert out.splitlines()[-2].startswith("next flight: IMU 1 gyro x: ")
     assert out.splitlines()[-1].startswith("kept as flight 1")
@@ -183,7 +189,7 @@ def test_what_is_kept_of_a_flight_is_what_was_in_the_air(
 
 
 def test_a_flight_that_cannot_be_kept_is_told_all_the_same(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    log: Path, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = storage(tmp_path)
     (tmp_path / "flights").write_bytes(b"in the way")
@@ -196,7 +202,14 @@ def test_a_flight_that_cannot_be_kept_is_told_all_the_same(
     config = Path(folder[1])
     config.write_text(config.read_text().replace(f'directory = "{tmp_path}"', f'directory = "{elsewhere}"'))
     assert companion(["flight", "--json", str(log), *folder]) == 0
-    assert capsys.readouterr().err == f"note: not kept: there is no {elsewhere}\n"
+    assert capsys.readouterr().err == (
+        f"note: not kept: this computer has no companion's storage ({elsewhere}); on the companion flights are kept"
+        " for history and report\n"
+    )
+    # Of a log without a flight there is nothing to keep.
+    stood = dataflash(tmp_path / "stood.bin", messages(cut_off(flown, 66.0), parameters()))
+    assert companion(["flight", "--json", str(stood), *folder]) == 0
+    assert capsys.readouterr().err == ""
     assert not elsewhere.exists()
 
 

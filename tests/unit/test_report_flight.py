@@ -35,7 +35,7 @@ def test_the_figure_that_counts_stands_at_the_top_and_the_tables_have_the_record
     lead = content.index("30 s without GNSS: 2.1 m (95 %: 5.0 m, 150 starts); with the offsets of before 31.0 m")
     assert lead < content.index("<h2>")
     assert "2026-11-23 08:00 UTC, vehicle 1, 173 s in the air, log 00000012.BIN" in found.text
-    assert "Next flight: IMU 1 accel z: 5.1 mg of rectification at hover throttle: its damping." in found.text
+    assert "Next flight: IMU 1 accel z: 5.1 mg by vibration of the motors: damp the autopilot better." in found.text
     for k, axis in enumerate(AXES):
         for term, value in (("turn_on", LEFT[k]), ("motors", STEP[k]), ("in_flight", LEFT[k] + STEP[k])):
             assert found.exact[f"{term}.1.{axis}"][0] / UNITS[k] == pytest.approx(value)
@@ -59,7 +59,7 @@ def test_a_calibration_says_where_flights_have_found_more_than_its_sigma(tmp_pat
     for k in range(4):
         store.save(kept_flight(str(k), imu_flight(step=(0.0, 4.0, 45.0, 5.1))))
     text = Page(calibration_page(material(tmp_path, None), NOW)).text
-    ends = ", more than σ use, which is of the ground: its damping."
+    ends = ", more than σ use, which is of the ground: damp the autopilot better."
     assert text.count(ends) == 2
     # Each to 12 deg/h or 0.6 mg; what all flights have wrong alike is 0.2 mg.
     assert f"4 flights: motors move IMU 1 gyro z by +45 ± 6 deg/h{ends}" in text
@@ -79,8 +79,10 @@ def test_a_calibration_says_where_flights_have_found_more_than_its_sigma(tmp_pat
 
 def test_what_is_not_known_and_what_nobody_can_see_is_said() -> None:
     text = Page(shown(kept_flight())).text
-    assert "Not known: temperature, per m/s^2." in text
-    assert "accel x, y: not counted, a hover does not tell them from tilt" in text
+    assert "Not known: temperature, vibration." in text
+    assert "per minute: change in each minute of flight" in text
+    assert "vibration: change for" not in text
+    assert "accel x, y: not counted, in the air nothing tells them from tilt" in text
     assert "0.1 deg off make 8 m in 30 s" in text
     bare = msgspec.structs.replace(
         imu_flight(drifts={}),

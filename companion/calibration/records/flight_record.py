@@ -13,10 +13,19 @@ FORMAT_VERSION: Final = 1
 AXES: Final = ("gyro x", "gyro y", "gyro z", "accel z")
 HEADS: Final = {
     "in_flight": "in the air", "ekf": "EKF", "turn_on": "motors off", "temperature": "temperature", "motors": "motors",
-    "vibration": "per m/s^2", "trend": "a minute",
+    "vibration": "vibration", "trend": "per minute",
 }  # fmt: skip
 """The terms of a `Split`, as tables name them."""
-UNSEEN: Final = "accel x, y: not counted, a hover does not tell them from tilt"
+_MEANINGS: Final = {
+    "in_flight": "mean bias from take-off to landing",
+    "ekf": "the EKF's own estimate in the latter half of the flight",
+    "turn_on": "bias while standing, before the motors start",
+    "temperature": "warming from there into the air, by the learned curve",
+    "motors": "change as the motors start: vibration, and warming where no curve is known",
+    "vibration": "change for each m/s^2 of vibration level",
+    "trend": "change in each minute of flight",
+}
+UNSEEN: Final = "accel x, y: not counted, in the air nothing tells them from tilt"
 _WORTH: Final = {"deg/h": 30.0, "mg": 1.5}
 """Smaller findings are nobody's worry."""
 
@@ -129,6 +138,12 @@ def unit_of(axis: str) -> tuple[float, str, int]:
     return (DEG_H, "deg/h", 0) if axis.startswith("gyro") else (MG, "mg", 1)
 
 
+def legend(imus: Sequence[ImuFlight]) -> list[str]:
+    """Explain the terms that the tables of these IMUs have, a line for each."""
+    axes = [axis for imu in imus for axis in imu.axes]
+    return [f"{head}: {_MEANINGS[term]}" for term, head in HEADS.items() if any(getattr(axis, term) for axis in axes)]
+
+
 def is_worth_saying(axis: str, value: float) -> bool:
     """Whether a part of a bias is more than nobody's worry."""
     unit, name, _ = unit_of(axis)
@@ -167,7 +182,7 @@ def next_flight(found: Flight) -> str:
         for axis in imu.axes:
             unit, name, digits = unit_of(axis.axis)
             for term, what, remedy in (
-                (axis.motors, "of rectification at hover throttle", "its damping"),
+                (axis.motors, "by vibration of the motors", "damp the autopilot better"),
                 (axis.turn_on, "before the motors", "calibrate nearer to the take-off"),
             ):
                 if term is None or abs(term.value) < 2.0 * term.sigma:
