@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: help demo quick test long check format bench accuracy campaign pictures deb deb-test lock sbom audit clean
 
 help:
-	@echo 'make demo    watch a virtual aircraft being calibrated (about a minute)'
+	@echo 'make demo    watch a virtual aircraft being calibrated (about two minutes)'
 	@echo 'make quick   unit and property tests without real clock and processes (about a minute on two cores)'
 	@echo 'make test    all tests (under seven minutes on two cores); DURATIONS=1 notes how long each takes'
 	@echo 'make long    the whole of what make test plays a slice of, with new dice (half an hour and more)'

@@ -104,27 +104,34 @@ class CompanionProcess:
 
     async def undo(self) -> Record:
         """`companion undo --json`."""
-        return await self._ask("undo")
+        return await self.ask("undo")
 
     async def cancel(self) -> Record:
         """`companion cancel --json`."""
-        return await self._ask("cancel")
+        return await self.ask("cancel")
 
     async def start_calibration(self) -> Record:
         """`companion calibrate --json`: asked for, not waited for."""
-        return await self._ask("calibrate")
+        return await self.ask("calibrate")
 
     async def last_record(self) -> Record:
         """The latest of `companion history --json`."""
-        history = await self._ask("history")
+        history = await self.ask("history")
         record: Record = history["records"][0]
         return record
 
-    async def _ask(self, command: str) -> Record:
+    async def ask(self, *words: str) -> Record:
+        """Run a command with --json; what it prints.
+
+        Raises:
+            RuntimeError: it printed nothing.
+        """
         process = await asyncio.create_subprocess_exec(
-            *self.command(command, "--json"), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL
+            *self.command(*words, "--json"), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL
         )
         output, _ = await process.communicate()
+        if not output.strip():
+            raise RuntimeError(f"companion {words[0]} printed nothing (exit code {process.returncode})")
         answer: Record = json.loads(output)
         return answer
 

@@ -54,7 +54,7 @@ class Asking:
             else:
                 return
 
-    async def agrees(self, question: str, *, by_default: bool = True) -> bool:
+    async def agrees(self, question: str, *, by_default: bool = True, hint: str = "") -> bool:
         """Ask what is answered by yes or no."""
         found = by_default
 
@@ -62,7 +62,7 @@ class Asking:
             nonlocal found
             found = one_of(words, ("yes", "no")) == "yes"
 
-        await self.ask(question, "yes" if by_default else "no", put, choices=("yes", "no"))
+        await self.ask(question, "yes" if by_default else "no", put, hint, ("yes", "no"))
         return found
 
     async def _line(self) -> str:

@@ -56,6 +56,10 @@ def add_command(add: AddCommand) -> None:
         "--mounting", action="append", default=[], metavar="DEVICE=HOW",
         help="of gradienter, compass or imu: degrees clockwise from above, ROLL,PITCH,YAW, or ROTATION_...",
     )  # fmt: skip
+    parser.add_argument(
+        "--part", action="append", default=[], metavar="IMU=PART",
+        help="of an IMU by its name: fc=icm42688p (bmi088, adis16470, adis16405, unknown)",
+    )  # fmt: skip
     parser.add_argument("--no-check", action="store_true", help="write the file only")
     parser.add_argument("--no-service", action="store_true", help="do not offer to start it at every boot")
 

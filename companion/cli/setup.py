@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import dataclasses
-import logging
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,12 +12,13 @@ from typing import Any, Final
 
 from companion import config
 from companion.cli.asking import Asking
+from companion.cli.setup_imus import ask_autopilot, daemon_status, parts_given, parts_of
 from companion.cli.show import finding_lines
 from companion.cli.terminal import DONE, FAILED, config_path, load_config, own_name, print_json
 from companion.config.rules import bind_problem
-from companion.config.sections import Config, Imu, Storage
+from companion.config.sections import Config, Storage
 from companion.config.words import shown
-from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError
+from companion.errors import CompanionError, ConfigError
 from companion.installation import install as installing
 from companion.links.mavlink.listening import USUAL_PORTS
 from companion.links.serial.listening import ports_to_try
@@ -26,7 +26,7 @@ from companion.links.serial.ports import list_ports
 from companion.protocols.registry import Kind
 from companion.setup import keeping
 from companion.setup.document import active_lines
-from companion.setup.draft import Draft, storage_beside
+from companion.setup.draft import Draft, Question, part_key, storage_beside
 from companion.setup.survey import Survey, same_port, same_url, survey
 
 KINDS: Final[tuple[Kind, ...]] = ("gradienter", "compass", "imu")
@@ -34,7 +34,6 @@ WITHOUT: Final = {
     "gradienter": "no gradienter: gyros only, accelerometers by hand (connected later: companion setup again)",
     "compass": "no compass: the gyros' sigmas are a little wider",
 }
-IMUS_S: Final = 4.0
 CHECK_S: Final = 5.0
 
 
@@ -116,12 +115,22 @@ class _Session:
             draft.keep_beside(self._path)
         if self._options.page is not None:
             draft.show_page(self._options.page)
-        given = self._given()
+        given, parts = self._given(), parts_given(self._options.part)
         found = await self._listen(draft)
         await self._take_autopilot(draft, found)
         for kind in KINDS:
             await self._take_device(draft, found, kind)
-        await self._ask(draft, given)
+        await self._ask(draft, list(draft.questions()), given)
+        daemon = await daemon_status(draft.parsed())
+        if daemon is not None:
+            told = parts_of(daemon)
+        elif self._options.no_check:
+            told = {}
+        else:
+            told = await ask_autopilot(self.asking, draft, by_default=is_new)
+        names = [imu["name"] for imu in draft.wanted["imu"]]
+        to_ask = [name for name in names if told.get(name) is None or part_key(name) in parts]
+        await self._ask(draft, list(draft.part_questions(to_ask)), parts)
         draft.parsed()
         text = draft.result()
         self.answer |= {"guessed": sorted(draft.guessed), "configuration": draft.wanted}
@@ -135,7 +144,7 @@ class _Session:
             say("", f"{self._path} says all this already.")
             self.answer["state"] = "unchanged"
             self.so_far = f"{self._path} is as it was"
-        await self._finish(draft, is_new=is_new)
+        await self._finish(runs=daemon is not None)
 
     async def _begin(self) -> Draft:
         try:
@@ -247,9 +256,8 @@ class _Session:
         await self.asking.ask(f"{what}: which?", "1", put, choices=numbers)
         return chosen
 
-    async def _ask(self, draft: Draft, given: dict[str, str]) -> None:
-        questions = list(draft.questions())
-        strange = given.keys() - {question.key for question in questions} - {"vehicle.platform"}
+    async def _ask(self, draft: Draft, questions: Sequence[Question], given: dict[str, str]) -> None:
+        strange = given.keys() - {question.key for question in questions}
         if strange:
             raise ConfigError(f"{', '.join(sorted(strange))}: there is no such device to say it of")
         for question in questions:
@@ -265,28 +273,18 @@ class _Session:
                 guess = " (a guess)" if question.key in draft.guessed else ""
                 self.asking.say(f"{question.key}: {question.now}{guess}")
 
-    def _write(self, text: str, *, keep: bool = True) -> None:
-        kept = keeping.put(self._path, text, keep=keep)
+    def _write(self, text: str) -> None:
+        kept = keeping.put(self._path, text)
         self.so_far = f"{self._path} is written"
         self.asking.say(f"Written: {self._path}" + (f" (the old one: {kept.name})" if kept is not None else ""))
         if kept is not None:
             self.answer["kept"] = str(kept)
 
-    async def _finish(self, draft: Draft, *, is_new: bool) -> None:
+    async def _finish(self, *, runs: bool) -> None:
         """Check it, offer the service, tell the next step."""
-        from companion.daemon.faces.control import ask
-
         parsed = load_config(self._options, profiles=True)
-        try:
-            async for _ in ask(parsed.control.path, {"command": "status"}):
-                pass
-            runs = True
-        except DaemonUnreachableError as error:
-            runs = isinstance(error, DaemonDeniedError)
         good, checks = True, not runs and not self._options.no_check
         if checks:
-            await self._take_other_imus(draft, parsed, by_default=is_new)
-            parsed = load_config(self._options, profiles=True)
             good = await self._check(parsed)
         elif runs:
             self.asking.say("", "Not checked: a companion runs, and has the ports.")
@@ -297,28 +295,6 @@ class _Session:
         )
         self.answer["next"] = steps
         self.asking.say("", "Next:", *(f"  {number}. {step}" for number, step in enumerate(steps, 1)))
-
-    async def _take_other_imus(self, draft: Draft, parsed: Config, *, by_default: bool) -> None:
-        """Those that the autopilot has besides; it is asked, and nothing is written to it."""
-        others = draft.other_imus()
-        if not others:
-            return
-        self.asking.say("", "Asking the autopilot which IMUs it has:")
-        from companion.daemon.process.check import answering_imus  # takes seconds on a small board
-
-        logging.disable(logging.WARNING)  # what is wrong with an IMU that there is not
-        try:
-            there = await answering_imus(parsed, [Imu(**one) for one in others], IMUS_S)
-        finally:
-            logging.disable(logging.NOTSET)
-        found = [one for one in others if one["name"] in there]
-        numbers = " and ".join(str(one["instance"]) for one in found)
-        if not found:
-            self.asking.say("no others")
-        elif await self.asking.agrees(f"It has IMU {numbers} too; calibrate that as well?", by_default=by_default):
-            draft.wanted["imu"] += found
-            self._write(draft.result(), keep=self.answer["state"] == "unchanged")
-            self.answer |= {"state": "done", "configuration": draft.wanted}
 
     async def _check(self, parsed: Config) -> bool:
         """As `companion check` does: it speaks with autopilot and sensors as the daemon will, and writes nothing."""

@@ -52,6 +52,8 @@ def _range(words: str, entry: str) -> range:
 ImuProtocol = Literal["vectornav", "imu_line", "witmotion", "mip", "xsens", "stim300"]
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
 """Those of the catalogue; others are learned and saved (`companion profile --save`)."""
+UNKNOWN: Final[Profile] = "unknown"
+"""The profile of a part that nobody has named: the figures of the worst common parts."""
 GradienterProtocol = Literal[
     "inclinometer_xy", "jewell", "hmr3300", "nmea", "os5000", "rion", "pni", "witmotion", "stim300"
 ]

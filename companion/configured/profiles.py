@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+import functools
+
 import msgspec
 
-from companion.config.sections import Config, Imu, Noise, Profile
+from companion.calibration.noise.allan import PROFILES, predicted_sigma
+from companion.config.sections import UNKNOWN, Config, Imu, Noise, Profile
+from companion.configured.models import longest_window_s, settings
+from companion.physics.units import DEG_H
 from companion.storage.profiles import ProfileStore
+
+
+def gyro_sigmas_deg_h(config: Config) -> dict[str, float]:
+    """Predict how well the gyros of each part of the catalogue can be known; one sigma, "unknown" last.
+
+    The estimator's own V(T, H) of the longest window. A warm-up and integer telemetry add to it.
+    """
+    mean_s, horizon_s = longest_window_s(config), settings(config).horizon_s
+    return {name: predicted_sigma(one.gyro, mean_s, horizon_s) / DEG_H for name, one in PROFILES.items()}
 
 
 class Profiles:
@@ -52,11 +66,17 @@ class Profiles:
             )
         return found
 
+    @functools.cached_property
+    def _price_of_unknown(self) -> str:
+        *known, (_, unknown) = gyro_sigmas_deg_h(self._config).items()
+        others = ", ".join(f"{part} {sigma:.0f}" for part, sigma in known)
+        return f"gyros known to {unknown:.0f} deg/h at best ({others})"
+
     def _in_words(self, name: str) -> str:
         profile = self.of(name)
         if isinstance(profile, Noise):
             return f"{profile.name}, {profile.origin}"
-        if profile is None:
-            return "none: sigmas are those of the worst common parts"
+        if profile in (None, UNKNOWN):
+            return f"part unknown: {self._price_of_unknown}"
         by = "" if self._imus[name].profile is not None else ", by its device id"
         return f"{profile}, of the catalogue{by}"

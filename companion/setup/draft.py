@@ -7,13 +7,13 @@ import functools
 import math
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, get_args
 
 from companion import config
-from companion.config.sections import Config, Law, Platform
+from companion.config.sections import UNKNOWN, Config, Law, Platform
 from companion.config.words import shown
 from companion.errors import CompanionError, ConfigError
 from companion.links.mavlink.transport import parse_url
@@ -199,6 +199,36 @@ class Draft:
                     ("0", "90", "180", "270"),
                 )
 
+    def part_questions(self, names: Collection[str]) -> Iterator[Question]:
+        """Ask for the parts of these IMUs: the estimator knows their noise by them."""
+        from companion.configured.profiles import gyro_sigmas_deg_h  # numpy takes a second on a small board
+
+        sigmas = gyro_sigmas_deg_h(self.parsed())
+        price = ", ".join(f"{part} {sigma:.0f}" for part, sigma in sigmas.items())
+        for imu in self.wanted["imu"]:
+            if (name := imu["name"]) not in names:
+                continue
+            key, now = part_key(name), imu.get("profile", UNKNOWN)
+            if "profile" not in imu:
+                self.guessed.add(key)
+            choices = list(dict.fromkeys((*sigmas, now)))
+            whose = f"IMU {imu.get('instance', 1)} of the autopilot" if imu["source"] == "autopilot" else "the own IMU"
+            yield Question(
+                key,
+                f"Which part is {whose} ({name})?",
+                f"Its board's data sheet says; any other part: {UNKNOWN}. Gyros known, at best, to: {price} deg/h.",
+                now,
+                functools.partial(self._put_part, imu, key, choices),
+                choices,
+            )
+
+    def _put_part(self, imu: Table, key: str, choices: Sequence[str], words: str) -> None:
+        # As it is printed on the board: ICM-42688-P.
+        part = words if words in choices else one_of(re.sub(r"[-_ ]", "", words), choices)
+        if part != imu.get("profile", UNKNOWN):
+            imu["profile"] = part
+        self.guessed.discard(key)
+
     def _put_mounting(self, kind: Kind, words: str) -> None:
         self._put(kind, "mounting", _mounting(words), "ROTATION_NONE")
 
@@ -217,6 +247,11 @@ class Draft:
         except CompanionError as error:
             self.wanted = before
             raise ConfigError(str(error).removeprefix("answer: ")) from None
+
+
+def part_key(name: str) -> str:
+    """Name the question for the part of an IMU."""
+    return f"imu.{name}.profile"
 
 
 def storage_beside(path: Path) -> Path:

@@ -53,7 +53,7 @@ def holds(path: Path, text: str) -> bool:
         return False
 
 
-def put(path: Path, text: str, *, keep: bool = True) -> Path | None:
+def put(path: Path, text: str) -> Path | None:
     """Write the file at once and whole; where the old content went, None if it is nobody's, or there was none.
 
     Raises:
@@ -64,9 +64,8 @@ def put(path: Path, text: str, *, keep: bool = True) -> Path | None:
     kept, mode = None, installing.MODE
     if path.exists() and not holds(path, sample()):
         mode = stat.S_IMODE(path.stat().st_mode)
-        if keep:
-            names = (path.with_name(f"{path.name}.old{number}") for number in itertools.count(1))
-            kept = next(name for name in names if not name.exists())
-            write_atomically(kept, path.read_bytes(), mode=mode)
+        names = (path.with_name(f"{path.name}.old{number}") for number in itertools.count(1))
+        kept = next(name for name in names if not name.exists())
+        write_atomically(kept, path.read_bytes(), mode=mode)
     write_atomically(path, text.encode(), mode=mode, parents=True)
     return kept

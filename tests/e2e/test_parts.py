@@ -15,7 +15,7 @@ from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.record import ImuRecord
 from companion.calibration.request import What
 from companion.calibration.solution.site import IN_CONFIGURATION
-from companion.calibration.solution.solve import without_heading
+from companion.calibration.solution.solve import wide_gyros
 from companion.config import parse
 from companion.config.sections import Noise
 from companion.daemon.process.check import run_check
@@ -113,7 +113,8 @@ def test_the_part_named_by_the_autopilot_brings_its_profile(tmp_path: Path) -> N
     unnamed = gyros(tmp_path / "a", None)
     by_itself = gyros(tmp_path / "b", None, parameters=parameters)
     configured = gyros(tmp_path / "c", "bmi088")
-    assert unnamed.summary == "none: sigmas are those of the worst common parts"
+    price = "part unknown: gyros known to 49 deg/h at best (icm42688p 5, bmi088 7, adis16470 13, adis16405 55)"
+    assert unnamed.summary == price
     assert by_itself.summary == "bmi088, of the catalogue, by its device id"
     assert configured.summary == "bmi088, of the catalogue"
     assert [one.by_device_id for one in (unnamed, by_itself, configured)] == [False, True, False]
@@ -127,7 +128,7 @@ def test_the_part_named_by_the_autopilot_brings_its_profile(tmp_path: Path) -> N
 def test_what_is_configured_holds_whatever_the_ids_say(tmp_path: Path) -> None:
     parameters = ids("ardupilot", 0x34, 0x34)
     worst = gyros(tmp_path / "a", "unknown", parameters=parameters)
-    assert worst.summary == "unknown, of the catalogue"
+    assert worst.summary.startswith("part unknown: gyros known to 49 deg/h at best")
     learned = noise_profile("adis16405")
     saved = Noise(
         name="mine",
@@ -145,7 +146,7 @@ def test_the_warning_names_what_made_the_sigma(tmp_path: Path) -> None:
     """Unknown part: 30 deg/h of Allan floor at the least; unknown heading at 40 degrees north: 8 deg/h rms."""
     unnamed = gyros(tmp_path / "a", None, compass=False)
     named = gyros(tmp_path / "b", None, compass=False, parameters=ids("ardupilot", 0x2B, 0x2B))
-    profile, heading = "gyro sigma is that of the worst common parts", "horizontal part of the Earth's rate"
+    profile, heading = "gyro sigma is that of an unknown part", "horizontal part of the Earth's rate"
     assert any(profile in words for words in unnamed.warnings)
     assert not any(heading in words for words in unnamed.warnings)
     assert any(heading in words for words in named.warnings)
@@ -162,7 +163,9 @@ def test_check_says_it(tmp_path: Path) -> None:
 
     async def main() -> None:
         (said,) = [one for one in await run_check(config, 0.1) if one.name == "profile fc"]
-        assert said.words == "none: sigmas are those of the worst common parts"
+        assert said.verdict == "warning"
+        assert said.words.startswith("part unknown: gyros known to 47 deg/h at best")
+        assert said.words.endswith('set profile in [[imu]] "fc", or companion setup again')
 
     run_virtual(main())
 
@@ -183,8 +186,12 @@ def test_integers_that_hide_the_mean_are_not_blamed_on_the_part() -> None:
         named=False,
     )
     earth = np.diag([1.0, 1.0, 0.0]) * (8.0 * DEG_H) ** 2
-    (said,) = without_heading([window], earth, IN_CONFIGURATION)
-    assert said.startswith("imu fc: gyro sigma is that of the worst common parts")
+    (said,) = wide_gyros([window], earth, IN_CONFIGURATION)
+    assert said.startswith("imu fc: gyro sigma is that of an unknown part")
     hidden = msgspec.structs.replace(window, hidden={"gyro": Hidden("coarse steps", useless=False)})
-    (said,) = without_heading([hidden], earth, IN_CONFIGURATION)
+    (said,) = wide_gyros([hidden], earth, IN_CONFIGURATION)
     assert said.startswith("no compass: ")
+    (said,) = wide_gyros([window], None, IN_CONFIGURATION)
+    assert said.startswith("imu fc: gyro sigma is that of an unknown part")
+    named = msgspec.structs.replace(window, named=True)
+    assert wide_gyros([named, hidden], None, IN_CONFIGURATION) == []

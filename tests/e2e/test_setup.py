@@ -11,8 +11,9 @@ import socket
 import sys
 import termios
 import tomllib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import pytest
@@ -61,12 +62,20 @@ class Bench:
 
 
 @contextlib.asynccontextmanager
-async def bench(folder: Path, *, firmware: Firmware = "ardupilot", on_wire: bool = False) -> AsyncIterator[Bench]:
+async def bench(
+    folder: Path,
+    *,
+    firmware: Firmware = "ardupilot",
+    on_wire: bool = False,
+    parameters: Mapping[str, float] = MappingProxyType({}),
+) -> AsyncIterator[Bench]:
     """The demonstration's aircraft: devices as from the factory, the autopilot on UDP or on a serial port."""
     made, scenario = Bench(folder), demo(firmware=firmware)
     loop = asyncio.get_running_loop()
     scenario.aircraft.begin(loop.time())
     autopilot, receive = scenario.autopilot, scenario.autopilot.receive
+    for name, value in parameters.items():
+        autopilot.parameters.set(name, value)
 
     def told(data: bytes, t_s: float) -> None:
         made.told.append(data)
@@ -141,10 +150,15 @@ def test_a_person_answers_and_has_a_configuration_that_works(tmp_path: Path) -> 
             assert made.told == [], "it only listens"
             assert f"UDP {made.udp}: ArduPilot, system 1" in said
             await answered(terminal, "", "eu", "180", "0", "yaw 90")
+            await terminal.says("IMU 1: its device id tells no part of the catalogue")
+            await terminal.answer("It has IMU 2 too", "")
+            await terminal.answer(r"IMU 1 of the autopilot \(fc\).*unknown 47 deg/h", "ICM-42688-P")
+            await terminal.answer(r"the own IMU \(own\)", "bmi")
+            await terminal.answer(r"IMU 2 of the autopilot \(fc2\)", "")
+            assert made.left() == set()
             shown = await terminal.says(r"Write it\?")
             assert "# What its two readings mean" in shown
             await terminal.answer("", "")
-            await terminal.answer("It has IMU 2 too", "")
             checked = await terminal.says("Next:")
             assert await terminal.ended() == 0, terminal.screen
             assert not re.search("^wrong", checked, re.MULTILINE)
@@ -159,6 +173,11 @@ def test_a_person_answers_and_has_a_configuration_that_works(tmp_path: Path) -> 
             first, own, second = made.configuration()["imu"]
             assert own["mounting"] == "ROTATION_YAW_90"
             assert (first["source"], second) == ("autopilot", {"name": "fc2", "source": "autopilot", "instance": 2})
+            assert (first["profile"], own["profile"]) == ("icm42688p", "bmi088")
+            assert re.search("^ok +profile fc +icm42688p", checked, re.MULTILINE)
+            assert re.search(
+                "^warning +profile fc2 +part unknown: gyros known to 47 deg/h at best", checked, re.MULTILINE
+            )
             assert re.search(r"ok +fc2 +autopilot IMU 2", checked), "what is there, and nothing of the third"
             assert "IMU 3" not in terminal.screen
             assert made.left() == {"companion.toml"}
@@ -177,12 +196,37 @@ def test_a_script_has_gyros_of_an_autopilot_on_a_wire_alone(tmp_path: Path, firm
             assert made.configuration()["mavlink"]["url"] == f"serial:{tmp_path}/telem:57600"
             assert made.configuration()["vehicle"]["platform"] == "deck"
             assert made.configuration().keys() & {"gradienter", "compass"} == set()
-            assert (answer["state"], answer["reason"], answer["guessed"]) == ("done", "", [])
+            assert (answer["state"], answer["reason"], answer["guessed"]) == (
+                "done",
+                "",
+                ["imu.fc.profile", "imu.fc2.profile"],
+            )
             assert [finding["name"] for finding in answer["findings"] if not finding["good"]] == []
             assert "no gradienter: gyros only" in told.lower()
             assert [imu["name"] for imu in made.configuration()["imu"]] == ["fc", "fc2"]
             assert made.configuration()["storage"]["directory"] == str(tmp_path / "companion-state")
             assert answer["next"][-1].split("   ")[0] == f"companion -c {made.file} calibrate --wait"
+
+    asyncio.run(main())
+
+
+def test_a_part_that_device_ids_tell_is_not_asked_for(tmp_path: Path) -> None:
+    async def main() -> None:
+        parameters = {f"INS_{half}_ID": 0x340102 for half in ("GYR", "ACC")}
+        async with bench(tmp_path, parameters=parameters) as made:
+            async with Terminal(made.words("nobody"), tmp_path) as terminal:
+                await terminal.answer("on the ground")
+                await terminal.says("IMU 1: icm42688p, by its device id")
+                await terminal.answer("It has IMU 2 too", "no")
+                await terminal.answer(r"Write it\?")
+                checked = await terminal.says("Next:")
+                assert await terminal.ended() == 0, terminal.screen
+            assert "Which part" not in terminal.screen
+            assert re.search("^ok +profile fc +icm42688p, of the catalogue, by its device id", checked, re.MULTILINE)
+            assert made.configuration()["imu"] == [{"name": "fc", "source": "autopilot"}]
+            # Whoever knows better says so.
+            assert (await by_script(made, *made.words("nobody"), "--part", "fc=bmi088", "--no-check"))[0] == 0
+            assert made.configuration()["imu"] == [{"name": "fc", "source": "autopilot", "profile": "bmi088"}]
 
     asyncio.run(main())
 
@@ -202,7 +246,7 @@ def test_nothing_but_heartbeats_at_the_last_speed_is_enough(tmp_path: Path) -> N
     asyncio.run(main())
 
 
-@pytest.mark.parametrize("at", [0, 1, 3, 6])
+@pytest.mark.parametrize("at", [0, 1, 3, 5, 10])
 def test_whoever_ends_it_at_any_question_leaves_all_as_it_was(tmp_path: Path, at: int) -> None:
     async def main() -> None:
         async with bench(tmp_path) as made, Terminal(made.words(*LINES), tmp_path) as terminal:
@@ -219,7 +263,7 @@ def test_whoever_ends_it_at_any_question_leaves_all_as_it_was(tmp_path: Path, at
             await terminal.says("nothing was written")
             assert "Traceback" not in terminal.screen
             assert made.left() == set()
-            assert made.told == []
+            assert made.told == [] or at > len(LINES) + 2, "the autopilot is asked after these questions"
 
     asyncio.run(main())
 
@@ -231,6 +275,7 @@ def test_bad_answers_get_one_line_each_and_are_asked_again(tmp_path: Path) -> No
                 ("on the ground", "water"),
                 ("axis, slope or euler", "x" * 3000, "\x1b[2J"),
                 ("gradienter turned", "90 0", "ROTATION_ROLL_180"),
+                ("Which part", "mpu6000", "adis", "\x00"),
                 (r"Write it\?", "perhaps"),
             ):
                 await terminal.says(f"(?s){question}.*?> ")
@@ -261,6 +306,7 @@ def test_again_it_reads_what_is_there_and_keeps_the_old_file(tmp_path: Path) -> 
                 await terminal.answer("on the ground", "deck")
                 await terminal.answer("axis, slope or euler")
                 await terminal.answer("gradienter turned")
+                await terminal.answer("Which part")
                 await terminal.answer(r"Write it\?")
                 assert await terminal.ended() == 0, terminal.screen
             assert made.configuration()["vehicle"]["platform"] == "deck"
@@ -319,6 +365,12 @@ def test_a_port_that_somebody_holds_is_not_opened(tmp_path: Path) -> None:
         (["--mavlink", "udpin:0.0.0.0:14550", "--law", "axis"], "gradienter.law: there is no such device"),
         (["--mavlink", "udpin:0.0.0.0:14550", "--mounting", "hat=90"], "--mounting: found 'hat=90'"),
         (["--mavlink", "udpin:0.0.0.0:14550", "--platform", "sea"], "vehicle.platform: found 'sea'"),
+        (["--mavlink", "udpin:0.0.0.0:14550", "--part", "fc"], "--part: found 'fc'; allowed: IMU=PART"),
+        (["--mavlink", "udpin:0.0.0.0:14550", "--part", "fc=mpu6000", "--no-check"], "imu.fc.profile: found 'mpu6000'"),
+        (
+            ["--mavlink", "udpin:0.0.0.0:14550", "--part", "fc9=bmi088", "--no-check"],
+            "imu.fc9.profile: there is no such",
+        ),
     ],
 )
 def test_a_script_that_cannot_go_on_writes_nothing(tmp_path: Path, words: list[str], reason: str) -> None:
@@ -390,6 +442,7 @@ def test_a_damaged_file_is_not_replaced_unasked(tmp_path: Path) -> None:
         async with Terminal([*made.words("nobody"), "--mavlink", "udpin:0.0.0.0:14550", "--no-check"], tmp_path) as one:
             await one.answer("Begin anew", "yes")
             await one.answer("on the ground")
+            await one.answer("Which part")
             await one.answer(r"Write it\?")
             assert await one.ended() == 0
         assert made.configuration()["mavlink"]["url"] == "udpin:0.0.0.0:14550"

@@ -60,6 +60,13 @@ def test_a_phone_answers_and_there_is_a_configuration(tmp_path: Path) -> None:
             await press("euler")
             await asks("gradienter turned")
             await press("180")
+            await asks("IMU 1 of the autopilot")
+            assert await choices() == ["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
+            assert "unknown 47 deg/h" in await tab.value("$('hint').textContent")
+            assert await tab.value("document.querySelector('#choices .now').textContent") == "unknown"
+            for wide in ("document.documentElement", *(f"$('choices').children[{number}]" for number in range(5))):
+                assert await tab.value(f"{wide}.scrollWidth <= {wide}.clientWidth"), "nothing is cut off"
+            await press("icm42688p")
             await asks("Write it?")
             assert 'law = "euler"' in await tab.value("$('told').textContent")
             assert not made.file.exists()
@@ -70,6 +77,7 @@ def test_a_phone_answers_and_there_is_a_configuration(tmp_path: Path) -> None:
             assert await terminal.ended() == 0, terminal.screen
             found = made.configuration()
             assert (found["gradienter"]["law"], found["gradienter"]["mounting"]) == ("euler", "ROTATION_YAW_180")
+            assert found["imu"] == [{"name": "fc", "source": "autopilot", "profile": "icm42688p"}]
             assert found["web"] == {"bind": "127.0.0.1:0"}, "the daemon's page follows at the same address"
             assert made.told == [], "it only listens"
 
@@ -78,8 +86,9 @@ def test_a_phone_answers_and_there_is_a_configuration(tmp_path: Path) -> None:
 
 def test_beyond_the_board_it_needs_the_token_that_the_shell_shows(tmp_path: Path) -> None:
     async def main() -> None:
-        words = ["-c", str(tmp_path / "companion.toml"), "setup", str(tmp_path / "nobody"), "--udp", "1", "--page"]
-        async with Terminal([*words, "0.0.0.0:0", "--mavlink", "udpin:127.0.0.1:14550"], tmp_path) as terminal:
+        words = ["-c", str(tmp_path / "companion.toml"), "setup", str(tmp_path / "nobody"), "--udp", "1", "--no-check"]
+        words += ["--page", "0.0.0.0:0", "--mavlink", "udpin:127.0.0.1:14550"]
+        async with Terminal(words, tmp_path) as terminal:
             said = await terminal.says("camera read this")
             (token,) = re.findall(r"token: (\S+)", said)
             (port,) = re.findall(r":(\d+)/#token=", said)
@@ -88,6 +97,8 @@ def test_beyond_the_board_it_needs_the_token_that_the_shell_shows(tmp_path: Path
             assert b" 403 " in await answer(int(port), "2" * 12, 1, "deck")
             assert b"answered already" in await answer(int(port), token, 7, "deck")
             assert b" 200 " in await answer(int(port), token, 1, "deck")
+            await terminal.says(r"Which part.*\n(.*\n)*.*> ")
+            assert b" 200 " in await answer(int(port), token, 2, "unknown")
             await terminal.says(r"Write it\?")
             assert not (tmp_path / "companion.toml").exists()
             assert (tmp_path / "companion-state/web-token").read_text() == f"{token}\n", (

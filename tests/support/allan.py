@@ -1,8 +1,8 @@
-"""V(T, H) of a whole model, which the estimator works out in parts."""
+"""V(T, H) of a whole model, as a variance."""
 
 from __future__ import annotations
 
-from companion.calibration.noise.allan import AllanModel, floor_variance
+from companion.calibration.noise.allan import AllanModel, predicted_sigma
 
 
 def use_variance(model: AllanModel, mean_s: float, horizon_s: float) -> float:
@@ -13,4 +13,4 @@ def use_variance(model: AllanModel, mean_s: float, horizon_s: float) -> float:
         mean_s: T > 0.
         horizon_s: H > 0.
     """
-    return model.white**2 / mean_s + float(floor_variance(model.flicker, model.walk, mean_s, horizon_s))
+    return predicted_sigma(model, mean_s, horizon_s) ** 2

@@ -12,6 +12,8 @@ from companion.calibration.means.pose import heading_window, tilt_window
 from companion.calibration.means.windows import ImuInput, estimates, imu_estimates
 from companion.calibration.noise.allan import AllanModel, NoiseProfile, noise_profile, slope_variance
 from companion.calibration.seconds.batch import Batch
+from companion.config import parse
+from companion.configured.profiles import gyro_sigmas_deg_h
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H
 from tests.support.allan import use_variance
@@ -269,3 +271,16 @@ def test_the_slope_that_flicker_and_walk_make_is_as_computed() -> None:
         slopes = np.einsum("t,ktc->kc", times, parts) / np.square(times).sum()
         expected = math.sqrt(float(slope_variance(np.array(model.flicker), np.array(model.walk), 60.0)))
         assert float(slopes.std()) == pytest.approx(expected, rel=0.06)
+
+
+@pytest.mark.parametrize("part", ["icm42688p", "bmi088", "adis16470", "unknown"])
+def test_the_price_of_a_part_is_the_sigma_that_the_estimator_gives(part: str) -> None:
+    """The figures that setup and check show beside the parts, against windows of 60 s of the part's white noise."""
+    config = parse('[mavlink]\nurl = "udpin:127.0.0.1:9"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n', "x.toml")
+    profile, rng = noise_profile(part), np.random.default_rng(5)
+    white = np.repeat([profile.gyro.white, profile.accel.white], 3)
+    found = [
+        window_of(imu("fc", profile), batches_of(rng.normal(0.0, white, (60, 6)), spread=1e-3)).gyro_sigma_use_rad_s
+        for _ in range(20)
+    ]
+    assert float(np.median(found)) / DEG_H == pytest.approx(gyro_sigmas_deg_h(config)[part], rel=0.1)

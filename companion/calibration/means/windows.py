@@ -349,10 +349,10 @@ def _hidden(imu: ImuInput, own: Estimate) -> dict[Triad, Hidden]:
         if undecided.any():
             useless = bool(useless_axes.any())
             axes = _axes(useless_axes if useless else undecided)
-            what = "around 0 the mean is not known" if useless else "up to half a step may be hidden, sigma widened"
+            what = "not known: bias and" if useless else "half a step unknown:"
             found[part] = Hidden(
-                f"{part} {imu.name} {axes}: integer steps of {step} and too little noise for them, {what}; set"
-                " push.dither = true",
+                f"{part} {imu.name} {axes}: {what} noise smaller than its telemetry's steps of {step}; push.dither ="
+                " true measures it",
                 useless,
             )
         elif grid > 0.0 and (own.edge_rms[triad] > EDGE_RMS).any():

@@ -135,6 +135,12 @@ def floor_variance(flicker: Floats | float, walk: Floats | float, mean_s: Floats
     )
 
 
+def predicted_sigma(model: AllanModel, mean_s: float, horizon_s: float) -> float:
+    """Predict one sigma of the bias over the next `horizon_s` from a mean over `mean_s` seconds: sqrt(V(T, H))."""
+    floor = float(floor_variance(model.flicker, model.walk, mean_s, horizon_s))
+    return math.sqrt(model.white**2 / mean_s + floor)
+
+
 def slope_variance(flicker: Floats | float, walk: Floats | float, mean_s: float) -> Floats:
     """Variance of a straight line's slope over `mean_s` seconds that flicker and random walk make where there is none.
 

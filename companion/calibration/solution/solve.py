@@ -182,9 +182,10 @@ def solve(
         # It turns: of a yaw nobody knows when it was true.
         otherwise = msgspec.structs.replace(otherwise, heading=None)
     truth = truth_of(window, gradienter, compass, local, warnings, otherwise)
+    unknown_heading = None
     if compass is None and truth.heading_rad is None:
         unknown_heading = local.rate_in_body(np.eye(3), heading_known=False).covariance
-        warnings += without_heading(window.imus, unknown_heading, local.remedies)
+    warnings += wide_gyros(window.imus, unknown_heading, local.remedies)
     believed = window.imus if any_bias else tuple(believable(imu, truth.up, local) for imu in window.imus)
     sailing = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)
     shared = _shared(truth, local, window.turn, 0.0 if gradienter is None else gradienter.sigma_deg * DEG, sailing)
@@ -341,19 +342,19 @@ def widened(imu: ImuWindow, asked: Collection[Triad], powered_s: float, variance
     return [words] if words else []
 
 
-def without_heading(imus: Sequence[ImuWindow], earth_covariance: Matrix, remedies: Remedies) -> list[str]:
-    """What made the gyros' sigma wide whose heading nobody knows: that, or a part that nobody has named.
+def wide_gyros(imus: Sequence[ImuWindow], earth_covariance: Matrix | None, remedies: Remedies) -> list[str]:
+    """Name what makes the gyros' sigma wide: an unknown heading, or a part that nobody has named.
 
-    `earth_covariance` (3, 3) is what is not known of the Earth's rate, (rad/s)^2.
+    `earth_covariance` (3, 3) is what is not known of the Earth's rate, (rad/s)^2; None where the heading is known.
     """
-    earth = float(np.diag(earth_covariance).max())
+    earth = 0.0 if earth_covariance is None else float(np.diag(earth_covariance).max())
     by_part = [
         imu.name
         for imu in imus
         # Where integers hide the mean, that made it, and is said.
         if not imu.named and "gyro" not in imu.hidden and float(np.square(imu.gyro_sigma_use_rad_s).max()) > earth
     ]
-    found = [f"imu {name}: gyro sigma is that of the worst common parts: {remedies.part}" for name in by_part]
-    if len(by_part) < len(imus):
+    found = [f"imu {name}: gyro sigma is that of an unknown part: {remedies.part}" for name in by_part]
+    if earth_covariance is not None and len(by_part) < len(imus):
         found.append(f"{remedies.no_heading}: the horizontal part of the Earth's rate is unknown, gyro sigma widened")
     return found

@@ -14,7 +14,7 @@ from typing import Final, Literal
 import msgspec
 
 from companion.autopilot.firmware.port_parameters import baud_of, port_needs
-from companion.config.sections import Config, Imu
+from companion.config.sections import UNKNOWN, Config, Imu
 from companion.configured.models import SerialDevice, cannot_work, doubtful, serial_devices
 from companion.daemon.devices.sensor_health import ABSENT
 from companion.daemon.faces.control import ask, process_behind
@@ -204,8 +204,7 @@ async def run_check(
     for name in ("mqtt", "fleet"):
         if (face := status[name]) is not None:
             findings.append(Finding(name, good=face["good"], words=face["summary"]))
-    # Whose noise figures an IMU's sigmas are made of.
-    findings += [Finding(f"profile {one['imu']}", good=True, words=one["summary"]) for one in status["profiles"]]
+    findings += [_profile(profile) for profile in status["profiles"]]
     if config.push.attitude != "off" and is_running:
         findings.append(await _heading(config))
     if config.calibration.at_arm == "gate":
@@ -219,15 +218,18 @@ async def run_check(
     return findings
 
 
-async def answering_imus(config: Config, imus: Sequence[Imu], seconds: float) -> list[str]:
-    """Which of these IMUs of the autopilot there are: their offsets can be read, and they are sent. Writes nothing.
+async def answering_imus(config: Config, imus: Sequence[Imu], seconds: float) -> dict[str, str | None]:
+    """Find out which of these autopilot IMUs exist, and their parts by device id (None: not known). Writes nothing.
+
+    An IMU exists if its offsets can be read and its samples come.
 
     Raises:
         CompanionError: something that makes asking itself impossible.
     """
     alone = msgspec.structs.replace(config, imu=list(imus), gradienter=None, compass=None, mqtt=None, web=None)
     status = await Service(alone, only_listening=ONLY_CHECKING).listen(seconds)
-    return [device["name"] for device in status["devices"] if device["good"]]
+    parts = {profile["imu"]: profile["name"] for profile in status["profiles"]}
+    return {device["name"]: parts[device["name"]] for device in status["devices"] if device["good"]}
 
 
 def _autopilot(config: Config, vehicle: Object) -> Finding:
@@ -251,6 +253,15 @@ def _device(device: Object, elsewhere: Finding | None) -> Finding:
     if device.get("trouble") == ABSENT and port.startswith("/") and not os.path.exists(port) and elsewhere is not None:
         return Finding(name, good=False, words=f"{words}; {elsewhere.words}", remedy=elsewhere.remedy, port=port)
     return Finding(name, device["good"], words, port=port)
+
+
+def _profile(profile: Object) -> Finding:
+    """Report the noise profile of one IMU; warn of an unknown part, with its price."""
+    name, words = f"profile {profile['imu']}", profile["summary"]
+    if profile["name"] not in (None, UNKNOWN):
+        return Finding(name, good=True, words=words)
+    remedy = f'set profile in [[imu]] "{profile["imu"]}", or companion setup again'
+    return Finding(name, good=True, words=f"{words}: {remedy}", remedy=remedy)
 
 
 def _gate(config: Config, setup: Object) -> Finding:

@@ -26,6 +26,7 @@ function firstRun(found) {
     if (words === question.now) button.className = "now";
     return button;
   }));
+  $("choices").classList.toggle("long", question.choices.some(words => words.length > 8));
   $("typed").hidden = question.choices.length > 0 && question.choices.every(words => ["yes", "no"].includes(words));
 }
 async function reply(words) {
