@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import dataclasses
+import math
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -349,7 +350,11 @@ def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good:
     if not checks:
         yield f"{command} check"
     if parsed.gradienter is not None:
-        yield f"{command} align zero   (once: the gradienter's zero)"
+        from companion.configured.models import tilt_sigma_deg  # takes a second on a small board
+
+        sigma_deg = parsed.gradienter.sigma_deg or tilt_sigma_deg(parsed.gradienter.protocol)
+        until = f"until then accelerometers to {math.radians(sigma_deg) * 1e3:.1f} mg"
+        yield f"{command} align zero   (once: the gradienter's zero; {until})"
     yield f"{command} calibrate --wait   (disarmed, standing still, hands off)"
     ashore = parsed.vehicle.platform == "ground"
     if ashore and parsed.gradienter is None and any(imu.source == "autopilot" for imu in parsed.imu):

@@ -75,7 +75,7 @@ async def bench(
     scenario.aircraft.begin(loop.time())
     autopilot, receive = scenario.autopilot, scenario.autopilot.receive
     for name, value in parameters.items():
-        autopilot.parameters.set(name, value)
+        autopilot.set_parameter(name, value)
 
     def told(data: bytes, t_s: float) -> None:
         made.told.append(data)
@@ -163,6 +163,7 @@ def test_a_person_answers_and_has_a_configuration_that_works(tmp_path: Path) -> 
             assert await terminal.ended() == 0, terminal.screen
             assert not re.search("^wrong", checked, re.MULTILINE)
             assert "calibrate --wait" in terminal.screen
+            assert "align zero   (once: the gradienter's zero; until then accelerometers to 0.9 mg)" in terminal.screen
             assert made.configuration()["mavlink"]["url"] == f"udpin:127.0.0.1:{made.udp}"
             assert made.configuration()["gradienter"] == {
                 "port": str(tmp_path / "gradienter"), "protocol": "inclinometer_xy", "law": "euler", "baud": 9600,
