@@ -1,4 +1,4 @@
-"""Which IMUs the autopilot has and which parts they are: asked of the autopilot, or of the daemon that has its port."""
+"""Ask the autopilot, or the daemon that has its port, for its IMUs and their parts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COARSE: Final = "It sends whole steps of 206 deg/h and 1 mg: a gyro bias below o
 """1 mrad/s and 1 mg: the steps of SCALED_IMU2 and SCALED_IMU3."""
 
 Parts = Mapping[str, str | None]
-"""By the names of IMUs, the parts that device ids tell; None: they tell none."""
+"""Part of each IMU by name, from its device ids; None: not in the catalogue."""
 
 
 def parts_given(options: Sequence[str]) -> dict[str, str]:

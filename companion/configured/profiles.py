@@ -1,4 +1,4 @@
-"""Whose noise figures the sigmas of each IMU are made of."""
+"""Noise profile of each IMU: which one its sigmas are computed from, and what an unknown part costs."""
 
 from __future__ import annotations
 
