@@ -16,6 +16,7 @@ from typing import Any, Final, NoReturn
 from urllib.parse import quote
 
 from companion import config
+from companion.config.removed import COMMAND_LINE, refusal_of_words
 from companion.config.sections import Config, Noise, Storage
 from companion.errors import ConfigError
 from companion.printable import printable
@@ -116,8 +117,22 @@ def how_to_start(options: argparse.Namespace) -> str:
     return f"; start it with: {'sudo systemctl start companion' if serves else f'{own_name(options)} run'}"
 
 
+class _Removed(argparse.Action):
+    """Refuses an option that former versions had."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        """Refuse the option with its version and its remedy."""
+        parser.error(str(refusal_of_words(parser.prog, self.option_strings[0])))
+
+
 class Parser(argparse.ArgumentParser):
     """Says a usage error in one line, and what was probably meant."""
+
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
+        super().__init__(*arguments, **keywords)
+        for command, _, option in (words.partition(" --") for words in COMMAND_LINE):
+            if option and command == self.prog:
+                self.add_argument(f"--{option}", action=_Removed, nargs="?", help=argparse.SUPPRESS)
 
     def error(self, message: str) -> NoReturn:
         """Say a usage error in one line."""
@@ -128,6 +143,8 @@ class Parser(argparse.ArgumentParser):
         """Name the nearest command or choice, as the configuration does for its keys."""
         if action.choices is None or value in action.choices:
             return
+        if (refusal := refusal_of_words(self.prog, str(value))) is not None:
+            self.error(refusal)
         choices = list(map(str, action.choices))
         near = difflib.get_close_matches(str(value), choices, n=1)
         hint = f"did you mean {near[0]}?" if near else f"allowed: {', '.join(choices)}"

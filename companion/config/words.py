@@ -13,6 +13,7 @@ from typing import Annotated, Any, Final, Literal, Union
 import msgspec
 from msgspec import Meta
 
+from companion.config.removed import refusal_of_key
 from companion.config.sections import Config
 from companion.errors import ConfigError
 
@@ -32,6 +33,8 @@ def refuse_unknown_keys(raw: dict[str, Any], section: type[msgspec.Struct], path
     for key, value in raw.items():
         here = f"{path}.{key}" if path else key
         if key not in known:
+            if (refusal := refusal_of_key(here)) is not None:
+                raise ConfigError(f"{name}: {refusal}")
             kind = "section" if isinstance(value, dict) else "key"
             near = difflib.get_close_matches(key, known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"allowed: {', '.join(sorted(known))}"
