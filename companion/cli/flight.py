@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import datetime
-import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,9 +23,8 @@ from companion.calibration.records.flight_record import (
     next_flight,
     unit_of,
 )
-from companion.cli.client import request
 from companion.cli.terminal import AddCommand, conclude, print_lines, storage_path
-from companion.errors import CompanionError, ConfigError, StorageError
+from companion.errors import StorageError
 
 if TYPE_CHECKING:
     from companion.flight.flight import Knowledge
@@ -37,12 +34,7 @@ if TYPE_CHECKING:
 def add_commands(add: AddCommand) -> None:
     """Add it to the parser of the command line."""
     command = add("flight", flight, "what a log of the autopilot says of a flight")
-    command.add_argument("file", nargs="?", metavar="LOG", help="ArduPilot's .bin or PX4's .ulg")
-    command.add_argument(
-        "--fetch",
-        action="store_true",
-        help="get it from the autopilot first (disarmed); LOG is its name or number there, the latest if not given",
-    )
+    command.add_argument("file", type=Path, metavar="LOG", help="ArduPilot's .bin or PX4's .ulg")
     command.add_argument(
         "--offsets",
         type=Path,
@@ -58,9 +50,7 @@ async def flight(options: argparse.Namespace) -> int:
     from companion.calibration.records.flight_evidence import surely_moved
     from companion.flight.flight import flights, read
 
-    if options.file is None and not options.fetch:
-        raise ConfigError("companion flight: which LOG? --fetch gets the latest from the autopilot")
-    path = await _fetched(options) if options.fetch else Path(options.file)
+    path = options.file
     known, store = _knowledge(options)
     starts, imus, lines, found = 0, 0, [], []
     for boot in read(path, _Progress()):
@@ -81,24 +71,6 @@ async def flight(options: argparse.Namespace) -> int:
     answer = {"state": "done", "reason": "", "file": str(path), "numbers": numbers}
     answer |= {"flights": msgspec.to_builtins(found), "moved": msgspec.to_builtins(together)}
     return conclude(options, answer, lines, good=True)
-
-
-async def _fetched(options: argparse.Namespace) -> Path:
-    """Where the daemon has put the log that it fetched."""
-    try:
-        reply = await request(options, {"command": "fetch", "log": options.file}, in_place=True)
-    except asyncio.CancelledError:
-        print_lines(
-            "stopped: what has come is kept, and the next companion flight --fetch goes on from there", error=True
-        )
-        raise
-    if reply["kind"] == "error":
-        raise CompanionError(reply["reason"])
-    path = Path(reply["file"])
-    print_lines(f"fetched: {path}, {reply['bytes'] / 1e6:.1f} MB", error=True)
-    if not os.access(path, os.R_OK):
-        raise StorageError(f"{path}: may only be read by root: sudo companion flight {path}")
-    return path
 
 
 class _Progress:

@@ -8,7 +8,9 @@ from typing import Final
 KEYS: Final[dict[str, str]] = {}
 """Removed configuration keys without list indexes ("imu.port"), each with its version and its remedy."""
 
-COMMAND_LINE: Final[dict[str, str]] = {}
+COMMAND_LINE: Final[dict[str, str]] = {
+    "companion flight --fetch": "0.2: download the log with your ground station, then companion flight LOG",
+}
 """Removed commands ("companion NAME") and options ("companion NAME --option"), each with its version and its remedy."""
 
 

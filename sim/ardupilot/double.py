@@ -23,7 +23,6 @@ from sim.firmware.channel import Channel, Message
 from sim.firmware.command import command_of
 from sim.firmware.double import HEARTBEAT
 from sim.firmware.faults import Faults
-from sim.firmware.file_server import FileServer
 from sim.firmware.numbers import float32
 from sim.firmware.writes import Write
 from sim.imu_model import ImuModel
@@ -50,7 +49,6 @@ class ArduPilotDouble(Board):
         self._router = Router(self.system_id, self.channels)
         self._parameter_server = ParameterServer(self)
         self._commands = CommandServer(self)
-        self.file_server = FileServer(self, px4=False)
         self._boot_gyros(0.0)
 
     # What tests and people do to it.
@@ -145,7 +143,6 @@ class ArduPilotDouble(Board):
         self.parameters.set("STAT_BOOTCNT", self.parameters.values["STAT_BOOTCNT"] + 1)
         self.parameters.reload()
         self._router.forget()
-        self.file_server.restart()
         self._frozen.clear()
         self._boot_gyros(self.aircraft.time_at(loop_s))
         for path in self._paths:
@@ -180,7 +177,6 @@ class ArduPilotDouble(Board):
     def _receive_message(self, channel: Channel, message: Message, loop_s: float) -> None:
         if not self._router.route(channel, message):
             return
-        self.file_server.take(channel, message)
         if isinstance(message, mavlink.MAVLink_param_set_message):
             self._parameter_server.set(channel, message, loop_s)
         elif isinstance(message, mavlink.MAVLink_param_request_read_message):

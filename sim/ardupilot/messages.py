@@ -125,7 +125,6 @@ def autopilot_version(double: Board, loop_s: float) -> Message:
         | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
         | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
         | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-        | mavlink.MAV_PROTOCOL_CAPABILITY_FTP
     )
     major, minor = (int(part) for part in double.version.split("."))
     software = major << 24 | minor << 16 | (0 if double.version == NEWEST else mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL)

@@ -18,7 +18,6 @@ from sim.earth import Array
 from sim.firmware.channel import Channel, Message
 from sim.firmware.command import command_of
 from sim.firmware.faults import Faults
-from sim.firmware.file_server import FileServer
 from sim.firmware.writes import Write
 from sim.imu_model import ImuModel
 from sim.px4.arm_authorization import ArmAuthorization
@@ -77,7 +76,6 @@ class PX4Double(Board):
         self._parameter_server = ParameterServer(self)
         self._voice = Voice(self)
         self.shell = Shell(self)
-        self.file_server = FileServer(self, px4=True)
         self._consumers = (
             Consumer(self, 1.0 / imu_rate_hz, self._update_imus),
             Consumer(self, SAMPLE_S, self._update_gyro_rival),
@@ -186,7 +184,6 @@ class PX4Double(Board):
             self.commander,
             self.vision,
             self.shell,
-            self.file_server,
         ):
             part.restart()
         for consumer in self._consumers:
@@ -253,7 +250,6 @@ class PX4Double(Board):
         channel.seen.add(source)
         forward(self.system_id, self.ports, channel, message, heartbeats=bool(self.parameters["MAV_HB_FORW_EN"]))
         self._parameter_message(channel, message, loop_s)
-        self.file_server.take(channel, message)
         if isinstance(message, mavlink.MAVLink_heartbeat_message):
             heard_ground_station(channel, message, loop_s)
             self._voice.go_on(channel)

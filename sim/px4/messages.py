@@ -126,7 +126,6 @@ def autopilot_version(double: Board, loop_s: float) -> Message:
         | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
         | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
         | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-        | mavlink.MAV_PROTOCOL_CAPABILITY_FTP
         | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
     )
     major, minor = (int(part) for part in double.version.split("."))

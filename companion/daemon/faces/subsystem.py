@@ -51,7 +51,7 @@ class Faces(Subsystem):
         calibrating: Calibrating,
         arming: Arming,
         heading: Heading,
-        others: Sequence[Subsystem],
+        recorder: Subsystem,
     ) -> None:
         self._core, self._devices = core, devices
         self._models = calibrating.memory.models
@@ -67,7 +67,7 @@ class Faces(Subsystem):
         calibrating.conductor.on_ended.add(self._show_result)
         self._headlines = Headlines(core, devices, calibrating.conductor, arming, heading.attitude)
         self._pose = heading.pose
-        self._subsystems = (self, devices, offsets, calibrating, arming, heading, *others)
+        self._subsystems = (self, devices, offsets, calibrating, arming, heading, recorder)
         self._handlers: dict[str, Handler] = {"status": self._status, "monitor": self._monitor}
         for subsystem in self._subsystems:
             self._handlers |= subsystem.commands()

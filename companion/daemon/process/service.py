@@ -15,7 +15,6 @@ from companion.daemon.devices.subsystem import Devices
 from companion.daemon.faces.control import ControlServer
 from companion.daemon.faces.subsystem import Faces
 from companion.daemon.heading.subsystem import Heading
-from companion.daemon.logs.subsystem import Logs
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.recorder.recorder import Recorder
 from companion.formats import Object
@@ -50,8 +49,7 @@ class Service:
         self.arming = Arming(core, self.devices, self.offsets, self.calibrating)
         self.heading = Heading(core, self.devices, self.calibrating, self.arming)
         self.recorder = Recorder(core, self.devices, self.calibrating)
-        others = Logs(core, self.calibrating), self.recorder
-        self.faces = Faces(core, self.devices, self.offsets, self.calibrating, self.arming, self.heading, others)
+        self.faces = Faces(core, self.devices, self.offsets, self.calibrating, self.arming, self.heading, self.recorder)
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
         """Run until cancelled, reachable on the control socket from `on_ready` on.

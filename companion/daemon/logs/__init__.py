@@ -1,1 +1,0 @@
-"""Logs of flights, fetched from the autopilot."""
