@@ -85,7 +85,7 @@ def test_the_right_slot_is_seen_to_act_and_remembered(tmp_path: Path) -> None:
                 raw_gyro, raw_accel = stage.px4.raw[found.instance - 1]
                 np.testing.assert_allclose(far["gyro"].mean, raw_gyro - 0.02 * sign, atol=3e-3)
                 np.testing.assert_allclose(far["accel"].mean, raw_accel - 0.05 * sign, atol=0.03)
-            gyro_step, accel_step = step_from_far(one, small_changes(one), (0.0, 0.0, 0.0), ())
+            gyro_step, accel_step = step_from_far(one, small_changes(one), (0.0, 0.0, 0.0))
             np.testing.assert_allclose(gyro_step, 0.02 * np.ones(3), atol=1e-3)
             np.testing.assert_allclose(accel_step, 0.05 * np.ones(3), atol=5e-3)
 

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from companion.autopilot.firmware import ardupilot, ardupilot_tcal, px4
+from companion.autopilot.firmware import ardupilot, px4
 from companion.autopilot.firmware.imu_calibration import (
     MAX_ACCEL_OFFSET_M_S2,
     MAX_ACCEL_RESIDUAL_M_S2,
@@ -22,11 +22,9 @@ from companion.autopilot.firmware.imu_calibration import (
     rivals_of,
 )
 from companion.autopilot.firmware.px4 import SLOTS, SlotMemory
-from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import SCALES, Parameters
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.calibration.records.record import Outcome, WrittenParameter
-from companion.calibration.temperature.polynomial import Polynomial
 from companion.config.sections import Profile
 from companion.errors import AutopilotError, AutopilotRebootedError
 from companion.samples import Triad
@@ -66,26 +64,11 @@ async def read_calibration(parameters: Parameters, instance: int, memory: SlotMe
     return found
 
 
-async def thermal_changes(
-    parameters: Parameters, calibration: ImuCalibration, gyro: Polynomial, accel: Polynomial | None, degc: float
-) -> list[Change]:
-    """What to write so that curves are in force and the output at this temperature stays as it is.
-
-    Args:
-        parameters: of the autopilot.
-        calibration: in force.
-        gyro: in the IMU's axes, about 35 degC.
-        accel: likewise, before its scale; None: not known. PX4's is left as it is.
-        degc: of the IMU now.
-
-    Raises:
-        AutopilotError: this firmware has no temperature calibration, or as `Parameters.read`.
-    """
-    if parameters.vehicle.firmware == "ardupilot":
-        return await ardupilot_tcal.thermal_changes(parameters, calibration, gyro, accel, degc)
-    from companion.autopilot.firmware import px4_thermal
-
-    return await px4_thermal.thermal_changes(parameters, calibration, gyro, degc)
+def why_no_thermal_write(firmware: Firmware | None) -> str | None:
+    """Give the reason why no curve is written into this firmware's temperature calibration, or None."""
+    if firmware != "px4":
+        return None
+    return "PX4's thermal compensation (TC_*) is not written: the firmware of common boards is built without it"
 
 
 def settle_s(firmware: Firmware | None) -> float:
@@ -158,6 +141,7 @@ def _ardupilot() -> dict[str, Range]:
 
 def _px4() -> dict[str, Range]:
     found = {name: one for slot in range(SLOTS) for name, one in _offsets(px4.parameters_of(slot, slot)).items()}
+    # Former versions have written TC_G*: an undo or a restore of theirs still puts the old values back.
     for sensor in range(SLOTS):
         device_id, *rest = px4.thermal_names(sensor)
         found |= {device_id: _DEVICE_ID, **dict.fromkeys(rest[:3], _DEGC), **dict.fromkeys(rest[3:], _TC)}

@@ -178,8 +178,6 @@ class Thermal:
     """What decides about it, by parameter, as far as it was read."""
     gyro: Polynomial = NOTHING
     accel: Polynomial = NOTHING
-    gyro_constant: tuple[str, ...] = ()
-    """Parameters that act as gyro offsets do, X, Y, Z; none where there are none."""
 
     def taken_off(self, degc: float | None) -> tuple[Array, Array]:
         """At a temperature, rad/s and m/s^2, (3,) each; where none is known, nothing."""
@@ -340,8 +338,6 @@ def output_step(
         np.array([by_name.get(name, 0.0) for name in each])
         for each in (names.gyro_offset, names.accel_offset, names.accel_scale)
     )
-    if constant := calibration.thermal.gyro_constant:
-        gyro = gyro + [by_name.get(name, 0.0) for name in constant]
     rotation, before = calibration.orientation, calibration.in_use()
     after = calibration.in_use(vector(calibration.accel_scale + stretch)) if stretch.any() else before
     unscaled = rotation.T @ np.asarray(accel_m_s2) / before

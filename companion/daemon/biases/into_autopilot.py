@@ -9,9 +9,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from companion.autopilot.firmware.firmwares import thermal_changes
+from companion.autopilot.firmware.ardupilot_tcal import thermal_changes
+from companion.autopilot.firmware.firmwares import why_no_thermal_write
 from companion.autopilot.firmware.imu_calibration import Thermal
-from companion.autopilot.firmware.px4 import THERMAL_ENABLE
 from companion.autopilot.parameters.wire import same_float32
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
@@ -49,7 +49,9 @@ class IntoAutopilot:
         """Why nothing could be written; None where all is well."""
         if not self._imus:
             return "there is no IMU of the autopilot: none is configured"
-        return None if self._core.wanted.push else "nothing is written while push.parameters is false"
+        if not self._core.wanted.push:
+            return "nothing is written while push.parameters is false"
+        return why_no_thermal_write(self._core.vehicle.firmware)
 
     def why_no_undo(self) -> str | None:
         """Why curves cannot be put back now; None where the latest write is of them."""
@@ -89,9 +91,6 @@ class IntoAutopilot:
         await self._conclusion.conclude(job, plan, window, draft)
         warnings = (*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each))
         job.deliver(CurvesWritten(draft.written, warnings))
-        calibrations = [target.calibration for target in targets if target.all]
-        if any(one.far_step is not None and not one.thermal.gyro_constant for one in calibrations):
-            return f"{THERMAL_ENABLE} is on now: reboot PX4, then companion temperature --write once more"
         return f"written: {'; '.join(words)}"
 
     async def _find(self, window: Window, *, overwrite: bool) -> tuple[list[Target], list[str], list[str]]:

@@ -130,7 +130,7 @@ class EffectWatch:
             accel_residual=target.solution.accel_m_s2,
             apart_s=(after.start_s + after.end_s - before.start_s - before.end_s) / 2.0,
         )
-        steps = step_from_far(target.calibration, target.changes, sides.before.accel_m_s2, target.unseen)
+        steps = step_from_far(target.calibration, target.changes, sides.before.accel_m_s2)
         seen = self._px4.seen_far(target.calibration)
         on_the_way = {triad: (seen[triad], step) for triad, step in zip(TRIADS, steps, strict=True) if triad in seen}
         profile = self._profiles.of(target.name)

@@ -42,8 +42,6 @@ BEFORE_S: Final = 1.0
 SETTLE_S: Final = 1.3
 """PX4 looks at its parameters at most once a second (autopilots 9.2)."""
 LOOK_S: Final = 1.2
-THERMAL: Final = "TC_G"
-"""So begins what acts by the thermal compensation, of which nothing is learned about the slots."""
 LEAST_SAMPLES: Final = 5
 MATCH: Final = 0.4
 """Of the expected step: so far may what was seen be from it. PX4 may have used other offsets than its parameters say,
@@ -186,9 +184,6 @@ class _FarStepWatch:
         return "; ".join(wrong) or None
 
     def _conclude(self, step: FarStep, moved: list[int], still: list[int]) -> str | None:
-        if step.slot.startswith(THERMAL):
-            acts = step.instance in moved or step.instance not in still
-            return None if acts else f"{step.slot} has no effect: reboot PX4; if that does not help, it is not started"
         word = WORDS[step.sensor]
         if moved == [step.instance]:
             self._memory.learn(step.sensor, step.device_id, step.instance)
@@ -302,23 +297,14 @@ def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2
     )
     for kind, device_id, name, step in halves:
         if any(step) and device_id is not None:
-            slot = name.removesuffix("_ID")
-            constant = calibration.thermal.gyro_constant
-            if kind == "gyro" and any(change.parameter in constant for change in changes):
-                slot = constant[0].partition("_X")[0]
-            found.append(FarStep(calibration.instance, kind, device_id, slot, np.array(step)))
+            found.append(FarStep(calibration.instance, kind, device_id, name.removesuffix("_ID"), np.array(step)))
     return found
 
 
-def step_from_far(
-    calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector, unseen: Sequence[Change]
-) -> tuple[Vector, Vector]:
-    """By how much the output must move from the far values to the new ones: gyro rad/s, accelerometer m/s^2.
-
-    `unseen`: changes that together leave the output as it is.
-    """
+def step_from_far(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> tuple[Vector, Vector]:
+    """By how much the output must move from the far values to the new ones: gyro rad/s, accelerometer m/s^2."""
     indirect = [change for change in changes if change.via is not None]
-    far = _far((*changes, *unseen))
+    far = _far(changes)
     whole, there = (output_step(calibration, each, accel_m_s2) for each in (indirect, far))
     return vector(np.subtract(whole[0], there[0])), vector(np.subtract(whole[1], there[1]))
 
