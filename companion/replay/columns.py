@@ -18,37 +18,32 @@ from companion.errors import StorageError
 from companion.physics.units import DEG, DEG_H, MG, G
 
 IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
-FIELD: Final = ("mx", "my", "mz")
 TILT: Final = ("tilt_x", "tilt_y")
 
 TIMES: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 RATES: Final = {"rad_s": 1.0, "deg_s": DEG, "deg_h": DEG_H, "mdeg_s": 1e-3 * DEG, "mrad_s": 1e-3}
 FORCES: Final = {"m_s2": 1.0, "g": G, "mg": MG, "gal": 1e-2, "ft_s2": 0.3048}
-GAUSS: Final = {"gauss": 1.0, "mgauss": 1e-3, "ut": 1e-2, "nt": 1e-5, "t": 1e4}
 DEGREES: Final = {"deg": 1.0, "rad": 1.0 / DEG}
 _DEGC: Final = {"degc": 1.0, "c": 1.0}
 UNITS: Final[dict[str, dict[str, float]]] = {
     "t": TIMES,
     **dict.fromkeys(IMU[:3], RATES),
     **dict.fromkeys(IMU[3:], FORCES),
-    **dict.fromkeys(FIELD, GAUSS),
     **dict.fromkeys((*TILT, "heading", "heading_magnetic"), DEGREES),
     "temperature": _DEGC,
 }
-"""By quantity, each unit with its factor to SI; of the field to gauss, of angles and temperatures to degrees."""
-_BY_SIZE: Final = frozenset(("t", *IMU, *FIELD))
+"""By quantity, each unit with its factor to SI; of angles and temperatures to degrees."""
+_BY_SIZE: Final = frozenset(("t", *IMU))
 """Quantities whose unit the size of the readings can tell; the others are in degrees where nothing is said."""
 
 ALLOWED: Final = (
     "t_s (or _ms, _us, _ns), gx gy gz each with _rad_s, _deg_s or _deg_h, ax ay az each with _m_s2, _g or _mg; if"
-    " there: temperature_degc, tilt_x_deg tilt_y_deg, heading_deg or heading_magnetic_deg, mx my mz each with _ut,"
-    " _mgauss or _gauss"
+    " there: temperature_degc, tilt_x_deg tilt_y_deg, heading_deg or heading_magnetic_deg"
 )
 
 _STEMS: Final[dict[str, tuple[str, ...]]] = {
     "g": ("g", "gyr", "gyro", "gyroscope", "w", "omega", "angular_velocity", "rate", "gyro_rate", "rotation_rate"),
     "a": ("a", "acc", "accel", "acceleration", "accelerometer", "specific_force"),
-    "m": ("m", "mag", "magnetometer", "magnetic_field", "b"),
 }
 _ALIASES: Final[dict[str, str]] = {
     **{
@@ -75,14 +70,11 @@ _UNIT_WORDS: Final = {
     "m/s**2": "m_s2", "ms^-2": "m_s2", "ms2": "m_s2", "ms-2": "m_s2",
     "g": "g", "gee": "g", "g0": "g", "mg": "mg", "gal": "gal", "cm/s^2": "gal", "cm/s2": "gal",
     "ft/s^2": "ft_s2", "ft/s2": "ft_s2", "ft_s2": "ft_s2",
-    "gauss": "gauss", "gs": "gauss", "mgauss": "mgauss", "mgs": "mgauss", "milligauss": "mgauss",
-    "ut": "ut", "microtesla": "ut", "nt": "nt", "t": "t",
     "s": "s", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us",
     "usec": "us", "ns": "ns", "nsec": "ns",
     "deg": "deg", "degrees": "deg", "degree": "deg", "rad": "rad",
     "degc": "degc", "c": "c", "celsius": "degc",
 }  # fmt: skip
-_FIELD_WORDS: Final = {"g": "gauss", "mg": "mgauss"}
 _NO_UNIT: Final = frozenset(("", "-", "1", "n/a", "none", "a.u.", "raw", "lsb", "counts"))
 _ODD_LETTERS: Final = (
     ("²", "^2"), ("°", "deg"), ("µ", "u"), ("μ", "u"), ("·", ""), (" / ", "/"),
@@ -153,10 +145,9 @@ def columns_of(names: Sequence[str], where: str, units: Sequence[str] = (), *, t
             f"{where}: no column for {', '.join(missing)} in {', '.join(names)}{rate}; allowed: {ALLOWED}; or name"
             " them: --columns"
         )
-    for group in (TILT, FIELD):
-        if not all(what in used for what in group):
-            for what in group:
-                used.pop(what, None)
+    if not all(what in used for what in TILT):
+        for what in TILT:
+            used.pop(what, None)
     return Columns(names=tuple(names), used=used)
 
 
@@ -176,7 +167,7 @@ def meaning(name: str, below: str = "") -> tuple[str, str | None] | None:
     for at in range(len(parts) - 1, 0, -1):
         what = _ALIASES.get("_".join(parts[:at]), "")
         tail = "_".join(parts[at:])
-        if what and _UNIT_WORDS.get(tail, tail) in (*UNITS[what], *(_FIELD_WORDS if what in FIELD else ())):
+        if what and _UNIT_WORDS.get(tail, tail) in UNITS[what]:
             return what, _unit(what, tail)
     return None
 
@@ -193,8 +184,6 @@ def _unit(what: str, text: str) -> str | None:
     text = text.strip("[]() ")
     if text in _NO_UNIT:
         return None
-    if what in FIELD and text in _FIELD_WORDS:
-        return _FIELD_WORDS[text]
     return _UNIT_WORDS.get(text.replace(" ", ""), text)
 
 

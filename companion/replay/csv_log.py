@@ -25,8 +25,6 @@ from companion.errors import StorageError
 from companion.physics.frames import Floats
 from companion.replay import sizes
 from companion.replay.columns import (
-    FIELD,
-    GAUSS,
     IMU,
     TILT,
     TIMES,
@@ -318,19 +316,15 @@ class _Table:
     def _poses(self, values: dict[str, Floats]) -> Poses | None:
         used = self._columns.used
         factor = {what: UNITS[what][column.unit] for what, column in used.items() if column.unit is not None}
-        tilt = heading = field = None
+        tilt = heading = None
         if TILT[0] in values:
             tilt = np.column_stack([values[what] * factor[what] for what in TILT])
-        if FIELD[0] in values:
-            field = np.column_stack([values[what] for what in FIELD])
-            unit = sizes.field_unit(self._columns, field, self._notes)
-            field = None if unit is None else field * GAUSS[unit]
         for what in ("heading_magnetic", "heading"):
             if what in values:
                 heading, magnetic = values[what] * factor[what], what == "heading_magnetic"
-        if tilt is None and heading is None and field is None:
+        if tilt is None and heading is None:
             return None
-        return Poses(tilt_deg=tilt, heading_deg=heading, magnetic=heading is not None and magnetic, field_gauss=field)
+        return Poses(tilt_deg=tilt, heading_deg=heading, magnetic=heading is not None and magnetic)
 
 
 _SEPARATORS: Final = (";", "\t", ",", " ")

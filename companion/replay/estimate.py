@@ -26,10 +26,10 @@ from companion.calibration.solution.site import Remedies, Whereabouts, local_ear
 from companion.calibration.solution.solve import solve
 from companion.config.sections import Mounting, Noise, Platform
 from companion.errors import CalibrationRefusedError
-from companion.physics.frames import Floats, Matrix, rotation_matrix
+from companion.physics.frames import Floats, rotation_matrix
 from companion.physics.gradienter import Law
 from companion.replay.log import Poses, StillLog
-from companion.samples import CompassSample, ImuSample, MagSample, TiltSample, Vector
+from companion.samples import CompassSample, ImuSample, TiltSample, Vector
 
 MIN_STILL_S: Final = 5.0
 MAX_STILL_S: Final = 3600.0
@@ -122,33 +122,24 @@ class _Streams:
     What is given on the command line stands for the whole log; a column of the same is then left out.
     """
 
-    def __init__(self, log: StillLog, given: Given, rotation: Matrix) -> None:
+    def __init__(self, log: StillLog, given: Given) -> None:
         poses = log.poses or Poses()
         self.notes: list[str] = []
         tilt_given = given.pitch_deg is not None and given.roll_deg is not None
         heading_given = given.heading_deg is not None
         self.tilt = self._unless("tilt", poses.tilt_deg, given=tilt_given)
         self.heading = self._unless("heading", poses.heading_deg, given=heading_given)
-        self.field = self._unless("magnetic field", poses.field_gauss, given=heading_given)
-        if self.field is not None:
-            self.field = self.field @ rotation.T
         self.gradienter = self.compass = None
         if tilt_given or self.tilt is not None:
             law: Law = "euler" if tilt_given else given.law
             self.gradienter = GradienterModel(law, np.eye(3), (0.0, 0.0), given.sigma_deg, given.tilt_lag_s)
-        elif self.field is not None:
-            self.notes.append("magnetic field left out: without a tilt it tells no heading")
-            self.field = None
-        if heading_given or self.heading is not None or self.field is not None:
+        if heading_given or self.heading is not None:
             self.compass = CompassModel(
-                magnetic=not heading_given and (self.heading is None or poses.magnetic),
+                magnetic=not heading_given and poses.magnetic,
                 vehicle_from_sensor=np.eye(3),
                 offset_deg=0.0,
                 sigma_deg=given.heading_sigma_deg,
-                prefers_field=self.heading is None,
             )
-        # A tilt of the command line is the field's, too.
-        self._constant = TiltSample(0.0, given.roll_deg or 0.0, given.pitch_deg or 0.0) if tilt_given else None
 
     def _unless(self, what: str, values: Floats | None, *, given: bool) -> Floats | None:
         if given and values is not None:
@@ -164,17 +155,6 @@ class _Streams:
                 collector.add_tilt(TiltSample(now_s, x_deg, y_deg))
         if self.heading is not None and (heading_deg := float(self.heading[at])) == heading_deg:
             collector.add_compass(CompassSample(now_s, heading_deg % 360.0))
-        if self.field is not None:
-            x, y, z = self.field[at].tolist()
-            if x == x and y == y and z == z:
-                if self._constant is not None:
-                    collector.add_tilt(msgspec.structs.replace(self._constant, t_s=now_s))
-                collector.add_field(MagSample(now_s, (x, y, z)))
-
-    @property
-    def has_heading(self) -> bool:
-        """Whether one comes, or of a field."""
-        return self.heading is not None or self.field is not None
 
 
 class _Pass:
@@ -183,7 +163,7 @@ class _Pass:
     def __init__(self, log: StillLog, given: Given, max_still_s: float) -> None:
         self._log, self._given, self._max_still_s = log, given, max_still_s
         rotation = rotation_matrix(given.mounting)
-        self._streams = _Streams(log, given, rotation)
+        self._streams = _Streams(log, given)
         settings = Settings(
             min_still_s=MIN_STILL_S,
             max_s=max_still_s,
@@ -195,7 +175,7 @@ class _Pass:
         imu = ImuInput(name=log.imu, rotation=rotation, profile=noise_profile(given.profile or log.profile))
         tilt, compass = self._streams.gradienter, self._streams.compass
         self._collector = RollingCollector(settings, [imu], tilt, compass, on_deck=given.platform == "deck")
-        self._collector.expect(gradienter=self._streams.tilt is not None, compass=self._streams.has_heading)
+        self._collector.expect(gradienter=self._streams.tilt is not None, compass=self._streams.heading is not None)
         self._found: list[Measurement] = []
         self._still_s = 0.0
         self._obstacle = ""

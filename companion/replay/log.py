@@ -25,8 +25,6 @@ class Poses(msgspec.Struct, frozen=True, kw_only=True):
     heading_deg: Floats | None = None
     """(n,)."""
     magnetic: bool = False
-    field_gauss: Floats | None = None
-    """(n, 3), in the IMU's axes."""
 
 
 class StillLog(msgspec.Struct, frozen=True, kw_only=True):

@@ -16,7 +16,7 @@ from companion.calibration.noise.robust import median
 from companion.errors import StorageError
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, G
-from companion.replay.columns import FIELD, FORCES, GAUSS, IMU, RATES, TIMES, UNITS, Columns
+from companion.replay.columns import FORCES, IMU, RATES, TIMES, UNITS, Columns
 
 QUIETEST_RAD_S: Final = 3.0 * DEG_H
 LOUDEST_RAD_S: Final = 0.1 * DEG
@@ -26,8 +26,6 @@ MOST_TURN_RAD_S: Final = 10.0 * DEG
 ACCEL_REST_M_S2: Final = 0.05
 """Scatter of a second's mean specific force: more is handling, and tells nothing of the gyros."""
 GRAVITY_M_S2: Final = (7.0, 12.6)
-_FIELD_GAUSS: Final = (0.1, 1.5)
-"""The Earth's is 0.22 to 0.67 gauss; iron in the vehicle adds to it."""
 MOST_COLOURED: Final = 8.0
 """Scatter of means over that of as many independent samples: a sensor behind a low-pass of 1 Hz; sway has more."""
 _LEAST_PAIRS: Final = 5
@@ -137,21 +135,6 @@ def _rates(
             f" {rates['gx']}? Then: --columns {columns.named(dict.fromkeys(IMU[:3], large))}"
         )
     return rates
-
-
-def field_unit(columns: Columns, field: Floats, notes: list[str]) -> str | None:
-    """The unit of the magnetic field, by its columns' names or by its size; None: neither tells, which is said."""
-    named = {columns.used[what].unit for what in FIELD}
-    if len(named) == 1 and None not in named:
-        return named.pop()
-    found = np.sqrt(np.square(field[np.isfinite(field).all(axis=1)]).sum(axis=1))
-    size = float(median(found)) if len(found) else math.nan
-    unit = next((unit for unit in ("ut", "gauss", "mgauss", "nt") if _within(size * GAUSS[unit], _FIELD_GAUSS)), None)
-    if unit is None:
-        notes.append(f"magnetic field of {size:.3g} in no known unit: left out")
-    else:
-        notes.append(f"mx, my, mz: taken for {unit}, the field reads {size:.3g}")
-    return unit
 
 
 def factors(units: Mapping[str, str]) -> Floats:

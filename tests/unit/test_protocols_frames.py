@@ -57,7 +57,8 @@ def as_decoded(samples: list[Sample]) -> dict[str, Any]:
 
 def as_documented(frame: dict[str, Any]) -> dict[str, Any]:
     """What of the document's words a sample can say: one heading of a sentence, to the north that is right for it."""
-    decoded = {key: value for key, value in frame["decoded"].items() if key != "yaw_pitch_roll_deg"}
+    unused = {"yaw_pitch_roll_deg"} | ({"mag_gauss"} if KINDS[frame["device"]] == "imu" else set())
+    decoded = {key: value for key, value in frame["decoded"].items() if key not in unused}
     if "sensor_heading_deg" in decoded:  # HDG: from its magnetic heading the rest follows
         magnetic_deg = decoded["heading_magnetic_deg"]
         if "deviation_deg" in decoded:

@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from companion.protocols.imus.witmotion import WitMotionDecoder
-from companion.samples import ImuSample, MagSample, Sample, TiltSample
+from companion.samples import ImuSample, Sample, TiltSample
 from tests.support.frames import sum8, wit, wit_imu
 
 NEXT = wit(0x50)
@@ -53,8 +53,10 @@ def test_angles_are_a_tilt_with_the_nose_up() -> None:
     assert feed(wit(0x53, 0, -32768) + NEXT) == ([], {"out of range": 1})
 
 
-def test_the_field_is_in_counts() -> None:
-    assert feed(wit(0x54, 360, 105, -122) + NEXT) == ([MagSample(1.0, counts=(360, 105, -122))], {})
+def test_a_field_gives_no_sample_and_is_understood() -> None:
+    decoder = WitMotionDecoder()
+    assert decoder.feed(wit(0x54, 360, 105, -122) + NEXT, 1.0) == []
+    assert (decoder.accepted, decoder.rejected.total()) == (1, 0)
 
 
 @pytest.mark.parametrize("kind", [0x50, 0x55, 0x56, 0x57, 0x58, 0x59, 0x5A, 0x5F])

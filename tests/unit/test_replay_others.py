@@ -387,16 +387,6 @@ def with_poses(still: tuple[Floats, ImuModel], columns: Mapping[str, Sequence[st
 TILT = {"tilt_x_deg": ["-2.9885", "-2.9885", "-2.9884"], "tilt_y_deg": ["5.0001", "4.9999"]}
 
 
-def field_ut() -> list[float]:
-    """Of the Earth at 40 N 116 E, some 54 uT 59 deg down and 7.5 deg west, in the vehicle's axes by three rotations."""
-    from scipy.spatial.transform import Rotation
-
-    strength, dip, west = 54.4, np.radians(58.9), np.radians(7.5)
-    ned = strength * np.array([np.cos(dip) * np.cos(west), -np.cos(dip) * np.sin(west), np.sin(dip)])
-    body = Rotation.from_euler("ZYX", [POSE.heading_deg, POSE.pitch_deg, POSE.roll_deg], degrees=True)
-    return [float(value) for value in body.inv().apply(ned)]
-
-
 PLACE = ["--latitude-deg", "40", "--longitude-deg", "116", "--height-m", "50"]
 
 
@@ -405,10 +395,8 @@ PLACE = ["--latitude-deg", "40", "--longitude-deg", "116", "--height-m", "50"]
     [
         ({"heading_deg": ["40.0", "40.1", "39.9"]}, [], 0.2),
         ({"heading_magnetic_deg": ["47.5", "47.6", "47.4"]}, [], 1.0),
-        ({f"m{axis}_ut": [f"{value:.3f}"] for axis, value in zip("xyz", field_ut(), strict=True)}, [], 1.0),
-        ({f"mag_{axis}": [f"{value * 10:.2f}"] for axis, value in zip("xyz", field_ut(), strict=True)}, [], 1.0),
     ],
-    ids=["true", "magnetic", "field", "field by size"],
+    ids=["true", "magnetic"],
 )
 def test_tilt_and_heading_of_the_log_take_the_place_of_the_options(
     tmp_path: Path,
@@ -426,36 +414,14 @@ def test_tilt_and_heading_of_the_log_take_the_place_of_the_options(
     assert pose["gamma_deg"] == pytest.approx(POSE.roll_deg, abs=0.01)
     assert pose["psi_deg"] == pytest.approx(POSE.heading_deg, abs=sigma_deg)
     assert_near(record["imus"][0], still[1])
-    # With a tilt that was told, the field alone gives the heading as well.
-    if "mx_ut" in columns:
-        _, told = replay(capsys, path, *PLACE, "--pitch-deg", "5", "--roll-deg", "-3")
-        assert told["pose"]["psi_deg"] == pytest.approx(pose["psi_deg"], abs=0.05)
-        assert "tilt in the log left out: it is given on the command line" in told["log"]["notes"]
 
 
-def test_the_field_is_turned_by_the_mounting(
+def test_a_tilt_of_the_command_line_takes_the_place_of_the_log_s(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
 ) -> None:
-    """The board's x points to the right, its y backward."""
-    data, model = still
-    turned = np.column_stack([data[:, 0], data[:, 2], -data[:, 1], data[:, 3], data[:, 5], -data[:, 4], data[:, 6]])
-    x, y, z = field_ut()
-    columns = {"mx_ut": [f"{y:.3f}"], "my_ut": [f"{-x:.3f}"], "mz_ut": [f"{z:.3f}"]}
-    path = written(tmp_path, with_poses((turned, model), {**TILT, **columns}))
-    code, record = replay(capsys, path, *PLACE, "--mounting", "ROTATION_YAW_90")
-    assert code == 0
-    assert record["pose"]["psi_deg"] == pytest.approx(POSE.heading_deg, abs=1.0)
-    assert_near(record["imus"][0], model)
-
-
-def test_a_field_without_a_tilt_is_said_to_be_of_no_use(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
-) -> None:
-    columns = {f"m{axis}_ut": [f"{value:.3f}"] for axis, value in zip("xyz", field_ut(), strict=True)}
-    code, record = replay(capsys, written(tmp_path, with_poses(still, columns)), *PLACE)
-    assert code == 0
-    assert record["pose"]["psi_deg"] is None
-    assert record["log"]["notes"] == ["magnetic field left out: without a tilt it tells no heading"]
+    path = written(tmp_path, with_poses(still, TILT))
+    _, told = replay(capsys, path, *PLACE, "--pitch-deg", "5", "--roll-deg", "-3")
+    assert told["log"]["notes"] == ["tilt in the log left out: it is given on the command line"]
 
 
 def test_a_tilt_that_moves_is_no_rest(

@@ -3,10 +3,10 @@
     75 65  set  length  (length, descriptor, data)...  F1 F2        big-endian; F1 F2: 8-bit Fletcher over all before
 
 Source: 3DM-GX5-35 data communications protocol manual, p. 12; MicroStrain's `mip_sdk`. Of the sensor data (set 0x80)
-are used: 0x04 accelerometer in g, 0x05 gyro in rad/s, 0x06 magnetometer in gauss, 0x12 GPS time of week in seconds,
-which is the device's own clock until it has a GPS time. Accelerometer and gyro have to be set to the same rate: they
-then share a packet, and only a pair makes a sample. Axes are X forward, Y right, Z down: level and at rest it reads
-z = -1 g, and a unit with X forward and its base down has the mounting ROTATION_NONE.
+are used: 0x04 accelerometer in g, 0x05 gyro in rad/s, 0x12 GPS time of week in seconds, which is the device's own clock
+until it has a GPS time. Accelerometer and gyro have to be set to the same rate: they then share a packet, and only a
+pair makes a sample. Axes are X forward, Y right, Z down: level and at rest it reads z = -1 g, and a unit with X forward
+and its base down has the mounting ROTATION_NONE.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from companion.physics.units import G
 from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import WAIT, FrameDecoder, RejectedError, check_imu, check_vector
 from companion.protocols.decoding.dialogue import WakeDialogue
-from companion.samples import ImuSample, MagSample, Sample, Vector
+from companion.samples import ImuSample, Sample, Vector
 
 _MARK = b"\x75\x65"
 _SENSOR_DATA = 0x80
-_ACCEL, _GYRO, _MAG, _GPS_TIME = 0x04, 0x05, 0x06, 0x12
+_ACCEL, _GYRO, _GPS_TIME = 0x04, 0x05, 0x12
 _VECTOR = struct.Struct(">3f")
 _TIME = struct.Struct(">dHH")
 _ABSENT: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 class MipDecoder(FrameDecoder):
-    """MIP packets; gives `ImuSample` and `MagSample`."""
+    """MIP packets; gives `ImuSample`."""
 
     device_clock_wraps_s: ClassVar[float | None] = 7 * 86400.0  # GPS time of week
 
@@ -66,7 +66,7 @@ def _decode(buffer: bytes, at: int, stop: int, t_s: float) -> list[Sample]:
         if length < 2 or field + length > stop:
             raise RejectedError(reasons.FIELD_COUNT)
         kind = buffer[field + 1]
-        if kind == _GPS_TIME or _ACCEL <= kind <= _MAG:
+        if kind in {_ACCEL, _GYRO, _GPS_TIME}:
             if length != 14:
                 raise RejectedError(reasons.FIELD_COUNT)
             if kind == _GPS_TIME:
@@ -75,21 +75,15 @@ def _decode(buffer: bytes, at: int, stop: int, t_s: float) -> list[Sample]:
             else:
                 found[kind] = _VECTOR.unpack_from(buffer, field + 2)
         field += length
-    accel_g, gyro_rad_s, mag_gauss = found.get(_ACCEL), found.get(_GYRO), found.get(_MAG)
+    accel_g, gyro_rad_s = found.get(_ACCEL), found.get(_GYRO)
     accel_m_s2 = _ABSENT
     if accel_g is not None:
         x, y, z = accel_g
         accel_m_s2 = (x * G, y * G, z * G)
     check_imu(gyro_rad_s or _ABSENT, accel_m_s2, None)
-    samples: list[Sample] = []
-    if accel_g is not None and gyro_rad_s is not None:
-        samples.append(ImuSample(t_s, gyro_rad_s, accel_m_s2, None, None, t_device_s))
-    if mag_gauss is not None:
-        check_vector(mag_gauss)
-        samples.append(MagSample(t_s, mag_gauss))
-    if not samples:
+    if accel_g is None or gyro_rad_s is None:
         raise RejectedError(reasons.NOTHING_OF_USE)
-    return samples
+    return [ImuSample(t_s, gyro_rad_s, accel_m_s2, None, None, t_device_s)]
 
 
 class MipDialogue(WakeDialogue):

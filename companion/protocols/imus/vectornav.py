@@ -27,12 +27,11 @@ from companion.protocols.decoding.base import (
     RejectedError,
     body_of_sentence,
     check_imu,
-    check_vector,
     numbers,
     xor_checksum,
 )
 from companion.protocols.decoding.dialogue import WakeDialogue
-from companion.samples import ImuSample, MagSample, Sample, Vector
+from companion.samples import ImuSample, Sample, Vector
 
 _Fields = tuple[tuple[str, str], ...]
 
@@ -78,11 +77,10 @@ _RATES: tuple[str, ...] = (
     "uncompensated_gyro_rad_s",
 )
 _ACCELERATIONS: tuple[str, ...] = ("accel_m_s2", "imu_accel_m_s2", "uncompensated_accel", "uncompensated_accel_m_s2")
-_MAGS = ("mag", "mag_gauss", "uncompensated_mag_gauss")
 _TEMPERATURES = ("temperature_degc", "temperature")
 _PARTS = {
     "uncompensated_accel_and_gyro": {"uncompensated_accel": 0, "uncompensated_gyro": 3},
-    "mag_temperature_pressure": {"mag": 0, "temperature": 3},
+    "mag_temperature_pressure": {"temperature": 3},
 }
 
 
@@ -107,7 +105,6 @@ class Layout:
     time_startup: int | None
     imu: tuple[int, int] | None
     temperature: int | None
-    mag: int | None
 
     def samples(self, frame: bytes, start: int, t_s: float) -> list[Sample]:
         """The samples in a frame that begins at `start` and has passed its CRC.
@@ -116,22 +113,15 @@ class Layout:
             RejectedError: a value is not finite or out of range, or there is nothing of use in it.
         """
         values = self.payload.unpack_from(frame, start + self.payload_offset)
-        samples: list[Sample] = []
-        if self.imu is not None:
-            gyro, accel = self.imu
-            gyro_rad_s: Vector = values[gyro : gyro + 3]
-            accel_m_s2: Vector = values[accel : accel + 3]
-            temperature_degc = None if self.temperature is None else values[self.temperature]
-            check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
-            t_device_s = None if self.time_startup is None else values[self.time_startup] / 1e9
-            samples.append(ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, None, t_device_s))
-        if self.mag is not None:
-            field_gauss: Vector = values[self.mag : self.mag + 3]
-            check_vector(field_gauss)
-            samples.append(MagSample(t_s, field_gauss))
-        if not samples:
+        if self.imu is None:
             raise RejectedError(reasons.NOTHING_OF_USE)
-        return samples
+        gyro, accel = self.imu
+        gyro_rad_s: Vector = values[gyro : gyro + 3]
+        accel_m_s2: Vector = values[accel : accel + 3]
+        temperature_degc = None if self.temperature is None else values[self.temperature]
+        check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
+        t_device_s = None if self.time_startup is None else values[self.time_startup] / 1e9
+        return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, None, t_device_s)]
 
 
 def layout_of(header: bytes) -> Layout:
@@ -163,7 +153,6 @@ def layout_of(header: bytes) -> Layout:
         time_startup=places.get("time_startup_ns"),
         imu=_pair(places),
         temperature=_first(places, _TEMPERATURES),
-        mag=_first(places, _MAGS),
     )
 
 
@@ -194,7 +183,7 @@ _REPLIES = frozenset((b"VNRRG", b"VNWRG", b"VNWNV", b"VNRFS", b"VNRST", b"VNTAR"
 
 
 class VectorNavDecoder(FrameDecoder):
-    """VectorNav outputs; gives `ImuSample` and `MagSample` as far as a frame has them."""
+    """VectorNav outputs; gives `ImuSample`."""
 
     device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
     clock_from_start: ClassVar[bool] = True
@@ -256,10 +245,10 @@ class VectorNavDecoder(FrameDecoder):
 
 
 _SENTENCES: dict[bytes, tuple[int, slice, slice]] = {
-    b"VNYMR": (12, slice(3, 12), slice(0, 0)),
-    b"VNIMU": (11, slice(0, 9), slice(9, 10)),
+    b"VNYMR": (12, slice(6, 12), slice(0, 0)),
+    b"VNIMU": (11, slice(3, 9), slice(9, 10)),
 }
-"""How many numbers there are, and which are field, force and rate, and the temperature."""
+"""How many numbers there are, and which are force and rate, and the temperature."""
 
 
 def _decode(sentence: bytes, t_s: float) -> list[Sample]:
@@ -273,10 +262,10 @@ def _decode(sentence: bytes, t_s: float) -> list[Sample]:
     if len(fields) != count:
         raise RejectedError(reasons.FIELD_COUNT)
     values = numbers(fields)
-    mx, my, mz, ax, ay, az, gx, gy, gz = values[vectors]
+    ax, ay, az, gx, gy, gz = values[vectors]
     gyro_rad_s, accel_m_s2, temperature_degc = (gx, gy, gz), (ax, ay, az), next(iter(values[temperature]), None)
     check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
-    return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc), MagSample(t_s, (mx, my, mz))]
+    return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc)]
 
 
 def _command(body: bytes) -> bytes:

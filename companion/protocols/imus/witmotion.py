@@ -3,7 +3,6 @@
     55 51 ax ay az T SUM      accelerations, 1/2048 g; temperature, 1/100 degree Celsius
     55 52 wx wy wz T SUM      rates, 2000/32768 deg/s
     55 53 roll pitch yaw V SUM      angles, 180/32768 deg
-    55 54 hx hy hz T SUM      magnetic field, counts whose unit differs by model
 
 Little-endian 16-bit numbers, and the low byte of the sum of the ten bytes before it. Sources: WitMotion's WT901 data
 sheet p. 10-14, WT901SDCL p. 13-16, HWT905-TTL protocol page (9600 8N1, 10 Hz, 51 to 54 as it comes).
@@ -27,7 +26,7 @@ from typing import Final
 from companion.physics.units import DEG, MG
 from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import WAIT, FrameDecoder
-from companion.samples import ImuSample, MagSample, Sample, TiltSample, Vector
+from companion.samples import ImuSample, Sample, TiltSample, Vector
 
 FRAME_BYTES: Final = 11
 ALONE: Final = "without company"
@@ -35,7 +34,7 @@ ALONE: Final = "without company"
 
 _START: Final = b"\x55"
 _FIRST_TYPE, _LAST_TYPE = 0x50, 0x5F
-_ACCEL, _GYRO, _ANGLE, _MAG = 0x51, 0x52, 0x53, 0x54
+_ACCEL, _GYRO, _ANGLE, _FIELD = 0x51, 0x52, 0x53, 0x54
 _NUMBERS: Final = struct.Struct("<4h")
 _G_M_S2: Final = 1e3 * MG
 _ACCEL_SCALE: Final = 16.0 * _G_M_S2 / 32768.0
@@ -46,7 +45,7 @@ _WRONG_SUM: Final = 0
 
 
 class WitMotionDecoder(FrameDecoder):
-    """Frames of a WitMotion device; gives `ImuSample`, `TiltSample` and `MagSample` in counts.
+    """Frames of a WitMotion device; gives `ImuSample` and `TiltSample`.
 
     Acceleration and rate of one epoch are neighbours on the wire and make one `ImuSample`, timed at the latter's end;
     without its neighbour neither is used.
@@ -87,8 +86,10 @@ class WitMotionDecoder(FrameDecoder):
         if accel is not None and not (kind == _GYRO and accel[0] == origin + at):
             self._drop_accel()
             accel = None
-        if not _ACCEL <= kind <= _MAG:
-            return  # time, ports, pressure, position, quaternion: right, but nothing for us
+        if kind == _FIELD:
+            self.accepted += 1  # not used, but it shows whose frames these are
+        if not _ACCEL <= kind <= _ANGLE:
+            return  # field, time, ports, pressure, position, quaternion: right, but nothing for us
         x, y, z, last = _NUMBERS.unpack_from(buffer, at + 2)
         if kind == _ACCEL:
             if max(x, y, z) == _GREATEST or min(x, y, z) == _LEAST:
@@ -105,9 +106,6 @@ class WitMotionDecoder(FrameDecoder):
                 gyro_rad_s = (x * _GYRO_SCALE, y * _GYRO_SCALE, z * _GYRO_SCALE)
                 samples.append(ImuSample(self._time_of(end), gyro_rad_s, accel[1], accel[2]))
                 self.accepted += 1
-        elif kind == _MAG:
-            samples.append(MagSample(self._time_of(end), counts=(x, y, z)))
-            self.accepted += 1
         elif max(abs(x), abs(y)) > 16384:  # beyond 90 degrees
             self.rejected[reasons.OUT_OF_RANGE] += 1
         else:

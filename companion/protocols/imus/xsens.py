@@ -5,8 +5,8 @@
 A length of 255 means that the true one follows in 16 bits. The low nibble of an id names the number format: 0 float32,
 1 fixed point 12.20, 2 fixed point 16.32 (the fraction first), 3 float64. Used are 0x1020 packet counter, 0x1060
 SampleTimeFine (ticks of 0.1 ms), 0x0810 temperature (sent once a second at most, and held), 0x4020 acceleration in
-m/s^2 and 0x8020 rate of turn in rad/s, else 0x4040 and 0x8040 (both at high rate), 0xC020 magnetic field in arbitrary
-units, 0xE020 status word. Sources: MT0605P.E p. 48 (status word) and chapter 5; MT0101P for identifiers and formats.
+m/s^2 and 0x8020 rate of turn in rad/s, else 0x4040 and 0x8040 (both at high rate), 0xE020 status word. Sources:
+MT0605P.E p. 48 (status word) and chapter 5; MT0101P for identifiers and formats.
 
 Axes: X forward, Y left, Z up; level and at rest it reads z = +9.8. The axes are the device's own: an MTi that lies on
 its base with X forward becomes forward, right, down by the mounting ROTATION_ROLL_180.
@@ -18,22 +18,20 @@ import struct
 from typing import ClassVar, Final
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import WAIT, FrameDecoder, RejectedError, check_imu, check_vector
+from companion.protocols.decoding.base import WAIT, FrameDecoder, RejectedError, check_imu
 from companion.protocols.decoding.dialogue import WakeDialogue
-from companion.samples import ImuSample, MagSample, Sample, Vector
+from companion.samples import ImuSample, Sample, Vector
 
 MAX_DATA_BYTES: Final = 1024
 """The longest message of inertial data has some 200."""
-MAG_COUNTS: Final = 10_000
-"""Counts for one of the arbitrary units of the magnetic field."""
 
 _MARK = b"\xfa\xff"
 _MT_DATA_2 = 0x36
 _EXTENDED = 0xFF
 _HEAD = struct.Struct(">HB")
 _COUNTER, _TIME, _TEMPERATURE, _STATUS = 0x1020, 0x1060, 0x0810, 0xE020
-_ACCEL, _ACCEL_HR, _GYRO, _GYRO_HR, _MAG = 0x4020, 0x4040, 0x8020, 0x8040, 0xC020
-_VECTORS = frozenset((_ACCEL, _ACCEL_HR, _GYRO, _GYRO_HR, _MAG))
+_ACCEL, _ACCEL_HR, _GYRO, _GYRO_HR = 0x4020, 0x4040, 0x8020, 0x8040
+_VECTORS = frozenset((_ACCEL, _ACCEL_HR, _GYRO, _GYRO_HR))
 _TICKS_A_SECOND = 10_000.0
 _CLIPPED = 0x3F00
 """Bits 8 to 10 of the status word: acceleration out of range on X, Y, Z; bits 11 to 13: rate."""
@@ -43,7 +41,7 @@ _FLOAT32 = struct.Struct(">3f")
 
 
 class XsensDecoder(FrameDecoder):
-    """MTData2 messages; gives `ImuSample`, and `MagSample` with counts for want of a unit."""
+    """MTData2 messages; gives `ImuSample`."""
 
     device_clock_wraps_s: ClassVar[float | None] = 2**32 / _TICKS_A_SECOND
     clock_from_start: ClassVar[bool] = True
@@ -116,17 +114,9 @@ class XsensDecoder(FrameDecoder):
             gyro_rad_s = gyro_rad_s or vectors.get(_GYRO_HR)
             accel_m_s2 = accel_m_s2 or vectors.get(_ACCEL_HR)
         check_imu(gyro_rad_s or _ABSENT, accel_m_s2 or _ABSENT, None)
-        samples: list[Sample] = []
-        if gyro_rad_s is not None and accel_m_s2 is not None:
-            samples.append(ImuSample(t_s, gyro_rad_s, accel_m_s2, self._temperature_degc, counter, t_device_s))
-        mag = vectors.get(_MAG)
-        if mag is not None:
-            check_vector(mag)
-            x, y, z = mag
-            samples.append(MagSample(t_s, None, (round(x * MAG_COUNTS), round(y * MAG_COUNTS), round(z * MAG_COUNTS))))
-        if not samples:
+        if gyro_rad_s is None or accel_m_s2 is None:
             raise RejectedError(reasons.NOTHING_OF_USE)
-        return samples
+        return [ImuSample(t_s, gyro_rad_s, accel_m_s2, self._temperature_degc, counter, t_device_s)]
 
 
 def _unsigned(data: bytes, size: int) -> int:
