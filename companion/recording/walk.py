@@ -7,7 +7,6 @@ does; and it believes every length that a file says.
 
 from __future__ import annotations
 
-import codecs
 import io
 import mmap
 import struct
@@ -71,8 +70,7 @@ def is_text(path: Path) -> bool:
     """
     with path.open("rb") as file:
         head = file.read(len(MAGIC))
-    wide = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    return bool(head) and not MAGIC.startswith(head) and (wide or b"\0" not in head)
+    return bool(head) and not MAGIC.startswith(head) and b"\0" not in head
 
 
 class Recording:

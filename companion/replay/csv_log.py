@@ -1,21 +1,19 @@
-"""A table of text, as apps, loggers and other people's programs write them: its samples, and what was left out of it.
+"""A CSV log of an IMU: names of columns that say quantity and unit, then a line for each sample.
 
-`columns` says what its columns mean, `sizes` in which units, where nothing says it.
+There is one vocabulary of names (`COLUMNS`), for the header of the file and for --columns alike. Nothing is guessed: a
+column of another name is passed over, and said.
 """
 
 from __future__ import annotations
 
-import codecs
 import csv
-import datetime
 import itertools
 import math
-import re
 from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Final, NamedTuple, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,135 +21,149 @@ from numpy.typing import NDArray
 from companion.calibration.noise.robust import median
 from companion.errors import StorageError
 from companion.physics.frames import Floats
-from companion.replay import sizes
-from companion.replay.columns import (
-    IMU,
-    TILT,
-    TIMES,
-    UNITS,
-    Columns,
-    columns_of,
-    looks_like_units,
-    meaning,
-)  # fmt: skip
+from companion.physics.units import DEG, DEG_H, MG, G
 from companion.replay.log import LAST_S, NAME, Poses, StillLog
 
+IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
+TILT: Final = ("tilt_x", "tilt_y")
+_UNITS: Final[tuple[tuple[tuple[str, ...], dict[str, float]], ...]] = (
+    (("t",), {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}),
+    (IMU[:3], {"rad_s": 1.0, "deg_s": DEG, "deg_h": DEG_H, "mdeg_s": 1e-3 * DEG}),
+    (IMU[3:], {"m_s2": 1.0, "g": G, "mg": MG}),
+    (("temperature",), {"degc": 1.0}),
+    ((*TILT, "heading", "heading_magnetic"), {"deg": 1.0}),
+)
+COLUMNS: Final[dict[str, tuple[str, float]]] = {
+    f"{what}_{unit}": (what, factor)
+    for quantities, units in _UNITS
+    for what in quantities
+    for unit, factor in units.items()
+}
+"""By name of a column: quantity, and factor to seconds, rad/s, m/s^2, degrees and degrees Celsius."""
+HEADER: Final = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2"
+GRAVITY_M_S2: Final = (7.0, 12.6)
+"""Median specific force of a log at rest or nearly so: beyond, the unit or the column is another one than named."""
+
+_SEPARATORS: Final = (";", "\t", ",", " ")
 _LONGEST: Final = 1 << 14
 """The most characters of a line: a hundred columns have a tenth of that."""
-_REMARKS: Final = ("#", "//", "%")
-_NO_NUMBER: Final = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "--", "nil", "#n/a"))
-_MOST_TEXTS: Final = 60
-"""Lines of text before the numbers: a logger's preamble, the names, the units."""
 _AT_ONCE: Final = 4096
 _NUMBERS: Final = 1e20
-"""What is larger is none, in any unit: nanoseconds since 1970 are 2e18."""
+"""Limit of a number in any unit: nanoseconds since 1970 are 2e18."""
 _WRAPS: Final = 2.0**32
 """A counter of 32 bits begins anew: an Arduino's micros() every 71.6 min."""
-_DECIMAL_COMMA: Final = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?")
+_MOST_NAMED: Final = 12
 
 
-def _lines(file: TextIO, path: Path) -> Iterator[tuple[int, str]]:
-    """The lines of a file with their numbers; a last one that is cut is left out."""
-    some, readline = False, lambda: file.readline(_LONGEST)
-    for number, line in enumerate(iter(readline, ""), 1):
-        if len(line) == _LONGEST:
-            raise StorageError(f"{path}, line {number}: found no line end within {_LONGEST} characters")
-        if some and not line.endswith(("\n", "\r")):
-            return  # in the middle of a number, perhaps, which then still looks like one
-        text = line.strip(" \r\n")
-        if text[:1].isdigit() or (
-            text.strip() and not text.startswith(_REMARKS) and not text.lower().startswith("sep=")
-        ):
-            some = True
-            yield number, text
+class Column(NamedTuple):
+    """One column that is read."""
+
+    place: int
+    """From 0."""
+    factor: float
+    name: str
 
 
 def read(path: Path, columns: str | None = None, rate_hz: float | None = None, name: str = NAME) -> StillLog:
-    """All that is of use in a CSV file: semicolons, tabs, commas or blanks; "#", "//" and "%" begin a remark.
+    """Read a CSV file: semicolons, tabs, commas or blanks; "#" begins a remark.
 
-    `columns` in their order stand in place of the file's own, a rate in place of its times.
+    `columns`, separated by commas, take the place of the file's header, and a rate that of its times.
 
     Raises:
         StorageError: one line with the number of the line, what was found and what is allowed.
     """
     try:
-        with path.open("rb") as file:
-            wide = file.read(2) in {codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE}
-        # Where it is Latin-1 instead, the degree sign still shows (`columns`).
-        encoding, errors = ("utf-16", "strict") if wide else ("utf-8-sig", "surrogateescape")
-        with path.open(encoding=encoding, errors=errors, newline="") as file:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
             return _Table(path, file, columns, rate_hz).log(name)
-    except UnicodeError as error:
-        raise StorageError(f"{path}: cannot be read as text: {error}") from None
     except OSError as error:
         raise StorageError(f"{path}: cannot be read as text: {error.strerror or error}") from None
+
+
+def columns_of(names: Sequence[str], where: str, *, timed: bool) -> dict[str, Column]:
+    """Map quantities to columns; one is time, if `timed`.
+
+    Raises:
+        StorageError: a quantity is missing, or is there twice.
+    """
+    used: dict[str, Column] = {}
+    for place, name in enumerate(names):
+        if (known := COLUMNS.get(name)) is not None:
+            what, factor = known
+            if what in used:
+                raise StorageError(f"{where}: two columns for {what}: {used[what].name} and {name}")
+            used[what] = Column(place, factor, name)
+    if not timed:
+        used.pop("t", None)
+    wanted = (*(("t",) if timed else ()), *IMU, *(TILT if used.keys() & {*TILT} else ()))
+    if missing := [what for what in wanted if what not in used]:
+        rate = "; a log without time: --rate HZ" if "t" in missing else ""
+        raise StorageError(
+            f"{where}: no column for {', '.join(missing)} in {_some(names)}{rate}; allowed: {HEADER} or other units"
+            " (docs/recording.md), in the file or in --columns"
+        )
+    return used
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return ", ".join(name[:40] for name in names[:_MOST_NAMED]) + more
+
+
+def _lines(file: TextIO, path: Path) -> Iterator[tuple[int, str]]:
+    """Give the lines of a file with their numbers; leave out blank ones, remarks, and a last one that is cut."""
+    for number, line in enumerate(iter(lambda: file.readline(_LONGEST), ""), 1):
+        if len(line) == _LONGEST:
+            raise StorageError(f"{path}, line {number}: found no line end within {_LONGEST} characters")
+        if number > 1 and not line.endswith("\n"):
+            return  # in the middle of a number, perhaps, which then still looks like one
+        text = line.strip(" \n")
+        if text.strip() and not text.startswith("#"):
+            yield number, text
 
 
 class _Table:
     """One file while it is read."""
 
     def __init__(self, path: Path, file: TextIO, names: str | None, rate_hz: float | None) -> None:
-        self._path = path
-        self._rate_hz = rate_hz
+        self._path, self._rate_hz = path, rate_hz
         self._left_out: Counter[str] = Counter()
-        self._notes: list[str] = []
         lines = _lines(file, path)
-        texts, (number, first) = self._beginning(lines)
-        self._separator = _separator(first, [text for _, text in texts])
-        self._comma = self._separator != "," and any(map(_DECIMAL_COMMA.fullmatch, self._split(first)))
-        self._columns, self._again = self._named(texts, names, number)
-        self._width = len(self._columns.names)
-        self._dates = False
-        self._data = itertools.chain(((number, first),), lines)
+        number, first = next(lines, (0, ""))
+        if not number:
+            raise StorageError(f"{path}: the file is empty")
+        self._separator = _separator(first)
+        if names is None:
+            self._names = [name.strip() for name in _fields(first, self._separator)]
+            where = f"{path}, line {number}"
+        else:
+            self._names, where = names.split(","), "--columns"
+            lines = itertools.chain(((number, first),), lines)
+            lines = itertools.dropwhile(lambda line: self._is_text(line[1]), lines)
+            first_of_numbers = next(lines, (0, ""))
+            self._separator = _separator(first_of_numbers[1])
+            lines = itertools.chain((first_of_numbers,) if first_of_numbers[0] else (), lines)
+        while self._names and not self._names[-1]:
+            self._names.pop()  # a separator at the end of the line
+        self._columns = columns_of(self._names, where, timed=rate_hz is None)
+        passed = [name for name in self._names if name not in COLUMNS and name != "-"]
+        self._notes = [f"columns passed over: {_some(passed)}"] if passed else []
+        self._data = lines
 
-    # --- the beginning
-
-    def _beginning(self, lines: Iterator[tuple[int, str]]) -> tuple[list[tuple[int, str]], tuple[int, str]]:
-        """The lines of text before the first one of numbers, and that one."""
-        texts: list[tuple[int, str]] = []
-        for line in lines:
-            if any(_is_data(_fields(line[1], separator)) for separator in _SEPARATORS):
-                return texts, line
-            texts.append(line)
-            if len(texts) > _MOST_TEXTS:
-                raise StorageError(f"{self._path}: no line of numbers among the first {_MOST_TEXTS}")
-        if not texts:
-            raise StorageError(f"{self._path}: the file is empty")
-        return texts, (0, "")
-
-    def _split(self, text: str) -> list[str]:
-        return _fields(text, self._separator)
-
-    def _named(self, texts: Sequence[tuple[int, str]], names: str | None, first: int) -> tuple[Columns, list[str]]:
-        """The columns, and their names as they may come again further down; numbers begin in line `first`."""
-        timed = self._rate_hz is None
-        if names is not None:
-            return columns_of(names.split(","), "--columns", timed=timed), []
-        if not texts:
-            raise StorageError(
-                f"{self._path}, line {first}: no names of columns; name them: --columns t_s,gx_rad_s,..."
-            )
-        rows = [self._split(text) for _, text in texts]
-        known = [sum(meaning(name) is not None for name in row) for row in rows]
-        at = known.index(max(known)) if any(known) else len(rows) - 1
-        head = rows[at]
-        while len(head) > 1 and not head[-1].strip():
-            head = head[:-1]
-        units = next((row for row in rows[at + 1 :] if looks_like_units(row)), [])
-        return columns_of(head, f"{self._path}, line {texts[at][0]}", units, timed=timed), head
-
-    # --- the numbers
+    def _is_text(self, line: str) -> bool:
+        """Whether a line stands before the numbers: another header, a logger's preamble."""
+        fields = _fields(line, _separator(line))
+        return len(fields) < len(self._names) or not any(map(_is_number, fields))
 
     def log(self, name: str) -> StillLog:
         """Read it to its end."""
-        order = [what for what in UNITS if what in self._columns.used]
+        order = [what for quantities, _ in _UNITS for what in quantities if what in self._columns]
         flat, numbers = array("d"), array("I")
-        for lines, block in self._blocks([self._columns.used[what].place for what in order]):
+        for lines, block in self._blocks([self._columns[what].place for what in order]):
             block[~(np.abs(block) < _NUMBERS)] = math.nan
             flat.frombytes(np.ascontiguousarray(block).tobytes())
             numbers.extend(lines)
         if not flat:
-            raise StorageError(f"{self._path}: no line of numbers in it")
+            raise StorageError(f"{self._path}: no line of numbers in it with {len(self._names)} fields")
         table = np.frombuffer(flat).reshape(-1, len(order))
         values = {what: table[:, column] for column, what in enumerate(order)}
         first = order.index("gx")
@@ -162,10 +174,9 @@ class _Table:
         if len(kept) < len(readings):
             readings = readings[kept]
             values = {what: column[kept] for what, column in values.items()}
-        units, notes = sizes.units_of(self._columns, t_s, readings, str(self._path))
-        self._notes += notes
         # In place: of a night it is the largest thing there is.
-        readings *= sizes.factors(units)
+        readings *= [self._columns[what].factor for what in IMU]
+        self._check_gravity(readings[:, 3:])
         return StillLog(
             imu=name,
             files=(self._path.name,),
@@ -173,26 +184,32 @@ class _Table:
             t_s=t_s,
             readings=readings,
             temperature_degc=values.get("temperature", np.full(len(t_s), math.nan)),
-            poses=self._poses(values),
+            poses=_poses(values),
             notes=tuple(self._notes),
             left_out=dict(self._left_out),
         )
 
+    def _check_gravity(self, forces: Floats) -> None:
+        """Refuse units that make gravity another one: they would make another bias, too."""
+        with np.errstate(over="ignore"):
+            found_m_s2 = float(median(np.sqrt(np.square(forces).sum(axis=1))))
+        low, high = GRAVITY_M_S2
+        if not low <= found_m_s2 <= high:
+            names = ", ".join(self._columns[what].name for what in IMU[3:])
+            raise StorageError(
+                f"{self._path}: {names} read {found_m_s2:.4g} m/s^2 in all; allowed: gravity, {low:g} to {high:g}: name"
+                " their right unit, or log the accelerometer itself"
+            )
+
     def _blocks(self, places: Sequence[int]) -> Iterator[tuple[list[int], Floats]]:
-        """Some thousand lines at a time: their numbers, and what stands in the columns."""
-        texts, numbers = [], []
-        for number, text in self._data:
-            texts.append(text)
-            numbers.append(number)
-            if len(texts) == _AT_ONCE:
-                yield self._block(texts, numbers, places)
-                texts, numbers = [], []
-        if texts and texts != [""]:
+        """Give some thousand lines at a time: their numbers, and the values of the columns."""
+        while some := list(itertools.islice(self._data, _AT_ONCE)):
+            numbers, texts = [number for number, _ in some], [text for _, text in some]
             yield self._block(texts, numbers, places)
 
     def _block(self, texts: list[str], numbers: list[int], places: Sequence[int]) -> tuple[list[int], Floats]:
-        separator, between = self._separator, self._width - 1
-        if separator != " " and not self._comma and all(text.count(separator) == between for text in texts):
+        separator, between = self._separator, len(self._names) - 1
+        if separator != " " and all(text.count(separator) == between for text in texts):
             try:
                 found = np.loadtxt(texts, delimiter=separator, usecols=places, comments=None, quotechar='"', ndmin=2)
             except ValueError:
@@ -207,9 +224,6 @@ class _Table:
         try:
             for row in rows:
                 number = numbers[rows.line_num - 1]
-                if row == self._again:
-                    self._left_out["names again"] += 1
-                    continue
                 self._check_width(number, row)
                 values.append([self._number(row[place], number, place) for place in places])
                 lines.append(number)
@@ -218,36 +232,25 @@ class _Table:
         return lines, np.array(values).reshape(-1, len(places))
 
     def _check_width(self, number: int, row: Sequence[str]) -> None:
-        if len(row) < self._width or any(field.strip() for field in row[self._width :]):
+        width = len(self._names)
+        if len(row) < width or any(field.strip() for field in row[width:]):
             raise StorageError(
-                f"{self._path}, line {number}: found {len(row)} fields; allowed: {self._width}, as many as columns"
+                f"{self._path}, line {number}: found {len(row)} fields; allowed: {width}, as many as columns"
             )
 
     def _number(self, field: str, line: int, place: int) -> float:
-        text = field.strip(_AROUND)
-        if self._comma:
-            text = text.replace(",", ".")
+        text = field.strip(' "\t\r\n')
         try:
-            return float(text)
+            return float(text or "nan")
         except ValueError:
-            if text.lower() in _NO_NUMBER:
-                return math.nan
-        if "t" in self._columns.used and place == self._columns.used["t"].place:
-            try:
-                found = datetime.datetime.fromisoformat(text)
-            except ValueError:
-                pass
-            else:
-                self._dates = True
-                return (found if found.tzinfo else found.replace(tzinfo=datetime.UTC)).timestamp()
-        raise StorageError(
-            f"{self._path}, line {line}: found {field!r} in column {self._columns.names[place]}; allowed: a number"
-        )
+            raise StorageError(
+                f"{self._path}, line {line}: found {field!r} in column {self._names[place]}; allowed: a number"
+            ) from None
 
     # --- times
 
     def _times(self, stamps: Floats | None, readings: Floats, numbers: array[int]) -> tuple[Floats, NDArray[np.intp]]:
-        """Times of the lines that count, and which those are."""
+        """Give the times of the lines that count, and which those are."""
         whole = np.asarray(np.isfinite(readings).all(axis=1))
         self._count("without a number in each of " + ", ".join(IMU), whole)
         if stamps is None:
@@ -257,8 +260,7 @@ class _Table:
         timed = np.isfinite(stamps)
         self._count("without a time", timed)
         kept = np.flatnonzero(whole & timed)
-        raw = _unwrapped(stamps[kept])
-        t_s = raw * TIMES[self._time_unit(raw)]
+        t_s = _unwrapped(stamps[kept]) * self._columns["t"].factor
         if len(t_s) and np.abs(t_s).max() > LAST_S:
             line = numbers[int(kept[np.abs(t_s).argmax()])]
             raise StorageError(
@@ -283,23 +285,8 @@ class _Table:
         if count := int((~good).sum()):
             self._left_out[why] += count
 
-    def _time_unit(self, raw: Floats) -> str:
-        column = self._columns.used["t"]
-        if self._dates:
-            return "s"
-        if column.unit is not None:
-            return column.unit
-        unit = sizes.seconds_per(np.diff(raw))
-        if unit is None:
-            raise StorageError(
-                f"{self._path}: column {column.name} says no unit, and its steps do not tell; name them: --columns"
-                f" {self._columns.named({'t': 's'})}"
-            )
-        self._notes.append(f"{column.name}: taken for {unit}, by its steps")
-        return unit
-
     def _spread(self, t_s: Floats) -> Floats:
-        """Lines of one stamp evenly over the time to the next one: a logger's clock has coarse steps."""
+        """Spread lines of one stamp evenly over the time to the next one: a logger's clock has coarse steps."""
         first = np.flatnonzero(np.diff(t_s, prepend=-math.inf) > 0.0)
         runs = np.diff(np.append(first, len(t_s)))
         if len(first) == len(t_s):
@@ -311,24 +298,14 @@ class _Table:
         within = np.arange(len(t_s)) - np.repeat(first, runs)
         return np.asarray(t_s + within * np.repeat(steps / runs, runs))
 
-    # --- what else there is
 
-    def _poses(self, values: dict[str, Floats]) -> Poses | None:
-        used = self._columns.used
-        factor = {what: UNITS[what][column.unit] for what, column in used.items() if column.unit is not None}
-        tilt = heading = None
-        if TILT[0] in values:
-            tilt = np.column_stack([values[what] * factor[what] for what in TILT])
-        for what in ("heading_magnetic", "heading"):
-            if what in values:
-                heading, magnetic = values[what] * factor[what], what == "heading_magnetic"
-        if tilt is None and heading is None:
-            return None
-        return Poses(tilt_deg=tilt, heading_deg=heading, magnetic=heading is not None and magnetic)
-
-
-_SEPARATORS: Final = (";", "\t", ",", " ")
-_AROUND: Final = ' "\t\r\n'
+def _poses(values: dict[str, Floats]) -> Poses | None:
+    tilt = np.column_stack([values[what] for what in TILT]) if TILT[0] in values else None
+    true, magnetic = values.get("heading"), values.get("heading_magnetic")
+    heading = magnetic if true is None else true
+    if tilt is None and heading is None:
+        return None
+    return Poses(tilt_deg=tilt, heading_deg=heading, magnetic=true is None and magnetic is not None)
 
 
 def _fields(text: str, separator: str) -> list[str]:
@@ -338,31 +315,19 @@ def _fields(text: str, separator: str) -> list[str]:
         return [text]
 
 
-def _separator(first: str, texts: Sequence[str]) -> str:
-    """Of the first line of numbers; where that has but one field, of the texts before it."""
-    for separator in _SEPARATORS:
-        fields = _fields(first, separator)
-        if len(fields) > 1 and _is_data(fields):
-            return separator
-    return max(_SEPARATORS, key=lambda separator: max((text.count(separator) for text in texts), default=0))
-
-
-def _is_data(fields: Sequence[str]) -> bool:
-    """Whether there are more numbers than words in a line."""
-    texts = [text for field in fields if (text := field.strip(_AROUND)).lower() not in _NO_NUMBER]
-    numbers = sum(_is_number(text) for text in texts)
-    return numbers > len(texts) - numbers
+def _separator(text: str) -> str:
+    return next((each for each in _SEPARATORS if each in text), ",")
 
 
 def _is_number(text: str) -> bool:
     try:
         return math.isfinite(float(text))
     except ValueError:
-        return _DECIMAL_COMMA.fullmatch(text) is not None
+        return False
 
 
 def _unwrapped(stamps: Floats) -> Floats:
-    """The stamps of a counter of 32 bits, carried on over its end."""
+    """Carry the stamps of a counter of 32 bits on over its end."""
     falls = np.diff(stamps) < -_WRAPS / 2.0
     if not falls.any() or not (np.abs(stamps) < _WRAPS).all():
         return stamps

@@ -325,7 +325,7 @@ def test_a_profile_that_does_not_keep_its_word_is_not_saved(tmp_path: Path, caps
 @pytest.mark.parametrize(
     ("text", "more", "code", "words"),
     [
-        ("t_s,gx\n1,2\n", [], 1, "line 1: no column for gy, gz, ax, ay, az in t_s, gx"),
+        ("t_s,gx\n1,2\n", [], 1, "line 1: no column for gx, gy, gz, ax, ay, az in t_s, gx"),
         ("", [], 1, "the file is empty"),
         (None, [], 1, "No such file"),
         (None, ["--save", "bmi088"], 1, "that name is the catalogue's"),
