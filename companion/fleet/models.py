@@ -10,7 +10,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.calibration.noise.robust import median
 from companion.physics.frames import Floats
 
 LEAST_POWER_UPS: Final = 8
@@ -67,7 +66,7 @@ def scatter_of_model(parts: Sequence[Scatter]) -> Scatter | None:
 def middle_of(values: Floats, least: int = 1) -> float:
     """The median of those that are known; NaN: they are fewer than `least`."""
     there = values[np.isfinite(values)]
-    return float(median(there)) if len(there) >= least else np.nan
+    return float(np.median(there)) if len(there) >= least else np.nan
 
 
 def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float, float]:
@@ -94,4 +93,4 @@ def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float, float
 
 
 def _sigma(steps: Floats) -> float:
-    return MAD_TO_SIGMA * float(median(np.abs(steps)))
+    return MAD_TO_SIGMA * float(np.median(np.abs(steps)))

@@ -15,7 +15,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.noise.robust import HUBER_C, median
+from companion.calibration.noise.robust import HUBER_C
 from companion.physics.frames import Floats
 
 CLIP: Final = 3.0
@@ -154,7 +154,7 @@ def watch(  # noqa: PLR0915
             rose = up[column] > LEVEL_LIMIT
             since = int((up_0 if rose else down_0)[column])
             level = _at_one_temperature(y, laws, x, column)
-            moved = median(level[since : k + 1]) - median(level[max(since - _BASE, 0) : since])
+            moved = np.median(level[since : k + 1]) - np.median(level[max(since - _BASE, 0) : since])
             if not abs(moved) >= least[column]:
                 continue
             alarms.append(Alarm(column, "level", since, k, n, float(moved)))
@@ -184,13 +184,13 @@ def _begin(y: Floats, laws: Floats, there: NDArray[np.bool_]) -> tuple[Floats, F
         inverse = np.linalg.inv((laws * weight[:, None]).T @ laws + np.diag(1.0 / _BEFORE))
         x = inverse @ (laws * weight[:, None]).T @ y
         off = np.abs(y - laws @ x)
-        scale = max(1.4826 * float(median(off)), 1.0)
+        scale = max(1.4826 * float(np.median(off)), 1.0)
         weight = np.asarray(there * np.minimum(HUBER_C * scale / np.maximum(off, 1e-9), 1.0), dtype=np.float64)
     return x, np.asarray(inverse, dtype=np.float64), float((weight * np.square(off)).sum())
 
 
 def _scatter(level: Floats) -> float:
-    return float(1.4826 * median(np.abs(np.diff(level))) / np.sqrt(2.0)) if len(level) > 1 else 0.0
+    return float(1.4826 * np.median(np.abs(np.diff(level))) / np.sqrt(2.0)) if len(level) > 1 else 0.0
 
 
 def _at_one_temperature(y: Floats, laws: Floats, x: Floats, column: int) -> Floats:

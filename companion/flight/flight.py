@@ -14,7 +14,7 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.calibration.noise.allan import PROFILES, noise_profile
-from companion.calibration.noise.robust import MAD_TO_SIGMA, median
+from companion.calibration.noise.robust import MAD_TO_SIGMA
 from companion.calibration.records.flight_record import Drift, Flight, ImuFlight, Moment, Stages, Term
 from companion.calibration.records.record import Record
 from companion.calibration.solution.prior import curve_of
@@ -245,8 +245,8 @@ def _kept(rows: Sequence[Window]) -> list[Window]:
     if len(rows) < 4:
         return list(rows)
     values = np.array([[*one.gyro_rad_s, one.down_m_s2] for one in rows])
-    off = np.abs(values - [median(column) for column in values.T])
-    usual = np.maximum([MAD_TO_SIGMA * median(column) for column in off.T], _USUAL)
+    off = np.abs(values - [np.median(column, axis=0) for column in values.T])
+    usual = np.maximum([MAD_TO_SIGMA * np.median(column, axis=0) for column in off.T], _USUAL)
     return [one for one, far in zip(rows, (off > _OUTLIER * usual).any(axis=1), strict=True) if not far]
 
 

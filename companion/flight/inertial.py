@@ -12,7 +12,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.calibration.noise.robust import median
 from companion.calibration.records.flight_record import Drift
 from companion.physics.frames import Floats, rotations, running_products
 
@@ -129,7 +128,7 @@ def lag_s(found: Increments, solution: Navigation) -> float:
     Over a short while readings that are late have turned by less than the solution has, by the rate at its end less
     that at its beginning, times the delay.
     """
-    span = max(round(_LAG_SPAN_S / float(median(found.dt_s))), 1)
+    span = max(round(_LAG_SPAN_S / float(np.median(found.dt_s))), 1)
     rate = found.angle / found.dt_s[:, None]
     holes = np.cumsum(found.dt_s > GAP_S)
     k = np.arange(1, len(found.t_s) - span, span)
@@ -147,7 +146,7 @@ def lag_s(found: Increments, solution: Navigation) -> float:
         found_s = -float((by_off * by_change).sum()) / power if power > 0.0 else 0.0
         # Where the solution found its heading anew, no filter is to blame.
         size = np.linalg.norm(off + found_s * change, axis=1)
-        usual = size <= _OUTLIER * max(float(median(size)), 1e-9)
+        usual = size <= _OUTLIER * max(float(np.median(size)), 1e-9)
     return found_s if abs(found_s) < _MOST_LAG_S else 0.0
 
 

@@ -13,7 +13,6 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.noise.robust import median
 from companion.calibration.records.flight_record import AXES, Split, Term
 from companion.flight.inertial import Window
 from companion.physics.frames import Floats
@@ -101,7 +100,7 @@ def _slopes(
     columns = {}
     if len(times) > _LEAST and np.ptp(times) >= _LEAST_TREND_S:
         columns["trend"] = (times - times.mean()) / 60.0
-    if levels is not None and len(levels) and levels.std() > _LEAST_SPREAD * abs(median(levels)):
+    if levels is not None and len(levels) and levels.std() > _LEAST_SPREAD * abs(np.median(levels)):
         columns["vibration"] = levels - levels.mean()
     freedom = len(values) - 1 - len(columns)
     if not columns or freedom < _LEAST:

@@ -18,7 +18,6 @@ from typing import Final, NamedTuple, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.noise.robust import median
 from companion.errors import StorageError
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG, G
@@ -192,7 +191,7 @@ class _Table:
     def _check_gravity(self, forces: Floats) -> None:
         """Refuse units that make gravity another one: they would make another bias, too."""
         with np.errstate(over="ignore"):
-            found_m_s2 = float(median(np.sqrt(np.square(forces).sum(axis=1))))
+            found_m_s2 = float(np.median(np.sqrt(np.square(forces).sum(axis=1))))
         low, high = GRAVITY_M_S2
         if not low <= found_m_s2 <= high:
             names = ", ".join(self._columns[what].name for what in IMU[3:])
@@ -293,7 +292,7 @@ class _Table:
             return t_s
         self._notes.append(f"{len(t_s) - len(first)} lines with the time of the line before: spread evenly")
         steps = np.diff(t_s[first])
-        usual = median(steps) if len(steps) else 0.0
+        usual = np.median(steps, axis=0) if len(steps) else 0.0
         steps = np.minimum(np.append(steps, usual), usual)
         within = np.arange(len(t_s)) - np.repeat(first, runs)
         return np.asarray(t_s + within * np.repeat(steps / runs, runs))

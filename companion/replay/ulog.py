@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.noise.robust import median
 from companion.errors import StorageError
 from companion.replay.blocks import DROPOUTS, PARAMETERS, US, Block, Kept, Progress, columns, nobody, pieces
 
@@ -144,7 +143,7 @@ class _Log:
         self.waiting = []
         if latest:
             # One of them may be damaged.
-            self._now_s = float(median(latest))
+            self._now_s = float(np.median(latest))
         if self._parameters:
             times, names, values = zip(*self._parameters, strict=True)
             self._parameters = []

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
-from companion.calibration.noise.robust import HUBER_C, huber_line, huber_mean, median, robust_mean, slope_limit
-from companion.physics.frames import Floats
+from companion.calibration.noise.robust import HUBER_C, huber_line, huber_mean, robust_mean, slope_limit
 
 
 def test_huber_mean_solves_its_own_equation() -> None:
@@ -121,14 +117,3 @@ def test_chance_seldom_makes_a_slope_of_ten_seconds() -> None:
     line = huber_line(np.arange(10.0), np.random.default_rng(9).normal(size=(10, 20_000)), 10.0)
     assert float(np.mean(np.abs(line.t_statistic) > slope_limit(10))) < 1e-3
     assert float(np.mean(np.abs(line.t_statistic) > 5.0)) > 2e-3
-
-
-@settings(max_examples=200)
-@given(
-    st.integers(1, 9).flatmap(
-        lambda rows: arrays(np.float64, st.sampled_from([(rows,), (rows, 3)]), elements=st.floats(width=64))
-    )
-)
-def test_the_median_is_numpys_to_the_last_bit(values: Floats) -> None:
-    with np.errstate(all="ignore"):
-        np.testing.assert_array_equal(median(values), np.median(values, axis=0))

@@ -16,7 +16,6 @@ from companion.calibration.deck.fluid import Fluid, Level, level
 from companion.calibration.deck.smoother import Passage, passage
 from companion.calibration.means.pose import GradienterModel
 from companion.calibration.means.windows import ImuInput
-from companion.calibration.noise.robust import median
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
 
@@ -79,7 +78,7 @@ class Stream:
             return
         whole = np.vstack([last, own])
         rates = whole[:, 1:4]
-        step_s = float(median(np.diff(whole[:, 0]).tolist()))
+        step_s = float(np.median(np.diff(whole[:, 0]).tolist()))
         second = rates[2:] - 2.0 * rates[1:-1] + rates[:-2]
         white2 = float(np.square(second).mean()) / 6.0 * step_s if len(second) else 0.0
         self.seconds.append(

@@ -18,7 +18,6 @@ import msgspec
 import numpy as np
 
 from companion.calibration.noise.allan import NoiseProfile, floor_variance
-from companion.calibration.noise.robust import median
 from companion.calibration.seconds.batch import Batch
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats
@@ -87,7 +86,7 @@ def why_void(steps: Sequence[Step], latest: Step, steps_lsb: Floats) -> str | No
             return "a reading too near to zero"
     if not steps:
         return None
-    before = median([_corrected(step, steps_lsb)[0] for step in steps])
+    before = np.median([_corrected(step, steps_lsb)[0] for step in steps], axis=0)
     allowed = _MOVED_LSB + _MOVED_SIGMAS * np.sqrt(scatter)
     off = np.abs(corrected - before) - allowed
     worst = int(off.argmax())

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.means.quantised import MIN_BEYOND_TWO, Cells, Fit, fit, shape_variance, truncation_edges
 from companion.calibration.noise.robust import HUBER_C as FLOAT_HUBER_C
-from companion.calibration.noise.robust import MAD_TO_SIGMA, median
+from companion.calibration.noise.robust import MAD_TO_SIGMA
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
 
@@ -117,8 +117,10 @@ def _work_out(batches: Sequence[Batch], steps: Floats, edges: Floats, result: In
         found, values, scale = _linearised(bounds, grouped, sizes, weight, sigma)
         other = fit(Cells(bounds, grouped.sum(axis=0)), sigma * (1.0 + BORROWED_RMS))
         slope = np.where(found.identified & ~own, np.abs(other.mean - found.mean), 0.0)
-    centre = median(values)
-    outside = np.abs(values - centre) > _OUTLIER * np.maximum(scale, MAD_TO_SIGMA * median(np.abs(values - centre)))
+    centre = np.median(values, axis=0)
+    outside = np.abs(values - centre) > _OUTLIER * np.maximum(
+        scale, MAD_TO_SIGMA * np.median(np.abs(values - centre), axis=0)
+    )
     outside &= found.identified
     if outside.any():
         weight = np.where(outside, 0.0, 1.0)
@@ -148,7 +150,7 @@ def _borrowed(found: Fit, counts: Floats) -> Floats | None:
         triad = slice(start, start + 3)
         known = found.identified[triad]
         if known.any() and not known.all():
-            usual = float(median(found.sigma[triad][known]))
+            usual = float(np.median(found.sigma[triad][known]))
             result[triad] = np.where(~known & enough[triad], usual, result[triad])
     return None if np.isnan(result).all() else result
 
@@ -161,7 +163,7 @@ def _linearised(
     inside = np.maximum(grouped.sum(axis=1), 1.0)
     values = found.mean + np.einsum("mkc,kc->mc", grouped, found.influence) / inside
     total = (weight * sizes[:, None]).sum(axis=0)
-    scale = np.sqrt(found.variance * total / median(sizes))
+    scale = np.sqrt(found.variance * total / np.median(sizes, axis=0))
     return found, values, scale
 
 
@@ -170,8 +172,8 @@ def _aligned(batches: Sequence[Batch], plain: Floats, steps: Floats) -> tuple[In
 
     The grid reaches as far as noise does; a reading beyond is a fault of the line and is left out.
     """
-    centre = median(plain)
-    noise = np.sqrt(median([batch.variance for batch in batches])) / steps
+    centre = np.median(plain, axis=0)
+    noise = np.sqrt(np.median([batch.variance for batch in batches], axis=0)) / steps
     spread = np.maximum(np.maximum(noise, _LEAST_SPREAD), np.abs(plain - centre).max(axis=0) / _CORE_SIGMAS)
     reach = int(min(np.ceil(_CORE_SIGMAS * spread.max()) + _CORE_MARGIN, _MAX_REACH))
     start = np.rint(centre).astype(np.int64) - reach

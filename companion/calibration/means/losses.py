@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.noise.robust import median
 from companion.calibration.seconds.batch import Batch
 from companion.errors import CalibrationRefusedError
 
@@ -35,7 +34,7 @@ def refuse_broken(name: str, steps: tuple[float, float], batches: Sequence[Batch
 
 def lost(batches: Sequence[Batch]) -> float:
     """Share of the samples that never came: by the device's counter, else against the usual number in a second."""
-    usual = float(median([batch.n for batch in batches]))
+    usual = float(np.median([batch.n for batch in batches]))
     missing = came = 0.0
     for batch in batches:
         came += batch.n

@@ -14,7 +14,6 @@ import numpy as np
 
 from companion.calibration.means.windows import ImuInput, estimates
 from companion.calibration.noise.allan import NoiseProfile, allan_variance
-from companion.calibration.noise.robust import median
 from companion.calibration.profiling.profile_fit import CHANNELS, LEAST_STILL_S, MIN_SECONDS, Rest, fit_profile
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
@@ -42,7 +41,7 @@ class Held(msgspec.Struct, frozen=True, kw_only=True):
     def against(cls, miss: Floats, use: Floats, seen: Floats, **rest: Any) -> Self:
         """From misses, variances that were said, and variances of what was seen afterwards, all of one shape."""
         return cls(
-            sigma_use=float(np.sqrt(median(np.ravel(use)))),
+            sigma_use=float(np.sqrt(np.median(np.ravel(use)))),
             rms=float(np.sqrt(np.square(miss).mean())),
             ratio=float(np.sqrt((np.square(miss) / (use + seen)).mean())),
             share=float((np.square(miss) <= SIGMAS**2 * (use + seen)).mean()),

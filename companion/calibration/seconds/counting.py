@@ -13,7 +13,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.calibration.noise.robust import median
 from companion.physics.frames import Array, Floats, Matrix, rotations, running_products
 from companion.samples import ImuSample
 
@@ -82,7 +81,7 @@ class TurnCounter:
             return Counted(0.0, SIGMA_RAD)
         moves = (times > moves_s[0] - AT_REST_S) & (times < moves_s[-1] + AT_REST_S)
         times, rates = times[moves], rates[moves]
-        if len(times) < LEAST_SAMPLES or np.diff(times).max() > median(gaps.tolist()) + HOLE_S:
+        if len(times) < LEAST_SAMPLES or np.diff(times).max() > np.median(gaps.tolist(), axis=0) + HOLE_S:
             return None
         angle_rad = _turned_rad(times, rates)
         # What every fourth sample counts by itself differs by twice as much as sampling and stamps make of all.

@@ -17,7 +17,6 @@ from companion.calibration.alignment.faces import BIAS, SCALE, Face, Faces, face
 from companion.calibration.alignment.missing import Missing, missing, seen_before, up_of
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import ImuWindow, Window
-from companion.calibration.noise.robust import median
 from companion.calibration.records.align_record import FaceRecord, FacesImuRecord, FacesRecord, faces_imu_record
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.site import LocalEarth
@@ -138,7 +137,7 @@ class Facing:
             means = [one for window in windows for one in window.imus if one.name == name and not one.refused("accel")]
             if len(means) < len(windows) or imu.calibration is None:
                 continue
-            wander = median(np.array([_wander(one) for one in means]))
+            wander = np.median(np.array([_wander(one) for one in means]), axis=0)
             found = faces([self._face(one) for one in means], local.gravity_m_s2, local.gravity_sigma_m_s2, wander)
             by_imu[name] = found
             wish = wish or missing(found, imu.calibration.orientation)
