@@ -1,4 +1,4 @@
-"""What former versions had, and what to do without it: one row for a configuration key, an option or a command."""
+"""Configuration keys, commands and options that former versions had, each with its remedy."""
 
 from __future__ import annotations
 

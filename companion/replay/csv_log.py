@@ -38,7 +38,7 @@ COLUMNS: Final[dict[str, tuple[str, float]]] = {
     for what in quantities
     for unit, factor in units.items()
 }
-"""By name of a column: quantity, and factor to seconds, rad/s, m/s^2, degrees and degrees Celsius."""
+"""Quantity by name of a column, and its factor to seconds, rad/s, m/s^2, degrees and degrees Celsius."""
 HEADER: Final = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2"
 GRAVITY_M_S2: Final = (7.0, 12.6)
 """Median specific force of a log at rest or nearly so: beyond, the unit or the column is another one than named."""
@@ -58,7 +58,7 @@ class Column(NamedTuple):
     """One column that is read."""
 
     place: int
-    """From 0."""
+    """Number of the column, from 0."""
     factor: float
     name: str
 
@@ -149,7 +149,7 @@ class _Table:
         self._data = lines
 
     def _is_text(self, line: str) -> bool:
-        """Whether a line stands before the numbers: another header, a logger's preamble."""
+        """Return whether a line is text before the numbers: another header, a logger's preamble."""
         fields = _fields(line, _separator(line))
         return len(fields) < len(self._names) or not any(map(_is_number, fields))
 
