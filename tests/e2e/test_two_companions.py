@@ -70,7 +70,7 @@ async def two(folder: Path, *, bus: bool) -> AsyncIterator[tuple[Rig, Rig]]:
     one.radio = Wire(one.ground, ground.tap())
     other.autopilot, other.aircraft = one.autopilot, one.aircraft
     for device, same in zip(other.devices.values(), one.devices.values(), strict=True):
-        device.aircraft = same.aircraft  # type: ignore[attr-defined]
+        device.aircraft = same.aircraft
     other.wire = Wire(other.link, (first if bus else ground).tap())
     async with one.running():
         other._start()
