@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.config import parse
@@ -26,10 +27,13 @@ from companion.storage.state import StateFile
 from tests.support.rig import inline
 from tests.support.virtual_time import run_virtual
 from tests.unit.test_config import GOOD
-from tests.unit.test_mavlink_signing import KEY, NOW, NOW_S
+from tests.unit.test_mavlink_signing import KEY, NOW, NOW_S, YEAR_S, peer
 
 MARGIN = 2 * TICKS_PER_S
 """The steps of a test last no longer than this."""
+
+
+HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)
 
 
 class Board:
@@ -123,6 +127,65 @@ def test_a_clock_that_is_right_is_believed_and_one_that_steps_back_is_not(
         async with board.daemon() as second:
             assert second.signing is not None
             assert second.signing.clock.next() >= expected
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("wall_at_start_s", [NOW_S, 0.0])
+def test_a_clock_once_20_years_ahead_is_not_followed_in_that_boot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, wall_at_start_s: float
+) -> None:
+    """A board without a battery-backed clock has the time from a signed message instead."""
+
+    async def main() -> None:
+        board = Board(tmp_path, monkeypatch, wall_s=wall_at_start_s)
+        async with board.daemon() as first:
+            assert first.signing is not None
+            first.signing.clock.heard(NOW)
+            before = first.signing.clock.next()
+            board.wall_at_boot_s = NOW_S + 20 * YEAR_S
+            await asyncio.sleep(3.0)
+            assert first.signing.clock.next() < before + 5 * TICKS_PER_S
+            await asyncio.sleep(3.0)
+        async with board.daemon() as second:  # started again while the clock is wrong
+            assert second.signing is not None
+            assert second.signing.clock.next() < before + 10 * TICKS_PER_S
+        board.wall_at_boot_s = NOW_S
+        board.power_cut()
+        async with board.daemon() as third:
+            assert third.signing is not None
+            assert third.signing.clock.next() < before + int(AHEAD_S * TICKS_PER_S) + 10 * TICKS_PER_S
+
+    with caplog.at_level(logging.INFO):
+        run_virtual(main())
+    assert caplog.text.count("jumped 7305.0 days ahead") == 2, caplog.text  # once in each start
+
+
+def test_a_kept_time_far_ahead_is_named_with_the_way_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def main() -> None:
+        board = Board(tmp_path, monkeypatch, wall_s=NOW_S + 20 * YEAR_S)
+        async with board.daemon():
+            await asyncio.sleep(1.0)
+        board.wall_at_boot_s = NOW_S
+        board.power_cut()
+
+        def autopilot_says(found: LinkSigning) -> bool:
+            assert found.signing is not None
+            ticks = int((board.wall_s() - EPOCH_S) * TICKS_PER_S)
+            return found.signing.admits(HEARTBEAT.pack(peer(KEY, ticks)))
+
+        async with board.daemon() as deaf:
+            for _ in range(6):
+                assert not autopilot_says(deaf)
+                await asyncio.sleep(1.0)
+            way_back = "far ahead of this board's clock: stop the companion, delete mavlink-signing-time.json, start it"
+            assert way_back in str(deaf.watch.warning)
+            assert way_back in str(deaf.rejecting)
+        (tmp_path / SIGNING_FILE).unlink()
+        async with board.daemon() as hears:
+            assert autopilot_says(hears)
+            await asyncio.sleep(6.0)
+            assert hears.rejecting is None
 
     run_virtual(main())
 

@@ -31,6 +31,9 @@ HEARTBEAT = mavlink.MAVLink_heartbeat_message
 MESSAGE = HEARTBEAT(2, 3, 0, 5, 4, 3)
 
 
+YEAR_S = 365.25 * 86400.0
+
+
 class Clocks:
     """A board's clocks that stand still until told."""
 
@@ -260,6 +263,25 @@ def test_a_clock_of_1970_goes_on_from_what_was_kept_and_learns_from_who_has_the_
     assert judge.clock.next() >= later
     clocks.pass_(2.0)
     assert judge.clock.next() >= later + 2 * TICKS_PER_S
+
+
+def test_a_jump_of_the_clock_is_refused_and_true_senders_stay_believed() -> None:
+    clocks = Clocks()
+    judge = Signing(required=True, key=KEY, clock=clocks.clock())
+    assert judge.clock.next() == pytest.approx(NOW, abs=2)
+    clocks.pass_(1.0)
+    clocks.wall_s += 20 * YEAR_S
+    assert judge.clock.next() == pytest.approx(NOW + TICKS_PER_S, abs=2)
+    assert judge.clock.refused_s == pytest.approx(20 * YEAR_S)
+    assert judge.admits(MESSAGE.pack(peer(KEY, NOW)))
+    clocks.wall_s -= 20 * YEAR_S
+    # A small correction is followed: receivers allow a minute.
+    clocks.wall_s += 30.0
+    assert judge.clock.next() == pytest.approx(NOW + 31 * TICKS_PER_S, abs=2)
+    assert judge.clock.refused_s == 0.0
+    # A sender that has the key and the right time is believed, and moves the time.
+    assert judge.admits(MESSAGE.pack(peer(KEY, NOW + 90 * TICKS_PER_S)))
+    assert judge.clock.next() >= NOW + 90 * TICKS_PER_S
 
 
 def test_the_end_of_time_is_survived() -> None:

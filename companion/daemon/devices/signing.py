@@ -20,8 +20,16 @@ from companion.config.sections import Config
 from companion.daemon.core import Offload
 from companion.errors import LinkError, StorageError
 from companion.links.mavlink.link import MavlinkLink
-from companion.links.mavlink.signing import TICKS_PER_S, Reason, Signing, read_key, uptime_s
-from companion.storage.learned import SigningTime, signing_time_in, this_boot
+from companion.links.mavlink.signing import (
+    EARLIEST_S,
+    TICKS_PER_S,
+    Reason,
+    Signing,
+    read_key,
+    ticks_of,
+    uptime_s,
+)
+from companion.storage.learned import SIGNING_FILE, SigningTime, signing_time_in, this_boot
 
 logger = logging.getLogger(__name__)
 
@@ -48,14 +56,18 @@ ASK_AGAIN_S: Final = 30.0
 AGAIN_S: Final = 60.0
 """The least time between two messages about what changes to and fro."""
 
+AHEAD_OF_CLOCK_S: Final = 86400.0
+"""Signing time so far ahead of the system's clock comes from a wrong clock, not from a board that was without power."""
+
 _Doubt = Literal["other key", "unsigned", "old"]
-_Kind = Literal["wants ours", "other key", "unsigned", "old"]
+_Kind = Literal["wants ours", "other key", "unsigned", "old", "ahead"]
 
 _WORDS: Final[dict[_Kind, str]] = {
     "wants ours": "the autopilot wants signatures: give the companion its key (signing_key_file)",
     "other key": "the autopilot signs with another key: give both the same one",
     "unsigned": "the autopilot does not sign and is not believed: give it the companion's key",
     "old": "the autopilot's signatures are old, not believed: wait some seconds, or restart it",
+    "ahead": f"signing time far ahead of this board's clock: stop the companion, delete {SIGNING_FILE}, start it",
 }
 
 
@@ -131,7 +143,9 @@ class SignatureWatch:
             return None
         if self._bad_since_s is None:
             self._bad_since_s = now_s
-        return found if now_s - self._bad_since_s >= AFTER_S else self._kind
+        if now_s - self._bad_since_s < AFTER_S:
+            return self._kind
+        return "ahead" if found == "old" and signing.clock.ahead_of_wall_s > AHEAD_OF_CLOCK_S else found
 
     # --- we are judged
 
@@ -163,7 +177,7 @@ class LinkSigning:
         """Why there is no key; empty when there is one."""
         self._kept = signing_time_in(config.storage.path)
         self._reserved = 0
-        self._unwritable = self._setup_told = False
+        self._unwritable = self._setup_told = self._jump_told = False
         self._told: set[tuple[Reason, int, int]] = set()
         if self.mode != "off":
             # From the first byte on: what comes before the key is read is not believed either.
@@ -175,7 +189,8 @@ class LinkSigning:
     def load(self) -> None:
         """Read time and key, before anything is sent; a key that cannot be read is tried again in `run`."""
         if self.signing is not None:
-            self.signing.clock.heard(_go_on_from(self._kept.load(), uptime_s(), this_boot()))
+            ticks, in_this_boot = _go_on_from(self._kept.load(), uptime_s(), this_boot())
+            self.signing.clock.resume(ticks, is_set=in_this_boot and ticks >= ticks_of(EARLIEST_S))
             self._take_key(self.signing)
 
     async def run(self) -> None:
@@ -193,6 +208,7 @@ class LinkSigning:
                 if signing.clock.now() > self._reserved - int(RESERVE_BEFORE_S * TICKS_PER_S):
                     await self._keep(signing, AHEAD_S)
                 self._tell(signing)
+                self._tell_of_jump(signing.clock.refused_s)
                 self.watch.update(asyncio.get_running_loop().time())
                 await asyncio.sleep(LOOK_S)
         finally:
@@ -251,6 +267,14 @@ class LinkSigning:
                     Weight.NEWS,
                 )
 
+    def _tell_of_jump(self, refused_s: float) -> None:
+        if refused_s and not self._jump_told:
+            logger.info(
+                "mavlink signing: the system's clock jumped %.1f days ahead: not followed until the board restarts",
+                refused_s / 86400.0,
+            )
+        self._jump_told = refused_s > 0.0
+
     # --- words
 
     @property
@@ -265,6 +289,8 @@ class LinkSigning:
         ((reason, number),) = self.watch.dropped.most_common(1) or [("unsigned", 0)]
         if number == 0 or self._vehicle.alive:
             return None
+        if self.watch.warning == _WORDS["ahead"]:
+            return f"{number} messages dropped: {_WORDS['ahead']}"
         return {
             "unsigned": f"{number} unsigned messages dropped: the autopilot does not sign on this link",
             "other key": f"{number} messages dropped: the autopilot signs with another key",
@@ -298,10 +324,10 @@ class LinkSigning:
         }
 
 
-def _go_on_from(kept: SigningTime | None, now_s: float, boot_id: str) -> int:
-    """Ticks later than any that was used: exactly where that can be told, else behind what was reserved."""
+def _go_on_from(kept: SigningTime | None, now_s: float, boot_id: str) -> tuple[int, bool]:
+    """Ticks later than any that was used, and whether they go on exactly, from earlier in this boot."""
     if kept is None:
-        return 0
+        return 0, False
     if boot_id and boot_id == kept.boot_id and now_s >= kept.uptime_s:
-        return kept.ticks + int((now_s - kept.uptime_s) * TICKS_PER_S) + 1
-    return kept.reserved + 1
+        return kept.ticks + int((now_s - kept.uptime_s) * TICKS_PER_S) + 1, True
+    return kept.reserved + 1, False

@@ -81,7 +81,9 @@ def _digest(key: bytes, packet: bytes | bytearray) -> bytes:
 class SigningClock:
     """Time for signatures: never the same twice, never back, whatever the system's clock does.
 
-    A board without a battery-backed clock starts in 1970: then it goes on from `start` (ticks, later than all that was
+    The system's clock sets the time once a boot. A later jump of it by more than a minute is refused: one wrong clock
+    would otherwise stay in the kept time and in every receiver, and true senders would look old for good. A board
+    without a battery-backed clock starts in 1970: the time then goes on from `start` (ticks, later than all that was
     used before), and takes over the time of the first message that is signed with our key.
     """
 
@@ -91,26 +93,41 @@ class SigningClock:
         self._wall_s, self._uptime_s = wall_s, uptime
         self._base, self._base_s = start, uptime()
         self._used = 0
+        self._is_set = False
+        self.refused_s = 0.0
+        """How far ahead of this time the system's clock is, where that is refused; else 0."""
+
+    def resume(self, ticks: int, *, is_set: bool) -> None:
+        """Go on behind time used before; `is_set`: it was set in this boot, and the system's clock sets it no more."""
+        self._base, self._base_s, self._is_set = ticks, self._uptime_s(), is_set
 
     def now(self) -> int:
         """Ticks."""
         now_s = self._uptime_s()
         ticks = self._base + int((now_s - self._base_s) * TICKS_PER_S)
-        wall = ticks_of(self._wall_s())
-        if wall > ticks:
+        ahead = ticks_of(self._wall_s()) - ticks
+        self.refused_s = ahead / TICKS_PER_S if self._is_set and ahead > LATE_TICKS else 0.0
+        if ahead > 0 and not self.refused_s:
             # Taken as the new beginning, so that a clock which then steps back does not take us with it.
-            self._base, self._base_s = wall, now_s
-        return min(max(ticks, wall, self._used), LAST)
+            ticks += ahead
+            self._base, self._base_s, self._is_set = ticks, now_s, True
+        return min(max(ticks, self._used), LAST)
 
     def next(self) -> int:
         """Ticks for one message."""
         self._used = min(max(self.now(), self._used + 1), LAST)
         return self._used
 
+    @property
+    def ahead_of_wall_s(self) -> float:
+        """How far ahead of the system's clock this time is; 0 where that clock has not been set."""
+        wall = ticks_of(self._wall_s())
+        return max(0, self.now() - wall) / TICKS_PER_S if wall else 0.0
+
     def heard(self, ticks: int) -> None:
-        """Somebody who has the key is that far."""
+        """Take over the time of a sender that has the key and is ahead."""
         if ticks > self.now():
-            self._base, self._base_s = ticks, self._uptime_s()
+            self._base, self._base_s, self._is_set = ticks, self._uptime_s(), True
 
 
 class Signing:
