@@ -71,8 +71,13 @@ def test_a_daemon_that_writes_while_armed_is_caught() -> None:
     class Reckless(Vehicle):
         arm_state = ArmState.DISARMED
 
+    async def ensure() -> None:
+        pass
+
     def sabotage(stage: Stage) -> None:
-        stage.service.core.vehicle.__class__ = Reckless
+        vehicle = stage.service.core.vehicle
+        vehicle.__class__ = Reckless
+        vehicle.disarmed.ensure, vehicle.disarmed.proven = ensure, lambda: True  # type: ignore[method-assign]
 
     def is_caught(seed: int) -> bool:
         problems = run_cell(FAULTS["arms"], "writing", seed, sabotage=sabotage).problems

@@ -254,7 +254,7 @@ def test_biases_that_are_not_this_imus_now_are_not_used(
             in_air(flying)
             await flying.sleep(3.0)
             happens(flying)
-            killed_s = flying.rig.now_s
+            killed_s = flying.rig.now_s + flying.rig.wire.delay_s[1]  # one may be on its way
             looks, history = Counter[str](), RecordStore.history
 
             def counted(store: RecordStore, limit: int | None = None) -> list[Record]:

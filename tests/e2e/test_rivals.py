@@ -128,7 +128,7 @@ def test_a_reboot_is_not_sent_to_an_aircraft_that_armed_meanwhile(tmp_path: Path
             assert result.outcome == "done", result
             assert job.record is not None
             # Nor does the double restart while it is armed: what counts is that it was not asked.
-            assert any("not rebooted: the aircraft is not surely" in warning for warning in job.record.warnings)
+            assert any("not rebooted: the aircraft is armed" in warning for warning in job.record.warnings)
             await asyncio.sleep(5.0)
             assert rig.service.core.vehicle.boots == 0
 
