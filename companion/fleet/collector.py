@@ -15,7 +15,7 @@ import secrets
 import socket
 import time
 from collections.abc import AsyncIterator, Iterable
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from companion.config.sections import Mqtt
 from companion.errors import CompanionError, LinkError
@@ -38,7 +38,11 @@ GATHER_S: Final = 0.1
 ASK_AFTER: Final = 50
 """So many times as long of hellos: what is told with one has come by then, perhaps to another collector."""
 WAITING: Final = 20 * BATCH
-"""The most messages that wait; what is beyond is told again, or another collector hears it."""
+"""The most messages from the broker that wait; what is beyond is told again, or another collector hears it."""
+WAITING_BYTES: Final = 16 * 1024 * 1024
+"""The most bytes of them."""
+BATCH_BYTES: Final = 4 * 1024 * 1024
+"""The most bytes of a batch, of which a database makes several copies."""
 AT_ONCE: Final = 50
 """Messages that are being sent; aiomqtt looks at each of them for every further one."""
 SWEEP_S: Final = 5.0
@@ -86,6 +90,32 @@ async def stop(tasks: Iterable[asyncio.Task[None]]) -> list[BaseException]:
             task.cancel()
         _, pending = await asyncio.wait(pending, timeout=STOP_AGAIN_S)
     return [end for end in await asyncio.gather(*found, return_exceptions=True) if end is not None]
+
+
+class Waiting(asyncio.Queue[Any]):
+    """Messages that wait, bounded in bytes beside their number: one may have a quarter of a megabyte."""
+
+    most_bytes = WAITING_BYTES
+    _bytes = 0
+
+    def full(self) -> bool:
+        """Tell whether there is no room for another message."""
+        return super().full() or self._bytes >= self.most_bytes
+
+    def _put(self, item: Any) -> None:
+        super()._put(item)
+        self._bytes += len(item.payload or b"")
+
+    def _get(self) -> Any:
+        item = super()._get()
+        self._bytes -= len(item.payload or b"")
+        return item
+
+
+class Inbox(Waiting):
+    """Messages of the next batch."""
+
+    most_bytes = BATCH_BYTES
 
 
 class Collector:
@@ -162,11 +192,12 @@ class Collector:
             timeout=ANSWER_S,
             tls_context=tls_context(self.settings),
             max_queued_incoming_messages=WAITING,
+            queue_type=Waiting,
             logger=_quiet,
         )
 
     async def _serve(self, client: aiomqtt.Client) -> None:
-        items, hellos = asyncio.Queue[Message](BATCH), asyncio.Queue[Message](BATCH)
+        items, hellos = Inbox(BATCH), Inbox(BATCH)
         tasks = [
             asyncio.create_task(self._hear(client, items, hellos), name="fleet listener"),
             asyncio.create_task(self._collect(client, items, 1), name="fleet writer"),
