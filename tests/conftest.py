@@ -46,7 +46,7 @@ QUICK_S: Final = 0.5
 """The most processor time of a test that `make quick` runs."""
 LONG_LIMIT_S: Final = 7200.0
 """Time limit of a test with a real autopilot, or of `make long`; others have that of pyproject.toml."""
-LIMIT_AGAIN_S: Final = 20.0
+LIMIT_AGAIN_S: Final = 60.0
 """Interval at which a test beyond its limit is interrupted again: an exception may end in a task that nobody awaits."""
 OUTSIDE: Final = pytest.StashKey[Outside]()
 QUICK_ROOMS: Final = ("unit", "property")

@@ -177,6 +177,7 @@ async def carry_out(run: Run, folder: Path, number: int) -> Outcome:
         link = await open_udp(autopilot, listen=("127.0.0.1", 0))
         stack.callback(link.close)
         host, port = link.local
+        (folder / "state").mkdir()
         ProfileStore(folder / "state").write(calm())
         config = parse(
             CONFIG.format(host=host, port=port, folder=folder) + "\n".join(parts), "families.toml", saved_profile

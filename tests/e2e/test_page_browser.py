@@ -170,6 +170,7 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
         fc, held_back=("accel",), written={name: what for name, what in fc.written.items() if "GYR" in name}
     )
     record = msgspec.structs.replace(record, imus=(fc, own), reason=f"{record.reason}; accelerometers of fc held back")
+    (tmp_path / "state").mkdir()
     RecordStore(tmp_path / "state").save(record)
     known = BiasStore(tmp_path / "bench").read()["fc"]  # the same IMU
     earlier = msgspec.structs.replace(known, points=tuple(windows_of_days(10)))

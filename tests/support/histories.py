@@ -167,6 +167,7 @@ def arming(of: Record, *, good: bool = True) -> Arming:
 
 def a_season(directory: Path, number: int = 30) -> list[Record]:
     """Fill a storage folder: temperatures from 8 to 31 degC, every seventh one failed, some armings."""
+    directory.mkdir(parents=True, exist_ok=True)
     store, records, armings = RecordStore(directory), [], []
     rng = np.random.default_rng(3)
     for k in range(number):

@@ -46,7 +46,7 @@ def run(folder: Path, text: str, *options: str) -> tuple[int, str]:
     # The folders in place of those of this machine, in which others may write meanwhile.
     (folder / "watched.py").write_text(
         "import tests.conftest as conftest, tests.support.outside as outside\n"
-        "conftest.LIMIT_AGAIN_S = 0.3\n"
+        "conftest.LIMIT_AGAIN_S = 5.0\n"
         f"outside.DEPTHS, outside.HOME_DEPTHS = {{{str(folder / 'watched')!r}: 2}}, {{}}\n"
     )
     command = [sys.executable, "-m", "pytest", "-q", "-c", str(PROJECT / "pyproject.toml"), "--rootdir", str(folder)]
