@@ -7,6 +7,7 @@ to an autopilot, so that they may name nothing else than what the companion writ
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -18,7 +19,9 @@ from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.autopilot.parameters.change import Change
 from companion.errors import StorageError
 from companion.formats import Object
-from companion.storage.state import StateFile, numbers_in, remove_durably, write_atomically
+from companion.storage.state import BoundedList, StateFile, numbers_in, remove_durably, write_atomically
+
+logger = logging.getLogger(__name__)
 
 _UNDO: Final = re.compile(r"undo-(0|[1-9][0-9]{0,2})\.json")
 _SYSTEM_IDS: Final = range(1, 256)
@@ -210,3 +213,54 @@ class ChangeLog:
             for value in (changed.before, changed.after, changed.via, *changed.also):
                 if value is not None and not self._allowed[name].holds(value):
                     raise msgspec.ValidationError(f"found {name} = {value:.9g}; allowed: {self._allowed[name]}")
+
+
+KEEP_INTERRUPTIONS: Final = 50
+"""Interruptions kept: years of them."""
+PENDING: Final = "old values not restored yet: disarm and keep the link up"
+
+
+class Interruption(msgspec.Struct, frozen=True, kw_only=True):
+    """One interrupted write."""
+
+    what: str
+    """Kind of write, as `Origin.what`."""
+    began_at: str
+    """Begin of the calibration or alignment that wrote, UTC, ISO 8601; empty: not kept."""
+    ended_at: str | None
+    """End of the restore, UTC, ISO 8601; None: pending."""
+    system_id: int
+    parameters: tuple[str, ...]
+    reason: str
+    """Result of the restore, for people."""
+
+
+class Interruptions:
+    """List of interruptions on disk, with the pending one in front."""
+
+    def __init__(self, directory: Path) -> None:
+        self._file = BoundedList(directory / "interrupted.json", Interruption, KEEP_INTERRUPTIONS)
+
+    def keep(self, step: ChangeSet, reason: str, ended_at: str) -> None:
+        """Add an interruption that is over; blocking."""
+        try:
+            self._file.append(_interruption(step, reason, ended_at))
+        except StorageError as error:
+            logger.error("the history does not show it: %s", error)  # noqa: TRY400 - one line
+
+    def history(self, pending: ChangeSet | None) -> list[Object]:
+        """All interruptions, the latest first; blocking. `pending`: the write whose restore is to come."""
+        now = [] if pending is None else [_interruption(pending, PENDING, None)]
+        return [msgspec.to_builtins(each) for each in (*now, *reversed(self._file.read()))]
+
+
+def _interruption(step: ChangeSet, reason: str, ended_at: str | None) -> Interruption:
+    origin = step.origin
+    return Interruption(
+        what=origin.what,
+        began_at=origin.at,
+        ended_at=ended_at,
+        system_id=step.system_id,
+        parameters=tuple(step.names),
+        reason=reason,
+    )

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import secrets
+import os
 from collections.abc import Callable
 from typing import Final
 
@@ -67,7 +67,7 @@ class OtherCompanions:
     def __init__(self, link: MavlinkLink, say: Say, writes: Callable[[], bool]) -> None:
         """`writes`: whether this companion writes to the autopilot at all."""
         self._link, self._say, self._writes = link, say, writes
-        self._instance, self._is_new = secrets.randbits(INSTANCE_BITS), True
+        self._instance, self._is_new = int.from_bytes(os.urandom(4)) >> 32 - INSTANCE_BITS, True
         self._others: dict[int, _Other] = {}
         self._told: str | None = None
         link.subscribe(mavlink.MAVLink_named_value_int_message, self._on_value)
@@ -93,16 +93,17 @@ class OtherCompanions:
         loop = asyncio.get_running_loop()
         started_s, beats = loop.time(), 0
         while True:
+            await asyncio.sleep(BEAT_S)  # nothing may leave before the component's first heartbeat
             now_s = loop.time()
             if self._is_new and now_s - started_s >= SETTLE_S and self.why_not() is None:
                 self._is_new = False
-            if self._writes() and (beats < FIRST_BEATS or self._hears(now_s) or beats % IDLE_BEATS == 0):
+            due = beats < FIRST_BEATS or self._hears(now_s) or beats % IDLE_BEATS == 0
+            if due and self._writes() and self._link.connected:
                 value = self._instance << 1 | self._is_new
                 name = NAME.encode("ascii")
                 self._link.send(mavlink.MAVLink_named_value_int_message(int(now_s * 1e3) % 2**32, name, value))
             self._tell()
             beats += 1
-            await asyncio.sleep(BEAT_S)
 
     def _tell(self) -> None:
         words = self.warning

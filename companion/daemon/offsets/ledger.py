@@ -22,14 +22,13 @@ from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.records.record import WrittenParameter
 from companion.component.statustext import Severity, Weight
-from companion.daemon.core import Core, Offload
+from companion.daemon.core import Core, Offload, utc_now
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
-from companion.daemon.offsets.interruptions import Interruptions
 from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
 from companion.formats import Object
 from companion.links.system.listeners import Listeners
-from companion.storage.changes import ChangeLog, ChangeSet, Undoable
+from companion.storage.changes import ChangeLog, ChangeSet, Interruptions, Undoable
 
 logger = logging.getLogger(__name__)
 
@@ -199,7 +198,7 @@ class Recovery:
     ) -> None:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
         self._writer, self.ledger, self._imus, self._owed = writer, ledger, imus, owed
-        self._interruptions = Interruptions(core.config.storage.path, core.offload)
+        self._offload, self._interruptions = core.offload, Interruptions(core.config.storage.path)
         self.on_recovered: Listeners[str] = Listeners()
         """Told, in words, of what was put in order."""
         self.note_undone: Callable[[ChangeSet, str], Awaitable[object]] = _nobody_notes
@@ -237,7 +236,7 @@ class Recovery:
             words = f"Interrupted write on system {open_set.system_id}, not on this aircraft: check there {names}"
             logger.warning("%s", words)
             self._say(Severity.WARNING, words, Weight.REFUSAL)
-            await self._interruptions.keep(open_set, f"not on this aircraft: check there {names}")
+            await self._keep(open_set, f"not on this aircraft: check there {names}")
             await self.ledger.unchanged()
             return
         while self._vehicle.arm_state is not ArmState.DISARMED:
@@ -255,11 +254,14 @@ class Recovery:
         words = f"Interrupted write: {found}"
         if self.ledger.is_undoable(open_set):
             await self.note_undone(open_set, words)
-        await self._interruptions.keep(open_set, found)
+        await self._keep(open_set, found)
         await self.ledger.undone()
         logger.warning("%s", words)
         self.on_recovered.tell(words)
         self._say(Severity.WARNING, words, Weight.RESULT)
+
+    async def _keep(self, open_set: ChangeSet, reason: str) -> None:
+        await self._offload(self._interruptions.keep, open_set, reason, utc_now())
 
     async def undo(self, *, force: bool = False) -> tuple[ChangeSet, dict[str, WrittenParameter]]:
         """Put back the values from before the last step, all or none; returns the step and what was done.
