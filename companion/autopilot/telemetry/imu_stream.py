@@ -79,6 +79,9 @@ class _Source:
         return self.zeros >= _ABSENT_AFTER
 
 
+_NO_HEARTBEAT: Final = "no heartbeat from the autopilot"
+
+
 class ImuStream:
     """Asks for one IMU's messages (1, 2 or 3), keeps them coming and hands on their samples in vehicle FRD.
 
@@ -100,7 +103,8 @@ class ImuStream:
         self.kind: StreamKind | None = None
         """What the samples come from; None while there are none."""
         self.samples = 0
-        self.problem = f"waiting for the autopilot to start IMU {instance}"
+        self._starting = f"waiting for the autopilot to start IMU {instance}"
+        self.problem = self._starting
         """Why there are no samples, one line; empty while there are."""
         self.turns = 0
         """Turns of `run`, one at least every `BEAT_WITHIN_S`, whether samples come or not."""
@@ -148,7 +152,7 @@ class ImuStream:
 
     async def _serve(self) -> None:
         if not self._vehicle.alive:
-            self._lose("no heartbeat from the autopilot")
+            self._lose(_NO_HEARTBEAT)
         self.turns += 1
         while not await comes(self._vehicle.found, _TURN_S):
             self.turns += 1
@@ -314,8 +318,10 @@ class ImuStream:
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event in ("lost", "rebooted"):
-            self._lose("the autopilot restarted" if event == "rebooted" else "no heartbeat from the autopilot")
+            self._lose("the autopilot restarted" if event == "rebooted" else _NO_HEARTBEAT)
             self._restart.set()
+        elif event == "found" and self.problem == _NO_HEARTBEAT:
+            self.problem = self._starting
 
     def _on_message(self, message: Message, t_s: float) -> None:
         if not self._vehicle.sent(message):

@@ -52,6 +52,10 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fal
         """Whether nothing says that the power was off in between."""
         if self.host == other.host:
             return True
+        return self.started_with(other)
+
+    def started_with(self, other: PowerUp) -> bool:
+        """Whether both tell the same start: then the power was on all the while."""
         mine, theirs = self.since_unix_s, other.since_unix_s
         return mine is not None and theirs is not None and abs(mine - theirs) < SAME_START_S
 

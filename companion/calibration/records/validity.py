@@ -23,6 +23,7 @@ from typing import Final
 import msgspec
 
 from companion.calibration.noise.allan import AllanModel, floor_variance
+from companion.calibration.records.record import ImuRecord
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad, Vector
 
@@ -79,6 +80,26 @@ class Held(msgspec.Struct, frozen=True, kw_only=True):
     """Whether its effect was seen in the telemetry."""
     averaged_s: float
     """T of V(T, H)."""
+
+
+def held_of(
+    imu: ImuRecord, triad: Triad, now_s: float, averaged_s: float, *, corrected: bool, seen: bool
+) -> Held | None:
+    """State of one triad right after its calibration; None where that found nothing. `corrected`: by the autopilot."""
+    bias = imu.gyro_bias_rad_s if triad == "gyro" else imu.accel_bias_m_s2
+    sigma, settled = imu.sigma_in_force(triad), imu.settled_sigma(triad)
+    if sigma is None or settled is None or bias is None:
+        return None
+    return Held(
+        calibrated_s=now_s,
+        confirmed_s=now_s,
+        temperature_degc=imu.temperature_degc,
+        sigma_use=sigma,
+        sigma=settled,
+        expected=_NONE if corrected else bias,
+        seen=seen,
+        averaged_s=averaged_s,
+    )
 
 
 class Present(msgspec.Struct, frozen=True, kw_only=True):

@@ -26,6 +26,7 @@ from companion.calibration.records.validity import (
     Seen,
     Why,
     contradicts,
+    held_of,
     judge,
     worst_axis,
     worth_writing,
@@ -48,12 +49,12 @@ from companion.daemon.job import Job, Predicted
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import vector
 from companion.physics.units import DEG_H
-from companion.samples import TRIADS, Triad, Vector
+from companion.samples import TRIADS, Triad
 from companion.storage.changes import PREDICTION
 
 logger = logging.getLogger(__name__)
 
-_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
+_ZERO: Final = (0.0, 0.0, 0.0)
 # Causes that a measurement settles. What the pilot undid and what somebody else chose is theirs until asked for, and
 # what a boot replaced is pushed again.
 _SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED, Why.PREDICTED})
@@ -217,6 +218,22 @@ class InForce:
                 if imu.name in self._sources:
                     self._take(imu, asyncio.get_running_loop().time(), job.held_back)
 
+    def _from_record(self, key: Key, now_s: float) -> Held | None:
+        """What the last calibration before this start has written, while the IMU has run ever since with just that."""
+        (name, triad), record = key, self.earlier
+        calibration = self._imus[name].calibration if name in self._imus else None
+        imu = None if record is None else next((each for each in record.imus if each.name == name), None)
+        if record is None or imu is None or calibration is None or record.system_id != self._core.vehicle.system_id:
+            return None
+        written = {parameter: one.after for parameter, one in imu.written.items()}
+        if not outcomes_of(triad, imu.written) or triad in imu.held_back or calibration.contradicts(written):
+            return None
+        found = held_of(imu, triad, now_s, self._config.calibration.min_still_s, corrected=True, seen=False)
+        if found is None or not self._memory.on_since(name, record.started_at):
+            return None
+        # No clock of now tells how long ago that was.
+        return msgspec.structs.replace(found, calibrated_s=None)
+
     def _realigned(self) -> None:
         """The gradienter has another zero from now on: accelerometers calibrated with the old one must be seen anew."""
         for key, held in self._held.items():
@@ -227,30 +244,20 @@ class InForce:
 
     def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Doubt]) -> None:
         """Hold what a calibration has found in one IMU, save what it has not written for doubt."""
-        corrected = imu.name in self._imus
-        biases = (imu.gyro_bias_rad_s, imu.residual_gyro_rad_s), (imu.accel_bias_m_s2, imu.residual_accel_m_s2)
-        for triad, (bias, residual) in zip(TRIADS, biases, strict=True):
-            key, sigma, settled = (imu.name, triad), imu.sigma_in_force(triad), imu.settled_sigma(triad)
-            if key not in self._held or sigma is None or settled is None or bias is None:
+        corrected, averaged_s = imu.name in self._imus, self._config.calibration.min_still_s
+        for triad, residual in zip(TRIADS, (imu.residual_gyro_rad_s, imu.residual_accel_m_s2), strict=True):
+            # Of an IMU that is not in the autopilot's telemetry "stored" is all that can ever be known.
+            key, seen = (imu.name, triad), outcomes_of(triad, imu.written) <= {"verified"} or not corrected
+            found = held_of(imu, triad, now_s, averaged_s, corrected=corrected, seen=seen)
+            if key not in self._held or found is None:
                 continue
-            found = Held(
-                calibrated_s=now_s,
-                confirmed_s=now_s,
-                temperature_degc=imu.temperature_degc,
-                sigma_use=sigma,
-                sigma=settled,
-                expected=_ZERO if corrected else bias,
-                # Of an IMU that is not in the autopilot's telemetry "stored" is all that can ever be known.
-                seen=outcomes_of(triad, imu.written) <= {"verified"} or not corrected,
-                averaged_s=self._config.calibration.min_still_s,
-            )
             doubt = held_back.get(key)
             if doubt is None:
                 self._held[key] = found
                 self._held_back.let_go(name=imu.name, triad=triad)
                 continue
-            seen = msgspec.structs.replace(found, expected=residual if corrected and residual is not None else bias)
-            self._held_back.hold(key, doubt, seen)
+            expected = residual if corrected and residual is not None else found.expected
+            self._held_back.hold(key, doubt, msgspec.structs.replace(found, expected=expected))
 
     def poll(self, *, writing: bool) -> None:
         """See whether anybody has changed the autopilot's offsets, unless we may be changing them just now."""
@@ -353,6 +360,8 @@ class InForce:
         held = self._held[key]
         if held is Why.REBOOTED:
             held = self._shelved.get(key, held)
+        if held is Why.NEVER and (kept := self._from_record(key, end_s)) is not None:
+            held = held if worst_axis(kept, present) is not None else kept
         if held is Why.PREDICTED and (sigma := self._unseen.pop(key[0], None)) is not None:
             off_deg_h = max(map(abs, present.residual)) / DEG_H
             self._predicted += f"; seen: {off_deg_h:.0f} off"

@@ -153,14 +153,26 @@ class BiasMemory:
 
         An autopilot outlives our board's power, and without a clock nobody knows since when it has been on.
         """
-        known = self._known.get(name)
-        point = None if known is None else next((each for each in known.points if each.started_at == started_at), None)
+        known, point = self._known.get(name), self._point(name, started_at)
         if known is None or point is None:
             return "its calibration is not known of"
         if what := changed(known.identity, self.whose.identity(name, known.identity)):
             return f"another IMU than was calibrated ({what})"
         same = name in self._imus or point.power_up.is_same(self.whose.power_up(name, time.time()))
         return None if same else "the IMU was without power since its calibration"
+
+    def on_since(self, name: str, started_at: str) -> bool:
+        """Whether an IMU is the one that a calibration has measured, and its device has run ever since."""
+        point = self._point(name, started_at)
+        return (
+            point is not None
+            and not self._changed(name)
+            and point.power_up.started_with(self.whose.power_up(name, time.time()))
+        )
+
+    def _point(self, name: str, started_at: str) -> Point | None:
+        known = self._known.get(name)
+        return None if known is None else next((each for each in known.points if each.started_at == started_at), None)
 
     def expectation(self, solution: Solution, unix_s: float) -> Expectation:
         """What earlier calibrations say of these IMUs today."""

@@ -1,0 +1,87 @@
+"""All lines of one status tell the same moment, and the figures that the records have."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.calibration.machine import State
+from companion.physics.units import DEG_H
+from sim.imu_model import DEG_H as SIM_DEG_H
+from tests.e2e.test_calibration import calibrated
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+QUICK: dict[str, Any] = {"min_still_s": 4.0, "max_s": 8.0}
+
+
+def contradictions(rig: Rig) -> list[str]:
+    """What the headline and the line about arming say of each other's opposite."""
+    status = rig.service.status()
+    headline, arming, vehicle = status["headline"], status["arming"], status["vehicle"]
+    found = []
+    if (headline["word"] == "READY") is not (arming["verdict"] == "accept") and status["progress"] is None:
+        found.append(f"{headline} beside {arming['verdict']}, {arming['words']}")
+    if "no heartbeat" in f"{headline['reason']} {arming['words']}" and vehicle["armed"] == "disarmed":
+        found.append(f"{headline}, {arming['words']} above {vehicle['summary']}")
+    return found
+
+
+@pytest.mark.parametrize("at_arm", ["gate", "warn"])
+def test_headline_and_arming_say_the_same_at_every_moment(tmp_path: Path, at_arm: str) -> None:
+    """Through calibrations, a failed one, a lost link and a restart of the autopilot, looked at a hundred times a
+    second."""
+
+    async def main() -> None:
+        async with Rig(tmp_path, at_arm=at_arm, **QUICK).running() as rig:
+            found: set[str] = set()
+
+            async def look() -> None:
+                while True:
+                    found.update(contradictions(rig))
+                    await asyncio.sleep(0.01)
+
+            looking = asyncio.create_task(look())
+            conductor = rig.service.calibrating.conductor
+            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 120.0)
+            await rig.until(lambda: conductor.running is None, 120.0)
+            rig.double.faults.echo_without_effect = True
+            rig.model.turn_on([2000.0 * SIM_DEG_H, 0.0, 0.0], [0.0, 0.0, 0.0])
+            await calibrated(rig)
+            rig.double.faults.echo_without_effect = False
+            rig.wire.cut = True
+            await asyncio.sleep(4.0)
+            rig.wire.cut = False
+            await asyncio.sleep(4.0)
+            rig.double.reboot()
+            await asyncio.sleep(6.0)
+            looking.cancel()
+            assert conductor.state is not State.IDLE
+            assert found == set()
+
+    run_virtual(main())
+
+
+def test_after_a_restart_the_figures_are_those_of_the_record_while_the_autopilot_has_run_on(tmp_path: Path) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path, **QUICK)
+        async with rig.running():
+            await rig.ready()
+            await asyncio.sleep(60.0)
+            _, record = await calibrated(rig)
+            sigma = record.imus[0].sigma_in_force("gyro")
+            assert sigma is not None
+            for boots in (0, 1):
+                if boots:
+                    rig.double.reboot()
+                    await asyncio.sleep(5.0)
+                await rig.restart()
+                await rig.until(lambda: rig.service.status()["arming"]["state"] == "checked", 60.0)
+                words = rig.service.status()["arming"]["in_force"]
+                figure = f", {max(sigma) / DEG_H:.1f} deg/h"
+                assert (figure in words) is (boots == 0), (words, figure)
+
+    run_virtual(main())
