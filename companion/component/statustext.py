@@ -103,13 +103,18 @@ def as_lines(severity: Severity, text: str) -> list[tuple[Severity, str]]:
         rest = f"{GOES_ON}{rest[end:].lstrip()}" if end < len(rest) else ""
         severity = max(severity, Severity.INFO)
         if rest and len(found) == MOST_LINES:
-            found[-1] = (severity, f"{found[-1][1][: LINE_BYTES - 4]} ...")
+            found[-1] = (severity, f"{shortened(found[-1][1], LINE_BYTES - 4)} ...")
             break
     return found
 
 
-def _end_of_line(text: str, *, figures: bool) -> int:
-    blanks = [at for at, letter in enumerate(text[: LINE_BYTES + 1]) if letter == " " and at >= len(GOES_ON)]
+def shortened(text: str, most: int) -> str:
+    """Beginning of a text in so many characters: up to its last pause, else up to its last whole word."""
+    return text if len(text) <= most else text[: _end_of_line(text, figures=True, most=most)].rstrip(" :;,")
+
+
+def _end_of_line(text: str, *, figures: bool, most: int = LINE_BYTES) -> int:
+    blanks = [at for at, letter in enumerate(text[: most + 1]) if letter == " " and at >= len(GOES_ON)]
     pauses = [
         at
         for at in blanks
@@ -119,9 +124,9 @@ def _end_of_line(text: str, *, figures: bool) -> int:
         pauses = [at for at in pauses if at < figure.start()]
         if pauses:
             return pauses[-1]
-    if len(text) <= LINE_BYTES:
+    if len(text) <= most:
         return len(text)
-    return (pauses or blanks or [LINE_BYTES])[-1]
+    return (pauses or blanks or [most])[-1]
 
 
 class _Text(NamedTuple):

@@ -58,8 +58,13 @@ local strayed_rad, last_yaw_rad, last_ms = 0, nil, nil
 local is_broken = false
 local gated_ms, gate_after_ms = nil, PERIOD_MS
 
+-- To what is shown, at the end of a word if that leaves half of it.
 local function shorten(text)
-    return string.sub(text, 1, LONGEST)
+    if #text <= LONGEST then
+        return text
+    end
+    local words = string.match(string.sub(text, 1, LONGEST + 1), "^(.*[^ :;,])[:;,]* [^ ]*$")
+    return words ~= nil and #words > LONGEST / 2 and words or string.sub(text, 1, LONGEST)
 end
 
 local function add_parameters()
@@ -215,7 +220,7 @@ local function guard()
     end
     if set == SET_1 then
         if silent_since_ms ~= nil and since_ms(silent_since_ms) >= LOST_MS then
-            fall("companion silent")
+            fall("none from companion")
         elseif strays() then
             is_latched = true
             fall("companion's drifts")

@@ -228,7 +228,7 @@ def test_ekf3_goes_back_to_its_compass_when_our_heading_ends(tmp_path: Path, scr
             print(f"{found:.2f} deg, {on.vehicle.physics_s - physics_s:.1f} s after the end")
             assert abs(found) < FOLLOWS_DEG
             if script:
-                assert "Heading: compass, companion silent" in on.ground.texts_since(begun_s)
+                assert "Heading: compass, none from companion" in on.ground.texts_since(begun_s)
 
     asyncio.run(main())
 

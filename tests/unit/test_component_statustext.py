@@ -8,11 +8,15 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.component.arm_authorisation import ArmingScript
 from companion.component.own_parameters import Parameter
+from companion.component.service import ArmAnswer
 from companion.component.statustext import GOES_ON, Severity, StatusText, Weight, as_lines, to_ascii
 from companion.links.mavlink.link import MavlinkLink
-from tests.support.component import Ground, bench
+from tests.support.component import Ground, ScriptedGate, bench
+from tests.support.messages import FILLED, all_messages
 from tests.support.virtual_time import run_virtual
 
 
@@ -61,6 +65,43 @@ def test_any_text_is_cut_into_lines_that_can_be_put_together(severity: Severity,
     whole = "".join([line.removeprefix(GOES_ON) if number else line for number, (_, line) in enumerate(lines)])
     if not lines[4:]:
         assert whole.replace(" ", "") == text.replace(" ", "")
+
+
+FIELDS = ("gradienter", "-123456.7", "INS_GYROFFS_X, INS_GYROFFS_Y, INS_GYROFFS_Z")
+"""The longest that is filled in as a rule: a name, a figure, a list of parameters."""
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_every_text_of_the_code_is_cut_between_words_wherever_it_is_shown(field: str) -> None:
+    """In lines of STATUSTEXT, and as ArduPilot's reason not to arm, which its script gets by TUNNEL."""
+    texts = {to_ascii(message.template.replace(FILLED, field)) for message in all_messages()}
+    assert len(texts) > 500
+    for text in texts:
+        for severity in Severity:
+            lines = [line for _, line in as_lines(severity, text)]
+            assert all(len(line) <= 50 for line in lines), text
+            assert begins(text, put_together(lines).removesuffix(" ..."), 46), lines
+        reason = sent_to_script(text)
+        assert len(f"Arm: Companion: {reason}") <= 50
+        assert begins(text, reason, 30), reason
+
+
+def begins(text: str, shown: str, most: int) -> bool:
+    """Whether what is shown are the first words of a text; of a word that is longer than a line, its beginning."""
+    words, first = ([word.rstrip(":;,") for word in each.split()] for each in (text, shown))
+    return words[: len(first)] == first or any(len(word) > most for word in words)
+
+
+def sent_to_script(text: str) -> str:
+    """The reason in the TUNNEL message."""
+    link, ground, gate = MavlinkLink(), Ground(), ScriptedGate()
+    link.join((1, 1))
+    gate.asks_script, gate.says = True, ArmAnswer("wait", text)
+    link.attach(lambda data: ground.receive(data, 0.0))
+    ArmingScript(link, gate).step(0.0)
+    (message,) = [message for _, message in ground.received]
+    assert isinstance(message, mavlink.MAVLink_tunnel_message)
+    return bytes(message.payload[6 : message.payload_length]).decode("ascii")
 
 
 @pytest.mark.parametrize(

@@ -115,8 +115,18 @@ def test_the_reason_is_what_the_pilot_reads_in_at_most_41_characters(script: Scr
     script(received(sent(verdict, "no data from gradienter for 3600 s, look at its cable")))
     state, reason, _ = script("run 200")
     assert state == "failed"
-    assert reason == "Companion: no data from gradienter for 36"
-    assert len(reason) == 41
+    assert reason == "Companion: no data from gradienter for"
+    script(received(sent(verdict, "hold still 49 s: calibrates by itself")))
+    assert script("run 200")[1] == "Companion: hold still 49 s"
+
+
+def test_a_reason_that_comes_too_long_is_cut_at_a_word(script: Script) -> None:
+    for words, shown in (
+        ("the gradienter moves, or something else does", "Companion: the gradienter moves, or"),
+        ("x" * 60, "Companion: " + "x" * 30),
+    ):
+        script(received(tunnel(7, b"CMPA\x01\x00" + words.encode())))
+        assert script("run 200")[1] == shown
 
 
 def test_a_companion_that_no_longer_gates_lets_go(script: Script) -> None:
@@ -229,7 +239,7 @@ def test_a_stream_that_ends_in_flight_leaves_the_heading_to_the_gyros_within_hal
     """And not to a compass that may have come to lie."""
     flown("fly healthy 0")
     assert flown("run 250")[2] == ""
-    assert flown("run 150")[2] == "4:Heading: gyros, companion silent"
+    assert flown("run 150")[2] == "4:Heading: gyros, none from companion"
     flown("run 600000")
     assert source(flown) == "set 3"
 
@@ -237,7 +247,7 @@ def test_a_stream_that_ends_in_flight_leaves_the_heading_to_the_gyros_within_hal
 def test_on_the_ground_it_is_the_compass(flown: Script) -> None:
     flown("fly armed 0")
     flown("fly healthy 0")
-    assert flown("run 400")[2] == "4:Heading: compass, companion silent"
+    assert flown("run 400")[2] == "4:Heading: compass, none from companion"
     assert source(flown) == "set 2"
 
 

@@ -341,8 +341,8 @@ def test_what_a_firmware_cannot_do_is_said_before_it_is_started(
     ("told", "ours"),
     [
         ([], True),
-        (["Heading: compass, companion silent", "Heading: companion"], True),
-        (["Heading: companion", "Heading: gyros, companion silent", "EKF3 IMU0 is using GPS"], False),
+        (["Heading: compass, none from companion", "Heading: companion"], True),
+        (["Heading: companion", "Heading: gyros, none from companion", "EKF3 IMU0 is using GPS"], False),
         (["Heading: compass, companion's is not pushed"], False),
     ],
 )

@@ -147,7 +147,7 @@ def unseen_turn(solution: Solution | None) -> tuple[str, ...]:
         return ()
     turn = solution.turn
     if not turn.is_told:
-        return ("nothing saw whether the ground turns (a boat?)",)
+        return ("no compass: nothing saw whether the ground turns",)
     if turn.by == "earlier calibrations" and not turn.is_chance:
         return (f"the aircraft {turn.in_words}, or its gyros are unlike in earlier power-ups: sigma widened",)
     return ()
