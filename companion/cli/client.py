@@ -221,6 +221,16 @@ _SHOWN: Final = {"faces": ("accel_bias_mg", "accel_scale", "accel_shear"), "turn
 """Of other kinds all but the shear, as far as the stands tell."""
 
 
+def _bias_lines(words: str, whole: Sequence[float] | None, left: Sequence[float], sigma: Sequence[float]) -> list[str]:
+    """The whole bias, and where it is known what of it the output still shows: the change of a write."""
+    if words == "slant when level" or whole is None:
+        return [f"  {words:16} {'mg':6} {show.axes(left, sigma, '+.3f')}"]
+    return [
+        f"  {words:16} {'mg':6} {show.axes(whole, sigma, '+.3f')}",
+        f"  {'  change':16} {'mg':6} {show.changes(left, '+.3f')}",
+    ]
+
+
 def stands_lines(record: Object) -> list[str]:
     """What stands have told, as a person reads it: the spot, the zero, each IMU, the board, then what to copy."""
     slope = f"; the spot slopes by {record['slope_deg']:.2f} deg" if "slope_deg" in record else ""
@@ -241,12 +251,17 @@ def stands_lines(record: Object) -> list[str]:
     for imu in record["imus"]:
         scatter = f" stands miss gravity by {imu['scatter_mg']:.2f} mg" if "scatter_mg" in imu else ""
         lines.append(f"{imu['name']}:{scatter}")
+        whole = imu.get("whole_bias_mg")
         if "level_bias_mg" in imu:
-            level = show.axes(imu["level_bias_mg"], imu["level_sigma_mg"], "+.3f")
-            lines.append(f"  {'bias when level':16} {'mg':6} {level}")
+            # Of accelerometers that are known from all sides this is no bias, but how the board sits.
+            words = "bias when level" if record.get("board") is None else "slant when level"
+            lines += _bias_lines(words, whole, imu["level_bias_mg"], imu["level_sigma_mg"])
         known = [key for key in _FIGURES if key != "accel_shear" and key in imu and all(imu[key]["known"])]
         for key in _SHOWN.get(record["kind"], known):
             words, unit, form, scale = _FIGURES[key]
+            if key == "accel_bias_mg":
+                lines += _bias_lines(words, whole, imu[key]["value"], imu[key]["sigma"])
+                continue
             lines.append(f"  {words:16} {unit:6} {show.axes(imu[key]['value'], imu[key]['sigma'], form, scale)}")
         lines += show.written_lines(imu.get("written", {}))
     if (board := record.get("board")) is not None:

@@ -53,13 +53,15 @@ def _imu_lines(imu: Object) -> list[str]:
     lines = [
         f"{imu['name']}: {imu['samples']} samples" + (f", {temperature:.1f} degC" if temperature is not None else "")
     ]
-    for triad, unit, scale, form, bias, sigma in (
-        ("gyro", "deg/h", DEG_H, "+9.1f", "gyro_bias_rad_s", "gyro_sigma_use_rad_s"),
-        ("accel", "mg   ", MG, "+9.3f", "accel_bias_m_s2", "accel_sigma_use_m_s2"),
+    for triad, unit, scale, form, bias, sigma, left in (
+        ("gyro", "deg/h", DEG_H, "+9.1f", "gyro_bias_rad_s", "gyro_sigma_use_rad_s", "residual_gyro_rad_s"),
+        ("accel", "mg   ", MG, "+9.3f", "accel_bias_m_s2", "accel_sigma_use_m_s2", "residual_accel_m_s2"),
     ):
         if imu[bias] is None:
             continue
         lines.append(f"  {triad:5} bias {unit} {axes(imu[bias], imu[sigma], form, scale)}{_held_back(imu, triad)}")
+        if imu["written"] and imu.get(left) not in (None, imu[bias]):
+            lines.append(f"      change {unit} {changes(imu[left], form, scale)}")
     lines += written_lines(imu["written"])
     lines += [f"  warning: {warning}" for warning in imu["warnings"]]
     return lines
@@ -79,6 +81,11 @@ def axes(values: Sequence[float], sigmas: Sequence[float], form: str, scale: flo
         f"{axis} {value / scale:{form}} +- {sigma / scale:.{form[-2]}f}"
         for axis, value, sigma in zip("xyz", values, sigmas, strict=True)
     )
+
+
+def changes(values: Sequence[float], form: str, scale: float = 1.0) -> str:
+    """Three figures without their sigmas, as `axes`: what a write has changed, or would."""
+    return "  ".join(f"{axis} {value / scale:{form}}" for axis, value in zip("xyz", values, strict=True))
 
 
 def _number(value: float | None, form: str) -> str:

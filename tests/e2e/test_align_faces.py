@@ -14,6 +14,7 @@ import pytest
 from companion.calibration.records.align_record import FacesRecord
 from companion.calibration.records.record import Record
 from companion.calibration.request import What
+from companion.cli.client import stands_lines
 from companion.cli.show import status_lines
 from companion.component.service import Refusal
 from companion.daemon.job import Job
@@ -45,7 +46,8 @@ def read(rig: Rig, what: str) -> np.ndarray[Any, Any]:
 
 
 def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tmp_path: Path) -> None:
-    made, hands = rig(tmp_path)
+    offsets = dict(zip(offset_names(1, "accel"), (0.1, -0.08, 0.05), strict=True))
+    made, hands = rig(tmp_path, parameters=SCALES | offsets)
 
     async def main() -> None:
         async with made.running():
@@ -65,6 +67,13 @@ def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tmp_path
             true_mg = made.model.true_bias(made.aircraft.time_at(made.now_s)).accel_m_s2 / MG
             np.testing.assert_allclose(read(made, "accel") / MG, true_mg, atol=0.15)
             assert np.abs(true_mg - ACCEL_BIAS_MG).max() < 0.2
+            # What is told is what was written, the whole; and beside it what of that is new.
+            assert imu.whole_bias_mg is not None
+            np.testing.assert_allclose(imu.whole_bias_mg, true_mg, atol=0.15)
+            (bias, change) = [line for line in stands_lines(msgspec.to_builtins(record)) if " mg   " in line]
+            assert f"x {imu.whole_bias_mg[0]:+.3f} +- " in bias
+            told_mg = [float(value) for value in re.findall(r"[xyz] ([-+][\d.]+)", change)]
+            np.testing.assert_allclose(told_mg, true_mg - np.array(list(offsets.values())) / MG, atol=0.2)
             wrong = np.array(list(SCALES.values())) - 1.0
             np.testing.assert_allclose(imu.accel_scale.value, wrong, atol=2e-4)
             assert {one.outcome for one in imu.written.values()} == {"verified"}

@@ -6,10 +6,12 @@ import asyncio
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from companion.calibration.records.align_record import TurnRecord
+from companion.cli.client import stands_lines
 from companion.component.service import Refusal
 from companion.daemon.job import Job
 from sim.aircraft import Pose
@@ -198,6 +200,9 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
             assert isinstance(record, TurnRecord)
             assert record.board is not None
             assert max(record.board.sigma_deg) < 0.03
+            # With all sides known it is no bias that a level base would show.
+            (line,) = [words for words in stands_lines(msgspec.to_builtins(record)) if "when level" in words]
+            assert line.startswith("  slant when level ")
             up = mounting_matrix(*board_deg).T @ np.array([0.0, 0.0, -1.0])
             true_deg = np.degrees([np.arctan2(-up[1], -up[2]), np.arcsin(up[0])])
             trim = np.degrees([made.double.parameter("AHRS_TRIM_X"), made.double.parameter("AHRS_TRIM_Y")])

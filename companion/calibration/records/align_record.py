@@ -211,6 +211,8 @@ class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Rms by which the stands' readings, corrected, miss the length of gravity."""
     written: dict[str, WrittenParameter]
     """Empty where nothing was to be written."""
+    whole_bias_mg: Vector | None = None
+    """Bias of the sensor without any offset, as it is written; None: of an earlier version."""
 
 
 class FacesRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -245,6 +247,7 @@ def faces_imu_record(
     corrections: dict[str, float],
     temperature_degc: float | None,
     running: Running | None,
+    whole_m_s2: Array,
 ) -> FacesImuRecord:
     """One IMU in the units that people know, before anything is written."""
     kept = [k for k in range(len(found.off_m_s2)) if k not in found.left_out]
@@ -260,6 +263,7 @@ def faces_imu_record(
         left_out=tuple(k + 1 for k in found.left_out),
         scatter_mg=round(float(np.sqrt(np.mean(np.square(found.off_m_s2[kept])))) / MG, 4),
         written={},
+        whole_bias_mg=_axes(whole_m_s2 / MG),
     )
 
 
@@ -273,6 +277,8 @@ class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
 
     written: dict[str, WrittenParameter] = {}
     """Empty where nothing was to be written."""
+    whole_bias_mg: Vector | None = None
+    """`level_bias_mg` without the autopilot's offsets, as it would be written; None: of an earlier version."""
 
 
 class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -297,8 +303,8 @@ class TurnRecord(SpotRecord, frozen=True, kw_only=True):
 
 
 def turn_imu_record(
-    imu: ImuAlignment, temperature_degc: float | None, written: dict[str, WrittenParameter]
+    imu: ImuAlignment, temperature_degc: float | None, written: dict[str, WrittenParameter], whole_m_s2: Array
 ) -> TurnImuRecord:
     """One IMU in the units that people know."""
     told = msgspec.convert(imu_record(imu, temperature_degc), TurnImuRecord, from_attributes=True)
-    return msgspec.structs.replace(told, written=written)
+    return msgspec.structs.replace(told, written=written, whole_bias_mg=_axes(whole_m_s2 / MG))

@@ -187,9 +187,15 @@ class Facing:
                 corrections=self._imus[name].in_force.corrections,
                 temperature_degc=degrees.get(name),
                 running=self._kept.running(name),
+                whole_m_s2=self._whole_m_s2(name, found),
             )
             for name, found in by_imu.items()
         ]
+
+    def _whole_m_s2(self, name: str, found: Faces) -> Array:
+        """Bias without any offset, in the sensor's own scale, as offsets take it off."""
+        calibration = self._imus[name].in_force
+        return np.asarray(calibration.accel_offset_m_s2) + found.figures[BIAS] / calibration.in_use()
 
     def _record(
         self,

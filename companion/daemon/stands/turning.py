@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import changes_for
+from companion.autopilot.firmware.imu_calibration import changes_for, whole_bias
 from companion.calibration.alignment.align import Alignment, in_words
 from companion.calibration.alignment.align_model import Stand
 from companion.calibration.alignment.spot import Mounting, mounting, turned
@@ -29,7 +29,7 @@ from companion.daemon.stands.level_writes import LevelWrites
 from companion.daemon.stands.stands import Stands
 from companion.daemon.stands.taken import Taken, ground, readable
 from companion.errors import CalibrationRefusedError
-from companion.physics.frames import vector
+from companion.physics.frames import Array, vector
 from companion.physics.units import DEG, MG
 from companion.storage.changes import Origin
 
@@ -105,6 +105,7 @@ class Turning:
         if board is None and asked.level:
             raise CalibrationRefusedError("nothing is known from all sides of these accelerometers: align faces again")
         sits: dict[str, WrittenParameter] = {}
+        whole = self._whole_m_s2(found, taken[-1].window)
         try:
             if asked.write:
                 changes = {
@@ -118,11 +119,22 @@ class Turning:
                 if warning is not None:
                     self._core.say(Severity.WARNING, warning)
         finally:
-            record = _record(taken, stands, found, draft)
+            record = _record(taken, stands, found, draft, whole)
             job.deliver(msgspec.structs.replace(record, board=self._as_record(found, board, sits)))
         if not (asked.write or asked.level):
             self._machine.on(Event.NOTHING_TO_WRITE)
         return _in_words(found, board, asked)
+
+    def _whole_m_s2(self, found: Alignment, last: Window) -> dict[str, Array]:
+        """By IMU, what is shown when level without the offsets that are in force before a write."""
+        degrees = {one.name: one.temperature_degc for one in last.imus}
+        zero = (0.0, 0.0, 0.0)
+        return {
+            imu.name: np.array(
+                whole_bias(self._imus[imu.name].in_force, zero, vector(imu.level_bias_m_s2), degrees.get(imu.name))[1]
+            )
+            for imu in found.imus
+        }
 
     def _board(self, found: Alignment, local: LocalEarth, last: Window) -> Mounting | None:
         """How the board of the first IMU sits, where its accelerometers are known from all sides."""
@@ -160,7 +172,9 @@ def _sigma_m_s2(found: Alignment) -> float:
     return max(float(np.sqrt(np.diag(imu.level_covariance_m2_s4))[:2].max()) for imu in found.imus)
 
 
-def _record(taken: list[Taken], stands: list[Stand], found: Alignment, draft: Draft) -> TurnRecord:
+def _record(
+    taken: list[Taken], stands: list[Stand], found: Alignment, draft: Draft, whole_m_s2: Mapping[str, Array]
+) -> TurnRecord:
     degrees = {imu.name: imu.temperature_degc for imu in taken[-1].window.imus}
     return TurnRecord(
         measured_at=draft.started,
@@ -169,6 +183,9 @@ def _record(taken: list[Taken], stands: list[Stand], found: Alignment, draft: Dr
         chi_square=round(found.chi_square, 3),
         freedom=found.freedom,
         stands=tuple(stand_record(stand, found, k, taken[k].seconds, (0.0, 0.0)) for k, stand in enumerate(stands)),
-        imus=tuple(turn_imu_record(imu, degrees.get(imu.name), draft.written.get(imu.name, {})) for imu in found.imus),
+        imus=tuple(
+            turn_imu_record(imu, degrees.get(imu.name), draft.written.get(imu.name, {}), whole_m_s2[imu.name])
+            for imu in found.imus
+        ),
         warnings=(*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each)),
     )
