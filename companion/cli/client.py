@@ -130,8 +130,10 @@ async def setup(options: argparse.Namespace) -> int:
 
 def setup_lines(answer: Object) -> list[str]:
     """The set-up as a person reads it."""
-    lines = [f"heading: {answer['state']}: {answer['reason']}", *map(_row, answer["parameters"])]
-    lines += [f"safety net: {answer['net']['words']}", *(f"risk: {risk}" for risk in answer["risks"])]
+    net = answer["net"]
+    heading = answer["reason"] if net is None else f"{answer['state']}: {answer['reason']}"
+    lines = [f"heading: {heading}", *map(_row, answer["parameters"])]
+    lines += [] if net is None else [f"safety net: {net['words']}", *(f"risk: {risk}" for risk in answer["risks"])]
     gate = answer["gate"]
     how = gate["problem"] or "the autopilot asks before it arms"
     lines.append(f"gate: {how}" if gate["at_arm"] == "gate" else f"gate: not wanted; for at_arm = gate: {how}")

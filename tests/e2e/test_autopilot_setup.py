@@ -97,6 +97,24 @@ def test_what_is_to_be_set_is_said_and_nothing_is_written(tmp_path: Path, firmwa
     run_virtual(main())
 
 
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_where_no_heading_is_sent_none_is_missed_and_one_that_is_expected_all_the_same_is(
+    tmp_path: Path, firmware: Firmware
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, firmware=firmware, parameters=BEFORE[firmware]).running() as rig:
+            await rig.ready()
+            lines = setup_lines(await ask(rig))
+            assert lines[0].startswith("heading: not wanted; for push.attitude: set ")
+            assert not [line for line in lines if line.startswith(("safety net", "risk")) or "VisOdom" in line]
+            await follow(rig)
+            lines = setup_lines(await ask(rig))
+            assert lines[0].endswith('push.attitude is "off": no heading is sent')
+            assert [line for line in lines if line.startswith("risk: ")]
+
+    run_virtual(main())
+
+
 def test_the_set_up_and_the_stream_together(tmp_path: Path) -> None:
     """Apply, restart, calibrate: EKF3 has our heading."""
 

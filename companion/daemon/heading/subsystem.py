@@ -64,14 +64,21 @@ class Heading(Subsystem):
         port = await self._core.parameters.read_many(port_names(firmware), optional=True)
         changes = changes_for(firmware, found)
         assert firmware is not None  # or it would have been refused
+        sends, todo = (
+            self._core.config.push.attitude != "off",
+            ", ".join(f"{one.parameter} {one.after:g}" for one in changes),
+        )
+        # Where no heading is sent and none is taken in, nothing hangs on it.
+        concerned = sends or not changes
         net = net_of(firmware, found)
-        missing = without_compass(firmware, found)
-        if missing is not None:
+        missing = without_compass(firmware, found) if concerned else None
+        if not concerned:
+            reason = f"not wanted; for push.attitude: set {todo}; {REBOOT}"
+        elif missing is not None:
             reason = f"this autopilot has no compass in use ({missing}): {NETS['none']}"
         elif changes:
-            todo = ", ".join(f"{change.parameter} {change.after:g}" for change in changes)
             reason = f"set {todo}; {REBOOT}"
-        elif self._core.config.push.attitude == "off":
+        elif not sends:
             reason = 'the autopilot is set up, but push.attitude is "off": no heading is sent'
         else:
             reason = "the autopilot is set up"
@@ -79,7 +86,7 @@ class Heading(Subsystem):
             "kind": "result",
             "state": "not applied" if changes or missing is not None else "applied",
             "reason": reason,
-            "net": {"kind": net, "words": NETS[net]},
+            "net": {"kind": net, "words": NETS[net]} if concerned else None,
             "firmware": firmware,
             "parameters": [
                 {
@@ -91,7 +98,7 @@ class Heading(Subsystem):
                 for one in wanted_for(firmware)
                 for now in (found.get(one.parameter),)
             ],
-            "risks": list(RISKS.get(firmware, ())),
+            "risks": list(RISKS.get(firmware, ())) if concerned else [],
             "gate": {"at_arm": self._core.wanted.at_arm, "problem": await self._gate.find_missing(0.0)},
             "rivals": [rival.words for rival in await read_rivals(self._core.parameters)],
             "port": [row._asdict() for row in port_rows(firmware, port, baud_of(self._core.config.mavlink.url))],

@@ -276,7 +276,7 @@ def _gate(config: Config, setup: Object) -> Finding:
 async def _heading(config: Config) -> Finding:
     replies = [reply async for reply in ask(config.control.path, {"command": "autopilot-setup"})]
     reply = replies[-1]
-    words = f"{reply['reason']}; {reply['net']['words']}" if "net" in reply else reply["reason"]
+    words = f"{reply['reason']}; {reply['net']['words']}" if reply.get("net") else reply["reason"]
     return Finding("heading", good=reply.get("state") == "applied", words=words)
 
 
