@@ -18,22 +18,23 @@ from companion.autopilot.parameters.change import Change
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.calibration.means.windows import ImuWindow
 from companion.calibration.records.record import Outcome, WrittenParameter
-from companion.calibration.records.validity import WORTH_SIGMAS
+from companion.calibration.records.validity import RESIDUAL_SIGMAS
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.solve import ImuSolution, Solution
+from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.offsets.rivalry import Rivalry
 from companion.errors import AutopilotError
 from companion.physics.frames import Array, vector
 from companion.physics.units import MG
-from companion.samples import Triad, Vector
+from companion.samples import Triad, Vector, rows_of
 
 COARSE_ACCEL_MG: Final = 5.0
 """What the autopilots' own calibrations reach on a level table; a new offset known worse than that is worth a word."""
 
 AS_GOOD: Final = 1.5
-"""An earlier sigma of so many present ones at most is as good: a new write would better nothing worth its wear."""
+"""Offsets are as good as new ones up to this ratio of their expected errors: a write would better nothing worth its
+wear."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -129,7 +130,7 @@ class Planner:
             if imu is not None:
                 calibration = imu.in_force
                 draft.whole[found.name] = whole_of(calibration, whole)
-                found = found if anyway or not push else _less_noise(calibration, found, draft)
+                found = found if anyway or not push else _less_noise(calibration, found, solution.shared, draft)
                 gyro, accel = found.gyro_rad_s, found.accel_m_s2
             elif source.autopilot_instance is not None:
                 calibration = await read_calibration(self._parameters, source.autopilot_instance, self._memory)
@@ -187,20 +188,29 @@ def _to_be_written(found: ImuSolution, draft: Draft) -> ImuSolution:
     )
 
 
-def _less_noise(calibration: ImuCalibration, found: ImuSolution, draft: Draft) -> ImuSolution:
-    """What was found in one IMU, less the half where it only repeats a calibration as good: to write would be noise."""
+def _less_noise(calibration: ImuCalibration, found: ImuSolution, shared: Shared, draft: Draft) -> ImuSolution:
+    """The solution of one IMU, less the half where the offsets in force are as good: to write would be noise.
+
+    They are where the residual is within the errors of both estimates, or adds little to what the next minutes do to
+    old and new offsets alike.
+    """
     before = None if draft.before is None else next((imu for imu in draft.before.imus if imu.name == found.name), None)
-    sigmas, left = np.sqrt(np.diag(found.covariance)), {"gyro": found.gyro_rad_s, "accel": found.accel_m_s2}
-    halves: tuple[tuple[Triad, Array, Vector, bool], ...] = (
-        ("gyro", sigmas[:3], calibration.gyro_offset_rad_s, False),
-        ("accel", sigmas[3:], calibration.accel_offset_m_s2, calibration.accel_offset_may_be_unused),
+    variance, left = np.diag(found.covariance), {"gyro": found.gyro_rad_s, "accel": found.accel_m_s2}
+    estimated = np.minimum(np.square(found.sigma_stat) + np.diag(shared.covariance), variance)
+    stat = (None, None) if before is None else (before.gyro_sigma_stat_rad_s, before.accel_sigma_stat_m_s2)
+    halves: tuple[tuple[Triad, Vector, bool, Vector | None], ...] = (
+        ("gyro", calibration.gyro_offset_rad_s, False, stat[0]),
+        ("accel", calibration.accel_offset_m_s2, calibration.accel_offset_may_be_unused, stat[1]),
     )
-    for triad, sigma, offset, unsure in halves:
+    for triad, offset, unsure, averaged in halves:
         residual, then = left[triad], None if before is None else before.sigma_in_force(triad)
         # What has no offsets counts as uncalibrated to the autopilot itself.
         if residual is None or then is None or unsure or not any(offset):
             continue
-        if (np.abs(residual) <= WORTH_SIGMAS * sigma).all() and (np.asarray(then) <= AS_GOOD * sigma).all():
+        rows = rows_of(triad)
+        both = estimated[rows] + np.square(np.zeros(3) if averaged is None else averaged)
+        most = np.maximum(RESIDUAL_SIGMAS**2 * both, (AS_GOOD**2 - 1.0) * variance[rows])
+        if (np.square(residual) <= most).all() and (np.asarray(then) <= AS_GOOD * np.sqrt(variance[rows])).all():
             draft.unchanged.add((found.name, triad))
             left[triad] = None
     return dataclasses.replace(found, gyro_rad_s=left["gyro"], accel_m_s2=left["accel"])
