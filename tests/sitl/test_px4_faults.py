@@ -79,7 +79,7 @@ def test_a_daemon_that_dies_at_the_far_value_puts_the_old_ones_back_unless_px4_w
             before = await ground.whole_list(60.0)
             async with companion_daemon(vehicle, folder, more=QUICK) as daemon:
                 calibrating = asyncio.create_task(daemon.calibrate(CALIBRATE_WITHIN_S))
-                while await ground.get("CAL_ACC0_XOFF") == before["CAL_ACC0_XOFF"]:
+                while await ground.get("CAL_ACC0_ZOFF") == before["CAL_ACC0_ZOFF"]:
                     assert not calibrating.done(), daemon.log()
                     await asyncio.sleep(0.02)
                 daemon.kill()

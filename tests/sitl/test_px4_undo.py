@@ -63,7 +63,7 @@ def test_values_lost_by_a_power_cut_right_after_the_write_are_noticed_after_the_
             async with companion_daemon(vehicle, folder, more=QUICK) as daemon:
                 calibrating = asyncio.create_task(daemon.calibrate(CALIBRATE_WITHIN_S))
                 # PX4 saves a while after a change: cut the power when the first far value has come in.
-                while await ground.get("CAL_ACC0_XOFF") == before["CAL_ACC0_XOFF"]:
+                while await ground.get("CAL_ACC0_ZOFF") == before["CAL_ACC0_ZOFF"]:
                     assert not calibrating.done(), daemon.log()
                     await asyncio.sleep(0.02)
                 await vehicle.power_cycle()

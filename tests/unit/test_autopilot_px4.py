@@ -309,7 +309,7 @@ def test_whenever_px4_looked_at_its_parameters_last_the_small_change_gets_in(sin
     run_virtual(main())
 
 
-@pytest.mark.parametrize("number", range(1, 13))
+@pytest.mark.parametrize("number", range(1, 9))
 def test_a_write_that_fails_anywhere_leaves_the_old_values_in_use(number: int) -> None:
     count = 0
 
@@ -345,15 +345,19 @@ def test_what_is_seen_on_the_way_may_put_everything_back() -> None:
             changes = small_changes(await read_calibration(stage.client, 1))
             seen: list[list[float]] = []
 
-            async def look() -> str | None:
-                await asyncio.sleep(1.3)
-                seen.append(in_use(stage.px4, "GYRO"))
-                return "it acts on another IMU"
+            class Probe:
+                def mark(self, parameter: str) -> None:
+                    pass
+
+                async def verify(self, parameter: str) -> str | None:
+                    await asyncio.sleep(0.1)
+                    seen.append(in_use(stage.px4, "GYRO"))
+                    return "it acts on another IMU" if parameter.startswith("CAL_GYRO") else None
 
             with pytest.raises(WriteFailedError, match="not as believed: it acts on another IMU") as caught:
-                await stage.writer.apply(changes, look)
+                await stage.writer.apply(changes, Probe())
             assert caught.value.kind == "not as believed"
-            assert min(seen[0]) == pytest.approx(0.02)
+            assert max(seen[-1]) == pytest.approx(0.0228)
             await asyncio.sleep(1.5)
             assert in_use(stage.px4, "GYRO") == [0.0, 0.0, 0.0]
 
@@ -365,15 +369,19 @@ def test_armed_between_the_two_steps_nothing_more_is_written_until_it_is_disarme
         async with aboard(ScriptedPx4()) as stage:
             changes = small_changes(await read_calibration(stage.client, 1))
 
-            async def arm() -> str | None:
-                stage.px4.armed = True
-                await asyncio.sleep(1.5)
-                return None
+            class Arms:
+                def mark(self, parameter: str) -> None:
+                    pass
+
+                async def verify(self, parameter: str) -> str | None:
+                    stage.px4.armed = True
+                    await asyncio.sleep(1.5)
+                    return None
 
             with pytest.raises(WriteFailedError) as caught:
-                await stage.writer.apply(changes, arm)
+                await stage.writer.apply(changes, Arms())
             assert caught.value.kind == "armed in the middle"
-            assert set(caught.value.left_changed) == {c.parameter for c in changes}
+            assert set(caught.value.left_changed) == {"CAL_ACC0_ZOFF"}
             assert not any(armed for _, _, armed in stage.px4.sets)
             with pytest.raises(NotDisarmedError):
                 await stage.writer.restore(changes)

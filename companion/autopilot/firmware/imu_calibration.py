@@ -155,12 +155,12 @@ class ImuParameters:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class FarStep:
-    """By how much, and to which side, an offset is first set wrong where small changes would be ignored.
+    """How far an offset is set wrong first where the firmware would ignore a small change; zero on all axes but one.
 
-    PX4 ignores a vector of offsets that differs by no more than 0.01 (rad/s, m/s^2) from the one that it uses
-    (autopilots 4.2), and it looks at most once a second, so that of three writes it may see any one alone: X may be
-    taken and a small Y after it not (9.3.2). But if every axis makes a step of more than 0.01, then whatever was in
-    use before, old, new or mixed, the last look sees a vector that is far enough from it.
+    PX4 ignores a vector that differs by no more than 0.01 (rad/s, m/s^2) from the one in use (autopilots 4.2), and it
+    may read the parameters between any two writes. So what it uses may differ by 0.01 from what it has stored. One axis
+    that steps by twice that, after the others have their new values, brings in whatever was in use before. The axis is
+    the one nearest to the vehicle's vertical: there a wrong value turns the heading, but tilts nothing.
     """
 
     gyro_rad_s: Vector
@@ -288,10 +288,9 @@ def changes_for(
 
 
 def vector_changes(names: tuple[str, str, str], before: Vector, after: Vector, far: Vector | None) -> list[Change]:
-    """The changes of one vector; by way of a far one, at least `far` from both ends on every axis, if one is given."""
-    if far is None:
-        return list(map(Change, names, before, after))
-    vias = [max(b, a) + step if step > 0 else min(b, a) + step for b, a, step in zip(before, after, far, strict=True)]
+    """The changes of one vector; an axis on which `far` is not 0 goes by a value that far above old and new."""
+    steps = (0.0, 0.0, 0.0) if far is None else far
+    vias = [max(b, a) + step if step else None for b, a, step in zip(before, after, steps, strict=True)]
     return list(map(Change, names, before, after, vias))
 
 

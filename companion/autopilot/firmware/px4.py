@@ -32,7 +32,7 @@ from companion.autopilot.firmware.imu_calibration import (
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import SCALES, Parameters, read_integer, read_vector
 from companion.errors import AutopilotError
-from companion.physics.frames import Matrix, rotation_matrix
+from companion.physics.frames import Matrix, rotation_matrix, vector
 from companion.physics.units import MG
 from companion.rotations import ROTATION_NAMES
 from companion.samples import Triad, Vector
@@ -133,12 +133,11 @@ scales likewise: `set_scale` of src/lib/sensor_calibration/Accelerometer.cpp. Af
 MARGIN: Final = 1.05
 """Both sides round to 32 bits."""
 
-FAR_GYRO_RAD_S: Final = 0.02
-FAR_ACCEL_M_S2: Final = 0.05
-FAR_SCALE: Final = 0.02
-
-FAR_SIGNS: Final[dict[int, Vector]] = {1: (1.0, 1.0, 1.0), 2: (-1.0, -1.0, -1.0), 3: (1.0, -1.0, 1.0)}
-"""By instance: of several IMUs written at once each makes another far step, so that they cannot be mistaken."""
+FAR_GYRO_RAD_S: Final = 0.022
+"""1.3 deg/s: more than twice `IGNORED_STEP`, and 22 digits of SCALED_IMU."""
+FAR_ACCEL_M_S2: Final = 0.09
+"""9 digits of SCALED_IMU (9.2 mg): the least that `parameters.verify` can tell from no step."""
+FAR_SCALE: Final = 0.022
 
 SIMULATED_GYRO_GRID_RAD_S: Final = math.radians(2000.0 / 32768.0) / 4.0
 SIMULATED_ACCEL_GRID_M_S2: Final = 1e3 * MG / 2048.0 / 4.0
@@ -202,7 +201,7 @@ async def read_calibration(parameters: Parameters, instance: int, memory: SlotMe
     names = parameters_of(gyro.number, accel.number)
     offset = await read_vector(parameters, names.accel_offset)
     small = too_small_to_apply_at_boot(offset)
-    signs = FAR_SIGNS[instance]
+    orientation = await _read_rotation(parameters, gyro, accel)
     calibration = ImuCalibration(
         instance=instance,
         parameters=names,
@@ -211,12 +210,8 @@ async def read_calibration(parameters: Parameters, instance: int, memory: SlotMe
         accel_scale=await read_vector(parameters, names.accel_scale, *SCALES),
         gyro_id=gyro.device_id,
         accel_id=accel.device_id,
-        orientation=await _read_rotation(parameters, gyro, accel),
-        far_step=FarStep(
-            gyro_rad_s=_times(FAR_GYRO_RAD_S, signs),
-            accel_m_s2=_times(FAR_ACCEL_M_S2, signs),
-            scale=_times(FAR_SCALE, signs),
-        ),
+        orientation=orientation,
+        far_step=_far_step(orientation),
         gyro_grid_rad_s=SIMULATED_GYRO_GRID_RAD_S if _bus(gyro) == _SIMULATION_BUS else 0.0,
         accel_grid_m_s2=SIMULATED_ACCEL_GRID_M_S2 if _bus(accel) == _SIMULATION_BUS else 0.0,
         scale_unused_within=MARGIN * IGNORED_STEP,
@@ -309,6 +304,11 @@ def _warnings(calibration: ImuCalibration) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _times(size: float, signs: Vector) -> Vector:
-    x, y, z = signs
-    return size * x, size * y, size * z
+def _far_step(orientation: Matrix) -> FarStep:
+    vertical = np.zeros(3)
+    vertical[np.abs(orientation[2]).argmax()] = 1.0
+    return FarStep(
+        gyro_rad_s=vector(FAR_GYRO_RAD_S * vertical),
+        accel_m_s2=vector(FAR_ACCEL_M_S2 * vertical),
+        scale=vector(FAR_SCALE * vertical),
+    )

@@ -27,8 +27,8 @@ FailureKind = Literal[
 class Change:
     """One parameter: the value it has, and the value it shall get. All are rounded to float32.
 
-    Where `via` is set the firmware would ignore a small change: then that value is written first, for all such
-    parameters of a set, and held long enough for the firmware to take it into use; the same on the way back.
+    Where `via` is set the firmware would ignore a small change of the vector: this far value is written first, and when
+    the firmware uses it, the new values of the vector; the same on the way back.
     """
 
     parameter: str
@@ -41,6 +41,11 @@ class Change:
         object.__setattr__(self, "after", float32(self.after))
         if self.via is not None:
             object.__setattr__(self, "via", float32(self.via))
+
+    @property
+    def far(self) -> float:
+        """The far value, or the new one where it needs none."""
+        return self.after if self.via is None else self.via
 
     @property
     def ours(self) -> tuple[float, ...]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import logging
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from msgspec import structs
@@ -19,9 +19,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.parameters.change import Change, FailureKind, NothingWrittenError, WriteFailedError
 from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.items import POLL_S, FarProbe, Item, ItemVector, by_vector
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.vehicle import ArmState, Moment, Vehicle
-from companion.calibration.records.record import Outcome, WrittenParameter
+from companion.calibration.records.record import WrittenParameter
 from companion.errors import (
     AutopilotError,
     AutopilotRebootedError,
@@ -33,13 +34,6 @@ from companion.errors import (
 )
 
 logger = logging.getLogger(__name__)
-
-Look = Callable[[], Awaitable[str | None]]
-"""Looks at the effect of values on the way; gives a reason to put everything back, if there is one."""
-
-HOLD_S: Final = 2.5
-"""How long a value on the way (`Change.via`) stays: PX4 looks at its parameters at most once a second (autopilots 9.2),
-and 2.5 s is what a real one was tried with (9.3.2)."""
 
 TAKEN_S: Final = 1.3
 """How long after the last value PX4 has taken it into use; until then the one on the way acts."""
@@ -60,24 +54,6 @@ _ROUNDS: Final = 2
 """How often putting back is tried; a late echo may have passed for a confirmation the first time."""
 
 
-@dataclasses.dataclass(slots=True)
-class _Item:
-    change: Change
-    sent: bool = False
-    confirmed: bool = False
-    """The autopilot has answered with a value of ours: another one found later is somebody else's."""
-    read_back: float | None = None
-    outcome: Outcome = "failed"
-    left: bool = False
-
-    def seen(self) -> WrittenParameter:
-        """What the record says of it."""
-        change = self.change
-        return WrittenParameter(
-            before=change.before, after=change.after, read_back=self.read_back, outcome=self.outcome
-        )
-
-
 class _Failure(Exception):  # noqa: N818 - never leaves this module
     def __init__(self, kind: FailureKind, reason: str) -> None:
         super().__init__(reason)
@@ -91,17 +67,18 @@ class ParameterWriter:
         self.written: dict[str, WrittenParameter] = {}
         """Outcomes of the last operation, whatever its end: also when it was cancelled."""
         self.left_changed: tuple[str, ...] = ()
+        self.left_far: tuple[str, ...] = ()
+        """Those of them that have their far value."""
         self._parameters = parameters
         self._vehicle = vehicle
         self._lock = asyncio.Lock()
         self._boots = 0
         self._give_up_s = self._deadline_s = 0.0
 
-    async def apply(self, changes: Sequence[Change], on_the_way: Look | None = None) -> dict[str, WrittenParameter]:
+    async def apply(self, changes: Sequence[Change], probe: FarProbe | None = None) -> dict[str, WrittenParameter]:
         """Write all changes or none; a parameter that already has its new value is not written again.
 
-        `on_the_way` is called while the values on the way (`Change.via`) are in force, and may look at their effect;
-        what it returns is a reason to put everything back.
+        Vectors with a far value (`Change.via`) come last and one at a time, each verified by `probe`.
 
         Returns:
             Every parameter as "stored": read back afresh, its effect not yet looked at.
@@ -115,10 +92,10 @@ class ParameterWriter:
             items = self._begin(changes)
             try:
                 await self._check_before(items)
-                await self._write_on_the_way(items, on_the_way)
-                for item in items:
-                    if item.change.before != item.change.after or item.sent:
-                        await self._write(item, item.change.after)
+                plain, vectors = by_vector(items)
+                for item in plain:
+                    await self._write_new(item)
+                await self._write_by_far(vectors, probe)
                 await self._read_back(items)
                 await self._check_end()
             except _Failure as failure:
@@ -167,9 +144,6 @@ class ParameterWriter:
         """
         swapped = [dataclasses.replace(c, before=c.after, after=c.before) for c in reversed(changes)]
         done = await self.apply(swapped)
-        if any(change.via is not None for change in changes):
-            # Nobody looks at the telemetry after this, and who is told that it is done may arm.
-            await Moment(self._vehicle).let_pass(TAKEN_S)
         self.written = {
             c.parameter: structs.replace(done[c.parameter], before=c.before, after=c.after, outcome="rolled_back")
             for c in changes
@@ -178,11 +152,11 @@ class ParameterWriter:
 
     # --- forward
 
-    def _begin(self, changes: Sequence[Change]) -> list[_Item]:
+    def _begin(self, changes: Sequence[Change]) -> list[Item]:
         names = [change.parameter for change in changes]
         if len(set(names)) != len(names):
             raise ValueError("a parameter is named twice")
-        items = [_Item(change) for change in changes]
+        items = [Item(change) for change in changes]
         self._publish(items)
         if (why := self._vehicle.arm_state.why_not_written) is not None:
             raise NothingWrittenError(f"nothing is written: {why}")
@@ -191,7 +165,7 @@ class ParameterWriter:
         self._boots = self._vehicle.boots
         return items
 
-    async def _check_before(self, items: list[_Item]) -> None:
+    async def _check_before(self, items: list[Item]) -> None:
         for item in items:
             name, before = item.change.parameter, item.change.before
             now = await self._read(name)
@@ -201,20 +175,46 @@ class ParameterWriter:
                     f"{name} is {_words(now)} now but was {_words(before)} when it was measured; nothing was written",
                 )
 
-    async def _write_on_the_way(self, items: list[_Item], on_the_way: Look | None) -> None:
-        indirect = [(item, item.change.via) for item in items if item.change.via is not None]
-        for item, via in indirect:
-            await self._write(item, via)
-        if not indirect:
-            return
-        written = Moment(self._vehicle)
-        wrong = None if on_the_way is None else await on_the_way()
-        await written.let_pass(HOLD_S)
-        await self._check_end()
-        if wrong is not None:
-            raise _Failure("not as believed", wrong)
+    async def _write_by_far(self, vectors: Sequence[ItemVector], probe: FarProbe | None) -> None:
+        """Write one vector after another: its far value, and when that is in use all new values, the far axis last.
 
-    async def _write(self, item: _Item, value: float) -> None:
+        So whatever ends this, the far axis differs from its old value as long as any other axis does.
+        """
+        wrong: list[str] = []
+        for far, others in vectors:
+            await Moment(self._vehicle).let_pass(2.0 * POLL_S)
+            words = await self._write_far(far, probe)
+            if words is None:
+                for item in others:
+                    await self._write_new(item)
+                await self._write(far, far.change.after)
+            else:
+                # The other vectors go on: each tells which IMU its slot acts on.
+                wrong.append(words)
+                await self._write(far, far.change.before)
+            far.is_far = False
+        if vectors:
+            # Whoever is told that it is done may arm.
+            await Moment(self._vehicle).let_pass(POLL_S)
+        if wrong:
+            raise _Failure("not as believed", "; ".join(wrong))
+
+    async def _write_far(self, item: Item, probe: FarProbe | None) -> str | None:
+        """Write the far value and wait until it is in use; why it is not as believed, if so."""
+        if probe is not None:
+            probe.mark(item.change.parameter)
+        await self._write(item, item.change.far)
+        item.is_far = True
+        if probe is not None:
+            return await probe.verify(item.change.parameter)
+        await Moment(self._vehicle).let_pass(POLL_S)
+        return None
+
+    async def _write_new(self, item: Item) -> None:
+        if item.change.before != item.change.after or item.sent:
+            await self._write(item, item.change.after)
+
+    async def _write(self, item: Item, value: float) -> None:
         name = item.change.parameter
         sent_before = self._parameters.writes
         try:
@@ -226,7 +226,7 @@ class ParameterWriter:
             item.sent |= self._parameters.writes > sent_before
         self._check_boot(f"after {name} was written")
 
-    async def _read_back(self, items: list[_Item]) -> None:
+    async def _read_back(self, items: list[Item]) -> None:
         await asyncio.sleep(_LATE_ECHO_S)
         for item in items:
             name, wanted = item.change.parameter, item.change.after
@@ -261,7 +261,7 @@ class ParameterWriter:
 
     # --- back
 
-    async def _fail(self, items: list[_Item], failure: _Failure) -> None:
+    async def _fail(self, items: list[Item], failure: _Failure) -> None:
         kind, reason = failure.kind, str(failure)
         if not self._vehicle.alive and any(item.sent for item in items):
             # It fell silent: if it comes back, learn first whether it restarted.
@@ -278,7 +278,7 @@ class ParameterWriter:
         await self._put_back(items, leave_foreign=kind == "rebooted in the middle")
         raise WriteFailedError(kind, reason, self.written, self.left_changed) from failure
 
-    async def _put_back(self, items: list[_Item], *, leave_foreign: bool) -> None:
+    async def _put_back(self, items: list[Item], *, leave_foreign: bool) -> None:
         touched = [item for item in reversed(items) if item.sent]
         for item in touched:
             item.outcome, item.left, item.read_back = "failed", True, None  # until known better
@@ -290,23 +290,27 @@ class ParameterWriter:
                 if not remaining:
                     break
                 foreign = leave_foreign or self._vehicle.boots != self._boots
-                indirect = [(item, item.change.via) for item in remaining if item.change.via is not None]
-                for item, via in indirect:
-                    await self._put_back_one(item, via, leave_foreign=foreign)
-                if indirect and self._vehicle.alive and not self._late():
-                    await asyncio.sleep(HOLD_S)
-                for item in remaining:
+                plain, vectors = by_vector(remaining)
+                for item in plain:
                     await self._put_back_one(item, item.change.before, leave_foreign=foreign)
-                await asyncio.sleep(TAKEN_S if indirect and self._vehicle.alive else _LATE_ECHO_S)
+                for far, others in vectors:
+                    if not far.is_far:
+                        await self._put_back_one(far, far.change.far, leave_foreign=foreign)
+                    if self._vehicle.alive and not self._late():
+                        await Moment(self._vehicle).let_pass(2.0 * POLL_S)
+                    for item in (*others, far):
+                        await self._put_back_one(item, item.change.before, leave_foreign=foreign)
+                await asyncio.sleep(TAKEN_S if vectors and self._vehicle.alive else _LATE_ECHO_S)
                 for item in touched:
                     item.read_back = await self._read_in_force(item.change.parameter)
                     item.left = not _same(item.read_back, item.change.before)
+                    item.is_far &= item.left
                     item.outcome = "failed" if item.left else "rolled_back"
         finally:
             self._publish(items)
 
-    async def _put_back_one(self, item: _Item, value: float, *, leave_foreign: bool) -> None:
-        """Set one parameter to its old value, or to the one on the way to it."""
+    async def _put_back_one(self, item: Item, value: float, *, leave_foreign: bool) -> None:
+        """Set one parameter to its old value, or to the far one."""
         change = item.change
         if not await self._wait_disarmed() or self._late():
             return
@@ -314,7 +318,8 @@ class ParameterWriter:
             # What is neither ours nor the old value came from a start-up calibration or another ground station. Of a
             # value that was never confirmed nobody knows: it may be what the autopilot has made of ours.
             now = await self._read_in_force(change.parameter)
-            if not any(_same(now, ours) for ours in change.ours) and (leave_foreign or now is not None):
+            known = (change.before, *change.ours)
+            if not any(_same(now, value) for value in known) and (leave_foreign or now is not None):
                 return
         try:
             await self._parameters.write(change.parameter, value)
@@ -346,7 +351,7 @@ class ParameterWriter:
     def _late(self) -> bool:
         return asyncio.get_running_loop().time() > self._deadline_s
 
-    def _kind_now(self, items: list[_Item]) -> FailureKind:
+    def _kind_now(self, items: list[Item]) -> FailureKind:
         if self._vehicle.arm_state is ArmState.ARMED:
             return "armed in the middle"
         if self._vehicle.arm_state is ArmState.UNKNOWN:
@@ -356,9 +361,10 @@ class ParameterWriter:
         foreign = any(item.left and not any(_same(item.read_back, own) for own in item.change.ours) for item in items)
         return "changed by someone else" if foreign else "answered another value"
 
-    def _publish(self, items: list[_Item]) -> dict[str, WrittenParameter]:
+    def _publish(self, items: list[Item]) -> dict[str, WrittenParameter]:
         self.written = {item.change.parameter: item.seen() for item in items}
         self.left_changed = tuple(item.change.parameter for item in items if item.left)
+        self.left_far = tuple(item.change.parameter for item in items if item.left and item.is_far)
         return self.written
 
 

@@ -30,7 +30,7 @@ from companion.daemon.offsets.px4_writes import FarMean, Px4Writes, step_from_fa
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H, MG
-from companion.samples import TRIADS, Triad, Vector
+from companion.samples import Triad, Vector
 
 VERIFY_MAX_S: Final = 60.0
 """How long the aircraft may move after the write before its effect counts as not seen."""
@@ -130,9 +130,9 @@ class EffectWatch:
             accel_residual=target.solution.accel_m_s2,
             apart_s=(after.start_s + after.end_s - before.start_s - before.end_s) / 2.0,
         )
-        steps = step_from_far(target.calibration, target.changes, sides.before.accel_m_s2)
+        steps = step_from_far(target.calibration, target.all, sides.before.accel_m_s2)
         seen = self._px4.seen_far(target.calibration)
-        on_the_way = {triad: (seen[triad], step) for triad, step in zip(TRIADS, steps, strict=True) if triad in seen}
+        on_the_way = {triad: (seen[triad], vector(step)) for triad, step in steps.items() if triad in seen}
         profile = self._profiles.of(target.name)
         return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile, on_the_way)
 

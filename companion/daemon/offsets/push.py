@@ -121,8 +121,8 @@ class Pusher:
 
     async def _write(self, job: Job, plan: Plan, firmware: GyroParameters | None, draft: Draft) -> Plan:
         if firmware is None:
-            async with self._px4.standing_by([(t.calibration, t.all, t.read_m_s2) for t in plan.targets]) as look:
-                plan.note(draft, await self._writer.apply(plan.changes, look))
+            async with self._px4.standing_by([(t.calibration, t.all, t.read_m_s2) for t in plan.targets]) as probe:
+                plan.note(draft, await self._writer.apply(plan.changes, probe))
             return plan
 
         def go_on(words: str) -> None:

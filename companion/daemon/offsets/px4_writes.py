@@ -1,8 +1,8 @@
 """What a write to PX4 needs besides the writing: whose output it moves, and which offsets are in use at all.
 
-Which slot belongs to which SCALED_IMU is a guess (autopilot.firmware.px4) until a far value is in force and seen in the
-telemetry of all IMUs. The far step is large beside noise and truncation, and each IMU that is written makes another
-one, so a second of samples tells them apart; the small change itself often could not be seen at all.
+Which slot belongs to which SCALED_IMU is a guess (autopilot.firmware.px4) until a far value is in use and seen in the
+telemetry of all IMUs. The far step is large beside noise and truncation, and only one sensor makes one at a time; the
+small change itself often could not be seen at all.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import logging
 import math
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import Final
 
@@ -20,16 +21,18 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, vector_changes
-from companion.autopilot.firmware.px4 import NO_IMU, WORDS, SlotMemory, accel_offset_with
+from companion.autopilot.firmware.px4 import IGNORED_STEP, MARGIN, NO_IMU, WORDS, SlotMemory, accel_offset_with
 from companion.autopilot.parameters.change import Change, WriteFailedError
-from companion.autopilot.parameters.writer import Look, ParameterWriter
+from companion.autopilot.parameters.items import FarProbe
+from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.telemetry import imu_messages
 from companion.autopilot.vehicle.vehicle import ArmState, Moment, Vehicle
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.offsets.ledger import Ledger
 from companion.links.mavlink.link import MavlinkLink, Message
-from companion.physics.frames import Array, vector
+from companion.physics.frames import Array
+from companion.physics.units import DEG, MG
 from companion.samples import Triad, Vector
 from companion.storage.changes import ChangeSet
 
@@ -39,13 +42,16 @@ RATE_HZ: Final = 50.0
 """Rate asked of IMUs that nobody listens to otherwise."""
 HEAR_S: Final = 0.4
 BEFORE_S: Final = 1.0
-SETTLE_S: Final = 1.3
-"""PX4 looks at its parameters at most once a second (autopilots 9.2)."""
-LOOK_S: Final = 1.2
+"""Telemetry before a far value that its effect is compared with."""
+MEAN_S: Final = 0.4
+"""Telemetry that shows the far value in use, without a reading from before."""
+PATIENCE_S: Final = 2.5
+"""How long an effect is waited for: where somebody else writes too, PX4 reads ours up to 1 s later."""
+KEPT_S: Final = 4.0
 LEAST_SAMPLES: Final = 5
-MATCH: Final = 0.4
-"""Of the expected step: so far may what was seen be from it. PX4 may have used other offsets than its parameters say,
-by up to 0.01 of the 0.035 rad/s (0.087 m/s^2) that a far step has at least."""
+MATCH: Final = 0.2
+"""Share of the expected step by which the output may miss it besides what PX4 ignores."""
+CHECK_S: Final = 0.1
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +65,16 @@ class FarStep:
     """For people: CAL_GYRO0."""
     step: Array
     """(3,), rad/s or m/s^2, vehicle FRD."""
+    unknown: float
+    """Share of the step by which the offsets in use may have differed from the parameters."""
+
+    def moved(self, made: Array) -> bool:
+        """Whether an output that moved by so much followed it."""
+        return bool(np.linalg.norm(made - self.step) < (self.unknown + MATCH) * np.linalg.norm(self.step))
+
+    def stayed(self, made: Array) -> bool:
+        """Whether an output that moved by so much did not follow it."""
+        return bool(np.linalg.norm(made) < (1.0 - self.unknown - MATCH) * np.linalg.norm(self.step))
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -69,48 +85,57 @@ class FarMean:
     sigma: Array
 
 
-class _Sums:
-    """Samples of all IMUs over one stretch."""
+class _Samples:
+    """Latest telemetry of all IMUs."""
 
     def __init__(self) -> None:
-        self._sums: dict[tuple[int, Triad], list[Array]] = {}
+        self._kept: dict[int, deque[tuple[float, imu_messages.Reading]]] = {}
 
-    def add(self, instance: int, reading: imu_messages.Reading) -> None:
-        self._sums.setdefault((instance, "gyro"), []).append(np.array(reading.gyro_rad_s))
-        self._sums.setdefault((instance, "accel"), []).append(np.array(reading.accel_m_s2))
+    def add(self, instance: int, t_s: float, reading: imu_messages.Reading) -> None:
+        kept = self._kept.setdefault(instance, deque())
+        kept.append((t_s, reading))
+        while kept[0][0] < t_s - KEPT_S:
+            kept.popleft()
 
-    def mean(self, instance: int, sensor: Triad) -> FarMean | None:
-        samples = self._sums.get((instance, sensor), ())
-        if len(samples) < LEAST_SAMPLES:
+    def mean(self, instance: int, sensor: Triad, from_s: float, to_s: float) -> FarMean | None:
+        found = [
+            reading.gyro_rad_s if sensor == "gyro" else reading.accel_m_s2
+            for t_s, reading in self._kept.get(instance, ())
+            if from_s <= t_s <= to_s
+        ]
+        if len(found) < LEAST_SAMPLES:
             return None
-        values = np.array(samples)
-        return FarMean(values.mean(axis=0), values.std(axis=0, ddof=1) / math.sqrt(len(samples)))
+        values = np.array(found)
+        return FarMean(values.mean(axis=0), values.std(axis=0, ddof=1) / math.sqrt(len(found)))
 
 
 class _FarStepWatch:
-    """Watches the telemetry of all IMUs over a write in two steps, and tells the memory what was seen."""
+    """Watches the telemetry of all IMUs over a write by far values, and tells the memory what was seen."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, memory: SlotMemory) -> None:
-        self.means: Mapping[tuple[int, Triad], FarMean] = {}
-        """By instance, from the last look: only of what moved as it should."""
+        self.means: dict[tuple[int, Triad], FarMean] = {}
+        """By instance, of the latest far value: only of what moved as it should."""
         self._link, self._vehicle, self._memory = link, vehicle, memory
         self.learned = False
         """Whether the last look has told anything of the slots that was not known."""
-        self._sums: _Sums | None = None
+        self._samples = _Samples()
+        self._steps: Mapping[str, FarStep] = {}
+        self._boots = 0
+        self._before: dict[int, FarMean | None] = {}
         self._heard: set[int] = set()
         self._unknown: set[int] = set()
         """IMUs of which nobody could say whether there is such a one."""
 
     @contextlib.asynccontextmanager
-    async def watching(self, steps: Sequence[FarStep]) -> AsyncIterator[Look | None]:
-        """Collect from now on; gives what to call while the far values are in force (None: there are none)."""
-        self.means, self.learned = {}, False
+    async def watching(self, steps: Mapping[str, FarStep]) -> AsyncIterator[FarProbe | None]:
+        """Collect from now on; gives what verifies the far values, by parameter (None: there are none)."""
+        self.means, self.learned, self._steps = {}, False, steps
         if not steps:
             yield None
             return
         self._heard.clear()
         self._unknown.clear()
-        boots = self._vehicle.boots
+        self._samples, self._boots = _Samples(), self._vehicle.boots
         subscriptions = [self._subscribe(instance) for instance in imu_messages.PX4]
         asked: list[int] = []
         try:
@@ -121,25 +146,59 @@ class _FarStepWatch:
                     self._unknown.add(instance)
                     answer = self._vehicle.commands.request_message_interval(message.message.id, RATE_HZ)
                     answer.add_done_callback(functools.partial(self._answered, instance))
-            self._sums = before = _Sums()
-            await Moment(self._vehicle).let_pass(BEFORE_S)
-            self._sums = None
-
-            async def look() -> str | None:
-                await Moment(self._vehicle).let_pass(SETTLE_S)
-                self._sums = during = _Sums()
-                await Moment(self._vehicle).let_pass(LOOK_S)
-                self._sums = None
-                # A restart brings other offsets into use by itself: whoever moved or did not, it says nothing.
-                return None if self._vehicle.boots != boots else self._judge(steps, before, during)
-
-            yield look
+            yield self
         finally:
-            self._sums = None
             for unsubscribe in subscriptions:
                 unsubscribe()
             for message_id in asked:
                 self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 0.0)
+
+    def mark(self, parameter: str) -> None:
+        """Keep the means until now."""
+        if (step := self._steps.get(parameter)) is not None:
+            now_s = asyncio.get_running_loop().time()
+            self._before = {
+                instance: self._samples.mean(instance, step.sensor, now_s - BEFORE_S, now_s)
+                for instance in imu_messages.PX4
+            }
+
+    async def verify(self, parameter: str) -> str | None:
+        """Remember whose output moved; why this is not as it was believed, if so."""
+        if (step := self._steps.get(parameter)) is None:
+            return None
+        since, loop = Moment(self._vehicle), asyncio.get_running_loop()
+        from_s = to_s = loop.time()
+        while not since.has_passed(PATIENCE_S):
+            await asyncio.sleep(CHECK_S)
+            from_s, to_s = max(from_s, loop.time() - MEAN_S), loop.time()
+            middle_s = to_s - MEAN_S / 2.0
+            halves = (self._moves(step, from_s, middle_s), self._moves(step, middle_s, to_s))
+            if all(step.instance in moved for moved, _ in halves):
+                break
+        else:
+            from_s = loop.time() - BEFORE_S
+        if self._vehicle.boots != self._boots:
+            # A restart brings other offsets into use by itself: whoever moved or did not, it says nothing.
+            return None
+        moved, still = self._moves(step, from_s, loop.time())
+        if step.instance in moved and (now := self._samples.mean(step.instance, step.sensor, from_s, loop.time())):
+            self.means[step.instance, step.sensor] = now
+        return self._conclude(step, moved, still)
+
+    def _moves(self, step: FarStep, from_s: float, to_s: float) -> tuple[list[int], list[int]]:
+        """IMUs that made the step by then, and those that did not; what is neither is in none."""
+        moved: list[int] = []
+        still: list[int] = []
+        for instance in imu_messages.PX4:
+            was, now = self._before.get(instance), self._samples.mean(instance, step.sensor, from_s, to_s)
+            if was is None or now is None:
+                continue
+            made = now.mean - was.mean
+            if step.moved(made):
+                moved.append(instance)
+            elif step.stayed(made):
+                still.append(instance)
+        return moved, still
 
     def _answered(self, instance: int, answer: asyncio.Future[int | None]) -> None:
         if answer.result() is not None:
@@ -148,40 +207,13 @@ class _FarStepWatch:
     def _subscribe(self, instance: int) -> Callable[[], None]:
         kind = imu_messages.PX4[instance][0]
 
-        def take(message: Message, _t_s: float) -> None:
+        def take(message: Message, t_s: float) -> None:
             reading = kind.decode(message) if self._vehicle.sent(message) else ""
             if not isinstance(reading, str) and not reading.all_zero:
                 self._heard.add(instance)
-                if self._sums is not None:
-                    self._sums.add(instance, reading)
+                self._samples.add(instance, t_s, reading)
 
         return self._link.subscribe(kind.message, take)
-
-    def _judge(self, steps: Sequence[FarStep], before: _Sums, during: _Sums) -> str | None:
-        """Remember whose output moved; why this is not as it was believed, if so."""
-        wrong: list[str] = []
-        means: dict[tuple[int, Triad], FarMean] = {}
-        for step in steps:
-            rivals = [each for each in steps if each.sensor == step.sensor]
-            moved: list[int] = []
-            still: list[int] = []
-            for instance in imu_messages.PX4:
-                was, now = before.mean(instance, step.sensor), during.mean(instance, step.sensor)
-                if was is None or now is None:
-                    continue
-                made = now.mean - was.mean
-                cause = _cause(made, rivals)
-                if cause is step:
-                    moved.append(instance)
-                    if instance == step.instance:
-                        means[instance, step.sensor] = now
-                elif cause is not None or np.linalg.norm(made) < MATCH * np.linalg.norm(step.step):
-                    still.append(instance)
-            words = self._conclude(step, moved, still)
-            if words is not None:
-                wrong.append(words)
-        self.means = means
-        return "; ".join(wrong) or None
 
     def _conclude(self, step: FarStep, moved: list[int], still: list[int]) -> str | None:
         word = WORDS[step.sensor]
@@ -208,13 +240,6 @@ class _FarStepWatch:
         self._memory.learn(step.sensor, step.device_id, instance)
 
 
-def _cause(made: Array, steps: Sequence[FarStep]) -> FarStep | None:
-    """The step that an output made, if it made one."""
-    nearest = min(steps, key=lambda step: float(np.linalg.norm(made - step.step)))
-    off = float(np.linalg.norm(made - nearest.step))
-    return nearest if off < MATCH * float(np.linalg.norm(nearest.step)) else None
-
-
 class Px4Writes:
     """Stands by while parameters are written; of ArduPilot's it has nothing to say."""
 
@@ -233,19 +258,22 @@ class Px4Writes:
     @contextlib.asynccontextmanager
     async def standing_by(
         self, targets: Sequence[tuple[ImuCalibration, Sequence[Change], Vector]]
-    ) -> AsyncIterator[Look | None]:
-        """Over a write of these changes; gives what to call while the far values are in force (None: no need).
+    ) -> AsyncIterator[FarProbe | None]:
+        """Over a write of these changes; gives what verifies the far values (None: no need).
 
         The last of each target is what its accelerometers read.
         """
-        steps = [step for calibration, changes, read in targets for step in far_steps(calibration, changes, read)]
+        steps: dict[str, FarStep] = {}
+        for calibration, changes, read in targets:
+            steps |= far_steps(calibration, changes, read)
         try:
-            async with self._watch.watching(steps) as look:
-                yield look
+            async with self._watch.watching(steps) as probe:
+                yield probe
         except WriteFailedError as error:
-            if steps and error.left_changed and self._vehicle.arm_state is ArmState.ARMED:
-                # Between the steps the offsets are wrong on purpose, and while it is armed nobody may mend that.
-                self._say(Severity.CRITICAL, "DISARM NOW: the offsets are wrong", Weight.RESULT)
+            if self._vehicle.arm_state is ArmState.ARMED:
+                # One offset may be wrong on purpose, and while it is armed nobody may mend that.
+                for name in self._writer.left_far:
+                    self._say(Severity.CRITICAL, _danger(steps[name]), Weight.RESULT)
             if error.kind == "not as believed" and not self._watch.learned:
                 # Nothing was learned: the same slot again, and not for ever.
                 raise WriteFailedError("without effect", error.reason, error.written, error.left_changed) from error
@@ -277,8 +305,8 @@ class Px4Writes:
         try:
             async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
                 with changing(unsure):
-                    async with self.standing_by(targets) as look:
-                        await self._writer.apply(changes, look)
+                    async with self.standing_by(targets) as probe:
+                        await self._writer.apply(changes, probe)
                 await self._ledger.undone()
         except WriteFailedError as error:
             if error.kind != "not as believed" or error.left_changed:
@@ -287,30 +315,71 @@ class Px4Writes:
         return True
 
 
-def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> list[FarStep]:
-    """What the output must do when the far values of these changes come into force; it reads `accel_m_s2` before."""
-    gyro, accel = output_step(calibration, _far(changes), accel_m_s2)
-    names, found = calibration.parameters, []
-    halves: tuple[tuple[Triad, int | None, str, Vector], ...] = (
-        ("gyro", calibration.gyro_id, names.gyro_id, gyro),
-        ("accel", calibration.accel_id, names.accel_id, accel),
-    )
-    for kind, device_id, name, step in halves:
-        if any(step) and device_id is not None:
-            found.append(FarStep(calibration.instance, kind, device_id, name.removesuffix("_ID"), np.array(step)))
+def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> Mapping[str, FarStep]:
+    """What the output must do when each far value comes into use, by parameter; it reads `accel_m_s2` before."""
+    names, found = calibration.parameters, {}
+    for change in changes:
+        if change.via is None:
+            continue
+        old, far, _ = _outputs(calibration, changes, change, accel_m_s2)
+        triad = _triad(calibration, change.parameter)
+        step = far[triad] - old[triad]
+        device_id, name = (
+            (calibration.gyro_id, names.gyro_id) if triad == "gyro" else (calibration.accel_id, names.accel_id)
+        )
+        if not step.any() or device_id is None:
+            continue
+        slot = name.removesuffix("_ID")
+        unknown = MARGIN * IGNORED_STEP / abs(change.via - change.before)
+        found[change.parameter] = FarStep(calibration.instance, triad, device_id, slot, step, unknown)
     return found
 
 
-def step_from_far(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> tuple[Vector, Vector]:
-    """By how much the output must move from the far values to the new ones: gyro rad/s, accelerometer m/s^2."""
-    indirect = [change for change in changes if change.via is not None]
-    far = _far(changes)
-    whole, there = (output_step(calibration, each, accel_m_s2) for each in (indirect, far))
-    return vector(np.subtract(whole[0], there[0])), vector(np.subtract(whole[1], there[1]))
+def step_from_far(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> Mapping[Triad, Array]:
+    """By how much the output must move from the last far value of each triad to all new ones, rad/s and m/s^2."""
+    found: dict[Triad, Array] = {}
+    for change in changes:
+        if change.via is not None:
+            triad = _triad(calibration, change.parameter)
+            _, far, new = _outputs(calibration, changes, change, accel_m_s2)
+            found[triad] = new[triad] - far[triad]
+    return found
 
 
-def _far(changes: Sequence[Change]) -> list[Change]:
-    return [dataclasses.replace(c, after=c.via, via=None) for c in changes if c.via is not None]
+def _triad(calibration: ImuCalibration, parameter: str) -> Triad:
+    gyro = calibration.parameters.gyro_offset
+    return "gyro" if parameter in gyro else "accel"
+
+
+_Output = Mapping[Triad, Array]
+
+
+def _outputs(
+    calibration: ImuCalibration, changes: Sequence[Change], one: Change, accel_m_s2: Vector
+) -> tuple[_Output, _Output, _Output]:
+    """Output, less that before all changes: before one far value, with it in use, and after all changes."""
+    names, done = calibration.parameters, set[str]()
+    vectors = (names.gyro_offset, names.accel_offset, names.accel_scale)
+    for earlier in changes[: changes.index(one)]:
+        if earlier.via is not None:
+            done |= {name for vector in vectors if earlier.parameter in vector for name in vector}
+    old = {change.parameter: change.after if change.parameter in done else change.before for change in changes}
+    new = {change.parameter: change.after for change in changes}
+
+    def output(values: Mapping[str, float]) -> _Output:
+        there = [dataclasses.replace(change, after=values[change.parameter]) for change in changes]
+        gyro, accel = output_step(calibration, there, accel_m_s2)
+        return {"gyro": np.array(gyro), "accel": np.array(accel)}
+
+    return output(old), output(old | {one.parameter: one.far}), output(new)
+
+
+def _danger(step: FarStep) -> str:
+    """What a pilot sees of a far value in flight."""
+    size = float(np.linalg.norm(step.step))
+    if step.sensor == "gyro":
+        return f"DISARM NOW: yaw rate wrong by {size / DEG:.1f} deg/s"
+    return f"DISARM NOW: vertical acceleration wrong by {size / MG:.0f} mg"
 
 
 def _again(calibration: ImuCalibration) -> list[Change]:
