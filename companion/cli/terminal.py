@@ -16,8 +16,8 @@ from typing import Any, Final, NoReturn
 from urllib.parse import quote
 
 from companion import config
-from companion.config.removed import COMMAND_LINE, refusal_of_words
 from companion.config.sections import Config, Noise, Storage
+from companion.config.words import COMMAND_LINE, refusal_of_words
 from companion.errors import ConfigError
 from companion.printable import printable
 

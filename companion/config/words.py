@@ -1,4 +1,4 @@
-"""What went wrong in a configuration file, in the file's own words."""
+"""Errors of a configuration file, in the file's own words; removed keys, commands and options with their remedies."""
 
 from __future__ import annotations
 
@@ -13,14 +13,33 @@ from typing import Annotated, Any, Final, Literal, Union
 import msgspec
 from msgspec import Meta
 
-from companion.config.removed import refusal_of_key
 from companion.config.sections import Config
 from companion.errors import ConfigError
+
+KEYS: Final[dict[str, str]] = {}
+"""Removed configuration keys without list indexes ("imu.port"), each with its version and its remedy."""
+
+COMMAND_LINE: Final[dict[str, str]] = {
+    "companion flight --fetch": "0.2: download the log with your ground station, then companion flight LOG",
+}
+"""Removed commands ("companion NAME") and options ("companion NAME --option"), each with its version and its remedy."""
 
 _LONGEST: Final = 200
 _INT_BITS: Final = 63
 _briefly: Final = reprlib.Repr()
 _briefly.maxstring = _briefly.maxother = _briefly.maxlong = 80
+
+
+def refusal_of_key(path: str) -> str | None:
+    """Give the refusal of a removed configuration key or section such as `imu[0].port`, or None."""
+    remedy = KEYS.get(re.sub(r"\[\d+\]", "", path))
+    return None if remedy is None else f"{path} was removed in {remedy}; see CHANGELOG"
+
+
+def refusal_of_words(command: str, word: str) -> str | None:
+    """Give the refusal of a removed command or option behind a command such as `companion flight`, or None."""
+    remedy = COMMAND_LINE.get(f"{command} {word}")
+    return None if remedy is None else f"{word} was removed in {remedy}"
 
 
 def refuse_unknown_keys(raw: dict[str, Any], section: type[msgspec.Struct], path: str, name: str) -> None:

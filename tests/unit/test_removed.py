@@ -11,8 +11,8 @@ import pytest
 
 from companion import cli
 from companion.config import parse
-from companion.config.removed import COMMAND_LINE, KEYS
 from companion.config.sections import Config
+from companion.config.words import COMMAND_LINE, KEYS
 from companion.errors import ConfigError
 
 SMALLEST = """
