@@ -107,7 +107,7 @@ async def set_up(machine: Machine, configuration: str) -> None:
     await until(is_asked)
     ((port, token),) = re.findall(r"open once on the phone: http://\S+:(\d+)/#token=(\S+)", said)
     # Platform, law, two mountings, to write it, to start it, to end.
-    assert await take_all(int(port), token) == 7
+    assert await take_all(int(port), token) == 8
     shown = await machine.show("companion", "ActiveState", "UnitFileState")
     assert shown == {"ActiveState": "active", "UnitFileState": "enabled"}
     _, out, _ = await machine.run("cat", CONFIGURATION, "/var/lib/private/companion/web-token")
