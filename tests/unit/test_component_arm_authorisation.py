@@ -211,7 +211,7 @@ def test_the_script_hears_the_verdict_twice_a_second_only_while_it_is_asked_for(
             b.ground.received.clear()
             b.gate.says = ArmAnswer("refuse", "x" * 60)
             await asyncio.sleep(0.6)
-            assert tunnels(b)[-1] == b"CMPA\x01\x02" + b"x" * 41
+            assert tunnels(b)[-1] == b"CMPA\x01\x02" + b"x" * (41 - len("Companion: "))
             b.gate.at_arm = "warn"
             await asyncio.sleep(0.6)
             assert tunnels(b)[-1][5] == 3
