@@ -8,6 +8,7 @@ what would be free if the process ended.
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import contextlib
 import os
@@ -27,6 +28,7 @@ from tests.support.live_aircraft import live_aircraft
 
 LIMIT_MIB: Final = 60.0
 SETTLED_S: Final = 3.0
+PERIOD_S: Final = 15.0
 WITHIN_S: Final = 180.0
 
 EVERYTHING: Final = """
@@ -154,8 +156,8 @@ async def visited(port: int) -> AsyncIterator[None]:
         writer.close()
 
 
-async def of_companion(folder: Path) -> dict[str, Memory]:
-    """Started, and calibrated, with everything on."""
+async def of_companion(folder: Path, calibrations: int) -> dict[str, Memory]:
+    """Measure the companion with everything on: started, and after each calibration, one a quarter of a minute."""
     found: dict[str, Memory] = {}
     broker = await Broker(folder).start()
     try:
@@ -166,10 +168,14 @@ async def of_companion(folder: Path) -> dict[str, Memory]:
                 await asyncio.sleep(SETTLED_S)
                 found["companion, everything on, started"] = memory(process_id)
                 await status_when(control, lambda now: bool(now["arming"]["verdict"] == "accept"))
-                record = (await last_reply(control, {"command": "calibrate", "wait": True}))["record"]
-                assert record["state"] == "done", record["reason"]
-                await asyncio.sleep(SETTLED_S)
-                found["companion, everything on, calibrated"] = memory(process_id)
+                for number in range(1, calibrations + 1):
+                    next_s = asyncio.get_running_loop().time() + PERIOD_S
+                    record = (await last_reply(control, {"command": "calibrate", "wait": True}))["record"]
+                    assert record["state"] == "done", record["reason"]
+                    await asyncio.sleep(SETTLED_S)
+                    found[f"companion, everything on, calibrations: {number}"] = memory(process_id)
+                    if number < calibrations:
+                        await asyncio.sleep(max(0.0, next_s - asyncio.get_running_loop().time()))
                 after = await status_when(control, lambda now: bool(now["mqtt"]["connected"]))
                 assert after["recording"]["ring"]["bytes"] > 0, after["recording"]
     finally:
@@ -189,10 +195,10 @@ def of_peers(environment: Mapping[str, str]) -> dict[str, Memory]:
     return found
 
 
-def table() -> None:
-    """What is kept, beside the peers."""
+def table(calibrations: int = 1) -> None:
+    """Print what the companion keeps, beside its peers."""
     with tempfile.TemporaryDirectory() as text:
-        ours = asyncio.run(of_companion(Path(text)))
+        ours = asyncio.run(of_companion(Path(text), calibrations))
     rows = {**of_peers(os.environ), **ours}
     print(f"\n{'memory (MiB)':52} {'RSS':>6} {'PSS':>6} {'USS':>6} {'most':>6}")
     for words, found in rows.items():
@@ -202,4 +208,6 @@ def table() -> None:
 
 
 if __name__ == "__main__":
-    table()
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--calibrations", type=int, default=1, help="how many, one after the other")
+    table(parser.parse_args().calibrations)

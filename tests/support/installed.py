@@ -25,16 +25,19 @@ def install(folder: Path, *, bytecode: bool = True) -> dict[str, str]:
     shutil.copytree(Path(companion.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
     kept = {name: value for name, value in os.environ.items() if name not in _WOULD_CHANGE_IT}
     kept |= {"PYTHONPATH": str(folder), "PYTHONSAFEPATH": "1"}  # not from where it is started: that may be a checkout
-    kept |= {
-        "MALLOC_ARENA_MAX": "1",
-        "MALLOC_MMAP_THRESHOLD_": "131072",
-        "MALLOC_TRIM_THRESHOLD_": "131072",
-    }  # the unit's
+    kept |= {name: value for name, value in unit_environment().items() if name.startswith("MALLOC_")}
     if not bytecode:
         return {**kept, "PYTHONDONTWRITEBYTECODE": "1"}
     if not compileall.compile_dir(package, quiet=1):
         raise RuntimeError(f"{package} cannot be compiled")
     return kept
+
+
+def unit_environment() -> dict[str, str]:
+    """Read what the service's unit puts into the environment."""
+    lines = (Path(companion.__file__).parents[1] / "systemd" / "companion.service").read_text().splitlines()
+    given = [line.removeprefix("Environment=") for line in lines if line.startswith("Environment=")]
+    return dict(word.split("=", 1) for line in given for word in line.split())
 
 
 _WOULD_CHANGE_IT = frozenset(

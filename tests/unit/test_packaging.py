@@ -21,6 +21,7 @@ import pytest
 from dockerfile_parse import DockerfileParser
 
 import companion
+from tests.support.installed import unit_environment
 
 PROJECT = Path(__file__).resolve().parents[2]
 DEB = PROJECT / "packaging/deb"
@@ -127,6 +128,12 @@ def dockerfile(**arguments: str) -> DockerfileParser:
 
 def labels(**arguments: str) -> dict[str, str]:
     return dict(dockerfile(**arguments).labels)
+
+
+def test_the_container_has_the_units_settings_of_the_c_library() -> None:
+    ours = {name: value for name, value in dockerfile().envs.items() if name.startswith("MALLOC_")}
+    assert ours == {name: value for name, value in unit_environment().items() if name.startswith("MALLOC_")}
+    assert ours
 
 
 def test_the_labels_are_what_blueos_expects() -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import os
+import random
 import stat
+import tracemalloc
 from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
@@ -37,8 +39,6 @@ def taken(journal: Journal) -> list[Written]:
 
 def raw(count: int, size: int, seed: int = 0) -> list[Written]:
     """Messages that do not get smaller by compression."""
-    import random
-
     rng = random.Random(seed)
     made = Journal()
     made.begin(1000.0)
@@ -206,6 +206,24 @@ def test_raw_bytes_in_waiting_are_bounded_too(monkeypatch: pytest.MonkeyPatch) -
 
 def in_second(message: Written) -> list[Written]:
     return past_module.unpacked(msgspec.json.decode(message[2], type=topics.PastEntry).packed)
+
+
+def test_a_flood_of_one_second_takes_little_memory_on_its_way_to_the_disk() -> None:
+    chance = random.Random(1)
+    datagrams = [chance.randbytes(1400) for _ in range(journal_module.MOST_BYTES // 1400)]
+    made, past = Journal(), Past(60.0, ())
+    made.begin(0.0)
+    for datagram in datagrams:
+        made.raw(topics.MAVLINK_IN, 1.0, datagram)
+    assert not made.lost
+    entries = made.drain()
+    tracemalloc.start()
+    try:
+        past.keep(entries, past.messages(entries), 1.0)
+        _, most_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most_bytes < 12 * MB
 
 
 def test_a_file_begins_with_the_seconds_before_it_and_with_what_is_in_force(tmp_path: Path) -> None:
