@@ -27,7 +27,7 @@ CALIBRATION = ImuCalibration(
 )
 
 
-def is_left(residual_deg_h: float, estimated_deg_h: float = ESTIMATED_DEG_H) -> bool:
+def is_left(residual_deg_h: float, estimated_deg_h: float = ESTIMATED_DEG_H, written_rad_s: float = 1e-3) -> bool:
     """Whether gyros that read so much too much keep the offsets of an earlier calibration as good as this one."""
     sigma = NEXT_MINUTES_DEG_H * DEG_H
     found = ImuSolution(
@@ -47,6 +47,7 @@ def is_left(residual_deg_h: float, estimated_deg_h: float = ESTIMATED_DEG_H) -> 
         sigma_in_force=lambda triad: (sigma,) * 3,
         gyro_sigma_stat_rad_s=averaged,
         accel_sigma_stat_m_s2=averaged,
+        written={name: SimpleNamespace(after=written_rad_s) for name in parameters_of(1).gyro_offset},
     )
     draft: Any = SimpleNamespace(before=SimpleNamespace(imus=[earlier]), unchanged=set())
     left = _less_noise(CALIBRATION, found, shared, draft)
@@ -62,3 +63,7 @@ def test_a_residual_is_judged_by_how_well_it_is_known(residual_deg_h: float, *, 
 
 def test_what_is_known_no_better_than_the_next_minutes_is_left() -> None:
     assert is_left(33.0, estimated_deg_h=17.0)
+
+
+def test_offsets_that_the_last_calibration_has_not_written_are_replaced() -> None:
+    assert not is_left(0.0, written_rad_s=2e-3)

@@ -191,21 +191,28 @@ def _to_be_written(found: ImuSolution, draft: Draft) -> ImuSolution:
 def _less_noise(calibration: ImuCalibration, found: ImuSolution, shared: Shared, draft: Draft) -> ImuSolution:
     """The solution of one IMU, less the half where the offsets in force are as good: to write would be noise.
 
-    They are where the residual is within the errors of both estimates, or adds little to what the next minutes do to
-    old and new offsets alike.
+    They are as good where the last calibration wrote them, and the residual is within the errors of both estimates or
+    adds little to what the next minutes do to old and new offsets alike.
     """
     before = None if draft.before is None else next((imu for imu in draft.before.imus if imu.name == found.name), None)
+    if before is None:
+        return found
+    names, written = calibration.parameters, {name: one.after for name, one in before.written.items()}
     variance, left = np.diag(found.covariance), {"gyro": found.gyro_rad_s, "accel": found.accel_m_s2}
     estimated = np.minimum(np.square(found.sigma_stat) + np.diag(shared.covariance), variance)
-    stat = (None, None) if before is None else (before.gyro_sigma_stat_rad_s, before.accel_sigma_stat_m_s2)
-    halves: tuple[tuple[Triad, Vector, bool, Vector | None], ...] = (
-        ("gyro", calibration.gyro_offset_rad_s, False, stat[0]),
-        ("accel", calibration.accel_offset_m_s2, calibration.accel_offset_may_be_unused, stat[1]),
+    halves: tuple[tuple[Triad, Sequence[str], Vector, Vector | None], ...] = (
+        ("gyro", names.gyro_offset, calibration.gyro_offset_rad_s, before.gyro_sigma_stat_rad_s),
+        ("accel", names.accel_offset, calibration.accel_offset_m_s2, before.accel_sigma_stat_m_s2),
     )
-    for triad, offset, unsure, averaged in halves:
-        residual, then = left[triad], None if before is None else before.sigma_in_force(triad)
+    for triad, offsets, offset, averaged in halves:
+        residual, then = left[triad], before.sigma_in_force(triad)
         # What has no offsets counts as uncalibrated to the autopilot itself.
-        if residual is None or then is None or unsure or not any(offset):
+        if residual is None or then is None or not any(offset):
+            continue
+        if triad == "accel" and calibration.accel_offset_may_be_unused:
+            continue
+        # For instance by the autopilot's own calibration at its start.
+        if calibration.contradicts({name: written[name] for name in offsets if name in written}):
             continue
         rows = rows_of(triad)
         both = estimated[rows] + np.square(np.zeros(3) if averaged is None else averaged)
