@@ -56,8 +56,10 @@ _WAITS: Final = {
     Rung.UNKNOWN: "no heartbeat from the autopilot",
     Rung.PENDING: f"{_IN_THE_MIDDLE[State.UNDOING]}: wait",
 }
-WRITE_S: Final = 5.0
-"""A dozen parameters: with ArduPilot's own gyro calibration in between, or with PX4's far step, 4 s on either."""
+WRITE_S: Final = {"px4": 8.0}
+"""Time to write the offsets, by firmware. PX4 takes one vector after another: 7 s for one IMU."""
+OTHER_WRITE_S: Final = 5.0
+"""Time to write the offsets elsewhere: 4 s with ArduPilot's own gyro calibration in between."""
 LATE_S: Final = 2.0
 """Until the last second of telemetry is complete and judged."""
 EKF_S: Final = {"ardupilot": 3.0}
@@ -78,7 +80,8 @@ class Forecast:
     @property
     def whole_s(self) -> float:
         """From the end of the measurement until the new offsets are known to be right, without a dither."""
-        return WRITE_S + self._check_s + EKF_S.get(self._vehicle.firmware or "", 0.0)
+        firmware = self._vehicle.firmware or ""
+        return WRITE_S.get(firmware, OTHER_WRITE_S) + self._check_s + EKF_S.get(firmware, 0.0)
 
     @property
     def _check_s(self) -> float:
