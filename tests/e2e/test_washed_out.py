@@ -24,7 +24,8 @@ async def done(rig: Rig) -> None:
     job = ask(rig, "a pilot")
     assert isinstance(job, Job), job
     async with asyncio.timeout(120.0):
-        assert (await job.finished).outcome == "done"
+        result = await job.finished
+        assert result.outcome == "done", result
 
 
 def test_requests_and_cancels_in_a_loop_leave_the_history_as_it_was(tmp_path: Path) -> None:
@@ -38,6 +39,8 @@ def test_requests_and_cancels_in_a_loop_leave_the_history_as_it_was(tmp_path: Pa
                 await asyncio.sleep(0.005)
                 rig.ground.command(CANCEL)
                 await asyncio.sleep(0.005)
+            # The last cancel is still on its way, and would cancel what comes next.
+            await rig.until(lambda: len(rig.ground.finals(CANCEL)) == 1000, 30.0)
             await rig.until(lambda: not rig.service.calibrating.conductor.state.busy, 30.0)
             assert [entry.path.read_bytes() for entry in rig.service.calibrating.store.entries()] == before
             assert len(before) == 1
