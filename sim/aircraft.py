@@ -1,7 +1,7 @@
 """The one virtual aircraft: where it stands, how it is held, how warm it is. Everything else measures this truth.
 
 Frames: navigation NED, body FRD. Angles: heading clockwise from true north, pitch nose up +, roll right side down +
-(method section 1.1). Time is the aircraft's own, in seconds from 0; `begin` ties it to an event loop's clock.
+(method 1.1). Time is the aircraft's own, in seconds from 0; `begin` ties it to an event loop's clock.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A MEMS IMU with everything that makes its bias a moving target, and the true bias always at hand.
 
-Noise words and figures are those of the method, section 2.2: white noise N (unit * sqrt(s), two-sided PSD N^2),
+Noise words and figures are those of method 2.2: white noise N (unit * sqrt(s), two-sided PSD N^2),
 flicker B (PSD B^2 / (2 pi f), Allan floor 0.664 B), rate random walk K. The slow part (flicker and walk) is one path
 in time, the same for every reader and every sampling rate; only white noise and rounding belong to a reading.
 """
@@ -86,9 +86,9 @@ def _triad(*, white: float, floor: float, per_kelvin: float, scatter: float, ste
 _DPS = math.radians(1.0)
 _G = STANDARD_GRAVITY_M_S2
 
-# Noise and floors: method section 2.2. Steps and ranges are the parts' usual digital formats; temperature figures of
+# Noise and floors: method 2.2. Steps and ranges are the parts' usual digital formats; temperature figures of
 # the two Analog Devices parts, which are compensated inside, and the ADIS16405's accelerometer are assumptions.
-# Scatter: method section 1.3 for the ADIS16405, the others' is assumed.
+# Scatter: method 1.3 for the ADIS16405, the others' is assumed.
 # VN-100: VectorNav's data sheet (0.0035 deg/s/rtHz, 5 to 7 deg/h, 0.14 mg/rtHz, 0.04 mg); its temperature is assumed.
 PARTS: dict[str, ImuSpec] = {
     "icm42688p": ImuSpec(

@@ -295,7 +295,7 @@ def study(case: Case, trials: int, seed: int = 1) -> Outcome:
 
 
 GOOD: dict[str, Any] = {"stat": 1.6, "use": 5.0}
-"""A good gyro after 30 s (method section 2.2: ICM-42688-P)."""
+"""A good gyro after 30 s (method 2.2: ICM-42688-P)."""
 OLD: dict[str, Any] = {"stat": 47.0, "use": 63.0}
 """An ADIS16405 after 10 s (likewise)."""
 FLIGHTS: dict[str, dict[str, Any]] = {

@@ -1,13 +1,13 @@
 """The two slow corrections of the attitude: the tilt by specific force, the heading by a compass.
 
-Levelling has the form of VQF (Laidig and Seel, Information Fusion 91:187-204, 2023; method section 3): specific force
+Levelling has the form of VQF (Laidig and Seel, Information Fusion 91:187-204, 2023; method 3.7): specific force
 is low-passed in a frame that only gyro errors turn. There manoeuvre accelerations average out over the time constant
 while gravity stays, so the time constant may be as long as the gyro biases are good: a bias b leaves b * tau of tilt.
 What does not average out, a turn or a climb that lasts, shows itself by the length of the force: where it is not g,
 less is believed.
 
 The compass corrects a scalar, gated, and never touches the tilt: a device's own heading leans on its own pendulum and
-is worth nothing while the aircraft accelerates or stands steep (method section 3, "tilt-compensated heading").
+is worth nothing while the aircraft accelerates or stands steep (method 3.5).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Attitude of the aircraft from one calibrated IMU, a compass now and then, and what is known of the place.
 
-Method section 3, "Best candidate for the pushed attitude of a micro aircraft without GPS": strapdown on calibrated
+Method 3.7, "best candidate for the pushed attitude of a micro aircraft without GPS": strapdown on calibrated
 rates with the Earth's rotation taken out, a slow leveller, a scalar heading correction; the gyro biases are refined at
 rest only, because what looks like a bias in flight is a manoeuvre.
 """

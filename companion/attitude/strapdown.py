@@ -1,8 +1,8 @@
 """Quaternion strapdown: calibrated rates to attitude, and specific force turned along with it.
 
 The frame E that it ends in is fixed to the Earth and near NED; what is left between the two belongs to the leveller
-and to the heading. Rotation vectors with two-sample coning, phi_k = a_k + (a_{k-1} x a_k) / 12 (Savage; method section
-3, "propagation"). Plain floats: at these sizes they are ten times faster than arrays.
+and to the heading. Rotation vectors with two-sample coning, phi_k = a_k + (a_{k-1} x a_k) / 12 (Savage; method
+3.7). Plain floats: at these sizes they are ten times faster than arrays.
 """
 
 from __future__ import annotations

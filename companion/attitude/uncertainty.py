@@ -1,7 +1,7 @@
 """How well the attitude is known: a covariance beside the filter, fed by what the calibration left.
 
 The filter's gains are not a Kalman filter's, so its covariance is that of the gains in use (Joseph's form). Six states:
-attitude error in NED (rad) and gyro bias error in the sensor's axes (rad/s). Method sections 2.2 and 3.
+attitude error in NED (rad) and gyro bias error in the sensor's axes (rad/s). Method 2.2 and 3.7.
 """
 
 from __future__ import annotations

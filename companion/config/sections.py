@@ -202,7 +202,7 @@ class Calibration(Section, frozen=True):
     target_accel_sigma_mg: PositiveFloat = 0.2
     at_arm: AtArm = "warn"
     max_age_min: PositiveFloat = 30.0
-    """How long a calibration counts as fresh after it was last seen to be right (method section 3, item 8)."""
+    """How long a calibration counts as fresh after it was last seen to be right (method 3.2)."""
     max_temperature_change_degc: PositiveFloat = 3.0
     """How far the temperature may be from the one at which it was seen to be right (the same)."""
     prior: bool = True

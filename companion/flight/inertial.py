@@ -1,7 +1,7 @@
 """Free inertial navigation over pieces of a flight: what the firmware's corrected readings alone make of it.
 
 Between any two times the readings are integrated once, from the log's beginning; a start somewhere in the flight is
-then one turn and one shift of that, so that many starts cost no more than one (method section 3, "propagation").
+then one turn and one shift of that, so that many starts cost no more than one (method 3.7).
 """
 
 from __future__ import annotations

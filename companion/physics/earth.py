@@ -31,7 +31,7 @@ _LEAST_HORIZONTAL_NT: Final = 1.0
 
 
 def gravity_m_s2(latitude_deg: float, height_m: float) -> float:
-    """Normal gravity by Somigliana's formula, with height (WGS 84; method section 3, "gravity").
+    """Normal gravity by Somigliana's formula, with height (WGS 84; method 3.6).
 
     The latitude is geodetic, the height above the ellipsoid; sea level serves (its 100 m at most are 31 micro-g).
     """
@@ -81,7 +81,7 @@ class MagneticField:
 def magnetic_field(latitude_deg: float, longitude_deg: float, height_m: float, date: datetime.date) -> MagneticField:
     """The field of the world magnetic model WMM2025.
 
-    The paper takes the compass heading as true; omitting the declination costs W cos L sin D (method section 1.3).
+    The paper takes the compass heading as true; omitting the declination costs W cos L sin D (method 1.3).
     Outside the years of the model its nearest year is used: the secular change is a few tenths of a degree a year,
     so an old model beats none; `WMM_VALID_YEARS` lets the caller say so.
     """

@@ -3,7 +3,7 @@
 Body: FRD (x forward, y right, z down), as on the MAVLink wire. Navigation: NED. The paper writes RFU (x right,
 y forward, z up) and ENU instead.
 Angles: theta is pitch (nose up +), gamma is roll (right side down +), psi is heading, clockwise from true north;
-they are the aerospace 3-2-1 angles (method section 1.1).
+they are the aerospace 3-2-1 angles (method 1.1).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Matrix:
 
     Equation (5) of the paper, in FRD/NED, with its first row mended: the printed T11 and T12 have the wrong sign on
     their second terms, which leaves the matrix without orthogonality, and row 2 must carry cos(theta), not the
-    cosine of the latitude (method section 1.3).
+    cosine of the latitude (method 1.3).
     """
     sr, cr = math.sin(roll_rad), math.cos(roll_rad)
     st, ct = math.sin(pitch_rad), math.cos(pitch_rad)

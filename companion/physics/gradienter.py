@@ -2,7 +2,7 @@
 
 Equation (1) of the paper, gamma = arcsin(sin qx / cos theta) with theta = qy, holds only for a sensor of which each
 output is the elevation of its own axis. A liquid cell reads the slope of the liquid's surface instead, and many
-modern devices give Euler angles; the wrong law costs 0.15 degrees (2.6 mg) at 10/10 degrees (method section 1.2).
+modern devices give Euler angles; the wrong law costs 0.15 degrees (2.6 mg) at 10/10 degrees (method 1.2).
 So the law is a property of the sensor:
 
 | law     | outputs for (theta, gamma)                       | recovered by                                     |
@@ -50,7 +50,7 @@ def attitude_from_readings(law: Law, x_deg: float, y_deg: float) -> tuple[float,
 def up_in_sensor(law: Law, x_deg: float, y_deg: float) -> Array:
     """The direction of specific force at rest (up) in the sensor's own FRD axes, shape (3,), unit length.
 
-    This is f^b / g of method section 1.2: (sin theta, -sin gamma cos theta, -cos gamma cos theta). Turning it by
+    This is f^b / g of method 1.2: (sin theta, -sin gamma cos theta, -cos gamma cos theta). Turning it by
     the mounting gives the same direction in the vehicle's axes, whatever the mounting.
 
     Raises:
@@ -76,7 +76,7 @@ def readings_from_up(law: Law, up: Floats) -> Floats:
 def up_jacobian(law: Law, x_deg: float, y_deg: float) -> Matrix:
     """The Jacobian d up / d (qx, qy), shape (3, 2), per radian of reading; analytic for each law.
 
-    For "axis" this is method section 2.1's d b_a / d q divided by -g, in FRD: up = (sin qy, -sin qx, -c) with
+    For "axis" this is method 2.1's d b_a / d q divided by -g, in FRD: up = (sin qy, -sin qx, -c) with
     c = sqrt(1 - sin^2 qx - sin^2 qy).
 
     Raises:

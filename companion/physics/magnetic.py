@@ -1,8 +1,7 @@
 """What a magnetic field vector says of the heading, and how far it may be wrong.
 
 `up` is the unit vector of specific force at rest, `field` the field vector in any unit, both of shape (3,) and in the
-same axes: forward, right, down of the vehicle or of the sensor. Method section 3, rows "tilt-compensated heading" and
-"magnetic quality".
+same axes: forward, right, down of the vehicle or of the sensor. Method 3.5.
 """
 
 from __future__ import annotations
@@ -83,7 +82,7 @@ def deflection_bound_deg(unseen_gauss: float, horizontal_gauss: float) -> float:
     """How far a field across the meridian turns a compass; 180 where it may be as strong as what is measured.
 
     With `horizontal_gauss` as measured this is exact, sin(error) = unseen / measured; for small errors it is
-    dB / (F cos I) (method section 3).
+    dB / (F cos I) (method 3.5).
     """
     if unseen_gauss >= horizontal_gauss:
         return 180.0

@@ -266,7 +266,7 @@ def errata(seed: int, count: int) -> dict[paper.Erratum, Array]:
 
 
 def predicted(noise: AxisNoise, mean_s: float, horizon_s: float) -> float:
-    """sqrt(V(T, H)) of method section 2.2, from the simulator's own figures."""
+    """sqrt(V(T, H)) of method 2.2, from the simulator's own figures."""
     r = horizon_s / mean_s
     phi = ((1.0 + r) ** 2 * np.log(1.0 + r) - r**2 * np.log(r)) / r - np.log(r)
     variance = noise.white**2 / mean_s + noise.flicker**2 / np.pi * phi + noise.walk**2 * (mean_s + horizon_s) / 3.0

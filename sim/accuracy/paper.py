@@ -1,4 +1,4 @@
-"""The paper's equations (4) to (6) with any of their errors in print, to see what each costs (method section 1.3).
+"""The paper's equations (4) to (6) with any of their errors in print, to see what each costs (method 1.3).
 
 Body axes right, forward, up, which the paper calls E, N, U; angles theta, gamma and the compass' psi.
 """

@@ -1,8 +1,8 @@
 """What else is done with a still IMU, re-stated from its description; all of it in vehicle FRD and SI units.
 
 - The plain mean: level is believed, the Earth does not turn, sigma is s / sqrt(n).
-- ArduPilot's own calibrations (autopilots section 3; `AP_InertialSensor::_init_gyro`, `_acal_simple`) and PX4's
-  (section 4.6; `gyro_calibration.cpp`, quick calibration of the accelerometers), with their acceptance.
+- ArduPilot's own calibrations (autopilots 3; `AP_InertialSensor::_init_gyro`, `_acal_simple`) and PX4's
+  (autopilots 4.6; `gyro_calibration.cpp`, quick calibration of the accelerometers), with their acceptance.
 """
 
 from __future__ import annotations

@@ -38,10 +38,10 @@ BEGIN_S: Final = 0.5
 NEXT_S: Final = 180.0
 RATE_HZ: Final = 100
 GYRO_BIAS_RAD_S: Final = 100.0 * DEG_H
-"""One sigma of the bias of a power-up, as the paper's tables scatter (method section 1.3)."""
+"""One sigma of the bias of a power-up, as the paper's tables scatter (method 1.3)."""
 ACCEL_BIAS_M_S2: Final = 2.0 * MG
 GRAVITY_ANOMALY_M_S2: Final = 3.0e-4
-"""30 mGal, one sigma: what the formula of normal gravity leaves (method section 2.1)."""
+"""30 mGal, one sigma: what the formula of normal gravity leaves (method 2.1)."""
 STEADY_DEGC: Final = 25.0
 THERMOMETER_K: Final = 0.02
 """Noise of one reading of the IMU's own thermometer."""

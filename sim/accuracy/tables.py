@@ -38,7 +38,7 @@ from sim.imu_model import DEG_H, MG, PARTS, UG
 UPRIGHT: Final = ("level", "by eye", "5/-3")
 """Where the horizontal accelerometers are the body's x and y."""
 PAPER_LEFT_UG: Final = (56.80, 36.24)
-"""Mean absolute E and N of the paper's table 1, worked out again (method section 1.3)."""
+"""Mean absolute E and N of the paper's table 1, worked out again (method 1.3)."""
 _TRIADS: Final = (("gyro", "deg/h", DEG_H, slice(0, 3)), ("accel", "ug", UG, slice(3, 6)))
 _LSB_DEG_H: Final = STEP_RAD_S / DEG_H
 _REFERENCES: Final = f"gradienter {FIELD_TILT_DEG:g} deg, compass {FIELD_HEADING_DEG:g} deg"

@@ -1,7 +1,7 @@
 """An ArduPilot that fits in a test: parameters, telemetry and manners of the real one, on any event loop.
 
-What is modelled follows what was read in ArduPilot's sources and seen in runs of the real firmware (the "autopilots"
-reference of this project, sections 1, 2, 3, 5.4, 7.5, 9.1 and 9.3.1); the class says what is not.
+What is modelled follows what was read in ArduPilot's sources and seen in runs of the real firmware (autopilots
+1, 2, 3, 5.4, 7.5, 9.1 and 9.3.1); the class says what is not.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ DRIVE = Setup(
     rate_hz=100.0,
 )
 """Section 5.2 of the paper: 180 s in a car, the box fixed with 9.52 degrees of roll. The paper names neither route nor
-IMU; its turntable's scatter of biases is that of an ADIS16405 (method section 1.3), and the route is ours."""
+IMU; its turntable's scatter of biases is that of an ADIS16405 (method 1.3), and the route is ours."""
 
 CIRCLES = Setup(
     name="banked circles",

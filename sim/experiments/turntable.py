@@ -50,7 +50,7 @@ GROUPS: Final = (
     Group(5, 0, (0.0024125, 0.0021596, 8.9809e-4), (-8.1354e-5, 4.9918e-5, 4.3627e-6), (162.234, 169.563, 98.289)),
     Group(-5, 0, (0.0017076, 5.5211e-4, 2.7490e-3), (1.7039e-6, 3.3974e-5, -2.9729e-6), (-131.544, 100.8, -79.265)),
 )
-"""Tables 1 and 2 as printed; the first U residual cannot be right (method section 1.3)."""
+"""Tables 1 and 2 as printed; the first U residual cannot be right (method 1.3)."""
 PAPER_MEAN_G: Final = (5.680e-5, 3.624e-5, 3.556e-6)
 """Means of the absolute values of the rows, worked out again: the text prints 3.650e-5 and 3.502e-6."""
 

@@ -1,7 +1,7 @@
 """A PX4 that fits in a test: parameters, telemetry and manners of the real one, on any event loop.
 
-What is modelled follows what was read in PX4's sources and seen in runs of the real firmware (the "autopilots"
-reference of this project, sections 4, 5.1, 5.2, 5.4, 7.5, 8, 9.2 and 9.3.2); the class says what is not.
+What is modelled follows what was read in PX4's sources and seen in runs of the real firmware (autopilots
+4, 5.1, 5.2, 5.4, 7.5, 8, 9.2 and 9.3.2); the class says what is not.
 """
 
 from __future__ import annotations

@@ -13,6 +13,5 @@
     residuals       the table of what every calibration leaves
     cli             `python -m sim ardupilot | px4 | residuals`
 
-The binaries are not part of this project; a path names them. What they are expected to do stands in the "autopilots"
-reference, section 9.
+The binaries are not part of this project; a path names them. What they are expected to do: autopilots 9.
 """

@@ -142,7 +142,7 @@ def test_counts_without_a_unit_bound_by_their_direction_alone() -> None:
 
 
 def test_a_phone_in_the_method_raises_the_warning_that_a_norm_gate_does_not() -> None:
-    # Method section 3: +1.5 uT (3.5 %) in F and +1.5 deg in I, the heading 4 deg off.
+    # Method 3.5: +1.5 uT (3.5 %) in F and +1.5 deg in I, the heading 4 deg off.
     where = at.local("Munich")
     assert where.field is not None
     f, i = where.field.strength_gauss, where.field.inclination_deg * DEG

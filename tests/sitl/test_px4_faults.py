@@ -126,7 +126,7 @@ def test_another_station_that_writes_the_same_offset_meanwhile_is_not_overwritte
 
 
 def test_px4s_own_learning_at_disarm_leaves_our_offsets_alone(tmp_path: Path) -> None:
-    """SENS_IMU_AUTOCAL: with what a calibration leaves it finds nothing that is worth a write (autopilots 4.6)."""
+    """SENS_IMU_AUTOCAL: with what a calibration leaves it finds nothing that is worth a write (autopilots 4.3)."""
 
     async def main() -> None:
         folder = tmp_path / "daemon"

@@ -35,7 +35,7 @@ def slow(rng: np.random.Generator, seconds: int, flicker: float, walk: float, wh
 
 
 def adis16405(seconds: int, rate_hz: int, seed: int) -> tuple[Floats, Floats]:
-    """Times and readings (n, 6) of a part with the figures measured of the ADIS16405 (method section 2.2).
+    """Times and readings (n, 6) of a part with the figures measured of the ADIS16405 (method 2.2).
 
     Gyros: N 141 to 152 deg/h sqrt(s), floor 25 to 29 deg/h, steps of 0.05 deg/s. Accelerometers: a velocity random walk
     of 0.2 m/s/sqrt(h), 0.2 mg in-run. K as in the catalogues: it reaches the floor at 1000 s.

@@ -1,6 +1,6 @@
 """When the samples of a device are taken, what its clock says then, and when the host reads them: plain numpy.
 
-Written after the reference's comparison of methods (sensors.md 4.4), and independent of the code under test.
+Written after the comparison of methods in sensors 4.4, and independent of the code under test.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A real IMU moved by hand in front of cameras (BROAD): the optical attitude stands in for gradienter and compass.
 
 At rest before the movement it says how the sensor stands, so the biases can be found as in the field; during the
-movement it is the judge. Method section 2.3.
+movement it is the judge. Method 2.3.
 """
 
 from __future__ import annotations

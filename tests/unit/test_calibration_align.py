@@ -124,7 +124,7 @@ def test_the_covariance_of_the_method(
     gyro_deg_h: float,
     offset_deg: float,
 ) -> None:
-    """Method section 3, joint MAP covariance; its headings are taken as known, the spot slopes by 1.0 and 1.5 deg."""
+    """Method 3.4, joint MAP covariance; its headings are taken as known, the spot slopes by 1.0 and 1.5 deg."""
     world = World()
     # On its faces the liquid is out of its range, except level and, as the table has it, wherever it helps.
     six = len(poses) == 6

@@ -68,7 +68,7 @@ def test_white_and_walk_alone_have_the_documented_optimum() -> None:
     assert at_best < use_variance(model, 1.1 * best, horizon)
 
 
-# Method section 2.2: N, A, then sigma of the mean for the next 180 s after 10, 30, 60 s, then best T and its sigma.
+# Method 2.2: N, A, then sigma of the mean for the next 180 s after 10, 30, 60 s, then best T and its sigma.
 TABLE = [
     (7.1, 3.0, (5.8, 5.0, 4.7), 131.0, 4.6),
     (35.6, 2.0, (11.8, 7.3, 5.6), 455.0, 3.7),

@@ -207,7 +207,7 @@ def test_px4_predicts_the_next_seconds_within_its_sigma(until_s: float) -> None:
     coming = recording.gyro[(recording.t_s >= until_s) & (recording.t_s < until_s + 15.0)].mean(axis=0)
     miss = np.abs(np.array(window.gyro_rad_s) - coming)
     assert (miss < 2.0 * np.array(window.gyro_sigma_use_rad_s)).all()
-    # The plain mean of the same seconds is worse (method section 2.4: 20 to 51 against 9 to 31 deg/h).
+    # The plain mean of the same seconds is worse (method 2.4: 20 to 51 against 9 to 31 deg/h).
     plain = recording.gyro[(recording.t_s >= 9.0) & past].mean(axis=0)
     assert np.linalg.norm(miss) < np.linalg.norm(plain - coming)
 

@@ -27,7 +27,7 @@ def test_huber_mean_is_the_mean_of_what_has_no_outliers() -> None:
 
 
 def test_one_knock_hardly_moves_the_mean() -> None:
-    """60 s with a knock of 3 s: the mean is lost, Huber is not (method section 2.4)."""
+    """60 s with a knock of 3 s: the mean is lost, Huber is not (method 2.4)."""
     rng = np.random.default_rng(2)
     values = rng.normal(0.0, 1.0, (60, 1))
     clean = float(huber_mean(values)[0])
@@ -80,7 +80,7 @@ def test_t_statistic_of_noise_is_students() -> None:
 
 @pytest.mark.parametrize(("count", "within"), [(10, 0.05), (30, 0.03), (60, 0.025)])
 def test_the_robust_mean_is_within_a_few_per_cent_of_the_bound_where_nothing_knocks(count: int, within: float) -> None:
-    """The bound is the plain mean's 1 / sqrt(n), attained by it in Gaussian noise (method section 2.2)."""
+    """The bound is the plain mean's 1 / sqrt(n), attained by it in Gaussian noise (method 2.2)."""
     rng = np.random.default_rng(count)
     values = rng.normal(size=(count, 20_000))
     found = float(np.sqrt(np.mean(np.square(robust_mean(values))))) * np.sqrt(count)

@@ -1,4 +1,4 @@
-"""When a calibration no longer counts (method sections 2.2 and 3, item 8)."""
+"""When a calibration no longer counts (method 2.2 and 3.2)."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ def test_declination_outside_the_models_years_uses_the_nearest() -> None:
 
 
 def test_earth_rate_on_the_tilted_example() -> None:
-    # autopilots.md 9.3: pitch +5, roll -3, heading 40 deg at 40 N gives +9.64, -6.93, -9.24 deg/h.
+    # autopilots 9.3: pitch +5, roll -3, heading 40 deg at 40 N gives +9.64, -6.93, -9.24 deg/h.
     rate = body_from_ned(-3 * DEG, 5 * DEG, 40 * DEG) @ earth.earth_rate_ned_rad_s(40.0)
     np.testing.assert_allclose(rate / DEG_H, [9.64, -6.93, -9.24], atol=0.005)
 
@@ -106,7 +106,7 @@ def test_slope_law_by_the_liquids_surface() -> None:
 
 
 def test_the_wrong_law_costs_what_the_method_says() -> None:
-    # sensors.md 2.6: the axis formula on a slope device turns (10, 20) deg into (10.63, 20.36).
+    # sensors 2.6: the axis formula on a slope device turns (10, 20) deg into (10.63, 20.36).
     y_deg = math.atan(math.tan(10 * DEG) / math.cos(20 * DEG)) / DEG
     theta, gamma = attitude_from_readings("axis", 20.0, y_deg)
     assert (theta / DEG, gamma / DEG) == pytest.approx((10.63, 20.36), abs=0.005)

@@ -42,7 +42,7 @@ def test_heading_and_inclination_of_every_pose(inclination_deg: float) -> None:
 
 
 def test_heading_is_the_tilt_compensation_of_the_textbooks() -> None:
-    # Method section 3: Xh = mx ct + my sr st + mz cr st, Yh = my cr - mz sr, heading = atan2(-Yh, Xh).
+    # Method 3.5: Xh = mx ct + my sr st + mz cr st, Yh = my cr - mz sr, heading = atan2(-Yh, Xh).
     random = np.random.default_rng(1)
     for _ in range(200):
         up, (mx, my, mz) = random.standard_normal(3), random.standard_normal(3)
@@ -71,7 +71,7 @@ def test_sensitivities_are_those_of_finite_differences() -> None:
 
 
 def test_a_tilt_error_costs_two_and_a_half_times_itself_at_68_degrees() -> None:
-    # Method section 3: dpsi = tan I * tilt error (2.5 x at 68 deg).
+    # Method 3.5: dpsi = tan I * tilt error (2.5 x at 68 deg).
     size = np.linalg.norm(heading_by_up(field_ned(68.0), UP_NED))
     assert size == pytest.approx(2.5, abs=0.05)
 
@@ -90,13 +90,13 @@ def test_the_bound_of_the_unseen_part_holds_in_19_of_20_directions() -> None:
 
 
 def test_the_methods_example_of_a_deflection() -> None:
-    # Method section 3: 1.3 uT across makes 4 deg at I = 68 deg (49 uT there).
+    # Method 3.5: 1.3 uT across makes 4 deg at I = 68 deg (49 uT there).
     assert deflection_bound_deg(0.013, 0.49 * math.cos(68 * DEG)) == pytest.approx(4.06, abs=0.1)
     assert deflection_bound_deg(0.2, 0.19) == 180.0
 
 
 def test_the_earths_field_is_the_published_one() -> None:
-    # NOAA's test value (method section 3), and the example of wrldmagm in MathWorks' Aerospace Toolbox: 1000 m over
+    # NOAA's test value (method 3.5), and the example of wrldmagm in MathWorks' Aerospace Toolbox: 1000 m over
     # Natick on 4 July 2028: D -13.6891, I 65.9899 deg, F 50940, H 20727 nT.
     pole = earth.magnetic_field(80.0, 0.0, 0.0, datetime.date(2025, 1, 1))
     assert (pole.declination_deg, pole.inclination_deg) == pytest.approx((1.28, 83.21), abs=0.005)

@@ -128,7 +128,7 @@ def test_ardupilots_own_calibrations_leave_what_was_measured_on_its_firmware() -
     truth = np.concatenate([np.multiply(CASE_A[0], DEG_H), np.multiply(CASE_A[1], MG)])
     found = np.array([peers.ardupilot(standing, 1.0 + 0.5 * n) for n in range(150)]) - truth
     gyro, accel = found[:, :3] / DEG_H, found[:, 3:] / MG
-    # Table of 9.3.1: the Earth rate stays in it; 9.9 deg/h of noise beside it; the tilt goes into the accelerometers.
+    # Autopilots 9.3.1: the Earth rate stays in it; 9.9 deg/h of noise beside it; the tilt goes into the accelerometers.
     assert gyro.mean(axis=0) == pytest.approx(EARTH_DEG_H, abs=3.5)
     assert gyro.std(axis=0).mean() == pytest.approx(9.9, rel=0.12)
     assert accel.mean(axis=0) == pytest.approx([87.22, 52.18, 5.69], abs=0.15)
@@ -149,7 +149,7 @@ def test_px4_leaves_small_biases_where_they_were_and_averages_a_second_of_large_
     gyro = found[:, :3] / DEG_H - 3600.0
     assert gyro.mean(axis=0) == pytest.approx(EARTH_DEG_H, abs=FOUR * 7.1 / math.sqrt(60.0))
     assert gyro.std(axis=0).mean() == pytest.approx(7.1, rel=0.2)
-    # Table of 9.3.2, case B: x and y not corrected at all, z right to a milli-g or two.
+    # Autopilots 9.3.2, case B: x and y not corrected at all, z right to a milli-g or two.
     accel = found[:, 3:] / MG
     left = np.array(CASE_C[1]) - accel.mean(axis=0)
     assert np.abs(left[:2]) == pytest.approx([30.0, 30.0], abs=4.5)
@@ -162,7 +162,7 @@ def test_the_paper_put_right_finds_the_bias_and_as_printed_what_the_method_says(
     mean, truth = standing.imu.expected(0.0), standing.bias(0.0, 0.0)
     assert paper.biases(still, mean, paper.NONE) == pytest.approx(truth, abs=1e-12)
     printed = paper.biases(still, mean, paper.ALL)
-    # Method section 1.3, in FRD: north is forward, up is minus down.
+    # Method 1.3, in FRD: north is forward, up is minus down.
     assert printed[3] == pytest.approx(-truth[3])
     assert printed[5] == pytest.approx(
         truth[5] - 2.0 * standing.site.gravity_m_s2 * math.cos(0.0873) * 0.9986, rel=1e-3

@@ -49,7 +49,7 @@ def test_others_lose_the_vertical_in_a_turn_on_the_same_samples() -> None:
     assert float(rms(trial.tilt_deg["companion"])) < 1.0
     assert float(rms(trial.tilt_deg["gyros only"])) < 1.0
     if "VQF (3 s)" in trial.tilt_deg:
-        # Method section 3 has 23.7 degrees for it; and it is right where nothing turns, so it was fed rightly.
+        # Method 3.7 has 23.7 degrees for it; and it is right where nothing turns, so it was fed rightly.
         assert float(rms(trial.tilt_deg["VQF (3 s)"])) > 10.0
         assert float(trial.tilt_deg["VQF (3 s)"][:4].max()) < 0.2
 

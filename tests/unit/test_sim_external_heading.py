@@ -1,4 +1,4 @@
-"""The doubles take a heading from outside by the rules of the real ones (autopilots section 6), message by message."""
+"""The doubles take a heading from outside by the rules of the real ones (autopilots 6), message by message."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an autopilot needs set to take in our heading, and what that does to it (autopilots section 6)."""
+"""What an autopilot needs set to take in our heading, and what that does to it (autopilots 6)."""
 
 from __future__ import annotations
 

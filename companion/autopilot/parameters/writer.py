@@ -1,6 +1,6 @@
 """Several parameters as one: all of them are written, or the old values are back, or it is said which are not.
 
-MAVLink knows no transaction, so this is the nearest thing to one (autopilots section 8): a fresh look at each old
+MAVLink knows no transaction, so this is the nearest thing to one (autopilots 8): a fresh look at each old
 value, guarded writes one by one, a fresh read-back of every one, a last look at the arm state; and on any failure
 the old values again in reverse order, just as guarded. What cannot be put back, because the aircraft armed or fell
 silent, is in the error by name.

@@ -1,4 +1,4 @@
-"""Our attitude in MAVLink's words, for each firmware as it consumes them (autopilots section 6).
+"""Our attitude in MAVLink's words, for each firmware as it consumes them (autopilots 6).
 
 VISION_POSITION_ESTIMATE and not ODOMETRY: of an attitude without a position PX4 takes ODOMETRY for one in a frame of
 its own, not north's, and ArduPilot demands such a frame in so many words; and Euler angles have no norm that could be

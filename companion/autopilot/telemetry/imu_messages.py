@@ -1,4 +1,4 @@
-"""What the IMU messages of both autopilots carry: units, resolution, which IMU (autopilots section 2, 4.5)."""
+"""What the IMU messages of both autopilots carry: units, resolution, which IMU (autopilots 2, 4.5)."""
 
 from __future__ import annotations
 

@@ -22,8 +22,8 @@ from companion.physics.units import DEG
 
 ADJUSTING: Final = "EKF adjusting"
 SETTLED_RAD_S: Final = 0.02 * DEG
-"""Per axis: 72 deg/h. An EKF whose bias has just been reset wanders up to 52 deg/h on the ground (9.3.1); and 72 deg/h
-for the 40 s that it lasts turn the heading by 0.8 deg, less than a compass knows."""
+"""Per axis: 72 deg/h. An EKF whose bias has just been reset wanders up to 52 deg/h on the ground (autopilots
+9.3.1); and 72 deg/h for the 40 s that it lasts turn the heading by 0.8 deg, less than a compass knows."""
 
 _AHRS: Final[int] = mavlink.MAVLINK_MSG_ID_AHRS
 _RATE_HZ: Final = 4.0

@@ -37,7 +37,7 @@ __all__ = ["ArmState", "Firmware", "Moment", "Vehicle", "VehicleEvent"]
 logger = logging.getLogger(__name__)
 
 HEARTBEAT_TIMEOUT_S: Final = 2.0
-"""Without a heartbeat for this long nobody knows whether the aircraft is armed (autopilots section 8)."""
+"""Without a heartbeat for this long nobody knows whether the aircraft is armed (autopilots 8)."""
 
 HEARTBEAT_RATE_HZ: Final = 5.0
 """Asked of ArduPilot on our own link: a second is a long time not to know of an arming (autopilots 5.1)."""

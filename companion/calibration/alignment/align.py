@@ -1,4 +1,4 @@
-"""From several still stands to the gradienter's zero, and to what else they tell (method section 3).
+"""From several still stands to the gradienter's zero, and to what else they tell (method 3.4).
 
 One still pose cannot tell a zero offset of the gradienter from a bias of the accelerometers; the same spot seen twice,
 turned by 180 degrees, can. Further tilts tell bias from scale and how the gradienter sits against each IMU. Everything

@@ -14,7 +14,7 @@ turned about the vertical):
     turn           of C_k since the stand before, about the vehicle's z axis, (1 + s) times      s: a gyro's scale
     spot           down of the vehicle, seen from the ground, is the normal of the spot: C_k^T z = n + placement
 
-The last line is the level reversal (method section 3, "two headings"): the spot's true tilt is the same in the
+The last line is the level reversal (method 3.4): the spot's true tilt is the same in the
 ground's frame, however the aircraft is turned on it. "Level" is what is parallel to the plane on which it is turned.
 All derivatives are analytic; an attitude error eps is C = (I - [eps x]) C_0, as in `bias`.
 """
@@ -85,7 +85,7 @@ class Ground:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Priors:
-    """One sigma of what is known before; 0: taken as it is and not sought (method section 3, joint MAP covariance)."""
+    """One sigma of what is known before; 0: taken as it is and not sought (method 3.4, joint MAP covariance)."""
 
     offset_deg: float = 1.0
     placement_deg: float = 0.02

@@ -1,4 +1,4 @@
-"""What is in the way of a measurement, and when more seconds buy nothing (method section 3, item 7)."""
+"""What is in the way of a measurement, and when more seconds buy nothing (method 3.2)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The rolling collector: every stream in, one still stretch out.
 
 It knows no clock: time comes in with the samples and with `now_s`. All sources share one 1 s grid; a second counts
-when every source was still in it. Method section 3, items 2, 3 and 7.
+when every source was still in it. Method 2.4, 3.1 and 3.2.
 """
 
 from __future__ import annotations

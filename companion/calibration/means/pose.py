@@ -1,4 +1,4 @@
-"""Gradienter and compass: how readings become up and a heading of the vehicle, and their means (method section 3).
+"""Gradienter and compass: how readings become up and a heading of the vehicle, and their means (method 1.2 and 3.5).
 
 The compass' own heading is used where it sends one, unless it is set to be worked out here, from its field vector and
 the gradienter's tilt. A field alone, without a gradienter, gives none: nothing else at hand tells tilt well enough

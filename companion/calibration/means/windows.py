@@ -1,7 +1,7 @@
 """From the batches of a still stretch to means with honest sigmas.
 
 Two sigmas a reading: `sigma_stat` is what averaging left, `sigma_use` what the next H seconds can expect of the
-sensor. Method sections 2.2, 2.4, 2.5 and 3.
+sensor. Method 2.2, 2.4, 2.5 and 3.2.
 """
 
 from __future__ import annotations
@@ -275,7 +275,7 @@ def _quantisation(batches: Sequence[Sequence[Batch]], steps: Floats) -> tuple[Fl
     """What a rounded reading's steps may hide, as one sigma a column, and where there are fewer than 3 distinct values.
 
     Half a step for fewer than 3 distinct values; else the bound that noise of sigma leaves, (q / pi) exp(-2 pi^2
-    sigma^2 / q^2) (method sections 2.2 and 2.5).
+    sigma^2 / q^2) (method 2.2 and 2.5).
     """
     low = _columns([[batch.low for batch in item] for item in batches]).min(axis=0)
     high = _columns([[batch.high for batch in item] for item in batches]).max(axis=0)

@@ -1,7 +1,7 @@
 """Allan models of IMU noise, and what a mean over T seconds is worth for the next H seconds.
 
 One axis is white noise N (unit * sqrt(s)), flicker B (unit; the floor of the Allan deviation is 0.664 B) and rate
-random walk K (unit / sqrt(s)). Source: method section 2.2; IEEE Std 952.
+random walk K (unit / sqrt(s)). Source: method 2.2; IEEE Std 952.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ FLOOR_OF_FLICKER: Final = math.sqrt(2.0 * math.log(2.0) / math.pi)
 """Allan deviation of pure flicker noise over B: 0.664."""
 
 _FLOOR_REACHED_S: Final = 1000.0
-"""Catalogues give no random walk; K is taken such that it reaches the flicker floor here (method section 2.2)."""
+"""Catalogues give no random walk; K is taken such that it reaches the flicker floor here (method 2.2)."""
 
 
 WARM_UP_K: Final = 20.0
 """A board with its processor and radio, from cold to warm; two sigma."""
 WARM_UP: Final = (WARM_UP_K * 54.0 * DEG_H, WARM_UP_K * 0.4 * MG)
-"""Of a part that nobody has watched warming up and no data sheet is known of: a BMI088's gyro (method section 2.1), a
+"""Of a part that nobody has watched warming up and no data sheet is known of: a BMI088's gyro (method 2.1), a
 BMI160's accelerometer (the table named there)."""
 
 
@@ -85,12 +85,12 @@ def _profile(
     )
 
 
-# N in deg/h*sqrt(s) and ug*sqrt(s), A in deg/h and ug: the table of method section 2.2. The ADIS16405 gyro carries
+# N in deg/h*sqrt(s) and ug*sqrt(s), A in deg/h and ug: the table of method 2.2. The ADIS16405 gyro carries
 # the figures measured over six sessions of 2.8 h (upper ends), not the catalogue's; its accelerometer is a datasheet
 # velocity random walk of 0.2 m/s/sqrt(h) and in-run stability of 0.2 mg.
 # "unknown" is for a part that nobody named. Its floors are those of the worst common parts, so that sigma_use never
 # promises what an unknown MEMS cannot hold; its white noise is that of the best, because white noise is measured in
-# every window and the larger figure counts. Temperature coefficients: method section 2.1, which has none of
+# every window and the larger figure counts. Temperature coefficients: method 2.1, which has none of
 # the two ADIS.
 PROFILES: Final[dict[str, NoiseProfile]] = {
     profile.name: profile
@@ -119,7 +119,7 @@ def noise_profile(profile: str | Noise | None) -> NoiseProfile:
 
 
 def phi(ratio: Floats | float) -> Floats:
-    """PHI(H/T), the flicker's part of V(T, H), times pi / B^2; PHI(1) = 4 ln 2 (method section 2.2).
+    """PHI(H/T), the flicker's part of V(T, H), times pi / B^2; PHI(1) = 4 ln 2 (method 2.2).
 
     Written with log1p so that it neither cancels for H much longer than T nor for H much shorter.
     """
@@ -144,7 +144,7 @@ def predicted_sigma(model: AllanModel, mean_s: float, horizon_s: float) -> float
 def slope_variance(flicker: Floats | float, walk: Floats | float, mean_s: float) -> Floats:
     """Variance of a straight line's slope over `mean_s` seconds that flicker and random walk make where there is none.
 
-    The line's weights on the generalised covariance -(B^2 / pi) ln|t| - (K^2 / 2)|t| of method section 2.2: the double
+    The line's weights on the generalised covariance -(B^2 / pi) ln|t| - (K^2 / 2)|t| of method 2.2: the double
     integrals are 1/16 and 1/60 of T^4 and T^5, times 144 / T^6.
     """
     return np.asarray(9.0 / math.pi * np.square(flicker / mean_s) + 1.2 * np.square(walk) / mean_s)

@@ -3,7 +3,7 @@
 Generalised least squares on the overlapping Allan variance at averaging times of 1, 2, 4, ... s. The variance at t is
 N^2 / t + (2 ln 2 / pi) B^2 + K^2 t / 3 for averages over whole seconds, linear in N^2, B^2 and K^2; and how its
 estimates scatter, and with each other, follows from the same three figures: the differences behind them are Gaussian
-with a known generalised covariance (method section 2.2), and the covariance of two squares is twice the square of the
+with a known generalised covariance (method 2.2), and the covariance of two squares is twice the square of the
 covariance (Isserlis). So the weights are exact for the noise that is found, correlations between averaging times
 included, and the figures come with honest standard errors. None of the three may be negative.
 """

@@ -1,11 +1,11 @@
 """Means and lines that one knock does not move: Huber's M-estimator over batch means, and one step beyond it.
 
 c = 1.345 keeps 95 % of the efficiency on clean data; the scale is the median absolute deviation. Works on batch
-means, never on samples: a median of quantised samples is worse than the mean (method section 2.4).
+means, never on samples: a median of quantised samples is worse than the mean (method 2.4).
 Sources: Huber, Annals of Mathematical Statistics 35 (1964) 73-101; the step, Yohai, Annals of Statistics 15 (1987)
-642-656, with the weights of Beaton and Tukey, Technometrics 16 (1974) 147-185; method section 3.
+642-656, with the weights of Beaton and Tukey, Technometrics 16 (1974) 147-185.
 
-A line's slope may be a warm-up, whose end counts, or chance and the part's own wander (method section 2.4). An untested
+A line's slope may be a warm-up, whose end counts, or chance and the part's own wander (method 2.4). An untested
 line costs more than it saves: its end has four times the variance of a mean, and a part that wanders comes back. So a
 slope must exceed what white noise makes and what the flicker and walk of the part make.
 """

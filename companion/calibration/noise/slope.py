@@ -1,7 +1,7 @@
 """How fast a reading turns: a line through its seconds, with a sigma that holds for real sensors.
 
 A line's slope is uncertain by the white noise of the seconds, by slow wander, which the readings' own Allan deviation
-shows, and by coarse steps, which may hide a slope altogether (method section 12).
+shows, and by coarse steps, which may hide a slope altogether (method 2.6).
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def wandering(slots: NDArray[np.int64], left: Floats, white: Floats) -> tuple[Fl
 def hidden_by_steps(step: float, variance: float, *, dithered: bool = True) -> float:
     """By how much the mean of readings rounded to `step` (0 for floats) may be off, either way.
 
-    (q / pi) exp(-2 pi^2 sigma^2 / q^2), the first harmonic (method section 2.5), by the variance with rounding and
+    (q / pi) exp(-2 pi^2 sigma^2 / q^2), the first harmonic (method 2.5), by the variance with rounding and
     all; at most half a step, as where the readings show too few values to tell their noise (not `dithered`).
     """
     if step <= 0.0 or not dithered:

@@ -1,7 +1,7 @@
 """Is the calibration in force still good?
 
 What was found right (written and seen, or measured to be right as it is) ages: the bias wanders, the temperature
-changes, somebody changes the offsets. All limits come from the error budget (method sections 2.2 and 3, item 8):
+changes, somebody changes the offsets. All limits come from the error budget (method 2.2 and 3.2):
 
 - age: so long as the wandering expected of the sensor's Allan profile stays below `DRIFT_SIGMAS` sigma_use, and never
   longer than the configured limit (30 minutes);
@@ -134,7 +134,7 @@ class Finding(msgspec.Struct, frozen=True):
 def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
     """The horizon H at which the expected wandering, V(T, H) without its white part, reaches DRIFT_SIGMAS sigma_use.
 
-    At most a day (method section 2.2); of `sigma`, as in `Held`, the smallest axis counts, `averaged_s` is T.
+    At most a day (method 2.2); of `sigma`, as in `Held`, the smallest axis counts, `averaged_s` is T.
     """
     allowed = (DRIFT_SIGMAS * min(sigma)) ** 2
 

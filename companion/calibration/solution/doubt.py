@@ -2,7 +2,7 @@
 
 One tilt, one gravity and one rotation are behind the readings of all IMUs. What has changed alike in all of them is
 the gradienter (or its zero), the gravity that the place was believed to have, or a turn; what has changed in one of
-them, while the others agree with what is known of them, is that one (method section 2.1).
+them, while the others agree with what is known of them, is that one (method 2.1).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is known from before, and today's readings of all IMUs, as one estimate (method section 3, "prior / MAP").
+"""What is known from before, and today's readings of all IMUs, as one estimate (method 3.3).
 
 With d the biases by today's readings and p those expected, all IMUs together,
 

@@ -3,7 +3,7 @@
 A disturbance of the field has three parts. Along the field and in the dip it shows, as a wrong strength F and a wrong
 inclination I; across the meridian it turns the heading and shows in nothing. So the visible parts say how large the
 invisible one may be: drawn with one unknown size, it exceeds `BOUND_OF_TWO` times their root of squares in one case of
-twenty. Its effect is dB / (F cos I) (method section 3, "magnetic quality": 1.3 uT make 4 degrees at I = 68 degrees,
+twenty. Its effect is dB / (F cos I) (method 3.5: 1.3 uT make 4 degrees at I = 68 degrees,
 where a norm gate of 5 % sees nothing). What the model WMM2025 itself does not know counts as visible disturbance.
 """
 
@@ -33,7 +33,7 @@ from companion.physics.units import DEG
 
 STRENGTH_GATE: Final = 0.02
 INCLINATION_GATE_DEG: Final = 1.0
-"""Beyond these a warning is given (method section 3); what counts is the bound."""
+"""Beyond these a warning is given (method 3.5); what counts is the bound."""
 UNIT_GATE: Final = 0.5
 """Farther off the Earth's field than this it is no disturbance but a wrong unit or scale."""
 WANDER_WARNING_DEG: Final = 1.5

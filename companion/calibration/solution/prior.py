@@ -1,6 +1,6 @@
-"""From earlier calibrations to what today's bias should be (method section 3, "prior / MAP" and "temperature").
+"""From earlier calibrations to what today's bias should be (method 3.3).
 
-Run to run a MEMS bias scatters (an ADIS16405 by 70 deg/h and 2 mg, method section 1.3). What is expected of today is
+Run to run a MEMS bias scatters (an ADIS16405 by 70 deg/h and 2 mg, method 1.3). What is expected of today is
 the mean of the earlier power-ups, or their curve over temperature (`temperature.curve`), and its sigma is that of *one
 more* power-up: the scatter, widened as Student's for few points, and the error of the mean.
 
@@ -12,7 +12,7 @@ part.
 An accelerometer's bias moves with the attitude at which it is measured: f = (I + S) (I - [m x]) g u + b
 (`align_model`), so that in one pose u, scale, shear and misalignment times 1 g look like a bias. What a calibration
 finds is the *effective* bias at its attitude; g (S - [m x]) (u' - u) is by how much it is another one at u'. A
-multi-pose alignment knows S and m; otherwise they are as large as its priors say (method section 2.3: 0.5 % of scale
+multi-pose alignment knows S and m; otherwise they are as large as its priors say (method 2.3: 0.5 % of scale
 make 5 mg).
 """
 
@@ -132,9 +132,9 @@ GATE_SIGMAS: Final = 4.0
 TEMPERATURE_SIGMA_K: Final = 10.0
 """Between two calibrations of one power-up, where no temperature is told."""
 CATALOGUE_SCATTER: Final[dict[Triad, float]] = {"gyro": 70.0 * DEG_H, "accel": 2.0 * MG}
-"""Method section 1.3; here it only weighs the points against one another."""
+"""Method 1.3; here it only weighs the points against one another."""
 CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2 * MG}
-"""BMI088, the worse one of method section 2.1."""
+"""BMI088, the worse one of method 2.1."""
 _KNOWN: Final = 0.5
 """Of the catalogue's: a curve that is known worse is not worth following."""
 _UNEXPLAINED: Final = 0.1

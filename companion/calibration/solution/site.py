@@ -16,7 +16,7 @@ from companion.calibration.records.record import Site
 from companion.physics import earth
 from companion.physics.frames import Array, Matrix
 
-# A gravity anomaly of 30 mGal is what Somigliana's formula leaves (method section 2.1).
+# A gravity anomaly of 30 mGal is what Somigliana's formula leaves (method 2.1).
 GRAVITY_MODEL_SIGMA_M_S2: Final = 3.0e-4
 GRAVITY_BY_HEIGHT_1_S2: Final = 3.086e-6
 UNKNOWN_HEIGHT_SIGMA_M: Final = 1000.0

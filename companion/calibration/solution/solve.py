@@ -2,7 +2,7 @@
 
 The gradienter gives the direction of up, the compass the heading, the site gravity and the Earth's rate; what each
 sensor should have read follows, and the rest is its bias. "Bias" is the effective one at this pose: a scale error
-times 1 g on the vertical axis cannot be told from a bias in one pose (method section 2.3) and is what the
+times 1 g on the vertical axis cannot be told from a bias in one pose (method 2.3) and is what the
 autopilot's offset has to carry here; it is not part of sigma.
 
 The bias equations of the paper in their corrected form:
@@ -16,7 +16,7 @@ The bias equations of the paper in their corrected form:
 | (6)   | -mean - T Omega                                   | bias = mean - C_n^b w_ie^n                          |
 
 Coded as printed, (4) returns the negative of the north bias and (6) minus the bias less twice the Earth's rate
-(method section 1.3). Everything is FRD and NED; `up` is the unit vector of specific force at rest.
+(method 1.3). Everything is FRD and NED; `up` is the unit vector of specific force at rest.
 """
 
 from __future__ import annotations
@@ -245,7 +245,7 @@ def _pose(truth: Truth) -> Pose:
 
 
 def _shared(truth: Truth, local: LocalEarth, turn: Turn, zero_sigma_rad: float, turn_rad_s: Array) -> Shared:
-    """What one attitude, gravity, Earth's rate and turn of the platform add to the errors of all; method section 2.1.
+    """What one attitude, gravity, Earth's rate and turn of the platform add to the errors of all; method 2.1.
 
     An attitude error eps makes db_a = eps x f and db_g = eps x w = -[w x] eps; the cross term is kept, since one tilt
     error makes both. What remains unknown of the Earth's rate (latitude, or a heading never measured) comes in with

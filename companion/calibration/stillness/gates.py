@@ -3,7 +3,7 @@
 The detector is the generalised likelihood ratio test of Skog, Haendel, Nilsson and Rantakokko (IEEE Trans. Biomed.
 Eng. 57(11), 2010) in its centred form: T = mean(sum((a - abar)^2 / s_a^2 + (w - wbar)^2 / s_w^2)), 6 (W - 1) / W when
 at rest, because before a calibration the biases are unknown. What the centred form cannot see, a slow steady turn,
-is left to gates on the means, and to `turning`. Method section 3.
+is left to gates on the means, and to `turning`. Method 3.1.
 
 One set of constants serves all sensors; nothing here is tuned to a recording. Three ideas make that possible:
 

@@ -6,7 +6,7 @@ moved, and a new stretch begins.
 
 A gradienter, or a compass that averages, goes on moving after the aircraft has stopped: both follow the truth with a
 time constant; the fluid of a field gradienter is left with a tenth of what is missing after every second (BEI INC
-manual; sensors.md 2.2 and 2.7). The gate on its movement sees only the steep beginning of that. So whenever the IMUs
+manual; sensors 2.2 and 2.7). The gate on its movement sees only the steep beginning of that. So whenever the IMUs
 say that a second was not still, what the sensor is off by at its end is taken from its own readings, and its seconds
 count again once that has died away to a tenth of its sigma. The IMUs' own seconds count meanwhile: nobody who stands
 still waits longer.

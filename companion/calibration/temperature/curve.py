@@ -34,7 +34,7 @@ REFERENCE_DEGC: Final = 35.0
 UNIT_K: Final = 20.0
 LAGS_S: Final = (0.0, 10.0, 20.0, 30.0)
 VALID_K: Final = 3.0
-"""How far beyond the temperatures seen the curve goes on (method section 3)."""
+"""How far beyond the temperatures seen the curve goes on (method 3.3)."""
 FEWEST: Final = 3
 """Power-ups."""
 _ORDER: Final = 3

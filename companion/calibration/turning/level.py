@@ -27,7 +27,7 @@ RESTED_S: Final = 20
 TELLS_NOISE_S: Final = 20
 """So many seconds tell the white noise of their means; fewer are taken for as noisy as the stretch before."""
 PER_K_RAD_S: Final = 54.0 * DEG_H
-"""Of a common gyro's bias (BMI088, method section 2.1)."""
+"""Of a common gyro's bias (BMI088, method 2.1)."""
 PER_G_RAD_S: Final = 0.1 * DEG
 """By how much an uncompensated MEMS gyro feels gravity: its level is another one at another tilt."""
 EARTH_RAD_S: Final = 15.04 * DEG_H

@@ -45,7 +45,7 @@ SAID_AGAIN_S: Final = 30.0
 LATE_S: Final = 3.0
 """So long after a start in flight it is said why nothing is pushed."""
 SHORTEST_S: Final = 0.02
-"""The least time between two messages: ArduPilot drops what comes sooner (autopilots section 6)."""
+"""The least time between two messages: ArduPilot drops what comes sooner (autopilots 6)."""
 SHOWN_EVERY_S: Final = 0.2
 """For people: autopilots forward these to radios that carry little."""
 RATE_SPAN_S: Final = 2.0

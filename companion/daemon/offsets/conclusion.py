@@ -30,7 +30,7 @@ from companion.errors import AutopilotError, AutopilotRebootedError, NotDisarmed
 logger = logging.getLogger(__name__)
 
 STORED_AFTER_S: Final = 3.0
-"""PX4 saves its parameters up to 2 s after a change, ArduPilot from a queue (autopilots section 8)."""
+"""PX4 saves its parameters up to 2 s after a change, ArduPilot from a queue (autopilots 8)."""
 ANSWER_S: Final = 3.0
 BACK_WITHIN_S: Final = 60.0
 CONCLUDING_PERCENT: Final = 95.0

@@ -38,7 +38,8 @@ from companion.storage.changes import Changed, ChangeSet
 logger = logging.getLogger(__name__)
 
 SETTLE_S: Final = {"ardupilot": 1.0, "px4": 2.5}
-"""Until the telemetry shows a written offset: ArduPilot's filter 60 ms, PX4's parameter updates a second (9.3)."""
+"""Until the telemetry shows a written offset: ArduPilot's filter 60 ms, PX4's parameter updates a second (autopilots
+9.1, 9.2)."""
 WRITE_S: Final = 0.5
 POLL_S: Final = 0.2
 SLACK_S: Final = 6.0

@@ -273,7 +273,7 @@ def nearly_visible(verdict: Verdict) -> bool:
 
 
 def _drift_sigma(model: AllanModel, most_flicker: float, spans_s: tuple[float, float]) -> float:
-    """How far the bias itself wanders between two neighbouring windows (method section 2.2, V less its white part)."""
+    """How far the bias itself wanders between two neighbouring windows (method 2.2, V less its white part)."""
     return float(np.sqrt(floor_variance(min(model.flicker, most_flicker), model.walk, *spans_s)))
 
 

@@ -46,15 +46,15 @@ from companion.storage.changes import ChangeSet
 logger = logging.getLogger(__name__)
 
 WORTH_RAD_S: Final = 20.0 * DEG_H
-"""A step on any axis beyond this: a stale EKF bias turns the heading by the step times some 40 s (9.3.1), here 0.2 deg;
-and the firmware's calibration rewrites the flash of all instances."""
+"""A step on any axis beyond this: a stale EKF bias turns the heading by the step times some 40 s (autopilots
+9.3.1), here 0.2 deg; and the firmware's calibration rewrites the flash of all instances."""
 
 SETTLE_RESET_S: Final = 60.0
 """After the reset what is left is the tilt error of the old accelerometer offsets: while it fades the EKF takes a part
 of it for gyro bias (a step of 30 mg: 850 deg/h for a moment, settled after 26 s on the real firmware)."""
 
 SETTLE_ALONE_S: Final = 150.0
-"""By itself EKF3 takes about two minutes (9.3.1: 140 s)."""
+"""By itself EKF3 takes about two minutes (autopilots 9.3.1: 140 s)."""
 
 
 class FirmwareCalibration:

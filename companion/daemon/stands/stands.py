@@ -33,7 +33,7 @@ from companion.physics.frames import Array
 from companion.physics.units import DEG
 
 STAND_S: Final = 12.0
-"""Seconds of stillness for each stand: averaging beyond 10 s buys an accelerometer nothing (method section 2.3)."""
+"""Seconds of stillness for each stand: averaging beyond 10 s buys an accelerometer nothing (method 2.3)."""
 SETTLE_S: Final = 1.0
 STOP_WITHIN_DEG: Final = 5.0
 """Who would be that near what is asked for, or beyond, by the next look is told to stop."""

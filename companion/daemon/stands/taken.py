@@ -18,7 +18,7 @@ from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG
 
 READING_SIGMA_DEG: Final = 0.005
-"""What one mean of a gradienter is good for besides its zero (the gradienter noise of method section 3's table)."""
+"""What one mean of a gradienter is good for besides its zero (the gradienter noise of the table in method 3.4)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

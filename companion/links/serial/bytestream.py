@@ -28,7 +28,7 @@ COLLECT_S = 0.0205
 """How long such a stream is collected before the next read: a wake-up costs far more than the bytes that it brings.
 
 What it brings is stamped that much late at worst (where the device has no clock of its own), as behind a USB adapter.
-A little more than the 20 ms within which an autopilot takes one heading (autopilots section 6): each read brings one.
+A little more than the 20 ms within which an autopilot takes one heading (autopilots 6): each read brings one.
 """
 JUDGED_S = 0.1
 """How often a stream is judged anew, whether to collect it: what comes in bunches is no other stream."""

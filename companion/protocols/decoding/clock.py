@@ -4,7 +4,7 @@ A read comes late by anything: the frame's way through the line, a USB adapter t
 was busy for 60 ms. A device's clock knows better, but not what time it is here. Between the two lies an offset, and the
 least delay ever seen tells it best: the running minimum of (read - device), which may creep upwards as fast as two
 crystals drift apart. It is causal, forgives every stall, and leaves only the least delay in, which nobody can see from
-one end (reference: sensors.md 4.4; dawonn/vectornav#88 and ethz-asl's cuckoo_time_translator discuss the choice).
+one end (sensors 4.4; dawonn/vectornav#88 and ethz-asl's cuckoo_time_translator discuss the choice).
 
 A clock that went back, or that has advanced by far less than the host's, is a device that restarted (its biases are
 new ones); one that jumped forward belongs to another device, or the host slept. Either way it is mapped afresh.

@@ -2,9 +2,9 @@
 
 - imu_tk (Tedaldi et al., ICRA 2014; `MultiPosCalibration::calibrateAcc`): 100 readings of each stand, all alike, a
   triangular matrix, least squares on the length of every reading.
-- ArduPilot's six positions (`AccelCalibrator`; autopilots section 3): half a second each, offsets and scales; the
+- ArduPilot's six positions (`AccelCalibrator`; autopilots 3): half a second each, offsets and scales; the
   length of gravity is 9.80665 wherever it flies.
-- PX4's (`accelerometer_calibration.cpp`; section 4.6): 750 readings each, offsets are the middle of two opposite
+- PX4's (`accelerometer_calibration.cpp`; autopilots 4.6): 750 readings each, offsets are the middle of two opposite
   sides, scales the diagonal of the inverse of three sides, which are taken for exact.
 """
 
