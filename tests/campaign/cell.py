@@ -35,8 +35,9 @@ MOST_VIRTUAL_S = 1500.0
 DRAWS = 4
 SETTLES = 10
 CONNECTS = 80
-REFUSALS = 4
-"""So often a request, one each 4 s, may be refused after the fault: a contradiction of heartbeats counts for 10 s."""
+REFUSALS = 9
+"""Requests, 4 s apart, that may be refused after a fault: contradicting heartbeats are believed again after 30 s of
+nothing but "disarmed" (docs/security.md)."""
 
 
 @dataclasses.dataclass
