@@ -39,6 +39,14 @@ class CalibrationRefusedError(CompanionError):
     """The measurement fails its own checks; nothing may be written."""
 
 
+class RequestRefusedError(CalibrationRefusedError):
+    """A request was not started; `kind` says why in one word, as in docs/mqtt.md (armed, busy, moving, ...)."""
+
+    def __init__(self, kind: str, reason: str) -> None:
+        super().__init__(reason)
+        self.kind = kind
+
+
 class AutopilotError(CompanionError):
     """The autopilot did not do what was asked."""
 

@@ -19,8 +19,8 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from companion.daemon.faces.control import ask
 from companion.errors import DaemonUnreachableError
+from companion.links.system.control_client import ask
 from tests.bench_arming import running
 from tests.support.broker import Broker
 from tests.support.installed import install

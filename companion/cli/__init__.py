@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from companion import __version__, config
-from companion.cli import logs
 from companion.cli.terminal import (
     FAILED,
     NO_DAEMON,
@@ -29,6 +28,7 @@ from companion.cli.terminal import (
     within,
 )
 from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError, NobodyHeardError
+from companion.links.system import logs
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

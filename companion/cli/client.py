@@ -11,8 +11,8 @@ from typing import Final
 
 from companion.cli import show
 from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds
-from companion.daemon.faces.control import ask
 from companion.formats import Object
+from companion.links.system.control_client import ask
 
 SILENT_S: Final = 2.0
 """After so long without an answer it is said that one is waited for."""

@@ -11,9 +11,9 @@ from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from companion.cli import logs
 from companion.cli.terminal import DONE, Parser, print_lines
 from companion.errors import ConfigError
+from companion.links.system import logs
 
 if TYPE_CHECKING:
     from companion.fleet.metrics import Metrics

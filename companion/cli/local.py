@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from companion.cli import logs, show
+from companion.cli import show
 from companion.cli.terminal import (
     DONE,
     FAILED,
@@ -28,6 +28,7 @@ from companion.cli.terminal import (
     within,
 )
 from companion.errors import CompanionError, StorageError
+from companion.links.system import logs
 
 if TYPE_CHECKING:
     from companion.installation.install import Step, Target

@@ -18,9 +18,9 @@ from typing import Final
 
 from companion.cli import show
 from companion.cli.terminal import DONE, load_config, print_json, print_lines
-from companion.daemon.faces.control import ask
 from companion.errors import DaemonUnreachableError
 from companion.formats import Object
+from companion.links.system.control_client import ask
 from companion.printable import printable
 
 SILENT_S: Final = 5.0

@@ -40,7 +40,7 @@ def parts_given(options: Sequence[str]) -> dict[str, str]:
 
 async def daemon_status(config: Config) -> Object | None:
     """Ask the running daemon for its status; None: none runs; empty: one runs and refuses to answer."""
-    from companion.daemon.faces.control import ask
+    from companion.links.system.control_client import ask
 
     found: Object = {}
     try:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.daemon.calibrating.subsystem import RequestRefusedError
+from companion.errors import RequestRefusedError
 from companion.storage.changes import BY_TEMPERATURE, Changed, ChangeLog, ChangeSet, Origin, Undoable
 from sim.imu_model import DEG_H
 from sim.px4.defaults import SIMULATED_IDS

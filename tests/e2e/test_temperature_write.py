@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from companion.calibration.records.history import PowerUp
-from companion.daemon.calibrating.subsystem import RequestRefusedError
+from companion.errors import RequestRefusedError
 from companion.storage.learned import BiasStore
 from sim.imu_model import DEG_H, MG
 from tests.support.rig import GYRO_BIAS_DEG_H, Rig

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from companion.cli.logs import LimitedHandler
+from companion.links.system.logs import LimitedHandler
 
 Log = Callable[[str], None]
 
@@ -71,7 +71,7 @@ def test_what_comes_now_and_then_is_written_as_it_comes() -> None:
 
 WITHOUT_DESCRIPTORS = """
 import logging, os, resource
-from companion.cli import logs
+from companion.links.system import logs
 
 logs.set_up("info")
 resource.setrlimit(resource.RLIMIT_NOFILE, (20, 20))

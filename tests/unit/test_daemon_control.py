@@ -15,9 +15,11 @@ import pytest
 
 from companion.config.sections import Control
 from companion.daemon.faces import control
-from companion.daemon.faces.control import ControlServer, ask
+from companion.daemon.faces.control import ControlServer
 from companion.errors import CalibrationRefusedError, DaemonUnreachableError, LinkError
 from companion.formats import Object
+from companion.links.system import control_client
+from companion.links.system.control_client import ask
 
 
 async def _echo(request: Object) -> AsyncIterator[Object]:
@@ -245,7 +247,8 @@ def test_a_burst_of_silent_clients_leaves_no_descriptor_open(tmp_path: Path) -> 
 
 
 def test_who_does_not_read_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(control, "ANSWER_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(control_client, "READ_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(control, "READ_TIMEOUT_S", 0.2)
     path = tmp_path / "control.sock"
 
     async def main() -> None:

@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from companion.component.service import Refusal
-from companion.daemon.calibrating.subsystem import RequestRefusedError
 from companion.daemon.faces.mqtt.requests import MAX_PENDING, REMEMBER_S, REMEMBERED, Misfit, Request, Requests, parse
+from companion.errors import RequestRefusedError
 from tests.support.virtual_time import run_virtual
 
 Object = dict[str, Any]
@@ -39,7 +38,7 @@ class Daemon:
             yield {"kind": "result", "state": "cancelled", "reason": "cancelled by mqtt cancel"}
             return
         if self.running:
-            raise RequestRefusedError(Refusal("busy", "a calibration is running (hold still 3 s)"))
+            raise RequestRefusedError("busy", "a calibration is running (hold still 3 s)")
         self.running = True
         while not self.end.is_set():
             yield {"kind": "progress", "state": "waiting", "percent": 0, "text": "hold still"}
@@ -109,7 +108,7 @@ def test_a_repeated_transaction_gets_the_same_answer_and_starts_nothing() -> Non
 def test_what_was_refused_may_be_asked_again_under_its_transaction() -> None:
     async def main() -> None:
         daemon = Daemon()
-        daemon.fault = RequestRefusedError(Refusal("armed", "armed: disarm first"))
+        daemon.fault = RequestRefusedError("armed", "armed: disarm first")
         await daemon.take(b'{"transaction": "x"}')
         daemon.fault = None
         await daemon.take(b'{"transaction": "x"}')

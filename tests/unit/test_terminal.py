@@ -21,14 +21,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.cli import logs, main, monitor
-from companion.cli.logs import JournalFormatter, OneLineFormatter
+from companion.cli import main, monitor
 from companion.cli.show import finding_lines
 from companion.daemon.process.check import Finding
 from companion.errors import LinkError
 from companion.ground.display import Display
 from companion.ground.heard import Heard, Target
 from companion.links.serial.ports import Holder, SerialPort
+from companion.links.system import logs
+from companion.links.system.logs import JournalFormatter, OneLineFormatter
 from companion.printable import printable
 from tests.support.ground_wire import StationOnTheWire
 from tests.support.rig import Rig

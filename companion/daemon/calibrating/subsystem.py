@@ -37,7 +37,7 @@ from companion.daemon.stands.level_writes import LevelWrites
 from companion.daemon.stands.measuring import Measuring
 from companion.daemon.stands.stands import Stands
 from companion.daemon.stands.turning import TurnAsked, Turning
-from companion.errors import CalibrationRefusedError
+from companion.errors import CalibrationRefusedError, RequestRefusedError
 from companion.formats import Object
 from companion.links.system.waiting import comes
 from companion.storage.records import RecordStore
@@ -47,14 +47,6 @@ HEARD_WITHIN_S: Final = 5.0
 """How long an undo waits for an autopilot that was not heard since the start."""
 ALIGN_TIMEOUT_S: Final = 900.0
 """An alignment that nobody ends must not keep calibrations from starting for ever."""
-
-
-class RequestRefusedError(CalibrationRefusedError):
-    """A request was not taken; `kind` as in `Refusal`."""
-
-    def __init__(self, refusal: Refusal) -> None:
-        super().__init__(refusal.reason)
-        self.kind = refusal.kind
 
 
 class Calibrating(Subsystem):
@@ -115,6 +107,21 @@ class Calibrating(Subsystem):
             "by_hand": self.by_hand.latest(),
             "stands": msgspec.to_builtins(self.stands.shown),
             "last": _summary(conductor.results.last),
+            "job": self._job(),
+        }
+
+    def _job(self) -> Object | None:
+        """Progress of the latest job; None before the first."""
+        conductor, job = self.conductor, self.conductor.job
+        if job is None:
+            return None
+        return {
+            "kind": job.kind,
+            "what": job.what.name.lower(),
+            "requester": job.requester,
+            "state": conductor.state.shown,
+            "percent": conductor.progress_percent,
+            "text": job.words if conductor.running is not None else conductor.reason,
         }
 
     async def _calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
@@ -142,7 +149,7 @@ class Calibrating(Subsystem):
         if action == "undo":
             await self._hear()
             if (why := into.why_no_undo()) is not None:
-                raise RequestRefusedError(Refusal("nothing_to_undo", why))
+                raise RequestRefusedError("nothing_to_undo", why)
             async for reply in self._undo(request, face):
                 yield reply
         elif action == "write":
@@ -270,7 +277,7 @@ class Calibrating(Subsystem):
 
 def _accepted(answer: Job | Refusal) -> Job:
     if isinstance(answer, Refusal):
-        raise RequestRefusedError(answer)
+        raise RequestRefusedError(answer.kind, answer.reason)
     return answer
 
 

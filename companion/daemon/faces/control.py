@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import grp
-import json
 import logging
 import os
 import socket
@@ -23,22 +21,19 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Final, Self
 
-import msgspec
-
-from companion.errors import CompanionError, DaemonDeniedError, DaemonUnreachableError, LinkError
+from companion.errors import CompanionError, LinkError, RequestRefusedError
 from companion.formats import Object, parse_request
+from companion.links.system.control_client import READ_TIMEOUT_S, write_line
 
 logger = logging.getLogger(__name__)
 
 Handler = Callable[[Object], AsyncIterator[Object]]
 
-# A request is below 1 kB, the longest answer (a history of 1000 records) below 8 MB.
+# A request is below 1 kB.
 REQUEST_LIMIT: Final = 64 * 1024
-ANSWER_LIMIT: Final = 32 * 1024 * 1024
 REQUEST_TIMEOUT_S: Final = 5.0
-ANSWER_TIMEOUT_S: Final = 10.0
-"""How long a client may take to read an answer before it is given up."""
 KERNEL_BYTES: Final = 16 * 1024
+INTERNAL_ERROR: Final = "internal error of the daemon; its log has the details"
 MAX_CLIENTS: Final = 16
 """The most connections of each kind: not asked yet, urgent commands, all others."""
 URGENT: Final = ("cancel", "status")
@@ -114,7 +109,7 @@ class ControlServer:
                 line = await reader.readline()
             return parse_request(line)
         except ValueError as error:
-            await _write(writer, {"kind": "error", "reason": f"request not understood: {error}"})
+            await write_line(writer, {"kind": "error", "reason": f"request not understood: {error}"})
             await _finish(writer)
             return None
 
@@ -124,7 +119,7 @@ class ControlServer:
             self._silent.pop(client, None)
         urgent = request.get("command") in URGENT
         if self._served[urgent] >= MAX_CLIENTS:
-            await _write(writer, {"kind": "error", "reason": "the daemon has too many clients at once; try again"})
+            await write_line(writer, {"kind": "error", "reason": "the daemon has too many clients at once; try again"})
             await _finish(writer)
             return
         self._served[urgent] += 1
@@ -137,30 +132,22 @@ class ControlServer:
     async def _answer(self, request: Object, writer: asyncio.StreamWriter) -> None:
         try:
             async for reply in self._handler(request):
-                await _write(writer, reply)
+                await write_line(writer, reply)
+        except RequestRefusedError as error:
+            await write_line(writer, {"kind": "error", "reason": str(error), "refusal": error.kind})
         except CompanionError as error:
-            await _write(writer, {"kind": "error", "reason": str(error)})
+            await write_line(writer, {"kind": "error", "reason": str(error)})
         except ConnectionError:
             raise
         except Exception:
             logger.exception("control request %r failed", request.get("command"))
-            await _write(writer, {"kind": "error", "reason": "internal error of the daemon; its log has the details"})
-
-
-async def _write(writer: asyncio.StreamWriter, reply: Object) -> None:
-    """Send one line; a ConnectionError where the other side is gone, or does not read."""
-    writer.write(msgspec.json.encode(reply) + b"\n")
-    try:
-        async with asyncio.timeout(ANSWER_TIMEOUT_S):
-            await writer.drain()
-    except TimeoutError:
-        raise ConnectionAbortedError from None
+            await write_line(writer, {"kind": "error", "reason": INTERNAL_ERROR})
 
 
 async def _finish(writer: asyncio.StreamWriter) -> None:
     """Close when the other side has everything; an OSError where it is gone, or does not read."""
     writer.close()
-    async with asyncio.timeout(ANSWER_TIMEOUT_S):
+    async with asyncio.timeout(READ_TIMEOUT_S):
         await writer.wait_closed()
 
 
@@ -193,16 +180,6 @@ def _open_to(path: Path, group: str) -> None:
         logger.warning("control socket: group %s may not use it: %s", group, why)
 
 
-def _who_may(path: Path) -> str:
-    try:
-        found = path.stat()
-        if found.st_mode & stat.S_IWGRP:
-            return f"only group {grp.getgrgid(found.st_gid).gr_name} and root may: usermod -aG, log in again; or sudo"
-    except (OSError, KeyError):
-        pass
-    return "permission denied, try with sudo"
-
-
 def _remove_stale(path: Path) -> None:
     """Remove a socket that nobody listens on any more; a LinkError where somebody does, or it is no socket."""
     try:
@@ -232,35 +209,3 @@ def process_behind(path: Path) -> set[int]:
     except OSError:
         return set()
     return {struct.unpack("3i", credentials)[0]}
-
-
-async def ask(path: Path, request: Object) -> AsyncIterator[Object]:
-    """Send one request to the daemon and yield its replies; the last has kind "result" or "error".
-
-    Raises:
-        DaemonUnreachableError: nobody answers at the socket, or the daemon went away in the middle.
-    """
-    try:
-        reader, writer = await asyncio.open_unix_connection(str(path), limit=ANSWER_LIMIT)
-    except OSError as error:
-        why = {
-            errno.ENOENT: "no such socket",
-            errno.ECONNREFUSED: "nobody listens there",
-        }.get(error.errno or 0, str(error))
-        if error.errno == errno.EACCES:
-            raise DaemonDeniedError(f"the daemon at {path} may not be asked: {_who_may(path)}") from None
-        raise DaemonUnreachableError(f"no daemon answers at {path} ({why})") from None
-    try:
-        await _write(writer, request)
-        while line := await reader.readline():
-            reply: Object = json.loads(line)
-            yield reply
-            if reply.get("kind") in ("result", "error"):
-                return
-        raise DaemonUnreachableError(f"the daemon at {path} went away in the middle of the answer")
-    except ConnectionError:
-        raise DaemonUnreachableError(f"the daemon at {path} went away in the middle of the answer") from None
-    finally:
-        writer.close()
-        with contextlib.suppress(ConnectionError):
-            await writer.wait_closed()

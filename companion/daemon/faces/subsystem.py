@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 
 LARGEST: Final = 1e6
 MONITOR_EVERY_S: Final = 0.5
+POSE_EVERY_S: Final = 0.2
+FACES: Final = {"page": "the page's", "mqtt": "mqtt", "fleet": "fleet"}
+"""Child processes by their name in a request, and as a record names the requester ("cancelled by mqtt cancel")."""
 FLEET_AFTER_S: Final = 10.0
 
 
@@ -67,6 +70,7 @@ class Faces(Subsystem):
         calibrating.conductor.on_ended.add(self._show_result)
         self._headlines = Headlines(core, devices, calibrating.conductor, arming, heading.attitude)
         self._pose, self._readiness = heading.pose, arming.readiness
+        self._conductor = calibrating.conductor
         self._subsystems = (self, devices, offsets, calibrating, arming, heading, recorder)
         self._handlers: dict[str, Handler] = {"status": self._status, "monitor": self._monitor}
         for subsystem in self._subsystems:
@@ -87,13 +91,14 @@ class Faces(Subsystem):
             bind, folder = core.config.web.bind, core.config.storage.path
             self.page = Page(bind, folder, self.answer, self.refresh, core.offload)
 
-    async def answer(self, request: Object, face: str = "companion") -> AsyncIterator[Object]:
-        """Answer one request of the control socket, or of another face that speaks its words.
+    async def answer(self, request: Object, face: str | None = None) -> AsyncIterator[Object]:
+        """Answer one request of the control socket, whose key `face` names the child process that sent it.
 
         Raises:
-            CompanionError: it is not taken, and why, or it could not be carried out.
+            CompanionError: the request is refused, or could not be carried out, and why.
         """
         command = request.get("command")
+        face = face or FACES.get(str(request.get("face")), "companion")
         handler = self._handlers.get(command) if isinstance(command, str) else None
         if handler is None:
             yield {"kind": "error", "reason": f"unknown command {command!r}"}
@@ -104,10 +109,21 @@ class Faces(Subsystem):
     async def _status(self, _request: Object, _face: str) -> AsyncIterator[Object]:
         yield {"kind": "result", "status": await self.refresh()}
 
-    async def _monitor(self, _request: Object, _face: str) -> AsyncIterator[Object]:
+    async def _monitor(self, request: Object, _face: str) -> AsyncIterator[Object]:
+        """Stream the status every 0.5 s; with `pose` the attitude every 0.2 s too, and a new state at once."""
+        if request.get("pose") is not True:
+            while True:
+                yield {"kind": "progress", "status": await self.refresh()}
+                await asyncio.sleep(MONITOR_EVERY_S)
+        shown, due_s, loop = "", 0.0, asyncio.get_running_loop()
         while True:
-            yield {"kind": "progress", "status": await self.refresh()}
-            await asyncio.sleep(MONITOR_EVERY_S)
+            reply: Object = {"kind": "progress", "pose": await self._pose.refresh()}
+            state = self._conductor.state.shown
+            if state != shown or loop.time() >= due_s:
+                reply["status"] = self.all_status()
+                shown, due_s = state, loop.time() + MONITOR_EVERY_S
+            yield reply
+            await asyncio.sleep(POSE_EVERY_S)
 
     async def refresh(self) -> Object:
         """`all_status`, with the declination of the place looked up when it is time to."""
@@ -143,6 +159,9 @@ class Faces(Subsystem):
         refused = self.component.permission.refused
         return {
             "system_id": vehicle.system_id,
+            "uid": vehicle.uid,
+            "version_known": vehicle.version is not None,
+            "unix_time_s": vehicle.place.unix_time_s,
             "firmware": vehicle.firmware,
             "armed": vehicle.arm_state.value,
             "summary": f"{vehicle.name}, {vehicle.arm_state.value}"

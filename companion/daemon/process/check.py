@@ -17,13 +17,14 @@ from companion.autopilot.firmware.port_parameters import baud_of, port_needs
 from companion.config.sections import UNKNOWN, Config, Imu
 from companion.configured.models import SerialDevice, cannot_work, doubtful, serial_devices
 from companion.daemon.devices.sensor_health import ABSENT
-from companion.daemon.faces.control import ask, process_behind
+from companion.daemon.faces.control import process_behind
 from companion.daemon.process.service import Service
 from companion.errors import DaemonDeniedError, DaemonUnreachableError
 from companion.formats import Object
 from companion.links.serial.faults import port_faults, same_ports, unnamed
 from companion.links.serial.listening import Heard, listen_to_all
 from companion.links.serial.ports import ROOT, list_ports
+from companion.links.system.control_client import ask
 from companion.protocols.guess import Line
 from companion.protocols.registry import PROTOCOLS, main_kind
 

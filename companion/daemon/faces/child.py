@@ -1,0 +1,126 @@
+"""One child process of the daemon: started, watched, and started again when it ends or falls silent.
+
+The child side is `companion.links.system.child`. Whatever happens to a child costs the daemon nothing but its status.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal
+import sys
+from asyncio.subprocess import PIPE, Process
+from typing import Final
+
+import msgspec
+
+from companion.errors import LinkError
+from companion.formats import Object
+from companion.links.system.child import REPORT_EVERY_S, ChildSettings
+from companion.links.system.connection import Backoff, Reconnection
+
+logger = logging.getLogger(__name__)
+
+FIRST_REPORT_S: Final = 60.0
+"""A small board with a cold SD card takes this long to import the child's libraries."""
+SILENT_S: Final = 5.0 * REPORT_EVERY_S
+END_WITHIN_S: Final = 3.0
+"""The MQTT process publishes the last state and "offline" before it ends."""
+WORTH_S: Final = 30.0
+"""A child that lasted this long is started again at once."""
+REPORT_LIMIT: Final = 256 * 1024
+
+
+class Child:
+    """Keeps `python -m MODULE` running; `run` it as a task."""
+
+    def __init__(self, name: str, module: str, settings: ChildSettings) -> None:
+        self._name, self._module, self._settings = name, module, settings
+        self._report: Object | None = None
+        self._restart = Reconnection(name, Backoff(first_s=0.5, cap_s=4.0), worth_s=WORTH_S)
+        self.process_id: int | None = None
+
+    def status(self) -> Object:
+        """Return the child's last report, or why there is none."""
+        if self._report is not None:
+            return self._report
+        return {"good": False, "summary": self._restart.last_error or "starting"}
+
+    async def run(self) -> None:
+        """Keep the child running until cancelled, then let it end."""
+        await self._restart.keep(self._once)
+
+    async def _once(self) -> str:
+        try:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable,
+                "-m",
+                self._module,
+                stdin=PIPE,
+                stdout=PIPE,
+                limit=REPORT_LIMIT,
+                # Ctrl-C in the terminal is the daemon's to handle.
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise LinkError(f"the process cannot be started: {error.strerror or error}") from error
+        self.process_id = process.pid
+        try:
+            assert process.stdin is not None
+            process.stdin.write(msgspec.json.encode(self._settings) + b"\n")
+            return await self._watch(process)
+        finally:
+            self._report = self.process_id = None
+            await _end(process)
+
+    async def _watch(self, process: Process) -> str:
+        """Read reports until the child ends, or is silent for too long; return why."""
+        reading = asyncio.get_running_loop().create_task(self._read(process))
+        try:
+            silent_s, heard = 0.0, self._report
+            while not reading.done():
+                await asyncio.wait([reading], timeout=REPORT_EVERY_S)
+                # Counted, not read from the clock: a daemon that stood still itself must not blame its child.
+                silent_s, heard = (silent_s + REPORT_EVERY_S if heard is self._report else 0.0), self._report
+                if silent_s >= (SILENT_S if heard is not None else FIRST_REPORT_S):
+                    process.kill()
+                    return f"the process gave no sign of life for {silent_s:.0f} s: ended"
+            return await reading
+        finally:
+            reading.cancel()
+            await asyncio.gather(reading, return_exceptions=True)
+
+    async def _read(self, process: Process) -> str:
+        assert process.stdout is not None
+        try:
+            while line := await process.stdout.readline():
+                if self._report is None:
+                    self._restart.up(f"process {process.pid} runs")
+                self._report = msgspec.json.decode(line, type=dict[str, object])
+        except ValueError as error:
+            process.kill()
+            return f"the process reported what is not understood: {error}"
+        return _ended(await process.wait())
+
+
+async def _end(process: Process) -> None:
+    """Ask the process to end, and kill it where it does not."""
+    if process.returncode is None:
+        with contextlib.suppress(ProcessLookupError):
+            process.terminate()
+        try:
+            async with asyncio.timeout(END_WITHIN_S):
+                await process.wait()
+        except TimeoutError:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
+    if process.stdin is not None:
+        process.stdin.close()
+
+
+def _ended(code: int) -> str:
+    if code >= 0:
+        return f"the process ended with code {code}"
+    return f"the process was ended by {signal.Signals(-code).name}"
