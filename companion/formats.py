@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from typing import Any
 
 import msgspec
@@ -24,6 +25,11 @@ def decode(data: bytes, kind: Any, newest: int | None) -> Any:
                 f"found format {version}; allowed: up to {newest} (a newer companion has saved it)"
             )
     return msgspec.json.decode(data, type=kind)
+
+
+def utc_now() -> str:
+    """Return the time now as records have it: ISO 8601, UTC."""
+    return datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
 
 
 Object = dict[str, Any]

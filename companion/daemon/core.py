@@ -135,11 +135,6 @@ class Core:
         self.say(Severity.NOTICE, text)
 
 
-def utc_now() -> str:
-    """ISO 8601, as records have it."""
-    return datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
-
-
 class Subsystem:
     """A part of the daemon as the service sees it; each overrides what it has."""
 

@@ -7,7 +7,7 @@ import ssl
 from pathlib import Path
 
 from companion.errors import ConfigError
-from companion.links.mqtt.broker import load_pair, unusable
+from companion.mqtt.broker import load_pair, unusable
 
 logger = logging.getLogger(__name__)
 

@@ -22,8 +22,8 @@ from companion.errors import CompanionError, LinkError
 from companion.fleet.contract import MOST_BYTES, answers, ranges
 from companion.fleet.metrics import Metrics
 from companion.fleet.store import Message, Outcome, Store
-from companion.links.mqtt.broker import explain, is_of_protocol, read_password, tls_context
 from companion.links.system.connection import Backoff, Reconnection
+from companion.mqtt.broker import explain, is_of_protocol, read_password, tls_context
 
 if TYPE_CHECKING:
     import aiomqtt

@@ -9,7 +9,8 @@ from typing import Final
 import msgspec
 
 from companion.calibration.records import align_record, history
-from companion.storage.state import StateFile
+from companion.calibration.records.record import Arming
+from companion.storage.state import BoundedList, StateFile
 
 
 def alignment_in(directory: Path) -> StateFile[align_record.AlignmentRecord]:
@@ -22,6 +23,36 @@ def faces_in(directory: Path) -> StateFile[align_record.FacesRecord]:
     """`faces.json`, likewise."""
     kind, newest = align_record.FacesRecord, align_record.FORMAT_VERSION
     return StateFile(directory / "faces.json", kind, align_record.check_faces, newest)
+
+
+class Done(msgspec.Struct, frozen=True, kw_only=True):
+    """Outcome of one alignment."""
+
+    what: str
+    """"zero", "tilts", "turn", "level", "faces"; files of version 0.1 hold "gyro prediction" too."""
+    state: str
+    """"done" or "failed"."""
+    measured_at: str
+    reason: str
+    system_id: int | None
+    written: dict[str, float]
+    """Values in the autopilot, by parameter."""
+    undone_at: str | None = None
+
+
+KEEP_DONE: Final = 50
+KEEP_ARMINGS: Final = 200
+"""A season of flying, below 100 kB at some 400 bytes each."""
+
+
+def alignments_in(directory: Path) -> BoundedList[Done]:
+    """Return the list of the latest alignments, `by-hand.json` in a storage directory."""
+    return BoundedList(directory / "by-hand.json", Done, KEEP_DONE)
+
+
+def armings_in(directory: Path) -> BoundedList[Arming]:
+    """Return the list of the latest armings, `armings.json` in a storage directory."""
+    return BoundedList(directory / "armings.json", Arming, KEEP_ARMINGS)
 
 
 FORMAT_VERSION: Final = 2

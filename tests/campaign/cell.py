@@ -34,7 +34,6 @@ RECOVERED_WITHIN_S = 240.0
 MOST_VIRTUAL_S = 1500.0
 DRAWS = 4
 SETTLES = 10
-CONNECTS = 80
 REFUSALS = 9
 """Requests, 4 s apart, that may be refused after a fault: contradicting heartbeats are believed again after 30 s of
 nothing but "disarmed" (docs/security.md)."""
@@ -161,11 +160,6 @@ class _Course:
             await asyncio.sleep(1.0)
             self._known.append(judge.vectors(stage))
             strangers = judge.others(stage)
-            # The broker is behind a real socket: whoever is slow to connect must not count as grown afterwards.
-            for _ in range(CONNECTS):
-                if stage.service.faces.mqtt is None or stage.service.faces.mqtt.status()["connected"]:
-                    break
-                await asyncio.sleep(0.25)
             whole = stage.census()
             await self._reach()
             calm = Census(*map(max, whole, stage.census()))
@@ -364,7 +358,3 @@ class _Course:
         now = stage.census()
         if _leaked(calm, now):
             self._wrong(f"not as before the fault: {calm} {now}")
-        if stage.service.faces.mqtt is not None and stage.service.faces.mqtt.link is not None:
-            waiting = len(stage.service.faces.mqtt.link.outbox)
-            if waiting > 80:
-                self._wrong(f"{waiting} messages wait for the broker")

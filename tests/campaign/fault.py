@@ -11,7 +11,7 @@ from tests.campaign.stage import Stage
 Phase = Literal["idle", "waiting", "collecting", "solving", "writing", "verifying", "done", "armed"]
 PHASES: tuple[Phase, ...] = ("idle", "waiting", "collecting", "solving", "writing", "verifying", "done", "armed")
 
-Room = Literal["device", "link", "autopilot", "broker", "disk", "clock", "process", "files", "faces", "intruder"]
+Room = Literal["device", "link", "autopilot", "disk", "clock", "process", "files", "faces", "intruder"]
 
 
 @dataclasses.dataclass

@@ -1,4 +1,4 @@
-"""What the companion computer does: its disk, clock and power; its files, broker and people."""
+"""What the companion computer does: its disk, clock and power; its files and people."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, Literal
 from tests.campaign.disk import Refusal
 from tests.campaign.fault import Act, Fault, Scene
 from tests.campaign.faults_devices import STILLNESS
-from tests.campaign.faults_mavlink import LOST, every
+from tests.campaign.faults_mavlink import LOST
 from tests.campaign.witness import vectors
 
 DISK = r"cannot be (written|removed)|not kept|No space|read-only|Read-only|Input/output"
@@ -195,44 +195,6 @@ async def tamper_journal(scene: Scene) -> None:
     path.write_text(json.dumps(whole))
     scene.notes["somebody else"] = "journal"
     await begin_again(scene)
-
-
-# --- the broker
-
-
-async def broker_dies(scene: Scene) -> None:
-    await scene.stage.broker.stop()
-
-
-async def broker_is_back(scene: Scene) -> None:
-    broker = scene.stage.broker
-    broker.refuses = broker.deaf = False
-    await broker.stop()
-    await broker.start()
-
-
-async def broker_refuses(scene: Scene) -> None:
-    broker = scene.stage.broker
-    broker.refuses = True
-    await broker.stop()
-    await broker.start()
-
-
-async def broker_is_deaf(scene: Scene) -> None:
-    scene.stage.broker.deaf = True
-
-
-def _requests(scene: Scene) -> None:
-    broker = scene.stage.broker
-    for number in range(40):
-        topic = "companion/1/request/" + ("calibrate", "nothing", "a/b", "calibrate")[number % 4]
-        payload = (b"{", b'{"transaction": "x", "what": 7}', b"\xff" * 500, b'{"what": "none"}')[number % 4]
-        broker.publish(topic, payload)
-
-
-async def retained_request(scene: Scene) -> None:
-    for command in ("calibrate", "undo", "cancel"):
-        scene.stage.broker.publish(f"companion/1/request/{command}", b'{"transaction": "old"}', retained=True)
 
 
 # --- control socket and page
@@ -452,47 +414,6 @@ def faults() -> list[Fault]:
         ),
         Fault(
             "recording-damaged", "files", "the newest recording is damaged", spoil_recording, recordings_mb=8, **back
-        ),
-        Fault(
-            "broker-dies",
-            "broker",
-            "the MQTT broker is killed and comes back",
-            broker_dies,
-            broker_is_back,
-            names=r"nobody listens|closed|lost|disconnect|gone",
-            lasts_s=(5.0, 9.0),
-        ),
-        Fault(
-            "broker-refuses",
-            "broker",
-            "the broker lets us in no longer",
-            broker_refuses,
-            broker_is_back,
-            names=r"asks for a user|refuse|not authori",
-            lasts_s=(6.0, 10.0),
-        ),
-        Fault(
-            "broker-deaf",
-            "broker",
-            "the broker acknowledges nothing",
-            broker_is_deaf,
-            broker_is_back,
-            names=r"127.0.0.1:\d+: .*(answer|acknowledg|says nothing|timed out|no )",
-            lasts_s=(14.0, 20.0),
-        ),
-        Fault(
-            "broker-flood",
-            "broker",
-            "400 nonsensical requests a second by MQTT",
-            *every(0.1, _requests),
-            lasts_s=(2.0, 4.0),
-        ),
-        Fault(
-            "broker-retained",
-            "broker",
-            "retained requests, which are never obeyed",
-            retained_request,
-            names=r"retained request",
         ),
         Fault("control-garbage", "faces", "nonsense at the control socket", control_garbage),
         Fault(

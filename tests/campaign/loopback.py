@@ -1,24 +1,21 @@
-"""Ports that lead from the daemon to its devices and its broker within this process.
+"""Ports that lead from the daemon to its devices within this process.
 
 On a loaded machine the kernel delivers what was written to a TCP socket of 127.0.0.1 some time later, and virtual time
 does not wait for it. What is written to a Unix socket is there when the write returns, so that a cell is the same every
-time. `CampaignLoop.sock_connect` leads here; `taken` leads blocking libraries here.
+time. `CampaignLoop.sock_connect` leads here.
 """
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import os
 import socket
-from collections.abc import Iterator
 from typing import Any, Final
 
 _FIRST: Final = 20_000
 _PORTS: Final = 40_000
 _numbers = itertools.count()
 _open: set[int] = set()
-_real_create_connection = socket.create_connection
 
 
 def new_port() -> int:
@@ -54,20 +51,6 @@ def connect(port: int) -> socket.socket:
         end.close()
         raise
     return end
-
-
-@contextlib.contextmanager
-def taken() -> Iterator[None]:
-    """Blocking connections to a port of ours lead to it, too: that is how MQTT's library connects."""
-
-    def create_connection(address: Any, *arguments: Any, **options: Any) -> socket.socket:
-        return connect(address[1]) if leads_here(address) else _real_create_connection(address, *arguments, **options)
-
-    socket.create_connection = create_connection
-    try:
-        yield
-    finally:
-        socket.create_connection = _real_create_connection
 
 
 def _name(port: int) -> str:

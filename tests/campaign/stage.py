@@ -1,6 +1,6 @@
 """The whole daemon, all faces on, on a virtual aircraft; it can be killed at any instant and started again.
 
-On top of `Rig`: devices behind `tcp://`, so that plugs can be pulled; a control socket, a page and a broker; a disk and
+On top of `Rig`: devices behind `tcp://`, so that plugs can be pulled; a control socket and a page; a disk and
 a wall clock that can go wrong. Everything in one event loop on virtual time.
 """
 
@@ -28,8 +28,8 @@ from tests.campaign import loopback
 from tests.campaign.clock import WallClock
 from tests.campaign.disk import Disk
 from tests.campaign.loop import OWNER, tasks_of
-from tests.campaign.mqtt_broker import Broker
 from tests.campaign.rough_wire import RoughWire
+from tests.support.children import Idle
 from tests.support.rig import Rig
 
 IMU_RATE_HZ = 10.0
@@ -119,12 +119,8 @@ class Stage(Rig):
     def __init__(self, root: Path, variant: Variant, *, seed: int, at_arm: str = "off", recordings_mb: int = 0) -> None:
         self.root = root
         self.store = root / "store1"
-        self.broker = Broker()
         self.plugs = {name: Plug() for name in ("gradienter", "compass", "own")}
-        more = (
-            f'[control]\nsocket = "{root}/c1"\n[web]\nbind = "127.0.0.1:0"\n'
-            f'[mqtt]\nhost = "127.0.0.1"\nport = {self.broker.port}\n'
-        )
+        more = f'[control]\nsocket = "{root}/c1"\n[web]\nbind = "127.0.0.1:0"\n'
         super().__init__(
             self.store,
             seed=seed,
@@ -176,8 +172,7 @@ class Stage(Rig):
         root_logger = logging.getLogger("companion")
         root_logger.addHandler(self.said)
         propagate, root_logger.propagate = root_logger.propagate, False
-        with self.disk.mounted(), self.wall.worn(), loopback.taken():
-            await self.broker.start()
+        with self.disk.mounted(), self.wall.worn():
             for plug in self.plugs.values():
                 await plug.put_in()
             around = [
@@ -195,7 +190,6 @@ class Stage(Rig):
                 await asyncio.gather(*around, return_exceptions=True)
                 self.wire.unplug()
                 self.radio.unplug()
-                await self.broker.stop()
                 for plug in self.plugs.values():
                     await plug.pull_out()
                 await asyncio.sleep(0.1)
@@ -228,7 +222,7 @@ class Stage(Rig):
         return f"daemon {self.incarnation}"
 
     async def _live(self) -> None:
-        self.service = Service(self.config, link=self.link, offload=self.offload, imu_rate_hz=IMU_RATE_HZ)
+        self.service = Service(self.config, link=self.link, offload=self.offload, imu_rate_hz=IMU_RATE_HZ, child=Idle)
         machine = self.service.calibrating.conductor._machine
         on = machine.on
 

@@ -13,6 +13,7 @@ import pytest
 
 from companion.calibration.machine import State
 from tests.support.broker import BEST, Heard, broker, hurry, peer
+from tests.support.children import mqtt_of
 from tests.support.mqtt_daemon import (
     ALONE,
     BASE,
@@ -174,10 +175,9 @@ def test_a_flood_of_requests_is_answered_and_disturbs_nothing(tmp_path: Path) ->
                 assert rig.service.calibrating.conductor.cancel("test")
                 await rig.until(lambda: rig.service.calibrating.conductor.state is State.CANCELLED, 10.0)
                 assert rig.service.calibrating.store.history() == []  # nothing had been measured
-                mqtt = rig.service.faces.mqtt
-                assert mqtt is not None
-                assert mqtt.link is not None
-                assert len(mqtt.link.outbox) < 100
+                link = mqtt_of(rig.service).link
+                assert link is not None
+                assert len(link.outbox) < 100
                 dropped = rig.service.status()["mqtt"]["dropped"]
                 assert len([one for one in answers if one["transaction"] != "last"]) >= 500 - dropped
 

@@ -13,10 +13,11 @@ import pytest
 
 from companion.calibration.machine import State
 from companion.config import parse
-from companion.daemon.faces.mqtt import face
 from companion.daemon.process.service import Service
-from companion.links.mqtt import client as link
+from companion.mqtt import client as link
+from companion.mqtt import process
 from tests.support.broker import BEST, KINDS, Broker, Kind, broker, hurry, peer
+from tests.support.children import in_process, mqtt_of
 from tests.support.mqtt_daemon import (
     ALONE,
     BASE,
@@ -61,7 +62,7 @@ def test_the_last_will_after_the_daemon_was_killed(tmp_path: Path) -> None:
 def test_a_daemon_that_is_stopped_says_goodbye_and_ends_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(face, "FLUSH_S", 30.0)
+    monkeypatch.setattr(process, "FLUSH_S", 30.0)
 
     async def main() -> None:
         async with broker(tmp_path) as one, peer(one) as watcher:
@@ -168,12 +169,12 @@ def test_what_ended_while_the_broker_was_away_is_not_lost(tmp_path: Path) -> Non
 
 
 def test_a_vehicle_that_is_heard_late_moves_to_its_own_topics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(face, "FOUND_WITHIN_S", 0.1)
+    monkeypatch.setattr(process, "FOUND_WITHIN_S", 0.1)
 
     async def main() -> None:
         async with broker(tmp_path) as one, peer(one) as watcher:
             text = ALONE.replace("[vehicle]\nsystem_id = 7\n", "").format(folder=tmp_path, more=one.section())
-            service = Service(parse(text, "test.toml"))
+            service = Service(parse(text, "test.toml"), child=in_process(lambda: service))
             task = asyncio.create_task(service.serve(mavlink=False, ports=False))
             await watcher.until("companion/1/status", is_(b"online"))
             await watcher.until("companion/1/state")
@@ -245,6 +246,9 @@ def test_a_password_file_that_is_missing_is_one_line(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # paho leaves a failed handshake's socket
 @pytest.mark.parametrize("kind", KINDS)
 def test_tls_by_an_authority_of_ones_own(tmp_path: Path, kind: Kind) -> None:
     async def main() -> None:
@@ -324,43 +328,20 @@ def test_a_message_that_is_too_long_for_the_broker_is_left_out_and_the_others_go
     async def main() -> None:
         async with broker(tmp_path, more=limit) as one, alone(tmp_path, one.section()) as service:
             await until_connected(service)
-            assert service.faces.mqtt is not None
-            assert service.faces.mqtt.link is not None
-            outbox = service.faces.mqtt.link.outbox
+            link = mqtt_of(service).link
+            assert link is not None
+            outbox = link.outbox
             async with peer(one) as watcher:
                 outbox.answer("fleet/of/long", b"x" * 9000, droppable=True)
                 outbox.answer("fleet/of/short", b"behind it", droppable=True)
                 await watcher.until("fleet/of/short", is_(b"behind it"))
                 await until_bad(service, "messages of 9.0 kB or more end the connection (the broker's size limit?)")
-                connections = service.faces.mqtt.link.connections
+                connections = link.connections
                 for k in range(5):
                     outbox.answer("fleet/of/long", b"x" * 9000, droppable=True)
                     outbox.answer("fleet/of/almost", b"%d" % k + b"x" * 8500, droppable=True)
                     await watcher.until("fleet/of/almost", is_(b"%d" % k + b"x" * 8500))
-                assert service.faces.mqtt.link.connections == connections
+                assert link.connections == connections
                 assert not [heard for heard in watcher.heard if heard.topic == "fleet/of/long"]
-
-    asyncio.run(main())
-
-
-@mosquitto_only
-def test_what_the_broker_refuses_is_said(tmp_path: Path) -> None:
-    words = "the broker does not let us publish to fleet/of/long (its access list?)"
-    (tmp_path / "acl").write_text(f"topic readwrite {BASE}/#\n")
-
-    async def main() -> None:
-        async with (
-            broker(tmp_path, more=f"acl_file {tmp_path}/acl") as one,
-            alone(tmp_path, one.section()) as service,
-        ):
-            await until_connected(service)
-            assert service.faces.mqtt is not None
-            assert service.faces.mqtt.link is not None
-            assert service.status()["mqtt"]["good"]
-            for _ in range(3):
-                service.faces.mqtt.link.outbox.answer("fleet/of/long", b"x" * 9500, droppable=True)
-            await until_bad(service, words)
-            assert service.status()["mqtt"]["summary"].count("publish to") == 1
-            assert service.faces.mqtt.link.connections == 1
 
     asyncio.run(main())

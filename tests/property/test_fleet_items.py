@@ -17,8 +17,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from companion.config.sections import Location
-from companion.daemon.faces.fleet import wire
 from companion.errors import StorageError
+from companion.mqtt import fleet_wire as wire
 from companion.storage.fleet_items import FILE, Entry, FleetItems, Item, Mark, Waiting
 from tests.support.extent import extent
 from tests.support.fleet import CRANE, HERON

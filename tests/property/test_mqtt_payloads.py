@@ -8,7 +8,7 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.daemon.faces.mqtt.requests import KEYS, MAX_PAYLOAD_BYTES, Misfit, parse
+from companion.mqtt.requests import KEYS, MAX_PAYLOAD_BYTES, Misfit, parse
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),

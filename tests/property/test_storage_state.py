@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from companion.calibration.records.record import Arming
 from companion.daemon.offsets.reboot_owed import owed_in
-from companion.daemon.stands.by_hand import Done
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
-from companion.storage.learned import SIGNING_FILE, BiasStore, alignment_in, faces_in, signing_time_in
+from companion.storage.learned import SIGNING_FILE, BiasStore, Done, alignment_in, faces_in, signing_time_in
 from companion.storage.records import RecordStore
 from companion.storage.state import BoundedList, sealed
 

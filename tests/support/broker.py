@@ -20,7 +20,7 @@ import aiomqtt
 import pytest
 import trustme
 
-from companion.links.mqtt import client as link
+from companion.mqtt import client as link
 
 Kind = Literal["mosquitto", "amqtt"]
 

@@ -6,7 +6,8 @@ import asyncio
 import contextlib
 import functools
 import json
-from collections.abc import AsyncIterator, Callable
+import time
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -15,13 +16,11 @@ import jsonschema
 import yaml
 
 from companion.config.sections import Fleet, Location
-from companion.daemon.biases.model_priors import ModelPriors
-from companion.daemon.core import Handler
-from companion.daemon.faces.fleet.face import FleetFace
 from companion.formats import Object
-from companion.links.mqtt.client import Incoming
-from companion.links.mqtt.outbox import Outbox
-from companion.links.system.listeners import Listeners
+from companion.mqtt.client import Incoming, MqttLink
+from companion.mqtt.daemon import CLOCKS_AGREE_S, Daemon
+from companion.mqtt.fleet import AircraftFleet
+from companion.mqtt.outbox import Outbox
 
 ASYNCAPI = Path(__file__).parents[2] / "docs" / "fleet" / "asyncapi.yaml"
 CONTRACT: Any = yaml.safe_load(ASYNCAPI.read_text(encoding="utf-8"))
@@ -87,10 +86,10 @@ class Collector:
 
 
 class Connection:
-    """In the place of the MQTT face and its link: what is sent reaches the collector, while there is a connection."""
+    """In the place of the link to the broker: what is sent reaches the collector, while there is a connection."""
 
     def __init__(self) -> None:
-        self.on_other: Listeners[Incoming] = Listeners()
+        self.on_message: Callable[[Incoming], None] = lambda message: None
         self.outbox = Outbox()
         self.connected = False
         self.connections = 0
@@ -98,16 +97,12 @@ class Connection:
         self.loses: Callable[[], bool] = lambda: False
         self.collector = Collector(self.deliver)
 
-    @property
-    def link(self) -> Connection:
-        return self
-
     async def hear(self, topic: str) -> None:
         self.heard.add(topic)
 
     def deliver(self, topic: str, payload: bytes, *, retained: bool = False) -> None:
         if self.connected and topic in self.heard:
-            asyncio.get_running_loop().call_later(0.02, self.on_other.tell, Incoming(topic, payload, retained))
+            asyncio.get_running_loop().call_later(0.02, self.on_message, Incoming(topic, payload, retained))
 
     def connect(self) -> None:
         self.connected, self.connections = True, self.connections + 1
@@ -128,12 +123,33 @@ class Connection:
                 self.collector.take(parcel.topic, parcel.payload)
 
 
+class _Daemon(Daemon):
+    double: SimpleNamespace
+
+    @property
+    def vehicle(self) -> Object:
+        return {
+            "uid": self.double.uid,
+            "system_id": self.double.system_id,
+            "version_known": self.double.version is not None,
+        }
+
+    @property
+    def clock_agrees(self) -> bool:
+        unix_s = self.double.unix_time_s
+        return unix_s is not None and abs(unix_s - time.time()) < CLOCKS_AGREE_S
+
+    @clock_agrees.setter
+    def clock_agrees(self, agrees: bool) -> None:
+        pass
+
+
 class Aircraft:
     """The fleet's face of one companion, beside an autopilot that tells no more than who it is and what time it is."""
 
     def __init__(self, folder: Path, *, uid: str | None = HERON, location: Location = "off") -> None:
         self.folder, self.location = folder, location
-        self.vehicle = SimpleNamespace(uid=uid, version="4.6.3", system_id=1, place=SimpleNamespace(unix_time_s=None))
+        self.vehicle = SimpleNamespace(uid=uid, version="4.6.3", system_id=1, unix_time_s=None)
         self.connection = Connection()
         self.curves: list[Object] = []
 
@@ -142,21 +158,18 @@ class Aircraft:
         return self.connection.collector
 
     @contextlib.asynccontextmanager
-    async def running(self, models: ModelPriors | None = None) -> AsyncIterator[FleetFace]:
-        async def temperature(_request: Object, _face: str) -> AsyncIterator[Object]:
+    async def running(self) -> AsyncIterator[AircraftFleet]:
+        async def answers(_request: Object) -> AsyncGenerator[Object, None]:
             yield {"kind": "result", "imus": self.curves}
 
         async def inline(function: Callable[..., Any], *arguments: Any) -> Any:
             return function(*arguments)
 
-        core: Any = SimpleNamespace(
-            vehicle=self.vehicle,
-            offload=inline,
-            only_listening=None,
-            config=SimpleNamespace(storage=SimpleNamespace(path=self.folder)),
-        )
         settings = Fleet(name="Heron 7", location=self.location)
-        face = FleetFace(core, settings, cast("Any", self.connection), cast("Handler", temperature), models)
+        daemon, link = _Daemon(answers), cast("MqttLink", self.connection)
+        daemon.double = self.vehicle
+        face = AircraftFleet(settings, self.folder, daemon, lambda: link, inline)
+        self.connection.on_message = face.on_message
         tasks = [asyncio.create_task(face.run()), asyncio.create_task(self.connection.run())]
         try:
             yield face

@@ -12,6 +12,7 @@ import pytest
 from companion.config import parse
 from companion.daemon.process.service import Service
 from tests.support.broker import BEST, Heard
+from tests.support.children import in_process
 
 ALONE = """
 [mavlink]
@@ -37,7 +38,8 @@ mosquitto_only = pytest.mark.skipif(
 @contextlib.asynccontextmanager
 async def alone(folder: Path, section: str) -> AsyncIterator[Service]:
     """The daemon's parts without an autopilot; it is stopped in order at the end."""
-    service = Service(parse(ALONE.format(folder=folder, more=section), "test.toml"))
+    config = parse(ALONE.format(folder=folder, more=section), "test.toml")
+    service = Service(config, child=in_process(lambda: service))
     task = asyncio.create_task(service.serve(mavlink=False, ports=False))
     try:
         yield service
@@ -49,7 +51,6 @@ async def alone(folder: Path, section: str) -> AsyncIterator[Service]:
 
 
 async def until_connected(service: Service, *, connected: bool = True, within_s: float = 90.0) -> None:
-    assert service.faces.mqtt is not None
     async with asyncio.timeout(within_s):
         while service.status()["mqtt"]["connected"] != connected:
             await asyncio.sleep(0.02)

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from companion.config import parse
 from companion.daemon.core import Offload
+from companion.daemon.faces.child import StartChild
 from companion.daemon.process.service import Service
 from companion.links.mavlink.link import MavlinkLink
 from sim.aircraft import Pose, Site, VirtualAircraft
@@ -24,6 +25,7 @@ from sim.imu_model import DEG_H, MG, ImuModel
 from sim.px4.double import PX4Double
 from sim.scenario import site_at
 from sim.thermal import Curve
+from tests.support.children import in_process
 from tests.support.component import Ground
 from tests.support.wire import Wire
 
@@ -200,6 +202,7 @@ class Rig:
         self.unplugged: set[str] = set()
         """Devices that say nothing."""
         self.service: Service
+        self.start_child: StartChild = in_process(lambda: self.service)
 
     @property
     def double(self) -> ArduPilotDouble:
@@ -236,7 +239,13 @@ class Rig:
             self.radio.unplug()
 
     def _start(self) -> None:
-        self.service = Service(self.config, link=self.link, offload=self.offload, imu_rate_hz=self.imu_rate_hz)
+        self.service = Service(
+            self.config,
+            link=self.link,
+            offload=self.offload,
+            imu_rate_hz=self.imu_rate_hz,
+            child=self.start_child,
+        )
         self._serving = asyncio.create_task(self.service.serve(mavlink=False, ports=False))
 
     async def restart(self) -> None:

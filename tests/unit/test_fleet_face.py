@@ -23,13 +23,13 @@ from companion.calibration.records.record import Arming, Magnetic
 from companion.calibration.solution.by_temperature import by_temperature
 from companion.calibration.solution.prior import curve_of
 from companion.config.sections import Location
-from companion.daemon.faces.fleet import face as face_module
-from companion.daemon.faces.fleet.face import FleetFace
-from companion.daemon.faces.fleet.sources import Sources
-from companion.daemon.stands.by_hand import Done
 from companion.errors import StorageError
+from companion.mqtt import fleet as face_module
+from companion.mqtt.fleet import AircraftFleet
+from companion.mqtt.fleet_sources import Sources
 from companion.storage import fleet_items
 from companion.storage.flights import FlightStore
+from companion.storage.learned import Done
 from companion.storage.profiles import ProfileStore
 from companion.storage.records import RecordStore
 from companion.storage.state import BoundedList, sealed, write_atomically
@@ -49,7 +49,7 @@ async def until(what: Callable[[], object], within_s: float = 3600.0) -> None:
             await asyncio.sleep(0.5)
 
 
-async def until_told(face: FleetFace, within_s: float = 3600.0) -> None:
+async def until_told(face: AircraftFleet, within_s: float = 3600.0) -> None:
     """Until the face has looked, and all is confirmed."""
     await asyncio.sleep(15.0)
     await until(lambda: not face.status()["waiting"], within_s)
@@ -415,8 +415,7 @@ def test_a_clock_is_good_where_gnss_agrees_and_never_for_what_was_before(
     async def main() -> None:
         now = datetime.datetime.now(tz=datetime.UTC)
         aircraft = Aircraft(tmp_path)
-        place = aircraft.vehicle.place
-        place.unix_time_s = None if off_s is None else now.timestamp() + off_s
+        aircraft.vehicle.unix_time_s = None if off_s is None else now.timestamp() + off_s
         async with aircraft.running() as face:
             await asyncio.sleep(1.0)
             at = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")

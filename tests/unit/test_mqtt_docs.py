@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from companion.config import parse
-from companion.daemon.faces.mqtt.face import Topics
-from companion.daemon.faces.mqtt.requests import KEYS, Request
-from companion.daemon.faces.mqtt.requests import parse as parse_request
+from companion.mqtt.requests import KEYS, Request
+from companion.mqtt.requests import parse as parse_request
+from companion.mqtt.topics import Topics
 
 DOCS = (Path(__file__).parents[2] / "docs" / "mqtt.md").read_text(encoding="utf-8")
 ROWS = dict(re.findall(r"^\| `([a-z/]+)` \|(.*)\|$", DOCS, re.MULTILINE))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from companion.links.mqtt.outbox import MAX_ANSWERS, Outbox, Parcel
+from companion.mqtt.outbox import MAX_ANSWERS, Outbox, Parcel
 
 
 async def drain(box: Outbox) -> list[tuple[str, bytes]]:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from typing import Any
 
 import pytest
 
-from companion.daemon.faces.mqtt.requests import MAX_PENDING, REMEMBER_S, REMEMBERED, Misfit, Request, Requests, parse
-from companion.errors import RequestRefusedError
+from companion.mqtt.requests import MAX_PENDING, REMEMBER_S, REMEMBERED, Misfit, Request, Requests, parse
 from tests.support.virtual_time import run_virtual
 
 Object = dict[str, Any]
@@ -20,25 +19,26 @@ class Daemon:
 
     def __init__(self) -> None:
         self.asked: list[Object] = []
-        self.faces: set[str] = set()
         self.responses: list[tuple[str, Object, bool]] = []
         self.end = asyncio.Event()
         self.running = False
         self.fault: Exception | None = None
+        self.refusal: tuple[str, str] | None = None
         self.retained: list[str] = []
         self.requests = Requests(self.answer, self.respond, self.retained.append)
 
-    async def answer(self, request: Object, face: str) -> AsyncIterator[Object]:
+    async def answer(self, request: Object) -> AsyncGenerator[Object, None]:
         self.asked.append(request)
-        self.faces.add(face)
         if self.fault is not None:
             raise self.fault
+        if self.refusal is not None or (self.running and request["command"] == "calibrate"):
+            kind, reason = self.refusal or ("busy", "a calibration is running (hold still 3 s)")
+            yield {"kind": "error", "refusal": kind, "reason": reason}
+            return
         if request["command"] == "cancel":
             await self.end.wait()
             yield {"kind": "result", "state": "cancelled", "reason": "cancelled by mqtt cancel"}
             return
-        if self.running:
-            raise RequestRefusedError("busy", "a calibration is running (hold still 3 s)")
         self.running = True
         while not self.end.is_set():
             yield {"kind": "progress", "state": "waiting", "percent": 0, "text": "hold still"}
@@ -64,7 +64,6 @@ def test_a_calibration_is_answered_twice_with_its_transaction() -> None:
         assert daemon.asked == [
             {"command": "calibrate", "what": "gyros", "timeout_s": 60, "reboot": True, "wait": True}
         ]
-        assert daemon.faces == {"mqtt"}
         daemon.end.set()
         await asyncio.sleep(1.0)
         assert daemon.responses == [
@@ -108,9 +107,9 @@ def test_a_repeated_transaction_gets_the_same_answer_and_starts_nothing() -> Non
 def test_what_was_refused_may_be_asked_again_under_its_transaction() -> None:
     async def main() -> None:
         daemon = Daemon()
-        daemon.fault = RequestRefusedError("armed", "armed: disarm first")
+        daemon.refusal = ("armed", "armed: disarm first")
         await daemon.take(b'{"transaction": "x"}')
-        daemon.fault = None
+        daemon.refusal = None
         await daemon.take(b'{"transaction": "x"}')
         assert daemon.responses[0] == (
             "calibrate",

@@ -12,7 +12,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from companion.config.sections import Mqtt
 from companion.errors import LinkError
-from companion.links.mqtt.broker import explain, is_open_to_all, read_password, tls_context
+from companion.mqtt.broker import explain, is_open_to_all, read_password, tls_context
 
 HOST = "192.0.2.1"
 

@@ -43,7 +43,7 @@ def test_nothing_heavy_before_the_first_heartbeat(tmp_path: Path, text: str, mos
         )
         modules, _ = modules_at_first_heartbeat(config, {**os.environ, "PYTHONPATH": os.getcwd()})
     assert "companion.daemon.process.service" in modules
-    assert ("companion.daemon.faces.mqtt.face" in modules) == (text is FULL)
+    assert ("companion.mqtt.topics" in modules) == (text is FULL)
     assert {
         name for name in NOT_YET if any(found == name or found.startswith(f"{name}.") for found in modules)
     } == set()

@@ -14,14 +14,13 @@ from companion.autopilot.vehicle.vehicle import VehicleEvent
 from companion.calibration.records.record import Arming, Record
 from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.readiness import Readiness
-from companion.daemon.core import Core, utc_now
+from companion.daemon.core import Core
 from companion.errors import StorageError
-from companion.storage.state import BoundedList
+from companion.formats import utc_now
+from companion.storage.learned import armings_in
 
 logger = logging.getLogger(__name__)
 
-KEEP: Final = 200
-"""The most armings kept: a season of flying, below 100 kB at some 400 bytes each."""
 QUEUE: Final = 16
 
 
@@ -30,7 +29,7 @@ class Armings:
 
     def __init__(self, core: Core, readiness: Readiness) -> None:
         self._readiness, self._say, self._offload = readiness, core.say, core.offload
-        self._file = BoundedList(core.config.storage.path / "armings.json", Arming, KEEP)
+        self._file = armings_in(core.config.storage.path)
         self._queue: asyncio.Queue[Arming] = asyncio.Queue(QUEUE)
         self.last: Arming | None = None
         self.seen_disarmed = False

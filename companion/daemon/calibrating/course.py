@@ -29,7 +29,7 @@ from companion.config.sections import Platform
 from companion.daemon.biases.memory import BiasMemory, Foretold
 from companion.daemon.calibrating import held_back
 from companion.daemon.calibrating.solver import Given, Solver
-from companion.daemon.core import Core, utc_now
+from companion.daemon.core import Core
 from companion.daemon.job import Job, Predicted
 from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.dither import Ditherer
@@ -37,6 +37,7 @@ from companion.daemon.offsets.effect import TELEMETRY
 from companion.daemon.offsets.plan import Planner
 from companion.daemon.offsets.push import WATCHING, Pusher
 from companion.daemon.stands.measuring import Measuring
+from companion.formats import utc_now
 from companion.links.system.listeners import Listeners
 from companion.physics.units import DEG_H
 from companion.samples import Triad

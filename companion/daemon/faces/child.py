@@ -11,13 +11,14 @@ import logging
 import signal
 import sys
 from asyncio.subprocess import PIPE, Process
+from collections.abc import Callable
 from typing import Final
 
 import msgspec
 
 from companion.errors import LinkError
 from companion.formats import Object
-from companion.links.system.child import REPORT_EVERY_S, ChildSettings
+from companion.links.system.child import OUT_OF_MEMORY, REPORT_EVERY_S, ChildSettings
 from companion.links.system.connection import Backoff, Reconnection
 
 logger = logging.getLogger(__name__)
@@ -104,6 +105,10 @@ class Child:
         return _ended(await process.wait())
 
 
+StartChild = Callable[[str, str, ChildSettings], Child]
+"""Makes a child of a name, a module and settings; tests run the work of one in their own loop."""
+
+
 async def _end(process: Process) -> None:
     """Ask the process to end, and kill it where it does not."""
     if process.returncode is None:
@@ -121,6 +126,8 @@ async def _end(process: Process) -> None:
 
 
 def _ended(code: int) -> str:
+    if code == OUT_OF_MEMORY:
+        return "the process needed more memory than it may have"
     if code >= 0:
         return f"the process ended with code {code}"
     return f"the process was ended by {signal.Signals(-code).name}"

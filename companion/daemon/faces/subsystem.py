@@ -6,6 +6,8 @@ Each command is answered by the subsystem whose it is, and the status by all of 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import logging
 from collections.abc import AsyncIterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, get_args
 
@@ -20,18 +22,18 @@ from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task, Wanted, joined
 from companion.daemon.devices.subsystem import Devices
+from companion.daemon.faces.child import Child, StartChild
 from companion.daemon.faces.headline import Headlines
 from companion.daemon.heading.subsystem import Heading
 from companion.daemon.job import Job
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import ConfigError
 from companion.formats import Object
+from companion.links.system.child import ChildSettings
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad
 
 if TYPE_CHECKING:
-    from companion.daemon.faces.fleet.face import FleetFace
-    from companion.daemon.faces.mqtt.face import MqttFace
     from companion.web.server import Page
 
 
@@ -40,7 +42,6 @@ MONITOR_EVERY_S: Final = 0.5
 POSE_EVERY_S: Final = 0.2
 FACES: Final = {"page": "the page's", "mqtt": "mqtt", "fleet": "fleet"}
 """Child processes by their name in a request, and as a record names the requester ("cancelled by mqtt cancel")."""
-FLEET_AFTER_S: Final = 10.0
 
 
 class Faces(Subsystem):
@@ -55,9 +56,9 @@ class Faces(Subsystem):
         arming: Arming,
         heading: Heading,
         recorder: Subsystem,
+        child: StartChild = Child,
     ) -> None:
         self._core, self._devices = core, devices
-        self._models = calibrating.memory.models
         self.component = Component(
             core.link,
             calibrating.conductor,
@@ -75,15 +76,10 @@ class Faces(Subsystem):
         self._handlers: dict[str, Handler] = {"status": self._status, "monitor": self._monitor}
         for subsystem in self._subsystems:
             self._handlers |= subsystem.commands()
-        # What nobody asked for costs the start nothing: it is imported only where it is configured.
-        self.mqtt: MqttFace | None = None
-        if core.config.mqtt is not None:
-            from companion.daemon.faces.mqtt.face import MqttFace
-
-            self.mqtt = MqttFace(
-                core, core.config.mqtt, self.answer, self.all_status, calibrating.conductor, heading.pose
-            )
-        self.fleet: FleetFace | None = None
+        settings = ChildSettings(
+            core.config, logging.getLevelName(logging.getLogger().level), only_listening=core.only_listening
+        )
+        self.mqtt = None if core.config.mqtt is None else child("mqtt", "companion.mqtt", settings)
         self.page: Page | None = None
         if core.config.web is not None:
             from companion.web.server import Page
@@ -110,14 +106,17 @@ class Faces(Subsystem):
         yield {"kind": "result", "status": await self.refresh()}
 
     async def _monitor(self, request: Object, _face: str) -> AsyncIterator[Object]:
-        """Stream the status every 0.5 s; with `pose` the attitude every 0.2 s too, and a new state at once."""
+        """Stream the status every 0.5 s; with `pose` the attitude every 0.2 s too, a new state or record at once."""
         if request.get("pose") is not True:
             while True:
                 yield {"kind": "progress", "status": await self.refresh()}
                 await asyncio.sleep(MONITOR_EVERY_S)
-        shown, due_s, loop = "", 0.0, asyncio.get_running_loop()
+        shown, due_s, loop, record = "", 0.0, asyncio.get_running_loop(), None
         while True:
             reply: Object = {"kind": "progress", "pose": await self._pose.refresh()}
+            if self._conductor.results.last is not record:
+                record = self._conductor.results.last
+                reply["record"] = msgspec.to_builtins(record)
             state = self._conductor.state.shown
             if state != shown or loop.time() >= due_s:
                 reply["status"] = self.all_status()
@@ -147,8 +146,7 @@ class Faces(Subsystem):
         return {
             "headline": msgspec.to_builtins(self._headlines.now()),
             "vehicle": self._vehicle(),
-            "mqtt": None if self.mqtt is None else self.mqtt.status(),
-            "fleet": self._fleet_status(),
+            **self._mqtt_status(),
             "page": None if self.page is None else self.page.status(),
             "spoken": [spoken._asdict() for spoken in self._core.texts.spoken],
         }
@@ -175,35 +173,33 @@ class Faces(Subsystem):
             "refused": {f"{system}/{one}": count for (system, one), count in refused.items()},
         }
 
-    def _fleet_status(self) -> Object | None:
-        if self._core.config.fleet is None or self.fleet is not None:
-            return None if self.fleet is None else self.fleet.status()
-        return {"good": True, "summary": f"what waits is told once the companion has run for {FLEET_AFTER_S:.0f} s"}
+    def _mqtt_status(self) -> Object:
+        """Return the MQTT process's report, and the fleet's part of it under its own key."""
+        if self.mqtt is None:
+            return {"mqtt": None, "fleet": None}
+        report: Object = {"connected": False, "fleet": None} | self.mqtt.status()
+        fleet = report.pop("fleet")
+        if fleet is None and self._core.config.fleet is not None:
+            fleet = {"good": False, "summary": f"nothing is sent: {report['summary']}"}
+        return {"mqtt": report, "fleet": fleet}
 
-    async def _run_fleet(self) -> None:
-        """Not before the start is over; and in a thread, as its libraries take a while."""
-        await asyncio.sleep(FLEET_AFTER_S)
-        settings = self._core.config.fleet
-        if settings is not None and self.mqtt is not None:
-            kind: type[FleetFace] = await self._core.offload(_fleet_face)
-            self.fleet = kind(self._core, settings, self.mqtt, self.answer, self._models)
-            await self.fleet.run()
+    async def settled(self, within_s: float) -> None:
+        """Wait until the MQTT process has reached its broker, or says why not; for so long at most."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while self.mqtt is not None:
+                    report = self.mqtt.status()
+                    if report.get("connected") or report.get("last_error"):
+                        return
+                    await asyncio.sleep(POSE_EVERY_S)
 
     def tasks(self) -> Sequence[Task]:  # noqa: D102
         tasks: list[Task] = [("component", self.component.run)]
         if self.mqtt is not None:
             tasks.append(("mqtt", self.mqtt.run))
-        if self._core.config.fleet is not None and self._core.only_listening is None:
-            tasks.append(("fleet", self._run_fleet))
         if self.page is not None and self._core.only_listening is None:
             tasks.append(("page", self.page.run))
         return tasks
-
-
-def _fleet_face() -> type[FleetFace]:
-    from companion.daemon.faces.fleet.face import FleetFace
-
-    return FleetFace
 
 
 def own_parameters(wanted: Wanted) -> list[Parameter]:

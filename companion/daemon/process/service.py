@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from typing import Final
 
 from companion.config.sections import Config
 from companion.configured import models
@@ -12,6 +13,7 @@ from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Offload, Task
 from companion.daemon.devices.subsystem import Devices
+from companion.daemon.faces.child import Child, StartChild
 from companion.daemon.faces.control import ControlServer
 from companion.daemon.faces.subsystem import Faces
 from companion.daemon.heading.subsystem import Heading
@@ -24,12 +26,15 @@ from companion.storage.lock import only_daemon
 
 logger = logging.getLogger(__name__)
 
+SETTLED_WITHIN_S: Final = 20.0
+"""A small board takes seconds to start the MQTT process, and a silent broker 10 s to be given up."""
+
 
 class Service:
     """The daemon, subsystem by subsystem; each knows only those above it here.
 
     A test may have put the link on a wire of its own. `offload` runs a blocking call elsewhere; `only_listening` says
-    why nothing may be started, where it must change nothing.
+    why nothing may be started, where it must change nothing; `child` runs the page's and the MQTT process.
     """
 
     def __init__(
@@ -40,6 +45,7 @@ class Service:
         offload: Offload = asyncio.to_thread,
         imu_rate_hz: float | None = None,
         only_listening: str | None = None,
+        child: StartChild = Child,
     ) -> None:
         self.config = config
         self.core = core = Core(config, link, offload, only_listening)
@@ -49,7 +55,9 @@ class Service:
         self.arming = Arming(core, self.devices, self.offsets, self.calibrating)
         self.heading = Heading(core, self.devices, self.calibrating, self.arming)
         self.recorder = Recorder(core, self.devices, self.calibrating)
-        self.faces = Faces(core, self.devices, self.offsets, self.calibrating, self.arming, self.heading, self.recorder)
+        self.faces = Faces(
+            core, self.devices, self.offsets, self.calibrating, self.arming, self.heading, self.recorder, child
+        )
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
         """Run until cancelled, reachable on the control socket from `on_ready` on.
@@ -109,6 +117,7 @@ class Service:
         running = [asyncio.get_running_loop().create_task(run(), name=name) for name, run in tasks]
         try:
             await asyncio.sleep(seconds)
+            await self.faces.settled(SETTLED_WITHIN_S)
             return self.status()
         finally:
             for task in running:

@@ -16,13 +16,14 @@ from companion.calibration.means.windows import Window
 from companion.calibration.records.align_record import AlignmentRecord, imu_record, stand_record
 from companion.calibration.solution.site import LocalEarth
 from companion.configured import models
-from companion.daemon.core import Core, utc_now
+from companion.daemon.core import Core
 from companion.daemon.job import Job
 from companion.daemon.stands.align_steps import Plan, Seen
 from companion.daemon.stands.alignment import AlignmentInForce
 from companion.daemon.stands.stands import Stands
 from companion.daemon.stands.taken import Taken, ground, readable
 from companion.errors import CalibrationRefusedError
+from companion.formats import utc_now
 from companion.physics.units import DEG
 
 LEAST_STANDS: Final = 3

@@ -10,39 +10,22 @@ import msgspec
 from companion.autopilot.parameters.wire import same_float32
 from companion.calibration.records.align_record import AlignmentRecord, FacesRecord, TurnRecord
 from companion.component.service import JobResult
-from companion.daemon.core import Core, utc_now
+from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job, Predicted
 from companion.errors import StorageError
-from companion.formats import Object
+from companion.formats import Object, utc_now
 from companion.storage.changes import PREDICTION, ChangeSet
-from companion.storage.state import BoundedList
+from companion.storage.learned import KEEP_DONE, Done, alignments_in
 
 logger = logging.getLogger(__name__)
-
-KEEP = 50
-
-
-class Done(msgspec.Struct, frozen=True, kw_only=True):
-    """One alignment that has come to an end of its own, or a prediction."""
-
-    what: str
-    """"zero", "tilts", "turn", "level", "faces" or "gyro prediction"."""
-    state: str
-    """"done", "failed" or "predicted"."""
-    measured_at: str
-    reason: str
-    system_id: int | None
-    written: dict[str, float]
-    """What of it has come into the autopilot, by parameter."""
-    undone_at: str | None = None
 
 
 class ByHand:
     """Keeps the latest of them, on disk and in memory."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
-        self._file = BoundedList(core.config.storage.path / "by-hand.json", Done, KEEP)
+        self._file = alignments_in(core.config.storage.path)
         self._vehicle, self._offload, self._imus = core.vehicle, core.offload, imus
         self._done: list[Done] = []
 
@@ -72,7 +55,7 @@ class ByHand:
         )
         # Every power-up may bring another prediction: they must not push out what somebody has measured.
         earlier = [each for each in self._done if each.what != what or what != PREDICTION]
-        await self._write([*earlier, done][-KEEP:])
+        await self._write([*earlier, done][-KEEP_DONE:])
 
     async def undone(self, step: ChangeSet) -> None:
         """What was written in this step is in force no more."""

@@ -14,6 +14,7 @@ import os
 import resource
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Protocol
@@ -29,6 +30,10 @@ logger = logging.getLogger(__name__)
 REPORT_EVERY_S: Final = 1.0
 NICENESS: Final = 19
 """The daemon answers an arming request within 20 ms whatever its children are busy with."""
+OUT_OF_MEMORY: Final = 12
+"""Exit code of a child that needed more than its limit: ENOMEM."""
+STACK_BYTES: Final = 1024 * 1024
+"""Stack of a thread: it counts as data, and the usual 8 MiB would use up the limit."""
 OOM_SCORE: Final = "900"
 """Where memory runs out the kernel ends a child before anything else on the board."""
 
@@ -59,6 +64,7 @@ def run_child(make: Callable[[ChildSettings], ChildWork], *, memory_mib: int) ->
     """
     limit = memory_mib * 1024 * 1024
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    threading.stack_size(STACK_BYTES)
     # The service's unit, or a container, may forbid either.
     with contextlib.suppress(OSError):
         os.nice(NICENESS)
@@ -70,10 +76,11 @@ def run_child(make: Callable[[ChildSettings], ChildWork], *, memory_mib: int) ->
     settings = msgspec.json.decode(line, type=ChildSettings)
     set_up(settings.log_level)
     try:
-        asyncio.run(_run(make(settings)))
-    except MemoryError:
-        # Nothing that allocates may follow.
-        os._exit(1)
+        try:
+            asyncio.run(_run(make(settings)))
+        except* MemoryError:
+            # Nothing that allocates may follow.
+            os._exit(OUT_OF_MEMORY)
     except Exception:
         logger.exception("the process failed")
         sys.exit(1)

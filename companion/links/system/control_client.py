@@ -10,7 +10,7 @@ import contextlib
 import errno
 import grp
 import stat
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Final
 
@@ -25,7 +25,7 @@ READ_TIMEOUT_S: Final = 10.0
 """A peer that reads nothing for this long is given up."""
 
 
-async def ask(path: Path, request: Object) -> AsyncIterator[Object]:
+async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
     """Send one request to the daemon and yield its replies; the last has kind "result" or "error".
 
     Raises:

@@ -14,7 +14,6 @@ from typing import Final
 
 from companion.config.sections import Mqtt
 from companion.errors import LinkError
-from companion.links.mqtt.filter import NoGreetingError
 
 MAX_PASSWORD_BYTES: Final = 4096
 
@@ -131,8 +130,7 @@ def reason_code(error: BaseException) -> int | None:
 
 def is_of_protocol(error: BaseException) -> bool:
     """Whether the broker may not speak the version of MQTT that it was spoken to in."""
-    closed = any(isinstance(cause, NoGreetingError) for cause in causes(error))
-    return closed or reason_code(error) == UNSUPPORTED_PROTOCOL or _is_unanswered(error)
+    return reason_code(error) == UNSUPPORTED_PROTOCOL or _is_unanswered(error)
 
 
 def _is_unanswered(error: BaseException) -> bool:
@@ -151,8 +149,6 @@ def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bo
     if _is_unanswered(error):
         return "the broker does not answer any more" if reached else f"what listens there says nothing{hint}"
     for cause in causes(error):
-        if isinstance(cause, NoGreetingError):
-            return f"{cause}{hint}"
         if isinstance(cause, LinkError):
             return str(cause)
         if isinstance(cause, OSError) and (words := _of_system(cause, settings)):

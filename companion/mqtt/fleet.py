@@ -13,18 +13,17 @@ import math
 from collections import deque
 from collections.abc import Awaitable, Callable
 from itertools import islice
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 from companion.config.sections import Fleet
-from companion.daemon.biases.model_priors import TOPIC, ModelPriors
-from companion.daemon.core import Core, Handler, utc_now
-from companion.daemon.faces.fleet import wire
-from companion.daemon.faces.fleet.sources import Look, Sources, utc
-from companion.daemon.faces.mqtt.face import MqttFace
-from companion.errors import StorageError
-from companion.formats import Object
-from companion.links.mqtt.client import Incoming, MqttLink
+from companion.errors import CompanionError
+from companion.formats import Object, utc_now
 from companion.links.system.waiting import comes
+from companion.mqtt import fleet_wire as wire
+from companion.mqtt.client import Incoming, MqttLink
+from companion.mqtt.daemon import Daemon
+from companion.mqtt.fleet_sources import Look, Sources, utc
 from companion.storage.fleet_items import Clock, Entry, FleetItems, Kept, Mark
 
 logger = logging.getLogger(__name__)
@@ -42,22 +41,28 @@ PAUSE_S: Final = 0.05
 CURVES_AFTER_S: Final = 60.0
 """They have to be worked out first."""
 CURVES_EVERY_S: Final = 6 * 3600.0
-CLOCKS_AGREE_S: Final = 2.0
 INBOX: Final = 64
 AIRCRAFT, CURVE = "aircraft", "curve/"
 """Marks: of which one the last was, and the curve that was told last."""
 
 
-class FleetFace:
-    """One aircraft's part of the fleet, and what is left of others that had this companion; `run` it."""
+class AircraftFleet:
+    """One aircraft's part of the fleet, and what is kept of others that carried this companion; `run` it.
+
+    `link` returns the broker's connection of now, or None; `offload` runs a blocking call elsewhere.
+    """
 
     def __init__(
-        self, core: Core, settings: Fleet, mqtt: MqttFace, answer: Handler, models: ModelPriors | None = None
+        self,
+        settings: Fleet,
+        directory: Path,
+        daemon: Daemon,
+        link: Callable[[], MqttLink | None],
+        offload: Callable[..., Awaitable[Any]] = asyncio.to_thread,
     ) -> None:
-        self._settings, self._mqtt, self._answer, self._models = settings, mqtt, answer, models
-        self._vehicle, self._offload = core.vehicle, core.offload
-        self._items = FleetItems(core.config.storage.path)
-        self._sources = Sources(core.config.storage.path, self._items)
+        self._settings, self._daemon, self._current_link, self._offload = settings, daemon, link, offload
+        self._items = FleetItems(directory)
+        self._sources = Sources(directory, self._items)
         self._inbox: deque[Incoming] = deque(maxlen=INBOX)
         self._woken = asyncio.Event()
         self._kept: list[Kept] = []
@@ -80,7 +85,6 @@ class FleetFace:
         self._problem: str | None = None
         self._fault = ""
         """Of the program, said once."""
-        mqtt.on_other.add(self._on_message)
 
     def status(self) -> Object:
         """For `companion status` and `check`."""
@@ -92,11 +96,9 @@ class FleetFace:
             words = f"{words}; {self._problem}"
         elif self._nameless:
             words = "the autopilot tells no unique id (AUTOPILOT_VERSION): nothing is kept for the fleet"
-        models = [] if self._models is None else self._models.status()
         return {
             "good": self._problem is None and not self._nameless,
-            "summary": "; ".join([words, *(each["summary"] for each in models)]),
-            "models": models,
+            "summary": words,
             "aircraft": self._of,
             "waiting": waiting,
             "confirmed_at": confirmed_at,
@@ -105,11 +107,12 @@ class FleetFace:
 
     @property
     def _nameless(self) -> bool:
-        return self._vehicle.version is not None and self._vehicle.uid is None
+        vehicle = self._daemon.vehicle
+        return bool(vehicle.get("version_known")) and vehicle["uid"] is None
 
-    def _on_message(self, message: Incoming) -> None:
-        # A retained one would come back at every connection, as what is told of models should.
-        if message.topic.startswith(TOPIC) or (message.topic.startswith("fleet/") and not message.retained):
+    def on_message(self, message: Incoming) -> None:
+        """Accept a message of the fleet; a retained one, which would come back at every connection, is ignored."""
+        if message.topic.startswith("fleet/") and not message.retained:
             self._inbox.append(message)
             self._woken.set()
 
@@ -131,7 +134,7 @@ class FleetFace:
         """What was in its way, in words: what cannot be kept is no reason not to send, and the reverse."""
         try:
             await step()
-        except StorageError as error:
+        except CompanionError as error:
             if str(error) != self._problem:
                 logger.warning("fleet: %s", error)
             return str(error)
@@ -147,14 +150,14 @@ class FleetFace:
             marks = await self._offload(self._items.marks, AIRCRAFT)
             self._of = marks[AIRCRAFT].value if marks else None
             await self._count()
-        uid = self._vehicle.uid
+        uid, system_id = self._daemon.vehicle.get("uid"), self._daemon.vehicle.get("system_id")
         if self._of is not None and not self._caught_up:
             # What an earlier run has left is of the aircraft that there was then.
             await self._take_all(Look(self._of, None, self._clock()))
         self._caught_up = True
         if uid is None:
             return
-        look = Look(uid, self._vehicle.system_id, self._clock())
+        look = Look(uid, system_id, self._clock())
         if uid != self._of:
             moved = [look.item("event", utc_now(), {"what": "airframe changed", "before": self._of})]
             await self._add(uid, [Entry({AIRCRAFT: Mark("", uid)}, moved if self._of is not None else [])])
@@ -185,20 +188,19 @@ class FleetFace:
         """The curves of biases over temperature, where they are others than were told last."""
         marks = await self._offload(self._items.marks, f"{CURVE}{look.aircraft}/")
         entries = []
-        async for reply in self._answer({"command": "temperature"}, "fleet"):
-            for imu in reply["imus"]:
-                body = {key: imu[key] for key in ("imu", "power_ups", "days", "curve", "accel_curve")}
-                key, mark = f"{CURVE}{look.aircraft}/{imu['imu']}", Mark("", imu["summary"])
-                if imu["curve"] and marks.get(key) != mark:
-                    entries.append(Entry({key: mark}, [look.item("curve", utc_now(), body)]))
+        reply = await self._daemon.result({"command": "temperature", "face": "fleet"})
+        for imu in reply["imus"]:
+            body = {key: imu[key] for key in ("imu", "power_ups", "days", "curve", "accel_curve")}
+            key, mark = f"{CURVE}{look.aircraft}/{imu['imu']}", Mark("", imu["summary"])
+            if imu["curve"] and marks.get(key) != mark:
+                entries.append(Entry({key: mark}, [look.item("curve", utc_now(), body)]))
         await self._add(look.aircraft, entries)
 
     def _clock(self) -> Callable[[str], Clock]:
-        """How good our clock is: good if the autopilot's GNSS agrees, for whatever it has timed in this run."""
-        unix_s, now = self._vehicle.place.unix_time_s, datetime.datetime.now(tz=datetime.UTC)
+        """Return how good the clock was at a time: good within this run where the autopilot's GNSS confirms it now."""
         run_s = asyncio.get_running_loop().time() - self._started_s
-        since = (now - datetime.timedelta(seconds=run_s)).isoformat(timespec="milliseconds")
-        agrees = unix_s is not None and abs(unix_s - now.timestamp()) < CLOCKS_AGREE_S
+        began = datetime.datetime.now(tz=datetime.UTC) - datetime.timedelta(seconds=run_s)
+        since, agrees = began.isoformat(timespec="milliseconds"), self._daemon.clock_agrees
         return lambda at: "good" if agrees and at >= since else "unknown"
 
     async def _count(self) -> None:
@@ -210,10 +212,6 @@ class FleetFace:
         heard = bool(self._inbox)
         while self._inbox:
             message = self._inbox.popleft()
-            if message.topic.startswith(TOPIC):
-                if self._models is not None:
-                    await self._offload(self._models.take, message.topic, message.payload)
-                continue
             said = wire.parse(message.payload)
             for kept in self._kept:
                 if said is not None and message.topic in wire.Topics(kept.aircraft).heard:
@@ -236,7 +234,7 @@ class FleetFace:
 
     @property
     def _link(self) -> MqttLink | None:
-        link = self._mqtt.link
+        link = self._current_link()
         return link if link is not None and link.connected else None
 
     async def _greet(self) -> None:
@@ -248,8 +246,6 @@ class FleetFace:
             self._connection = (link, link.connections)
             self._greeted.clear()
             self._begin_again()
-        for topic in () if self._models is None else self._models.topics:
-            await link.hear(topic)
         news = [kept for kept in self._kept if self._greeted.get(kept.aircraft) != kept.last]
         if now_s - self._hello_s < HELLO_AGAIN_S and all(kept.aircraft in self._greeted for kept in news):
             return

@@ -1,9 +1,8 @@
-"""The connection to an MQTT broker, for as long as it takes.
+"""The connection to an MQTT broker: kept, made again after every loss, and spoken to by way of an outbox.
 
-aiomqtt speaks MQTT (paho below): asyncio without a thread of ours, typed, and its version 2 speaks MQTT 3.1.1 and 5.
-All that knows aiomqtt is in this module, as its version 3 will be another library; what it gets of the broker has
-passed `mqtt_filter`. MQTT 5 is tried first: only there can a message say that it was published to be retained, and
-only there is the broker told how large a message may be.
+aiomqtt 2 speaks MQTT 3.1.1 and 5. Only this module knows it, as its version 3 will be another library. MQTT 5 is tried
+first: only there can a message say that it was published to be retained, and only there is the broker told how long a
+message may be. A broker that sends more than this process may hold ends the process, and nothing else.
 """
 
 from __future__ import annotations
@@ -15,15 +14,15 @@ import importlib
 import importlib.util
 import logging
 import math
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+import ssl
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from companion.config.sections import Mqtt
-from companion.links.mqtt.broker import explain, is_of_protocol, is_open_to_all, read_password, tls_context
-from companion.links.mqtt.filter import LEAVE_DEADLINE_S, MAX_PACKET_BYTES, MqttFilter
-from companion.links.mqtt.outbox import Outbox, Parcel
 from companion.links.system.connection import Backoff, Reconnection
 from companion.links.system.waiting import comes
+from companion.mqtt.broker import causes, explain, is_of_protocol, is_open_to_all, read_password, tls_context
+from companion.mqtt.outbox import Outbox, Parcel
 
 if TYPE_CHECKING:
     import aiomqtt
@@ -44,15 +43,16 @@ WORTH_S: Final = 10.0
 MQTT_3_1_1: Final = 4
 MQTT_5: Final = 5
 """The numbers of the two protocols on the wire."""
+MAX_PACKET_BYTES: Final = 64 * 1024
+"""The longest message that the broker may send us (MQTT 5)."""
+MAX_WAITING: Final = 64
+"""The most messages received and not handled yet; more are dropped."""
 _REFUSED: Final = 128
-_NOT_AUTHORISED: Final = 0x87
 LONG_BYTES: Final = 4096
 """What is shorter is no reason for a broker to end a connection."""
 LOSSES: Final = 3
 """So often a connection ends at one long message before it is left out."""
 LEFT_OUT_S: Final = 3600.0
-
-Offload = Callable[..., Awaitable[Any]]
 
 
 class Incoming(NamedTuple):
@@ -80,14 +80,12 @@ class MqttLink:
         will: tuple[str, bytes] | None = None,
         subscriptions: Sequence[str] = (),
         on_message: Callable[[Incoming], None] = lambda message: None,
-        offload: Offload = asyncio.to_thread,
     ) -> None:
         self.settings, self.client_id = settings, client_id
         self.outbox = Outbox()
         self.connections = 0
         self._will, self._subscriptions, self._on_message = will, list(subscriptions), on_message
         self._spoken_to: aiomqtt.Client | None = None
-        self._offload = offload
         self._reconnection = Reconnection("mqtt", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S)
         self._protocol: int = MQTT_5
         self._connected_s: float | None = None
@@ -151,7 +149,7 @@ class MqttLink:
     async def run(self) -> None:
         """Keep the connection until cancelled; a loss is an event to report, never an exception."""
         loop = asyncio.get_running_loop()
-        problem = await self._offload(_load_library)
+        problem = await asyncio.to_thread(_load_library)
         if problem is not None:
             self._reconnection.down(problem)
             await loop.create_future()
@@ -169,6 +167,8 @@ class MqttLink:
                 ended = group
             if ended is None:
                 return reason
+            if any(isinstance(cause, MemoryError) for cause in causes(ended)):
+                raise MemoryError from ended
             logger.debug("mqtt", exc_info=ended)
             reached = self.connections > before
             reason = f"{self.where}: {explain(ended, self.settings, self.client_id, reached=reached)}"
@@ -184,37 +184,24 @@ class MqttLink:
             await comes(self.outbox.emptied, within_s)
 
     async def _serve(self) -> None:
-        """One connection, to its end; raises LinkError, OSError or aiomqtt.MqttError for why."""
-        import aiomqtt
-
-        password = await self._offload(read_password, self.settings)
+        """Hold one connection to its end; raises LinkError, OSError or aiomqtt.MqttError for why."""
+        password = await asyncio.to_thread(read_password, self.settings)
         if not self._warned_open and is_open_to_all(self.settings):
             self._warned_open = True
             path = self.settings.password_path
             logger.warning("mqtt: password file %s: everybody on this computer can read it (chmod o-r)", path)
-        context = await self._offload(tls_context, self.settings)
-        lost: Exception | None = None
-        async with MqttFilter(self.settings.host, self.settings.broker_port, context, self._protocol) as broker:
+        context = await asyncio.to_thread(tls_context, self.settings)
+        async with self._client(password, context) as client:
             try:
-                await self._talk(broker, password)
-            except aiomqtt.MqttError as error:
-                lost = error
-        # What is wrong with the broker is the better reason: the library knows only that the connection is gone.
-        if (reason := broker.fault or lost) is not None:
-            raise reason
+                async with asyncio.TaskGroup() as group:
+                    group.create_task(self._speak(client), name="mqtt sender")
+                    group.create_task(self._receive(client), name="mqtt receiver")
+            finally:
+                self._count_loss()
+                self._connected_s = self._spoken_to = None
+                self.outbox.closed()
 
-    async def _talk(self, broker: MqttFilter, password: str | None) -> None:
-        client = self._client(broker.address, password)
-        await _enter(client, broker)
-        try:
-            await _both(self._speak(client, broker), self._receive(client))
-        finally:
-            self._count_loss()
-            self._connected_s = self._spoken_to = None
-            self.outbox.closed()
-            await _leave(client)
-
-    def _client(self, address: str, password: str | None) -> aiomqtt.Client:
+    def _client(self, password: str | None, context: ssl.SSLContext | None) -> aiomqtt.Client:
         import aiomqtt
         from paho.mqtt.packettypes import PacketTypes
         from paho.mqtt.properties import Properties
@@ -224,8 +211,8 @@ class MqttLink:
             properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
             properties.MaximumPacketSize = MAX_PACKET_BYTES
         return aiomqtt.Client(
-            address,
-            transport="unix",
+            self.settings.host,
+            self.settings.broker_port,
             username=self.settings.username,
             password=password,
             identifier=self.client_id,
@@ -234,16 +221,17 @@ class MqttLink:
             clean_session=True if properties is None else None,
             keepalive=self.settings.keepalive_s,
             properties=properties,
+            tls_context=context,
             timeout=GREETING_DEADLINE_S,
-            queue_type=_inbox(self._deliver),
+            max_queued_incoming_messages=MAX_WAITING,
             logger=_quiet,
         )
 
-    async def _speak(self, client: aiomqtt.Client, broker: MqttFilter) -> None:
+    async def _speak(self, client: aiomqtt.Client) -> None:
         await self._subscribe(client)
         self._spoken_to = client
         self._up()
-        await self._send(client, broker)
+        await self._send(client)
 
     async def hear(self, topic: str) -> None:
         """Subscribe to one more topic, now and at every connection."""
@@ -275,7 +263,7 @@ class MqttLink:
             self._refused.append(f"the broker does not let us hear {topic} (its access list?)")
             logger.warning("mqtt: %s: %s", self.where, self._refused[-1])
 
-    async def _send(self, client: aiomqtt.Client, broker: MqttFilter) -> None:
+    async def _send(self, client: aiomqtt.Client) -> None:
         loop = asyncio.get_running_loop()
         while True:
             parcel = await self.outbox.next()
@@ -286,18 +274,7 @@ class MqttLink:
                     parcel.topic, parcel.payload, qos=parcel.qos, retain=parcel.retain, timeout=ANSWER_DEADLINE_S
                 )
                 self._under_way = None
-                if parcel.qos and broker.receipt >= _REFUSED:
-                    self._say_refused(parcel.topic, broker.receipt)
             self.outbox.sent(parcel)
-
-    def _say_refused(self, topic: str, code: int) -> None:
-        """Once for each topic and connection; only brokers of MQTT 5 say it."""
-        words = f"the broker refuses what we publish to {topic} (reason {code})"
-        if code == _NOT_AUTHORISED:
-            words = f"the broker does not let us publish to {topic} (its access list?)"
-        if words not in self._refused:
-            self._refused.append(words)
-            logger.warning("mqtt: %s: %s", self.where, words)
 
     def _count_loss(self) -> None:
         """A long message at which connections end again and again is more than the broker, or the line, takes."""
@@ -311,7 +288,7 @@ class MqttLink:
             logger.warning("mqtt: %s: %s", self.where, _left_out_words(len(lost.payload)))
 
     async def _receive(self, client: aiomqtt.Client) -> None:
-        """Wait for the end of the connection; what comes is dealt with as it comes (`_inbox`)."""
+        """Handle messages until the connection ends, which raises."""
         async for message in client.messages:
             self._deliver(message)
 
@@ -339,25 +316,6 @@ def _left_out_words(size: float) -> str:
     )
 
 
-async def _both(sending: Coroutine[Any, Any, None], receiving: Coroutine[Any, Any, None]) -> None:
-    """Run both until one fails; raises what it raised.
-
-    No task group: one that has an error to tell forgets that it was cancelled meanwhile (CPython before 3.13), and
-    whoever is stopped at the moment of a loss would go on for ever.
-    """
-    loop = asyncio.get_running_loop()
-    tasks = [loop.create_task(sending, name="mqtt sender"), loop.create_task(receiving, name="mqtt receiver")]
-    try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
-    finally:
-        for task in tasks:
-            task.cancel()
-        ended = await asyncio.gather(*tasks, return_exceptions=True)
-    for end in ended:
-        if isinstance(end, Exception):
-            raise end
-
-
 def _load_library() -> str | None:
     """Import aiomqtt, in a thread as it takes a while; returns what is wrong with it, in words."""
     try:
@@ -373,38 +331,3 @@ def _load_library() -> str | None:
     if not found.startswith("2."):
         return f"aiomqtt {found} is of another make ({INSTALL}); the companion goes on without MQTT"
     return None
-
-
-def _inbox(take: Callable[[aiomqtt.Message], None]) -> type[asyncio.Queue[aiomqtt.Message]]:
-    """A queue that never holds anything: it hands over at once.
-
-    aiomqtt reads faster than its iterator gives, so that a flood would fill any queue, and what is beyond its end is
-    lost without an answer.
-    """
-
-    class Inbox(asyncio.Queue[Any]):
-        def put_nowait(self, item: Any) -> None:
-            take(item)
-
-    return Inbox
-
-
-async def _enter(client: aiomqtt.Client, broker: MqttFilter) -> None:
-    entering = asyncio.get_running_loop().create_task(client.__aenter__(), name="mqtt connect")
-    try:
-        await asyncio.shield(entering)
-    except asyncio.CancelledError:
-        # Left alone half way, it would live on without us: without the broker it ends by itself.
-        broker.hang_up()
-        await asyncio.wait([entering], timeout=LEAVE_DEADLINE_S)
-        entering.cancel()
-        await asyncio.gather(entering, return_exceptions=True)
-        raise
-
-
-async def _leave(client: aiomqtt.Client) -> None:
-    import aiomqtt
-
-    with contextlib.suppress(aiomqtt.MqttError, OSError, TimeoutError):
-        async with asyncio.timeout(LEAVE_DEADLINE_S):
-            await client.__aexit__(None, None, None)

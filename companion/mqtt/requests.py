@@ -1,8 +1,7 @@
 """Requests over MQTT: each is answered, none is obeyed twice, and no flood of them grows into anything.
 
 An answer repeats the request's transaction. A calibration is answered twice: "accepted" at once, and how it ended;
-everything else once. What is asked goes through the same door as the command line's (`Faces.answer`), so refusals
-are the same too.
+everything else once. Requests go to the control socket, as the command line's do, so refusals are the same too.
 
 Three kinds of request are not what somebody wants now:
 - a retained one comes back at every connection, for ever: it is never obeyed, and the log says so once;
@@ -13,6 +12,7 @@ Three kinds of request are not what somebody wants now:
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import difflib
 import logging
 import re
@@ -23,9 +23,9 @@ from typing import Final, Protocol
 import msgspec
 
 from companion.calibration.request import What, is_time_limit
-from companion.daemon.core import Handler
 from companion.errors import CompanionError
 from companion.formats import Object
+from companion.mqtt.daemon import Ask
 from companion.printable import printable
 
 logger = logging.getLogger(__name__)
@@ -143,7 +143,7 @@ class Requests:
     `on_retained` is told once of each command of which a retained request lies at the broker.
     """
 
-    def __init__(self, ask: Handler, respond: Respond, on_retained: Callable[[str], None]) -> None:
+    def __init__(self, ask: Ask, respond: Respond, on_retained: Callable[[str], None]) -> None:
         self._ask, self._respond, self._on_retained = ask, respond, on_retained
         self._tasks: set[asyncio.Task[None]] = set()
         self._known: OrderedDict[tuple[str, Transaction], _Known] = OrderedDict()
@@ -222,16 +222,17 @@ class Requests:
             question["wait"] = True
         accepted = False
         try:
-            async for reply in self._ask(question, "mqtt"):
-                if reply["kind"] != "progress":
-                    self._answer(request, _final(reply))
-                elif not accepted:
-                    accepted = True
-                    self._answer(request, {"state": "accepted", "reason": "calibration started"})
+            async with contextlib.aclosing(self._ask(question)) as replies:
+                async for reply in replies:
+                    if reply["kind"] == "error":
+                        self._reject(request, reply.get("refusal", "other"), reply["reason"])
+                    elif reply["kind"] == "result":
+                        self._answer(request, _final(reply))
+                    elif not accepted:
+                        accepted = True
+                        self._answer(request, {"state": "accepted", "reason": "calibration started"})
         except CompanionError as error:
-            # What was refused is not remembered: the same request may be taken a moment later.
-            self._known.pop((request.command, request.transaction), None)
-            self._refuse(request.command, request.transaction, getattr(error, "kind", "other"), str(error))
+            self._reject(request, "other", str(error))
         except Exception:
             logger.exception("mqtt request %s failed", request.command)
             self._answer(
@@ -244,6 +245,11 @@ class Requests:
         if known is not None:
             known.response = response
         self._respond(request.command, response, droppable=False)
+
+    def _reject(self, request: Request, refusal: str, reason: str) -> None:
+        # A refused request is not remembered: the daemon may accept the same one a moment later.
+        self._known.pop((request.command, request.transaction), None)
+        self._refuse(request.command, request.transaction, refusal, reason)
 
     def _refuse(self, command: str, transaction: Transaction, refusal: str, reason: str) -> None:
         response = {"transaction": transaction, "state": "refused", "refusal": refusal, "reason": reason}

@@ -11,17 +11,14 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.records.record import Arming, Record
-from companion.daemon.arming import armings
-from companion.daemon.stands import by_hand
+from companion.calibration.records.record import Record
 from companion.errors import StorageError
 from companion.storage.changes import PREDICTION
 from companion.storage.fleet_items import Clock, Entry, FleetItems, Item, Mark
 from companion.storage.flights import FlightStore
-from companion.storage.learned import alignment_in, faces_in
+from companion.storage.learned import alignment_in, alignments_in, armings_in, faces_in
 from companion.storage.profiles import ProfileStore
 from companion.storage.records import RecordStore
-from companion.storage.state import BoundedList
 
 RECORD, ARMING, BY_HAND, PROFILE, FLIGHT, IMU = "record/", "arming/", "by-hand/", "profile/", "flight/", "imu/"
 """What marks begin with."""
@@ -65,8 +62,7 @@ class Sources:
         """
         yield from self._of_records(look)
         yield from self._of_stands(look)
-        arming = BoundedList(self._directory / "armings.json", Arming, armings.KEEP)
-        at = {one.armed_at: one for one in arming.all()}
+        at = {one.armed_at: one for one in armings_in(self._directory).all()}
         yield from self._told(
             ARMING, dict.fromkeys(at, TOLD), lambda key, _: (TOLD, [look.item("arming", key, at[key])])
         )
@@ -109,7 +105,7 @@ class Sources:
             exchanged.clear()
 
     def _of_stands(self, look: Look) -> Iterator[Entry]:
-        file = BoundedList(self._directory / "by-hand.json", by_hand.Done, by_hand.KEEP)
+        file = alignments_in(self._directory)
         done = {f"{each.what} {each.measured_at}": each for each in file.all() if each.what != PREDICTION}
 
         def tell(key: str, before: str) -> Told:

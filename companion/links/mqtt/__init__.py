@@ -1,1 +1,0 @@
-"""MQTT: the client, what it lets in, what it keeps for later."""

@@ -1,0 +1,211 @@
+"""The MQTT process: publishes the daemon's state, answers requests, and sends what the fleet has not confirmed yet."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+from collections.abc import AsyncGenerator
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from companion.config.sections import Mqtt
+from companion.formats import Object
+from companion.links.system.child import ChildSettings
+from companion.links.system.control_client import ask
+from companion.links.system.waiting import comes
+from companion.mqtt.client import Incoming, MqttLink
+from companion.mqtt.daemon import Ask, Daemon
+from companion.mqtt.requests import Requests
+from companion.mqtt.topics import OFFLINE, ONLINE, Pace, Topics, summary
+
+if TYPE_CHECKING:
+    from companion.mqtt.fleet import AircraftFleet
+
+logger = logging.getLogger(__name__)
+_json: Final = msgspec.json.encode
+
+MEMORY_MIB: Final = 128
+"""The process needs 30 MiB, 55 MiB with the fleet."""
+FOUND_WITHIN_S: Final = 3.0
+"""Wait this long for the autopilot's system id; without it the vehicle is number 1, as on MAVLink."""
+NEWS_WITHIN_S: Final = 1.0
+PROGRESS_S: Final = 0.5
+AFTER_FAULT_S: Final = 30.0
+ANSWER_AT_END_S: Final = 0.5
+FLUSH_S: Final = 1.0
+
+
+class MqttProcess:
+    """Work of the process. A test hands in the daemon's answers; otherwise they come from the control socket."""
+
+    def __init__(self, settings: ChildSettings, asks: Ask | None = None) -> None:
+        config = settings.config
+        assert config.mqtt is not None
+        self._settings: Mqtt = config.mqtt
+        self._socket, self._only_listening = config.control.path, settings.only_listening is not None
+        self._system_id = config.vehicle.system_id
+        self.daemon = Daemon(asks or self._ask)
+        self.link: MqttLink | None = None
+        self.topics: Topics | None = None
+        self.fleet: AircraftFleet | None = None
+        if config.fleet is not None and not self._only_listening:
+            # It needs numpy for the records, 20 MiB: imported only where it is configured.
+            from companion.mqtt.fleet import AircraftFleet
+
+            self.fleet = AircraftFleet(config.fleet, config.storage.path, self.daemon, lambda: self.link)
+
+    def status(self) -> Object:
+        """Return the connection's state, for `companion status` and `check`; the fleet's under its own key."""
+        fleet = None if self.fleet is None else self.fleet.status()
+        if self.link is None or self.topics is None:
+            return {
+                "good": False,
+                "summary": "waiting for the autopilot's system id",
+                "connected": False,
+                "fleet": fleet,
+            }
+        return {**self.link.status(), "base_topic": self.topics.base, "fleet": fleet}
+
+    async def run(self) -> None:
+        """Serve the broker until cancelled. In a check the broker is only connected to."""
+        if self._only_listening:
+            await self._connect_only()
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self.daemon.follow(), name="daemon")
+            if self.fleet is not None:
+                group.create_task(self.fleet.run(), name="fleet")
+            group.create_task(self._publish_forever(), name="publisher")
+
+    async def _ask(self, request: Object) -> AsyncGenerator[Object, None]:
+        async with contextlib.aclosing(ask(self._socket, {"face": "mqtt", **request})) as replies:
+            async for reply in replies:
+                yield reply
+
+    @property
+    def _known_system_id(self) -> int | None:
+        return self.daemon.vehicle.get("system_id") or self._system_id
+
+    def _base(self) -> str:
+        return self._settings.base_topic or f"companion/{self._known_system_id or 1}"
+
+    def _client_id(self, base: str) -> str:
+        # The same after every restart: our old connection, and its last will with it, gives way to the new one.
+        return self._settings.client_id or base.replace("/", "-")
+
+    async def _news(self) -> None:
+        await comes(self.daemon.news, NEWS_WITHIN_S)
+        self.daemon.news.clear()
+
+    async def _connect_only(self) -> None:
+        base = self._base()
+        self.topics = Topics(base)
+        self.link = MqttLink(self._settings, client_id=f"{self._client_id(base)}-check")
+        await self.link.run()
+
+    async def _publish_forever(self) -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(FOUND_WITHIN_S):
+                while self._settings.base_topic is None and self._known_system_id is None:
+                    await self._news()
+        while True:
+            try:
+                await self._publish_as(self._base())
+            except MemoryError:
+                raise
+            except Exception:
+                logger.exception("MQTT met a fault of the program; it begins again in %.0f s", AFTER_FAULT_S)
+                await asyncio.sleep(AFTER_FAULT_S)
+
+    async def _publish_as(self, base: str) -> None:
+        """Serve under a base topic until the vehicle has another one."""
+        self.topics = topics = Topics(base)
+        self.link = link = MqttLink(
+            self._settings,
+            client_id=self._client_id(base),
+            will=(topics.status, OFFLINE),
+            subscriptions=(f"{topics.request}+", topics.status),
+            on_message=self._on_message,
+        )
+        self._requests = Requests(self.daemon.ask, self._respond, self._on_retained)
+        publisher = _Publisher(self.daemon, link, topics)
+        running = asyncio.get_running_loop().create_task(link.run(), name="mqtt link")
+        try:
+            while self._base() == base:
+                publisher.publish()
+                if running.done():
+                    running.result()
+                await self._news()
+            logger.info("mqtt: the vehicle is %s, no longer %s", self._base(), base)
+            await self._requests.close(ANSWER_AT_END_S)
+            for topic in topics.kept:
+                link.outbox.keep(topic, b"")  # the broker forgets it
+        except asyncio.CancelledError:
+            await self._requests.close(ANSWER_AT_END_S)
+            await self.daemon.refresh()
+            publisher.publish()
+            link.outbox.keep(topics.status, OFFLINE)
+            raise
+        finally:
+            await link.flush(FLUSH_S)
+            running.cancel()
+            await asyncio.wait([running], timeout=FLUSH_S)
+
+    # --- messages received
+
+    def _on_message(self, message: Incoming) -> None:
+        if self.topics is None or self.link is None:
+            return
+        if message.topic == self.topics.status:
+            if message.payload != ONLINE and self.link.outbox.kept(message.topic) == ONLINE:
+                # The last will of an earlier connection, come late.
+                self.link.outbox.send_again(message.topic)
+        elif message.topic.startswith(self.topics.request):
+            command = message.topic.removeprefix(self.topics.request)
+            self._requests.accept(command, message.payload, retained=message.retained)
+        elif self.fleet is not None:
+            self.fleet.on_message(message)
+
+    def _on_retained(self, command: str) -> None:
+        if self.topics is not None:
+            topic = self.topics.request + command
+            logger.warning(
+                "mqtt: the retained request at %s is not obeyed; delete it: mosquitto_pub -r -n -t %s", topic, topic
+            )
+
+    def _respond(self, command: str, response: Object, *, droppable: bool) -> None:
+        if self.topics is not None and self.link is not None:
+            self.link.outbox.answer(self.topics.response + command, _json(response), droppable=droppable)
+
+
+class _Publisher:
+    """Puts into the outbox what has changed since the last call."""
+
+    def __init__(self, daemon: Daemon, link: MqttLink, topics: Topics) -> None:
+        self._daemon, self._link, self._topics = daemon, link, topics
+        self._pace = Pace()
+        self._progress, self._progress_s = b"", -math.inf
+
+    def publish(self) -> None:
+        daemon, outbox, topics = self._daemon, self._link.outbox, self._topics
+        outbox.keep(topics.status, ONLINE if daemon.alive else OFFLINE)
+        if daemon.status is None:
+            return
+        now_s = asyncio.get_running_loop().time()
+        if daemon.record is not None:
+            outbox.keep(topics.record, _json(daemon.record))
+        state = summary(daemon.status)
+        if self._pace.is_due(state, now_s):
+            outbox.keep(topics.state, _json(state))
+        if not self._link.connected:
+            return
+        job = daemon.status["job"]
+        progress = b"" if job is None else _json(job)
+        busy = daemon.status["progress"] is not None
+        if progress != self._progress and (now_s - self._progress_s >= PROGRESS_S or not busy):
+            outbox.pass_on(topics.progress, progress)
+            self._progress, self._progress_s = progress, now_s
+        if daemon.pose is not None:
+            outbox.pass_on(topics.attitude, _json(daemon.pose))
