@@ -24,7 +24,6 @@ UID = b"virtual 0000".ljust(18, b"\0").hex()
 @pytest.fixture(autouse=True)
 def _hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     hurry(monkeypatch, BEST)
-    monkeypatch.setattr("companion.daemon.faces.subsystem.FLEET_AFTER_S", 0.3)
 
 
 @contextlib.asynccontextmanager

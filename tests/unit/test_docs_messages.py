@@ -25,7 +25,7 @@ NOT_MESSAGES = {
     "ground stations: …", "ground stations", "at arming (…): …", "… … … … …  what came of it", "; … parameters written",
     "an undo",
     # Names of tasks, in the line of the watchdog, and of what failed, in the log.
-    "MAVLink component", "MAVLink connection", "automatic calibration", "the state for MQTT",
+    "MAVLink component", "MAVLink connection", "automatic calibration", "the page's",
     # When a rival acts, and whether a rival does: keys, not words for people.
     "at a start", "while still", "after a flight",
     # A key of what a fleet is told.

@@ -22,18 +22,17 @@ from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task, Wanted, joined
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.faces.child import Child, StartChild
 from companion.daemon.faces.headline import Headlines
 from companion.daemon.heading.subsystem import Heading
 from companion.daemon.job import Job
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import ConfigError
 from companion.formats import Object
-from companion.links.system.child import ChildSettings
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad
 
 if TYPE_CHECKING:
+    from companion.daemon.faces.child import Child, StartChild
     from companion.web.server import Page
 
 
@@ -56,7 +55,7 @@ class Faces(Subsystem):
         arming: Arming,
         heading: Heading,
         recorder: Subsystem,
-        child: StartChild = Child,
+        child: StartChild | None = None,
     ) -> None:
         self._core, self._devices = core, devices
         self.component = Component(
@@ -76,16 +75,23 @@ class Faces(Subsystem):
         self._handlers: dict[str, Handler] = {"status": self._status, "monitor": self._monitor}
         for subsystem in self._subsystems:
             self._handlers |= subsystem.commands()
-        settings = ChildSettings(
-            core.config, logging.getLevelName(logging.getLogger().level), only_listening=core.only_listening
-        )
-        self.mqtt = None if core.config.mqtt is None else child("mqtt", "companion.mqtt", settings)
+        self._start_child = child
+        self.mqtt = None if core.config.mqtt is None else self._child("mqtt", "companion.mqtt")
         self.page: Page | None = None
         if core.config.web is not None:
             from companion.web.server import Page
 
             bind, folder = core.config.web.bind, core.config.storage.path
             self.page = Page(bind, folder, self.answer, self.refresh, core.offload)
+
+    def _child(self, name: str, module: str) -> Child:
+        # Imported only where a child is configured: the start of the daemon is short.
+        from companion.daemon.faces.child import Child
+        from companion.links.system.child import ChildSettings
+
+        level = logging.getLevelName(logging.getLogger().level)
+        settings = ChildSettings(self._core.config, level, only_listening=self._core.only_listening)
+        return (self._start_child or Child)(name, module, settings)
 
     async def answer(self, request: Object, face: str | None = None) -> AsyncIterator[Object]:
         """Answer one request of the control socket, whose key `face` names the child process that sent it.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from companion.config.sections import Config
 from companion.configured import models
@@ -13,7 +13,6 @@ from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Offload, Task
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.faces.child import Child, StartChild
 from companion.daemon.faces.control import ControlServer
 from companion.daemon.faces.subsystem import Faces
 from companion.daemon.heading.subsystem import Heading
@@ -23,6 +22,9 @@ from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.transport import run_transport
 from companion.storage.lock import only_daemon
+
+if TYPE_CHECKING:
+    from companion.daemon.faces.child import StartChild
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +47,7 @@ class Service:
         offload: Offload = asyncio.to_thread,
         imu_rate_hz: float | None = None,
         only_listening: str | None = None,
-        child: StartChild = Child,
+        child: StartChild | None = None,
     ) -> None:
         self.config = config
         self.core = core = Core(config, link, offload, only_listening)
