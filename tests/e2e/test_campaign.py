@@ -46,7 +46,7 @@ def test_the_catalogue_is_whole() -> None:
         assert set(fault.not_in) < set(PHASES)
         assert set(fault.variants) <= {variant.name for variant in VARIANTS}
     assert {fault.room for fault in FAULTS.values()} == {
-        "device", "link", "autopilot", "broker", "disk", "clock", "process", "files", "faces", "intruder",
+        "device", "link", "autopilot", "disk", "clock", "process", "files", "faces", "intruder",
     }  # fmt: skip
 
 
@@ -94,8 +94,9 @@ def test_a_daemon_that_does_not_mend_is_caught() -> None:
     def sabotage(stage: Stage) -> None:
         stage.service.offsets.recovery._recover = never  # type: ignore[assignment,method-assign]
 
-    outcome = run_cell(FAULTS["arms-in-write"], "solving", SEED, sabotage=sabotage)
-    assert any("still to be put back" in words for words in outcome.problems), outcome
+    # Some strikes come before the first write, when nothing has to be put back.
+    outcomes = [run_cell(FAULTS["arms-in-write"], "solving", SEED + k, sabotage=sabotage) for k in range(3)]
+    assert any("still to be put back" in words for outcome in outcomes for words in outcome.problems), outcomes
 
 
 def test_a_daemon_that_answers_twice_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
