@@ -100,7 +100,7 @@ deb-test: deb
 
 # What supply chain tools need is theirs alone: nothing of it is in the environment that runs or tests the companion.
 TOOLS := $(VENV)-tools
-LOCKED := runtime mqtt recording ground fleet parquet dev
+LOCKED := runtime mqtt recording ground fleet dev
 UPGRADE ?=
 COMPILE = $(TOOLS)/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 	--no-header $(if $(UPGRADE),--upgrade)
@@ -114,7 +114,7 @@ $(TOOLS)/.made: requirements/tools.txt
 lock: $(TOOLS)/.made
 	@$(COMPILE) pyproject.toml --extra dev -o requirements/dev.txt
 	@$(COMPILE) pyproject.toml -c requirements/dev.txt --no-annotate -o requirements/runtime.txt
-	@for extra in mqtt recording ground fleet parquet; do \
+	@for extra in mqtt recording ground fleet; do \
 		$(COMPILE) pyproject.toml --extra $$extra -c requirements/dev.txt --no-annotate -o requirements/$$extra.txt || exit 1; \
 	done
 	@$(COMPILE) requirements/build.in -o requirements/build.txt

@@ -40,16 +40,12 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
     run = add(
         "run", _run, "collect, until Ctrl-C; -c names a file whose [mqtt] names the broker (default: this machine's)"
     )
-    export = add("export", _export, "a view or a table of the database as a file, for a spreadsheet, pandas and others")
-    export.add_argument("what", metavar="VIEW", help="fleet, bias_history, ... (docs/fleet.md; another word lists all)")
-    export.add_argument("file", type=Path, metavar="FILE", help="to be written: NAME.csv or NAME.parquet")
-    for command in (run, export):
-        command.add_argument(
-            "--database",
-            default="fleet.sqlite",
-            metavar="URL",
-            help="postgresql://USER@HOST/NAME, or the path of an SQLite file (default fleet.sqlite, here)",
-        )
+    run.add_argument(
+        "--database",
+        default="fleet.sqlite",
+        metavar="URL",
+        help="postgresql://USER@HOST/NAME, or the path of an SQLite file (default fleet.sqlite, here)",
+    )
     demo = add("demo", _demo, "thirty simulated aircraft and the page, on this computer alone, until Ctrl-C")
     for command in (run, demo):
         command.add_argument(
@@ -82,15 +78,6 @@ async def _run(options: argparse.Namespace) -> int:
     collector = Collector(mqtt, Store(options.database))
     pages = [] if options.page == "off" else [_server(options, options.database, collector.metrics).run()]
     await _until_stopped(collector.run(), *pages)
-    return DONE
-
-
-async def _export(options: argparse.Namespace) -> int:
-    """`companion fleet export`."""
-    _check_installed()
-    from companion.fleet.export import export
-
-    print_lines(f"{options.file}: {export(options.database, options.what, options.file)} rows")
     return DONE
 
 

@@ -129,6 +129,21 @@ def test_calibrations_and_armings_each_once(told: str) -> None:
     assert len(asked(told, "SELECT * FROM calibration_history")) == 4
 
 
+def test_biases_in_the_units_of_people(told: str) -> None:
+    query = "SELECT sequence, imu, axis, gyro_bias_deg_h, accel_bias_mg FROM bias_history WHERE aircraft = "
+    found = {
+        (row["sequence"], row["imu"], row["axis"]): (row["gyro_bias_deg_h"], row["accel_bias_mg"])
+        for row in asked(told, f"{query}'{ONE.id}'")
+    }
+    wanted = {}
+    for sequence in ONE.biases:
+        for imu in json.loads(ONE.told[sequence])["body"]["imus"]:
+            for k, axis in enumerate("xyz"):
+                gyro, accel = imu["gyro_bias_rad_s"][k] / RAD_S, imu["accel_bias_m_s2"][k] / MG
+                wanted[sequence, imu["name"], axis] = pytest.approx(gyro), pytest.approx(accel)
+    assert found == wanted
+
+
 def test_the_latest_curve_of_each_imu(told: str) -> None:
     found = asked(told, "SELECT * FROM temperature_curves ORDER BY imu, triad, degc, axis")
     assert {row["aircraft"] for row in found} == {ONE.id}
