@@ -16,7 +16,6 @@ from companion.errors import ConfigError
 from companion.links.system import logs
 
 if TYPE_CHECKING:
-    from companion.fleet.metrics import Metrics
     from companion.fleet.server import Server
 
 DEFAULT_PAGE: Final = "127.0.0.1:8291"
@@ -52,7 +51,7 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
             "--page",
             default=DEFAULT_PAGE,
             metavar="HOST:PORT",
-            help=f"where the page is (default {DEFAULT_PAGE}: for this computer alone; off: no page, no /metrics)",
+            help=f"where the page is (default {DEFAULT_PAGE}: for this computer alone; off: no page)",
         )
         command.add_argument(
             "--password-file", type=Path, metavar="FILE", help="who looks at the page is asked for what is in it"
@@ -76,7 +75,7 @@ async def _run(options: argparse.Namespace) -> int:
     mqtt = settings.load(options.config).mqtt if hasattr(options, "config") else Mqtt(host="127.0.0.1")
     logs.set_up("info")
     collector = Collector(mqtt, Store(options.database))
-    pages = [] if options.page == "off" else [_server(options, options.database, collector.metrics).run()]
+    pages = [] if options.page == "off" else [_server(options, options.database).run()]
     await _until_stopped(collector.run(), *pages)
     return DONE
 
@@ -108,7 +107,7 @@ async def _acl(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _server(options: argparse.Namespace, database: str, counts: Metrics | None = None) -> Server:
+def _server(options: argparse.Namespace, database: str) -> Server:
     from companion.fleet.certificate import Certificate
     from companion.fleet.server import Server, read_password
 
@@ -116,7 +115,7 @@ def _server(options: argparse.Namespace, database: str, counts: Metrics | None =
     if (options.cert is None) != (options.key is None):
         raise ConfigError("--cert and --key: found one of them; allowed: both, or neither")
     certificate = None if options.cert is None else Certificate(options.cert, options.key)
-    return Server(options.page, database, password, certificate, counts)
+    return Server(options.page, database, password, certificate)
 
 
 async def _until_stopped(*runs: Coroutine[Any, Any, None]) -> None:

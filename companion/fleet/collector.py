@@ -13,14 +13,12 @@ import logging
 import math
 import secrets
 import socket
-import time
 from collections.abc import AsyncIterator, Iterable
 from typing import TYPE_CHECKING, Any, Final
 
 from companion.config.sections import Mqtt
 from companion.errors import CompanionError, LinkError
 from companion.fleet.contract import MOST_BYTES, answers, ranges
-from companion.fleet.metrics import Metrics
 from companion.fleet.store import Message, Outcome, Store
 from companion.links.system.connection import Backoff, Reconnection
 from companion.mqtt.broker import explain, is_of_protocol, read_password, tls_context
@@ -126,7 +124,6 @@ class Collector:
 
     def __init__(self, settings: Mqtt, store: Store, *, mqtt_5: bool = True) -> None:
         self.settings, self.store = settings, store
-        self.metrics = Metrics()
         self.client_id = settings.client_id or f"collector-{socket.gethostname()[:40]}-{secrets.token_hex(4)}"
         self._protocol = _MQTT_5 if mqtt_5 else _MQTT_3_1_1
         self._reconnection = Reconnection("fleet", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S)
@@ -210,7 +207,6 @@ class Collector:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
         finally:
             ended = await stop(tasks)
-            self.metrics.connected = False
         for end in ended:
             if isinstance(end, Exception):
                 raise end
@@ -235,8 +231,6 @@ class Collector:
             await self._hear_of(client, topic)
         words = "MQTT 3.1.1: no other collector beside this one" if alone else "MQTT 5"
         self._reconnection.up(f"{self.where} ({words}) into {self.store.where}")
-        self.metrics.connections += 1
-        self.metrics.connected = True
         if not alone:
             # What was said before is not told to those who share.
             await self._hear_of(client, _HELLO, qos=0)
@@ -267,10 +261,7 @@ class Collector:
             with contextlib.suppress(asyncio.QueueEmpty):
                 while len(batch) < BATCH:
                     batch.append(inbox.get_nowait())
-            began_s = time.monotonic()
-            outcome = await asyncio.to_thread(self.store.take, batch)
-            self.metrics.committed(outcome, time.monotonic() - began_s)
-            await self._answer(client, outcome)
+            await self._answer(client, await asyncio.to_thread(self.store.take, batch))
 
     async def _judge(self) -> None:
         loop = asyncio.get_running_loop()

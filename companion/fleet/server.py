@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import datetime
 import logging
 import secrets
 from pathlib import Path
@@ -14,7 +13,6 @@ import sqlalchemy as sa
 
 from companion.config.rules import bind_problem
 from companion.errors import ConfigError
-from companion.fleet import metrics
 from companion.fleet.certificate import Certificate
 from companion.fleet.database import engine_of, why
 from companion.fleet.rendering import Renderer
@@ -62,7 +60,7 @@ def read_password(path: Path) -> str:
 
 
 class Server:
-    """The pages at HOST:PORT, and the collector's `counts` at /metrics; `run` it as a task.
+    """Server of the pages at HOST:PORT, read only; `run` it as a task.
 
     Raises:
         ConfigError: the address is none, or others could look without a password.
@@ -74,7 +72,6 @@ class Server:
         database: str,
         password: str | None,
         certificate: Certificate | None = None,
-        counts: metrics.Metrics | None = None,
     ) -> None:
         if (wrong := bind_problem(bind, "--page")) is not None:
             raise ConfigError(wrong)
@@ -85,7 +82,7 @@ class Server:
             )
         if certificate is None and not is_loopback(self._host):
             logger.warning("page: whoever listens on the network can read its password: --cert and --key prevent it")
-        self._password, self._certificate, self._counts = password, certificate, counts
+        self._password, self._certificate = password, certificate
         self._access = Access("", handed_out=True)
         self._engine = engine_of(database, reads_only=True)
         self._pages = Renderer(self._engine)
@@ -161,8 +158,6 @@ class Server:
             return _text(401, "the page needs its password; any user name will do", answer)
         if request.method not in ("GET", "HEAD"):
             return _text(405, "only GET is known here", ("Allow", "GET, HEAD"))
-        if request.path == "/metrics" and self._counts is not None:
-            return Response(200, await self._metrics(), metrics.CONTENT_TYPE)
         try:
             found = await self._pages.get(request.path)
         except sa.exc.SQLAlchemyError as error:
@@ -181,17 +176,6 @@ class Server:
         except ValueError:
             return False
         return scheme.lower() == "basic" and secrets.compare_digest(password, (self._password or "").encode())
-
-    async def _metrics(self) -> bytes:
-        counts = self._counts or metrics.Metrics()
-        try:
-            return counts.text(await asyncio.to_thread(self._heard))
-        except sa.exc.SQLAlchemyError:
-            return counts.text(None)
-
-    def _heard(self) -> int:
-        with self._engine.begin() as connection:
-            return metrics.heard(connection, datetime.datetime.now(tz=datetime.UTC))
 
 
 def _text(status: int, words: str, *headers: tuple[str, str]) -> Response:

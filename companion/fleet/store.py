@@ -59,8 +59,6 @@ class Outcome(NamedTuple):
     confirmed: dict[tuple[str, str], list[int]]
     wanted: dict[tuple[str, str], list[list[int]]]
     rejected: list[tuple[Message, str]]
-    new: int = 0
-    """Items that were not there yet."""
 
 
 class Store:
@@ -163,7 +161,6 @@ class Store:
                 found.confirmed.setdefault(key, []).extend(sequences)
             found.wanted.update(one.wanted)
             found.rejected.extend(one.rejected)
-            found = found._replace(new=found.new + one.new)
         return found
 
     def _take(self, messages: Sequence[Message], now: datetime.datetime) -> Outcome:
@@ -191,13 +188,13 @@ class Store:
             for table, of in made.items():
                 rows.setdefault(table, []).extend(of)
         with self._engine.begin() as connection:
-            new = self._put(connection, schema.items, told)
+            self._put(connection, schema.items, told)
             self._put_made(connection, rows)
             self._hear(connection, hellos.values(), heard, now)
             self._keep_aside(connection, outcome.rejected, now)
             if hellos:
                 outcome.wanted.update(_lacking(connection, {aircraft for aircraft, _ in hellos}))
-        return outcome._replace(new=new)
+        return outcome
 
     def _put_made(self, connection: sa.Connection, made: Rows) -> None:
         """What was made of items; an aircraft of which there is something new to be judged by is noted."""
@@ -220,18 +217,14 @@ class Store:
             news = {"news": table.c.news + 1}
             connection.execute(insert.on_conflict_do_update(index_elements=["aircraft"], set_=news), values)
 
-    def _put(self, connection: sa.Connection, table: sa.Table, rows: list[Row]) -> int:
-        """Rows that are not there yet, in the order of their keys: so two collectors never wait for one another.
-
-        Returns how many they were.
-        """
+    def _put(self, connection: sa.Connection, table: sa.Table, rows: list[Row]) -> None:
+        """Insert rows that are not there yet, in the order of their keys, so that no two collectors deadlock."""
         if not rows:
-            return 0
+            return
         keys = [column.name for column in table.primary_key]
         rows.sort(key=lambda row: [row[key] for key in keys])
         insert, values = self._insert_many(table, rows)
-        counted = {"preserve_rowcount": True}
-        return connection.execute(insert.on_conflict_do_nothing(), values, execution_options=counted).rowcount
+        connection.execute(insert.on_conflict_do_nothing(), values)
 
     def _insert_many(self, table: sa.Table, rows: list[Row]) -> tuple[Any, Any]:
         """A statement for all of them, and its values. PostgreSQL takes them at once, as JSON: a third of the time."""

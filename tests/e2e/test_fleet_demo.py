@@ -9,6 +9,7 @@ import json
 import os
 import re
 import signal
+import sqlite3
 import sys
 from pathlib import Path
 
@@ -193,5 +194,17 @@ def test_who_may_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             assert (await get(port, "/", host, basic(PASSWORD)))[0] == 200
             for wrong in (basic(PASSWORD + "x"), basic(""), "Authorization: Basic ~", "Authorization: Bearer x"):
                 assert (await get(port, "/", host, wrong))[0] == 401
+
+    asyncio.run(main())
+
+
+def test_a_database_that_cannot_be_read_is_said_and_asked_again(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with served(tmp_path, Aircraft(1)) as port:
+            with contextlib.closing(sqlite3.connect(tmp_path / "fleet.sqlite")) as connection:
+                connection.execute("DROP TABLE aircraft")
+            status, answer = await get(port)
+            assert status == 503
+            assert "Refresh: 2\r\n" in answer  # a phone that looked too soon is not left with it
 
     asyncio.run(main())

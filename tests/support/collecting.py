@@ -20,7 +20,6 @@ from companion.fleet import schema
 from companion.fleet.certificate import Certificate
 from companion.fleet.collector import stop
 from companion.fleet.database import engine_of
-from companion.fleet.metrics import Metrics
 from companion.fleet.server import Server
 from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
@@ -142,7 +141,7 @@ async def served(
         store.take([Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()])
         store.take([Message(f"fleet/{one.id}/hello", one.hello)])
     store.close()
-    serving = asyncio.create_task(Server(f"127.0.0.1:{port}", database, password, certificate, Metrics()).run())
+    serving = asyncio.create_task(Server(f"127.0.0.1:{port}", database, password, certificate).run())
     try:
         async with asyncio.timeout(30.0):
             while True:

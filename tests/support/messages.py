@@ -54,7 +54,6 @@ ELSEWHERE = {
     "companion/fleet/contract.py": "reasons in the table of what was rejected, with what was found and what is allowed",
     "companion/fleet/demo.py": "what simulated aircraft tell, and words to their broker",
     "companion/fleet/imu_pages.py": "labels of pages: docs/fleet.md",
-    "companion/fleet/metrics.py": "what Prometheus reads: docs/fleet.md",
     "companion/fleet/judgement.py": "what is said against sensors: docs/fleet.md",
     "companion/fleet/judging.py": "likewise",
     "companion/fleet/page.py": "labels of pages: docs/fleet.md",
