@@ -17,7 +17,7 @@ import sqlalchemy as sa
 
 from companion.fleet import schema
 from companion.fleet.database import engine_of
-from companion.fleet.priors import models
+from companion.fleet.imu_pages import models
 from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
 from tests.support.broker import broker, free_port

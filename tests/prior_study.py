@@ -20,7 +20,6 @@ from companion.calibration.noise.allan import AllanModel
 from companion.calibration.records.history import Measured, Point, PowerUp
 from companion.calibration.records.record import Pose, PoseSigma, Site
 from companion.calibration.solution.joint import Weighed, weigh
-from companion.calibration.solution.model_prior import TriadPrior
 from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, PoseEffect, expect, pose_effect
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.samples import TRIADS
@@ -68,17 +67,6 @@ class Case:
     earlier_zero_deg: float | None = None
     """Of another one with which all earlier calibrations were made; None: it was today's."""
 
-    usual: float | None = None
-    """Scatter that a fleet says of the model, in the truth's unit; None: no fleet says anything."""
-    usual_sigma: float = 0.2
-    """Of that, as a share: so different the parts are said to be."""
-    usual_per_k: tuple[float, float] | None = None
-    """Mean slope and spread that it says."""
-    slope_mean: float = 0.0
-    """Of the model's parts; one part's differs by `slope_per_k`."""
-    parts_differ: float = 0.0
-    """The true scatter of a part is e to the power of this times a normal number times `scatter`."""
-
     flown: float | None = None
     """If each earlier power-up's flight counted as one more: sigma of what its log says of the bias, an axis."""
     shaken: float = 0.0
@@ -87,15 +75,6 @@ class Case:
     @property
     def unit(self) -> float:
         return DEG_H if self.triad == "gyro" else MG
-
-    @property
-    def known(self) -> TriadPrior | None:
-        """What is said of the model."""
-        if self.usual is None:
-            return None
-        figures = (self.usual, self.usual_sigma * self.usual, *(self.usual_per_k or ()))
-        scatter, sigma, *slope = (axes(np.full(3, each * self.unit)) for each in figures)
-        return TriadPrior(scatter, sigma, *(slope or (None, None)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,8 +95,6 @@ class Outcome:
     """Of 2 sigma of that."""
     foretold_sigma: float = np.nan
     """What it claims, root mean square."""
-    foretold: float = 1.0
-    """Share of the trials in which something was expected."""
 
     @property
     def ratio(self) -> float:
@@ -186,8 +163,7 @@ def one_trial(
     found, expected, truths = [], [], []
     for k in range(case.imus):
         mean = random.normal(0.0, 300.0, 3) if case.triad == "gyro" else random.normal(0.0, 10.0, 3)
-        slope = random.normal(case.slope_mean, case.slope_per_k, 3)
-        scatter = case.scatter * np.exp(random.normal(0.0, case.parts_differ)) if case.parts_differ else case.scatter
+        slope = random.normal(0.0, case.slope_per_k, 3)
         shaken = random.normal(0.0, case.shaken, 3) if case.shaken else np.zeros(3)
 
         def measured(truth: Array, of_zero: Array) -> Array:
@@ -198,7 +174,7 @@ def one_trial(
         points = []
         for r in range(case.power_ups):
             mean = mean + random.normal(0.0, case.ageing, 3)
-            bias = mean + random.normal(0.0, scatter, 3) + slope * (temperatures[r] - 25.0)
+            bias = mean + random.normal(0.0, case.scatter, 3) + slope * (temperatures[r] - 25.0)
             one = Measured(
                 bias=axes(measured(bias, earlier) * unit),
                 sigma_stat=axes(stat[:3]),
@@ -226,7 +202,7 @@ def one_trial(
                 host = PowerUp(host=f"flight {r}", since_unix_s=None)
                 points.append(msgspec.structs.replace(points[-1], power_up=host, **{case.triad: said}))
         mean = mean + random.normal(0.0, case.ageing, 3) + random.normal(0.0, 1.0, 3) * case.jump
-        truth = mean + random.normal(0.0, scatter, 3) + slope * (today_degc - 25.0)
+        truth = mean + random.normal(0.0, case.scatter, 3) + slope * (today_degc - 25.0)
         truths.append(truth)
         reading = measured(truth, zero) * unit
         covariance = shared.covariance + np.diag(np.full(6, (claimed * unit) ** 2))
@@ -243,7 +219,7 @@ def one_trial(
         expected.append(
             ExpectedImu(
                 name=f"imu{k}",
-                earlier={triad: expect(points, triad, now, effect, STEADY, case.known) for triad in TRIADS},
+                earlier={triad: expect(points, triad, now, effect, STEADY) for triad in TRIADS},
                 effect=effect,
             )
         )
@@ -290,7 +266,6 @@ def study(case: Case, trials: int, seed: int = 1) -> Outcome:
         foretold_rms=float(np.sqrt(np.mean(np.square(foretold)))),
         foretold_coverage=float(np.mean(np.abs(foretold) <= 2.0 * said_by)),
         foretold_sigma=float(np.sqrt(np.mean(np.square(said_by)))),
-        foretold=float(told.mean()),
     )
 
 
@@ -351,65 +326,18 @@ CASES = (
     ),
 )
 
-MODEL: dict[str, Any] = {"scatter": 30.0, "parts_differ": 0.15}
-TOLD: dict[str, dict[str, Any]] = {
-    "nothing": {},
-    "30": {"usual": 30.0},
-    "10, surely": {"usual": 10.0, "usual_sigma": 0.01},
-    "3": {"usual": 3.0},
-    "90": {"usual": 90.0},
-}
-WARM: dict[str, Any] = {"temperatures": (10.0, 35.0), "today_degc": None}
-SLOPES: dict[str, dict[str, Any]] = {
-    "nothing": {},
-    "10 +- 6 a kelvin": {"usual": 30.0, "usual_per_k": (10.0, 6.0)},
-    "-50 +- 0.01 a kelvin": {"usual": 30.0, "usual_per_k": (-50.0, 0.01)},
-}
-COLD: dict[str, Any] = MODEL | {
-    "slope_mean": 10.0,
-    "slope_per_k": 6.0,
-    "temperatures": (20.0, 21.0),
-    "today_degc": 35.0,
-}
-"""Never seen at today's temperature."""
-FLEET = (
-    *(
-        Case(name=f"{name}, {n} power-ups, told {told}", power_ups=n, **part, **MODEL, **what)
-        for name, part in (("noisy gyro", OLD), ("good gyro", GOOD))
-        for n in (2, 3, 4)
-        for told, what in TOLD.items()
-    ),
-    *(
-        Case(name=f"another good gyro, {n} power-ups, told {told}", power_ups=n, jump=300.0, **GOOD, **MODEL, **what)
-        for n in (2, 3)
-        for told, what in list(TOLD.items())[:2]
-    ),
-    *(
-        Case(name=f"good gyro, 3 power-ups at 20 degC, {told}", power_ups=3, **GOOD, **COLD, **what)
-        for told, what in SLOPES.items()
-    ),
-    *(
-        Case(name=f"noisy gyro, 3 power-ups, 10 to 35 degC, {told}", power_ups=3, **OLD, **(COLD | WARM), **what)
-        for told, what in SLOPES.items()
-    ),
-)
-"""What a fleet tells of the gyro's model, true and untrue; its parts scatter by 30."""
-
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.prior_study", description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument(
-        "--fleet", action="store_true", help="the first power-ups, with what a fleet tells of the model"
-    )
     given = parser.parse_args()
     print(
         f"{'':56} {'without':>8} {'with':>8} {'ratio':>6} {'2 sigma':>8} {'used':>6} {'doubted':>8}"
         f" {'foretold':>8} {'sigma':>8} {'2 sigma':>8}"
     )
-    for case in FLEET if given.fleet else CASES:
+    for case in CASES:
         found = study(case, given.trials, given.seed)
         print(
             f"{case.name:56} {found.rms_without:8.2f} {found.rms_with:8.2f} {found.ratio:6.3f}"

@@ -50,8 +50,6 @@ def _complaints(config: Config) -> Iterator[str]:
         yield from broker_complaints(config.mqtt)
     elif config.fleet is not None:
         yield "'mqtt' is missing; allowed: a table with the broker's host (needed by [fleet])"
-    if config.calibration.fleet_prior and config.fleet is None:
-        yield "'fleet' is missing; allowed: a table, which may be empty (needed by calibration.fleet_prior)"
     if (config.vehicle.latitude_deg is None) != (config.vehicle.longitude_deg is None):
         yield "'vehicle': found only one of latitude_deg and longitude_deg; allowed: both or neither"
     room_mb = config.storage.recordings_mb

@@ -207,8 +207,6 @@ class Calibration(Section, frozen=True):
     """How far the temperature may be from the one at which it was seen to be right (the same)."""
     prior: bool = True
     """Whether earlier calibrations guard new ones, and weigh in where that betters them (docs/calibration.md)."""
-    fleet_prior: bool = False
-    """Whether what a fleet tells of an IMU's model counts as some power-ups more, unless its own contradict it."""
     any_bias: bool = False
     """Whether to take biases beyond what any part has, and readings along other axes than the tilt says."""
 

@@ -16,7 +16,9 @@ from msgspec import Meta
 from companion.config.sections import Config
 from companion.errors import ConfigError
 
-KEYS: Final[dict[str, str]] = {}
+KEYS: Final[dict[str, str]] = {
+    "calibration.fleet_prior": "0.2: delete the line (calibration.prior, of the aircraft's own power-ups, stays)",
+}
 """Removed configuration keys without list indexes ("imu.port"), each with its version and its remedy."""
 
 COMMAND_LINE: Final[dict[str, str]] = {

@@ -29,7 +29,6 @@ _WRITES: Final = (
 _READS: Final = (
     "fleet/{id}/confirmed",
     "fleet/{id}/wanted",
-    "fleet/priors/+",
     "companion/{user}/status",
     "companion/{user}/request/+",
 )
@@ -51,11 +50,7 @@ def access_list(broker: Broker, aircraft: Sequence[str]) -> list[str]:
     """
     name, words = _BROKERS[broker]
     found = [_aircraft(user, which) for user, which in _pairs(aircraft)] or [_aircraft(None, name)]
-    collector = Right(
-        COLLECTOR,
-        ("fleet/+/confirmed", "fleet/+/wanted", "fleet/priors/+"),
-        ("fleet/+/hello", "fleet/+/item", "fleet/priors/+"),
-    )
+    collector = Right(COLLECTOR, ("fleet/+/confirmed", "fleet/+/wanted"), ("fleet/+/hello", "fleet/+/item"))
     return words([collector, *found])
 
 

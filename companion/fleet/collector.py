@@ -49,8 +49,6 @@ JUDGE_S: Final = 2.0
 """Between two looks for aircraft that are to be judged."""
 REST: Final = 4.0
 """Times as long as a judgement took it rests after it: what comes in goes first."""
-PRIORS_AFTER_S: Final = 30.0
-PRIORS_EVERY_S: Final = 3600.0
 ANSWER_S: Final = 10.0
 STOP_AGAIN_S: Final = 0.5
 FIRST_WAIT_S: Final = 0.5
@@ -200,7 +198,6 @@ class Collector:
             asyncio.create_task(self._collect(client, items, 1), name="fleet writer"),
             asyncio.create_task(self._collect(client, hellos, ASK_AFTER), name="fleet asker"),
             asyncio.create_task(self._subscribe(client), name="fleet subscriptions"),
-            asyncio.create_task(self._tell_of_models(client), name="fleet priors"),
             asyncio.create_task(self._judge(), name="fleet judgement"),
         ]
         try:
@@ -210,19 +207,6 @@ class Collector:
         for end in ended:
             if isinstance(end, Exception):
                 raise end
-
-    async def _tell_of_models(self, client: aiomqtt.Client) -> None:
-        """What new aircraft may know of their IMUs' models, retained; another collector says the same."""
-        told: dict[str, bytes] = {}
-        await asyncio.sleep(PRIORS_AFTER_S)
-        while True:
-            found = await asyncio.to_thread(self.store.model_priors)
-            for topic in {**told, **found}:
-                payload = found.get(topic, b"")  # nothing withdraws it
-                if told.get(topic) != payload:
-                    await client.publish(topic, payload, qos=1, retain=True)
-                    told[topic] = payload
-            await asyncio.sleep(PRIORS_EVERY_S)
 
     async def _subscribe(self, client: aiomqtt.Client) -> None:
         alone = self._protocol == _MQTT_3_1_1

@@ -14,10 +14,9 @@ import numpy as np
 import sqlalchemy as sa
 
 from companion.calibration.solution.by_temperature import ByTemperature, Expected, ExpectedForces, Seen
-from companion.calibration.solution.model_prior import TriadPrior
-from companion.fleet.models import Scatter
-from companion.fleet.priors import Part, model_prior, models, parts_of
-from companion.fleet.schema import Moment, aircraft
+from companion.fleet.judging import Part, parts_of
+from companion.fleet.models import Scatter, Typical, typical_part
+from companion.fleet.schema import Moment, aircraft, parts
 from companion.report import svg
 from companion.report.by_temperature import biases_by_temperature
 from companion.report.markup import Child, Markup, join, row, tag
@@ -33,8 +32,15 @@ _LEAST_HEIGHT: Final = 36.0
 _MOST_HEIGHT: Final = 180.0
 
 
+def models(connection: sa.Connection) -> dict[str, int]:
+    """Count the parts of each model."""
+    one = sa.and_(parts.c.model.is_not(None), parts.c.triad == "gyro", parts.c.axis == "x")
+    query = sa.select(parts.c.model, sa.func.count()).where(one).group_by(parts.c.model).order_by(parts.c.model)
+    return {row[0]: row[1] for row in connection.execute(query)}
+
+
 def model_links(connection: sa.Connection) -> Markup | None:
-    """To the page of each model."""
+    """Link to the page of each model."""
     links = [
         join(tag("a", model, href=f"/model/{model}"), f" ({count} parts) ")
         for model, count in models(connection).items()
@@ -43,17 +49,17 @@ def model_links(connection: sa.Connection) -> Markup | None:
 
 
 def model_page(connection: sa.Connection, model: str, now: datetime.datetime, source: str) -> str | None:
-    """All parts of one model; None: there are none."""
+    """Show all parts of one model; None: there are none."""
     of_model = parts_of(connection, model)
     if not of_model:
         return None
     of_parts = aircraft.c.aircraft.in_({one for one, _ in of_model})
     query = sa.select(aircraft.c.aircraft, aircraft.c.name).where(of_parts)
     names = {row.aircraft: row.name for row in connection.execute(query)}
-    prior = model_prior(model, list(of_model.values()))
+    typical = typical_part(list(of_model.values()))
     all_parts = models(connection).get(model, 0)
     power_ups = sum(part.power_ups for part in of_model.values())
-    parts: list[Child] = [
+    shown: list[Child] = [
         tag("p", tag("a", "Fleet", href="/")),
         tag("h1", f"IMU model {model}"),
         tag("p", f"{len(of_model)} parts, {power_ups} power-ups", class_="lead"),
@@ -61,16 +67,15 @@ def model_page(connection: sa.Connection, model: str, now: datetime.datetime, so
         tag("p", "How far the biases of each part scatter from one power-up to the next, at one temperature."),
     ]
     for triad in TRIADS:
-        known = None if prior is None else prior.of(triad)
-        parts += _distribution(of_model, triad, known)
-        parts += _outside(of_model, triad, known, names)
-    if prior is None:
-        parts.append(tag("p", "New aircraft are told nothing of this model yet: too few parts tell how they scatter."))
-    return page(f"IMU model {model}", now, *parts, source=source)
+        shown += _distribution(of_model, triad, typical)
+        shown += _outside(of_model, triad, typical, names)
+    if typical is None:
+        shown.append(tag("p", "Too few parts with a known scatter to say which one is typical."))
+    return page(f"IMU model {model}", now, *shown, source=source)
 
 
-def _distribution(of_model: Mapping[Part, Scatter], triad: Triad, known: TriadPrior | None) -> list[Child]:
-    """A dot for each part, above the others that scatter as much, and what new aircraft are told."""
+def _distribution(of_model: Mapping[Part, Scatter], triad: Triad, typical: Typical | None) -> list[Child]:
+    """Draw a dot for each part, above the others that scatter as much, and the typical part."""
     unit, unit_name = UNITS[triad]
     columns = {axis: _scatters(of_model, triad, axis) for axis in range(3)}
     every = [value / unit for of_axis in columns.values() for value in of_axis.values()]
@@ -89,20 +94,24 @@ def _distribution(of_model: Mapping[Part, Scatter], triad: Triad, known: TriadPr
             told=f"{len(points)} parts",
             height=min(max(_DOT * (most + 1.0), _LEAST_HEIGHT), _MOST_HEIGHT),
             x_label=f"turn-on scatter, {unit_name}" if axis == 2 else "",
-            y_label=f"{AXES[axis]}, {unit_name}{_in_words(known, axis, unit)}",
+            y_label=f"{AXES[axis]}, {unit_name}{_in_words(typical, triad, axis)}",
             left=16.0,
         )
         plot.points(points, CLASSES[axis], [(place, place) for _, place in points])
-        if known is not None:
-            plot.upright(known.scatter[axis] / unit, "now")
+        if typical is not None and np.isfinite(usual := typical.turn_on[_column(triad, axis)]):
+            plot.upright(float(usual) / unit, "now")
         plots.append(plot.svg())
-    words = "A dot is a part. " + ("Dashes: the typical one." if known is not None else "")
-    return [tag("h2", NAMES[triad]), tag("figure", *plots, tag("figcaption", words)), _slopes(known, triad)]
+    words = "A dot is a part. " + ("Dashes: the typical one." if typical is not None else "")
+    return [tag("h2", NAMES[triad]), tag("figure", *plots, tag("figcaption", words)), _slopes(typical, triad)]
+
+
+def _column(triad: Triad, axis: int) -> int:
+    """Give the column of an axis in the figures of a part."""
+    return 3 * TRIADS.index(triad) + axis
 
 
 def _scatters(of_model: Mapping[Part, Scatter], triad: Triad, axis: int) -> dict[Part, float]:
-    k = 3 * TRIADS.index(triad) + axis
-    found = {key: float(part.turn_on[k]) for key, part in of_model.items()}
+    found = {key: float(part.turn_on[_column(triad, axis)]) for key, part in of_model.items()}
     return {key: value for key, value in found.items() if np.isfinite(value)}
 
 
@@ -117,36 +126,40 @@ def _stacked(values: Sequence[float], across: svg.Axis) -> list[svg.Pair]:
     return points
 
 
-def _in_words(known: TriadPrior | None, axis: int, unit: float) -> str:
-    if known is None:
+def _in_words(typical: Typical | None, triad: Triad, axis: int) -> str:
+    if typical is None:
         return ""
-    scatter, differ = known.scatter[axis] / unit, known.scatter_sigma[axis] / unit
-    return f": typically {scatter:.3g}, parts differ by {differ:.2g}"
+    scatter, spread = (
+        each[_column(triad, axis)] / UNITS[triad][0] for each in (typical.turn_on, typical.turn_on_spread)
+    )
+    return f": typically {scatter:.3g}, parts differ by {spread:.2g}" if np.isfinite(scatter) else ""
 
 
-def _slopes(known: TriadPrior | None, triad: Triad) -> Markup | None:
-    if known is None or known.per_k is None or known.per_k_spread is None:
-        return None
+def _slopes(typical: Typical | None, triad: Triad) -> Markup | None:
     unit, unit_name = UNITS[triad]
+    at = slice(_column(triad, 0), _column(triad, 0) + 3)
+    if typical is None or not np.isfinite(typical.per_k[at]).all():
+        return None
     each = ", ".join(
         f"{axis} {mean / unit:+.2g} ± {spread / unit:.2g}"
-        for axis, mean, spread in zip(AXES, known.per_k, known.per_k_spread, strict=True)
+        for axis, mean, spread in zip(AXES, typical.per_k[at], typical.per_k_spread[at], strict=True)
     )
     return tag("p", f"By temperature, {unit_name} a kelvin, mean and how parts differ: {each}.")
 
 
 def _outside(
-    of_model: Mapping[Part, Scatter], triad: Triad, known: TriadPrior | None, names: Mapping[str, str | None]
+    of_model: Mapping[Part, Scatter], triad: Triad, typical: Typical | None, names: Mapping[str, str | None]
 ) -> list[Child]:
-    """Parts that scatter far more, or less, than the others."""
-    if known is None:
+    """List the parts that scatter far more, or less, than the others."""
+    if typical is None:
         return []
     unit, unit_name = UNITS[triad]
     found = [
-        (value / known.scatter[axis], value, axis, key)
+        (float(value / usual), value, axis, key)
         for axis in range(3)
+        for usual, spread in [(each[_column(triad, axis)] for each in (typical.turn_on, typical.turn_on_spread))]
         for key, value in _scatters(of_model, triad, axis).items()
-        if abs(value - known.scatter[axis]) > OUTSIDE * known.scatter_sigma[axis]
+        if abs(value - usual) > OUTSIDE * spread
     ]
     if not found:
         return [tag("p", "No part is far off the others (three times what they differ).", class_="soft")]

@@ -18,7 +18,6 @@ from companion.fleet import schema
 from companion.fleet.contract import Row
 from companion.fleet.judgement import Finding, History, judge, judge_compass, judge_zero
 from companion.fleet.models import Scatter, scatter_of_model, scatter_of_part
-from companion.fleet.priors import parts_of
 from companion.fleet.schema import Moment
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, MG, G
@@ -30,10 +29,16 @@ SAME_POWER_UP: Final = datetime.timedelta(minutes=30)
 MOST_DEGC: Final = 150.0
 """Beyond this a thermometer tells none: above all one whose kelvins were not turned into degrees."""
 _AGREE_SIGMAS: Final = 5.0
+MOST_PARTS: Final = 300
+"""Parts of one model that are compared."""
 _TOGETHER: Final = 10
 """Power-ups within which accelerometers that moved have moved together."""
 REPLACE: Final = {"scatter": 3.0, "noise": 2.0, "drift": 8.0, "bias": 8.0}
 """From such sizes on."""
+
+
+Part = tuple[str, str]
+"""Aircraft and name of the IMU there."""
 
 
 class Judged(NamedTuple):
@@ -89,6 +94,18 @@ def judged(connection: sa.Connection, aircraft: str) -> Judged:
     found += [(None, [row.zero_at for row in zeros], each) for each in judge_zero(np.array(offsets), np.array(sigmas))]
     worst = sorted(found, key=lambda one: -one[2].size)
     return Judged(parts, [_row(aircraft, place, *each) for place, each in enumerate(worst)])
+
+
+def parts_of(connection: sa.Connection, model: str, *, but: str = "") -> dict[Part, Scatter]:
+    """Read the scatter of each part of a model that is in an aircraft now, except in the aircraft `but`."""
+    query = sa.select(schema.parts).where(schema.parts.c.model == model, schema.parts.c.aircraft != but)
+    found: dict[Part, Scatter] = {}
+    for row in connection.execute(query.order_by("aircraft", "imu").limit(6 * MOST_PARTS)):
+        one = found.setdefault((row.aircraft, row.imu), Scatter(row.power_ups, 1, *np.full((3, 6), np.nan)))
+        place = "xyz".index(row.axis) + 3 * (row.triad == "accel")
+        for name in ("turn_on", "wander", "per_k"):
+            getattr(one, name)[place] = np.nan if (value := getattr(row, name)) is None else value
+    return found
 
 
 def _done(connection: sa.Connection, aircraft: str) -> dict[tuple[str, int], Any]:

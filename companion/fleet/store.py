@@ -33,7 +33,6 @@ from companion.fleet.contract import (
 )
 from companion.fleet.database import OF_THE_DATABASE, OF_THE_ITEM, engine_of, why
 from companion.fleet.judging import Judged, judged
-from companion.fleet.priors import payloads
 
 logger = logging.getLogger(__name__)
 
@@ -128,15 +127,6 @@ class Store:
         except (ArithmeticError, LookupError, ValueError):
             logger.error("fleet: %s cannot be judged; what was found before stands", aircraft, exc_info=True)
             return None
-
-    def model_priors(self) -> dict[str, bytes]:
-        """By topic, what is known of each IMU model.
-
-        Raises:
-            LinkError: the database cannot be reached, or fails.
-        """
-        with self._link_errors(), self._reads.begin() as connection:
-            return payloads(connection)
 
     def take(self, messages: Sequence[Message]) -> Outcome:
         """Put a batch into the database; what is not taken is kept aside there with its reason.

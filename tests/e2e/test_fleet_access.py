@@ -30,7 +30,7 @@ def may_say(user: str, which: str) -> set[str]:
 
 def may_hear(user: str, which: str) -> set[str]:
     """What an aircraft hears."""
-    of_it = {f"fleet/{which}/confirmed", f"fleet/{which}/wanted", "fleet/priors/icm42688p"}
+    of_it = {f"fleet/{which}/confirmed", f"fleet/{which}/wanted"}
     return of_it | {f"companion/{user}/{what}" for what in ("status", "request/calibrate", "request/undo")}
 
 
@@ -40,10 +40,7 @@ def said_and_heard(users: tuple[str, str]) -> tuple[dict[str, set[str]], dict[st
     says = {user: may_say(user, which) for user, which in each}
     hears = {user: may_hear(user, which) for user, which in each}
     says["collector"] = {f"fleet/{which}/{what}" for _, which in each for what in ("confirmed", "wanted")}
-    says["collector"].add("fleet/priors/icm42688p")
-    hears["collector"] = {f"fleet/{which}/{what}" for _, which in each for what in ("hello", "item")} | {
-        "fleet/priors/icm42688p"
-    }
+    hears["collector"] = {f"fleet/{which}/{what}" for _, which in each for what in ("hello", "item")}
     return says, hears
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from companion.autopilot.firmware.firmwares import model_of
 from companion.fleet.models import LEAST_PARTS, Scatter, scatter_of_model, scatter_of_part
 from companion.physics.frames import Floats
 
@@ -59,3 +60,13 @@ def test_gaps_and_unknown_temperatures_are_left_out() -> None:
     assert scatter_of_part(biases, degc).turn_on == pytest.approx(TRUE, rel=0.2)
     unknown = scatter_of_part(biases, np.full(300, np.nan)).turn_on
     assert unknown == pytest.approx(TRUE * np.hypot(1.0, 0.3 * 40.0 / np.sqrt(12.0)), rel=0.25)
+
+
+def test_a_model_is_known_by_firmware_and_types() -> None:
+    ids = (0x34 << 16 | 0x1234, 0x34 << 16 | 0x4321)
+    assert model_of("ardupilot", *ids) == "icm42688p"
+    assert model_of("px4", 0x26 << 16 | 1, 0x26 << 16 | 2) == "icm42688p"
+    assert model_of("px4", *ids) == "px4-0x34-0x34"
+    assert model_of(None, *ids) is None
+    assert model_of("ardupilot", None, 1) is None
+    assert model_of("px4", 0, 1) is None

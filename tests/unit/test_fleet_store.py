@@ -377,10 +377,10 @@ def test_what_the_database_refuses_in_any_form_is_confirmed_all_the_same(
     one = aircraft(2)
     real = Store._put
 
-    def spoilt(self: Store, connection: sa.Connection, table: sa.Table, rows: list[dict[str, object]]) -> int:
+    def spoilt(self: Store, connection: sa.Connection, table: sa.Table, rows: list[dict[str, object]]) -> None:
         for row in rows:
             row |= {"received_at": None} if (table.name, row["sequence"]) == ("items", 2) else {}
-        return real(self, connection, table, rows)
+        real(self, connection, table, rows)
 
     monkeypatch.setattr(Store, "_put", spoilt)
     outcome = store.take(items_of(one))

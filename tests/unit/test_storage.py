@@ -14,7 +14,7 @@ import msgspec
 import pytest
 
 from companion.calibration.collector.trace import Trace
-from companion.calibration.records.record import ImuRecord, Record, WrittenParameter, to_json
+from companion.calibration.records.record import GyroPrior, ImuRecord, Prior, Record, WrittenParameter, to_json
 from companion.errors import StorageError
 from companion.storage import records as records_module
 from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
@@ -138,6 +138,27 @@ def test_a_record_of_a_newer_companion_is_refused_in_one_line(tmp_path: Path) ->
     found = next(store.entries())
     assert found.record is None
     assert found.problem.endswith("found format 2; allowed: up to 1 (a newer companion has saved it)")
+
+
+def test_a_record_with_keys_that_were_removed_since_is_read(tmp_path: Path) -> None:
+    """`by_model` stood in `prior` where a fleet's statistics had taken part."""
+    gyro = GyroPrior(
+        used=True,
+        power_ups=5,
+        temperature_model=False,
+        expected_rad_s=(1e-4, 0.0, 0.0),
+        sigma_rad_s=(1e-5, 1e-5, 1e-5),
+        measured_rad_s=(1e-4, 0.0, 0.0),
+        shift_sigma=(0.0, 0.0, 0.0),
+    )
+    record = _record("of before")
+    imu = msgspec.structs.replace(record.imus[0], prior=Prior(gyro=gyro, accel=None))
+    record = msgspec.structs.replace(record, imus=(imu,))
+    store = RecordStore(tmp_path)
+    before = to_json(record).replace(b'"shift_sigma"', b'"by_model":true,"shift_sigma"')
+    assert b'"by_model"' in before
+    store.save(record).write_bytes(before)
+    assert store.history() == [record]
 
 
 def test_a_record_that_was_changed_is_passed_over_and_one_from_before_there_were_checksums_is_not(

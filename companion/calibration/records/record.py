@@ -145,8 +145,6 @@ class GyroPrior(msgspec.Struct, frozen=True, kw_only=True):
     """Today's whole bias by the readings alone."""
     shift_sigma: Vector
     """Measured less expected, in sigmas of that difference."""
-    by_model: bool = False
-    """What a fleet knows of its model was part of it."""
 
 
 class AccelPrior(msgspec.Struct, frozen=True, kw_only=True):
@@ -159,7 +157,6 @@ class AccelPrior(msgspec.Struct, frozen=True, kw_only=True):
     sigma_m_s2: Vector
     measured_m_s2: Vector
     shift_sigma: Vector
-    by_model: bool = False
 
 
 class Prior(msgspec.Struct, frozen=True, kw_only=True):

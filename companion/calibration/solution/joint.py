@@ -357,7 +357,6 @@ def _prior(known: Sequence[_Known], used: Sequence[_Known]) -> Prior | None:
             f"sigma_{unit}": vector(np.sqrt(np.array(expected.variance))),
             f"measured_{unit}": vector(one.measured),
             "shift_sigma": vector(witness.difference / witness.sigma),
-            "by_model": expected.by_model,
         }
         by_temperature = expected.by_temperature
         found[one.triad] = kind(

@@ -4,10 +4,8 @@ Run to run a MEMS bias scatters (an ADIS16405 by 70 deg/h and 2 mg, method 1.3).
 the mean of the earlier power-ups, or their curve over temperature (`temperature.curve`), and its sigma is that of *one
 more* power-up: the scatter, widened as Student's for few points, and the error of the mean.
 
-From three power-ups on that guards (`joint`), from five on it may take part in the estimate; from one and two fewer
-where it is known how the other parts of its model scatter (`model_prior`) and these do not contradict that. Within one
-power-up the bias is the one it started with, moved by temperature and drift: that guards best of all, and takes no
-part.
+From three power-ups on that guards (`joint`), from five on it may take part in the estimate. Within one power-up the
+bias is the one it started with, moved by temperature and drift: that guards best of all, and takes no part.
 
 An accelerometer's bias moves with the attitude at which it is measured: f = (I + S) (I - [m x]) g u + b
 (`align_model`), so that in one pose u, scale, shear and misalignment times 1 g look like a bias. What a calibration
@@ -21,7 +19,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import msgspec
 import numpy as np
@@ -33,13 +31,10 @@ from companion.calibration.records.align_record import Determined, ImuAlignmentR
 from companion.calibration.records.history import Measured, Point, PowerUp, believed
 from companion.calibration.records.record import Effective
 from companion.calibration.temperature.along import WARM_AFTER, Along, Settling, along
-from companion.calibration.temperature.curve import REFERENCE_DEGC, Curve, Node, PowerUpNodes, fit
+from companion.calibration.temperature.curve import Curve, Node, PowerUpNodes, fit
 from companion.physics.frames import Array, Floats, Matrix, skew, symmetric, vector
 from companion.physics.units import DEG, DEG_H, MG, G
 from companion.samples import Triad, Vector
-
-if TYPE_CHECKING:
-    from companion.calibration.solution.model_prior import TriadPrior
 
 LEVEL: Final = np.array([0.0, 0.0, -1.0])
 WORTH_SAYING_M_S2: Final = 1.0 * MG
@@ -121,13 +116,6 @@ def _known(found: Determined | None, unit: float, assumed: float) -> tuple[Array
 GUARDS_FROM: Final = 3
 """Power-ups."""
 WEIGHS_FROM: Final = 5
-FEWER: Final = (1, 2)
-"""Of these two, where it is known what is usual of the model."""
-ALONE_FROM: Final = 10
-"""Power-ups of its own, from which on an IMU needs no others."""
-CONTRADICTS: Final = 2.0
-"""Sigmas; the power-ups of one in twenty aircraft do so by chance, and do without."""
-_TESTED_K: Final = 5.0
 GATE_SIGMAS: Final = 4.0
 TEMPERATURE_SIGMA_K: Final = 10.0
 """Between two calibrations of one power-up, where no temperature is told."""
@@ -160,15 +148,6 @@ class Expected(msgspec.Struct, frozen=True, kw_only=True):
     """The share of it that was measured with today's zero of the gradienter, whose error is in both."""
     other_zero_rad: float = 0.0
     """One sigma of the error of the other zeros in it."""
-    of_model: float | None = None
-    """By how many sigmas its power-ups scatter more than is usual of its model; None: nothing was known of that."""
-    by_model: bool = False
-    """What is known of its model has taken part."""
-
-    def is_surer(self, other: Expected) -> bool:
-        """Whether it is worth more: in the estimate, or as a guard where the other one is no more than that."""
-        share = 1.0 if other.weighs else (other.limit / self.limit) ** 2
-        return sum(self.variance) < share * sum(other.variance)
 
 
 class ExpectedImu(msgspec.Struct, frozen=True, kw_only=True):
@@ -218,58 +197,26 @@ def student_limit(freedom: float) -> float:
     return x + first / n + second / n**2 + third / n**3
 
 
-def expect(
-    points: Sequence[Point],
-    triad: Triad,
-    now: Now,
-    effect: PoseEffect,
-    model: AllanModel,
-    known: TriadPrior | None = None,
-) -> Expected | None:
-    """What the earlier power-ups say of today; None where they are too few. `known`: of the IMU's model."""
+def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, model: AllanModel) -> Expected | None:
+    """Predict today's bias from the earlier power-ups; None: they are too few."""
     groups = [
         group for group in believed(points, triad) if not any(point.power_up.is_same(now.power_up) for point in group)
     ]
-    alone = _expect(groups, triad, now, effect, model) if len(groups) >= GUARDS_FROM else None
-    if known is None or len(groups) < GUARDS_FROM - FEWER[0]:
-        return alone
-    if alone is not None and len(groups) >= ALONE_FROM:
-        return msgspec.structs.replace(alone, of_model=0.0)
-    found = _expect(groups, triad, now, effect, model, known)
-    # What makes nothing surer, such as a slope that the readings have to make good, is not taken.
-    if found.by_model and (alone is None or found.is_surer(alone)):
-        return found
-    return None if alone is None else msgspec.structs.replace(alone, of_model=found.of_model)
-
-
-def _expect(
-    groups: Sequence[Sequence[Point]],
-    triad: Triad,
-    now: Now,
-    effect: PoseEffect,
-    model: AllanModel,
-    known: TriadPrior | None = None,
-) -> Expected:
+    if len(groups) < GUARDS_FROM:
+        return None
     # Where a temperature is missing they all count as measured at one.
     told = now.temperature_degc is not None and _told(groups)
-    slope, per_k = np.zeros(3), CATALOGUE_PER_K[triad]
-    if known is not None and told:
-        degcs = [point.temperature_degc or 0.0 for group in groups for point in group]
-        slope, per_k = known.line(per_k, tested=max(degcs) - min(degcs) >= _TESTED_K)
     seen = [[_of(point, triad) for point in group] for group in groups]
     here = [_here(group, found, triad, now, effect) for group, found in zip(groups, seen, strict=True)]
     zeros = [group[-1].zero_sigma_rad * now.gravity_m_s2 if triad == "accel" else 0.0 for group in groups]
     nodes = [
         PowerUpNodes(
-            [
-                _node(point, bias - slope * _warmer(point.temperature_degc), _white(one), told=told)
-                for point, one, bias in zip(group, found, biases, strict=True)
-            ],
+            [_node(point, bias, _white(one), told=told) for point, one, bias in zip(group, found, biases, strict=True)],
             common_variance=float(np.square(pose).mean()) + zero**2,
         )
         for group, found, (biases, pose), zero in zip(groups, seen, here, zeros, strict=True)
     ]
-    curve = fit(nodes, _in_run(model), per_k, usual=None if known is None else known.usual)
+    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad])
     assert curve is not None
     degc = now.temperature_degc or 0.0
     value, variance = curve.at(degc, now.k_s) if told else curve.at(0.0)
@@ -278,18 +225,15 @@ def _expect(
     shared = [one.sigma_shared for found in seen for one in found]
     together = np.square(curve.shares @ pose) + np.max(np.square(shared), axis=0)
     same, other = _zeros([group[-1] for group in groups], curve.shares, now.zero) if triad == "accel" else (0.0, 0.0)
-    enough = WEIGHS_FROM - (0 if known is None else FEWER[1])
     return Expected(
-        value=vector(value + slope * _warmer(now.temperature_degc)),
+        value=vector(value),
         variance=vector(variance + together),
         limit=student_limit(curve.freedom),
         power_ups=len(groups),
-        weighs=len(groups) >= enough and (not told or curve.beyond_k(degc) == 0.0),
+        weighs=len(groups) >= WEIGHS_FROM and (not told or curve.beyond_k(degc) == 0.0),
         by_temperature=curve.order > 0,
         same_zero=same,
         other_zero_rad=other,
-        of_model=None if known is None else curve.surprise,
-        by_model=known is not None and abs(curve.surprise) <= CONTRADICTS,
     )
 
 
@@ -321,10 +265,6 @@ def follow(curve: Curve, path: Path, settles: Settling | None, model: AllanModel
     """What a curve says of a window, and of the time when it is warm."""
     wander = 0.0 if settles is None else _in_run(model, max(WARM_AFTER * settles.tau_s, _SHORTEST_GAP_S))
     return along(curve, path.states, path.span_s, path.variance, settles, wander)
-
-
-def _warmer(degc: float | None) -> float:
-    return 0.0 if degc is None else degc - REFERENCE_DEGC
 
 
 def _white(found: Measured) -> float:

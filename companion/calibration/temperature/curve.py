@@ -77,21 +77,6 @@ class PowerUpNodes:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Usual:
-    """How much other parts of the same model scatter from power-up to power-up, which counts as some more power-ups."""
-
-    variance: Array
-    """About a part's own curve, its wandering included, (3,)."""
-    power_ups: float
-    """As many as it is worth."""
-
-    @property
-    def mean(self) -> float:
-        """Over the axes."""
-        return float(self.variance.mean())
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Curve:
     """What the next power-up's bias will be.
 
@@ -110,7 +95,6 @@ class Curve:
         freedom: degrees of freedom of the scatter.
         span_degc: lowest and highest temperature seen.
         per_kelvin: one sigma of what a kelvin beyond that does.
-        surprise: by how many sigmas the power-ups scatter more than is usual of the model; 0 where that is not known.
     """
 
     order: int
@@ -126,7 +110,6 @@ class Curve:
     freedom: float
     span_degc: tuple[float, float]
     per_kelvin: float
-    surprise: float = 0.0
 
     def beyond_k(self, degc: float) -> float:
         """By how much a temperature lies beyond what is valid."""
@@ -173,18 +156,16 @@ def fit(
     per_kelvin: float,
     *,
     may_be_mean: bool = True,
-    usual: Usual | None = None,
 ) -> Curve | None:
-    """The curve of one triad of one IMU; None of fewer than three power-ups, or two where it is known what is usual.
+    """Fit the curve of one triad of one IMU; None: fewer than three power-ups.
 
     Args:
         power_ups: at least one node each, in the order in which they were measured.
         in_run_variance: by which a bias wanders within a power-up, (rad/s)^2 or (m/s^2)^2.
         per_kelvin: one sigma of how much parts move, rad/s or m/s^2 a kelvin.
         may_be_mean: where that foretells as well; it tells nothing of a change within a power-up.
-        usual: of its model; None: not known.
     """
-    if len(power_ups) < FEWEST - (usual is not None):
+    if len(power_ups) < FEWEST:
         return None
     seen = [node.degc for one in power_ups for node in one.nodes]
     span = min(seen), max(seen)
@@ -192,7 +173,7 @@ def fit(
 
     def of(order: int, lag_s: float = 0.0) -> Curve:
         sums = _Sums.of(power_ups, lag_s, in_run_variance)
-        return _Fit(sums, order, in_run_variance, per_kelvin, usual).curve(span)
+        return _Fit(sums, order, in_run_variance, per_kelvin).curve(span)
 
     mean = of(0) if may_be_mean else None
     if mean is not None and span[0] == span[1]:
@@ -251,9 +232,8 @@ class _Sums:
 class _Fit:
     """One order."""
 
-    def __init__(self, sums: _Sums, order: int, in_run_variance: float, per_kelvin: float, usual: Usual | None) -> None:
+    def __init__(self, sums: _Sums, order: int, in_run_variance: float, per_kelvin: float) -> None:
         some = slice(order)
-        self._usual = usual
         self._sums, self._order, self._in_run, self._per_kelvin = sums, order, in_run_variance, per_kelvin
         self._first, between = _with_one(sums.first[:, some]), _with_one(sums.mean[:, some])
         self._change = np.concatenate([np.zeros((len(sums.change), 1)), sums.change[:, some]], axis=1)
@@ -272,10 +252,9 @@ class _Fit:
         covariance = np.linalg.inv(self._base + normal.sum(axis=0))
         squares = np.mean(np.square(error), axis=0)
         # Three axes know the scatter better than one, but one may scatter more than the others.
-        own, worth = 3.0 * max(len(shares) - 1.0 - (self._order > 0), 1.0), self._worth
-        freedom = own + 3.0 * worth
+        freedom = 3.0 * max(len(shares) - 1.0 - (self._order > 0), 1.0)
         student = freedom / (freedom - 2.0)
-        widening = np.maximum(self._over(error, variance, scatter), 1.0) * student
+        widening = np.maximum(_over(error, variance), 1.0) * student
         said, of_changes = self._by_others(scatter, self._change)
         missed, noise = np.square(self._sums.change_bias - said), self._sums.change_variance[:, None]
         surely = float((missed - np.square(_SURELY) * (of_changes[:, None] + noise)).sum())
@@ -296,37 +275,16 @@ class _Fit:
             freedom=freedom,
             span_degc=span_degc,
             per_kelvin=self._per_kelvin,
-            surprise=self._surprise(own),
         )
 
-    @property
-    def _worth(self) -> float:
-        return 0.0 if self._usual is None else self._usual.power_ups
-
-    def _over(self, error: Floats, variance: Floats, scatter: float) -> Floats:
-        """What was seen in squares over what was said, by axis, (3,): in those left out and, as more, in the model."""
-        squares = (error * error / variance[:, None]).sum(axis=0)
-        if self._usual is not None:
-            squares = squares + self._worth * self._usual.variance / (scatter + self._in_run)
-        return np.asarray(squares / (len(error) + self._worth))
-
-    def _surprise(self, own: float) -> float:
-        """Of the quotient of two variances, as a normal deviate (Abramowitz and Stegun 26.6.15)."""
-        if self._usual is None:
-            return 0.0
-        error, variance = self._foretold(max(self._usual.mean - self._in_run, 0.0))
-        quotient = float((error * error / variance[:, None]).mean())
-        a, b, root = 2.0 / (9.0 * own), 2.0 / (27.0 * self._worth), math.cbrt(quotient)
-        return ((1.0 - b) * root - (1.0 - a)) / math.sqrt(b * root * root + a)
-
     def _scatter(self) -> float:
-        """By which the mean square of what is foretold is what was said."""
+        """Find the scatter with which the actual mean square of the prediction errors is the predicted one."""
         unit = math.log(self._per_kelvin**2)
         low, high = unit - _RANGE, unit + _RANGE
         for _ in range(_HALVINGS):
             middle = (low + high) / 2.0
             error, variance = self._foretold(math.exp(middle))
-            if float(self._over(error, variance, math.exp(middle)).mean()) > 1.0:
+            if float(_over(error, variance).mean()) > 1.0:
                 low = middle
             else:
                 high = middle
@@ -352,6 +310,11 @@ class _Fit:
         others = np.concatenate([rows[:, :, None], right.sum(axis=0) - right], axis=2)
         solved = rows[:, None, :] @ np.linalg.solve(self._base + normal.sum(axis=0) - normal, others)
         return solved[:, 0, 1:], solved[:, 0, 0]
+
+
+def _over(error: Floats, variance: Floats) -> Floats:
+    """Give the actual over the predicted mean square error of each axis, (3,)."""
+    return np.asarray((error * error / variance[:, None]).sum(axis=0) / len(error))
 
 
 def _terms(degc: Floats) -> Floats:

@@ -11,7 +11,7 @@ import logging
 import math
 import time
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -45,9 +45,6 @@ from companion.formats import Object
 from companion.physics.frames import vector
 from companion.samples import TRIADS, Triad
 from companion.storage.learned import BiasStore, KnownImu
-
-if TYPE_CHECKING:
-    from companion.daemon.biases.model_priors import ModelPriors
 
 logger = logging.getLogger(__name__)
 
@@ -91,11 +88,6 @@ class BiasMemory:
         self.whose = Whose(core, imus, sensors, used)
         self.curves = Curves(core, imus)
         self._store = BiasStore(core.config.storage.path)
-        self.models: ModelPriors | None = None
-        if core.config.calibration.fleet_prior:
-            from companion.daemon.biases.model_priors import ModelPriors
-
-            self.models = ModelPriors(core.config.storage.path, self.whose.models)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], _Reference] = {}
         self._now_degc: dict[str, float | None] = {}
@@ -104,8 +96,6 @@ class BiasMemory:
     def load(self) -> None:
         """Read what was kept before this start; blocking."""
         self._known = self._store.read()
-        if self.models is not None:
-            self.models.load()
         self.follow()
 
     def follow(self) -> None:
@@ -199,20 +189,13 @@ class BiasMemory:
         earlier = self._known[name].points if name in self._known else ()
         profile = noise_profile(self._profiles.of(name))
 
-        def by_earlier(triad: Triad) -> Expected | None:
-            if self.models is None:
-                return expect(earlier, triad, now, effect, profile.of(triad))
-            found = expect(earlier, triad, now, effect, profile.of(triad), self.models.of(name, triad))
-            self.models.judged(name, triad, found)
-            return found
-
         def today(triad: Triad) -> Expected | None:
             last, curve = self._reference(name, triad), self.curves.of(name, triad)
             return None if last is None else expect_today(last, triad, now, effect, profile.of(triad), curve)
 
         return ExpectedImu(
             name=name,
-            earlier={triad: by_earlier(triad) for triad in TRIADS},
+            earlier={triad: expect(earlier, triad, now, effect, profile.of(triad)) for triad in TRIADS},
             today={triad: today(triad) for triad in TRIADS},
             along={triad: self.curves.along(name, triad, imu.warming) for triad in TRIADS},
             effect=effect,

@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 
-from companion.autopilot.firmware.firmwares import model_of
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.calibration.records.align_record import ImuAlignmentRecord
 from companion.calibration.records.history import PowerUp
@@ -48,14 +47,6 @@ class Whose:
     def names(self) -> Collection[str]:
         """Of the IMUs."""
         return self._sources.keys()
-
-    def models(self) -> dict[str, str]:
-        """By IMU of the autopilot, its model, where that is known at the moment."""
-        firmware, known = self._vehicle.firmware, {name: imu.calibration for name, imu in self._imus.items()}
-        found = {
-            name: model_of(firmware, each.gyro_id, each.accel_id) for name, each in known.items() if each is not None
-        }
-        return {name: model for name, model in found.items() if model is not None}
 
     def power_up(self, name: str, unix_s: float) -> PowerUp:
         """Since when the sensor of an IMU has been powered, at a wall clock time."""

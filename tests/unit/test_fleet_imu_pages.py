@@ -1,8 +1,7 @@
-"""What a fleet knows of IMU models, and the pages that show it: against the figures that the parts were drawn with."""
+"""The pages of IMU models and of one IMU's biases, against the figures that the parts were drawn with."""
 
 from __future__ import annotations
 
-import asyncio
 import datetime
 import json
 import re
@@ -13,16 +12,14 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from companion.calibration.solution.model_prior import read
 from companion.fleet import page, schema
-from companion.fleet.collector import Collector
 from companion.fleet.imu_pages import model_page
-from companion.fleet.priors import model_prior, parts_of
+from companion.fleet.judging import parts_of
+from companion.fleet.models import LEAST_PARTS, Typical, typical_part
 from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
 from companion.physics.units import DEG_H, MG
 from tests.support.collecting import NOW
-from tests.support.fleet import check
 
 MODEL = "icm42688p"
 TRUE = np.array([30.0 * DEG_H] * 3 + [0.3 * MG] * 3)
@@ -67,80 +64,48 @@ def fill(store: Store, parts: list[list[dict[str, Any]]]) -> None:
             connection.execute(sa.insert(schema.aircraft).values(name))
 
 
-def test_what_is_told_is_what_the_parts_were_drawn_with(store: Store) -> None:
+def typical_of(store: Store, model: str = MODEL) -> Typical | None:
+    with store._engine.begin() as connection:
+        return typical_part(list(parts_of(connection, model).values()))
+
+
+def test_the_typical_part_has_the_figures_that_the_parts_were_drawn_with(store: Store) -> None:
     others = [rows(400 + k, "bmi088") for k in range(4)] + [rows(500, None)]
     liars = [rows(300, times=1e3), rows(301, times=0.0)]
     fill(store, [*[rows(k) for k in range(200)], *others, *liars])
-    told = store.model_priors()
-    assert set(told) == {f"fleet/priors/{MODEL}"}
-    (payload,) = told.values()
-    check("prior", payload)
-    found = read(payload, MODEL)
-    assert (found.parts, found.turn_ons) == (202, 202 * 20)
-    gyro, accel = found.of("gyro"), found.of("accel")
-    assert gyro is not None
-    assert accel is not None
-    assert [*gyro.scatter, *accel.scatter] == pytest.approx(TRUE, rel=0.1)
-    assert [*gyro.scatter_sigma, *accel.scatter_sigma] == pytest.approx(DIFFER * TRUE, rel=0.35)
-    assert gyro.per_k == pytest.approx(PER_K[:3], rel=0.2)
-    assert gyro.per_k_spread == pytest.approx(SPREAD[:3], rel=0.25)
+    found = typical_of(store)
+    assert found is not None
+    assert found.turn_on == pytest.approx(TRUE, rel=0.1)
+    assert found.turn_on_spread == pytest.approx(DIFFER * TRUE, rel=0.35)
+    assert found.per_k[:3] == pytest.approx(PER_K[:3], rel=0.2)
+    assert found.per_k_spread[:3] == pytest.approx(SPREAD[:3], rel=0.25)
 
 
-def test_few_parts_and_impossible_ones_are_told_to_nobody(store: Store) -> None:
-    fill(store, [rows(k) for k in range(4)])
-    assert store.model_priors() == {}
-    fill(store, [rows(k, "bmi088", times=1e6) for k in range(10, 20)])
-    assert store.model_priors() == {}
+def test_few_parts_have_no_typical_one(store: Store) -> None:
+    fill(store, [rows(k) for k in range(LEAST_PARTS - 1)])
+    assert typical_of(store) is None
+    with store._engine.begin() as connection:
+        shown = model_page(connection, MODEL, NOW, "of a test")
+    assert "Too few parts with a known scatter" in (shown or "")
 
 
 def test_what_is_not_known_of_an_axis_is_left_out(store: Store) -> None:
     parts = [rows(k) for k in range(8)]
     for part in parts:
-        part[4]["turn_on"] = part[0]["per_k"] = None
+        part[5]["turn_on"] = part[0]["per_k"] = None
     fill(store, parts)
-    found = read(next(iter(store.model_priors().values())), MODEL)
-    gyro = found.of("gyro")
-    assert gyro is not None
-    assert gyro.per_k is None
-    assert found.of("accel") is None
-
-
-def test_a_collector_says_it_once_retained_and_takes_it_back(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    fill(store, [rows(k) for k in range(8)])
-    said: list[tuple[str, bytes, int, bool]] = []
-
-    class Client:
-        async def publish(self, topic: str, payload: bytes, qos: int, retain: bool) -> None:
-            said.append((topic, payload, qos, retain))
-
-    monkeypatch.setattr("companion.fleet.collector.PRIORS_AFTER_S", 0.0)
-    monkeypatch.setattr("companion.fleet.collector.PRIORS_EVERY_S", 0.01)
-    collector = Collector.__new__(Collector)
-    collector.store = store
-
-    async def main() -> None:
-        task = asyncio.create_task(collector._tell_of_models(Client()))  # type: ignore[arg-type]
-        async with asyncio.timeout(60.0):
-            while not said:
-                await asyncio.sleep(0.01)
-            await asyncio.sleep(0.1)
-            with store._engine.begin() as connection:
-                connection.execute(sa.delete(schema.parts).where(schema.parts.c.aircraft != f"{1:036x}"))
-            while len(said) < 2:
-                await asyncio.sleep(0.01)
-        task.cancel()
-
-    asyncio.run(main())
-    assert [(topic, bool(payload), qos, retain) for topic, payload, qos, retain in said] == [
-        (f"fleet/priors/{MODEL}", True, 1, True),
-        (f"fleet/priors/{MODEL}", False, 1, True),
-    ]
+    with store._engine.begin() as connection:
+        shown = model_page(connection, MODEL, NOW, "of a test")
+    assert shown is not None
+    labels = re.findall(r">([xyz], (?:deg/h|mg): typically)", shown)
+    assert labels == [f"{axis}, deg/h: typically" for axis in "xyz"] + [f"{axis}, mg: typically" for axis in "xy"]
+    assert "deg/h a kelvin" not in shown
+    assert "mg a kelvin" in shown
 
 
 def test_the_models_page_has_a_dot_for_each_part_and_names_who_is_outside(store: Store) -> None:
     fill(store, [*[rows(k) for k in range(30)], rows(77, times=4.0)])
     with store._engine.begin() as connection:
-        assert model_prior(MODEL, list(parts_of(connection, MODEL).values())) is not None
         shown = model_page(connection, MODEL, NOW, "of a test")
         assert model_page(connection, "bmi088", NOW, "of a test") is None
         links = page.glance(connection, NOW) or ""
