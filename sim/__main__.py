@@ -1,4 +1,4 @@
-"""`python -m sim`: devices, autopilot, all, demo, ardupilot, px4, residuals, turntable, flights, ..."""
+"""`python -m sim`: devices, autopilot, all, demo, fleet, ardupilot, px4, residuals, turntable, flights, ..."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Final
 
 MODULES: Final = {
     "demo": "sim.demo",
+    "fleet": "sim.fleet.demo",
     "turntable": "sim.experiments.turntable",
     "accuracy": "sim.accuracy.cli",
     "rest": "sim.experiments.rest",

@@ -93,6 +93,7 @@ def parser() -> argparse.ArgumentParser:
             help="what the gradienter shows too much, degrees (default 0.003 -0.002)",
         )  # fmt: skip
     commands.add_parser("demo", help="the whole chain, with a result to look at")
+    commands.add_parser("fleet", help="thirty aircraft, a broker and a fleet's collector with its page, until Ctrl-C")
     for name, text in FIRMWARE_COMMANDS.items():
         commands.add_parser(name, help=text)
     commands.add_parser("fly", help="a real firmware flies with our heading, and something fails")

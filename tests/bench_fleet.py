@@ -25,8 +25,8 @@ import psycopg
 
 from companion.fleet.collector import BATCH
 from companion.fleet.contract import read_key
-from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Outcome, Store, _read
+from sim.fleet.aircraft import Aircraft
 from tests import bench_fleet_pages
 from tests.bench_memory import memory
 from tests.support.broker import Broker, broker

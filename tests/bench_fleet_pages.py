@@ -18,8 +18,8 @@ import sqlalchemy as sa
 from companion.fleet import schema
 from companion.fleet.database import engine_of
 from companion.fleet.imu_pages import models
-from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
+from sim.fleet.aircraft import Aircraft
 from tests.support.broker import broker, free_port
 from tests.support.collecting import CollectorProcess
 from tests.support.fleet_bench import MOSQUITTO, NOW, Meter, Place, Sessions, p95, processor_s, say, spread

@@ -1,4 +1,4 @@
-"""`companion fleet ...`: what many aircraft tell, in one database; on the ground, not on the aircraft."""
+"""`companion fleet ...`: collects the items of many aircraft in one database; for the ground, not for an aircraft."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import argparse
 import asyncio
 import contextlib
 import signal
-import tempfile
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -45,22 +44,18 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
         metavar="URL",
         help="postgresql://USER@HOST/NAME, or the path of an SQLite file (default fleet.sqlite, here)",
     )
-    demo = add("demo", _demo, "thirty simulated aircraft and the page, on this computer alone, until Ctrl-C")
-    for command in (run, demo):
-        command.add_argument(
-            "--page",
-            default=DEFAULT_PAGE,
-            metavar="HOST:PORT",
-            help=f"where the page is (default {DEFAULT_PAGE}: for this computer alone; off: no page)",
-        )
-        command.add_argument(
-            "--password-file", type=Path, metavar="FILE", help="who looks at the page is asked for what is in it"
-        )
-        command.add_argument("--cert", type=Path, metavar="FILE", help="the page's certificate with its chain (PEM)")
-        command.add_argument("--key", type=Path, metavar="FILE", help="its key; with both the page speaks https")
+    run.add_argument(
+        "--page",
+        default=DEFAULT_PAGE,
+        metavar="HOST:PORT",
+        help=f"address of the page (default {DEFAULT_PAGE}, for this computer alone; off: no page)",
+    )
+    run.add_argument("--password-file", type=Path, metavar="FILE", help="file with the password of the page")
+    run.add_argument("--cert", type=Path, metavar="FILE", help="certificate of the page with its chain (PEM)")
+    run.add_argument("--key", type=Path, metavar="FILE", help="key of the certificate; both together turn on https")
     acl = add("acl", _acl, "print a broker's access list: each aircraft below its own name, and the collector")
-    acl.add_argument("broker", choices=("mosquitto", "emqx"), help="whose format")
-    words = "which user is which aircraft, by its id (default: each aircraft's user name is its id)"
+    acl.add_argument("broker", choices=("mosquitto", "emqx"), help="format of the list")
+    words = "user name of an aircraft and its id (default: each aircraft's user name is its id)"
     acl.add_argument("aircraft", nargs="*", metavar="USER=ID", help=words)
 
 
@@ -68,34 +63,14 @@ async def _run(options: argparse.Namespace) -> int:
     """`companion fleet run`."""
     _check_installed()
     from companion.config.sections import Mqtt
-    from companion.fleet import settings
-    from companion.fleet.collector import Collector
+    from companion.fleet.collector import Collector, load_broker
     from companion.fleet.store import Store
 
-    mqtt = settings.load(options.config).mqtt if hasattr(options, "config") else Mqtt(host="127.0.0.1")
+    mqtt = load_broker(options.config) if hasattr(options, "config") else Mqtt(host="127.0.0.1")
     logs.set_up("info")
     collector = Collector(mqtt, Store(options.database))
-    pages = [] if options.page == "off" else [_server(options, options.database).run()]
+    pages = [] if options.page == "off" else [_server(options).run()]
     await _until_stopped(collector.run(), *pages)
-    return DONE
-
-
-async def _demo(options: argparse.Namespace) -> int:
-    """`companion fleet demo`."""
-    _check_installed()
-    from companion.fleet import demo
-    from companion.fleet.store import Store
-
-    logs.set_up("warning")
-    with tempfile.TemporaryDirectory(prefix="companion-fleet-") as folder:
-        database = Path(folder) / "fleet.sqlite"
-        server = _server(options, str(database))
-        Store(str(database)).prepare()  # whoever looks at once sees an empty fleet
-        mosquitto = demo.find_mosquitto()
-        beside = "Mosquitto" if mosquitto else "a broker of its own"
-        print_lines(f"{demo.AIRCRAFT} simulated aircraft, {beside}, and an SQLite file in {folder}, until Ctrl-C")
-        print_lines(f"look at {server.url}")
-        await _until_stopped(demo.play(database, mosquitto), server.run())
     return DONE
 
 
@@ -107,7 +82,7 @@ async def _acl(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _server(options: argparse.Namespace, database: str) -> Server:
+def _server(options: argparse.Namespace) -> Server:
     from companion.fleet.certificate import Certificate
     from companion.fleet.server import Server, read_password
 
@@ -115,11 +90,11 @@ def _server(options: argparse.Namespace, database: str) -> Server:
     if (options.cert is None) != (options.key is None):
         raise ConfigError("--cert and --key: found one of them; allowed: both, or neither")
     certificate = None if options.cert is None else Certificate(options.cert, options.key)
-    return Server(options.page, database, password, certificate)
+    return Server(options.page, options.database, password, certificate)
 
 
 async def _until_stopped(*runs: Coroutine[Any, Any, None]) -> None:
-    """Until Ctrl-C or SIGTERM, or the first of them fails, with what it raised; all have ended then."""
+    """Run until Ctrl-C or SIGTERM, or until one fails, and raise what that raised; all have ended then."""
     from companion.fleet.collector import stop
 
     tasks = [asyncio.ensure_future(run) for run in runs]

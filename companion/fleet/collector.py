@@ -1,7 +1,7 @@
-"""A collector: hears aircraft at a broker, puts what they tell into the database, and then says that it is there.
+"""Collector of a fleet: receives the items of aircraft from a broker, writes them into the database, confirms them.
 
-It keeps nothing itself. Whatever goes wrong, at the broker or in the database, ends its connection; what it had not
-confirmed the aircraft tell again, and at the next connection they are asked for what is lacking.
+A collector has no state of its own. Any failure of the broker or the database ends both connections. Aircraft send
+again what was not confirmed; at each new connection the collector asks them for what the database lacks.
 """
 
 from __future__ import annotations
@@ -14,10 +14,15 @@ import math
 import secrets
 import socket
 from collections.abc import AsyncIterator, Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
+
+from companion.config import converted, read
+from companion.config.rules import broker_complaints
 from companion.config.sections import Mqtt
-from companion.errors import CompanionError, LinkError
+from companion.errors import CompanionError, ConfigError, LinkError
 from companion.fleet.contract import MOST_BYTES, answers, ranges
 from companion.fleet.store import Message, Outcome, Store
 from companion.links.system.connection import Backoff, Reconnection
@@ -31,25 +36,27 @@ _quiet = logging.getLogger(f"{__name__}.aiomqtt")
 _quiet.setLevel(logging.CRITICAL)
 
 BATCH: Final = 500
+"""Most messages in one transaction."""
 GATHER_S: Final = 0.1
-"""How long more of a batch is waited for."""
+"""Time to wait for more messages of a batch."""
 ASK_AFTER: Final = 50
-"""So many times as long of hellos: what is told with one has come by then, perhaps to another collector."""
+"""Factor on `GATHER_S` for hellos: items sent with a hello have arrived by then, perhaps at another collector."""
 WAITING: Final = 20 * BATCH
-"""The most messages from the broker that wait; what is beyond is told again, or another collector hears it."""
+"""Most messages that wait to be written; more are dropped, and sent again by their aircraft."""
 WAITING_BYTES: Final = 16 * 1024 * 1024
-"""The most bytes of them."""
+"""Most bytes of waiting messages."""
 BATCH_BYTES: Final = 4 * 1024 * 1024
-"""The most bytes of a batch, of which a database makes several copies."""
+"""Most bytes of a batch; a database makes several copies of it."""
 AT_ONCE: Final = 50
-"""Messages that are being sent; aiomqtt looks at each of them for every further one."""
+"""Answers sent concurrently; the time that aiomqtt takes for each grows with their number."""
 SWEEP_S: Final = 5.0
-"""For what aircraft said before this collector was there."""
+"""Time to receive the retained hellos, which shared subscriptions do not deliver."""
 JUDGE_S: Final = 2.0
-"""Between two looks for aircraft that are to be judged."""
+"""Interval at which the collector looks for aircraft to judge."""
 REST: Final = 4.0
-"""Times as long as a judgement took it rests after it: what comes in goes first."""
+"""Pause after a judgement, as a multiple of its duration: collecting goes first."""
 ANSWER_S: Final = 10.0
+"""Timeout of the broker's answers."""
 STOP_AGAIN_S: Final = 0.5
 FIRST_WAIT_S: Final = 0.5
 LONGEST_WAIT_S: Final = 30.0
@@ -61,9 +68,25 @@ _MQTT_5: Final = 5
 _MQTT_3_1_1: Final = 4
 
 
+class _Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    mqtt: Mqtt
+
+
+def load_broker(path: Path) -> Mqtt:
+    """Read the section [mqtt] of a collector's configuration file.
+
+    Raises:
+        ConfigError: one line that names the file, the key, what was found and what is allowed.
+    """
+    mqtt = converted(read(path, "write one with a section [mqtt] that names the broker"), str(path), _Settings).mqtt
+    for wrong in broker_complaints(mqtt):
+        raise ConfigError(f"{path}: {wrong}")
+    return mqtt
+
+
 @contextlib.asynccontextmanager
 async def connected(client: aiomqtt.Client) -> AsyncIterator[aiomqtt.Client]:
-    """A connection whose end hides nothing: what goes wrong on leaving does not take the place of a cancellation."""
+    """Connect; errors of the disconnection do not replace a cancellation."""
     import aiomqtt
 
     await client.__aenter__()
@@ -75,10 +98,10 @@ async def connected(client: aiomqtt.Client) -> AsyncIterator[aiomqtt.Client]:
 
 
 async def stop(tasks: Iterable[asyncio.Task[None]]) -> list[BaseException]:
-    """Cancel tasks until they have ended; what they raised.
+    """Cancel tasks until they have ended; return their exceptions.
 
-    Once is not enough: before Python 3.12 `asyncio.wait_for`, which aiomqtt waits with, loses a cancellation that comes
-    at the moment of its result.
+    One cancellation is not enough: before Python 3.12 `asyncio.wait_for`, which aiomqtt uses, loses one that comes at
+    the moment of its result.
     """
     pending = found = set(tasks)
     while pending:
@@ -89,7 +112,7 @@ async def stop(tasks: Iterable[asyncio.Task[None]]) -> list[BaseException]:
 
 
 class Waiting(asyncio.Queue[Any]):
-    """Messages that wait, bounded in bytes beside their number: one may have a quarter of a megabyte."""
+    """Queue of messages that is bounded in bytes, too: one message may have 256 KiB."""
 
     most_bytes = WAITING_BYTES
     _bytes = 0
@@ -109,38 +132,35 @@ class Waiting(asyncio.Queue[Any]):
 
 
 class Inbox(Waiting):
-    """Messages of the next batch."""
+    """Queue of the messages of the next batch."""
 
     most_bytes = BATCH_BYTES
 
 
 class Collector:
-    """One of as many as are wanted at one broker; `run` it as a task.
+    """Collector at one broker, beside any number of others; `run` it as a task."""
 
-    Without `mqtt_5` it tries MQTT 3.1.1 first, for a broker that says nothing to MQTT 5.
-    """
-
-    def __init__(self, settings: Mqtt, store: Store, *, mqtt_5: bool = True) -> None:
+    def __init__(self, settings: Mqtt, store: Store) -> None:
         self.settings, self.store = settings, store
         self.client_id = settings.client_id or f"collector-{socket.gethostname()[:40]}-{secrets.token_hex(4)}"
-        self._protocol = _MQTT_5 if mqtt_5 else _MQTT_3_1_1
+        self._protocol = _MQTT_5
         self._reconnection = Reconnection("fleet", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S)
 
     @property
     def where(self) -> str:
-        """The broker's address."""
+        """Address of the broker."""
         return f"{self.settings.host}:{self.settings.broker_port}"
 
     async def run(self) -> None:
         """Collect until cancelled.
 
         Raises:
-            StorageError: a newer companion has made the database.
+            StorageError: a newer companion has written the database.
         """
         await self._reconnection.keep(self._once)
 
     async def _once(self) -> str:
-        """One connection to both, to its end; why it has ended."""
+        """Connect to broker and database, serve until one of them fails, and return the reason."""
         import aiomqtt
 
         await asyncio.to_thread(self.store.prepare)
@@ -156,7 +176,7 @@ class Collector:
             raise
         except (aiomqtt.MqttError, OSError, TimeoutError) as error:
             if not reached and self._protocol == _MQTT_5 and is_of_protocol(error):
-                # Too old for MQTT 5: it says so, or says nothing, or closes the connection.
+                # A broker without MQTT 5 refuses it, closes the connection, or does not answer.
                 self._protocol = _MQTT_3_1_1
                 return f"{self.where}: no MQTT 5 there, so one collector only; going on with MQTT 3.1.1"
             self._protocol = _MQTT_5
@@ -194,7 +214,7 @@ class Collector:
     async def _serve(self, client: aiomqtt.Client) -> None:
         items, hellos = Inbox(BATCH), Inbox(BATCH)
         tasks = [
-            asyncio.create_task(self._hear(client, items, hellos), name="fleet listener"),
+            asyncio.create_task(self._receive(client, items, hellos), name="fleet listener"),
             asyncio.create_task(self._collect(client, items, 1), name="fleet writer"),
             asyncio.create_task(self._collect(client, hellos, ASK_AFTER), name="fleet asker"),
             asyncio.create_task(self._subscribe(client), name="fleet subscriptions"),
@@ -212,22 +232,22 @@ class Collector:
         alone = self._protocol == _MQTT_3_1_1
         shared = "" if alone else _SHARED
         for topic in (shared + _ITEM, shared + _HELLO):
-            await self._hear_of(client, topic)
+            await self._subscribe_to(client, topic)
         words = "MQTT 3.1.1: no other collector beside this one" if alone else "MQTT 5"
         self._reconnection.up(f"{self.where} ({words}) into {self.store.where}")
         if not alone:
-            # What was said before is not told to those who share.
-            await self._hear_of(client, _HELLO, qos=0)
+            # Shared subscriptions do not deliver retained hellos.
+            await self._subscribe_to(client, _HELLO, qos=0)
             await asyncio.sleep(SWEEP_S)
             await client.unsubscribe(_HELLO)
         await asyncio.get_running_loop().create_future()
 
-    async def _hear_of(self, client: aiomqtt.Client, topic: str, qos: int = 1) -> None:
+    async def _subscribe_to(self, client: aiomqtt.Client, topic: str, qos: int = 1) -> None:
         granted = await client.subscribe(topic, qos=qos)
         if any(getattr(code, "value", code) >= 128 for code in granted):
             raise LinkError(f"{self.where}: the broker does not let us hear {topic} (its access list?)")
 
-    async def _hear(
+    async def _receive(
         self, client: aiomqtt.Client, items: asyncio.Queue[Message], hellos: asyncio.Queue[Message]
     ) -> None:
         async for message in client.messages:
@@ -255,7 +275,7 @@ class Collector:
             await asyncio.sleep(REST * (loop.time() - began_s) if found else JUDGE_S)
 
     async def _answer(self, client: aiomqtt.Client, outcome: Outcome) -> None:
-        # A confirmation that gets lost is given again, as the item is told again.
+        # QoS 0 for confirmations: an item whose confirmation is lost is sent again, and confirmed again.
         said = [
             (f"fleet/{aircraft}/confirmed", payload, 0)
             for (aircraft, epoch), sequences in outcome.confirmed.items()
@@ -269,7 +289,7 @@ class Collector:
         if outcome.rejected:
             message, reason = outcome.rejected[0]
             logger.warning("fleet: %s: not taken: %s (table rejected has it)", message.topic, reason)
-        # One timer for some: theirs would cost as much as sending.
+        # One timer for several: one each would cost as much as sending.
         publish = functools.partial(client.publish, timeout=math.inf)
         for some in (said[k : k + AT_ONCE] for k in range(0, len(said), AT_ONCE)):
             async with asyncio.timeout(ANSWER_S):

@@ -25,7 +25,7 @@ import sqlalchemy as sa
 
 from companion.fleet.contract import moment
 from companion.fleet.schema import Moment
-from companion.fleet.simulated import Aircraft
+from sim.fleet.aircraft import Aircraft
 from tests.support.broker import Broker, broker
 from tests.support.collecting import (
     NOW,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,11 +13,13 @@ from typing import Literal
 import pytest
 import sqlalchemy as sa
 
+from companion.config.sections import Mqtt
 from companion.fleet import schema
+from companion.fleet.collector import Collector, stop
 from companion.fleet.database import engine_of
-from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
 from companion.physics.units import DEG_H
+from sim.fleet.aircraft import Aircraft
 from tests.support.broker import MOSQUITTO, broker
 from tests.support.collecting import (
     NOW,
@@ -90,6 +93,25 @@ def test_nothing_is_confirmed_before_it_is_committed(database: str, tmp_path: Pa
 
     asyncio.run(main())
     assert items_in(database) == told_by(fleet)
+
+
+def test_a_broker_without_mqtt_5_gets_one_collector(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("companion.fleet.collector.ANSWER_S", 3.0)  # amqtt does not answer to MQTT 5
+    fleet, database = fleet_of(3, 4, seed=5), str(tmp_path / "fleet.sqlite")
+
+    async def main() -> None:
+        async with broker(tmp_path, "amqtt") as one:
+            collecting = asyncio.create_task(Collector(Mqtt(host="127.0.0.1", port=one.port), Store(database)).run())
+            async with telling(fleet, one):
+                await until_confirmed(fleet)
+            await stop([collecting])
+
+    with caplog.at_level(logging.INFO):
+        asyncio.run(main())
+    assert items_in(database) == told_by(fleet)
+    assert "no MQTT 5 there, so one collector only; going on with MQTT 3.1.1" in caplog.text
 
 
 @pytest.mark.parametrize("database", KINDS, indirect=True)

@@ -1,4 +1,4 @@
-"""`companion fleet demo` in one command, and its pages: as HTTP says, and as a phone and a desktop show them."""
+"""`python -m sim fleet` in one command, and the pages: as HTTP says, and as a phone and a desktop show them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from companion.fleet.demo import AIRCRAFT
-from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
+from sim.fleet.aircraft import Aircraft
+from sim.fleet.demo import AIRCRAFT
 from tests.support import browser
 from tests.support.broker import MOSQUITTO, free_port
 from tests.support.collecting import NOW, basic, get, served
@@ -25,18 +25,14 @@ from tests.support.collecting import NOW, basic, get, served
 PASSWORD = "Grus grus grus"  # noqa: S105
 
 
-@pytest.mark.parametrize("there_is", ["mosquitto", "no mosquitto"])
-def test_one_command_shows_a_fleet(tmp_path: Path, there_is: str) -> None:
+@pytest.mark.skipif(MOSQUITTO is None, reason="no Mosquitto")
+def test_one_command_shows_a_fleet(tmp_path: Path) -> None:
     port = free_port()
-    hidden = "from companion.fleet import demo; demo.find_mosquitto = lambda: None; " * (there_is == "no mosquitto")
-    start = (
-        f"import sys; {hidden}from companion.cli import main; sys.exit(main(['fleet', 'demo', '--page', sys.argv[1]]))"
-    )
 
     async def main() -> None:
         with (tmp_path / "log").open("wb") as log:
             process = await asyncio.create_subprocess_exec(
-                sys.executable, "-c", start, f"127.0.0.1:{port}", stdout=log, stderr=log
+                *(sys.executable, "-m", "sim", "fleet", "--page", f"127.0.0.1:{port}"), stdout=log, stderr=log
             )
         try:
             async with asyncio.timeout(90.0):
@@ -59,36 +55,33 @@ def test_one_command_shows_a_fleet(tmp_path: Path, there_is: str) -> None:
 
 
 @pytest.mark.skipif(MOSQUITTO is None, reason="no Mosquitto")
-def test_its_mosquitto_ends_with_it_though_it_is_killed(tmp_path: Path) -> None:
-    start = "import sys; from companion.cli import main; sys.exit(main(['fleet', 'demo', '--page', sys.argv[1]]))"
-
+def test_broker_and_collector_end_with_it_though_it_is_killed() -> None:
     async def main() -> None:
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", start, f"127.0.0.1:{free_port()}", stdout=asyncio.subprocess.PIPE
-        )
+        command = (sys.executable, "-m", "sim", "fleet", "--page", f"127.0.0.1:{free_port()}")
+        process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
         try:
             assert process.stdout is not None
             folder = (await process.stdout.readline()).decode().partition("file in ")[2].partition(",")[0]
             async with asyncio.timeout(60.0):
-                while not (brokers := _mosquittos(folder)):
+                while len(children := _children(folder)) < 2:
                     await asyncio.sleep(0.1)
         finally:
             process.kill()
             await process.wait()
         async with asyncio.timeout(20.0):
-            while any(os.path.exists(f"/proc/{pid}") for pid in brokers):  # noqa: ASYNC240 - /proc is memory
+            while any(os.path.exists(f"/proc/{pid}") for pid in children):  # noqa: ASYNC240 - /proc is memory
                 await asyncio.sleep(0.05)
 
     asyncio.run(main())
 
 
-def _mosquittos(folder: str) -> list[str]:
-    """Processes of that name whose configuration is in the folder."""
+def _children(folder: str) -> list[str]:
+    """List the processes of broker and collector: those with a configuration in the folder, without their shells."""
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
             words = path.read_bytes().decode().split("\0")
-            if words[0].endswith("mosquitto") and any(word.startswith(folder) for word in words):
+            if words[0] != "sh" and any(word.startswith(f"{folder}/") for word in words):
                 found.append(path.parent.name)
     return found
 

@@ -11,8 +11,8 @@ import pytest
 import sqlalchemy as sa
 
 from companion.fleet.database import engine_of
-from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
+from sim.fleet.aircraft import Aircraft
 from tests.campaign.__main__ import SEED
 from tests.campaign.fleet import FAULTS, KINDS, Kind, judge, play
 from tests.support.broker import MOSQUITTO

@@ -12,8 +12,9 @@ from typing import Any
 import psycopg
 import pytest
 
-from companion.fleet import demo, schema
+from companion.fleet import schema
 from companion.fleet.store import Message, Store
+from sim.fleet import demo
 from tests.support.postgres import INITDB, postgres
 
 DASHBOARD = json.loads((Path(__file__).parents[2] / "docs/fleet/grafana.json").read_text(encoding="utf-8"))

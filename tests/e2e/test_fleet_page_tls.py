@@ -16,7 +16,7 @@ from companion.cli import main as companion
 from companion.errors import ConfigError
 from companion.fleet.certificate import Certificate
 from companion.fleet.server import Server
-from companion.fleet.simulated import Aircraft
+from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW, get, served
 
 AUTHORITY = trustme.CA()

@@ -12,9 +12,9 @@ import sqlalchemy as sa
 
 from companion.fleet import schema
 from companion.fleet.database import engine_of
-from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
 from companion.physics.units import DEG_H
+from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW, rows_of
 from tests.support.postgres import INITDB, Postgres, postgres
 

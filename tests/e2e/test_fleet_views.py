@@ -15,8 +15,8 @@ import sqlalchemy as sa
 from companion.calibration.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
 from companion.fleet import page, schema
 from companion.fleet.database import engine_of
-from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
+from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW, rows_of
 from tests.support.fleet import check
 from tests.support.postgres import INITDB, postgres

@@ -21,8 +21,8 @@ from companion.fleet.certificate import Certificate
 from companion.fleet.collector import stop
 from companion.fleet.database import engine_of
 from companion.fleet.server import Server
-from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
+from sim.fleet.aircraft import Aircraft
 from tests.support.broker import Broker, free_port
 
 NOW = datetime.datetime(2026, 11, 20, 12, tzinfo=datetime.UTC)

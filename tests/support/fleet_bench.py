@@ -17,7 +17,7 @@ import msgspec
 
 from companion.calibration.request import What
 from companion.daemon.job import Job
-from companion.fleet.simulated import Aircraft
+from sim.fleet.aircraft import Aircraft
 from tests.support.broker import Broker
 from tests.support.light_aircraft import Fleet, Light
 from tests.support.postgres import Postgres

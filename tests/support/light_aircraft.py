@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from companion.fleet.simulated import Aircraft
+from sim.fleet.aircraft import Aircraft
 
 AGAIN_S: Final = 30.0
 CONNECTING: Final = 200

@@ -52,14 +52,11 @@ ELSEWHERE = {
     "companion/report": "labels of pages",
     "companion/fleet/acl.py": "lines of brokers' files; what is no aircraft and its user, with what is allowed",
     "companion/fleet/contract.py": "reasons in the table of what was rejected, with what was found and what is allowed",
-    "companion/fleet/demo.py": "what simulated aircraft tell, and words to their broker",
     "companion/fleet/imu_pages.py": "labels of pages: docs/fleet.md",
     "companion/fleet/judgement.py": "what is said against sensors: docs/fleet.md",
     "companion/fleet/judging.py": "likewise",
     "companion/fleet/page.py": "labels of pages: docs/fleet.md",
     "companion/fleet/server.py": "answers to browsers; what of its options is wrong, with what is allowed",
-    "companion/fleet/settings.py": "as companion/config",
-    "companion/fleet/simulated.py": "what simulated aircraft tell",
     "companion/web": "answers to browsers that ask for the wrong thing; what people see is the page",
 }
 """Rooms whose words need no row of their own, and why."""

@@ -16,9 +16,9 @@ from companion.fleet import page, schema
 from companion.fleet.imu_pages import model_page
 from companion.fleet.judging import parts_of
 from companion.fleet.models import LEAST_PARTS, Typical, typical_part
-from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
 from companion.physics.units import DEG_H, MG
+from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW
 
 MODEL = "icm42688p"

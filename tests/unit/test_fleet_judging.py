@@ -14,9 +14,9 @@ import sqlalchemy as sa
 
 from companion.fleet import page
 from companion.fleet.judgement import judge, judge_zero
-from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
 from companion.physics.units import DEG_H
+from sim.fleet.aircraft import Aircraft
 from tests import judgement_study as study
 from tests.support.collecting import NOW, rows_of
 

@@ -13,8 +13,8 @@ import sqlalchemy as sa
 from companion.fleet import page, schema
 from companion.fleet.database import engine_of
 from companion.fleet.rendering import Renderer
-from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Store
+from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW
 
 

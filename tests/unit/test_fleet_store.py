@@ -20,8 +20,8 @@ from companion.errors import CompanionError, LinkError, StorageError
 from companion.fleet import contract, schema
 from companion.fleet.contract import MOST_RANGES, answers, ranges
 from companion.fleet.database import url_of
-from companion.fleet.simulated import Aircraft
 from companion.fleet.store import Message, Outcome, Store
+from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW, items_in, rows_of, told_by
 from tests.support.fleet import check
 

@@ -1,6 +1,6 @@
-"""Simulated aircraft for the demonstration and for tests: a client of the broker each, which keeps what it tells.
+"""Simulated aircraft of a fleet: each is a client of the broker that keeps the items it tells.
 
-No daemon and no calibration is in them: records are made from biases that are known, of a seed.
+There is no daemon and no calibration in them: records are made from known biases, drawn from a seed.
 """
 
 from __future__ import annotations

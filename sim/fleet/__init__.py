@@ -1,0 +1,1 @@
+"""Simulated aircraft that tell a fleet's collector what happens to them."""
