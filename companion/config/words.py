@@ -24,7 +24,7 @@ KEYS: Final[dict[str, str]] = {
 COMMAND_LINE: Final[dict[str, str]] = {
     "companion flight --fetch": "0.2: download the log with your ground station, then companion flight LOG",
     "companion fleet demo": "0.2: run python -m sim fleet in the folder of the companion's sources",
-    "companion fleet export": "0.2: use psql, sqlite3 or DuckDB, as docs/fleet.md shows under Export",
+    "companion fleet export": "0.2: use psql, sqlite3 or DuckDB, as docs/fleet.md shows (Export)",
 }
 """Removed commands ("companion NAME") and options ("companion NAME --option"), each with its version and its remedy."""
 
