@@ -1,6 +1,6 @@
-"""The access list of a broker: each aircraft below its own name, the collector only where it collects.
+"""Access list of a broker: each aircraft publishes below its own name only, the collector only its answers.
 
-Nobody here may publish below an aircraft's `request/`: who may press its buttons is for the keeper to add.
+No user of the list may publish below an aircraft's `request/`: the operator adds who may press its buttons.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _READS: Final = (
 
 
 class Right(NamedTuple):
-    """What one user may do; `user` None: every user, whose name is in the topics then."""
+    """Rights of one user; `user` None: rights of every user, with the user name in the topics."""
 
     user: str | None
     writes: tuple[str, ...]
@@ -43,10 +43,10 @@ class Right(NamedTuple):
 
 
 def access_list(broker: Broker, aircraft: Sequence[str]) -> list[str]:
-    """The lines of the file; `aircraft` are "USER=ID" each, none: every aircraft's user name is its id.
+    """Make the lines of the file for aircraft given as "USER=ID"; none: every aircraft's user name is its id.
 
     Raises:
-        ConfigError: one is no such pair, or is there twice.
+        ConfigError: one is no such pair, or an id has two users.
     """
     name, words = _BROKERS[broker]
     found = [_aircraft(user, which) for user, which in _pairs(aircraft)] or [_aircraft(None, name)]
@@ -96,4 +96,4 @@ _BROKERS: Final[dict[Broker, tuple[str, Callable[[Iterable[Right]], list[str]]]]
     "mosquitto": ("%u", _mosquitto),
     "emqx": ("${username}", _emqx),
 }
-"""How each writes a client's user name in a topic, and a file."""
+"""Placeholder of the user name in topics, and writer of the file, by broker."""

@@ -1,6 +1,6 @@
-"""What aircraft say (docs/fleet/asyncapi.yaml), from the bytes of a broker to rows of the tables.
+"""Parser of the aircraft's payloads (docs/fleet/asyncapi.yaml): from bytes to rows of the tables.
 
-Whatever the bytes are, nothing here raises anything but `NotTakenError`.
+Bytes of any content raise nothing but `NotTakenError`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from companion.physics.units import DEG_H, MG
 
 FORMAT_VERSION: Final = 1
 MOST_RANGES: Final = 256
-"""In one message to an aircraft."""
+"""Most ranges of sequences in one message to an aircraft."""
 MOST_SEQUENCE: Final = 2**53
 MOST_BYTES: Final = 256 * 1024
 AIRCRAFT_ID: Final = re.compile(r"[0-9a-f]{16}|[0-9a-f]{36}")
@@ -27,7 +27,7 @@ _AIRCRAFT: Final = re.compile(rf"fleet/({AIRCRAFT_ID.pattern})/(hello|item)")
 _MOST: Final = 1e12
 _EARLIEST: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _LATEST: Final = datetime.datetime(2200, 1, 1, tzinfo=datetime.UTC)
-"""A clock without a battery starts in 1970; nothing records a later time than this."""
+"""Latest time that is accepted; the earliest is that of a clock without a battery."""
 
 _Aircraft = Annotated[str, msgspec.Meta(pattern=f"^({AIRCRAFT_ID.pattern})$")]
 _Epoch = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
@@ -42,15 +42,15 @@ _Keyed = TypeVar("_Keyed", "Hello", "Item")
 
 Row = dict[str, Any]
 Rows = dict[str, list[Row]]
-"""By table."""
+"""Rows by table."""
 
 
 class NotTakenError(Exception):
-    """A payload that is nothing of the contract; one line that says why."""
+    """A payload breaks the contract; the message is one line with the reason."""
 
 
 class Hello(msgspec.Struct, frozen=True):
-    """What an aircraft keeps."""
+    """Range of the items that an aircraft keeps."""
 
     format_version: Annotated[int, msgspec.Meta(ge=FORMAT_VERSION, le=FORMAT_VERSION)]
     aircraft: _Aircraft
@@ -62,7 +62,7 @@ class Hello(msgspec.Struct, frozen=True):
 
 
 class Item(msgspec.Struct, frozen=True):
-    """What has happened; all but its key may be of another kind in a newer format."""
+    """Key of an item; a newer format may change everything else."""
 
     format_version: Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
     aircraft: _Aircraft
@@ -71,7 +71,7 @@ class Item(msgspec.Struct, frozen=True):
 
     @property
     def key(self) -> Row:
-        """As columns."""
+        """Columns of the primary key."""
         return {"aircraft": self.aircraft, "epoch": self.epoch, "sequence": self.sequence}
 
 
@@ -157,7 +157,7 @@ class _Event(msgspec.Struct, frozen=True):
 
 
 _FIRMWARES: Final = {"INS": "ardupilot", "CAL": "px4", "TC": "px4"}
-"""By what the names of their parameters begin with."""
+"""Firmwares by the prefix of their parameters."""
 _ABOUT: Final = ("gyro_id", "accel_id", "temperature_degc", "samples")
 _TRIADS: Final = tuple(name for name in _Imu.__struct_fields__ if name.endswith(("_rad_s", "_m_s2")))
 
@@ -191,14 +191,14 @@ def _calibration(body: bytes) -> Rows:
 
 
 def _by_readings(imu: _Imu) -> dict[str, _Axes]:
-    """Whole biases before earlier ones were weighed in; None: none were."""
+    """Give the biases before earlier power-ups were weighed in; None: none were."""
     prior = imu.prior or _Prior()
     gyro, accel = prior.gyro or _Found(), prior.accel or _Found()
     return {"gyro_read_rad_s": gyro.measured_rad_s, "accel_read_m_s2": accel.measured_m_s2}
 
 
 def _firmware(imus: Iterable[_Imu]) -> str | None:
-    """Whose parameters were written; None: there were none."""
+    """Tell the firmware by the written parameters; None: none were written."""
     prefixes = {name.partition("_")[0] for imu in imus for name in imu.written}
     return next((firmware for prefix, firmware in _FIRMWARES.items() if prefix in prefixes), None)
 
@@ -262,7 +262,7 @@ def _flight(body: bytes) -> Rows:
 
 
 def _within(rows: list[Row]) -> list[Row]:
-    """Of figures that their own types do not bound."""
+    """Refuse figures beyond the limit, for types that have none of their own."""
     for name, value in (each for row in rows for each in row.items()):
         if isinstance(value, int | float) and abs(value) > _MOST:
             raise NotTakenError(f"{name}: found {value:g}; allowed: up to {_MOST:g}")
@@ -284,14 +284,14 @@ KINDS: Final[dict[str, Callable[[bytes], Rows]]] = {
     "curve": _curve,
     "flight": _flight,
 }
-"""What each kind's body becomes; the others are kept until a newer companion knows them."""
+"""Parsers of the bodies by kind; items of other kinds are kept until a newer companion knows them."""
 
 
 def moment(words: str) -> datetime.datetime:
     """Parse a time of ISO 8601, in UTC unless it names another zone.
 
     Raises:
-        NotTakenError: it is no time, or one that no clock of an aircraft shows.
+        NotTakenError: it is no time, or out of range.
     """
     try:
         found = datetime.datetime.fromisoformat(words)
@@ -308,25 +308,25 @@ def _at(words: str | None) -> datetime.datetime | None:
 
 
 def addressed(topic: str) -> tuple[str, str] | None:
-    """The aircraft of a topic and "hello" or "item"; None: it is another topic."""
+    """Give the aircraft of a topic and "hello" or "item"; None: it is another topic."""
     match = _AIRCRAFT.fullmatch(topic)
     return None if match is None else (match[1], match[2])
 
 
 def read_hello(aircraft: str, payload: bytes) -> Hello:
-    """A hello on that aircraft's topic.
+    """Parse a hello on that aircraft's topic.
 
     Raises:
-        NotTakenError: it is none, of another one, or of a newer format.
+        NotTakenError: it is none, names another aircraft, or has a newer format.
     """
     return _of(aircraft, _decode(payload, Hello))
 
 
 def read_key(aircraft: str, payload: bytes) -> Item:
-    """The key of an item on that aircraft's topic, also of a newer format.
+    """Parse the key of an item on that aircraft's topic, of any format.
 
     Raises:
-        NotTakenError: it has none, or that of another aircraft.
+        NotTakenError: it has none, or names another aircraft.
     """
     if len(payload) > MOST_BYTES:
         raise NotTakenError(f"found {len(payload)} bytes; allowed: up to {MOST_BYTES}")
@@ -334,10 +334,10 @@ def read_key(aircraft: str, payload: bytes) -> Item:
 
 
 def read_item(item: Item, payload: bytes) -> tuple[Row, Rows]:
-    """Columns of the item itself, and the rows of other tables that it makes; `state` "unknown": it is of a newer one.
+    """Parse an item into its own columns and rows of other tables; `state` "unknown": a newer kind or format.
 
     Raises:
-        NotTakenError: its kind and format are known, but its body is none of them.
+        NotTakenError: kind and format are known, but the body does not fit them.
     """
     if item.format_version != FORMAT_VERSION:
         return {"state": "unknown", "kind": None, "at": None, "clock": None, "same": None}, {}
@@ -356,7 +356,7 @@ def read_item(item: Item, payload: bytes) -> tuple[Row, Rows]:
 
 
 def ranges(sequences: Iterable[int]) -> list[list[int]]:
-    """From one to another, both included, of numbers in any order."""
+    """Combine numbers in any order into ranges from first to last, both included."""
     found: list[list[int]] = []
     for sequence in sorted(set(sequences)):
         if found and found[-1][1] == sequence - 1:
@@ -367,7 +367,7 @@ def ranges(sequences: Iterable[int]) -> list[list[int]]:
 
 
 def answers(epoch: str, found: list[list[int]]) -> list[bytes]:
-    """Payloads of `confirmed` and `wanted` for that many ranges."""
+    """Encode ranges as payloads of `confirmed` or `wanted`."""
     return [
         msgspec.json.encode(
             {"format_version": FORMAT_VERSION, "epoch": epoch, "sequences": found[start : start + MOST_RANGES]}
@@ -390,7 +390,7 @@ def _of(aircraft: str, told: _Keyed) -> _Keyed:
 
 
 def _same(told: _Told, rows: Rows) -> str:
-    """What a thing has told again under another epoch: all but whether it has been undone since."""
+    """Hash everything that stays the same when an item is sent again under another epoch, so not `undone_at`."""
     content: Any = [(table, {**row, "undone_at": None}) for table in sorted(rows) for row in rows[table]]
     if not rows:
         content = msgspec.json.decode(told.body)

@@ -1,4 +1,4 @@
-"""Connections to the database, PostgreSQL or SQLite, and what may go wrong there."""
+"""Connections to the database, PostgreSQL or SQLite, and their errors."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from companion.errors import StorageError
 _STATEMENT_MS: Final = 30_000
 _BUSY_S: Final = 10.0
 OF_THE_DATABASE: Final = (sa.exc.OperationalError, sa.exc.InterfaceError, sa.exc.InternalError, sa.exc.TimeoutError)
-"""It is not there, full, or broken: no fault of what was to be written."""
+"""Errors of a database that cannot be reached, is full or broken."""
 OF_THE_ITEM: Final = (sa.exc.DataError, sa.exc.IntegrityError, sa.exc.ProgrammingError)
-"""The database is well, and does not take it."""
+"""Errors of a row that the database refuses."""
 
 
 def url_of(database: str) -> sa.URL:
-    """The database that people mean: postgresql://..., sqlite:///..., or a file's path.
+    """Parse postgresql://..., sqlite:///... or the path of a file.
 
     Raises:
-        StorageError: it is neither.
+        StorageError: it is none of these.
     """
     try:
         url = sa.make_url(database if "://" in database else f"sqlite:///{database}")
@@ -37,10 +37,10 @@ def url_of(database: str) -> sa.URL:
 
 
 def engine_of(database: str, *, reads_only: bool = False) -> sa.Engine:
-    """Connections to the database, none of which is opened yet.
+    """Make an engine without opening a connection.
 
     Raises:
-        StorageError: the address cannot be read.
+        StorageError: the address cannot be parsed.
     """
     url = url_of(database)
     if url.drivername == "sqlite":
@@ -50,7 +50,7 @@ def engine_of(database: str, *, reads_only: bool = False) -> sa.Engine:
         return engine
     return sa.create_engine(
         url,
-        # A server whose host has died is noticed within seconds, not when TCP gives up.
+        # Notice the death of the server's host within seconds, before TCP does.
         connect_args={
             "connect_timeout": 5,
             "tcp_user_timeout": 10_000,
@@ -65,18 +65,18 @@ def _begin_reading(connection: sa.Connection) -> None:
 
 
 def _begin_writing(connection: sa.Connection) -> None:
-    # One that began by reading and then wrote would be refused where another has written meanwhile.
+    # SQLite refuses the first write of a transaction that began with a read when another has written meanwhile.
     connection.exec_driver_sql("BEGIN IMMEDIATE")
 
 
 def _prepare_sqlite(connection: Any, _record: object) -> None:
-    connection.isolation_level = None  # transactions begin where we say so
+    connection.isolation_level = None  # `_begin_...` starts transactions
     connection.execute("PRAGMA journal_mode=WAL")
-    # What was confirmed outlives a power cut.
+    # A confirmed item must survive a power cut.
     connection.execute("PRAGMA synchronous=FULL")
 
 
 def why(error: sa.exc.SQLAlchemyError) -> str:
-    """The database's own words, in one line."""
+    """Give the database's own message in one line."""
     cause = getattr(error, "orig", None) or error
     return " ".join(str(cause).split())[:300] or type(cause).__name__

@@ -1,4 +1,4 @@
-"""What the pages show of IMUs: a model with all its parts, and one IMU's biases over temperature."""
+"""Pages of IMUs: one model with all its parts, and one IMU's biases over temperature."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from companion.report.page import AXES, CLASSES, NAMES, TRIADS, UNITS, page
 from companion.samples import Triad
 
 OUTSIDE: Final = 3.0
-"""Sigmas of how parts differ."""
+"""Least distance from the typical part, in sigmas of the spread, for the list of outliers."""
 MOST_OUTSIDE: Final = 30
 _BINS: Final = 40
 _DOT: Final = 7.5
@@ -116,7 +116,7 @@ def _scatters(of_model: Mapping[Part, Scatter], triad: Triad, axis: int) -> dict
 
 
 def _stacked(values: Sequence[float], across: svg.Axis) -> list[svg.Pair]:
-    """Each where it belongs, one step above those that are there already."""
+    """Place each value on its abscissa, one step above the values already there."""
     there: Counter[int] = Counter()
     points = []
     for value in sorted(values):
@@ -180,7 +180,7 @@ def _outside(
 
 
 def curves(connection: sa.Connection, which: str) -> dict[str, ByTemperature]:
-    """The latest curve over temperature of each IMU of an aircraft."""
+    """Read the latest curve over temperature of each IMU of an aircraft."""
     query = """
         SELECT imu, triad, degc, power_ups, at,
                COALESCE(gyro_bias_deg_h, accel_bias_mg) AS bias, COALESCE(gyro_sigma_deg_h, accel_sigma_mg) AS sigma
@@ -205,7 +205,7 @@ def curves(connection: sa.Connection, which: str) -> dict[str, ByTemperature]:
 
 
 def by_temperature(told: ByTemperature | None, points: Sequence[Seen]) -> Markup | None:
-    """Its curve, and what its calibrations have found."""
+    """Draw the curve of one IMU and the biases that its calibrations found."""
     if told is None:
         return None
     return biases_by_temperature([msgspec.structs.replace(told, points=tuple(points))], looking_back=True)

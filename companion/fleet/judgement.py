@@ -1,4 +1,4 @@
-"""From the calibrations of one sensor, in their order, to what is to be said against it: no database, and no clock."""
+"""Judgement of one sensor: from its calibrations, in order, to findings. It needs no database and no clock."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG, G
 
 LEARNS: Final = 16
-"""Power-ups from which a figure that no model tells is taken."""
+"""Power-ups at the beginning that define what is usual, where no model does."""
 _WITH_MODEL: Final = 10
+"""Power-ups at the beginning that define the level, where a model defines the scatter."""
 _OF_MODEL, _OF_OWN = 1.5, 3.0
-"""How many usual scatters a part's own may be: where its model tells, and where its first power-ups do."""
+"""Largest accepted scatter of a part, as a multiple of its model's or of that of its first power-ups."""
 WANDER: Final = (0.03, 0.3)
-"""In scatters: the least and the most that a bias may wander from one power-up to the next."""
+"""Least and largest wander of a bias from one power-up to the next, in scatters."""
 LEAST_SIZE: Final = 1.8
-"""In scatters: less of a move, or of a scatter, is not worth telling."""
+"""Least size of a finding, in scatters."""
 LEAST_TIMES: Final = 1.4
-"""Likewise of a noise."""
+"""Least factor by which a noise has grown in a finding."""
 _FEW_TELL: Final = 1.2
-"""Times the scatter that a part's first power-ups show: it may be larger than they say."""
+"""Factor on the scatter of a part's first power-ups, which may be too small."""
 _LEAST_NOISE: Final = 0.08
-"""Scatter of the logarithm of a noise that is measured over some ten seconds, at the least."""
+"""Least scatter of the logarithm of a noise that is measured over some ten seconds."""
 _BOUND_DEG: Final = 5.0
-"""A heading that is better than this is none to complain about."""
+"""Least bound of the heading's error in a finding."""
 _DRIFT_AFTER: Final = 8
-"""Power-ups: what takes longer to be seen is a drift."""
+"""Power-ups until an alarm; a level that takes longer has drifted."""
 SHOWN: Final = 30
 """Power-ups for which a level that has moved is shown."""
 _AXES: Final = [f"{triad} {axis}" for triad in ("gyro", "accel") for axis in "xyz"]
@@ -47,15 +48,15 @@ class History(NamedTuple):
     biases: Floats
     """(n, 6) gyro rad/s, accelerometer m/s^2, by the readings alone."""
     sigma_use: Floats
-    """(n, 6) likewise."""
+    """(n, 6) sigma of the biases, same units."""
     white: Floats
-    """(n, 6) white noise, likewise times sqrt(s)."""
+    """(n, 6) white noise, same units times sqrt(s)."""
     new_zero: NDArray[np.bool_]
-    """(n,) where the gradienter's zero is another than before."""
+    """(n,) whether the gradienter's zero differs from the power-up before."""
 
 
 class Columns(NamedTuple):
-    """What `watch` takes; and the unit of each column."""
+    """Arguments of `watch`, and the unit of each column."""
 
     values: Floats
     variance: Floats
@@ -69,7 +70,7 @@ class Columns(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """Something to be said against a sensor."""
+    """Complaint about a sensor."""
 
     kind: str
     """bias, drift, scatter, noise, zero, compass."""
@@ -78,14 +79,14 @@ class Finding(NamedTuple):
     since: int
     """Index of the power-up."""
     size: float
-    """How bad, in what is usual."""
+    """Severity, as a multiple of what is usual."""
     words: str
     moved: float = 0.0
-    """Of a level: rad/s or m/s^2."""
+    """Move of a level, rad/s or m/s^2."""
 
 
 def columns_of(history: History, model: Scatter | None) -> Columns:
-    """Of the biases, (n, 6), then of their noise, (n, 6); `model`: of the other parts of its kind."""
+    """Make the columns of the biases, (n, 6), and of their noise, (n, 6); `model`: scatter of the other parts."""
     own = scatter_of_part(history.biases[:LEARNS], history.temperature_degc[:LEARNS])
     turn_on, wander = _FEW_TELL * own.turn_on, np.full(6, WANDER[0])
     first, most_own = np.full(12, LEARNS), np.full(12, _OF_OWN)
@@ -97,10 +98,10 @@ def columns_of(history: History, model: Scatter | None) -> Columns:
     unit = np.where(turn_on > 0.0, turn_on, np.nan)
     use = np.square(history.sigma_use)
     usual = np.array([middle_of(column) for column in use.T])
-    # What is in all calibrations alike is in the scatter already.
+    # The usual sigma is part of the scatter already.
     variance = np.nan_to_num(np.maximum(use - usual, 0.0) / unit**2)
     noise = np.log(np.where(history.white > 0.0, history.white, np.nan))
-    # The end of a warm-up is that of a line, whose sigma tells nothing of the noise.
+    # At the end of a warm-up the sigma is that of a fitted line, which does not tell the noise.
     share = np.sqrt(use) / history.white
     noise = np.where(share > 3.0 * np.array([middle_of(column) for column in share.T]), np.nan, noise)
     of_noise = scatter_of_part(noise[:LEARNS], history.temperature_degc[:LEARNS]).turn_on
@@ -123,12 +124,12 @@ def columns_of(history: History, model: Scatter | None) -> Columns:
 
 
 def counts(alarm: Alarm) -> bool:
-    """Whether an alarm, of a column as `columns_of` gives them, is one: not that a noise is less, or scatters."""
+    """Tell whether an alarm of these columns is a complaint: a noise that falls or scatters is none."""
     return alarm.column < 6 or (alarm.kind == "level" and alarm.size > 0.0)
 
 
 def judge(history: History, model: Scatter | None) -> list[Finding]:
-    """What is to be said against one IMU as of its latest power-up, the worst first."""
+    """List the findings against one IMU as of its latest power-up, the worst first."""
     columns = columns_of(history, model)
     n = len(history.biases)
     found: dict[tuple[int, str], Finding] = {}
@@ -152,7 +153,7 @@ def judge(history: History, model: Scatter | None) -> list[Finding]:
                 f" {'deg/h' if axis < 3 else 'mg'}, {abs(size):.1f} times {its}"
             )
             found[axis, "level"] = Finding(kind, axis, since, size, words, size * unit)
-    # A scatter that has grown moves the level, too.
+    # A grown scatter also raises alarms of the level.
     left = [each for (axis, what), each in found.items() if what != "level" or (axis, "scatter") not in found]
     return sorted((each._replace(size=abs(each.size)) for each in left), key=lambda each: -each.size)
 
@@ -170,7 +171,7 @@ def _noise(found: dict[tuple[int, str], Finding], alarm: Alarm, columns: Columns
 
 
 def judge_compass(heading_bound_deg: Floats) -> list[Finding]:
-    """By the bound of the heading's error, (n,) of power-ups with a compass; NaN: not known."""
+    """Judge the compass by the bound of the heading's error at each power-up, (n,); NaN: not known."""
     if len(heading_bound_deg) <= LEARNS:
         return []
     columns = compass_column(heading_bound_deg)
@@ -185,7 +186,7 @@ def judge_compass(heading_bound_deg: Floats) -> list[Finding]:
 
 
 def compass_column(heading_bound_deg: Floats) -> Columns:
-    """As `columns_of`."""
+    """Make the column of the heading's bound for `watch`."""
     bound = np.log(np.where(heading_bound_deg > 0.0, heading_bound_deg, np.nan))[:, None]
     n, nowhere = len(bound), np.full((len(bound), 1), np.nan)
     six = np.repeat(bound[:LEARNS], 6, axis=1)
@@ -196,12 +197,13 @@ def compass_column(heading_bound_deg: Floats) -> Columns:
 
 
 ZERO_SIGMAS: Final = 8.0
+"""Least move of a zero in a finding, in sigmas."""
 ZERO_USUAL_DEG: Final = 0.05
-"""By how much a good gradienter's zero differs from one alignment to the next, with the air's temperature."""
+"""One sigma between two alignments of a good gradienter, from the air's temperature."""
 
 
 def judge_zero(offset_deg: Floats, sigma_deg: Floats) -> list[Finding]:
-    """By its latest two alignments, (m, 2) and (m,); `since` is the index of the later one."""
+    """Judge the gradienter by its latest two alignments, (m, 2) and (m,); `since` is the index of the later one."""
     if len(offset_deg) < 2:
         return []
     moved = float(np.abs(offset_deg[-1] - offset_deg[-2]).max())

@@ -1,7 +1,7 @@
-"""Judging an aircraft: from the rows of its calibrations to those of `parts` and `findings`.
+"""Judgement of an aircraft: from the rows of its calibrations to rows of `parts` and `findings`.
 
-Whoever judges, and however often, comes to the same: it is worked out from all calibrations, never from an earlier
-judgement, and written only if nothing came meanwhile.
+Every collector gets the same result, however often it judges: all calibrations are the input, never an earlier
+judgement.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from companion.physics.frames import Floats
 from companion.physics.units import DEG, MG, G
 
 MOST_CALIBRATIONS: Final = 2000
-"""Of an aircraft, the latest: five years of one a day."""
+"""Most calibrations of an aircraft, the latest ones: five years of one a day."""
 SAME_POWER_UP: Final = datetime.timedelta(minutes=30)
-"""Calibrations that follow one another sooner and agree are of one power-up."""
+"""Most time between two calibrations that agree and count as one power-up."""
 MOST_DEGC: Final = 150.0
-"""Beyond this a thermometer tells none: above all one whose kelvins were not turned into degrees."""
+"""Limit of a believable temperature, to catch kelvins that were not turned into degrees."""
 _AGREE_SIGMAS: Final = 5.0
 MOST_PARTS: Final = 300
 """Parts of one model that are compared."""
 _TOGETHER: Final = 10
-"""Power-ups within which accelerometers that moved have moved together."""
+"""Most power-ups between moves of accelerometers that count as one move of the gradienter."""
 REPLACE: Final = {"scatter": 3.0, "noise": 2.0, "drift": 8.0, "bias": 8.0}
-"""From such sizes on."""
+"""Least sizes of findings, by kind, for the word "replace"."""
 
 
 Part = tuple[str, str]
@@ -42,7 +42,7 @@ Part = tuple[str, str]
 
 
 class Judged(NamedTuple):
-    """Rows by table, of one aircraft."""
+    """Rows of one aircraft, by table."""
 
     parts: list[Row]
     findings: list[Row]
@@ -51,25 +51,25 @@ class Judged(NamedTuple):
 class _Calibration(NamedTuple):
     at: datetime.datetime
     about: Any
-    """Its row."""
+    """Row of `calibrations`."""
     axes: list[Any]
-    """Rows of one IMU: x, y, z."""
+    """Rows of `biases` of one IMU: x, y, z."""
 
     def figures(self, name: str) -> list[float]:
-        """Gyro x y z, accelerometer x y z."""
+        """Give a figure of gyro x y z, accelerometer x y z."""
         names = (f"gyro_{name}_rad_s", f"accel_{name}_m_s2")
         return [np.nan if (value := getattr(row, each)) is None else value for each in names for row in self.axes]
 
 
 def judged(connection: sa.Connection, aircraft: str) -> Judged:
-    """By all that the database has of it."""
+    """Judge an aircraft by all calibrations in the database."""
     done = _done(connection, aircraft)
     imus: dict[str, list[_Calibration]] = {}
     for key, rows in _biases(connection, aircraft).items():
         if key[:2] in done and len(rows) == 3:
             about = done[key[:2]]
             imus.setdefault(key[2], []).append(_Calibration(about.started_at, about, rows))
-    # Its import is heavy, and most of the collector does without.
+    # The import is heavy, and most of the collector does without.
     from companion.autopilot.firmware.firmwares import model_of
 
     firmware = next((row.firmware for row in reversed(done.values()) if row.firmware), None)
@@ -109,7 +109,7 @@ def parts_of(connection: sa.Connection, model: str, *, but: str = "") -> dict[Pa
 
 
 def _done(connection: sa.Connection, aircraft: str) -> dict[tuple[str, int], Any]:
-    """Calibrations that stand, by key, in their order: that of the epochs, and of the sequences in each."""
+    """Read the calibrations that were not undone, by key, in the order of epochs and sequences."""
     query = """
         SELECT s.epoch, s.sequence, s.started_at, s.duration_s, s.firmware, s.heading_bound_deg,
                s.zero_at, s.zero_x_deg, s.zero_y_deg, s.zero_sigma_deg, i.received_at
@@ -141,14 +141,14 @@ def _biases(connection: sa.Connection, aircraft: str) -> dict[tuple[str, int, st
 
 
 def _present(calibrations: list[_Calibration]) -> list[_Calibration]:
-    """Those of the part that is in there now."""
+    """Select the calibrations of the part that is in the aircraft now."""
     ids = [(one.axes[0].gyro_id, one.axes[0].accel_id) for one in calibrations]
     others = [place for place, each in enumerate(ids) if each != ids[-1]]
     return calibrations[others[-1] + 1 if others else 0 :]
 
 
 def _power_ups(calibrations: list[_Calibration]) -> list[_Calibration]:
-    """The last of each power-up, which a clock that is wrong cannot make one of many: they agree, too."""
+    """Select the last calibration of each power-up; they must also agree, as a wrong clock could join many."""
     found = calibrations[:1]
     for before, one in pairwise(calibrations):
         read, use = (np.array([each.figures(name) for each in (before, one)]) for name in ("read", "sigma_use"))
@@ -162,7 +162,7 @@ def _power_ups(calibrations: list[_Calibration]) -> list[_Calibration]:
 def _history(calibrations: Sequence[_Calibration]) -> History:
     samples = np.array([one.axes[0].samples or np.nan for one in calibrations], dtype=np.float64)
     took_s = np.array([one.about.duration_s for one in calibrations])
-    # Its rate is what the quickest of those around it shows: the others have waited, too.
+    # Sample rate by the quickest of the calibrations before: the duration of others includes waiting.
     rate = samples / np.maximum(took_s, 1.0)
     rate = np.array([np.fmax.reduce(rate[max(k - 7, 0) : k + 1]) for k in range(len(rate))])
     degc = [np.nan if (told := one.axes[0].temperature_degc) is None else told for one in calibrations]
@@ -198,7 +198,7 @@ _Found = list[tuple[str | None, Sequence[datetime.datetime], Finding]]
 
 
 def _of_the_gradienter(found: _Found, imus: int) -> _Found:
-    """Level accelerometers that have all moved together: it is what they are measured against."""
+    """Replace findings of level accelerometers that moved together by one against the gradienter."""
     left = list(found)
     for axis, name in ((3, "forward"), (4, "right")):
         of_it = [one for one in found if one[2].axis == axis and one[2].kind in ("bias", "drift")]

@@ -1,6 +1,6 @@
-"""What the parts of one IMU model have in common: how far their biases scatter from power-up to power-up, and wander.
+"""Scatter of IMU parts and of their models: how far biases scatter from power-up to power-up, and wander.
 
-Pure functions of what calibrations have found; columns are gyro x y z, then accelerometer x y z, vehicle FRD, SI units.
+Pure functions of biases; columns are gyro x y z, then accelerometer x y z, vehicle FRD, SI units.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ import numpy as np
 from companion.physics.frames import Floats
 
 LEAST_POWER_UPS: Final = 8
-"""Of one part, before its scatter says something."""
+"""Least power-ups for the scatter of a part."""
 LEAST_PARTS: Final = 4
-"""Of a model, before it is one to compare with."""
+"""Least parts for the scatter of a model."""
 WANDER_LAG: Final = 30
+"""Power-ups between the two levels that tell the wander."""
 _STEP_K: Final = 15.0
 _FOR_A_TERM: Final = 24
 """Power-ups for each further power of the temperature."""
@@ -24,14 +25,13 @@ MAD_TO_SIGMA: Final = 1.4826
 _LEAST_SPREAD: Final = 0.05
 """Least difference between the scatters of parts, as a share of the typical scatter."""
 _OUTLIER: Final = 3.0
-"""Sigmas beyond which a step counts no more for the slope over temperature."""
+"""Sigmas beyond which a step is left out of the slope over temperature."""
 _GROUPS: Final = (slice(0, 3), slice(3, 5), slice(5, 6))
-"""Columns whose scatter is one: parts are mounted in any direction, but that of the level accelerometers has the
-gradienter's share in it."""
+"""Columns with one scatter: parts are mounted in any direction, but the gradienter adds to the level accelerometers."""
 
 
 class Scatter(NamedTuple):
-    """Of one part, or of a model: (6,) each, NaN where it is not known."""
+    """Scatter of one part, or of a model; (6,) each, NaN where not known."""
 
     power_ups: int
     parts: int
@@ -40,21 +40,21 @@ class Scatter(NamedTuple):
     wander: Floats
     """One sigma of the step that stays, from one power-up to the next."""
     per_k: Floats
-    """How it follows the temperature, at the mean of those that were told."""
+    """Slope over temperature, at the mean of the known temperatures."""
 
 
 def scatter_of_part(biases: Floats, temperature_degc: Floats) -> Scatter:
-    """Of one part over its power-ups in their order, (n, 6) and (n,); NaN: not measured.
+    """Estimate the scatter of a part from its power-ups in order, (n, 6) and (n,); NaN: not measured.
 
-    Made of the steps between power-ups that follow one another, which neither a bias that ages nor one that has moved
-    once makes larger, less what follows the temperature.
+    Steps between successive power-ups, less the part that follows the temperature, are the input: neither ageing nor a
+    single move makes them larger.
     """
     turn_on, wander, per_k = np.array([_column(column, temperature_degc) for column in biases.T]).T
     return Scatter(len(biases), 1, turn_on, wander, per_k)
 
 
 def scatter_of_model(parts: Sequence[Scatter]) -> Scatter | None:
-    """The typical part's, by the median; None: there are fewer than `LEAST_PARTS` that tell."""
+    """Give the median scatter of the parts; None: fewer than `LEAST_PARTS` have one."""
     telling = [part for part in parts if np.isfinite(part.turn_on).any()]
     if len(telling) < LEAST_PARTS:
         return None

@@ -1,4 +1,4 @@
-"""The pages that people look at: the fleet at a glance, and one aircraft. Read from the views, nothing is written."""
+"""Pages of the fleet and of one aircraft, read from the views."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ STALE: Final = datetime.timedelta(days=30)
 """A calibration that is older is shown as stale."""
 SILENT: Final = datetime.timedelta(days=7)
 MOST_AIRCRAFT: Final = 500
-"""The most aircraft on one page, which has some 90 kB then."""
+"""Most aircraft on one page of some 90 kB."""
 MOST_CALIBRATIONS: Final = 120
-"""The most of one IMU that are drawn, the latest."""
+"""Most calibrations of one IMU in a plot, the latest ones."""
 MOST_LISTED: Final = 25
 MOST_REFUSED: Final = 5
 MOST_FINDINGS: Final = 8
-"""The worst."""
+"""Most findings in the card, the worst ones."""
 
 
 class Standing(NamedTuple):
-    """How an aircraft stands: the kind of card, a word, and why."""
+    """State of an aircraft: the kind of card, a word, and the reason."""
 
     kind: str
     word: str
@@ -62,7 +62,7 @@ _ORDERED: Final = (
     " ORDER BY w.size DESC NULLS LAST, s.untold, s.standing, s.heard_at DESC NULLS LAST, s.aircraft"
     " LIMIT :most OFFSET :first"
 )
-"""An id that has told no calibration comes after all that have: nobody moves an aircraft away by inventing others."""
+"""Ids without a calibration come last, so that invented ids move no real aircraft from the first page."""
 
 
 def standing(one: Any) -> Standing:
@@ -79,7 +79,7 @@ def standing(one: Any) -> Standing:
 
 
 def glance(connection: sa.Connection, now: datetime.datetime, number: int = 1) -> str | None:
-    """The fleet, `MOST_AIRCRAFT` on each numbered page; None: there is no such page."""
+    """Show the fleet, `MOST_AIRCRAFT` on each numbered page; None: there is no such page."""
     since = {"stale": now - STALE, "silent": now - SILENT}
     counted = f"SELECT standing, COUNT(*) AS number, SUM(silent) AS silent FROM ({_FLEET}) s GROUP BY standing"  # noqa: S608 - constants
     groups = _rows(connection, f"{counted} ORDER BY standing", **since)
@@ -113,7 +113,7 @@ def glance(connection: sa.Connection, now: datetime.datetime, number: int = 1) -
 
 
 def _line(one: Any, now: datetime.datetime) -> Markup:
-    """One aircraft in the table of the fleet."""
+    """Make the row of one aircraft in the table of the fleet."""
     stands = standing(one)
     calibrated = "" if one.calibrated_at is None else _ago(one.calibrated_at, now)
     return row(
@@ -141,7 +141,7 @@ def _other_pages(number: int, known_in_all: int) -> Markup | None:
 
 
 def aircraft(connection: sa.Connection, which: str, now: datetime.datetime) -> str | None:
-    """One aircraft; None: it was never heard."""
+    """Show one aircraft; None: it was never heard."""
     query = f"SELECT * FROM ({_FLEET}) s WHERE aircraft = :which"  # noqa: S608 - constants
     found = _rows(connection, query, which=which, stale=now - STALE, silent=now - SILENT)
     if not found:
@@ -169,7 +169,7 @@ def aircraft(connection: sa.Connection, which: str, now: datetime.datetime) -> s
 
 
 def _findings(connection: sa.Connection, which: str | None = None) -> Markup | None:
-    """What is to be said against sensors, the worst first: of one aircraft, or each one's worst."""
+    """Show the findings, the worst first: all of one aircraft, or the worst of each."""
     each, one = findings.c, sa.join(findings, known, findings.c.aircraft == known.c.aircraft)
     query = sa.select(each.aircraft, known.c.name, each.words, sa.func.count().over().label("all")).select_from(one)
     query = query.where(each.place == 0 if which is None else each.aircraft == which)
@@ -218,7 +218,7 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
 
 
 def _seen(rows: Sequence[Any]) -> list[Seen]:
-    """At which temperature which bias was found."""
+    """Select the biases with a temperature."""
     degc = {(each.sequence, seconds_of(each.started_at)): each.temperature_degc for each in rows}
     gyro, accel = ({(one.number, one.unix_s): one for one in _points(rows, triad)} for triad in TRIADS)
     return [
@@ -238,7 +238,7 @@ def _seen(rows: Sequence[Any]) -> list[Seen]:
 
 
 def _points(rows: Sequence[Any], triad: Triad) -> list[Point]:
-    """The latest ones, in the order of time, SI units."""
+    """Select the latest biases, in the order of time, SI units."""
     unit, name = UNITS[triad]
     suffix = name.replace("/", "_")
     found: dict[tuple[str, int], dict[str, Any]] = {}
@@ -268,7 +268,7 @@ def _armings(connection: sa.Connection, which: str) -> list[Child]:
 
 
 def _notes(connection: sa.Connection, which: str) -> list[Child]:
-    """What else has happened: failed calibrations, undos, events, flights."""
+    """List failed calibrations, undos, events and flights."""
     query = """
         SELECT started_at AS at, 'calibration ' || state AS what, reason AS more FROM calibrations
         WHERE aircraft = :which AND state <> 'done'
@@ -287,7 +287,7 @@ def _notes(connection: sa.Connection, which: str) -> list[Child]:
 
 
 def _refused(connection: sa.Connection, now: datetime.datetime) -> Markup | None:
-    """What was not taken lately, and on whose topic: with the broker's access list nobody else can have said it."""
+    """Show the latest rejected payloads by topic: with the broker's access list only its owner can have sent them."""
     last = sa.select(rejected).order_by(rejected.c.last_at.desc()).limit(MOST_REFUSED).subquery()
     of = last.c.topic.startswith("fleet/" + known.c.aircraft + "/")
     query = sa.select(last, known.c.name).outerjoin_from(last, known, of).order_by(last.c.last_at.desc())
@@ -309,7 +309,7 @@ _MOMENTS: Final = ("heard_at", "calibrated_at", "tried_at", "armed_at", "started
 
 
 def _rows(connection: sa.Connection, query: str, **values: Any) -> Sequence[Any]:
-    """With times as times, also where the database keeps them as texts."""
+    """Run a query; times are times, also where the database keeps them as texts."""
     names = [name for name in _MOMENTS if name in query.split()[1:] or "*" in query]
     columns = {name: Moment() for name in names}
     times = [
@@ -323,7 +323,7 @@ def _moment(at: datetime.datetime | None) -> str:
 
 
 def _ago(at: datetime.datetime | None, now: datetime.datetime) -> str:
-    """How long ago, coarsely; a time to come is shown as it is: some clock is wrong."""
+    """Say how long ago a time is, coarsely; show a future time as it is: some clock is wrong."""
     if at is None:
         return "never"
     ago_s = (now - at).total_seconds()

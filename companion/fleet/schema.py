@@ -1,7 +1,8 @@
-"""The database: one schema for PostgreSQL and SQLite, and what brings an older one up to date.
+"""Schema of the database, for PostgreSQL and SQLite, and the steps that bring an older one up to date.
 
-Raw items are what was told, to the letter. All else is made from them and can be made anew. Axes are the vehicle's
-FRD; times are UTC by the aircraft's clock, which may be wrong, save `heard_at`, `received_at` and what is rejected.
+The table `items` has the payloads as they came. All else is made from them and can be made again. Axes are the
+vehicle's FRD. Times are UTC by the aircraft's clock, which may be wrong; `heard_at`, `received_at` and `last_at` are by
+the collector's.
 """
 
 from __future__ import annotations
@@ -17,33 +18,33 @@ import sqlalchemy as sa
 from companion.errors import StorageError
 
 _LOCK: Final = 0x636F6D70616E696F
-"""Of PostgreSQL's advisory locks: while it is held, no other collector looks at the version."""
+"""Key of PostgreSQL's advisory lock that the collector holds while it reads and changes the version."""
 
 
 class Moment(sa.types.TypeDecorator[datetime.datetime]):
-    """A time with its zone, UTC; SQLite, which has none, keeps it as a text."""
+    """Time with its zone, UTC; SQLite keeps it as a text without."""
 
     impl = sa.DateTime(timezone=True)
     cache_ok = True
 
     def process_bind_param(self, value: datetime.datetime | None, dialect: sa.Dialect) -> datetime.datetime | None:
-        """Of what goes in."""
+        """Convert a value for the database."""
         return value if value is None or dialect.name != "sqlite" else value.astimezone(datetime.UTC)
 
     def process_result_value(self, value: Any, dialect: sa.Dialect) -> datetime.datetime | None:
-        """Of what comes out."""
+        """Convert a value from the database."""
         found: datetime.datetime | None = value
         return found if found is None or found.tzinfo is not None else found.replace(tzinfo=datetime.UTC)
 
 
 class Words(sa.types.TypeDecorator[str]):
-    """A text; a zero byte, which PostgreSQL refuses, is replaced."""
+    """Text; zero bytes, which PostgreSQL refuses, are replaced."""
 
     impl = sa.Text
     cache_ok = True
 
     def process_bind_param(self, value: str | None, dialect: sa.Dialect) -> str | None:
-        """Of what goes in."""
+        """Convert a value for the database."""
         return value if value is None else value.replace("\0", "\ufffd")
 
 
@@ -265,14 +266,14 @@ def _indices_by_time(connection: sa.Connection) -> None:
 
 
 def curves_and_flights(connection: sa.Connection) -> None:
-    """Tables of their own; until then they were kept as they came."""
+    """Make the tables of curves and flights; parse the curves that were kept as they came."""
     for table in (curves, flights):
         table.create(connection, checkfirst=True)
     connection.execute(sa.update(items).where(items.c.kind == "curve").values(state="unknown"))
 
 
 def _to_be_judged(connection: sa.Connection) -> None:
-    """What a sensor is judged by; calibrations are taken in anew, as an older version left that out."""
+    """Add the columns that sensors are judged by, and parse the calibrations again to fill them."""
     for table in (calibrations, biases):
         there = {column["name"] for column in sa.inspect(connection).get_columns(table.name)}
         for column in table.columns:
@@ -291,13 +292,13 @@ def _to_be_judged(connection: sa.Connection) -> None:
 _TAKEN: Final = items.c.state == "taken"
 Step = Callable[[sa.Connection], object]
 STEPS: Sequence[Step] = (_indices_by_time, curves_and_flights, _to_be_judged)
-"""The n-th brings tables of version n to version n + 1; views are made anew after it, and where one is lacking."""
+"""Updates of the tables, from version n to n + 1; views are made again after an update, and where one is missing."""
 
 
 def bring_up_to_date(connection: sa.Connection) -> bool:
-    """Make the tables, or bring those of an older version up to date; whether there was anything to do.
+    """Make the tables, or bring those of an older version up to date; return whether anything was to do.
 
-    Within the connection's transaction: it is done wholly or not at all, and by one collector only.
+    All of it happens within the connection's transaction, by one collector at a time.
 
     Raises:
         StorageError: a newer companion has made them.
@@ -332,5 +333,5 @@ def bring_up_to_date(connection: sa.Connection) -> bool:
 
 
 def views() -> list[tuple[str, str, str]]:
-    """Name, purpose and query of each view; those that others rest on come first."""
+    """List name, purpose and query of each view; a view comes after the views it rests on."""
     return _VIEW.findall(_VIEWS.read_text(encoding="utf-8"))

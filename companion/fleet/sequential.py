@@ -1,11 +1,11 @@
-"""Whether a figure that is measured at each power-up stays what it was: sequential tests.
+"""Sequential tests for a figure that is measured at each power-up: has its level or its scatter changed?
 
-A Kalman filter foretells each value from those before: a level that wanders as those of its model do, and a cubic over
-temperature. What it is off by, in its sigmas, goes into two-sided CUSUMs (Page, Biometrika 41 (1954) 100-115) for a
-level that has moved; the scatter of each value about the three before it into one for twice the scatter, by the
-likelihood ratio. Single values count no more than `CLIP` sigmas: no knock alone raises an alarm.
+A Kalman filter predicts each value from those before: a level that wanders like those of its model, and a cubic over
+temperature. Its normalised residuals go into two-sided CUSUMs (Page, Biometrika 41 (1954) 100-115) for a moved level.
+The scatter of each value about the three before it goes into a likelihood-ratio CUSUM for twice the scatter. Single
+values count at most `CLIP` sigmas: no knock alone raises an alarm.
 
-The limits are those at which tests/judgement_study.py finds less than one false alarm a hundred aircraft and month.
+With these limits tests/judgement_study.py finds less than one false alarm per hundred aircraft and month.
 """
 
 from __future__ import annotations
@@ -20,42 +20,42 @@ from companion.physics.frames import Floats
 
 CLIP: Final = 3.0
 LEAST_SHIFT: Final = 0.5
-"""In sigmas: half of the shift that is found the soonest."""
+"""Reference value of the CUSUMs in sigmas: half of the shift that is found soonest."""
 LEVEL_LIMIT: Final = 17.0
 SCATTER_LIMIT: Final = 20.0
 _FURTHER: Final = 6.0
-"""So far beyond its limit the sum goes at most: thus it comes back when the scatter does."""
+"""Largest excess of the sum over its limit, so that it falls again when the scatter does."""
 _TWICE: Final = (0.375, np.log(2.0))
-"""Of z^2, and of none: the likelihood ratio of twice the scatter."""
+"""Factor of z^2 and constant of the log-likelihood ratio for twice the scatter."""
 OWN_WEIGHT: Final = 8.0
-"""Power-ups that its model's scatter counts for: that of the parts of one model differs by a quarter."""
+"""Weight of the model's scatter, in power-ups: the scatter of parts differs by a quarter."""
 _HELD: Final = 2.5
 _HELD_MEAN: Final = 0.9775
-"""Mean of the square of a normal number that is held to `_HELD`."""
+"""Mean square of a normal number that is clipped to `_HELD`."""
 _MEDIAN_OF_3: Final = 0.449
 """Variance of the median of three normal numbers."""
 _STEP_K: Final = 15.0
 _AT_DEGC: Final = 20.0
 _BEFORE: Final = np.square([100.0, 50.0, 10.0, 2.0])
-"""Variances at first, in scatters: level, and what a step of temperature, its square and its cube do."""
+"""Initial variances in scatters: of the level, and of the three coefficients over temperature."""
 _NEW_LEVEL: Final = 1e4
 _BASE: Final = 20
-"""Power-ups before that a level is compared with."""
+"""Power-ups before a move that the level is compared with."""
 
 
 class Alarm(NamedTuple):
-    """One column's figure has changed."""
+    """Change of one column's figure."""
 
     column: int
     kind: Literal["level", "scatter"]
     since: int
-    """The first power-up that counts towards it, by index."""
+    """Index of the first power-up that counts towards it."""
     at: int
-    """When it was seen."""
+    """Index of the power-up at which it was found."""
     until: int
-    """When it was as before again; a level that has moved stays. The number of power-ups: not yet."""
+    """Index of the power-up at which the scatter was as before; the number of power-ups: not yet, or a moved level."""
     size: float
-    """By how much the level has moved, or what the scatter was then, and is if it is so still; in scatters."""
+    """Move of the level, or the scatter since then, in usual scatters."""
 
 
 def watch(  # noqa: PLR0915
@@ -68,17 +68,17 @@ def watch(  # noqa: PLR0915
     most_own: Floats,
     least: Floats,
 ) -> list[Alarm]:
-    """All alarms of all columns, in the order in which they were raised.
+    """Find the alarms of all columns, in the order in which they were raised.
 
     Args:
-        values: (n, c) of n power-ups in their order, in the scatter that is usual; NaN: not measured.
-        variance: (n, c) by which a value is less certain than usual, in squares of that scatter.
+        values: (n, c) of n power-ups in order, in usual scatters; NaN: not measured.
+        variance: (n, c) variance of a value beyond the usual one, in squares of the usual scatter.
         temperature_degc: (n, c); NaN: not known.
-        wander: (c,) one sigma of the step of the level from one power-up to the next, likewise.
-        relevel: (n, c) where what it is measured with has changed, so that its level may be another.
-        first: (c,) how many tell at first what is usual, at least 3.
-        most_own: (c,) up to how many usual scatters its own may be without being too large.
-        least: (c,) what moves by less, or scatters less, raises no alarm yet.
+        wander: (c,) one sigma of the step of the level from one power-up to the next, in usual scatters.
+        relevel: (n, c) whether the reference of the measurement has changed, so that the level may differ.
+        first: (c,) number of power-ups at the beginning that define what is usual, at least 3.
+        most_own: (c,) largest accepted scatter of the column itself, in usual scatters.
+        least: (c,) least move or scatter that raises an alarm.
     """
     n, c = values.shape
     there = np.isfinite(values)
@@ -87,7 +87,7 @@ def watch(  # noqa: PLR0915
     unknown &= ~unknown.all(axis=0)
     laws = warmer[:, :, None] ** np.arange(4)
     columns = np.arange(c)
-    # What was not measured stands as that before it: for the filter it does not count.
+    # A value that was not measured repeats the one before; the filter does not count it.
     held = np.maximum.accumulate(np.where(there, np.arange(n)[:, None], there.argmax(axis=0)), axis=0)
     y, laws = np.nan_to_num(values[held, columns] - values[held[0], columns]), laws[held, columns]
     x, p = np.zeros((c, 4)), np.tile(np.diag(_BEFORE), (c, 1, 1))
@@ -114,19 +114,19 @@ def watch(  # noqa: PLR0915
         usual = np.clip(own / count, 1.0, most_own**2)
         ph = (p * h[:, None, :]).sum(axis=2)
         of_filter = (ph * h).sum(axis=1)
-        # One without a temperature may have been taken at any.
+        # A value without a temperature may belong to any.
         law = np.square(x[:, 1:]) + p[:, range(1, 4), range(1, 4)]
         more = variance[k] + unknown[k] * law.sum(axis=1)
         total = of_filter + usual + more
         off = np.where(here, y[k] - (x * h).sum(axis=1), 0.0)
         z = off / np.sqrt(total)
         gain = ph * (here / total)[:, None]
-        # Once it knows its level it follows slowly what may be a fault.
+        # Once the level is known, follow slowly: the residual may be a fault.
         most = np.where(of_filter < usual, HUBER_C, CLIP)
         x += gain * (np.clip(z, -most, most) * np.sqrt(total))[:, None]
         p -= gain[:, :, None] * ph[:, None, :]
 
-        # The scatter: about the median of the three before it, so that a level that moves is two large ones.
+        # Scatter about the median of the three values before: a moved level makes two large residuals only.
         before = y[latest, columns] - (laws[latest, columns, 1:] * x[:, 1:]).sum(axis=2)
         middle = before.sum(axis=0) - before.max(axis=0) - before.min(axis=0)
         apart = h[:, 1:] - laws[latest, columns, 1:].mean(axis=0)
@@ -143,7 +143,7 @@ def watch(  # noqa: PLR0915
         down = np.where(here, np.maximum(down - z - LEAST_SHIFT, 0.0), down)
         up_0, down_0 = np.where(up == 0.0, k + 1, up_0), np.where(down == 0.0, k + 1, down_0)
 
-        # What it has learned of its own scatter; not while that is in doubt, nor of what the filter did not know.
+        # Learn the column's own scatter, except while it is in doubt or the filter does not know the level.
         learns = here & (wide < SCATTER_LIMIT / 4.0) & (of_filter < usual)
         own = own + np.where(learns, usual * np.minimum(np.square(z), _HELD**2) / _HELD_MEAN, 0.0)
         count = count + learns
@@ -175,9 +175,9 @@ def watch(  # noqa: PLR0915
 
 
 def _begin(y: Floats, laws: Floats, there: NDArray[np.bool_]) -> tuple[Floats, Floats, float]:
-    """Level and law of one column's first power-ups, their covariance, and the sum of squares about them.
+    """Fit level and law of one column's first power-ups; return them, their covariance and the sum of squares.
 
-    Knocked ones count for little.
+    Huber weights: knocked windows count little.
     """
     weight: Floats = there.astype(np.float64)
     for _ in range(8):
@@ -194,5 +194,5 @@ def _scatter(level: Floats) -> float:
 
 
 def _at_one_temperature(y: Floats, laws: Floats, x: Floats, column: int) -> Floats:
-    """(n,) of one column."""
+    """Reduce the values of one column to one temperature, (n,)."""
     return np.asarray(y[:, column] - laws[:, column, 1:] @ x[column, 1:])

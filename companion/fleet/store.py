@@ -1,4 +1,4 @@
-"""Writing and asking: batches in one transaction each, so that nothing is there by halves and nothing twice."""
+"""Writer of the database: each batch is one transaction, so that no item is written by halves or twice."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ MOST_REJECTED: Final = 10_000
 _SHOWN_BYTES: Final = 4096
 _REJECTED: Final[Row] = {"state": "rejected", "kind": None, "at": None, "clock": None, "same": None}
 _AGAIN: Final = 500
-"""Items of a newer aircraft that are looked at anew in one transaction after an update."""
+"""Items of a newer aircraft that are parsed again in one transaction after an update."""
 _CURVE: Final = itemgetter("aircraft", "epoch", "imu")
 
 
 class Message(NamedTuple):
-    """As it came from the broker."""
+    """Message as the broker delivered it."""
 
     topic: str
     payload: bytes
@@ -53,7 +53,7 @@ class Message(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What to answer once a batch is in the database: sequences by aircraft and epoch; and what was not taken, why."""
+    """Result of a batch: sequences to confirm and to ask for, by aircraft and epoch; rejected messages with reasons."""
 
     confirmed: dict[tuple[str, str], list[int]]
     wanted: dict[tuple[str, str], list[list[int]]]
@@ -61,7 +61,7 @@ class Outcome(NamedTuple):
 
 
 class Store:
-    """The tables; each call is one transaction or several whole ones. Calls block: they belong into a thread."""
+    """Store of items, hellos and judgements; calls block, so call them in a thread."""
 
     def __init__(self, database: str) -> None:
         self._engine, self._reads = engine_of(database), engine_of(database, reads_only=True)
@@ -69,11 +69,11 @@ class Store:
 
     @property
     def where(self) -> str:
-        """The database, without a password."""
+        """Address of the database, without a password."""
         return self._engine.url.set(drivername=self._engine.dialect.name).render_as_string()
 
     def close(self) -> None:
-        """Leave the connections; the next call opens one anew."""
+        """Close the connections; the next call opens a new one."""
         self._engine.dispose()
         self._reads.dispose()
 
@@ -85,7 +85,7 @@ class Store:
             raise LinkError(f"{self.where}: {why(error)}") from None
 
     def prepare(self) -> None:
-        """Bring the tables up to date, and take in what an older version did not know.
+        """Bring the tables up to date, and parse the items that an older version did not know.
 
         Raises:
             StorageError: a newer companion has made them.
@@ -98,7 +98,7 @@ class Store:
                 pass
 
     def judge(self) -> bool:
-        """Judge an aircraft of which there is something new; whether there was one.
+        """Judge one aircraft with new calibrations or undos; return False if there is none.
 
         Raises:
             LinkError: the database cannot be reached, or fails.
@@ -112,7 +112,7 @@ class Store:
                 found = self._judged(connection, due.aircraft)
             is_it = table.c.aircraft == due.aircraft
             with self._engine.begin() as connection:
-                # Not if there was something new meanwhile.
+                # Write nothing if new items have come meanwhile.
                 update = sa.update(table).where(is_it, table.c.news == due.news).values(judged=due.news)
                 if connection.execute(update).rowcount and found is not None:
                     for of, rows in ((schema.parts, found.parts), (schema.findings, found.findings)):
@@ -129,7 +129,7 @@ class Store:
             return None
 
     def take(self, messages: Sequence[Message]) -> Outcome:
-        """Put a batch into the database; what is not taken is kept aside there with its reason.
+        """Write a batch into the database; refused messages go to the table `rejected` with their reasons.
 
         Raises:
             LinkError: the database cannot be reached, or fails; nothing of the batch may be confirmed.
@@ -141,7 +141,7 @@ class Store:
             raise LinkError(f"{self.where}: {why(error)}") from None
         except sa.exc.SQLAlchemyError as error:
             reason = _refusal(error)
-        # One of them it is: each by itself.
+        # Find the refused message: write each by itself.
         if len(messages) == 1:
             return self._reject(messages[0], reason, now)
         found = Outcome({}, {}, [])
@@ -187,8 +187,8 @@ class Store:
         return outcome
 
     def _put_made(self, connection: sa.Connection, made: Rows) -> None:
-        """What was made of items; an aircraft of which there is something new to be judged by is noted."""
-        # Each power-up makes another curve, of hundreds of rows: only those of the latest stay.
+        """Write the rows made from items, and mark the aircraft that are to be judged again."""
+        # Each power-up makes a new curve of hundreds of rows: keep the latest only.
         curves = sorted(made.get("curves", ()), key=itemgetter("sequence"))
         latest, each = {_CURVE(row): row["sequence"] for row in curves}, schema.curves.c
         made = {**made, "curves": [row for row in curves if row["sequence"] == latest[_CURVE(row)]]}
@@ -217,7 +217,7 @@ class Store:
         connection.execute(insert.on_conflict_do_nothing(), values)
 
     def _insert_many(self, table: sa.Table, rows: list[Row]) -> tuple[Any, Any]:
-        """A statement for all of them, and its values. PostgreSQL takes them at once, as JSON: a third of the time."""
+        """Make a statement for all rows, and its values; PostgreSQL reads JSON in a third of the time."""
         insert, names = self._insert(table), list(rows[0])
         if self._insert is sqlite.insert:
             return insert, rows
@@ -243,7 +243,7 @@ class Store:
             row |= {"name": hello.name, "epoch": hello.epoch, "first": hello.first, "last": hello.last}
             with contextlib.suppress(NotTakenError):
                 row["hello_at"] = moment(hello.at)
-            if not retained:  # else it was said some time ago
+            if not retained:  # a retained hello is old
                 row["heard_at"] = now
         if rows:
             insert, values = self._insert_many(table, [row for _, row in sorted(rows.items())])
@@ -271,7 +271,7 @@ class Store:
             connection.execute(sa.delete(table).where(table.c.digest.in_(beyond)))
 
     def _reject(self, message: Message, reason: str, now: datetime.datetime) -> Outcome:
-        """Keep aside what the database refuses; an item is confirmed then, or its aircraft would tell it for ever."""
+        """Note a message that the database refuses; confirm an item, or its aircraft would send it for ever."""
         outcome = Outcome({}, {}, [(message, reason)])
         to = addressed(message.topic)
         item = None
@@ -287,7 +287,7 @@ class Store:
         return outcome
 
     def _take_in_again(self) -> bool:
-        """Items of a newer aircraft that are known by now; whether there may be more of them."""
+        """Parse items of a newer aircraft whose kind is known by now; return whether there may be more."""
         items, each, refused = schema.items, schema.items.c, []
         of_a_kind = each.kind.is_(None) | each.kind.in_(KINDS)
         known = sa.select(items).where(each.state == "unknown", each.format_version == FORMAT_VERSION, of_a_kind)
@@ -311,7 +311,7 @@ class Store:
 
 
 def _read(item: Item, message: Message, outcome: Outcome) -> tuple[Row, Rows]:
-    """Columns of an item and the rows that it makes; of one that cannot be read its reason is kept aside."""
+    """Parse an item into its columns and rows; add one that cannot be parsed to the rejected messages."""
     try:
         columns, rows = read_item(item, message.payload)
     except NotTakenError as error:
@@ -329,7 +329,7 @@ def _raw(item: Item, message: Message) -> Row:
 
 
 def _lacking(connection: sa.Connection, which: Iterable[str]) -> dict[tuple[str, str], list[list[int]]]:
-    """What the database lacks of what these aircraft keep, as their last hellos say."""
+    """Find the sequences that these aircraft keep, by their last hellos, and the database lacks."""
     one, items = schema.aircraft.c, schema.items.c
     of = one.aircraft.in_(sorted(which))
     before = sa.select(one.aircraft, one.epoch, one.last, (one.first - 1).label("number")).where(of)
@@ -348,7 +348,7 @@ def _lacking(connection: sa.Connection, which: Iterable[str]) -> dict[tuple[str,
 
 
 def _without_zero(value: object) -> object:
-    """PostgreSQL has no zero byte in a text."""
+    """Replace zero bytes, which PostgreSQL refuses in a text."""
     return value.replace("\0", "\ufffd") if isinstance(value, str) else value
 
 
