@@ -1,10 +1,9 @@
 """How much one collector takes, of ten thousand aircraft at a real Mosquitto, into a real PostgreSQL and into SQLite.
 
 Each aircraft has a connection of its own and comes with a session: its hello, a calibration and an arming as companions
-send them. Rates are items a second, by the clock and by a core-second of the collector's process; beside them, in the
-same run, the floors: COPY of the same rows into the same tables, the same rows through the store alone, and a
-subscriber that does nothing. Then how long an item takes from being published to being confirmed, two collectors of
-which one is killed every ten seconds, and the pages of a database of five years.
+send them. Rates are items a second: by the clock, by a core-second of the collector's process, and by one of process
+and database together. Then how long an item takes from being published to being confirmed, two collectors of which one
+is killed every ten seconds, and the pages of a database of five years.
 """
 
 from __future__ import annotations
@@ -14,18 +13,12 @@ import asyncio
 import contextlib
 import itertools
 import os
-import sys
 import tempfile
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-import psycopg
-
-from companion.fleet.collector import BATCH
-from companion.fleet.contract import read_key
-from companion.fleet.store import Message, Outcome, Store, _read
 from sim.fleet.aircraft import Aircraft
 from tests import bench_fleet_pages
 from tests.bench_memory import memory
@@ -35,7 +28,6 @@ from tests.support.fleet_bench import (
     MOSQUITTO,
     NOW,
     POSTGRES,
-    Cost,
     Meter,
     Place,
     Sessions,
@@ -52,84 +44,6 @@ AT_ONCE: Final = 1000
 QUIET_A_SECOND: Final = 200
 """Sessions a second while latencies are measured, and while collectors are killed."""
 KILLED_EVERY_S: Final = 10.0
-
-
-# --- floors
-
-
-def copy_rows(url: str, batches: Sequence[Sequence[Message]], database: Callable[[], float]) -> Cost:
-    """COPY of the rows that a collector makes of these messages, a transaction each batch."""
-    tables = []
-    for batch in batches:
-        rows: dict[str, list[dict[str, Any]]] = {}
-        for message in batch:
-            item = read_key(message.topic.split("/")[1], message.payload)
-            columns, made = _read(item, message, Outcome({}, {}, []))
-            for table, of in {"items": [{**item.key, **columns, "received_at": NOW}], **made}.items():
-                rows.setdefault(table, []).extend(of)
-        tables.append([(table, list(of[0]), [tuple(row.values()) for row in of]) for table, of in rows.items()])
-    store = Store(url)
-    store.prepare()
-    store.close()
-    with psycopg.connect(url) as connection:
-        meter = Meter(time.process_time, database)
-        for each in tables:
-            with connection.cursor() as cursor:
-                for table, names, values in each:
-                    with cursor.copy(f"COPY {table} ({', '.join(names)}) FROM STDIN".encode()) as copy:
-                        for row in values:
-                            copy.write_row(row)
-            connection.commit()
-        return meter.cost(sum(map(len, batches)))
-
-
-def take(url: str, batches: Sequence[Sequence[Message]], database: Callable[[], float] = lambda: 0.0) -> Cost:
-    """The store alone."""
-    store = Store(url)
-    store.prepare()
-    store.take(batches[0])
-    meter = Meter(time.process_time, database)
-    for batch in batches[1:]:
-        outcome = store.take(batch)
-        assert not outcome.rejected, outcome.rejected[0]
-    cost = meter.cost(sum(map(len, batches[1:])))
-    store.close()
-    return cost
-
-
-_SUBSCRIBER: Final = """
-import asyncio, sys, aiomqtt
-async def main():
-    async with aiomqtt.Client("127.0.0.1", int(sys.argv[1])) as client:
-        await client.subscribe("fleet/+/item", qos=1)
-        print("there", flush=True)
-        async for message in client.messages:
-            pass
-asyncio.run(main())
-"""
-
-
-async def bare_subscriber(fleet: Fleet, sessions: Sequence[tuple[Light, list[int]]], port: int) -> Cost:
-    """One that hears every item, and does nothing."""
-    command = [sys.executable, "-c", _SUBSCRIBER, str(port)]
-    process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
-    try:
-        assert process.stdout is not None
-        await process.stdout.readline()
-        meter = Meter(lambda: processor_s(process.pid))
-        for number, (light, sequences) in enumerate(sessions):
-            light.tell(sequences)
-            if number % 20 == 0:
-                while fleet.deliveries - fleet.taken > AT_ONCE:
-                    await asyncio.sleep(0.005)
-        while True:  # until it has nothing more to do
-            cost = meter.cost(fleet.deliveries)
-            await asyncio.sleep(0.5)
-            if meter.cost(1).own_s - cost.own_s < 0.02:
-                return cost
-    finally:
-        process.kill()
-        await process.wait()
 
 
 # --- collectors
@@ -215,7 +129,7 @@ async def rates(place: Place, number: int, sessions: Sessions) -> None:
     sizes = [len(one_of.told[sequence]) for sequence in sessions.add(one_of, NOW)]
     print(f"{number} aircraft; a calibration has {sizes[0]} bytes, an arming {sizes[1]}")
     async with broker(folder, "mosquitto", more=MOSQUITTO) as one:
-        place, numbers = place._replace(one=one), itertools.count(2)
+        place, numbers = place._replace(one=one), itertools.count(1)
 
         def another() -> str:
             return postgres.create(f"rates-{time.monotonic_ns()}")
@@ -223,21 +137,11 @@ async def rates(place: Place, number: int, sessions: Sessions) -> None:
         def another_file() -> str:
             return str(folder / f"rates-{time.monotonic_ns()}.sqlite")
 
-        def of_database() -> float:
-            return processor_s(postgres.process_id)
-
         begun_s = time.monotonic()
         async with fleet.at(one.port):
             resident_mib = memory(one.process_id).resident
             print(f"all at the broker after {time.monotonic() - begun_s:.1f} s, which has {resident_mib:.0f} MiB then")
             print(f"\n{'items a second':52} {'by clock':>9} {'a core-s':>9} {'with db':>9}")
-            told = sessions.of(fleet, 1)
-            messages = [Message(f"fleet/{each.one.id}/item", each.one.told[k]) for each, of in told for k in of]
-            batches = [messages[k : k + BATCH] for k in range(0, len(messages), BATCH)]
-            say("floor: COPY of the same rows", copy_rows(another(), batches, of_database))
-            say("the store alone, PostgreSQL", take(another(), batches, of_database))
-            say("the store alone, SQLite", take(another_file(), batches))
-            say("floor: a subscriber that does nothing", await bare_subscriber(fleet, told, one.port))
             for words, where, many in (
                 ("one collector, PostgreSQL", another(), 1),
                 ("two collectors, PostgreSQL", another(), 2),

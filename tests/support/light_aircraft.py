@@ -21,7 +21,7 @@ from sim.fleet.aircraft import Aircraft
 AGAIN_S: Final = 30.0
 CONNECTING: Final = 200
 """The most that are on their way to the broker at once."""
-_CONNACK, _PUBLISH, _PUBACK, _SUBACK = 2, 3, 4, 9
+_CONNACK, _PUBLISH, _SUBACK = 2, 3, 9
 
 
 class _Said(msgspec.Struct):
@@ -101,8 +101,6 @@ class Light(asyncio.Protocol):
             self._write(0x82, b"\0\1" + b"".join(topics))
         elif kind >> 4 == _SUBACK:
             self._fleet.arrived()
-        elif kind >> 4 == _PUBACK:
-            self._fleet.taken += 1
         elif kind >> 4 == _PUBLISH:
             end = 2 + int.from_bytes(body[:2], "big")
             if kind & 0x06:
@@ -138,8 +136,8 @@ class Fleet:
     def __init__(self, fleet: Sequence[Aircraft]) -> None:
         self.lights = [Light(one, self) for one in fleet]
         self.confirmed: list[Confirmed] = []
-        self.deliveries = self.taken = self.lost = 0
-        """Items published; publications that the broker has acknowledged; connections lost."""
+        self.deliveries = self.lost = 0
+        """Items published; connections lost."""
         self.free = asyncio.Event()
         self.leaving = False
         self._arriving = asyncio.Semaphore(CONNECTING)
@@ -168,7 +166,7 @@ class Fleet:
 
     def begin_anew(self, number: int) -> None:
         """As with another memory card: nothing is kept of what was told, nothing was confirmed."""
-        self.confirmed, self.deliveries, self.taken = [], 0, 0
+        self.confirmed, self.deliveries = [], 0
         for light in self.lights:
             light.under_way.clear()
             light.one.confirmed.clear()
