@@ -101,7 +101,7 @@ def parts_of(connection: sa.Connection, model: str, *, but: str = "") -> dict[Pa
     query = sa.select(schema.parts).where(schema.parts.c.model == model, schema.parts.c.aircraft != but)
     found: dict[Part, Scatter] = {}
     for row in connection.execute(query.order_by("aircraft", "imu").limit(6 * MOST_PARTS)):
-        one = found.setdefault((row.aircraft, row.imu), Scatter(row.power_ups, 1, *np.full((3, 6), np.nan)))
+        one = found.setdefault((row.aircraft, row.imu), Scatter(row.power_ups, *np.full((3, 6), np.nan)))
         place = "xyz".index(row.axis) + 3 * (row.triad == "accel")
         for name in ("turn_on", "wander", "per_k"):
             getattr(one, name)[place] = np.nan if (value := getattr(row, name)) is None else value

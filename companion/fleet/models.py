@@ -34,7 +34,6 @@ class Scatter(NamedTuple):
     """Scatter of one part, or of a model; (6,) each, NaN where not known."""
 
     power_ups: int
-    parts: int
     turn_on: Floats
     """One sigma from one power-up to another at one temperature, errors of the calibrations included."""
     wander: Floats
@@ -50,7 +49,7 @@ def scatter_of_part(biases: Floats, temperature_degc: Floats) -> Scatter:
     single move makes them larger.
     """
     turn_on, wander, per_k = np.array([_column(column, temperature_degc) for column in biases.T]).T
-    return Scatter(len(biases), 1, turn_on, wander, per_k)
+    return Scatter(len(biases), turn_on, wander, per_k)
 
 
 def scatter_of_model(parts: Sequence[Scatter]) -> Scatter | None:
@@ -58,11 +57,11 @@ def scatter_of_model(parts: Sequence[Scatter]) -> Scatter | None:
     telling = [part for part in parts if np.isfinite(part.turn_on).any()]
     if len(telling) < LEAST_PARTS:
         return None
-    figures = np.array([part[2:] for part in telling])
+    figures = np.array([part[1:] for part in telling])
     middle = np.empty((3, 6))
     for group in _GROUPS:
         middle[:, group] = [[middle_of(each)] for each in np.moveaxis(figures[:, :, group], 1, 0)]
-    return Scatter(sum(part.power_ups for part in telling), len(telling), *middle)
+    return Scatter(sum(part.power_ups for part in telling), *middle)
 
 
 class Typical(NamedTuple):

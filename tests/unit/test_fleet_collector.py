@@ -1,12 +1,14 @@
-"""What waits in a collector is bounded in bytes, whatever comes from the broker."""
+"""A collector's configuration is checked, and its queues are bounded in bytes, whatever comes from the broker."""
 
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 
 import pytest
 
-from companion.fleet.collector import BATCH, BATCH_BYTES, WAITING, WAITING_BYTES, Inbox, Waiting
+from companion.errors import ConfigError
+from companion.fleet.collector import BATCH, BATCH_BYTES, WAITING, WAITING_BYTES, Inbox, Waiting, load_broker
 from companion.fleet.contract import MOST_BYTES
 from companion.fleet.store import Message
 
@@ -46,3 +48,33 @@ def test_who_brings_more_waits_for_room() -> None:
             await bringing
 
     asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "no such file: write one with a section [mqtt] that names the broker"),
+        ("", "'mqtt' is missing"),
+        ('[mqtt]\nhost = "b"\nprot = 1\n', "unknown key 'mqtt.prot'; did you mean 'port'?"),
+        ('[mqtt]\nhost = "b"\n[fleet]\n', "unknown section 'fleet'"),
+        ('[mqtt]\nhost = "b"\ncert_file = "/c"\ntls = true\n', "key_file"),
+    ],
+)
+def test_a_configuration_that_cannot_be_used_is_refused_in_one_line(
+    tmp_path: Path, text: str | None, said: str
+) -> None:
+    path = tmp_path / "collector.toml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ConfigError) as refused:
+        load_broker(path)
+    assert str(refused.value).startswith(f"{path}: ")
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_configuration_names_the_broker(tmp_path: Path) -> None:
+    path = tmp_path / "collector.toml"
+    path.write_text('[mqtt]\nhost = "broker.example"\nusername = "collector"\n')
+    found = load_broker(path)
+    assert (found.host, found.username) == ("broker.example", "collector")
