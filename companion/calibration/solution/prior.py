@@ -1,17 +1,16 @@
-"""From earlier calibrations to what today's bias should be (method 3.3).
+"""Prediction of today's bias from earlier calibrations (method 3.3).
 
-Run to run a MEMS bias scatters (an ADIS16405 by 70 deg/h and 2 mg, method 1.3). What is expected of today is
-the mean of the earlier power-ups, or their curve over temperature (`temperature.curve`), and its sigma is that of *one
-more* power-up: the scatter, widened as Student's for few points, and the error of the mean.
+Run to run a MEMS bias scatters (an ADIS16405 by 70 deg/h and 2 mg, method 1.3). The prediction for today is the
+mean of the earlier power-ups, or their curve over temperature (`temperature.curve`). Its sigma is that of *one more*
+power-up: the scatter, widened as Student's for few points, and the error of the mean.
 
-From three power-ups on that guards (`joint`), from five on it may take part in the estimate. Within one power-up the
-bias is the one it started with, moved by temperature and drift: that guards best of all, and takes no part.
+From three power-ups on the prediction guards (`joint`), from five on it may take part in the estimate. Within one
+power-up the bias is the one it started with, moved by temperature and drift: that guards best, and takes no part.
 
-An accelerometer's bias moves with the attitude at which it is measured: f = (I + S) (I - [m x]) g u + b
-(`align_model`), so that in one pose u, scale, shear and misalignment times 1 g look like a bias. What a calibration
-finds is the *effective* bias at its attitude; g (S - [m x]) (u' - u) is by how much it is another one at u'. A
-multi-pose alignment knows S and m; otherwise they are as large as its priors say (method 2.3: 0.5 % of scale
-make 5 mg).
+An accelerometer's bias depends on the attitude at which it is measured: f = (I + S) (I - [m x]) g u + b
+(`align_model`). In one pose u, scale, shear and misalignment times 1 g look like a bias. A calibration finds the
+*effective* bias at its attitude; at u' it is larger by g (S - [m x]) (u' - u). A multi-pose alignment knows S and m;
+otherwise they are as large as its priors say (method 2.3: 0.5 % of scale make 5 mg).
 """
 
 from __future__ import annotations
@@ -38,14 +37,14 @@ from companion.samples import Triad, Vector
 
 LEVEL: Final = np.array([0.0, 0.0, -1.0])
 WORTH_SAYING_M_S2: Final = 1.0 * MG
-"""Below this nobody stands tilted enough for the effect to matter: what a wheel on a stone makes is not said."""
+"""Least effect of the attitude in a warning; a wheel on a stone makes less."""
 _SIGMAS: Final = 2.0
 _PRIORS: Final = Priors()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class PoseEffect:
-    """S - [m x] of one IMU: its mean and one sigma of each element, both (3, 3)."""
+    """Matrix S - [m x] of one IMU: mean and one sigma of each element, both (3, 3)."""
 
     mean: Matrix
     sigma: Matrix
@@ -54,21 +53,21 @@ class PoseEffect:
     source: Literal["assumed", "alignment"]
 
     def change(self, gravity_m_s2: float, at: Array, then: Array) -> tuple[Array, Array]:
-        """By how much the bias at `at` is more than that at `then`, and one sigma of it; each (3,), m/s^2."""
+        """Give the bias at `at` less the bias at `then`, and one sigma of that; each (3,), m/s^2."""
         by = gravity_m_s2 * (at - then)
         mean = (self.mean + self.misalignment_mean) @ by
         variance = (np.square(self.sigma) + np.square(self.misalignment_sigma)) @ np.square(by)
         return mean, np.sqrt(variance)
 
     def effective(self, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> Effective:
-        """What a record says of it, without misalignment, which turns the axes and is none of the sensor's bias.
+        """Make the entry of the record, without misalignment, which turns the axes and is no bias of the sensor.
 
         Args:
-            gravity_m_s2: local.
+            gravity_m_s2: local gravity.
             up: unit vector, the attitude of the calibration, (3,).
-            sigma_use_m_s2: of the bias at this attitude, (3,).
+            sigma_use_m_s2: sigma of the bias at this attitude, (3,).
         """
-        # The mean is known but not taken off what is written, so that it counts in full.
+        # The mean is known but not subtracted from what is written, so it counts in full.
         whole = np.sqrt(np.square(self.mean) + np.square(self.sigma))
         to_level = np.square(gravity_m_s2 * (LEVEL - up))
         own = np.square(whole) @ np.square(gravity_m_s2 * up)
@@ -80,7 +79,7 @@ class PoseEffect:
         )
 
     def warning(self, name: str, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> str | None:
-        """What a pilot should know who has calibrated while it stood tilted; None while it stood about level."""
+        """Warn a pilot who has calibrated a tilted aircraft; None: it stood about level."""
         whole = np.square(self.mean) + np.square(self.sigma)
         moves = np.sqrt(whole @ np.square(gravity_m_s2 * (LEVEL - up)))
         if not (moves > np.maximum(WORTH_SAYING_M_S2, _SIGMAS * sigma_use_m_s2)).any():
@@ -92,7 +91,7 @@ class PoseEffect:
 
 
 def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:
-    """What is known of one IMU's scale, shear and misalignment."""
+    """Give the known scale, shear and misalignment of one IMU."""
     none: Determined | None = None
     scale, scale_sigma = _known(aligned.accel_scale if aligned else none, 1.0, _PRIORS.scale)
     shear, shear_sigma = _known(aligned.accel_shear if aligned else none, 1.0, _PRIORS.shear)
@@ -114,66 +113,67 @@ def _known(found: Determined | None, unit: float, assumed: float) -> tuple[Array
 
 
 GUARDS_FROM: Final = 3
-"""Power-ups."""
+"""Least earlier power-ups of a guard."""
 WEIGHS_FROM: Final = 5
+"""Least earlier power-ups that take part in the estimate."""
 GATE_SIGMAS: Final = 4.0
 TEMPERATURE_SIGMA_K: Final = 10.0
-"""Between two calibrations of one power-up, where no temperature is told."""
+"""Temperature change between two calibrations of one power-up, where no temperature is known."""
 CATALOGUE_SCATTER: Final[dict[Triad, float]] = {"gyro": 70.0 * DEG_H, "accel": 2.0 * MG}
-"""Method 1.3; here it only weighs the points against one another."""
+"""Run-to-run scatter of method 1.3; it only weighs the points against one another."""
 CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2 * MG}
-"""BMI088, the worse one of method 2.1."""
+"""Slope over temperature of a BMI088, the worse one of method 2.1."""
 _KNOWN: Final = 0.5
-"""Of the catalogue's: a curve that is known worse is not worth following."""
+"""Largest sigma of a usable curve's slope, as a share of the catalogue's slope."""
 _UNEXPLAINED: Final = 0.1
-"""Of the changes within power-ups: with a thermometer of its own 0.05 and less, but for one simulated aircraft in some
-hundreds; with that of the air, of a heater or of a processor 0.1 to 1 and more."""
+"""Largest unexplained share of the changes within power-ups. With the IMU's own thermometer it is 0.05 and less (except
+for one simulated aircraft in some hundreds); with that of the air, a heater or a processor 0.1 to 1 and more."""
 _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0
 
 
 class Expected(msgspec.Struct, frozen=True, kw_only=True):
-    """What one triad's whole bias should be today, vehicle FRD, rad/s or m/s^2."""
+    """Prediction of one triad's whole bias today, vehicle FRD, rad/s or m/s^2."""
 
     value: Vector
     variance: Vector
-    """Of today's bias about it, without the gradienter's zero."""
+    """Variance of today's bias about the prediction, without the gradienter's zero."""
     limit: float
-    """Of the gate, in sigmas: 4, or what is as improbable where the scatter is known from few points."""
+    """Limit of the gate in sigmas: 4, or an equally improbable one where the scatter is known from few points."""
     power_ups: int
     weighs: bool
-    """Whether it may take part in the estimate."""
+    """True if the prediction may take part in the estimate."""
     by_temperature: bool = False
     same_zero: float = 0.0
-    """The share of it that was measured with today's zero of the gradienter, whose error is in both."""
+    """Share that was measured with today's zero of the gradienter, so that its error is in both."""
     other_zero_rad: float = 0.0
-    """One sigma of the error of the other zeros in it."""
+    """One sigma of the error from other zeros."""
 
 
 class ExpectedImu(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU."""
+    """Predictions for one IMU."""
 
     name: str
     earlier: dict[Triad, Expected | None] = {}
-    """By earlier power-ups."""
+    """Prediction from earlier power-ups."""
     today: dict[Triad, Expected | None] = {}
-    """By what was measured earlier in this one."""
+    """Prediction from a calibration earlier in this power-up."""
     along: dict[Triad, Along | None] = {}
-    """What the curve says of a window in which the temperature changed."""
+    """Prediction by the curve for a window in which the temperature changed."""
     effect: PoseEffect | None = None
-    """How its accelerometers' bias moves with the attitude."""
+    """Effect of the attitude on the accelerometers' bias."""
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):
-    """Everything that a calibration knows from before."""
+    """Predictions for all IMUs of a calibration."""
 
     imus: tuple[ExpectedImu, ...] = ()
     zero_is_known: bool = False
-    """The sigma of the gradienter's zero is one that somebody measured or vouches for, and no cautious guess."""
+    """True if the sigma of the gradienter's zero was measured or configured, and is no cautious guess."""
 
 
 class Now(msgspec.Struct, frozen=True, kw_only=True):
-    """Today's circumstances of one IMU."""
+    """Present state of one IMU."""
 
     unix_s: float
     power_up: PowerUp
@@ -185,7 +185,7 @@ class Now(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def student_limit(freedom: float) -> float:
-    """What is as improbable in Student's distribution as `GATE_SIGMAS` is in the normal one.
+    """Give the limit that is as improbable in Student's distribution as `GATE_SIGMAS` is in the normal one.
 
     Cornish-Fisher expansion to third order (Abramowitz and Stegun 26.7.5); from 6 degrees of freedom on, and below the
     exact value by at most a tenth.
@@ -204,7 +204,7 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
     ]
     if len(groups) < GUARDS_FROM:
         return None
-    # Where a temperature is missing they all count as measured at one.
+    # Where a temperature is missing, all count as measured at the same one.
     told = now.temperature_degc is not None and _told(groups)
     seen = [[_of(point, triad) for point in group] for group in groups]
     here = [_here(group, found, triad, now, effect) for group, found in zip(groups, seen, strict=True)]
@@ -220,7 +220,7 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
     assert curve is not None
     degc = now.temperature_degc or 0.0
     value, variance = curve.at(degc, now.k_s) if told else curve.at(0.0)
-    # What one attitude or one place adds to all of them is not averaged away.
+    # An error that all power-ups share, of one attitude or one place, does not average out.
     pose = np.array([each.mean(axis=0) for _, each in here])
     shared = [one.sigma_shared for found in seen for one in found]
     together = np.square(curve.shares @ pose) + np.max(np.square(shared), axis=0)
@@ -238,7 +238,7 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
 
 
 def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve | None:
-    """How a bias follows the temperature within a power-up; None where little is known of that."""
+    """Fit how a bias follows the temperature within a power-up; None: too little is known."""
     groups = believed(points, triad)
     if len(groups) < WEIGHS_FROM or not _told(groups):
         return None
@@ -252,7 +252,7 @@ def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve 
 
 
 def _along(first: Point, point: Point, triad: Triad) -> Node:
-    """One of a power-up; the accelerometers' bias is another one at another attitude than the first."""
+    """Make a node of a power-up; an accelerometer's variance grows with the change of attitude from the first."""
     found = _of(point, triad)
     variance = _white(found)
     if triad == "accel":
@@ -262,7 +262,7 @@ def _along(first: Point, point: Point, triad: Triad) -> Node:
 
 
 def follow(curve: Curve, path: Path, settles: Settling | None, model: AllanModel) -> Along:
-    """What a curve says of a window, and of the time when it is warm."""
+    """Predict by a curve the bias over a window, and when the IMU is warm."""
     wander = 0.0 if settles is None else _in_run(model, max(WARM_AFTER * settles.tau_s, _SHORTEST_GAP_S))
     return along(curve, path.states, path.span_s, path.variance, settles, wander)
 
@@ -276,16 +276,16 @@ def _told(groups: Sequence[Sequence[Point]]) -> bool:
 
 
 def _in_run(model: AllanModel, gap_s: float = _SHORTEST_GAP_S) -> float:
-    """Variance by which a bias wanders."""
+    """Give the variance by which a bias wanders within a power-up."""
     return float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * gap_s))
 
 
 def expect_today(
     last: Point, triad: Triad, now: Now, effect: PoseEffect, model: AllanModel, curve: Curve | None = None
 ) -> Expected | None:
-    """What an earlier calibration in this very power-up says of now; None where it did not measure this.
+    """Predict the bias from an earlier calibration in this power-up; None: it did not measure this triad.
 
-    The temperature has moved it by what the `curve` of this triad says; without one, by what parts move.
+    The `curve` predicts the change with the temperature; without one, the catalogue's slope widens the sigma.
     """
     found = last.of(triad)
     if found is None:
@@ -313,7 +313,7 @@ def expect_today(
 
 def _of(point: Point, triad: Triad) -> Measured:
     found = point.of(triad)
-    assert found is not None  # `believed` gives no others
+    assert found is not None  # `believed` returns only these
     return found
 
 
@@ -325,7 +325,7 @@ def _node(point: Point, bias: Array, variance: float, *, told: bool) -> Node:
 def _here(
     points: Sequence[Point], found: Sequence[Measured], triad: Triad, now: Now, effect: PoseEffect
 ) -> tuple[Floats, Floats]:
-    """The biases as they would be at today's attitude, and one sigma of what that adds; each (points, 3)."""
+    """Convert biases to today's attitude, and give one sigma of the conversion; each (points, 3)."""
     bias = np.array([one.bias for one in found])
     pose = np.zeros_like(bias)
     if triad == "accel":
@@ -337,7 +337,7 @@ def _here(
 
 
 def _zeros(points: Sequence[Point], share: Floats, today: str | None) -> tuple[float, float]:
-    """The share that was measured with today's zero, and one sigma of what the others add."""
+    """Give the share that was measured with today's zero, and one sigma of the error of the others."""
     shares: dict[str | None, float] = {}
     sigmas: dict[str | None, float] = {}
     for point, part in zip(points, share, strict=True):

@@ -1,20 +1,19 @@
-"""From still seconds of many power-ups to the bias of the next one, by temperature.
+"""Curve of a bias over temperature, fitted to still seconds of many power-ups; it predicts the next power-up.
 
 The bias of power-up s at the temperature T is
 
-    o_s + c1 d + c2 d^2 + c3 d^3,    d = (T - lag dT/dt - 35 degC) / 20 K,
+    o_s + c1 d + c2 d^2 + c3 d^3,    d = (T - lag dT/dt - 35 degC) / 20 K.
 
-with an offset o_s of its own, scattered about a mean with the variance tau^2 (run to run), and one curve for all; the
-die is as warm as its thermometer was `lag` before, by which heating and cooling differ. Generalised least squares over
-the means of still seconds at one temperature (`Node`): within a power-up its offset is free, between power-ups it is
-tau.
-The coefficients have a prior as wide as the catalogue's parts move, so that a curve that has seen little is uncertain
-where it has seen nothing.
+Each power-up has an offset o_s of its own, scattered about a mean with the variance tau^2 (run to run); the curve is
+common to all. The die is as warm as its thermometer was `lag` before: that is why heating and cooling differ.
 
-Each power-up in turn is foretold by the others, at its first node: that decides the lag, and whether a mean does as
-well as the curve, and tau is such that those errors are as large as is said. Likewise its change from there to its last
-node: what is said of changes is as uncertain as that shows, and a thermometer that is none of this IMU explains little
-of them.
+The fit is generalised least squares over means of still seconds at one temperature (`Node`). Within a power-up the
+offset is free, between power-ups it scatters by tau. The coefficients have a prior as wide as the catalogue's parts
+move, so the curve is uncertain at temperatures that were not seen.
+
+Each power-up is predicted from the others at its first node. The errors choose the lag, choose between the curve and a
+mean, and scale tau until the actual error matches the predicted one. The change from the first node to the last is
+predicted as well: it scales the error of changes, and reveals a thermometer that is not in this IMU.
 """
 
 from __future__ import annotations
@@ -34,24 +33,24 @@ REFERENCE_DEGC: Final = 35.0
 UNIT_K: Final = 20.0
 LAGS_S: Final = (0.0, 10.0, 20.0, 30.0)
 VALID_K: Final = 3.0
-"""How far beyond the temperatures seen the curve goes on (method 3.3)."""
+"""Kelvins beyond the temperatures seen within which the curve is valid (method 3.3)."""
 FEWEST: Final = 3
-"""Power-ups."""
+"""Least power-ups of a fit."""
 _ORDER: Final = 3
-"""Of every curve. One of fewer terms would be as sure of itself where it has seen little as where it has seen much."""
+"""Order of every curve. A lower order would claim the same sigma where little was seen as where much was."""
 _BETTER: Final = 0.9
-"""Of the mean square of what is foretold: a curve must be worth it."""
+"""Largest mean square error of a curve, as a share of that of a mean, at which the curve is used."""
 _AT_LEAST: Final = 0.5
-"""The least share of what the power-ups show that counts as their scatter; the noise said of them may be too much."""
+"""Least scatter, as a share of the mean square error: the stated noise may be too large."""
 _RANGE: Final = 18.0
-"""Of the logarithm of the scatter's variance, about that of a kelvin."""
+"""Half the search range of the logarithm of the scatter's variance, about that of a kelvin."""
 _HALVINGS: Final = 25
 _SURELY: Final = 2.0
-"""Sigmas."""
+"""Sigmas beyond which an error is not chance."""
 _LITTLE: Final = 1e-6
-"""In squares: of a kelvin, what no thermometer shows; of noise, what nobody sees."""
+"""Lower bounds of variances, as shares of that of a kelvin and of that of the noise."""
 _PRIOR_K: Final = np.array([UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
-"""One sigma of each term's coefficient, in kelvin of what parts move."""
+"""Prior sigma of each coefficient, in kelvins of the slope of parts."""
 State = tuple[float, float]
 """A temperature and how fast it rises, degC and K/s."""
 
@@ -62,39 +61,38 @@ class Node(msgspec.Struct, frozen=True):
     degc: float
     bias: Vector
     variance: float
-    """Of its white noise, the mean over the axes."""
+    """Variance of the white noise, mean over the axes."""
     k_s: float = 0.0
-    """How fast the temperature rose meanwhile."""
+    """Rate of the temperature, K/s."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class PowerUpNodes:
-    """One power-up."""
+    """Nodes of one power-up."""
 
     nodes: Sequence[Node]
     common_variance: float = 0.0
-    """Of an error that all its nodes have in common, and perhaps those of others: it weighs less for it."""
+    """Variance of an error that all nodes share, perhaps with other power-ups; it lowers the weight."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """What the next power-up's bias will be.
+    """Prediction of the next power-up's bias over temperature.
 
     Attributes:
         order: 0 a mean, 3 a cubic.
-        lag_s: of the die behind its thermometer.
-        coefficients: mean and those of the terms, (1 + terms, 3).
-        covariance: of these, for an axis that scatters as usual.
-        widening: of each axis, (3,).
-        of_changes: likewise, for changes within a power-up.
-        unexplained: share of these, in squares, by which power-ups left out differ from what was foretold and is not
-            chance.
-        scatter: variance of one more power-up about the curve, its wandering included, (3,).
-        foretold: mean square error of what was foretold of power-ups left out, (rad/s)^2 or (m/s^2)^2.
-        shares: of every power-up in the mean, (n,).
+        lag_s: lag of the die behind its thermometer.
+        coefficients: mean and coefficients of the terms, (1 + terms, 3).
+        covariance: covariance of the coefficients, for an axis with the usual scatter.
+        widening: factor on the covariance for each axis, (3,).
+        of_changes: factor on the covariance for changes within a power-up, (3,).
+        unexplained: share of the changes, in squares, that the curve does not explain and that is not chance.
+        scatter: variance of one more power-up about the curve, wandering included, (3,).
+        foretold: mean square error of the predictions of left-out power-ups, (rad/s)^2 or (m/s^2)^2.
+        shares: weight of each power-up in the mean, (n,).
         freedom: degrees of freedom of the scatter.
         span_degc: lowest and highest temperature seen.
-        per_kelvin: one sigma of what a kelvin beyond that does.
+        per_kelvin: one sigma of the change per kelvin beyond that.
     """
 
     order: int
@@ -112,11 +110,11 @@ class Curve:
     per_kelvin: float
 
     def beyond_k(self, degc: float) -> float:
-        """By how much a temperature lies beyond what is valid."""
+        """Give the kelvins by which a temperature lies beyond the valid range."""
         return max(self.span_degc[0] - VALID_K - degc, degc - self.span_degc[1] - VALID_K, 0.0)
 
     def at(self, degc: float, k_s: float = 0.0) -> tuple[Array, Array]:
-        """Bias of the next power-up at a temperature and its variance, (3,) each; straight on where it is not valid."""
+        """Predict the next power-up's bias at a temperature, and its variance, (3,) each; a line beyond the range."""
         x = _with_one(self._row(degc, k_s)[None])[0]
         steepest = self.per_kelvin
         if self.order:
@@ -127,14 +125,14 @@ class Curve:
         return x @ self.coefficients, self.scatter + float(x @ self.covariance @ x) * self.widening + outside
 
     def change(self, then: State, now: State) -> tuple[Array, Array]:
-        """By how much the bias of one power-up is more now than then, and its variance, (3,) each.
+        """Predict the change of the bias within a power-up, and its variance, (3,) each; a mean has none.
 
-        Both are a temperature and how fast it rises, degC and K/s. Not of a mean.
+        `then` and `now` are a temperature and its rate, degC and K/s.
         """
         return self.moves([(-1.0, then), (1.0, now)])
 
     def moves(self, weighted: Iterable[tuple[float, State]]) -> tuple[Array, Array]:
-        """The same of several states with weights whose sum is zero."""
+        """Predict a weighted sum of several states, and its variance, (3,) each; the weights add up to zero."""
         x, outside_k = np.zeros(self.order), 0.0
         for weight, (degc, k_s) in weighted:
             side = 1.0 if degc > self.span_degc[1] else -1.0
@@ -163,7 +161,7 @@ def fit(
         power_ups: at least one node each, in the order in which they were measured.
         in_run_variance: by which a bias wanders within a power-up, (rad/s)^2 or (m/s^2)^2.
         per_kelvin: one sigma of how much parts move, rad/s or m/s^2 a kelvin.
-        may_be_mean: where that foretells as well; it tells nothing of a change within a power-up.
+        may_be_mean: whether to return a mean where it predicts as well; a mean has no change within a power-up.
     """
     if len(power_ups) < FEWEST:
         return None
@@ -186,27 +184,27 @@ def fit(
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Sums:
-    """Of every power-up, axis 0, what least squares need of its nodes, for the largest model."""
+    """Sums of least squares for each power-up, axis 0, for the largest order."""
 
     lag_s: float
     variance: Floats
-    """Of the weighted mean, (n,)."""
+    """Variance of the weighted mean, (n,)."""
     common: Floats
-    """(n,)."""
+    """Variance of the common error, (n,)."""
     mean: Floats
     """Weighted mean of the terms, (n, 3)."""
     bias: Floats
-    """Likewise, (n, 3)."""
+    """Weighted mean of the biases, (n, 3)."""
     normal: Floats
-    """About the means, (n, 3, 3)."""
+    """Normal matrix about the means, (n, 3, 3)."""
     right: Floats
-    """(n, 3, 3)."""
+    """Right-hand side about the means, (n, 3, 3)."""
     first: Floats
     """Terms of the first node, (n, 3)."""
     first_bias: Floats
     first_variance: Floats
     change: Floats
-    """From the first node to the last."""
+    """Terms of the last node less those of the first, (n, 3)."""
     change_bias: Floats
     change_variance: Floats
 
@@ -230,7 +228,7 @@ class _Sums:
 
 
 class _Fit:
-    """One order."""
+    """Fit of one order."""
 
     def __init__(self, sums: _Sums, order: int, in_run_variance: float, per_kelvin: float) -> None:
         some = slice(order)
@@ -245,7 +243,7 @@ class _Fit:
         self._base = np.diag([0.0, *(1.0 / np.square(per_kelvin * _PRIOR_K[some]))])
 
     def curve(self, span_degc: tuple[float, float]) -> Curve:
-        """With the scatter by which the power-ups left out are foretold as well as is said."""
+        """Fit with the scatter at which the actual error of left-out power-ups matches the predicted one."""
         scatter = self._scatter()
         error, variance = self._foretold(scatter)
         shares, normal, right = self._equations(scatter)
@@ -291,7 +289,7 @@ class _Fit:
         return math.exp(high)
 
     def _equations(self, scatter: float) -> tuple[Floats, Floats, Floats]:
-        """Weights of the power-ups' means, and the normal equations of each."""
+        """Give the weights of the power-ups' means, and the normal equations of each."""
         u = 1.0 / (scatter + self._sums.variance + self._sums.common)
         return (
             u,
@@ -300,12 +298,12 @@ class _Fit:
         )
 
     def _foretold(self, scatter: float) -> tuple[Floats, Floats]:
-        """By how much each power-up's first node is off what the others say, (n, 3), and the variance of it, (n,)."""
+        """Give each first node less its prediction by the other power-ups, (n, 3), and the variance of that, (n,)."""
         said, variance = self._by_others(scatter, self._first)
         return self._sums.first_bias - said, variance + self._sums.first_variance + scatter
 
     def _by_others(self, scatter: float, rows: Floats) -> tuple[Floats, Floats]:
-        """What the others say of each power-up's row of terms, (n, 3), and how sure that is, (n,)."""
+        """Predict each power-up's row of terms from the other power-ups, (n, 3), and its variance, (n,)."""
         _, normal, right = self._equations(scatter)
         others = np.concatenate([rows[:, :, None], right.sum(axis=0) - right], axis=2)
         solved = rows[:, None, :] @ np.linalg.solve(self._base + normal.sum(axis=0) - normal, others)
@@ -318,7 +316,7 @@ def _over(error: Floats, variance: Floats) -> Floats:
 
 
 def _terms(degc: Floats) -> Floats:
-    """Line, square, cubic; (n, 3)."""
+    """Give line, square and cube, (n, 3)."""
     d = (degc - REFERENCE_DEGC) / UNIT_K
     return np.stack([d, d**2, d**3], axis=1)
 
