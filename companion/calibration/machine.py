@@ -87,8 +87,6 @@ TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
     **{(state, Event.REQUEST): State.WAITING for state in RESTING},
     **{(state, Event.UNDO): State.UNDOING for state in RESTING},
     (State.WAITING, Event.STILL): State.COLLECTING,
-    # What earlier power-ups foretell needs no stillness.
-    (State.WAITING, Event.WRITE): State.WRITING,
     (State.COLLECTING, Event.MOVED): State.WAITING,
     (State.COLLECTING, Event.ENOUGH): State.SOLVING,
     (State.SOLVING, Event.DITHER): State.DITHERING,

@@ -127,11 +127,7 @@ def status_lines(status: Object) -> list[str]:
         + (f", {arming['words']}" if arming["verdict"] != "accept" else "")
     )
     lines.append(f"in force: {arming['in_force']}")
-    lines += [
-        f"{'by itself' if one['state'] == 'predicted' else 'by hand'}, {_minute(one['measured_at'])} UTC:"
-        f" {by_hand_words(one)}"
-        for one in status["by_hand"]
-    ]
+    lines += [f"by hand, {_minute(one['measured_at'])} UTC: {by_hand_words(one)}" for one in status["by_hand"]]
     lines += [f"profile {each['imu']}: {each['summary']}" for each in status["profiles"]]
     lines += end_lines(status)
     if status["undoable"]:
@@ -315,7 +311,7 @@ def _flown(flight: Flight) -> str:
 
 
 def by_hand_words(done: Object) -> str:
-    """What came of an alignment or a prediction, and whether that is in force."""
+    """Give the result of an alignment, and whether its parameters are in force."""
     words = f"{done['what']}{' failed' if done['state'] == 'failed' else ''}: {done['reason']}"
     if not (number := len(done["written"])):
         return words

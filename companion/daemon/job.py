@@ -45,17 +45,7 @@ class CurvesWritten(msgspec.Struct, frozen=True):
     warnings: tuple[str, ...]
 
 
-class Predicted(msgspec.Struct, frozen=True, kw_only=True):
-    """Gyro offsets written because earlier power-ups foretell them."""
-
-    predicted_at: str
-    words: str
-    sigmas_rad_s: dict[str, float]
-    """By IMU: of the worst axis."""
-    written: dict[str, WrittenParameter]
-
-
-Product = Record | AlignmentRecord | FacesRecord | TurnRecord | Predicted | Undone | CurvesWritten
+Product = Record | AlignmentRecord | FacesRecord | TurnRecord | Undone | CurvesWritten
 
 
 class JobCancelledError(Exception):

@@ -30,10 +30,9 @@ MOST_STEPS: Final = 10
 AUTOMATIC: Final = "auto calibration"
 BY_TEMPERATURE: Final = "temperature"
 PREDICTION: Final = "gyro prediction"
-"""Gyro offsets that earlier power-ups foretell."""
+"""Gyro offsets that versions before 0.2 predicted and wrote: still in their files, and still undone."""
 BY_HAND: Final = ("faces", "turn", "level", BY_TEMPERATURE, PREDICTION)
 """What leaves no calibration's record."""
-_ONE_STEP: Final = {(AUTOMATIC, AUTOMATIC), (AUTOMATIC, PREDICTION), (PREDICTION, PREDICTION)}
 
 
 class Changed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -146,12 +145,9 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
         return self.steps or ((ChangeSet(self.system_id, self.changes),) if self.changes else ())
 
     def and_then(self, latest: ChangeSet) -> Undoable:
-        """With another write; those that nobody has asked for are one step, as long as nothing else comes between.
-
-        A prediction stays one by itself until a calibration has replaced it.
-        """
+        """Add a write; automatic calibrations in a row are one step."""
         steps = self.all
-        while steps and (latest.origin.what, steps[0].origin.what) in _ONE_STEP:
+        while steps and latest.origin.what == steps[0].origin.what == AUTOMATIC:
             latest, steps = latest.after(steps[0]), steps[1:]
         return Undoable(self.system_id, (latest, *steps)[:MOST_STEPS])
 

@@ -29,9 +29,9 @@ class Done(msgspec.Struct, frozen=True, kw_only=True):
     """Outcome of one alignment."""
 
     what: str
-    """"zero", "tilts", "turn", "level", "faces"; files of version 0.1 hold "gyro prediction" too."""
+    """"zero", "tilts", "turn", "level", "faces", or "gyro prediction" of version 0.1."""
     state: str
-    """"done" or "failed"."""
+    """"done", "failed", or "predicted" of version 0.1."""
     measured_at: str
     reason: str
     system_id: int | None

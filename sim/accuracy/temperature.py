@@ -133,11 +133,11 @@ class Aircraft:
         return points
 
 
-def power_up(part: str, seed: int, number: int, shown: Callable[[Array, float], Array] | None = None) -> PowerUpRun:
+def power_up(part: str, seed: int, number: int) -> PowerUpRun:
     """One aircraft of a part: twenty days, and what is known when it is switched on again."""
     random = np.random.default_rng([seed, number])
     scatter = PARTS[part].gyro.scatter
-    aircraft = Aircraft(PARTS[part].gyro, random, shown)
+    aircraft = Aircraft(PARTS[part].gyro, random)
     known: tuple[Point, ...] = ()
     once: list[Point] = []
     for day in range(DAYS):

@@ -24,7 +24,6 @@ from companion.storage.learned import BiasStore
 from sim.companion_process import CompanionProcess
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG
-from sim.motions import Handling
 from sim.sitl.ardupilot import ArduPilotSitl
 from sim.sitl.daemon import companion_daemon
 from sim.sitl.ground import GroundStation
@@ -54,7 +53,6 @@ WITHIN_DEG_H, WITHIN_MG = 5.0, 0.2
 """Of 500 deg/h and 3 mg."""
 LOOK_S = 12.0
 """White noise of 2 deg/h; the firmware's own of the same size."""
-SETTLE_S = 25.0
 QUICK = '\n[calibration]\nmin_still_s = 8\nmax_s = 12\nat_arm = "off"\n'
 
 
@@ -99,16 +97,6 @@ async def typed(daemon: CompanionProcess, *words: str) -> dict[str, Any]:
     output, _ = await process.communicate()
     answer: dict[str, Any] = json.loads(output)
     return answer
-
-
-async def predicted(daemon: CompanionProcess, within_s: float, power_ups: int = 5) -> float:
-    """Wait until gyro offsets that earlier power-ups foretell are in force; the sigma that is said, deg/h."""
-    begin, status = f"predicted from {power_ups} power-ups: ", None
-    async with asyncio.timeout(within_s):
-        while status is None or not (words := status["arming"]["in_force"]).startswith(begin):
-            await asyncio.sleep(0.5)
-            status = await daemon.status()
-    return float(words.removeprefix(begin).removesuffix(" deg/h"))
 
 
 async def left_deg_h(vehicle: ArduPilotSitl, ground: GroundStation, degc: float, look_s: float = LOOK_S) -> Array:
@@ -218,50 +206,6 @@ def test_five_partial_warm_ups_leave_less_than_its_own_learner_does_after_one(tm
             unseen = [low for low in ours if not low_degc - BIN_K <= low <= low + 10.0 <= high_degc + BIN_K]
             assert len(unseen) > 2
             assert all(ours[low] < own[low] / 3.0 for low in unseen), (unseen, own, ours)
-
-    asyncio.run(main())
-
-
-LEARNED_DEGC = (10.0, 34.0, 22.0, 16.0, 28.0)
-FORETOLD_DEGC = 19.0
-
-
-@pytest.mark.sitl
-def test_offsets_are_foretold_at_another_temperature_before_it_has_stood_still(tmp_path: Path) -> None:
-    async def main() -> None:
-        random = np.random.default_rng(5)
-        folder = tmp_path / "daemon"
-
-        async def power_up(degc: float) -> None:
-            bias = random.normal(0.0, SCATTER_DEG_H, 3) * DEG_H
-            turn_on = {f"SIM_GYR1_BIAS_{axis}": float(bias[k]) for k, axis in enumerate("XYZ")}
-            await ground.put_all({"SIM_IMUT_FIXED": degc, **turn_on})
-            await vehicle.sleep(3.0)  # until it is stored
-            await vehicle.power_cycle()
-
-        async with flying(tmp_path, INS_GYR_CAL=0.0) as (vehicle, ground):
-            for day, degc in enumerate(LEARNED_DEGC):
-                await power_up(degc)
-                # At the last of them what is found is written.
-                more = QUICK if degc == LEARNED_DEGC[-1] else QUICK + "[push]\nparameters = false\n"
-                async with companion_daemon(vehicle, folder, more=more) as daemon:
-                    record = await daemon.calibrate(60.0)
-                    assert record["state"] == "done", (record, daemon.log())
-                another_day(folder / "state", day)
-            await power_up(FORETOLD_DEGC)
-            await vehicle.sleep(SETTLE_S)
-            names = [f"INS_GYROFFS_{axis}" for axis in "XYZ"]
-
-            async def held_deg_h() -> Array:
-                return np.array([await ground.get(name) for name in names]) / DEG_H
-
-            was, held = (await residual(vehicle, ground, 1, LOOK_S))[:3] / DEG_H, await held_deg_h()
-            vehicle.move([Handling(start_s=vehicle.now_s - 10.0, duration_s=60.0, angle_deg=6.0)])
-            async with companion_daemon(vehicle, folder, more=QUICK.replace('"off"', '"warn"')) as daemon:
-                sigma_deg_h = await predicted(daemon, 40.0)
-                left = was + held - await held_deg_h()
-            print("was", np.round(was), "left", np.round(left, 1), "said", sigma_deg_h, flush=True)
-            assert np.abs(left).max() < 2.0 * sigma_deg_h < np.abs(was).max()
 
     asyncio.run(main())
 

@@ -39,10 +39,9 @@ def test_every_state_can_be_reached_and_left() -> None:
     assert {old for old, _ in TRANSITIONS} == set(State)
 
 
-def test_nothing_is_written_without_having_been_solved_or_foretold() -> None:
+def test_nothing_is_written_without_having_been_solved() -> None:
     into_writing = {(old, event) for (old, event), new in TRANSITIONS.items() if new is State.WRITING}
-    # From waiting: what earlier power-ups foretell, which is solved before it is asked for.
-    assert into_writing == {(state, Event.WRITE) for state in (State.WAITING, State.SOLVING, State.DITHERING)}
+    assert into_writing == {(state, Event.WRITE) for state in (State.SOLVING, State.DITHERING)}
     into_dithering = {old for (old, _), new in TRANSITIONS.items() if new is State.DITHERING}
     assert into_dithering == {State.SOLVING, State.DITHERING}
     assert {old for (old, event), new in TRANSITIONS.items() if new is State.UNDOING} == set(RESTING)

@@ -13,7 +13,6 @@ from companion.calibration.records.history import kept
 from companion.calibration.solution.prior import curve_of
 from companion.calibration.temperature.curve import Curve, Node, PowerUpNodes, fit
 from sim.accuracy.temperature import Aircraft
-from sim.accuracy.temperature import power_up as simulated
 from sim.imu_model import PARTS
 
 Array = NDArray[np.float64]
@@ -158,18 +157,6 @@ def of_a_heater(board_degc: Array, air_degc: float) -> Array:
 
 def in_degf(board_degc: Array, air_degc: float) -> Array:
     return 1.8 * board_degc + 32.0
-
-
-@pytest.mark.parametrize("shown", [of_the_air, of_a_processor, of_a_heater, in_degf])
-def test_no_thermometer_makes_a_power_up_worse_than_what_is_in_force(shown: Callable[[Array, float], Array]) -> None:
-    """The last calibration's value is, until what is foretold differs by two sigma, as the daemon has it."""
-    runs = [simulated("bmi088", 8, number, shown) for number in range(8)]
-    last, foretold, sigma = (np.array([getattr(run, name) for run in runs]) for name in ("last", "error", "sigma"))
-    written = (np.abs(foretold - last) > 2.0 * sigma).any(axis=1, keepdims=True)
-    left = np.where(written, foretold, last)
-    assert np.square(left).mean() <= np.square(last).mean()
-    if shown is in_degf:
-        assert np.square(left).mean() < 0.5 * np.square(last).mean()
 
 
 @pytest.mark.parametrize("shown", [of_the_air, of_a_processor, of_a_heater])

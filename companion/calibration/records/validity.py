@@ -42,7 +42,6 @@ class Why(enum.Enum):
 
     NEVER = "not calibrated yet"
     UNDONE = "calibration was undone"
-    PREDICTED = "predicted"
     REBOOTED = "autopilot restarted"
     REPLACED = "boot reset gyro offsets"
     ALIGNED = "gradienter aligned since then"
@@ -190,11 +189,6 @@ def _off(present: Present, expected: Vector, then: Vector, sigmas: float, floor:
 def worst_axis(held: Held, present: Present) -> float | None:
     """The largest difference, signed, beyond RESIDUAL_SIGMAS of what both sides were known with; None: all agree."""
     return max(_off(present, held.expected, held.sigma, RESIDUAL_SIGMAS), key=abs, default=None)
-
-
-def contradicts(present: Present, sigma: float) -> bool:
-    """Whether the output is off by more than what was known of it with this sigma lets expect."""
-    return bool(_off(present, _NONE, (sigma, sigma, sigma), RESIDUAL_SIGMAS))
 
 
 def worth_writing(present: Present, held: Held | None, floor: float) -> bool:

@@ -25,14 +25,12 @@ from companion.calibration.records.validity import Why
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.in_force import InForce
-from companion.daemon.biases.memory import BiasMemory, Foretold
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.job import NO_CALIBRATION, Job, Predicted
+from companion.daemon.job import NO_CALIBRATION, Job
 from companion.errors import AutopilotError, StorageError
-from companion.storage.changes import PREDICTION
 from companion.storage.state import BoundedList
 
 logger = logging.getLogger(__name__)
@@ -50,8 +48,6 @@ FAILURES: Final = 3
 RETRY_S: Final = 60.0
 """After a failure; doubled with each further one."""
 TIMEOUT_S: Final = 180.0
-STEADY_K: Final = 0.5
-"""Between two looks at a thermometer whose word counts."""
 _DAY_S: Final = 86400.0
 
 
@@ -65,27 +61,16 @@ class AutomaticWrite(msgspec.Struct, frozen=True):
 class Automatic:
     """Starts calibrations by itself; `run` decides when."""
 
-    def __init__(
-        self,
-        core: Core,
-        imus: Mapping[str, AutopilotImu],
-        conductor: Conductor,
-        in_force: InForce,
-        memory: BiasMemory,
-    ) -> None:
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, in_force: InForce) -> None:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
         self._wanted, self._only_listening = core.wanted, core.only_listening is not None
-        self._imus, self._in_force, self._memory = imus, in_force, memory
+        self._imus, self._in_force = imus, in_force
         self._say, self._offload = core.say, core.offload
         self._file = BoundedList(core.config.storage.path / "automatic.json", AutomaticWrite, PER_DAY + 8)
         self._writes: list[AutomaticWrite] = []
         self._to_keep: list[AutomaticWrite] = []
         self._this_boot: tuple[int, int] = (0, 0)
         """Restarts of the autopilot seen, and automatic writes since the last one."""
-        self._degc: dict[str, tuple[float, float]] = {}
-        """By IMU: how warm it was, and when that was told."""
-        self._asked: dict[str, int] = {}
-        """By IMU: at which start of the autopilot it was asked what earlier power-ups foretell."""
         self._next_s = -math.inf
         self._failures = 0
         self.turns = 0
@@ -147,29 +132,10 @@ class Automatic:
         in_force, now_s = self._in_force, asyncio.get_running_loop().time()
         if self.why_not() is not None or not (in_force.findings(now_s) or in_force.worth_writing_s >= WORTH_FOR_S):
             return
-        if foretold := await self._foretold():
-            if await self._still_ours() and self._may_write():
-                _started(self._conductor.start_prediction(foretold, REQUESTER))
-        elif self._is_possible() and await self._still_ours() and self._is_possible():
+        if self._is_possible() and await self._still_ours() and self._is_possible():
             answer = self._conductor.start_calibration(self._in_force.what, REQUESTER, TIMEOUT_S, automatic=True)
-            _started(answer)
-
-    async def _foretold(self) -> dict[str, Foretold]:
-        """What to write of what earlier power-ups foretell, asked once at each start, by IMU."""
-        found: dict[str, Foretold] = {}
-        for name, imu in self._imus.items():
-            before, now = self._degc.get(name), imu.stream.temperature
-            if now is None or imu.calibration is None or not self._may_write():
-                continue
-            self._degc[name] = now
-            # A thermometer behind a filter climbs for seconds after the power came.
-            if before is None or now[1] <= before[1] or abs(now[0] - before[0]) > STEADY_K:
-                continue
-            if self._asked.get(name) != self._vehicle.boots:
-                self._asked[name] = self._vehicle.boots
-                one = await self._offload(self._memory.foretold, name, now[0])
-                found |= {} if one is None else {name: one}
-        return found
+            if isinstance(answer, Refusal):
+                logger.info("nothing is written by itself: %s", answer.reason)
 
     async def _still_ours(self) -> bool:
         """What another station has set unheard by us must not be overwritten by what nobody asked for."""
@@ -181,12 +147,9 @@ class Automatic:
         self._in_force.poll(writing=False)
         return all(same)
 
-    def _may_write(self) -> bool:
-        return self._conductor.why_not((Rung.BUSY, Rung.ARMED, Rung.UNKNOWN)) is None
-
     def _is_possible(self) -> bool:
         """Disarmed, nothing else runs, and the window would not get better by waiting."""
-        if not self._may_write():
+        if self._conductor.why_not((Rung.BUSY, Rung.ARMED, Rung.UNKNOWN)) is not None:
             return False
         status = self._collector.status(asyncio.get_running_loop().time())
         return status.waiting_for is None and status.enough and self._in_force.measured
@@ -205,8 +168,7 @@ class Automatic:
             return
         now_s = asyncio.get_running_loop().time()
         if job.kind == "undo":
-            step = job.undone.step if job.undone is not None else None
-            if result.outcome == "done" and (job.undid_calibration or (step and step.origin.what == PREDICTION)):
+            if result.outcome == "done" and job.undid_calibration:
                 self._stop("undone")
             return
         if not job.automatic:
@@ -214,8 +176,6 @@ class Automatic:
             self._next_s = now_s + SPACING_S
             return
         self._count(job)
-        if job.kind == PREDICTION and result.outcome != "cancelled":
-            return  # it is no calibration, and delays none
         if result.outcome == "done":
             self._failures = 0
             self._next_s = now_s + SPACING_S
@@ -229,7 +189,6 @@ class Automatic:
 
     def _count(self, job: Job) -> None:
         parameters = sum(len(imu.written) for imu in job.record.imus) if job.record is not None else 0
-        parameters += len(job.product.written) if isinstance(job.product, Predicted) else 0
         if parameters:
             write = AutomaticWrite(time.time(), parameters)
             self._writes = [*self._writes, write][-PER_DAY - 8 :]
@@ -254,8 +213,3 @@ class Automatic:
             "most_per_boot": PER_BOOT,
             "most_per_day": PER_DAY,
         }
-
-
-def _started(answer: Job | Refusal) -> None:
-    if isinstance(answer, Refusal):
-        logger.info("nothing is written by itself: %s", answer.reason)

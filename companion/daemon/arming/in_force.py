@@ -25,7 +25,6 @@ from companion.calibration.records.validity import (
     Present,
     Seen,
     Why,
-    contradicts,
     held_of,
     judge,
     worst_axis,
@@ -35,7 +34,6 @@ from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.solve import Solution
 from companion.component.service import JobResult
-from companion.component.statustext import Severity
 from companion.config.sections import Config, Imu
 from companion.configured import models
 from companion.daemon.arming.offset_watch import OffsetWatch
@@ -45,19 +43,17 @@ from companion.daemon.calibrating.held_back import HeldBack, Key
 from companion.daemon.calibrating.solver import Solver
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.job import Job, Predicted
+from companion.daemon.job import Job
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import vector
-from companion.physics.units import DEG_H
 from companion.samples import TRIADS, Triad
-from companion.storage.changes import PREDICTION
 
 logger = logging.getLogger(__name__)
 
 _ZERO: Final = (0.0, 0.0, 0.0)
 # Causes that a measurement settles. What the pilot undid and what somebody else chose is theirs until asked for, and
 # what a boot replaced is pushed again.
-_SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED, Why.PREDICTED})
+_SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
 SETTLED_EVERY_S: Final = 5
 """How often the output is checked while nothing speaks against what is in force; otherwise every second."""
 
@@ -91,10 +87,6 @@ class InForce:
         self._present: dict[Key, Present] = {}
         self.temperatures_degc: dict[str, float] = {}
         """Of each IMU that tells one, when its output was last looked at."""
-        self._predicted = ""
-        """What is in force where it was predicted, for people."""
-        self._unseen: dict[str, float] = {}
-        """By IMU: one sigma of what is in force and no still window has shown yet, rad/s."""
         self._measured_s = self._looked_s = -1.0
         self._worth_since_s: float | None = None
         self.offsets = OffsetWatch(core.vehicle, imus, self._lose)
@@ -119,7 +111,6 @@ class InForce:
                 if not any(finding.why is held for finding in found):
                     since = held is Why.NEVER and self.earlier is not None
                     words = "not confirmed since start" if since else held.value
-                    words = self._predicted if held is Why.PREDICTED else words
                     found += self._held_back.left_of((name, triad), [Finding(held, words)])
                 continue
             profile = noise_profile(self._core.profiles.of(name))
@@ -203,13 +194,6 @@ class InForce:
                 self.undone, self.calibration = True, None
                 self._held_back.let_go()
                 self._held = dict.fromkeys(self._held, Why.UNDONE)
-            elif done and job.undone is not None and job.undone.step.origin.what == PREDICTION:
-                self._held = {key: Why.NEVER if why is Why.PREDICTED else why for key, why in self._held.items()}
-            return
-        if isinstance(job.product, Predicted):
-            self._predicted = job.product.words
-            self._unseen = {name: sigma for name, sigma in job.product.sigmas_rad_s.items() if name in self._sources}
-            self._held |= {(name, "gyro"): Why.PREDICTED for name in self._unseen}
             return
         if done and job.record is not None:
             self.undone = False
@@ -273,8 +257,7 @@ class InForce:
         for key in [key for key in self._held if key[0] == name]:
             held = self._held[key]
             # What was never there, or was taken back on purpose, is not lost again by a restart.
-            replaced = held is Why.PREDICTED and why is Why.REPLACED
-            if isinstance(held, Held) or replaced or why in (Why.CHANGED, Why.FAILED):
+            if isinstance(held, Held) or why in (Why.CHANGED, Why.FAILED):
                 if isinstance(held, Held) and why is Why.REBOOTED:
                     self._shelved[key] = held
                 self._held[key] = why
@@ -362,12 +345,6 @@ class InForce:
             held = self._shelved.get(key, held)
         if held is Why.NEVER and (kept := self._from_record(key, end_s)) is not None:
             held = held if worst_axis(kept, present) is not None else kept
-        if held is Why.PREDICTED and (sigma := self._unseen.pop(key[0], None)) is not None:
-            off_deg_h = max(map(abs, present.residual)) / DEG_H
-            self._predicted += f"; seen: {off_deg_h:.0f} off"
-            logger.info("imu %s: what is predicted is %.0f deg/h off", key[0], off_deg_h)
-            if contradicts(present, sigma):
-                self._core.say(Severity.WARNING, f"Predicted bias of {key[0]} is wrong: hold still")
         if isinstance(held, Why):
             right = key[0] in self._imus and not worth_writing(present, None, self._floors[key[1]])
             if right and held in _SETTLED_BY_MEASURING:

@@ -34,7 +34,7 @@ class Arming(Subsystem):
         self._recovery = offsets.recovery
         # In this order they hear of a calibration's end: who starts the next one asks what is in force.
         self.in_force = InForce(core, devices.imus, calibrating.conductor, calibrating.solver, calibrating.memory)
-        self.automatic = Automatic(core, devices.imus, calibrating.conductor, self.in_force, calibrating.memory)
+        self.automatic = Automatic(core, devices.imus, calibrating.conductor, self.in_force)
         self.readiness = Readiness(core, offsets.owed, calibrating.conductor, self.in_force, self.automatic)
         self.armings = Armings(core, self.readiness)
         self.gate_setup = GateSetup(core, self.readiness)

@@ -11,20 +11,16 @@ import logging
 import math
 import time
 from collections.abc import Collection, Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
-import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for, whole_bias, whole_of
-from companion.autopilot.parameters.change import Change
+from companion.autopilot.firmware.imu_calibration import whole_of
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.history import Point, kept
-from companion.calibration.records.validity import WORTH_SIGMAS
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import (
-    LEVEL,
     Expectation,
     Expected,
     ExpectedImu,
@@ -51,8 +47,6 @@ logger = logging.getLogger(__name__)
 LOOK_K: Final = 1.0
 WRITE_EVERY_S: Final = 60.0
 """What still windows tell is written so often at most: a power cut costs no more of it."""
-AT_POWER_UP_S: Final = 300.0
-"""Since its power came an IMU's offsets may not have been seen right by anybody else, such as a ground station."""
 _MUCH_BETTER: Final = 0.7
 
 
@@ -62,19 +56,6 @@ class _Reference(msgspec.Struct):
     session: str
     point: Point
     contradicted: int = 0
-
-
-class Foretold(NamedTuple):
-    """What earlier power-ups say that the gyro offsets of an IMU should be."""
-
-    calibration: ImuCalibration
-    """In force."""
-    changes: tuple[Change, ...]
-    off_rad_s: float
-    """By which the offsets in force seem to be off, on the worst axis."""
-    sigma_rad_s: float
-    """Of what is foretold, on the worst axis."""
-    power_ups: int
 
 
 class BiasMemory:
@@ -200,39 +181,6 @@ class BiasMemory:
             along={triad: self.curves.along(name, triad, imu.warming) for triad in TRIADS},
             effect=effect,
         )
-
-    def foretold(self, name: str, degc: float) -> Foretold | None:
-        """Gyro offsets for an autopilot's IMU that nobody has seen still since its power came; blocking.
-
-        None where too little is known, or where those in force are not surely worse. Where the firmware has measured
-        them itself at this start, only what earlier power-ups contradict is.
-
-        Raises:
-            CalibrationRefusedError: what is foretold is no bias.
-        """
-        known, calibration = self._known.get(name), self._imus[name].calibration
-        if not self._config.calibration.prior or known is None or calibration is None or calibration.thermal.enabled_by:
-            return None
-        unix_s = time.time()
-        power_up = self.whose.power_up(name, unix_s)
-        since_s = power_up.since_unix_s
-        if since_s is None or unix_s - since_s > AT_POWER_UP_S or self._changed(name):
-            return None
-        if any(point.power_up.is_same(power_up) for point in known.points):
-            return None
-        now = Now(
-            unix_s=unix_s, power_up=power_up, temperature_degc=degc, up=vector(LEVEL), gravity_m_s2=9.81, zero=None
-        )
-        expected = expect(known.points, "gyro", now, pose_effect(None), noise_profile(self._profiles.of(name)).gyro)
-        if expected is None or not expected.weighs:
-            return None
-        in_force, _ = whole_bias(calibration, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), degc)
-        off, sigma = np.subtract(expected.value, in_force), np.sqrt(expected.variance)
-        own = any(rival.acts == "at a start" for rival in calibration.rivals)
-        if (np.abs(off) <= (expected.limit if own else WORTH_SIGMAS) * sigma).all():
-            return None
-        changes = changes_for(calibration, vector(off), None)
-        return Foretold(calibration, tuple(changes), np.abs(off).max(), sigma.max(), expected.power_ups)
 
     # --- and afterwards
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
-from functools import partial
+from collections.abc import Awaitable, Callable, Collection, Coroutine
 from typing import Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -22,7 +21,6 @@ from companion.calibration.solution.draft import in_words
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.component.tunes import Tune
-from companion.daemon.biases.memory import Foretold
 from companion.daemon.calibrating.course import Course
 from companion.daemon.calibrating.results import Results
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
@@ -32,7 +30,7 @@ from companion.daemon.offsets.ledger import Recovery
 from companion.daemon.stands.by_hand import ByHand
 from companion.errors import CompanionError
 from companion.links.system.listeners import Listeners
-from companion.storage.changes import AUTOMATIC, BY_HAND, PREDICTION, ChangeSet
+from companion.storage.changes import AUTOMATIC, BY_HAND, ChangeSet
 
 logger = logging.getLogger(__name__)
 
@@ -120,11 +118,6 @@ class Conductor:
         job = Job(kind, what, requester, deadline_s, reboot=reboot, automatic=automatic)
         return self._start(job, Event.REQUEST, self._calibrate(job))
 
-    def start_prediction(self, foretold: Mapping[str, Foretold], requester: str) -> Job | Refusal:
-        """Start writing the gyro offsets that earlier power-ups foretell, by IMU, or say why not."""
-        run = partial(self._course.predict, foretold=foretold)
-        return self.start_job(PREDICTION, What.GYROS, requester, None, None, run, automatic=True)
-
     def start_job(
         self,
         kind: str,
@@ -133,23 +126,20 @@ class Conductor:
         timeout_s: float | None,
         missing: str | None,
         run: Callable[[Job], Awaitable[str]],
-        *,
-        automatic: bool = False,
     ) -> Job | Refusal:
         """Start what is no calibration, or say why not.
 
         Args:
-            kind: one of `NO_CALIBRATION`, or a prediction.
+            kind: one of `NO_CALIBRATION`.
             what: which biases it is about.
             requester: for the log.
             timeout_s: for what waits for stillness.
             missing: why it cannot be done on this aircraft, if so.
             run: does it, and says in words what came of it.
-            automatic: nobody asked for it.
         """
         if (refusal := self._refusal(requester, missing)) is not None:
             return refusal
-        job = Job(kind, what, requester, _deadline_s(timeout_s), automatic=automatic)
+        job = Job(kind, what, requester, _deadline_s(timeout_s))
         return self._start(job, Event.REQUEST, self._keep_by_hand(job, run))
 
     async def _keep_by_hand(self, job: Job, run: Callable[[Job], Awaitable[str]]) -> None:

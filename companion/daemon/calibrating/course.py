@@ -26,11 +26,11 @@ from companion.component.service import WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.component.tunes import Tune
 from companion.config.sections import Platform
-from companion.daemon.biases.memory import BiasMemory, Foretold
+from companion.daemon.biases.memory import BiasMemory
 from companion.daemon.calibrating import held_back
 from companion.daemon.calibrating.solver import Given, Solver
 from companion.daemon.core import Core
-from companion.daemon.job import Job, Predicted
+from companion.daemon.job import Job
 from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.effect import TELEMETRY
@@ -39,9 +39,7 @@ from companion.daemon.offsets.push import WATCHING, Pusher
 from companion.daemon.stands.measuring import Measuring
 from companion.formats import utc_now
 from companion.links.system.listeners import Listeners
-from companion.physics.units import DEG_H
 from companion.samples import Triad
-from companion.storage.changes import PREDICTION, Origin
 
 logger = logging.getLogger(__name__)
 
@@ -173,29 +171,6 @@ class Course:
             else:
                 break
         await self._solving.remember(job, draft)
-
-    async def predict(self, job: Job, foretold: Mapping[str, Foretold]) -> str:
-        """Write gyro offsets that earlier power-ups foretell, by IMU; in words.
-
-        Raises:
-            CompanionError: it failed, and why; the autopilot is in order, or it is said what is not.
-            JobCancelledError: cancelled; nothing was written.
-        """
-        at = utc_now()
-        targets = [(each.calibration, each.changes) for each in foretold.values()]
-        written = await self._pusher.push_unseen(job, targets, Origin(PREDICTION, at))
-        sigma = max(each.sigma_rad_s for each in foretold.values()) / DEG_H
-        power_ups = min(each.power_ups for each in foretold.values())
-        job.deliver(
-            Predicted(
-                predicted_at=at,
-                words=f"predicted from {power_ups} power-ups: {sigma:.0f} deg/h",
-                sigmas_rad_s={name: each.sigma_rad_s for name, each in foretold.items()},
-                written=written,
-            )
-        )
-        off = max(each.off_rad_s for each in foretold.values()) / DEG_H
-        return f"was {off:.0f} deg/h off, now {sigma:.0f}"
 
     async def _measure_and_push(self, job: Job, draft: Draft) -> None:
         measured, window = await self._measure(job, draft)

@@ -88,4 +88,4 @@ class HeldBack:
         """What speaks against a triad all the same: a person's choice, and what was written and never seen right."""
         if key not in self._kept:
             return against
-        return [finding for finding in against if finding.why in _CHOSEN or finding.why in (Why.UNSEEN, Why.PREDICTED)]
+        return [finding for finding in against if finding.why in _CHOSEN or finding.why is Why.UNSEEN]

@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequenc
 from typing import Final
 
 from companion.autopilot.firmware.gyro_calibration import GyroParameters
-from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
 from companion.autopilot.parameters.verify import Verdict
 from companion.autopilot.parameters.wire import same_float32
@@ -16,7 +15,6 @@ from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
-from companion.calibration.records.record import WrittenParameter
 from companion.calibration.solution.draft import Draft
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.daemon.core import Core
@@ -91,27 +89,6 @@ class Pusher:
             job.progress(WRITTEN_PERCENT, WATCHING)
             await self._verify(job, plan, before, draft, go_on or job.going_on(WRITTEN_PERCENT, WATCHING))
         return plan
-
-    async def push_unseen(
-        self, job: Job, targets: Sequence[tuple[ImuCalibration, Sequence[Change]]], origin: Origin
-    ) -> dict[str, WrittenParameter]:
-        """Write and read back what the telemetry cannot show, because nothing is known to stand still.
-
-        Raises:
-            AutopilotError: as `push`.
-            StorageError: as `push`.
-        """
-        changes = [change for _, each in targets for change in each]
-        await self._begin(job, changes)
-        kept = ChangeSet.of(self._vehicle.system_id, changes, origin=origin)
-        async with self._ledger.transaction(kept):
-            with changing(self._imus.values()):
-                async with self._px4.standing_by([(*target, (0.0, 0.0, 0.0)) for target in targets]):
-                    written = await self._writer.apply(changes)
-            await self._ledger.done(kept)
-        for event in (Event.WRITTEN, Event.VERIFIED, Event.CONCLUDED):
-            self._machine.on(event)
-        return written
 
     async def _begin(self, job: Job, changes: Sequence[Change]) -> None:
         job.check_cancelled()

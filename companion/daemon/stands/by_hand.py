@@ -1,4 +1,4 @@
-"""What was written without a calibration: what stands have told, and the latest prediction; for history and status."""
+"""History of alignments: their results, and the parameters that they wrote; for `companion history` and `status`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from companion.calibration.records.align_record import AlignmentRecord, FacesRec
 from companion.component.service import JobResult
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.job import Job, Predicted
+from companion.daemon.job import Job
 from companion.errors import StorageError
 from companion.formats import Object, utc_now
 from companion.storage.changes import PREDICTION, ChangeSet
@@ -34,28 +34,22 @@ class ByHand:
         self._done = self._file.read()
 
     async def keep(self, job: Job, result: JobResult) -> None:
-        """Remember how a job with stands, or a prediction, has ended, where it has come so far."""
+        """Add an alignment that has delivered a record, unless it was cancelled."""
         record = job.product
-        if isinstance(record, Predicted):
-            what, state, at, parts = PREDICTION, "predicted", record.predicted_at, [record.written]
-        elif result.outcome == "cancelled" or not isinstance(record, AlignmentRecord | FacesRecord | TurnRecord):
+        if result.outcome == "cancelled" or not isinstance(record, AlignmentRecord | FacesRecord | TurnRecord):
             return
-        else:
-            board = record.board.written if isinstance(record, TurnRecord) and record.board is not None else {}
-            what, state, at = "level" if board else record.kind, result.outcome, record.measured_at
-            parts = [board, *([] if isinstance(record, AlignmentRecord) else [imu.written for imu in record.imus])]
+        board = record.board.written if isinstance(record, TurnRecord) and record.board is not None else {}
+        parts = [board, *([] if isinstance(record, AlignmentRecord) else [imu.written for imu in record.imus])]
         kept = [(name, one) for part in parts for name, one in part.items() if one.outcome in ("verified", "stored")]
         done = Done(
-            what=what,
-            state=state,
-            measured_at=at,
+            what="level" if board else record.kind,
+            state=result.outcome,
+            measured_at=record.measured_at,
             reason=result.reason,
             system_id=self._vehicle.system_id,
             written={name: one.after for name, one in kept},
         )
-        # Every power-up may bring another prediction: they must not push out what somebody has measured.
-        earlier = [each for each in self._done if each.what != what or what != PREDICTION]
-        await self._write([*earlier, done][-KEEP_DONE:])
+        await self._write([*self._done, done][-KEEP_DONE:])
 
     async def undone(self, step: ChangeSet) -> None:
         """What was written in this step is in force no more."""
@@ -79,8 +73,9 @@ class ByHand:
         return [self._shown(done) for done in reversed(self._done)]
 
     def latest(self) -> list[Object]:
-        """The last of each kind on this aircraft, the latest first."""
+        """List the last alignment of each kind on this aircraft, the latest first."""
         here = {done.what: done for done in self._done if done.system_id == self._vehicle.system_id}
+        here.pop(PREDICTION, None)
         return [self._shown(done) for done in sorted(here.values(), key=self._done.index, reverse=True)]
 
     def _shown(self, done: Done) -> Object:
