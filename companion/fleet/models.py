@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from companion.physics.frames import Floats
+from companion.physics.statistics import MAD_TO_SIGMA
 
 LEAST_POWER_UPS: Final = 8
 """Least power-ups for the scatter of a part."""
@@ -21,7 +22,6 @@ WANDER_LAG: Final = 30
 _STEP_K: Final = 15.0
 _FOR_A_TERM: Final = 24
 """Power-ups for each further power of the temperature."""
-MAD_TO_SIGMA: Final = 1.4826
 _LEAST_SPREAD: Final = 0.05
 """Least difference between the scatters of parts, as a share of the typical scatter."""
 _OUTLIER: Final = 3.0

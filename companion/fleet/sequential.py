@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.noise.robust import HUBER_C
 from companion.physics.frames import Floats
+from companion.physics.statistics import MAD_TO_SIGMA
 
 CLIP: Final = 3.0
 LEAST_SHIFT: Final = 0.5
@@ -184,13 +185,13 @@ def _begin(y: Floats, laws: Floats, there: NDArray[np.bool_]) -> tuple[Floats, F
         inverse = np.linalg.inv((laws * weight[:, None]).T @ laws + np.diag(1.0 / _BEFORE))
         x = inverse @ (laws * weight[:, None]).T @ y
         off = np.abs(y - laws @ x)
-        scale = max(1.4826 * float(np.median(off)), 1.0)
+        scale = max(MAD_TO_SIGMA * float(np.median(off)), 1.0)
         weight = np.asarray(there * np.minimum(HUBER_C * scale / np.maximum(off, 1e-9), 1.0), dtype=np.float64)
     return x, np.asarray(inverse, dtype=np.float64), float((weight * np.square(off)).sum())
 
 
 def _scatter(level: Floats) -> float:
-    return float(1.4826 * np.median(np.abs(np.diff(level))) / np.sqrt(2.0)) if len(level) > 1 else 0.0
+    return float(MAD_TO_SIGMA * np.median(np.abs(np.diff(level))) / np.sqrt(2.0)) if len(level) > 1 else 0.0
 
 
 def _at_one_temperature(y: Floats, laws: Floats, x: Floats, column: int) -> Floats:

@@ -14,7 +14,6 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.calibration.noise.allan import PROFILES, noise_profile
-from companion.calibration.noise.robust import MAD_TO_SIGMA
 from companion.calibration.records.flight_record import Drift, Flight, ImuFlight, Moment, Stages, Term
 from companion.calibration.records.record import Record
 from companion.calibration.solution.prior import curve_of
@@ -26,6 +25,7 @@ from companion.flight.log import Boot, FlownImu
 from companion.flight.split import LENGTH_S, SHORT_S, split
 from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
 from companion.physics.frames import Floats
+from companion.physics.statistics import MAD_TO_SIGMA
 from companion.physics.units import DEG_H, MG
 from companion.replay.autopilot_logs import read_ulog, reader_of
 from companion.replay.blocks import Progress

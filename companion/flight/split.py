@@ -16,6 +16,7 @@ import numpy as np
 from companion.calibration.records.flight_record import AXES, Split, Term
 from companion.flight.inertial import Window
 from companion.physics.frames import Floats
+from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG, MG
 
 LENGTH_S: Final = 10.0
@@ -87,7 +88,7 @@ def _mean(values: Floats, span_s: float, end: float, constant: float) -> Term | 
     if len(values) < _LEAST:
         return None
     freedom = len(values) - 1
-    scatter = float(values.std(ddof=1)) / np.sqrt(len(values)) * _student(freedom)
+    scatter = float(values.std(ddof=1)) / np.sqrt(len(values)) * student_quantile(2.0, freedom) / 2.0
     sigma = np.sqrt(scatter**2 + 2.0 * (end / span_s) ** 2 + constant**2)
     return Term(float(values.mean()), float(sigma))
 
@@ -110,14 +111,9 @@ def _slopes(
     if rank < design.shape[1]:
         return None, None
     left = values - design @ fit
-    variance = float(left @ left) / freedom * _student(freedom) ** 2
+    variance = float(left @ left) / freedom * (student_quantile(2.0, freedom) / 2.0) ** 2
     # The solution's own wandering over minutes, by the same columns.
     wander = math.hypot(end / LENGTH_S / math.sqrt(len(values)), aside * _tilt(windows))
     sigmas = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * (variance + wander**2))
     terms = {name: Term(float(fit[1 + k]), float(sigmas[1 + k])) for k, name in enumerate(columns)}
     return terms.get("vibration"), terms.get("trend")
-
-
-def _student(freedom: int) -> float:
-    """By how much two sigma of few samples are wider than of many: 97.7 % of Student's distribution, approximated."""
-    return 1.0 + 1.4 / freedom + 2.2 / freedom**2

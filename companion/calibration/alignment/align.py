@@ -23,6 +23,7 @@ from companion.calibration.alignment.align_model import DOWN, Ground, Model, Par
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
 from companion.physics.gradienter import Law, up_in_sensor
+from companion.physics.statistics import chi_square_ratio
 from companion.physics.units import DEG, MG
 
 MAX_ROUNDS: Final = 30
@@ -35,6 +36,8 @@ SPOT_W_LIMIT: Final = 3.9
 DETERMINED: Final = 0.2
 """A figure counts as determined where its sigma is below this share of what was known before."""
 _LEAST_REDUNDANCY: Final = 1e-3
+_NINETY_NINE: Final = 2.326
+"""Sigmas that a normal number exceeds in one case of a hundred."""
 MOST_TURNED_DEG: Final = 30.0
 """Of an IMU against the base: more is another orientation than the one configured."""
 LEVEL: Final = -DOWN
@@ -172,15 +175,11 @@ def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:
 
 
 def widened_by(chi_square: float, freedom: int) -> float:
-    """The scatter over that of the sigmas, where it is more than chance makes of them: less of it proves nothing.
-
-    Beyond the 99 % point of chi square (Wilson and Hilferty, PNAS 17, 684, 1931).
-    """
+    """Give the variance of the residuals over that of their sigmas where it is beyond its 99 % point, else 1."""
     if freedom <= 0:
         return 1.0
-    part = 2.0 / (9.0 * freedom)
-    by_chance = freedom * (1.0 - part + 2.326 * math.sqrt(part)) ** 3
-    return chi_square / freedom if chi_square > by_chance else 1.0
+    ratio = chi_square / freedom
+    return ratio if ratio > chi_square_ratio(freedom, _NINETY_NINE) else 1.0
 
 
 def _first_attitude(law: Law, mounting: Matrix, stand: Stand) -> Matrix:

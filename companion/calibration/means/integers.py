@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from companion.calibration.means.quantised import MIN_BEYOND_TWO, Cells, Fit, fit, shape_variance, truncation_edges
 from companion.calibration.noise.robust import HUBER_C as FLOAT_HUBER_C
-from companion.calibration.noise.robust import MAD_TO_SIGMA
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
+from companion.physics.statistics import MAD_TO_SIGMA
 
 Integers = NDArray[np.int64]
 

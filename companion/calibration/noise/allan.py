@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from companion.config.sections import Noise
 from companion.errors import ConfigError
 from companion.physics.frames import Floats
+from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad
 
@@ -181,14 +182,8 @@ def allan_variance(slots: NDArray[np.int64], values: Floats, span: int) -> tuple
 
 
 def student_ratio(freedom: float) -> float:
-    """Half width of Student's 95 % interval over the normal one, for a sigma known with few degrees of freedom.
-
-    Cornish-Fisher expansion to second order; within 3 % of the exact ratio from 4 degrees of freedom on, capped at 3
-    below 2.
-    """
-    if freedom <= 0.0:
-        return 3.0
-    return min(1.0 + 1.210 / freedom + 1.441 / freedom**2, 3.0)
+    """Give the half width of Student's 95 % interval over the normal one, 3 at most and where nothing is known."""
+    return min(student_quantile(1.96, freedom) / 1.96, 3.0) if freedom >= 1.0 else 3.0
 
 
 def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:

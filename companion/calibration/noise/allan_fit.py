@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import FLOOR_OF_FLICKER, allan_variance
 from companion.physics.frames import Floats, vector
+from companion.physics.statistics import chi_square_sigmas
 
 Slots = NDArray[np.int64]
 
@@ -198,10 +199,8 @@ def _excess(parts: Sequence[_Part], theta: Floats) -> tuple[int, float] | None:
             total[2] += weight * model[row]
     worst: tuple[int, float] | None = None
     for span, (weight, measured, expected) in found.items():
-        # sum(w v) has the variance sum(w); a sum of squares is chi-square, which Wilson and Hilferty make normal.
-        freedom = 2.0 * expected**2 / weight
-        spread = 2.0 / (9.0 * freedom)
-        above = ((measured / expected) ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(spread)
+        # sum(w v) has the variance sum(w); a sum of squares is chi-square.
+        above = chi_square_sigmas(measured / expected, 2.0 * expected**2 / weight)
         if above > EXCESS_SIGMAS and measured > EXCESS_RATIO * expected:
             ratio = math.sqrt(measured / expected)
             if worst is None or ratio > worst[1]:

@@ -32,6 +32,7 @@ from companion.calibration.records.record import Effective
 from companion.calibration.temperature.along import WARM_AFTER, Along, Settling, along
 from companion.calibration.temperature.curve import Curve, Node, PowerUpNodes, fit
 from companion.physics.frames import Array, Floats, Matrix, skew, symmetric, vector
+from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG, DEG_H, MG, G
 from companion.samples import Triad, Vector
 
@@ -184,19 +185,6 @@ class Now(msgspec.Struct, frozen=True, kw_only=True):
     zero: str | None
 
 
-def student_limit(freedom: float) -> float:
-    """Give the limit that is as improbable in Student's distribution as `GATE_SIGMAS` is in the normal one.
-
-    Cornish-Fisher expansion to third order (Abramowitz and Stegun 26.7.5); from 6 degrees of freedom on, and below the
-    exact value by at most a tenth.
-    """
-    x, n = GATE_SIGMAS, freedom
-    first = (x**3 + x) / 4.0
-    second = (5.0 * x**5 + 16.0 * x**3 + 3.0 * x) / 96.0
-    third = (3.0 * x**7 + 19.0 * x**5 + 17.0 * x**3 - 15.0 * x) / 384.0
-    return x + first / n + second / n**2 + third / n**3
-
-
 def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, model: AllanModel) -> Expected | None:
     """Predict today's bias from the earlier power-ups; None: they are too few."""
     groups = [
@@ -228,7 +216,7 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
     return Expected(
         value=vector(value),
         variance=vector(variance + together),
-        limit=student_limit(curve.freedom),
+        limit=student_quantile(GATE_SIGMAS, curve.freedom),
         power_ups=len(groups),
         weighs=len(groups) >= WEIGHS_FROM and (not told or curve.beyond_k(degc) == 0.0),
         by_temperature=curve.order > 0,

@@ -29,9 +29,10 @@ from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.seconds.recent import Recent
 from companion.calibration.stillness.coarse import Steps
-from companion.calibration.stillness.own_noise import OwnNoise, variance_ratio
+from companion.calibration.stillness.own_noise import OwnNoise
 from companion.calibration.stillness.plausible import MOST_GYRO_RAD_S, unit_of_force
 from companion.physics.frames import Floats
+from companion.physics.statistics import chi_square_ratio
 from companion.physics.units import DEG, MG
 
 GYRO_MOTION_RAD_S: Final = 0.10 * DEG
@@ -246,7 +247,7 @@ class ImuGate:
             ordered = np.sort(self._learned.rows, axis=0)
             below, share = divmod(0.25 * (len(ordered) - 1), 1.0)
             low, high = ordered[int(below)], ordered[int(below) + 1]
-            learned[:] = ((low + (high - low) * share) / variance_ratio(n - 1, _LOWER_QUARTILE)).tolist()
+            learned[:] = ((low + (high - low) * share) / chi_square_ratio(n - 1, _LOWER_QUARTILE)).tolist()
         for (_, triad, *_), own in zip(_TRIADS, self._own.known, strict=True):
             if own is not None:
                 learned[triad] = own.variance

@@ -24,11 +24,11 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import allan_variance
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
+from companion.physics.statistics import chi_square_ratio
 from companion.physics.units import DEG, MG
 
 LEARN_S: Final = 30
@@ -233,10 +233,10 @@ class _Seen:
     def _is_steady(self, part: slice, found: Known) -> bool:
         """Whether no second is an outlier, by its variance or by its step from the one before."""
         most = float(self._variances[:, part].mean(axis=1).max())
-        if most > sum(found.variance) / 3.0 * float(variance_ratio(3.0 * found.freedom, _OUTLIER_SIGMAS)):
+        if most > sum(found.variance) / 3.0 * float(chi_square_ratio(3.0 * found.freedom, _OUTLIER_SIGMAS)):
             return False
         steps = np.square(self._steps(part)).mean(axis=1) / 2.0
-        return float(steps.max()) <= sum(found.density) / 3.0 * float(variance_ratio(3.0, _OUTLIER_SIGMAS))
+        return float(steps.max()) <= sum(found.density) / 3.0 * float(chi_square_ratio(3.0, _OUTLIER_SIGMAS))
 
     def _is_round(self, part: slice) -> bool:
         """Whether the axes go their own ways, each about as far: a rocking aircraft turns about one axis or two."""
@@ -267,10 +267,4 @@ def _freedom(parts: Floats) -> Floats:
 def _allowed(depth: int) -> Floats:
     """(depth, 1) Allan variance that chance alone may make of noise whose density is one."""
     parts = _parts(depth)
-    return np.asarray((parts * variance_ratio(_freedom(parts), _OUTLIER_SIGMAS))[:, None])
-
-
-def variance_ratio(freedom: NDArray[np.float64] | float, sigmas: float) -> Floats:
-    """A variance estimate over the variance, so many sigmas from the usual one (Wilson and Hilferty's chi-square)."""
-    spread = 2.0 / (9.0 * np.asarray(freedom))
-    return np.asarray((1.0 - spread + sigmas * np.sqrt(spread)) ** 3)
+    return np.asarray((parts * chi_square_ratio(_freedom(parts), _OUTLIER_SIGMAS))[:, None])

@@ -15,6 +15,7 @@ import numpy as np
 
 from companion.calibration.temperature.curve import FEWEST, Curve, State
 from companion.physics.frames import Array, vector
+from companion.physics.statistics import MAD_TO_SIGMA
 from companion.samples import Vector
 
 _SLOWED_K_S: Final = 0.25 / 60.0
@@ -23,7 +24,6 @@ _LEAST: Final = 0.05
 """One sigma of tau, the least of it: boards have more than one."""
 WARM_AFTER: Final = 5.0
 """So many tau."""
-_MAD_TO_SIGMA: Final = 1.4826
 _TO_END: Final = (-1.0 / 6.0, -4.0 / 6.0, 5.0 / 6.0)
 """The last less the mean by Simpson's rule."""
 
@@ -78,7 +78,7 @@ def settling(power_ups: Iterable[Sequence[State]]) -> Settling | None:
     if len(found) < FEWEST:
         return None
     tau = _middle(found)
-    scatter = _MAD_TO_SIGMA * _middle([abs(each - tau) for each in found])
+    scatter = MAD_TO_SIGMA * _middle([abs(each - tau) for each in found])
     return Settling(tau, math.hypot(scatter, _LEAST * tau))
 
 
