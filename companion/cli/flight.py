@@ -21,10 +21,10 @@ from companion.calibration.records.flight_record import (
     drift_lines,
     legend,
     next_flight,
-    unit_of,
 )
 from companion.cli.terminal import AddCommand, conclude, print_lines, storage_path
 from companion.errors import StorageError
+from companion.physics.units import unit_of
 
 if TYPE_CHECKING:
     from companion.flight.flight import Knowledge

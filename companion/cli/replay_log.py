@@ -11,7 +11,7 @@ import msgspec
 from companion.cli import show
 from companion.cli.terminal import conclude, print_lines, storage_path, within
 from companion.errors import ConfigError, StorageError
-from companion.physics.units import DEG_H, MG
+from companion.physics.units import unit_of
 
 if TYPE_CHECKING:
     from companion.replay.estimate import Given, Used
@@ -162,7 +162,7 @@ def window_lines(found: Windows) -> list[str]:
         lines.append(f"against the next {next_s:g} s, {rows[0].pairs} pairs:")
         lines.append(f"{'':16} {'sigma_use':>10} {'rms error':>10} {'over sigma':>10} {'2 sigma':>8}")
         for each in rows:
-            unit, name = (DEG_H, "deg/h") if each.axis.startswith("gyro") else (MG, "mg")
+            unit, name, _ = unit_of(each.axis)
             digits = 1 if name == "deg/h" else 3
             figures = f"{each.sigma_use / unit:>10.{digits}f} {each.rms / unit:>10.{digits}f} {each.ratio:>10.2f}"
             lines.append(f"{f'{each.axis}, {name}':16} {figures} {each.share:>8.1%}")

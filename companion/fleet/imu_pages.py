@@ -17,11 +17,12 @@ from companion.calibration.solution.by_temperature import ByTemperature, Expecte
 from companion.fleet.judging import Part, parts_of
 from companion.fleet.models import Scatter, Typical, typical_part
 from companion.fleet.schema import Moment, aircraft, parts
+from companion.physics.units import UNITS
 from companion.report import svg
 from companion.report.by_temperature import biases_by_temperature
 from companion.report.markup import Child, Markup, join, row, tag
-from companion.report.page import AXES, CLASSES, NAMES, TRIADS, UNITS, page
-from companion.samples import Triad
+from companion.report.page import AXES, CLASSES, NAMES, page
+from companion.samples import TRIADS, Triad
 
 OUTSIDE: Final = 3.0
 """Least distance from the typical part, in sigmas of the spread, for the list of outliers."""
@@ -76,7 +77,7 @@ def model_page(connection: sa.Connection, model: str, now: datetime.datetime, so
 
 def _distribution(of_model: Mapping[Part, Scatter], triad: Triad, typical: Typical | None) -> list[Child]:
     """Draw a dot for each part, above the others that scatter as much, and the typical part."""
-    unit, unit_name = UNITS[triad]
+    unit, unit_name, _ = UNITS[triad]
     columns = {axis: _scatters(of_model, triad, axis) for axis in range(3)}
     every = [value / unit for of_axis in columns.values() for value in of_axis.values()]
     if not every:
@@ -136,7 +137,7 @@ def _in_words(typical: Typical | None, triad: Triad, axis: int) -> str:
 
 
 def _slopes(typical: Typical | None, triad: Triad) -> Markup | None:
-    unit, unit_name = UNITS[triad]
+    unit, unit_name, _ = UNITS[triad]
     at = slice(_column(triad, 0), _column(triad, 0) + 3)
     if typical is None or not np.isfinite(typical.per_k[at]).all():
         return None
@@ -153,7 +154,7 @@ def _outside(
     """List the parts that scatter far more, or less, than the others."""
     if typical is None:
         return []
-    unit, unit_name = UNITS[triad]
+    unit, unit_name, _ = UNITS[triad]
     found = [
         (float(value / usual), value, axis, key)
         for axis in range(3)

@@ -14,10 +14,10 @@ from companion.fleet.imu_pages import by_temperature, curves, model_links
 from companion.fleet.schema import Moment, findings, rejected
 from companion.fleet.schema import aircraft as known
 from companion.physics.frames import vector
-from companion.physics.units import DEG_H, MG
+from companion.physics.units import DEG_H, MG, UNITS
 from companion.report.markup import Child, Markup, join, row, tag
-from companion.report.page import NAMES, TRIADS, UNITS, Point, arming_items, card, drift, page, seconds_of, with_sigma
-from companion.samples import Triad, Vector
+from companion.report.page import NAMES, Point, arming_items, card, drift, page, seconds_of, with_sigma
+from companion.samples import TRIADS, Triad, Vector
 
 STALE: Final = datetime.timedelta(days=30)
 """A calibration that is older is shown as stale."""
@@ -204,7 +204,7 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
             points = _points(of_it, triad)
             if not points:
                 continue
-            unit, unit_name = UNITS[triad]
+            unit, unit_name, _ = UNITS[triad]
             last = points[-1]
             pairs = (with_sigma(last.bias[k], last.sigma_use[k], unit) for k in range(3))
             cells = [tag("td", value, " ± ", sigma) for value, sigma in pairs]
@@ -239,7 +239,7 @@ def _seen(rows: Sequence[Any]) -> list[Seen]:
 
 def _points(rows: Sequence[Any], triad: Triad) -> list[Point]:
     """Select the latest biases, in the order of time, SI units."""
-    unit, name = UNITS[triad]
+    unit, name, _ = UNITS[triad]
     suffix = name.replace("/", "_")
     found: dict[tuple[str, int], dict[str, Any]] = {}
     for each in rows:

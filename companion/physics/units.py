@@ -1,9 +1,11 @@
-"""Factors from the field's units to SI."""
+"""Factors from the field's units to SI, and the units in which gyros and accelerometers are shown."""
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
+
+from companion.samples import Triad
 
 DEG: Final = math.pi / 180.0
 """rad per degree."""
@@ -16,3 +18,21 @@ G: Final = 9.80665
 
 MG: Final = 9.80665e-3
 """m/s^2 per milli-g of the standard gravity, the unit in which accelerometers are specified."""
+
+
+class Unit(NamedTuple):
+    """Unit in which people read a bias."""
+
+    si: float
+    """The unit in SI units."""
+    name: str
+    digits: int
+    """Decimals that a bias is worth."""
+
+
+UNITS: Final[dict[Triad, Unit]] = {"gyro": Unit(DEG_H, "deg/h", 0), "accel": Unit(MG, "mg", 1)}
+
+
+def unit_of(axis: str) -> Unit:
+    """Give the unit of an axis such as "gyro x"."""
+    return UNITS["gyro" if axis.startswith("gyro") else "accel"]

@@ -8,10 +8,11 @@ from typing import Final
 import msgspec
 
 from companion.calibration.solution.by_temperature import ByTemperature, Expected
+from companion.physics.units import UNITS
 from companion.report import svg
 from companion.report.markup import Child, Markup, tag
-from companion.report.page import AXES, CLASSES, NAMES, TRIADS, UNITS
-from companion.samples import Triad, Vector
+from companion.report.page import AXES, CLASSES, NAMES
+from companion.samples import TRIADS, Triad, Vector
 
 _LEAST_K: Final = 4.0
 """How wide an axis is at least, so that a tenth of a kelvin does not fill it."""
@@ -97,7 +98,7 @@ def _mark(plot: svg.Plot, degc: float, bias: float) -> None:
 
 
 def _label(imu: ByTemperature, triad: Triad, axis: int, when: str) -> str:
-    name = f"{AXES[axis]}, {UNITS[triad][1]}"
+    name = f"{AXES[axis]}, {UNITS[triad].name}"
     if triad == "accel":
         return name
     told = [(when, imu.now), ("at power-up", imu.at_power_up)]
@@ -111,7 +112,7 @@ def _value(found: Expected, axis: int) -> str:
 
 def _told(imu: ByTemperature, triad: Triad, axis: int, dots: Sequence[tuple[float, float, float]], when: str) -> str:
     """For who cannot see it."""
-    unit, digits = UNITS[triad][1], 0 if triad == "gyro" else 2
+    unit, digits = UNITS[triad].name, 0 if triad == "gyro" else 2
     low, high = (f"{pick(value for _, value, _ in dots):+.{digits}f}" for pick in (min, max))
     words = [f"{len(dots)} points, {low} to {high} {unit}."]
     if triad == "gyro" and imu.curve:

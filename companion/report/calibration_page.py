@@ -12,6 +12,7 @@ import msgspec
 from companion.calibration.collector.trace import Trace
 from companion.calibration.records.record import Arming, ImuRecord, Outcome, Record, outcome_word
 from companion.calibration.solution.by_temperature import ByTemperature
+from companion.physics.units import UNITS
 from companion.report.by_temperature import biases_by_temperature
 from companion.report.markup import Child, Markup, cell, join, number, row, tag
 from companion.report.page import (
@@ -19,8 +20,6 @@ from companion.report.page import (
     MAX_IMUS,
     MAX_WARNINGS,
     NAMES,
-    TRIADS,
-    UNITS,
     arming_items,
     card,
     damaged,
@@ -31,7 +30,7 @@ from companion.report.page import (
     with_sigma,
 )
 from companion.report.seconds import stillness
-from companion.samples import Triad
+from companion.samples import TRIADS, Triad
 
 _ARMED: Final = attrgetter("armed_at", "state", "reason")
 _OUTCOMES: Final[dict[Outcome, tuple[str, str]]] = {
@@ -152,7 +151,7 @@ def _imu(imu: ImuRecord, flown: Sequence[str]) -> Markup:
 
 
 def _triad(imu: ImuRecord, triad: Triad) -> Markup:
-    unit, unit_name = UNITS[triad]
+    unit, unit_name, _ = UNITS[triad]
     if triad == "gyro":
         bias, stat, use = imu.gyro_bias_rad_s, imu.gyro_sigma_stat_rad_s, imu.gyro_sigma_use_rad_s
         left = imu.residual_gyro_rad_s

@@ -20,8 +20,8 @@ from companion.calibration.records.flight_record import (
     figure,
     legend,
     next_flight,
-    unit_of,
 )
+from companion.physics.units import unit_of
 from companion.report import svg
 from companion.report.markup import Child, Markup, cell, row, tag
 from companion.report.page import CLASSES, MAX_IMUS, card, moment, page, with_sigma
@@ -145,7 +145,7 @@ def _drift_plot(imu: ImuFlight, sets: dict[str, list[Drift]], shape: dict[str, t
 def _biases(flight: Flight, imu: ImuFlight) -> list[Child]:
     shown = [term for term in HEADS if any(getattr(axis, term) for axis in imu.axes)]
     lacking = [head for term, head in HEADS.items() if term not in shown]
-    heads = ["", *(f"{axis.axis}, {unit_of(axis.axis)[1]}" for axis in imu.axes)]
+    heads = ["", *(f"{axis.axis}, {unit_of(axis.axis).name}" for axis in imu.axes)]
     rows = [row(HEADS[term], *(_term(f"{term}.{imu.imu}", axis, term) for axis in imu.axes)) for term in shown]
     return [
         tag("h3", "Biases that the offsets left"),
@@ -168,7 +168,7 @@ def _term(key: str, axis: Split, term: str) -> Markup:
     found: Term | None = getattr(axis, term)
     if found is None:
         return tag("td", "?")
-    value, sigma = with_sigma(found.value, found.sigma, unit_of(axis.axis)[0])
+    value, sigma = with_sigma(found.value, found.sigma, unit_of(axis.axis).si)
     return cell(f"{key}.{axis.axis}", value, tag("small", "± ", sigma))
 
 

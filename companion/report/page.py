@@ -13,14 +13,12 @@ import msgspec
 
 from companion import __version__
 from companion.calibration.records.record import Record
-from companion.physics.units import DEG_H, MG
+from companion.physics.units import UNITS
 from companion.report import svg
 from companion.report.markup import Child, Markup, join, number, tag
 from companion.samples import Triad, Vector
 
-UNITS: Final[Mapping[Triad, tuple[float, str]]] = {"gyro": (DEG_H, "deg/h"), "accel": (MG, "mg")}
 NAMES: Final[Mapping[Triad, str]] = {"gyro": "Gyro", "accel": "Accelerometer"}
-TRIADS: Final[tuple[Triad, ...]] = ("gyro", "accel")
 AXES: Final = ("x", "y", "z")
 CLASSES: Final = ("sx", "sy", "sz")
 _MOST: Final = 1e4
@@ -148,7 +146,7 @@ def _too_close(places: Sequence[float]) -> bool:
 
 def drift(points: Sequence[Point], triad: Triad, *, name: str, this: int | None = None) -> Markup | None:
     """Three plots, one an axis, of a bias against time; None where there is nothing to show."""
-    unit, unit_name = UNITS[triad]
+    unit, unit_name, _ = UNITS[triad]
     numbered = not clock_is_sound(points)
     given = [(float(point.number) if numbered else point.unix_s, point) for point in points]
     shown = [(x, point) for x, point in given if x is not None]

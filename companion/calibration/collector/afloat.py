@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import msgspec
 
 from companion.calibration.collector.measurement import Measurement
@@ -13,11 +11,10 @@ from companion.calibration.deck.estimate import MAX_S, MIN_LOOK_S, MIN_S, DeckFo
 from companion.calibration.deck.outlook import Past, aim, more
 from companion.calibration.means.windows import Window
 from companion.errors import CalibrationRefusedError
-from companion.physics.units import DEG_H, MG
+from companion.physics.units import UNITS
+from companion.samples import TRIADS
 
 Smoothed = DeckFound | CalibrationRefusedError
-_UNITS: Final = ((DEG_H, "deg/h"), (MG, "mg"))
-"""Of gyros and accelerometers."""
 
 
 class DeckMeasurement(Measurement, frozen=True, kw_only=True):
@@ -111,16 +108,16 @@ class Afloat:
         if isinstance(found, CalibrationRefusedError):
             return Progress(enough=False, share=0.0, words=str(found))
         targets = settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2
-        aims = [(aim(self._past, at, targets[at % 2]), *_UNITS[at % 2]) for at in range(len(found.known))]
-        last, unit, name = max(aims, key=lambda each: each[0].whole_s)
-        if all(each.sigma <= each.goal for each, _, _ in aims):
+        aims = [(aim(self._past, at, targets[at % 2]), TRIADS[at % 2]) for at in range(len(found.known))]
+        last, triad = max(aims, key=lambda each: each[0].whole_s)
+        if all(each.sigma <= each.goal for each, _ in aims):
             return Progress(enough=True, share=1.0, words="sigma is good enough")
         if self.seconds >= MAX_S:
             return Progress(enough=True, share=1.0, words=f"measured for {MAX_S // 60} min")
         left_s = max(last.whole_s - self.seconds, 1)
-        left = more(left_s)
+        left, unit = more(left_s), UNITS[triad]
         share = self.seconds / (self.seconds + left_s)
-        return Progress(enough=False, share=share, words=f"{left}: {last.in_words(unit, name)}", left=left)
+        return Progress(enough=False, share=share, words=f"{left}: {last.in_words(unit.si, unit.name)}", left=left)
 
     def _at_least(self, needed: int) -> str:
         return f"at least {max(needed - self.seconds, 1)} s more"

@@ -13,8 +13,8 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.records.flight_record import AXES, Flight, Term, is_worth_saying, unit_of
-from companion.physics.units import MG
+from companion.calibration.records.flight_record import AXES, Flight, Term, is_worth_saying
+from companion.physics.units import MG, unit_of
 
 SURE_SIGMAS: Final = 3.0
 _COMMON: Final = {"deg/h": 0.0, "mg": 0.2 * MG}

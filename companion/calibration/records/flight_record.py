@@ -7,7 +7,7 @@ from typing import Final
 
 import msgspec
 
-from companion.physics.units import DEG_H, MG
+from companion.physics.units import unit_of
 
 FORMAT_VERSION: Final = 1
 AXES: Final = ("gyro x", "gyro y", "gyro z", "accel z")
@@ -131,11 +131,6 @@ class KeptFlight(msgspec.Struct, frozen=True, kw_only=True):
     read_at: str
     flight: Flight
     format_version: int = FORMAT_VERSION
-
-
-def unit_of(axis: str) -> tuple[float, str, int]:
-    """In SI units, its name, and the digits that are worth saying."""
-    return (DEG_H, "deg/h", 0) if axis.startswith("gyro") else (MG, "mg", 1)
 
 
 def legend(imus: Sequence[ImuFlight]) -> list[str]:

@@ -24,7 +24,7 @@ import msgspec
 
 from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.calibration.records.record import ImuRecord
-from companion.physics.units import DEG_H, MG
+from companion.physics.units import UNITS
 from companion.samples import Triad, Vector
 
 DRIFT_SIGMAS: Final = 2.0
@@ -34,7 +34,7 @@ WORTH_SIGMAS: Final = 2.0
 
 _LONGEST_S: Final = 24 * 3600.0
 _NONE: Final[Vector] = (0.0, 0.0, 0.0)
-_UNITS: Final = {"gyro": (DEG_H, "deg/h", ".0f"), "accel": (MG, "mg", ".2f")}
+_DIGITS: Final[dict[Triad, int]] = {"gyro": 0, "accel": 2}
 
 
 class Why(enum.Enum):
@@ -154,20 +154,19 @@ def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
 def judge(triad: Triad, name: str, held: Held, model: AllanModel, limits: Limits, seen: Seen) -> list[Finding]:
     """Everything that speaks against one triad's calibration now; empty while it is good."""
     present, drift, temperature_degc = seen.present, seen.drift, seen.temperature_degc
+    (unit, words, _), digits = UNITS[triad], _DIGITS[triad]
     found: list[Finding] = []
     if not held.seen:
         found.append(Finding(Why.UNSEEN, f"{triad} {name}: new offsets not seen to work"))
     if present is not None and (worst := worst_axis(held, present)) is not None:
-        unit, words, form = _UNITS[triad]
-        found.append(Finding(Why.RESIDUAL, f"{triad} {name} is off by {worst / unit:{form}} {words}"))
+        found.append(Finding(Why.RESIDUAL, f"{triad} {name} is off by {worst / unit:.{digits}f} {words}"))
     if held.temperature_degc is not None and temperature_degc is not None:
         change = temperature_degc - held.temperature_degc
         warmer = "warmer" if change > 0 else "colder"
         if drift is not None:
             moved = max(math.sqrt(mean**2 + variance) for mean, variance in zip(*drift, strict=True))
             if moved > DRIFT_SIGMAS * max(held.sigma):
-                unit, words, form = _UNITS[triad]
-                off = f"{triad} {name}: about {moved / unit:{form}} {words} off"
+                off = f"{triad} {name}: about {moved / unit:.{digits}f} {words} off"
                 found.append(Finding(Why.TEMPERATURE, f"{off}, {abs(change):.0f} K {warmer}"))
         elif abs(change) > limits.max_temperature_change_k:
             found.append(Finding(Why.TEMPERATURE, f"imu {name}: {abs(change):.0f} K {warmer} than calibrated"))

@@ -19,7 +19,7 @@ from companion.calibration.solution.prior import ExpectedImu
 from companion.calibration.solution.solve import ImuSolution, Shared
 from companion.calibration.temperature.along import Along
 from companion.physics.frames import Array, vector
-from companion.physics.units import DEG_H, MG
+from companion.physics.units import UNITS
 from companion.samples import TRIADS, Triad, rows_of
 
 _CONTRADICTS: Final = 4.0
@@ -28,7 +28,6 @@ _WORTH_SAYING: Final = 2.0
 """Of sigma_use: by so much it will move."""
 _OF_END: Final = 0.25
 """Variance of a mean over that of the end of a line through the same values (`robust.Line.end_leverage`)."""
-_WORDS: Final = {"gyro": (DEG_H, "deg/h", ".0f"), "accel": (MG, "mg", ".1f")}
 
 Pair = tuple[Array | None, Array | None]
 
@@ -99,11 +98,11 @@ def foretold(imu: ImuSolution, whole: Pair, expected: ExpectedImu | None, follow
         figures[triad] = now + change, sigma
         worst = int(np.abs(change).argmax())
         if abs(change[worst]) > _WORTH_SAYING * np.sqrt(np.diag(imu.covariance)[rows_of(triad)])[worst]:
-            unit, name, form = _WORDS[triad]
+            unit, name, digits = UNITS[triad]
             then, of_then = (now + change)[worst] / unit, sigma[worst] / unit
             words.append(
-                f"{triad} {imu.name} {'xyz'[worst]} now {now[worst] / unit:{form}} {name},"
-                f" at {degc:.0f} degC {then:{form}} +- {of_then:{form}}"
+                f"{triad} {imu.name} {'xyz'[worst]} now {now[worst] / unit:.{digits}f} {name},"
+                f" at {degc:.0f} degC {then:.{digits}f} +- {of_then:.{digits}f}"
             )
     if "gyro" not in figures:
         return imu

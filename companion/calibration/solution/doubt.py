@@ -15,14 +15,13 @@ from typing import Final, Literal
 import numpy as np
 
 from companion.physics.frames import Array, Matrix
-from companion.physics.units import DEG, DEG_H, MG
+from companion.physics.units import DEG, DEG_H, MG, UNITS
 from companion.samples import Triad
 
 Cause = Literal["gradienter", "gravity", "turn", "imu", "unclear"]
 
 TELLS: Final = 9.0
 """By so much of chi square one explanation must be better than the other: three sigmas."""
-_UNITS: Final[dict[Triad, tuple[float, str, str]]] = {"gyro": (DEG_H, "deg/h", ".0f"), "accel": (MG, "mg", ".1f")}
 _AXES: Final = "xyz"
 
 
@@ -142,14 +141,14 @@ def _alone(
     triad: Triad, witness: Witness, others: Sequence[Witness], up: Array, by_reading: Matrix | None, *, today: bool
 ) -> Doubt:
     """One IMU contradicts; do the others exonerate what it has in common with them?"""
-    unit, words, form = _UNITS[triad]
+    unit, words, digits = UNITS[triad]
     axis = int(np.argmax(np.abs(witness.difference) / witness.sigma))
     before = (
         "the calibration before in this power-up"
         if today
-        else f"{witness.power_ups} earlier power-ups (usual: {witness.sigma[axis] / unit:{form}})"
+        else f"{witness.power_ups} earlier power-ups (usual: {witness.sigma[axis] / unit:.{digits}f})"
     )
-    by = f"{witness.difference[axis] / unit:+{form}} {words}"
+    by = f"{witness.difference[axis] / unit:+.{digits}f} {words}"
     line = f"{triad} {witness.name}: {_AXES[axis]} differs by {by} from {before}"
     kinds = _explanations(triad, up, by_reading)
     shifts = [(cause, *_common([witness], directions)) for cause, directions, _ in kinds]
