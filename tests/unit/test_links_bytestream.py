@@ -27,7 +27,6 @@ from companion.links.serial import port as serial_port
 from companion.links.serial.bytestream import OUT_BUFFER_BYTES, QUICK_READS, ByteLink, PortSettings
 from companion.links.serial.port import SerialOpener, open_serial
 from companion.links.system.connection import Backoff, Budget
-from companion.links.system.together import Together
 
 NOBODY = 65534
 FAST = 4_000_000
@@ -150,10 +149,6 @@ async def collecting(port: Port, pty: Pty) -> None:
     assert reads == QUICK_READS
 
 
-def is_driven(together: Together) -> bool:
-    return together.driven
-
-
 def is_paused(port: Port) -> bool:
     return port.link._paused is not None
 
@@ -270,47 +265,6 @@ def test_a_device_that_is_pulled_out_while_its_stream_is_collected_comes_back(
                     pty.unplug()
                     assert "the device is gone" in await port.state(connected=False)
                     assert port.link._collecting is None
-
-    asyncio.run(main())
-
-
-@pytest.mark.parametrize("end", ["pulled out", "flood", "silence", "stopped"])
-def test_what_waits_is_taken_with_a_stream_that_is_collected_and_is_not_lost_when_that_ends(
-    path: Path, monkeypatch: pytest.MonkeyPatch, end: str
-) -> None:
-    monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
-    monkeypatch.setattr(bytestream, "JUDGED_S", 0.0 if end == "silence" else 3600.0)
-
-    async def main() -> None:
-        together, got = Together(), asyncio.Queue[bytes]()
-
-        def take(data: bytes, _t_s: float) -> None:
-            got.put_nowait(data)
-
-        with plugged(path) as pty:
-            async with running(path, FAST) as port:
-                port.link.together = together
-                await port.state(connected=True)
-                await collecting(port, pty)
-                assert is_driven(together)
-                together.put(take, b"waits", 1.0)
-                assert got.empty()
-                if end != "silence":
-                    assert await asyncio.wait_for(got.get(), 40) == b"waits"
-                    assert is_driven(together)
-                    together.put(take, b"waits", 2.0)
-                if end == "pulled out":
-                    pty.unplug()
-                elif end == "flood":
-                    port.link.budget = Budget(bytes_per_s=0.0, burst_bytes=3)
-                    os.write(pty.master, bytes(10))
-                if end != "stopped":
-                    assert await asyncio.wait_for(got.get(), 40) == b"waits"
-                    async with asyncio.timeout(40):
-                        while is_driven(together):
-                            await asyncio.sleep(0.001)
-            assert not is_driven(together)
-            assert len(together._waiting) == 0
 
     asyncio.run(main())
 

@@ -16,7 +16,6 @@ from companion.links.serial.bytestream import ByteLink
 from companion.links.serial.ports import find_holders
 from companion.links.system.connection import Budget
 from companion.links.system.listeners import Listeners
-from companion.links.system.together import Together
 from companion.protocols.registry import Kind
 from companion.protocols.stream_health import SILENT_AFTER_S
 from companion.samples import CompassSample, Sample
@@ -106,7 +105,6 @@ class SerialSensor:
         device: SerialDevice,
         take: Callable[[Role, Sample], None],
         offload: Offload = asyncio.to_thread,
-        together: Together | None = None,
     ) -> None:
         settings = device.settings
         self.device = device
@@ -117,18 +115,14 @@ class SerialSensor:
         self.dialogue = None if device.read_only or device.info.dialogue is None else device.info.dialogue()
         name = ", ".join(role.name for role in device.roles)
         self.kinds = frozenset(role.kind for role in device.roles)
-        # Only an IMU: where none of our own is fast, the autopilot's may be what the attitude is carried with.
-        driven = together if "imu" in self.kinds else None
         self.link = ByteLink(
             settings,
-            self._arrived,
+            self.receive,
             name=name,
             on_state=self._on_state,
             budget=Budget(),
-            together=driven,
             on_gap=self._on_gap,
         )
-        self._together = Together() if together is None else together
         self.health = SensorHealth(self.link, self.protocol, self.decoder, polled=self.dialogue is not None)
         self.on_bytes: Listeners[str, bytes | None, float] = Listeners()
         """Told (name, bytes, time) before they are decoded; without bytes: some are missing."""
@@ -158,7 +152,6 @@ class SerialSensor:
 
     def _on_state(self, connected: bool, reason: str) -> None:  # noqa: FBT001 - ByteLink's signature
         del reason
-        self._together.drain()
         if connected:
             now_s = asyncio.get_running_loop().time()
             self._interrupted(now_s)
@@ -169,22 +162,11 @@ class SerialSensor:
                 self.dialogue.opened(now_s)
 
     def _on_gap(self) -> None:
-        self._together.drain()
         self._interrupted(asyncio.get_running_loop().time())
 
     def _interrupted(self, now_s: float) -> None:
         self.on_bytes.tell(self.name, None, now_s)
         self.decoder.interrupted()
-
-    def _arrived(self, data: bytes, t_s: float) -> None:
-        """Take bytes that were read at `t_s`: with the next read of a fast stream, unless it is this one's."""
-        if self.link.collecting:
-            self.receive(data, t_s)
-        elif self._is_lively(t_s):
-            self._together.drain()
-            self.receive(data, t_s)
-        else:
-            self._together.put(self.receive, data, t_s)
 
     def _is_lively(self, t_s: float) -> bool:
         """Whether a conversation with it goes on, in which the answer to each word is waited for."""

@@ -39,9 +39,7 @@ class Devices(Subsystem):
         if not self._asks:
             self._ekf_bias.settled.set()
         self.imus = {imu.name: AutopilotImu(core, imu, self.slots, self._ekf_bias, rate_hz) for imu in imus}
-        self.sensors = [
-            SerialSensor(device, self._take, core.offload, core.link.together) for device in serial_devices(core.config)
-        ]
+        self.sensors = [SerialSensor(device, self._take, core.offload) for device in serial_devices(core.config)]
         self.watch = SensorWatch(self.sensors, core.collector, self._corrected, core.say)
         self.signing = LinkSigning(core.config, core.link, core.vehicle, core.say, core.offload)
         self.reach = Reach(core.link, core.vehicle, core.parameters, core.config.mavlink.url)

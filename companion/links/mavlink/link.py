@@ -19,7 +19,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.links.mavlink.signing import NEVER_SIGNED, Signing
 from companion.links.system.listeners import Listeners, Unsubscribe
-from companion.links.system.together import Take, Together
 
 Codec = mavlink.MAVLink
 Message = mavlink.MAVLink_message
@@ -38,51 +37,16 @@ CHECKSUM_BYTES: Final = 2
 MARKER: Final = 0xFD
 KINDS: Final[dict[int, Kind]] = mavlink.mavlink_map
 _EXTRA: Final[dict[Kind, bytes]] = {}
-_STREAM_NAMES: Final = (
-    "AHRS", "AHRS2", "AIRSPEED_AUTOCAL", "ALTITUDE", "ATTITUDE", "ATTITUDE_QUATERNION", "ATTITUDE_TARGET",
-    "BATTERY_STATUS", "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "GLOBAL_POSITION_INT", "GPS2_RAW", "GPS_RAW_INT",
-    "HIGHRES_IMU", "HWSTATUS", "LOCAL_POSITION_NED", "MEMINFO", "NAV_CONTROLLER_OUTPUT", "ODOMETRY",
-    "POSITION_TARGET_GLOBAL_INT", "POSITION_TARGET_LOCAL_NED", "POWER_STATUS", "RANGEFINDER", "RAW_IMU",
-    "RC_CHANNELS", "RC_CHANNELS_RAW", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "SCALED_PRESSURE",
-    "SCALED_PRESSURE2", "SERVO_OUTPUT_RAW", "SYS_STATUS", "TERRAIN_REPORT", "VFR_HUD", "VIBRATION", "WIND",
-    "WIND_COV",
-)  # fmt: skip
-STREAMS: Final = frozenset(getattr(mavlink, f"MAVLINK_MSG_ID_{name}") for name in _STREAM_NAMES)
-"""Sent again and again, each the successor of the one before: nobody asks something with them or waits for one."""
-AHEAD: Final = frozenset(
-    {mavlink.MAVLINK_MSG_ID_TIMESYNC, mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT}
-)
-"""Asked of us, and answered from what is known anyway, ahead of telemetry that waits. Not so parameters, heartbeats and
-answers: what was measured before them was measured under other offsets, or before arming."""
 
 
-def _holds_only(datagram: bytes, numbers: frozenset[int]) -> bool:
-    """Whether there are whole unsigned frames of such messages in it and nothing else; their sums are not checked."""
-    at = 0
-    while (found := _frame_at(datagram, at)) is not None:
-        number, at = found
-        if number not in numbers:
-            return False
-    return 0 < at == len(datagram)
-
-
-def _frame_at(data: bytes, at: int) -> tuple[int, int] | None:
-    """The message's number and the end of a whole unsigned frame of version 2; nobody has checked its sum."""
+def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
+    """Give kind and end of the message that begins there; None unless whole, unsigned, intact and of version 2."""
     size = len(data)
     if size - at < HEADER_BYTES + CHECKSUM_BYTES or data[at] != MARKER or data[at + 2]:
         return None
     end = at + HEADER_BYTES + data[at + 1] + CHECKSUM_BYTES
-    return None if end > size else (data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16, end)
-
-
-def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
-    """Which message begins there and where it ends; None where it is not the common case."""
-    found = _frame_at(data, at)
-    if found is None:
-        return None
-    number, end = found
-    kind = KINDS.get(number)
-    if kind is None:
+    kind = KINDS.get(data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16)
+    if kind is None or end > size:
         return None
     extra = _EXTRA.get(kind)
     if extra is None:
@@ -109,8 +73,6 @@ class MavlinkLink:
         """Messages that could not be sent: no transport was attached, or its buffer was full."""
         self.signing: Signing | None = None
         """Signs what is sent and judges what comes; None: nobody does."""
-        self.together = Together()
-        """Where datagrams of telemetry wait for the next read of a fast stream, while there is one."""
         self.autopilot: Sender | None = None
         """The autopilot that this link is for; None while it is not known."""
         self._codec: Codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
@@ -152,7 +114,6 @@ class MavlinkLink:
         A `transmit` that returns False has dropped the bytes because its buffer is full. `settled` does its part of
         our own `settled`.
         """
-        self.together.drain()  # what came over the transport before this one
         self._transmit, self._settled = transmit, settled
         self._attached += 1
         self._forget_received()
@@ -185,19 +146,6 @@ class MavlinkLink:
     def subscribe(self, kind: type[M], handler: Handler[M]) -> Unsubscribe:
         """Call `handler(message, t_s)` for every message of a kind, whoever sent it; returns how to stop that."""
         return self._handlers.setdefault(kind.msgname, Listeners()).add(handler)  # type: ignore[arg-type]
-
-    def arrived(self, datagram: bytes, t_s: float, take: Take) -> None:
-        """Have a datagram taken by `take(datagram, t_s)`: streams of telemetry with the next read of a fast stream.
-
-        Whatever else comes is taken at once, behind what waits; some of what is asked of us ahead of it.
-        """
-        together = self.together
-        if together.driven and _holds_only(datagram, STREAMS):
-            together.put(take, datagram, t_s)
-            return
-        if not (together.driven and _holds_only(datagram, AHEAD)):
-            together.drain()
-        take(datagram, t_s)
 
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes of a stream that arrived at `t_s` (monotonic); never raises, whatever they are."""

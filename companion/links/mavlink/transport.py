@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import functools
 import re
 import socket
 from typing import Any
@@ -187,10 +186,7 @@ class _Speaker(_Udp):
         self.link.attach(lambda data: self.send_to(data, None), self.settled)
 
     def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
-        self.link.arrived(data, self.now_s(), self._receive)
-
-    def _receive(self, datagram: bytes, t_s: float) -> None:
-        self.link.receive_datagram(datagram, t_s, lambda sender: None)
+        self.link.receive_datagram(data, self.now_s(), lambda sender: None)
 
 
 class _Listener(_Udp):
@@ -206,10 +202,8 @@ class _Listener(_Udp):
         """Those of them that have spoken for the autopilot."""
 
     def datagram_received(self, data: bytes, addr: Peer) -> None:
-        self.link.arrived(data, self.now_s(), functools.partial(self._receive, addr))
-
-    def _receive(self, peer: Peer, datagram: bytes, t_s: float) -> None:
-        self.link.receive_datagram(datagram, t_s, lambda sender: self._hear(peer, sender, t_s))
+        t_s = self.now_s()
+        self.link.receive_datagram(data, t_s, lambda sender: self._hear(addr, sender, t_s))
 
     def _hear(self, peer: Peer, sender: Sender, t_s: float) -> None:
         autopilot = sender == self.link.autopilot

@@ -17,7 +17,6 @@ from urllib.parse import urlsplit
 from companion.errors import LinkError
 from companion.links.serial.port import SerialOpener, close_serial
 from companion.links.system.connection import Backoff, Budget, OnState, Reconnection, connect_tcp, words_of
-from companion.links.system.together import Together
 
 READ_BYTES = 4096
 """As much as a tty buffers: one wake-up empties the port, so one time stamp holds for all that it brought."""
@@ -109,7 +108,6 @@ class ByteLink:
         name: str,
         on_state: OnState | None = None,
         budget: Budget | None = None,
-        together: Together | None = None,
         on_turn: Callable[[], None] = lambda: None,
         on_gap: Callable[[], None] = lambda: None,
     ) -> None:
@@ -117,8 +115,6 @@ class ByteLink:
         self.name = name
         self.budget = budget
         """How much is taken in; None: whatever comes. What comes beyond it is thrown away unread."""
-        self.together = together
-        """What waits for the next read, whenever this stream is collected; None: nothing."""
         self.bytes_received = 0
         self.reconnects = 0
         self.turns = 0
@@ -150,11 +146,6 @@ class ByteLink:
     def last_error(self) -> str:
         """Why the port is, or last was, not open; one line for people."""
         return self._reconnection.last_error
-
-    @property
-    def collecting(self) -> bool:
-        """Whether it is read at intervals, since its every byte would wake the loop."""
-        return self._collecting is not None
 
     async def run(self) -> None:
         """Keep the port open until cancelled; a loss is an event to report, never an exception."""
@@ -234,8 +225,6 @@ class ByteLink:
             if now_s - self._reads_since[0] < QUICK_READS * QUICK_S and self._fits_the_line(now_s):
                 loop.remove_reader(self._descriptor)
                 self._collecting = loop.call_at(now_s + COLLECT_S, self._collected)
-                if self.together is not None:
-                    self.together.drive()
             self._reads, self._attempts, self._reads_since = 0, 0, (now_s, self.bytes_received)
 
     def _collected(self) -> None:
@@ -245,8 +234,6 @@ class ByteLink:
         # First of all: whatever happens in this turn, there will be another.
         self._collecting = loop.call_at(now_s + COLLECT_S, self._collected)
         self._attempts += 1
-        if self.together is not None:
-            self.together.turn(now_s)  # what waits came before what is read now
         self._reads += self._read(now_s)
         if self._descriptor is None or self._paused is not None or now_s - self._reads_since[0] < JUDGED_S:
             return
@@ -260,8 +247,6 @@ class ByteLink:
         if self._collecting is not None:
             self._collecting.cancel()
             self._collecting = None
-            if self.together is not None:
-                self.together.rest()
 
     def _fits_the_line(self, now_s: float) -> bool:
         """Whether the line, as it is set, could have carried what came since `_reads_since`.
