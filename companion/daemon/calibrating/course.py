@@ -37,7 +37,6 @@ from companion.daemon.offsets.effect import TELEMETRY
 from companion.daemon.offsets.plan import Planner
 from companion.daemon.offsets.push import WATCHING, Pusher
 from companion.daemon.stands.measuring import Measuring
-from companion.formats import utc_now
 from companion.links.system.listeners import Listeners
 from companion.samples import Triad
 

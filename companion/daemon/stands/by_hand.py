@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 class ByHand:
-    """Keeps the latest of them, on disk and in memory."""
+    """The latest alignments, on disk and in memory."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._file = alignments_in(core.config.storage.path)
@@ -30,7 +30,7 @@ class ByHand:
         self._done: list[Done] = []
 
     def load(self) -> None:
-        """Read what was kept before this start; blocking."""
+        """Read the file; blocking."""
         self._done = self._file.read()
 
     async def keep(self, job: Job, result: JobResult) -> None:
@@ -52,7 +52,7 @@ class ByHand:
         await self._write([*self._done, done][-KEEP_DONE:])
 
     async def undone(self, step: ChangeSet) -> None:
-        """What was written in this step is in force no more."""
+        """Note that the writes of a step were undone."""
         now = utc_now()
         await self._write(
             [
@@ -69,7 +69,7 @@ class ByHand:
             logger.error("the history does not show it: %s", error)  # noqa: TRY400 - one line
 
     def history(self) -> list[Object]:
-        """All that is kept, the latest first, each with whether it is in force."""
+        """List all alignments, the latest first, each with whether it is in force."""
         return [self._shown(done) for done in reversed(self._done)]
 
     def latest(self) -> list[Object]:
@@ -82,7 +82,7 @@ class ByHand:
         return {**msgspec.to_builtins(done), "in_force": self._in_force(done)}
 
     def _in_force(self, done: Done) -> bool | None:
-        """Whether the autopilot has all that was written; None where nothing was, or nobody looks at it."""
+        """Whether the autopilot holds all written values; None where none is read from it."""
         if done.undone_at is not None:
             return False
         if done.system_id != self._vehicle.system_id:

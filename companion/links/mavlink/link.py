@@ -65,7 +65,7 @@ class MavlinkLink:
     def __init__(self, *, system_id: int = 1, component_id: int = 191) -> None:
         self.component_id = component_id
         self.turns = 0
-        """Turns of whatever carries the link's bytes, so that it is seen to go on."""
+        """Turns of the transport's loop: a sign of life for the supervisor."""
         self.received: Counter[str] = Counter()
         """Messages by type, plus "bad" (failed checks), "unknown" (not in the dialect) and "handler error"."""
         self.sent = 0
@@ -82,7 +82,7 @@ class MavlinkLink:
         self._attached = 0
         self._handlers: dict[str, Listeners[Message, float]] = {}
         self.on_bytes: Listeners[Direction, bytes | None, float | None] = Listeners()
-        """Told of everything that passes: direction, bytes, time of arrival; without bytes: some are missing here."""
+        """Listeners to all traffic: direction, bytes, time of arrival; bytes None: some were lost here."""
 
     @property
     def system_id(self) -> int:
@@ -96,7 +96,7 @@ class MavlinkLink:
 
     @property
     def half_received(self) -> bytes:
-        """What may be the beginning of a message."""
+        """Bytes of a message that is not complete yet."""
         return bytes(self._codec.buf[self._codec.buf_index :])
 
     @property
@@ -105,7 +105,7 @@ class MavlinkLink:
         return self._transmit is not None
 
     def turn(self) -> None:
-        """Whatever carries the link's bytes goes on."""
+        """Count a turn of the transport's loop."""
         self.turns += 1
 
     def attach(self, transmit: Callable[[bytes], object] | None, settled: Callable[[], bool] = lambda: True) -> None:
