@@ -13,6 +13,8 @@ from tests.campaign.fault import PHASES
 
 BEGIN: Final = "<!-- the table begins: python -m tests.campaign --markdown docs/faults.md -->"
 END: Final = "<!-- the table ends -->"
+_DESCRIBED: Final = ("autopilot", "intruder")
+"""Rooms whose faults have names that do not say what happens."""
 
 
 def as_text(outcomes: Sequence[Outcome], seed: int) -> str:
@@ -45,16 +47,24 @@ def as_json(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
 
 
 def as_markdown(outcomes: Sequence[Outcome], seed: int, path: Path) -> None:
-    """Put the table into a document between its marks."""
+    """Write the faults by room into a document, between its marks, with the phases in which one is not ok."""
     by = {(outcome.fault, outcome.phase): outcome for outcome in outcomes}
-    lines = [BEGIN, "", summary(outcomes, seed) + ".", ""]
-    lines.append("| fault | what happens | " + " | ".join(PHASES) + " |")
-    lines.append("|---|---|" + "---|" * len(PHASES))
+    rooms: dict[str, list[str]] = {}
     for name, fault in FAULTS.items():
-        cells = [by.get((name, phase)) for phase in PHASES]
-        lines.append(f"| {name} | {fault.does} | " + " | ".join(one.verdict if one else "" for one in cells) + " |")
-    reasons = sorted({f"{one.fault} in *{one.phase}*: {one.not_applicable}" for one in outcomes if one.not_applicable})
-    lines += ["", "Not applicable: " + "; ".join(reasons) + ".", "", END]
+        cells = {phase: by.get((name, phase)) for phase in PHASES}
+        verdicts = {phase: one.verdict if one else "not played" for phase, one in cells.items()}
+        if any(cells.values()):
+            words = [fault.does] if fault.room in _DESCRIBED else []
+            words += [f"{phase} {verdict}" for phase, verdict in verdicts.items() if verdict not in ("ok", "n.a.")]
+            rooms.setdefault(fault.room, []).append(name + (f" ({'; '.join(words)})" if words else ""))
+    lines = [BEGIN, "", summary(outcomes, seed) + ".", ""]
+    lines += [f"- **{room}**: {', '.join(faults)}" for room, faults in rooms.items()]
+    reasons: dict[str, list[str]] = {}
+    for one in outcomes:
+        if one.not_applicable:
+            reasons.setdefault(one.not_applicable, []).append(f"{one.fault} in *{one.phase}*")
+    lines += ["", *(f"Not applicable, {reason}: {', '.join(cells)}." for reason, cells in sorted(reasons.items()))]
+    lines += ["", END]
     text = path.read_text(encoding="utf-8")
     head, _, rest = text.partition(BEGIN)
     _, _, tail = rest.partition(END)

@@ -65,6 +65,16 @@ HELP = {"_parser", "add_command", "add_commands", "add_options", "add_table_opti
 """Functions that build the command line: their words are its help."""
 
 _WORD = re.compile(r"[A-Za-z]{2,}")
+_REMEDY = re.compile(
+    r"\b(?:set|restart|reboot|disarm|hold still|keep|calibrate|try again|undo again|wait|use|give|name its|say|remove"
+    r"|replug|begin again|align|move away|learn|install|end it|make it|turn it|tilt it|look|allowed|wanted|mend|delete"
+    r"|pip|sudo|check|again|hands off|done)\b|\?"
+)
+"""Words of a remedy. A text that has one is understood without docs/messages.md."""
+_PROGRESS = re.compile(
+    r"(?:working|writing|watching|waiting|reading|putting|checking|restarting|dithering|comparing|measuring|turned)\b"
+)
+"""Beginnings of a text that says what is being done."""
 _UNITS = {"deg", "mg", "min", "Hz", "imu", "gyro", "accel", "http", "IMU", "baud", "is"}
 
 
@@ -88,8 +98,21 @@ class Message:
         # Most lines lack most parts: finding that out first is 20 times as fast.
         return all(part in line for part in self._parts) and self._pattern.search(line) is not None
 
+    def has(self, words: str) -> bool:
+        """Whether this message contains words of a document, where … is anything."""
+        parts, shown = [part.strip() for part in words.split("…")], self.shown()
+        return all(part in shown for part in parts) and re.search(".*?".join(map(re.escape, parts)), shown) is not None
+
+    def explains_itself(self) -> bool:
+        """Whether the text says what to do, what is allowed, or what is being done, so that it needs no row."""
+        return _REMEDY.search(self.template) is not None or _PROGRESS.match(self.template) is not None
+
     def shown(self) -> str:
         """The template as the documents may write it."""
+        return self._shown
+
+    @functools.cached_property
+    def _shown(self) -> str:
         return re.sub(rf"{FILLED}+", "…", self.template)
 
 
