@@ -1,4 +1,4 @@
-"""`python -m sim`: devices, autopilot, all, demo, fleet, ardupilot, px4, residuals, turntable, flights, ..."""
+"""Run a subcommand of `python -m sim`."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from typing import Final
 MODULES: Final = {
     "demo": "sim.demo",
     "fleet": "sim.fleet.demo",
-    "turntable": "sim.experiments.turntable",
     "accuracy": "sim.accuracy.cli",
-    "rest": "sim.experiments.rest",
+    "rest": "sim.rest",
     "fly": "sim.flying.cli",
     "fly-bench": "sim.flying.bench",
 }
-"""Commands whose `main` takes what follows; all others are told which one is meant."""
+"""Modules whose `main` gets the arguments after the command; all other commands get the command as well."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -25,14 +24,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = arguments[0] if arguments else ""
     if command in MODULES:
         return int(importlib.import_module(MODULES[command]).main(arguments[1:]) or 0)
-    if command in ("drive", "flights"):
-        from sim.experiments.journeys import main as run
-    else:
-        from sim.serve import FIRMWARE_COMMANDS
-        from sim.serve import main as run
+    from sim.serve import FIRMWARE_COMMANDS
+    from sim.serve import main as run
 
-        if command in FIRMWARE_COMMANDS:
-            from sim.sitl.cli import main as run
+    if command in FIRMWARE_COMMANDS:
+        from sim.sitl.cli import main as run
     return run(arguments)
 
 

@@ -98,9 +98,7 @@ def parser() -> argparse.ArgumentParser:
         commands.add_parser(name, help=text)
     commands.add_parser("fly", help="a real firmware flies with our heading, and something fails")
     commands.add_parser("fly-bench", help="a real firmware flies with known sensor errors, and its log is read")
-    commands.add_parser("turntable", help="the paper's five poses, with tables beside its own")
-    commands.add_parser("drive", help="the paper's drive of 180 s, many times")
-    commands.add_parser("flights", help="banked circles and shuttling, beside the filters of others")
+    commands.add_parser("rest", help="a log of an IMU at rest for hours, to try `companion profile` with")
     accuracy.add_options(commands.add_parser("accuracy", help=accuracy.HELP))
     return top
 

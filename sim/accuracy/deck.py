@@ -20,14 +20,12 @@ from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import PROFILES, floor_variance, noise_profile
 from companion.calibration.request import What
 from companion.calibration.seconds.batch import summary, unrolled
-from companion.calibration.solution.site import local_earth
 from companion.calibration.solution.solve import solve
 from companion.errors import CalibrationRefusedError
-from sim.accuracy.stand import ACCEL_BIAS_M_S2, GRAVITY_ANOMALY_M_S2, GYRO_BIAS_RAD_S, NEXT_S, AnomalousSite
+from sim.accuracy.stand import ACCEL_BIAS_M_S2, GRAVITY_ANOMALY_M_S2, GYRO_BIAS_RAD_S, NEXT_S, AnomalousSite, local
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
-from sim.experiments.still import whereabouts
 from sim.imu_model import PARTS, ImuModel
 from sim.motions import Motion, SlowTurn
 from sim.scenario import site_at
@@ -168,7 +166,7 @@ def _tilts(aircraft: VirtualAircraft, seconds: int, random: np.random.Generator)
 def _against_the_truth(
     window: Window, imu: ImuModel, tilt: GradienterModel, compass: CompassModel
 ) -> tuple[Array, Array]:
-    solution = solve(window, local_earth(whereabouts(imu.aircraft.site)), tilt, compass, What.BOTH, "deck")
+    solution = solve(window, local(imu.aircraft.site), tilt, compass, What.BOTH, "deck")
     found = solution.imus[0]
     assert found.gyro_rad_s is not None
     assert found.accel_m_s2 is not None

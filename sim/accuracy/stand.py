@@ -8,6 +8,7 @@ its gradienter are the simulator's own.
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -21,14 +22,13 @@ from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.request import What
-from companion.calibration.solution.site import LocalEarth, local_earth
+from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.calibration.solution.solve import ImuSolution, Solution, solve
 from companion.physics.gradienter import Law
 from companion.samples import CompassSample, ImuSample, TiltSample
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.devices import Gradienter
 from sim.earth import Array
-from sim.experiments.still import whereabouts
 from sim.imu_model import DEG_H, MG, ImuModel, ImuSpec
 from sim.scenario import site_at
 from sim.thermal import Curve
@@ -83,8 +83,11 @@ def sites() -> tuple[Site, ...]:
 
 
 @functools.cache
-def _local(site: Site) -> LocalEarth:
-    return local_earth(whereabouts(site))
+def local(site: Site) -> LocalEarth:
+    """Return gravity, Earth rate and declination at `site` as the companion computes them."""
+    return local_earth(
+        Whereabouts(site.latitude_deg, site.longitude_deg, site.height_m, "configuration", datetime.date(2026, 11, 21))
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +268,7 @@ def solved(standing: Stand, window: Window, references: References = EXACT) -> S
     Raises:
         CalibrationRefusedError: as `solve`.
     """
-    return solve(window, _local(standing.site), *_models(standing, references), What.BOTH)
+    return solve(window, local(standing.site), *_models(standing, references), What.BOTH)
 
 
 def _models(standing: Stand, references: References) -> tuple[GradienterModel, CompassModel]:

@@ -22,16 +22,15 @@ from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import NoiseProfile, allan_model, noise_profile
 from companion.calibration.request import What
-from companion.calibration.solution.site import local_earth
 from companion.calibration.solution.solve import solve
 from companion.physics.units import DEG_H, MG
 from companion.samples import CompassSample, ImuSample, TiltSample
 from sim.accuracy.experiments import many
 from sim.accuracy.figures import Claim, Figure, Section
+from sim.accuracy.stand import local
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
-from sim.experiments.still import whereabouts
 from sim.imu_model import PARTS, AxisNoise, ImuModel, ImuSpec
 from sim.motions import SlowTurn
 from sim.scenario import site_at
@@ -141,7 +140,7 @@ class Platform:
             accel_bias_m_s2=(random.normal(size=3) * 2.0 * MG).tolist(),
         )
         self.compass = COMPASSES[case.compass]
-        self.local = local_earth(whereabouts(site))
+        self.local = local(site)
         self.level = GradienterModel("axis", np.eye(3), (0.0, 0.0), 0.01)
         self.model = CompassModel(magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=1.0)
         wanted = Settings(

@@ -124,8 +124,7 @@ def understood(command: str) -> str:
 
 def sim_parser(words: list[str]) -> argparse.ArgumentParser:
     """Of `python -m sim`, as sim/__main__.py chooses it."""
-    from sim import serve
-    from sim.experiments import rest
+    from sim import rest, serve
     from sim.flying import bench
     from sim.flying import cli as flying
     from sim.sitl import cli as firmware

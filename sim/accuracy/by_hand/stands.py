@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import functools
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -19,13 +18,11 @@ from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.windows import ImuInput, ImuWindow
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.seconds.counting import Counted, TurnCounter
-from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.samples import ImuSample
 from sim.accuracy.by_hand import rivals
-from sim.accuracy.stand import GRAVITY_ANOMALY_M_S2, NEXT_S, RATE_HZ, AnomalousSite, sites
+from sim.accuracy.stand import GRAVITY_ANOMALY_M_S2, NEXT_S, RATE_HZ, AnomalousSite, local, sites
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array
-from sim.experiments.still import whereabouts
 from sim.hands import Hands
 from sim.imu_model import DEG_H, MG, ImuModel
 
@@ -203,16 +200,11 @@ class _Aircraft:
         return self.imu.in_accel_axes(level.truth_at(0.0).force_m_s2) + bias
 
 
-@functools.cache
-def _local(site: Site) -> LocalEarth:
-    return local_earth(whereabouts(site))
-
-
 def _ground(site: Site) -> Ground:
     """With no north."""
-    local = _local(site)
-    rate = local.rate_in_body(np.eye(3), heading_known=False)
-    return Ground(local.gravity_m_s2, local.gravity_sigma_m_s2, rate.mean, rate.covariance)
+    earth = local(site)
+    rate = earth.rate_in_body(np.eye(3), heading_known=False)
+    return Ground(earth.gravity_m_s2, earth.gravity_sigma_m_s2, rate.mean, rate.covariance)
 
 
 def by_hand(part: str, seed: int, number: int) -> HandRun:
@@ -221,12 +213,12 @@ def by_hand(part: str, seed: int, number: int) -> HandRun:
     spots = {slope: here.on_spot(slope) for slope in SLOPES_DEG}
     held = [here.propped(*pose) for pose in (*_FACES, *_EDGES)]
     bias = here.imu.mean_bias(here.t_s, here.t_s + NEXT_S).accel_m_s2
-    local, ground = _local(here.site), _ground(here.site)
-    known = faces([one.face() for one in held], local.gravity_m_s2, local.gravity_sigma_m_s2, wander_m_s2=_wander(held))
+    earth, ground = local(here.site), _ground(here.site)
+    known = faces([one.face() for one in held], earth.gravity_m_s2, earth.gravity_sigma_m_s2, wander_m_s2=_wander(held))
     truth = np.concatenate([bias, here.scale, here.shear])
     sides = [one.rows for one in held[:6]]
     others = (
-        rivals.imu_tk([one.rows for one in held], local.gravity_m_s2),
+        rivals.imu_tk([one.rows for one in held], earth.gravity_m_s2),
         rivals.ardupilot(sides),
         rivals.px4(sides),
     )
@@ -235,7 +227,7 @@ def by_hand(part: str, seed: int, number: int) -> HandRun:
     turns = {(headings, slope): turned(spots[slope].chosen(headings), ground) for headings, slope in TURNS}
     steepest = turns[4, max(SLOPES_DEG)]
     board, true_board = (
-        mounting(steepest.imus[0], Sides(known.figures, known.sigma, np.eye(3)), local.gravity_m_s2),
+        mounting(steepest.imus[0], Sides(known.figures, known.sigma, np.eye(3)), earth.gravity_m_s2),
         _tilt((read - bias) / (1.0 + here.scale)),
     )
     first = spots[max(SLOPES_DEG)].stood[0].rows[: rivals.ARDUPILOT_READINGS].mean(axis=0)
