@@ -13,7 +13,6 @@ MODULES: Final = {
     "accuracy": "sim.accuracy.cli",
     "rest": "sim.rest",
     "fly": "sim.flying.cli",
-    "fly-bench": "sim.flying.bench",
 }
 """Modules whose `main` gets the arguments after the command; all other commands get the command as well."""
 

@@ -6,9 +6,6 @@ faults      what happens in the air: killed, stopped, unplugged, a heading that 
 vehicle     what a flying firmware is: start, set-up, take-off, hold
 ardupilot   ArduPilot's own multicopter and plane
 px4         PX4's own quadrotor
-mission     waypoints round which it flies
 flight      one flight from power-up to verdict
 cli         `python -m sim fly`
-injected    what a sensor truly had too much in a flight, beside what `companion flight` has found; pure
-bench       `python -m sim fly-bench`: flights with known sensor errors
 """

@@ -8,7 +8,6 @@ import json
 import math
 import socket
 import struct
-from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -29,8 +28,8 @@ SERVO_MAGIC = 18458
 _SILENT_S = 0.1
 AHEAD = 40
 """Steps for which it has our word beforehand: it needs not wait while we are at something else."""
-COPTER_MODES = {"guided": 4, "hold": 5, "mission": 3}
-PLANE_MODES = {"takeoff": 13, "hold": 15, "mission": 10}
+COPTER_MODES = {"guided": 4, "hold": 5}
+PLANE_MODES = {"takeoff": 13, "hold": 15}
 STICKS_S = 0.2
 LOWEST_US, MIDDLE_US = 1000, 1500
 
@@ -53,11 +52,10 @@ class Rider:
 
     Args:
         aircraft: that follows it.
-        reads_each: of its steps; the others are answered and left aside.
     """
 
-    def __init__(self, aircraft: FlyingAircraft, reads_each: int = 1) -> None:
-        self._aircraft, self._reads_each = aircraft, reads_each
+    def __init__(self, aircraft: FlyingAircraft) -> None:
+        self._aircraft = aircraft
         self.boots = 0
         self._frame = 0
         self._heard_s = 0.0
@@ -107,8 +105,6 @@ class Rider:
             except OSError:
                 return
             self._answer()
-            if self._frame % self._reads_each:
-                continue
             state = state_of(data)
             if state is None:
                 continue
@@ -174,8 +170,6 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
         folder: for the binary's files.
         companion: where SERIAL1 sends to.
         wind: speed in m/s and where from in degrees.
-        parameters: defaults that outrank all others.
-        reads_each: of its states, a thousand a second.
 
     Raises:
         BinaryError: the binary is missing or not executable.
@@ -191,19 +185,15 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
         *,
         companion: tuple[str, int],
         wind: tuple[float, float] = (0.0, 0.0),
-        parameters: Mapping[str, float] | None = None,
-        reads_each: int = 1,
     ) -> None:
         super().__init__(scenario, folder)
         self._binary = check_binary(binary)
         self.is_plane = "plane" in self._binary.name
         self.modes = PLANE_MODES if self.is_plane else COPTER_MODES
-        self._parameters = (
-            flying_parameters(scenario, wind) | (PLANE if self.is_plane else COPTER) | dict(parameters or {})
-        )
+        self._parameters = flying_parameters(scenario, wind) | (PLANE if self.is_plane else COPTER)
         self._companion, self._ground = companion, (LOOPBACK, free_udp_port())
         self.system_id = 1
-        self.rider = Rider(self.truth, reads_each)
+        self.rider = Rider(self.truth)
         self.sticks_us = [MIDDLE_US, MIDDLE_US, LOWEST_US, MIDDLE_US]
         """Roll, pitch, throttle, yaw; sent to it while it flies."""
 
@@ -266,10 +256,6 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
             )
         )  # fmt: skip
         await self.until_mode(ground, "hold")
-
-    async def hasten(self, ground: GroundStation, speed: float) -> None:
-        """At once."""
-        await ground.put("SIM_SPEEDUP", speed)
 
     async def steer(self, ground: GroundStation) -> None:
         """Sends the sticks until cancelled."""

@@ -18,7 +18,7 @@ from sim.flying.flight import SET_UPS, WATCHED_S, Plan, SetUp, flying
 from sim.flying.verdict import HEADER, Figures, Record, figures, row, summary
 from sim.sitl.process import BinaryError
 
-OWN_COMPASS = ("own-compass", "own-compass-end")
+OWN_COMPASS = "own-compass"
 HELP = "A real firmware flies with our heading, and something fails: the largest errors, as a table."
 
 
@@ -44,7 +44,6 @@ def parser() -> argparse.ArgumentParser:
         "--flights", type=int, default=1, metavar="N",
         help="so many of each, with seeds from that one on; a last line has the largest figures (default 1)",
     )  # fmt: skip
-    command.add_argument("--mission", action="store_true", help="round a mission of waypoints, in the place of Loiter")
     command.add_argument(
         "--watch", type=float, default=WATCHED_S, metavar="SECONDS",
         help=f"how long it flies on after the fault (default {WATCHED_S:g})",
@@ -64,9 +63,9 @@ def plans_of(arguments: argparse.Namespace) -> list[Plan]:
     px4 = "px4" in arguments.binary.name
     if any((set_up == "px4") is not px4 for set_up in arguments.set_up):
         raise BinaryError(f"--set-up: {', '.join(arguments.set_up)}: px4 is that of PX4, the others are ArduPilot's")
-    if px4 and any(fault in OWN_COMPASS for fault in arguments.fault):
+    if px4 and OWN_COMPASS in arguments.fault:
         raise BinaryError("--fault own-compass: the compass of PX4's simulation cannot be turned; ArduPilot's can")
-    able = [fault for fault in FAULTS if not px4 or fault not in OWN_COMPASS]
+    able = [fault for fault in FAULTS if not px4 or fault != OWN_COMPASS]
     set_ups: list[SetUp] = ["px4"] if px4 else arguments.set_up or ["script"]
     seeds = range(arguments.seed, arguments.seed + arguments.flights)
     for fault, set_up, seed in itertools.product(arguments.fault or able, set_ups, seeds):
@@ -76,7 +75,7 @@ def plans_of(arguments: argparse.Namespace) -> list[Plan]:
         plans.append(
             Plan(
                 arguments.binary, fault, set_up, tuple(arguments.wind or wind), heading_deg,
-                seed, arguments.watch, arguments.mission,
+                seed, arguments.watch,
             )
         )  # fmt: skip
     return plans

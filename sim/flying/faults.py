@@ -97,12 +97,9 @@ def _killed_for(seconds: float) -> Callable[[Aloft], Awaitable[None]]:
     return strike
 
 
-def _own_compass_lies(then: signal.Signals) -> Callable[[Aloft], Awaitable[None]]:
-    async def strike(on: Aloft) -> None:
-        await on.vehicle.lie_with_own_compass(on.ground)
-        on.signal(then)
-
-    return strike
+async def _own_compass_lies(on: Aloft) -> None:
+    await on.vehicle.lie_with_own_compass(on.ground)
+    on.signal(signal.SIGKILL)
 
 
 async def _nothing(on: Aloft) -> None:
@@ -125,10 +122,7 @@ FAULTS = {
     "gyro-drift": Fault(f"its gyro about z begins to read {DRIFT_DEG_S:g} deg/s too much", _gyro_drifts),
     "compass-drift": Fault(f"its compass turns by {DRIFT_DEG_S:g} deg/s", _compass_drifts),
     "compass-lies": Fault(f"its compass lies by {LIE_DEG:g} deg", _compass_lies),
-    "own-compass": Fault(
-        "the autopilot's own compass is turned by 45 deg, and then kill -9", _own_compass_lies(signal.SIGKILL)
-    ),
-    "own-compass-end": Fault("likewise, and the daemon ends in order", _own_compass_lies(signal.SIGTERM)),
+    "own-compass": Fault("the autopilot's own compass is turned by 45 deg, and then kill -9", _own_compass_lies),
     "restart": Fault(f"kill -9 of the daemon, started anew after {RESTARTED_S:g} s", _killed_for(RESTARTED_S)),
     "board": Fault(f"its board has no power, and starts again after {POWERLESS_S:g} s", _killed_for(POWERLESS_S)),
 }

@@ -20,7 +20,6 @@ from sim.devices import SerialDevice
 from sim.earth import Array
 from sim.flying.ardupilot import FlyingArduPilot
 from sim.flying.faults import FAULTS
-from sim.flying.mission import CORNERS_M, upload
 from sim.flying.px4 import FlyingPx4
 from sim.flying.truth import FlyingAircraft
 from sim.flying.vehicle import FlyingVehicle
@@ -49,8 +48,6 @@ STORED_S = 3.0
 RESTARTED_S = 6.0
 HEIGHT_M = 10.0
 PLANE_HEIGHT_M = 60.0
-PLANE_LEGS = 8.0
-"""A plane's mission is so many times as large."""
 SETTLED_S = 6.0
 PLANE_SETTLED_S = 75.0
 """By then it has been on its circle for a whole one."""
@@ -76,8 +73,6 @@ class Plan:
     heading_deg: float = 40.0
     seed: int = 0
     watched_s: float = WATCHED_S
-    mission: bool = False
-    """It flies a mission, and does not hold its place."""
     stored: Path | None = None
     """What an autopilot that is set up has stored: taken from this folder if it is there, else put there."""
 
@@ -89,7 +84,7 @@ class Flight:
         self, plan: Plan, vehicle: FlyingVehicle, ground: GroundStation, link: LossyLink, folder: Path
     ) -> None:
         self.plan, self.vehicle, self.ground, self.link, self.folder = plan, vehicle, ground, link, folder
-        self.record = Record(plan.fault, plan.set_up, plan.wind, hold=not plan.mission)
+        self.record = Record(plan.fault, plan.set_up, plan.wind)
         self._since_s = 0.0
         self._asked_modes = 0
         self._background: list[asyncio.Task[None]] = []
@@ -215,13 +210,7 @@ class Flight:
         self.in_background(vehicle.steer(ground))
         height_m = PLANE_HEIGHT_M if vehicle.is_plane else HEIGHT_M
         await vehicle.take_off(ground, height_m)
-        if self.plan.mission:
-            scale = PLANE_LEGS if vehicle.is_plane else 1.0
-            corners_m = [(scale * north_m, scale * east_m) for north_m, east_m in CORNERS_M]
-            await upload(ground, vehicle.aircraft.site, height_m, corners_m)
-            await vehicle.mode(ground, "mission")
-        else:
-            await vehicle.hold(ground)
+        await vehicle.hold(ground)
         await vehicle.sleep(PLANE_SETTLED_S if vehicle.is_plane else SETTLED_S)
         record.circle = vehicle.circle
         await self.pushed()
@@ -229,8 +218,7 @@ class Flight:
         self.in_background(self._watch())
         await FAULTS[self.plan.fault].strike(self)
         await vehicle.sleep(TURNS_AFTER_S)
-        if not self.plan.mission:
-            await vehicle.turn(ground, TURN_DEG)
+        await vehicle.turn(ground, TURN_DEG)
         await vehicle.sleep(self.plan.watched_s - TURNS_AFTER_S)
         speed = (vehicle.truth.own_s - record.struck_s) / (asyncio.get_running_loop().time() - begun_s)
         if speed < SLOWEST:

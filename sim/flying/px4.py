@@ -8,7 +8,7 @@ import math
 import random
 import re
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +30,8 @@ from sim.udp import open_udp
 
 MODEL = "sihsim_quadx"
 MAGNETOMETER = {"cs_mag_hdg", "cs_mag_3d"}
-AUTO, LOITER, MISSION = 4, 3, 4
-"""A main mode, and two of its sub modes."""
+AUTO, LOITER = 4, 3
+"""A main mode and its sub mode."""
 _UDP_TRUTH = 19410
 TRUTH_HZ = 250.0
 ASKED_EVERY_S = 1.0
@@ -47,8 +47,8 @@ FORCE_OVER = 25
 class Truth:
     """Takes HIL_STATE_QUATERNION of SIH for an aircraft: rates from attitudes, forces from velocities."""
 
-    def __init__(self, aircraft: FlyingAircraft, system_id: int, rate_hz: float = TRUTH_HZ) -> None:
-        self.boots, self.rate_hz = 0, rate_hz
+    def __init__(self, aircraft: FlyingAircraft, system_id: int) -> None:
+        self.boots = 0
         self._aircraft, self._system_id = aircraft, system_id
         self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=mavlink.MAV_COMP_ID_USER2)
         self._codec.robust_parsing = True
@@ -71,7 +71,7 @@ class Truth:
                     self._aircraft.take(state, t_s)
         if self._transmit is not None and t_s - self._asked_s > ASKED_EVERY_S:
             self._asked_s = t_s
-            number, rate = mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION, 1e6 / self.rate_hz
+            number, rate = mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION, 1e6 / TRUTH_HZ
             command = mavlink.MAVLink_command_long_message(
                 self._system_id, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, rate, *[0.0] * 5
             )
@@ -128,8 +128,6 @@ class FlyingPx4(FlyingVehicle):
         folder: for the binary's files.
         wind: speed in m/s and where from in degrees.
         seed: of the gusts.
-        parameters: set at the first boot, and outrank all others.
-        truth_hz: how often it tells its truth.
 
     Raises:
         BinaryError: binary or folder is missing, or no instance is free.
@@ -145,20 +143,17 @@ class FlyingPx4(FlyingVehicle):
         *,
         wind: tuple[float, float] = (0.0, 0.0),
         seed: int = 0,
-        parameters: Mapping[str, float] | None = None,
-        truth_hz: float = TRUTH_HZ,
     ) -> None:
         super().__init__(scenario, folder)
         self._binary = check_binary(binary)
-        self.modes = {"hold": AUTO << 16 | LOITER << 24, "mission": AUTO << 16 | MISSION << 24}
+        self.modes = {"hold": AUTO << 16 | LOITER << 24}
         self.instance = free_instance()
         self.system_id = self.instance + 1
         from_rad = math.radians(wind[1])
         self._wind = {"SIH_WIND_N": -wind[0] * math.cos(from_rad), "SIH_WIND_E": -wind[0] * math.sin(from_rad)}
         self._gust_m_s, self._dice = GUST_SHARE * wind[0], random.Random(seed)
-        self._told = Truth(self.truth, self.system_id, truth_hz)
+        self._told = Truth(self.truth, self.system_id)
         self._flags = self.folder / "flags.txt"
-        self._parameters, self._speed = dict(parameters or {}), 1.0
         self.sticks_us = []
 
     @property
@@ -204,7 +199,6 @@ class FlyingPx4(FlyingVehicle):
         site = self.aircraft.site
         environment = {
             "PX4_SIM_MODEL": MODEL,
-            "PX4_SIM_SPEED_FACTOR": f"{self._speed:g}",
             "PX4_HOME_LAT": f"{site.latitude_deg}",
             "PX4_HOME_LON": f"{site.longitude_deg}",
             "PX4_HOME_ALT": f"{site.height_m}",
@@ -212,7 +206,6 @@ class FlyingPx4(FlyingVehicle):
         }
         if not (self.folder / self.stored[0]).exists():
             values = MEASURING_PARAMETERS | self._wind | {"SDLOG_BACKEND": 0.0, "COM_LOW_BAT_ACT": 0.0}
-            values |= self._parameters
             environment |= {f"PX4_PARAM_{name}": f"{value:g}" for name, value in values.items()}
         self.process.environment = environment
         await super().power_on()
@@ -260,11 +253,6 @@ class FlyingPx4(FlyingVehicle):
             TimeoutError: it does not.
         """
         await self.until_mode(ground, "hold")
-
-    async def hasten(self, ground: GroundStation, speed: float) -> None:
-        """It can be told at its start only."""
-        self._speed = speed
-        await self.power_cycle()
 
     async def turn(self, ground: GroundStation, degrees: float) -> None:
         """Told to turn clockwise on its spot."""

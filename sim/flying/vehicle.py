@@ -46,7 +46,7 @@ class FlyingVehicle(FirmwareVehicle):
     circle: tuple[float, float, float] | None = None
     """What a plane that holds is to fly, in m: north and east of the start, and the radius."""
     modes: Mapping[str, int]
-    """Custom modes by what they are for: hold, mission."""
+    """Custom modes by what they are for."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         super().__init__(scenario, folder)
@@ -89,7 +89,7 @@ class FlyingVehicle(FirmwareVehicle):
         """
 
     async def mode(self, ground: GroundStation, name: str) -> None:
-        """Ask until it changes its mode: PX4 refuses a mission that it has not looked through yet.
+        """Ask until it changes its mode.
 
         Raises:
             TimeoutError: it does not; with what it says.
@@ -130,10 +130,6 @@ class FlyingVehicle(FirmwareVehicle):
     @abstractmethod
     async def hold(self, ground: GroundStation) -> None:
         """Stay over the spot, or about it, until told otherwise."""
-
-    @abstractmethod
-    async def hasten(self, ground: GroundStation, speed: float) -> None:
-        """From now on so many times real time, which the companion must not see."""
 
     async def turn(self, ground: GroundStation, degrees: float) -> None:
         """Turned clockwise by the yaw stick, by the truth; a plane turns anyway."""

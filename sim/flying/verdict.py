@@ -55,8 +55,6 @@ class Record:
     events: list[Event] = field(default_factory=list)
     struck_s: float = math.inf
     """When the fault happened."""
-    hold: bool = True
-    """Whether it is to stay on its spot, or on its circle."""
     circle: tuple[float, float, float] | None = None
     """Where it is to be, if not on its spot: north and east of the middle, and the radius, in m."""
 
@@ -79,7 +77,7 @@ class Figures:
     """Largest horizontal error of the estimated place, less what it was before."""
     spot_m: float
     """Largest true horizontal distance from where it was at the fault, or from the circle that it is to fly: that one
-    less its largest distance in the circle before; nan where it is neither to stay nor to circle."""
+    less its largest distance in the circle before."""
     sets: int
     """Changes of the source set."""
     modes: int
@@ -133,7 +131,7 @@ def figures(record: Record) -> Figures:
         yaw_before_deg=float(np.abs(errors[(own_s < struck) & (own_s > struck - BEFORE_S)]).max()),
         fallback_s=next((event.own_s - struck for event in sets if event.words != "1"), math.inf),
         estimate_m=float(np.hypot(*off.T).max()),
-        spot_m=_off_spot_m(record, flown) if record.hold else math.nan,
+        spot_m=_off_spot_m(record, flown),
         sets=len(sets),
         modes=len(record.after("mode")),
         crashed=_crashed(record, flown),
@@ -163,11 +161,10 @@ def _crashed(record: Record, flown: Array) -> str:
 def row(record: Record, found: Figures) -> str:
     """One line of the table."""
     fallback = f"{found.fallback_s:.1f} s" if math.isfinite(found.fallback_s) else "never"
-    spot = f"{found.spot_m:.1f} m" if math.isfinite(found.spot_m) else "-"
     wind = f"{record.wind[0]:.0f} m/s {record.wind[1]:03.0f}"
     return (
         f"{record.fault:16}{record.set_up:9}{wind:>12}{found.yaw_deg:7.1f}{fallback:>13}"
-        f"{found.estimate_m:9.1f} m{spot:>10}  {'; '.join(found.wrong) or 'good'}"
+        f"{found.estimate_m:9.1f} m{found.spot_m:8.1f} m  {'; '.join(found.wrong) or 'good'}"
     )
 
 

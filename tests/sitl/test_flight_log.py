@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from companion.storage.records import RecordStore
 from sim.flying.flight import Flight, Plan, flying
-from sim.flying.injected import AXES, OF_AXIS, OFFSETS, told
 from sim.imu_model import DEG_H, MG
 from tests.sitl.test_flying import binary_of
 
 pytestmark = pytest.mark.sitl
+OFFSETS = {
+    "ardupilot": tuple(f"INS_{kind}OFFS_{axis}" for kind in ("GYR", "ACC") for axis in "XYZ"),
+    "px4": tuple(f"CAL_{kind}0_{axis}OFF" for kind in ("GYRO", "ACC") for axis in "XYZ"),
+}
+"""Offsets of the first IMU."""
+BIASES = tuple(f"SIM_{kind}1_BIAS_{axis}" for kind in ("GYR", "ACC") for axis in "XYZ")
+"""Errors of ArduPilot's simulated first IMU. PX4's has none: there, an offset that is too small stands for an error."""
+JUDGED = (0, 1, 2, 5)
+"""Axes that `companion flight` judges: gyros, vertical accelerometer."""
 MOVED_DEG_H = (400.0, -300.0, 200.0)
 MOVED_MG = 5.0
 """Of the vertical accelerometer; PX4 leaves offsets in force that differ by less than 1 mg."""
@@ -46,16 +54,34 @@ async def flown(craft: str, folder: Path) -> tuple[dict[str, Any], str, list[flo
         answer = await flight.ask("flight", str(log), "--offsets", str(unmoved))
         (record, *_) = RecordStore(flight.folder / "state").history()
     found = answer["flights"][-1]
-    armed_s = found["stages"]["armed_s"]
-    (left,), _ = told(log).left(np.array([armed_s]), armed_s)
-    return found, record.started_at, left[list(OF_AXIS)].tolist()
+    return found, record.started_at, (px4_true_error(log) if craft == "px4" else ardupilot_true_error(log))
+
+
+def px4_true_error(log: Path) -> list[float]:
+    """Error of PX4's readings, from the offsets that the log begins with (read by pyulog)."""
+    from pyulog import ULog
+
+    initial = ULog(str(log), ["vehicle_imu_status"]).initial_parameters
+    return [-float(initial[OFFSETS["px4"][k]]) for k in JUDGED]
+
+
+def ardupilot_true_error(log: Path) -> list[float]:
+    """Error of ArduPilot's readings, from the last parameters in the log (read by pymavlink): bias less offset."""
+    from pymavlink.DFReader import DFReader_binary
+
+    reader: Any = DFReader_binary(str(log))  # type: ignore[no-untyped-call]
+    told = dict[str, float]()
+    with contextlib.closing(reader):
+        while (message := reader.recv_match(type=["PARM"])) is not None:
+            told[message.Name] = message.Value
+    return [told[BIASES[k]] - told[OFFSETS["ardupilot"][k]] for k in JUDGED]
 
 
 async def move(flight: Flight, offsets: dict[str, float]) -> None:
     """ArduPilot's simulated gyros read more as of now; PX4's have no errors, so their offsets become less by that."""
     ground = flight.ground
     if flight.vehicle.firmware == "ardupilot":
-        names = [f"SIM_GYR1_BIAS_{axis}" for axis in AXES]
+        names = BIASES[:3]
         values = [await ground.get(name) for name in names]
         await ground.put_all({n: v + d * DEG_H for n, v, d in zip(names, values, MOVED_DEG_H, strict=True)})
         return

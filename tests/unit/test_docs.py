@@ -125,11 +125,10 @@ def understood(command: str) -> str:
 def sim_parser(words: list[str]) -> argparse.ArgumentParser:
     """Of `python -m sim`, as sim/__main__.py chooses it."""
     from sim import rest, serve
-    from sim.flying import bench
     from sim.flying import cli as flying
     from sim.sitl import cli as firmware
 
-    for name, own in (("rest", rest.parser), ("fly", flying.parser), ("fly-bench", bench.parser)):
+    for name, own in (("rest", rest.parser), ("fly", flying.parser)):
         if words[:1] == [name]:
             made = argparse.ArgumentParser()
             made.add_subparsers().add_parser(name, parents=[own()], add_help=False)

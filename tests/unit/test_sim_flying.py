@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 
 import numpy as np
@@ -12,14 +11,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim.flying.ardupilot import state_of
 from sim.flying.cli import main, parser, plans_of
 from sim.flying.flight import is_ours
-from sim.flying.mission import upload
 from sim.flying.px4 import Truth, source_changes
 from sim.flying.truth import BEHIND_S, FlyingAircraft, State, angles_of_quaternion
 from sim.flying.verdict import Event, Record, figures, row, summary
 from sim.imu_model import ImuModel
 from sim.scenario import site_at
-from sim.sitl.ground import GroundStation
-from tests.support.virtual_time import run_virtual
 
 STEP_S = 0.001
 STRUCK_S = 20.0
@@ -172,13 +168,6 @@ def test_a_plane_is_to_stay_on_its_circle_as_well_as_before() -> None:
     assert figures(circled(outwards_m=4.0)).wrong == ["place above 3 m"]
 
 
-def test_a_mission_has_no_spot_to_stay_on() -> None:
-    record = hovered(drifts_m=50.0)
-    record.hold = False
-    assert math.isnan(figures(record).spot_m)
-    assert not figures(record).wrong
-
-
 def test_several_flights_in_a_line() -> None:
     flights = [figures(hovered(yaw_deg=yaw_deg)) for yaw_deg in (1.0, 2.0, 12.0)]
     for flight in flights:
@@ -263,38 +252,6 @@ def test_px4_says_by_its_flags_which_heading_it_uses() -> None:
     assert source_changes("never published\n") == []
 
 
-def test_a_mission_is_uploaded_item_by_item() -> None:
-    """To a peer that asks for each; corners are where they belong."""
-    site, station, codec = site_at(40.0, 116.0, 50.0), GroundStation("ardupilot"), mavlink.MAVLink(None, 1, 1)
-    got = dict[int, mavlink.MAVLink_mission_item_int_message]()
-    total = 0
-
-    def say(message: mavlink.MAVLink_message) -> None:
-        asyncio.get_running_loop().call_soon(
-            lambda: station.receive(message.pack(codec), asyncio.get_running_loop().time())
-        )
-
-    def peer(data: bytes) -> None:
-        nonlocal total
-        message = codec.decode(bytearray(data))
-        if isinstance(message, mavlink.MAVLink_mission_count_message):
-            total = message.count
-        elif isinstance(message, mavlink.MAVLink_mission_item_int_message):
-            got[message.seq] = message
-        number = len(got)
-        if number == total:
-            say(mavlink.MAVLink_mission_ack_message(255, 190, mavlink.MAV_MISSION_ACCEPTED))
-        else:
-            say(mavlink.MAVLink_mission_request_int_message(255, 190, number))
-
-    station.attach(peer)
-    run_virtual(upload(station, site, 30.0, [(0.0, 0.0), (100.0, -200.0)]))
-    assert [item.command for _, item in sorted(got.items())] == [16, 16, 16, 177]
-    corner = got[2]
-    assert (corner.x, corner.y, corner.z) == (400_008_983, 1_159_976_547, 30.0)
-    assert (got[3].param1, got[3].param2) == (1.0, 1000.0)
-
-
 def test_what_px4_tells_of_its_truth_is_an_aircraft_that_turns_and_speeds_up() -> None:
     """Attitudes to rates, whole cm/s to forces; a clock that begins again is a boot."""
     aircraft = FlyingAircraft(site_at(40.0, 116.0, 50.0), heading_deg=30.0, unix_s=1_795_219_200.0)
@@ -324,7 +281,6 @@ def test_what_px4_tells_of_its_truth_is_an_aircraft_that_turns_and_speeds_up() -
 
 @pytest.mark.parametrize(("words", "why"), [
     (["--binary", "px4", "--fault", "own-compass"], "cannot be turned"),
-    (["--binary", "px4", "--fault", "own-compass-end"], "cannot be turned"),
     (["--binary", "px4", "--set-up", "today"], "the others are ArduPilot's"),
     (["--binary", "arducopter", "--set-up", "px4"], "px4 is that of PX4"),
 ])  # fmt: skip

@@ -36,8 +36,8 @@ def test_the_simulator_takes_nothing_from_the_science_it_judges() -> None:
                 names = [node.module or ""]
             for name in names:
                 foreign = name.split(".")[0] == "companion" and name != "companion.links.mavlink.link"
-                # The demonstration, the flying bench and the accuracy bench run the whole chain.
-                shows_all = path.name in ("demo.py", "bench.py") or "accuracy" in path.parts
+                # The demonstration and the accuracy bench run the whole chain.
+                shows_all = path.name == "demo.py" or "accuracy" in path.parts
                 assert not foreign or shows_all, f"{path}: {name}"
 
 
