@@ -129,9 +129,6 @@ PARTS: dict[str, ImuSpec] = {
     "white_only": ImuSpec(
         name="white_only", gyro=AxisNoise(white=7.1 * DEG_H), accel=AxisNoise(white=49.5 * UG)
     ),
-    "quiet": ImuSpec(  # a tenth of a whole milliradian per second, and of a milli-g, in readings of 4 ms
-        name="quiet", gyro=AxisNoise(white=1.3 * DEG_H), accel=AxisNoise(white=6.3 * UG)
-    ),
     "perfect": ImuSpec(name="perfect", gyro=AxisNoise(white=0.0), accel=AxisNoise(white=0.0)),
 }  # fmt: skip
 

@@ -79,20 +79,6 @@ def parser() -> argparse.ArgumentParser:
         "--listen", type=float, default=0.0, metavar="SECONDS",
         help="how long the companion hears the sensors before it is asked (default 0)",
     )  # fmt: skip
-    residuals.add_argument(
-        "--still", type=float, metavar="SECONDS", help="how long it averages where no --config is given (default 60)"
-    )
-    residuals.add_argument(
-        "--found", type=int, default=0, metavar="RUNS",
-        help="only what the companion finds beside the truth, writing nothing: so many starts, each with another seed",
-    )  # fmt: skip
-    residuals.add_argument(
-        "--primary",
-        type=int,
-        choices=(1, 2),
-        help="with --found: the IMU that PX4 flies by (default: the one that its EKFs choose)",
-    )
-    residuals.add_argument("--baud", type=int, help="with --found: of a serial line to PX4 (default: by UDP)")
     only = residuals.add_mutually_exclusive_group()
     only.add_argument("--companion-only", action="store_true", help="leave the firmware's own calibrations out")
     only.add_argument("--own-only", action="store_true", help="leave the companion out")
@@ -179,12 +165,10 @@ def main(argv: Sequence[str]) -> int:
     try:
         vehicle = vehicle_of(arguments, scenario, folder / "firmware")
         if arguments.command == "residuals":
-            from sim.sitl.residuals import DECK, STILL, STILL_S, report
+            from sim.sitl.residuals import DECK, STILL, report
 
             more = "".join(path.read_text(encoding="utf-8") for path in arguments.config)
-            more = more or (DECK if arguments.motion in ("sea", "engine") else STILL.format(arguments.still or STILL_S))
-            if arguments.found:
-                return _found(arguments, folder, more)
+            more = more or (DECK if arguments.motion in ("sea", "engine") else STILL)
             return asyncio.run(
                 report(
                     vehicle, folder, arguments.observe, more, listen_s=arguments.listen,
@@ -214,22 +198,6 @@ def main(argv: Sequence[str]) -> int:
             shutil.rmtree(folder / "firmware", ignore_errors=True)
             with contextlib.suppress(OSError):
                 os.rmdir(folder)
-
-
-def _found(arguments: argparse.Namespace, folder: Path, more: str) -> int:
-    from sim.sitl.residuals import HEADER, all_found, found
-
-    runs = []
-    print(HEADER, flush=True)
-    for number in range(arguments.found):
-        one = folder / "firmware" / str(number)
-        vehicle = vehicle_of(arguments, scenario_of(arguments), one / "firmware")
-        one.mkdir(parents=True)
-        how = {"listen_s": arguments.listen, "primary": arguments.primary, "baud": arguments.baud}
-        runs.append(asyncio.run(found(vehicle, one, more, **how)))
-        arguments.seed += 1
-    print(all_found(runs))
-    return 0
 
 
 async def _serve(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import socket
 from collections.abc import Mapping
@@ -141,28 +140,6 @@ class Px4Sitl(SitlVehicle):
         return FirmwareProcess(
             [str(self._binary), "-d", "-i", str(self.instance), "-w", str(self.folder), str(self._etc)], self.folder
         )
-
-    async def fly_by(self, instance: int) -> None:
-        """Make one IMU (1, 2) the primary: that of the EKF that is asked for by hand.
-
-        Raises:
-            BinaryError: the firmware did not take it.
-        """
-        await self._type("ekf2", "select_instance", str(instance - 1))
-
-    async def speak_on(self, port: Path, baud: int) -> None:
-        """Start MAVLink on a serial port too, as on TELEM1.
-
-        Raises:
-            BinaryError: the firmware did not take it.
-        """
-        await self._type("mavlink", "start", "-d", str(port), "-b", str(baud))
-
-    async def _type(self, module: str, *words: str) -> None:
-        program = self._binary.parent / f"px4-{module}"
-        asked = await asyncio.create_subprocess_exec(program, "--instance", str(self.instance), *words, cwd=self.folder)
-        if await asked.wait():
-            raise BinaryError(f"px4-{module} {' '.join(words)}: ended with {asked.returncode}")
 
     async def power_on(self) -> None:
         """Start the binary with what it has stored; when that is nothing, with our parameters."""

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import sys
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,8 +17,6 @@ from sim.imu_model import DEG_H, MG
 from sim.sitl.daemon import companion_daemon
 from sim.sitl.ground import GroundStation
 from sim.sitl.observe import residual
-from sim.sitl.px4 import Px4Sitl
-from sim.sitl.serial_line import serial_line
 from sim.sitl.vehicle import FirmwareVehicle, SitlVehicle
 from sim.udp import open_udp
 
@@ -38,8 +35,7 @@ CALIBRATE_WITHIN_S = 420.0
 OWN_TRIES = 3
 """Of the firmware's own gyro calibration: its quarter second of averaging gives another result each time, and one
 may be good by chance."""
-STILL = "[calibration]\nmin_still_s = {0:g}\nmax_s = {0:g}\n"
-STILL_S = 60.0
+STILL = "[calibration]\nmin_still_s = 60\nmax_s = 60\n"
 """A whole minute, as the figures of autopilots 9.3. By itself the companion stops where the part's flicker, which its
 profile knows, makes more averaging worthless; a part of white noise only has none."""
 DECK = """
@@ -51,8 +47,6 @@ target_gyro_sigma_deg_h = 500
 target_accel_sigma_mg = 5
 """
 """On a sea: when it is asked, not by itself, and as soon as it has heard a minute; for longer there is `--listen`."""
-FIND = "[push]\nparameters = false\n"
-"""Nothing written, nothing dithered, no rival stopped."""
 SLOW = 0.95
 UNITS = np.array([DEG_H] * 3 + [MG] * 3)
 
@@ -79,19 +73,6 @@ HEADER = (
     f"{'residual by telemetry, reading - truth':44} {'IMU':>3} {'gyro x':>9} {'y':>9} {'z deg/h':>9} {'rms':>8}"
     f" {'accel x':>9} {'y':>9} {'z mg':>9} {'rms':>8}"
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """The biases of one IMU as the companion finds them, less the true ones."""
-
-    row: Row
-    two_sigma: Array
-
-    def __str__(self) -> str:
-        wide = self.two_sigma / UNITS
-        within = int((np.abs(self.row.left) <= self.two_sigma).sum())
-        return f"{self.row}   2 sigma {wide[:3].max():.1f} deg/h {wide[3:].max():.3f} mg, {within} of 6 within"
 
 
 @contextlib.asynccontextmanager
@@ -188,74 +169,6 @@ async def _companion(
     await asyncio.sleep(SETTLE_S)
     await _look(vehicle, ground, "companion, after a power cycle", observe_s)
     return 0
-
-
-async def found(
-    vehicle: SitlVehicle,
-    folder: Path,
-    more: str,
-    *,
-    listen_s: float = 0.0,
-    primary: int | None = None,
-    baud: int | None = None,
-) -> list[Found]:
-    """Start the firmware and let the companion find its IMUs' biases, which are written nowhere.
-
-    Args:
-        vehicle: not running yet.
-        folder: for the companion's files; exists.
-        more: further lines of the companion's configuration.
-        listen_s: how long the companion hears the sensors before it is asked.
-        primary: the IMU that PX4 flies by; None: the one that its EKFs choose.
-        baud: of a serial line to PX4; None: by UDP.
-
-    Raises:
-        RuntimeError, TimeoutError: the companion failed.
-    """
-    async with contextlib.AsyncExitStack() as stack:
-        await stack.enter_async_context(vehicle)
-        await asyncio.sleep(SETTLE_S)
-        url = None
-        if primary is not None and isinstance(vehicle, Px4Sitl):
-            await vehicle.fly_by(primary)
-        if baud is not None and isinstance(vehicle, Px4Sitl):
-            theirs, ours = await stack.enter_async_context(serial_line(baud, folder))
-            await vehicle.speak_on(theirs, baud)
-            url = f"serial:{ours}:{baud}"
-        async with companion_daemon(vehicle, folder, more=more + FIND, url=url) as daemon:
-            await vehicle.sleep(listen_s)
-            record = await daemon.calibrate(CALIBRATE_WITHIN_S)
-            status = await daemon.status() or {}
-        result = []
-        for instance, imu in zip(vehicle.instances, record["imus"], strict=True):
-            bias = _both(imu["gyro_bias_rad_s"], imu["accel_bias_m_s2"])
-            sigma = _both(imu["gyro_sigma_stat_rad_s"], imu["accel_sigma_stat_m_s2"])
-            error = bias - np.concatenate(vehicle.true_bias(instance, vehicle.now_s))
-            kind = next((one["summary"] for one in status.get("devices", []) if one["name"] == imu["name"]), "")
-            result.append(Found(Row(kind or imu["name"], instance, error), 2.0 * sigma))
-            print(result[-1], flush=True)
-            print(f"imu {imu['name']}: {imu['samples']} samples; {'; '.join(imu['warnings'])}", file=sys.stderr)
-        return result
-
-
-def _both(gyro: Sequence[float] | None, accel: Sequence[float] | None) -> Array:
-    """Three of each; not a number where the companion does not know."""
-    unknown = [math.nan] * 3
-    return np.array([*(gyro or unknown), *(accel or unknown)])
-
-
-def all_found(runs: Sequence[list[Found]]) -> str:
-    """What the runs have in common: rms of the errors by IMU, and how many lie within two sigmas."""
-    lines = []
-    for each in zip(*runs, strict=True):
-        left = np.array([one.row.left / UNITS for one in each]).reshape(-1, 2, 3)
-        rms = np.sqrt((left**2).mean(axis=(0, 2)))
-        within = sum(int((np.abs(one.row.left) <= one.two_sigma).sum()) for one in each)
-        lines.append(
-            f"IMU {each[0].row.instance}, {len(each)} runs: {rms[0]:.1f} deg/h, {rms[1]:.3f} mg rms;"
-            f" {within} of {6 * len(each)} within two sigmas"
-        )
-    return "\n".join(lines)
 
 
 async def _own_calibrations(vehicle: SitlVehicle, ground: GroundStation, observe_s: float) -> None:
