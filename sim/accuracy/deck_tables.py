@@ -35,23 +35,23 @@ def deck(voyages: int, stands: int, seed: int, jobs: int) -> Section:
         "",
         "                                        bound     rms    +-   sigma   2 sigma covers",
     ]
-    figures: dict[str, Any] = {}
     claims: list[Claim] = []
     for index, span in enumerate(SPANS_S):
-        _rows(f"sea, {span} s", sea, index, bound(Voyage(), span), lines, figures)
+        lines += _rows(f"sea, {span} s", sea, index, bound(Voyage(), span))
         twice = covered(_stack(sea, "error")[:, index], _stack(sea, "sigma")[:, index], 2.0)
         claims.append(Claim(f"deck, {span} s: 2 sigma covers", "%", twice.times(100.0), 98.0, 93.0))
         for name, unit, part in _TRIADS[:2]:
             found = rms(_stack(sea, "error")[:, index, part] / unit)
             claims.append(Claim(f"deck, {span} s: {name}", "", found, MOST[name, span], 0.0))
     for index, span in enumerate(STILL_S):
-        _rows(f"still, {span} s", still, index, bound(STILL, span), lines, figures)
+        lines += _rows(f"still, {span} s", still, index, bound(STILL, span))
         share = _over_the_ground(still, index, span)
         claims.append(Claim(f"still ground, {span} s: gyro sigma over that at rest", "", share, 1.5, 0.0))
-    return Section(f"On a deck ({voyages} voyages, {stands} stands)", lines, figures, claims)
+    return Section(f"On a deck ({voyages} voyages, {stands} stands)", lines, claims)
 
 
-def _rows(title: str, runs: list[DeckRun], index: int, least: Any, lines: list[str], figures: dict[str, Any]) -> None:
+def _rows(title: str, runs: list[DeckRun], index: int, least: Any) -> list[str]:
+    lines = []
     errors, sigmas = _stack(runs, "error")[:, index], _stack(runs, "sigma")[:, index]
     for name, unit, part in _TRIADS:
         error, sigma = errors[:, part], sigmas[:, part]
@@ -63,7 +63,7 @@ def _rows(title: str, runs: list[DeckRun], index: int, least: Any, lines: list[s
             f"{title:13}{name:30}{physical:6.{digits}f}{found.value:8.{digits}f}{found.error:6.{digits}f}"
             f"{size:8.{digits}f}{100.0 * twice.value:12.1f} %"
         )
-        figures[f"{title}: {name}"] = {"bound": physical, "rms": found, "sigma": size, "covered_2_sigma": twice}
+    return lines
 
 
 def _over_the_ground(runs: list[DeckRun], index: int, span_s: int) -> Figure:

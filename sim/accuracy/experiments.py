@@ -16,7 +16,7 @@ import numpy as np
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import noise_profile
 from companion.errors import CalibrationRefusedError
-from sim.accuracy import paper, peers
+from sim.accuracy import peers
 from sim.accuracy.stand import (
     GRAVITY_ANOMALY_M_S2,
     NEXT_S,
@@ -50,7 +50,7 @@ TILT_DRAWS: Final = 8
 """Of a reference's error, for one stand."""
 FIELD_TILT_DEG: Final = 0.01
 FIELD_HEADING_DEG: Final = 1.0
-METHODS: Final = ("plain mean", "ArduPilot", "PX4, mean", "PX4, in force", "as printed")
+METHODS: Final = ("plain mean", "ArduPilot", "PX4, mean", "PX4, in force")
 STEP_RAD_S: Final = 1e-3
 NOISE_LSB: Final = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0)
 
@@ -121,7 +121,7 @@ class FloorRun:
     plain: Array
     plain_sigma: Array
     methods: Array
-    """Errors of `METHODS` (5, 6), from the end of the longest span on; NaN where one has none."""
+    """Errors of `METHODS` (4, 6), from the end of the longest span on; NaN where one has none."""
     tilted: Array
     """Errors of the two horizontal accelerometers in the longest span (references, draws, 2)."""
 
@@ -164,14 +164,12 @@ def floors(part: str, seed: int, number: int) -> FloorRun:
 def _methods(standing: Stand, end_s: float, mean: Array) -> Array:
     """The biases that others find at the end of the longest window, or of the same readings."""
     level, none = np.concatenate([np.zeros(3), peers.LEVEL]), np.full(3, np.nan)
-    still = paper.Still(standing.imu.aircraft.pose, standing.site)
     return np.array(
         [
             mean - level,
             peers.ardupilot(standing, end_s - 0.5),
             np.concatenate([peers.px4_mean(standing, end_s - 1.0), none]),
             peers.px4(standing, end_s - 1.0),
-            paper.biases(still, mean, paper.ALL),
         ]
     )
 
@@ -241,28 +239,6 @@ def integers(noise_lsb: float, seed: int, number: int) -> IntegerRun:
     except CalibrationRefusedError:  # gyros and accelerometers
         return IntegerRun(np.full(6, np.nan), np.full(6, np.nan), plain / steps, half / steps)
     return IntegerRun((biases(imu) - bias) / steps, sigmas_stat(imu) / steps, plain / steps, half / steps)
-
-
-# ------------------------------------------------------------------------------------------------------------- paper
-
-
-def errata(seed: int, count: int) -> dict[paper.Erratum, Array]:
-    """What each error in print alone makes, (count, 6) FRD, of noise-free readings with usual biases.
-
-    Poses within 20 degrees, headings and sites as they come; a sensor of specific force, as all are.
-    """
-    random = np.random.default_rng([seed, 23])
-    found: dict[paper.Erratum, list[Array]] = {name: [] for name in paper.ERRATA}
-    for number in range(count):
-        posture = replace(
-            POSTURES[0], pitch_deg=float(random.uniform(-20, 20)), roll_deg=float(random.uniform(-20, 20))
-        )
-        standing = stand("perfect", posture, sites()[number % len(sites())], (seed, 4, number))
-        still = paper.Still(standing.imu.aircraft.pose, standing.site)
-        mean, truth = standing.imu.expected(0.0), standing.bias(0.0, 0.0)
-        for name, values in found.items():
-            values.append(paper.biases(still, mean, frozenset((name,))) - truth)
-    return {name: np.array(values) for name, values in found.items()}
 
 
 def predicted(noise: AxisNoise, mean_s: float, horizon_s: float) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -87,5 +87,4 @@ class Section:
 
     title: str
     lines: list[str]
-    figures: dict[str, Any]
     claims: list[Claim] = field(default_factory=list)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -106,7 +106,6 @@ def section(runs: list[MidRun], each: int) -> Section:
         "",
         f"{'':27}{'without':>16}{'with':>23}{'when warm':>23}{'off by':>8}",
     ]
-    figures: dict[str, Any] = {}
     claims = []
     flat = iter(runs)
     for part in TRIED:
@@ -116,16 +115,7 @@ def section(runs: list[MidRun], each: int) -> Section:
             own = [next(flat) for _ in range(each)]
             for k, span in enumerate(SPANS_S):
                 error, sigma, warm, of_warm, plain, of_plain, later = (
-                    np.array([getattr(run, name)[k] for run in own])
-                    for name in (
-                        "error",
-                        "sigma",
-                        "warm_error",
-                        "warm_sigma",
-                        "plain_error",
-                        "plain_sigma",
-                        "plain_warm_error",
-                    )
+                    np.array([getattr(run, name)[k] for run in own]) for name in MidRun.__dataclass_fields__
                 )
                 told = np.isfinite(of_warm).all(axis=1)
                 ends.append((error, sigma))
@@ -139,15 +129,6 @@ def section(runs: list[MidRun], each: int) -> Section:
                     f"{size.value:9.1f}{_size(sigma):7.1f}{share.value:6.1f}%"
                     f"{then.value:9.1f}{_size(of_warm[told]):7.1f}{foreseen.value:6.1f}%{left.value:8.0f}"
                 )
-                figures.setdefault(part, {})[f"{rate:g} K/min, {span} s"] = {
-                    "without_deg_h": before,
-                    "with_deg_h": size,
-                    "covered": share,
-                    "warm_deg_h": then,
-                    "warm_covered": foreseen,
-                    "told": float(told.mean()),
-                    "off_when_warm_deg_h": left,
-                }
         for words, pairs in (("at the end", ends), ("when warm", warms)):
             errors, sigmas = (np.concatenate(one) for one in zip(*pairs, strict=True))
             claims.append(
@@ -160,7 +141,7 @@ def section(runs: list[MidRun], each: int) -> Section:
                 )
             )
     lines += ["", f"{DAYS} days before as above; the rate is that of the middle of the minute."]
-    return Section(f"In mid-warm-up ({each} aircraft of each part and rate)", lines, figures, claims)
+    return Section(f"In mid-warm-up ({each} aircraft of each part and rate)", lines, claims)
 
 
 def _size(sigma: Array) -> float:

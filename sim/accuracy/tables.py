@@ -1,15 +1,14 @@
-"""The experiments as tables for people, as figures for machines, and as claims that hold or do not."""
+"""The experiments as tables, and as claims that hold or do not."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from sim.accuracy import deck_tables, mid_warm_up, paper, temperature, turning, warmup_table
-from sim.accuracy.by_hand import table as by_hand_table
-from sim.accuracy.by_hand.stands import BY_HAND, by_hand
+from sim.accuracy import by_hand_table, deck_tables, mid_warm_up, temperature, turning, warmup_table
+from sim.accuracy.by_hand import BY_HAND, by_hand
 from sim.accuracy.experiments import (
     FIELD_HEADING_DEG,
     FIELD_TILT_DEG,
@@ -22,7 +21,6 @@ from sim.accuracy.experiments import (
     FloorRun,
     IntegerRun,
     WhiteRun,
-    errata,
     floors,
     integers,
     many,
@@ -99,8 +97,6 @@ def report(
         boards = [(part, seed, number) for part in BY_HAND for number in range(each)]
         found["by-hand"] = by_hand_table.section(many(by_hand, boards, jobs), each)
     found |= _by_temperature(runs, seed, only, jobs, progress)
-    if "paper" in only:
-        found["paper"] = _paper(errata(seed, 400))
     return found
 
 
@@ -135,7 +131,6 @@ def _white(runs: list[WhiteRun]) -> Section:
         "        gyro                 accelerometer             beside   sigma_stat covers    plain mean",
         "         x     y     z         x     y     z     all  the mean  1 sigma  2 sigma     all  2 sigma",
     ]
-    figures: dict[str, Any] = {}
     claims = []
     for index, span in enumerate(SPANS_S):
         axes = [rms(error[:, index, axis]) for axis in range(6)]
@@ -150,27 +145,16 @@ def _white(runs: list[WhiteRun]) -> Section:
             + f"{whole.value:8.3f}{efficient.value:10.3f} {_percent(once)} {_percent(twice)}"
             + f"{simple.value:8.3f} {_percent(simple_twice)}"
         )
-        figures[f"{span} s"] = {
-            "axes": axes,
-            "axes_beside_the_mean": by_axis,
-            "all": whole,
-            "beside_the_mean": efficient,
-            "covered_1_sigma": once,
-            "covered_2_sigma": twice,
-            "plain_mean": simple,
-            "plain_mean_covered_2_sigma": simple_twice,
-        }
         worst = max(by_axis)
         claims.append(Claim(f"white noise, {span} s: worst axis over the bound", "", worst, 1.05))
         claims.append(Claim(f"white noise, {span} s: 2 sigma of sigma_stat cover", "%", twice.times(100.0), 97.0, 94.0))
-    last = figures[f"{SPANS_S[-1]} s"]
     lines += [
         "",
-        f"Standard errors: one axis {last['axes'][0].error:.3f}, all {last['all'].error:.3f},",
-        f"beside the mean {last['beside_the_mean'].error:.4f}, coverage {100.0 * last['covered_2_sigma'].error:.2f} %.",
+        f"Standard errors: one axis {axes[0].error:.3f}, all {whole.error:.3f},",
+        f"beside the mean {efficient.error:.4f}, coverage {100.0 * twice.error:.2f} %.",
         "The plain mean attains the bound; beside it the luck of the readings falls out.",
     ]
-    return Section(f"White noise only, perfect references ({len(runs)} stands)", lines, figures, claims)
+    return Section(f"White noise only, perfect references ({len(runs)} stands)", lines, claims)
 
 
 def _stack(runs: list[FloorRun], name: str) -> Array:
@@ -188,7 +172,6 @@ def _floors(parts: dict[str, list[FloorRun]]) -> Section:
         f"{'':65}sigma_use covers      plain mean",
         f"{'':27}bound sqrt V    rms   +-  worst    /V  1 sigma  2 sigma     rms  2 sigma",
     ]
-    figures: dict[str, Any] = {}
     claims = []
     for part, runs in parts.items():
         level = _upright(runs)
@@ -207,20 +190,10 @@ def _floors(parts: dict[str, list[FloorRun]]) -> Section:
                     f"{words}{span:3d} s{bound:7.1f}{use:7.1f}{found.value:7.1f}{found.error:5.1f}{worst:7.1f}"
                     f"{found.value / use:6.2f} {_percent(once)} {_percent(twice)}"
                 )
-                each = figures.setdefault(part, {}).setdefault(triad, {})[f"{span} s"] = {
-                    "unit": unit,
-                    "bound": bound,
-                    "sqrt_v": use,
-                    "rms": found,
-                    "worst_axis": worst,
-                    "covered_1_sigma": once,
-                    "covered_2_sigma": twice,
-                }
                 if gyro:
                     plain, plain_sigma = _stack(runs, "plain")[:, index, :3], _stack(runs, "plain_sigma")[:, index, :3]
                     simple, simple_twice = rms(plain).times(1.0 / scale), covered(plain, plain_sigma, 2.0)
                     line += f"{simple.value:8.1f} {_percent(simple_twice)}"
-                    each |= {"plain_mean": simple, "plain_mean_covered_2_sigma": simple_twice}
                 lines.append(line)
                 if part == "icm42688p" and gyro and span == SPANS_S[-1]:
                     claims.append(Claim("ICM-42688-P gyro, 60 s, next 180 s: rms", "deg/h", found, 5.5))
@@ -231,18 +204,16 @@ def _floors(parts: dict[str, list[FloorRun]]) -> Section:
         "The plain mean takes the Earth for at rest and its sigma for s / sqrt(n).",
     ]
     count = len(next(iter(parts.values())))
-    return Section(f"Parts with flicker and walk ({count} stands each)", lines, figures, claims)
+    return Section(f"Parts with flicker and walk ({count} stands each)", lines, claims)
 
 
 def _methods(parts: dict[str, list[FloorRun]]) -> Section:
     names = ("companion", *METHODS)
     lines = ["gyro, rms deg/h against the bias of the next 180 s; biases of a power-up are 100 deg/h, 1 sigma", ""]
     lines.append(f"{'':12}" + "".join(f"{name:>14}" for name in names))
-    figures: dict[str, Any] = {"gyro_deg_h": {}, "accel_mg": {}}
     for part, runs in parts.items():
         errors = np.concatenate([_stack(runs, "error")[:, -1:], _stack(runs, "methods")], axis=1)
         found = [rms(errors[:, row, :3]).times(1.0 / DEG_H) for row in range(len(names))]
-        figures["gyro_deg_h"][part] = dict(zip(names, found, strict=True))
         lines.append(f"{part:12}" + "".join(f"{one.value:14.1f}" for one in found))
     runs = parts["icm42688p"]
     lines += ["", "accelerometers of an ICM-42688-P, rms mg horizontal / vertical; biases 2 mg, 1 sigma", ""]
@@ -250,21 +221,20 @@ def _methods(parts: dict[str, list[FloorRun]]) -> Section:
     for posture in UPRIGHT:
         here = [run for run in runs if run.posture == posture]
         errors = np.concatenate([_stack(here, "error")[:, -1:], _stack(here, "methods")], axis=1)
-        line, row_of = f"{posture:10}", figures["accel_mg"].setdefault(posture, {})
+        line = f"{posture:10}"
         for row, name in enumerate(names):
             if name == METHODS[2]:
                 continue
             flat, down = (rms(errors[:, row, part]).times(1.0 / MG) for part in (slice(3, 5), slice(5, 6)))
-            row_of[name] = {"horizontal": flat, "vertical": down}
             line += f"{_short(flat.value)} / {_short(down.value):>6}".rjust(17)
         lines.append(line)
     lines += [
         "",
-        f"Companion ({_REFERENCES}), plain mean, paper (exact angles): 60 s.",
+        f"Companion ({_REFERENCES}), plain mean: 60 s.",
         "ArduPilot: half a second; PX4, mean: one. By eye: level to 0.5 deg, 1 sigma. PX4, in force: a vector",
         "below 0.01 (rad/s, m/s^2) is not taken, and the accelerometers are levelled by themselves.",
     ]
-    return Section("Beside what else is done", lines, figures)
+    return Section("Beside what else is done", lines)
 
 
 def _short(value: float) -> str:
@@ -278,7 +248,6 @@ def _tilt(parts: dict[str, list[FloorRun]]) -> Section:
         "",
         "tilt reference       its own error     rms    +-   over it   mean of |error|",
     ]
-    figures: dict[str, Any] = {}
     claims = []
     tilted = _stack(runs, "tilted")
     for index, (name, sigma) in enumerate(TILTS):
@@ -287,7 +256,6 @@ def _tilt(parts: dict[str, list[FloorRun]]) -> Section:
         apart = np.abs(tilted[:, index]).mean(axis=(1, 2)) / UG
         size = Figure(float(apart.mean()), float(apart.std(ddof=1)) / float(np.sqrt(len(apart))))
         over = found.times(1.0 / own)
-        figures[name] = {"own_ug": own, "rms_ug": found, "over_its_own": over, "mean_absolute_ug": size}
         lines.append(
             f"{name:20}{own:14.1f}{found.value:8.1f}{found.error:6.1f}{over.value:10.3f}{size.value:18.1f}"
         )  # fmt: skip
@@ -300,7 +268,7 @@ def _tilt(parts: dict[str, list[FloorRun]]) -> Section:
         "",
         f"The paper, five stands, turntable of 10 arcsec: mean of |error| {east:.1f} ug east, {north:.1f} ug north.",
     ]
-    return Section(f"The tilt reference rules ({len(runs)} upright stands)", lines, figures, claims)
+    return Section(f"The tilt reference rules ({len(runs)} upright stands)", lines, claims)
 
 
 def _integers(noises: dict[float, list[IntegerRun]]) -> Section:
@@ -310,7 +278,6 @@ def _integers(noises: dict[float, list[IntegerRun]]) -> Section:
         "              by share                gyro, deg/h      accel, mg         covers    plain mean, deg/h",
         "noise refused  1/2 step measured     rms    max     rms    max  1 sigma  2 sigma    rms   max +1/2",
     ]
-    figures: dict[str, Any] = {}
     claims = []
     for noise, runs in noises.items():
         error, sigma = np.array([run.error for run in runs]), np.array([run.sigma for run in runs])
@@ -320,33 +287,16 @@ def _integers(noises: dict[float, list[IntegerRun]]) -> Section:
         measured = np.where(refused | coarse, np.nan, error)
         shares = [float(one.mean()) for one in (refused, coarse, ~refused & ~coarse)]
         words = f"{noise:5.1f}" + "".join(f"{100.0 * share:7.1f} %" for share in shares)
-        each: dict[str, Any] = {
-            "refused": shares[0],
-            "half_a_step": shares[1],
-            "measured": shares[2],
-            "plain_rms_deg_h": rms(plain).times(_LSB_DEG_H),
-            "plain_max_deg_h": float(np.abs(plain).max()) * _LSB_DEG_H,
-            "plain_and_half_a_step_rms_deg_h": rms(half).times(_LSB_DEG_H),
-        }
-        figures[f"{noise:g}"] = each
         simple = (
-            f"{each['plain_rms_deg_h'].value:7.0f}{each['plain_max_deg_h']:6.0f}"
-            f"{each['plain_and_half_a_step_rms_deg_h'].value:5.0f}"
+            f"{rms(plain).value * _LSB_DEG_H:7.0f}{float(np.abs(plain).max()) * _LSB_DEG_H:6.0f}"
+            f"{rms(half).value * _LSB_DEG_H:5.0f}"
         )
         if shares[2] > 0.0:
             gyro, accel = measured[:, :3], measured[:, 3:]
             once, twice = (covered(measured, sigma, times) for times in (1.0, 2.0))
             largest = (float(np.nanmax(np.abs(gyro))) * _LSB_DEG_H, float(np.nanmax(np.abs(accel))))
-            each |= {
-                "rms_deg_h": rms(gyro).times(_LSB_DEG_H),
-                "max_deg_h": largest[0],
-                "rms_mg": rms(accel),
-                "max_mg": largest[1],
-                "covered_1_sigma": once,
-                "covered_2_sigma": twice,
-            }
             words += (
-                f"{each['rms_deg_h'].value:8.1f}{largest[0]:7.1f}{each['rms_mg'].value:8.3f}{largest[1]:7.3f}"
+                f"{rms(gyro).value * _LSB_DEG_H:8.1f}{largest[0]:7.1f}{rms(accel).value:8.3f}{largest[1]:7.3f}"
                 f" {_percent(once)} {_percent(twice)}"
             )
             if 0.3 <= noise <= 1.0:
@@ -360,7 +310,6 @@ def _integers(noises: dict[float, list[IntegerRun]]) -> Section:
             words += f"{'-':>8}{'-':>7}{'-':>8}{'-':>7}{'-':>9}{'-':>9}"
         if coarse.any():
             kept = covered(np.where(coarse, error, np.nan), sigma, 1.0)
-            each["half_a_step_covered_1_sigma"] = kept
             claims.append(
                 Claim(f"integers, noise {noise:g}: half a step covers", "%", kept.times(100.0), 100.0, 99.9)
             )  # fmt: skip
@@ -372,22 +321,4 @@ def _integers(noises: dict[float, list[IntegerRun]]) -> Section:
         "(+1/2, rms), have the Earth and the pose taken off.",
     ]
     count = len(next(iter(noises.values())))
-    return Section(f"Integers cut toward zero ({count} stands of six axes each)", lines, figures, claims)
-
-
-def _paper(found: dict[paper.Erratum, Array]) -> Section:
-    lines = [
-        "what each error in print makes by itself, rms; accelerometers of specific force, poses within 20 deg",
-        "",
-        f"{'':62}right  forward       up",
-    ]
-    figures: dict[str, Any] = {}
-    for name, errors in found.items():
-        accel = name.startswith("4")
-        scale, unit = (MG, "mg") if accel else (DEG_H, "deg/h")
-        triad = errors[:, 3:] if accel else errors[:, :3]
-        # Body axes of the paper: right, forward, up.
-        axes = [rms(triad[:, axis]).times(1.0 / scale) for axis in (1, 0, 2)]
-        figures[name] = {"words": paper.ERRATA[name], "unit": unit, "right_forward_up": axes}
-        lines.append(f"{paper.ERRATA[name]:58}" + "".join(f"{axis.value:9.1f}" for axis in axes) + f"  {unit}")
-    return Section("The paper's equations as printed", lines, figures)
+    return Section(f"Integers cut toward zero ({count} stands of six axes each)", lines, claims)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -193,7 +193,6 @@ def section(runs: list[PowerUpRun], each: int) -> Section:
         "",
         f"{'':12}{'scatter':>8}{'curve':>8}{'sigma':>8}{'cover':>9}{'ratio':>8}{'last':>8}{'cubic':>8}",
     ]
-    figures: dict[str, Any] = {}
     claims = []
     for k, part in enumerate(TRIED):
         scatter = PARTS[part].gyro.scatter / DEG_H
@@ -208,13 +207,6 @@ def section(runs: list[PowerUpRun], each: int) -> Section:
             f"{part:12}{scatter:8.0f}{ratio.value * scatter:8.1f}{mean * scatter:8.1f}{share.value:7.1f} %"
             f"{ratio.value:8.2f}{before.value:8.0f}{cubic.value:8.0f}"
         )
-        figures[part] = {
-            "scatter_deg_h": scatter,
-            "over_scatter": ratio,
-            "covered": share,
-            "last": before,
-            "cubic": cubic,
-        }
         claims.append(Claim(f"power-up, {part}: rms over run-to-run scatter", "", ratio, AT_MOST))
         claims.append(Claim(f"power-up, {part}: 2 sigma cover", "%", share, COVERS[1], COVERS[0]))
     low, high = AMBIENT_DEGC
@@ -223,4 +215,4 @@ def section(runs: list[PowerUpRun], each: int) -> Section:
         f"{DAYS} days of 5 to 15 min between {low:g} and {high:g} degC, 10 to 25 K of own warmth,",
         "still now and then.",
     ]
-    return Section(f"At power-up, by temperature ({each} aircraft of each part)", lines, figures, claims)
+    return Section(f"At power-up, by temperature ({each} aircraft of each part)", lines, claims)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -27,7 +27,6 @@ def section(runs: list[WarmRun], each: int) -> Section:
         f"{'':27}{'no thermometer':>38}{'thermometer':>35}",
         f"{'':27}" + f"{'10 s 30 s 60 s':>17}{'10 s 30 s 60 s':>18}" * 2,
     ]
-    figures: dict[str, Any] = {}
     claims = []
     for part in WARMING:
         lowest: dict[str, list[Figure]] = {f"{what}{of}": [] for of in ("", ", accel") for what in ("ramps", "curves")}
@@ -45,9 +44,6 @@ def section(runs: list[WarmRun], each: int) -> Section:
                 sizes = [rms(sigma[:, at, _GYRO]).times(1.0 / DEG_H) for at in range(3)]
                 line += "   " + "".join(f"{share.value:5.0f}" for share in shares)
                 line += "   " + "".join(f"{size.value:5.0f}" for size in sizes)
-                figures.setdefault(part, {}).setdefault(words, {})[
-                    "thermometer" if thermometer else "no thermometer"
-                ] = {"covered": shares, "sigma_deg_h": sizes, "accel_covered": accel}
                 if not wanted[0].is_steady:
                     what = "curves" if wanted[0].curve_s else "ramps"
                     lowest[what] += shares
@@ -68,7 +64,7 @@ def section(runs: list[WarmRun], each: int) -> Section:
         f"Ramps in (deg/h)/s, from the first second on. Curves: {CURVE_K:g} K in so many minutes (time constant), seen",
         f"from {' and '.join(f'{late:g} s' for late in LATE_S)} after the switch-on.",
     ]
-    return Section(f"Warm-up ({each} stands in each case)", lines, figures, claims)
+    return Section(f"Warm-up ({each} stands in each case)", lines, claims)
 
 
 def _rows() -> list[tuple[str, list[Case]]]:

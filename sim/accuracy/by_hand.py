@@ -19,7 +19,6 @@ from companion.calibration.means.windows import ImuInput, ImuWindow
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.seconds.counting import Counted, TurnCounter
 from companion.samples import ImuSample
-from sim.accuracy.by_hand import rivals
 from sim.accuracy.stand import GRAVITY_ANOMALY_M_S2, NEXT_S, RATE_HZ, AnomalousSite, local, sites
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array
@@ -31,6 +30,8 @@ STAND_S: Final = 12
 PLACEMENT_DEG: Final = 0.02
 PROPPED_DEG: Final = 5.0
 """One sigma by which hands miss a face, about each axis."""
+ARDUPILOT_READINGS: Final = 50
+"""Number of readings that a level calibration of ArduPilot averages."""
 SLOPE_DEG: Final = 3.0
 """Of the ground on which it is propped."""
 SLOPES_DEG: Final = (0.5, 1.0, 3.0, 5.0)
@@ -53,8 +54,6 @@ class HandRun:
     faces_sigma: Array
     faces_checked: bool
     """No stand was left out or in doubt."""
-    rivals: Array
-    """(imu_tk, ArduPilot, PX4; bias and scale (6))."""
     turn: Array
     """(TURNS, 2) level bias ahead and to the right."""
     turn_sigma: Array
@@ -216,12 +215,6 @@ def by_hand(part: str, seed: int, number: int) -> HandRun:
     earth, ground = local(here.site), _ground(here.site)
     known = faces([one.face() for one in held], earth.gravity_m_s2, earth.gravity_sigma_m_s2, wander_m_s2=_wander(held))
     truth = np.concatenate([bias, here.scale, here.shear])
-    sides = [one.rows for one in held[:6]]
-    others = (
-        rivals.imu_tk([one.rows for one in held], earth.gravity_m_s2),
-        rivals.ardupilot(sides),
-        rivals.px4(sides),
-    )
     read = here.level_reading(bias)
     level_bias = read + np.array([0.0, 0.0, here.gravity_m_s2])
     turns = {(headings, slope): turned(spots[slope].chosen(headings), ground) for headings, slope in TURNS}
@@ -230,12 +223,11 @@ def by_hand(part: str, seed: int, number: int) -> HandRun:
         mounting(steepest.imus[0], Sides(known.figures, known.sigma, np.eye(3)), earth.gravity_m_s2),
         _tilt((read - bias) / (1.0 + here.scale)),
     )
-    first = spots[max(SLOPES_DEG)].stood[0].rows[: rivals.ARDUPILOT_READINGS].mean(axis=0)
+    first = spots[max(SLOPES_DEG)].stood[0].rows[:ARDUPILOT_READINGS].mean(axis=0)
     return HandRun(
         faces=known.figures - truth,
         faces_sigma=known.sigma,
         faces_checked=not known.left_out and not known.in_doubt,
-        rivals=np.array([np.concatenate(one) for one in others]) - truth[:6],
         turn=np.array([found.imus[0].level_bias_m_s2[:2] for found in turns.values()]) - level_bias[:2],
         turn_sigma=np.array([np.sqrt(np.diag(found.imus[0].level_covariance_m2_s4))[:2] for found in turns.values()]),
         slope=np.radians([found.slope_deg - slope for (_, slope), found in turns.items()]),

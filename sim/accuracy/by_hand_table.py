@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from sim.accuracy.by_hand.stands import BY_HAND, PLACEMENT_DEG, PROPPED_DEG, SLOPE_DEG, STAND_S, TURNS, HandRun
+from sim.accuracy.by_hand import BY_HAND, PLACEMENT_DEG, PROPPED_DEG, SLOPE_DEG, STAND_S, TURNS, HandRun
 from sim.accuracy.figures import Claim, Figure, Section, covered, rms
 from sim.earth import Array
 from sim.imu_model import MG
 
 _DEGREE: Final = float(np.radians(1.0))
-_METHODS: Final = ("companion", "imu_tk", "ArduPilot", "PX4")
 _BIAS: Final = slice(0, 3)
 _SCALE: Final = slice(3, 6)
 TURN_MG: Final = 0.25
@@ -26,18 +25,16 @@ def section(runs: list[HandRun], each: int) -> Section:
     """So many aircraft of every part."""
     parts = {part: runs[each * k : each * (k + 1)] for k, part in enumerate(BY_HAND)}
     lines: list[str] = []
-    figures: dict[str, Any] = {}
     claims: list[Claim] = []
     for make in (_turns, _faces, _level):
-        lines += [*make(parts, figures, claims), ""]
+        lines += [*make(parts, claims), ""]
     lines += [
         f"{STAND_S} s each; turned on marks met to {PLACEMENT_DEG:g} deg, gyros of 1 %, 0.5 % from square;",
         f"propped up within {PROPPED_DEG:g} deg on ground that slopes by {SLOPE_DEG:g}.",
         "Biases against their mean over the next 3 min.",
         "New boards: bias 20 mg, scale 0.5 %, shear 0.3 %, put in within 1 deg, gravity 30 mGal off.",
-        "imu_tk: 100 readings of each stand. ArduPilot, PX4: the six sides among them.",
     ]
-    return Section(f"By hand, without a gradienter ({each} aircraft of each part)", lines, figures, claims)
+    return Section(f"By hand, without a gradienter ({each} aircraft of each part)", lines, claims)
 
 
 def _stack(runs: list[HandRun], name: str) -> Array:
@@ -50,7 +47,7 @@ def _covers(words: str, errors: Array, sigmas: Array, claims: list[Claim]) -> Fi
     return found
 
 
-def _turns(parts: dict[str, list[HandRun]], figures: dict[str, Any], claims: list[Claim]) -> list[str]:
+def _turns(parts: dict[str, list[HandRun]], claims: list[Claim]) -> list[str]:
     lines = [
         "headings: horizontal bias when level, rms mg, mean sigma, 2 sigma cover; slope, rms deg",
         "",
@@ -64,12 +61,6 @@ def _turns(parts: dict[str, list[HandRun]], figures: dict[str, Any], claims: lis
             mean = float(sigma.mean()) / MG
             share = covered(error, sigma, 2.0).times(100.0)
             off = rms(_stack(runs, "slope")[:, row]).times(1.0 / _DEGREE)
-            figures.setdefault("turn", {}).setdefault(part, {})[f"{headings}, {slope:g} deg"] = {
-                "rms_mg": found,
-                "sigma_mg": mean,
-                "covered": share,
-                "slope_deg": off,
-            }
             line += f"{found.value:8.3f}{mean:6.3f}{share.value:5.0f} %{off.value:6.3f}"
             claims.append(Claim(f"turn, {part}, {headings} on {slope:g} deg: rms", "mg", found, TURN_MG))
         lines.append(line)
@@ -81,33 +72,27 @@ def _turns(parts: dict[str, list[HandRun]], figures: dict[str, Any], claims: lis
     return lines
 
 
-def _faces(parts: dict[str, list[HandRun]], figures: dict[str, Any], claims: list[Claim]) -> list[str]:
+def _faces(parts: dict[str, list[HandRun]], claims: list[Claim]) -> list[str]:
     lines = [
         "twelve stands: bias, rms mg, and scale, rms %",
         "",
-        f"{'':12}" + "".join(f"{name:>15}" for name in _METHODS) + f"{'sigma':>15}{'2 sigma':>8}",
+        f"{'':12}{'companion':>15}{'sigma':>15}{'2 sigma':>8}",
     ]
     for part, runs in parts.items():
         errors, sigma = _stack(runs, "faces"), _stack(runs, "faces_sigma")
-        each = [errors[:, :6], *np.moveaxis(_stack(runs, "rivals"), 1, 0)]
-        line = f"{part:12}"
-        for name, error in zip(_METHODS, each, strict=True):
-            bias, scale = rms(error[:, _BIAS]).times(1.0 / MG), rms(error[:, _SCALE]).times(100.0)
-            figures.setdefault("faces", {}).setdefault(part, {})[name] = {"bias_mg": bias, "scale_percent": scale}
-            line += f"{bias.value:8.3f}{scale.value:7.4f}"
-            if name == _METHODS[0]:
-                claims.append(Claim(f"faces, {part}: bias, rms", "mg", bias, BIAS_MG))
-                claims.append(Claim(f"faces, {part}: scale, rms", "%", scale, SCALE_PERCENT))
+        bias, scale = rms(errors[:, _BIAS]).times(1.0 / MG), rms(errors[:, _SCALE]).times(100.0)
+        line = f"{part:12}{bias.value:8.3f}{scale.value:7.4f}"
+        claims.append(Claim(f"faces, {part}: bias, rms", "mg", bias, BIAS_MG))
+        claims.append(Claim(f"faces, {part}: scale, rms", "%", scale, SCALE_PERCENT))
         share = _covers(f"faces, {part}", errors, sigma, claims)
         checked = Figure(100.0 * float(_stack(runs, "faces_checked").mean()), 0.0)
-        figures["faces"][part] |= {"covered": share, "no_stand_blamed": checked}
         line += f"{sigma[:, _BIAS].mean() / MG:8.3f}{100.0 * sigma[:, _SCALE].mean():7.4f}{share.value:6.0f} %"
         claims.append(Claim(f"faces, {part}: no good stand blamed", "%", checked, 100.0, 98.0))
         lines.append(line)
     return lines
 
 
-def _level(parts: dict[str, list[HandRun]], figures: dict[str, Any], claims: list[Claim]) -> list[str]:
+def _level(parts: dict[str, list[HandRun]], claims: list[Claim]) -> list[str]:
     lines = [
         "the board against the base, on 5 deg of slope: rms deg, 2 sigma cover; a firmware's own level there",
         "",
@@ -117,6 +102,5 @@ def _level(parts: dict[str, list[HandRun]], figures: dict[str, Any], claims: lis
         found, theirs = (rms(one).times(1.0 / _DEGREE) for one in (error, _stack(runs, "level_firmware")))
         claims.append(Claim(f"level, {part}: rms", "deg", found, LEVEL_DEG))
         share = _covers(f"level, {part}", error, sigma, claims)
-        figures.setdefault("level", {})[part] = {"rms_deg": found, "covered": share, "firmware_deg": theirs}
         lines.append(f"{part:12}{found.value:8.4f}{share.value:7.0f} %{theirs.value:8.2f}")
     return lines

@@ -1,1 +1,0 @@
-"""Accelerometers of an aircraft that somebody turns and props up, without a gradienter."""
