@@ -1,23 +1,23 @@
-"""Serial IMUs with binary frames of the virtual aircraft: MicroStrain MIP, Xsens MTData2, STIM300.
+"""Serial IMUs with binary frames: MicroStrain MIP, Xsens MTData2, STIM300, WitMotion.
 
-Each says its model's readings in the axes that the real device has, and obeys the commands that start and stop it.
+Each sends its model's readings in the axes that the real device has, and obeys the commands that start and stop it.
 """
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
+from sim.aircraft import VirtualAircraft
 from sim.devices import Frame, ImuDevice
 from sim.earth import Array
 from sim.imu_model import ImuModel
 
 _G = 9.80665
-_FIELD_GAUSS = (0.28, 0.0, 0.45)
-"""North (magnetic), east, down."""
 
 
 def mip_packet(descriptor_set: int, *fields: tuple[int, bytes]) -> bytes:
@@ -34,8 +34,8 @@ def mip_packet(descriptor_set: int, *fields: tuple[int, bytes]) -> bytes:
 class _Commanded(ImuDevice):
     """A device that answers to messages of a known form."""
 
-    def __init__(self, imu: ImuModel, *, rate_hz: float | None = None, clock_ppm: float = 0.0) -> None:
-        super().__init__(imu, rate_hz=rate_hz, clock_ppm=clock_ppm)
+    def __init__(self, imu: ImuModel, **line: Any) -> None:
+        super().__init__(imu, **line)
         self._pending = b""
 
     ANSWERS: ClassVar[dict[bytes, tuple[bytes, bool | None]]]
@@ -112,7 +112,7 @@ class XsensImu(_Commanded):
         messages = []
         for number, (time, device_s, reading) in enumerate(self._readings(times_s, first), first):
             gx, gy, gz, ax, ay, az = reading
-            mx, my, mz = self.imu.mounting.T @ self.aircraft.body_from_ned(time) @ np.array(_FIELD_GAUSS) / 0.53
+            mx, my, mz = self.imu.mounting.T @ self.aircraft.field_gauss(time) / self.aircraft.site.field_gauss
             fields = (
                 (0x1020, struct.pack(">H", number % 65536)),
                 (0x1060, struct.pack(">I", round(device_s * 1e4) % 2**32)),
@@ -150,10 +150,8 @@ class Stim300(ImuDevice):
     """Sensonor STIM300 on its base, X forward, Y left, Z up: datagram 0xA7 with all but AUX (TS1524 rev. 31).
 
     Args:
-        range_g: of the accelerometers: 5, 10, 30 or 80.
         upside_down: on its lid instead: X forward, Y right, Z down.
         inclination_noise_g: of each inclinometer.
-        crlf: whether each datagram ends with CR LF.
     """
 
     protocol = "stim300"
@@ -161,38 +159,32 @@ class Stim300(ImuDevice):
     default_rate_hz = 250.0
     LATENCY_S = 506e-6
     TICKS_A_SECOND = 2000
-    BITS: ClassVar[dict[int, tuple[int, int]]] = {10: (0, 19), 5: (3, 20), 30: (4, 18), 80: (6, 16)}
-    """Range: its code in the configuration datagram, and the bits after the point."""
+    RANGE_CODE, ACCEL_BITS = 0, 19
+    """Accelerometers of 10 g: the code in the configuration datagram, and the bits after the point."""
 
     def __init__(
         self,
         imu: ImuModel,
         *,
-        range_g: int = 10,
         upside_down: bool = False,
         inclination_noise_g: float = 1e-5,
-        crlf: bool = False,
         seed: int = 0,
-        rate_hz: float | None = None,
-        clock_ppm: float = 0.0,
+        **line: Any,
     ) -> None:
-        super().__init__(imu, rate_hz=rate_hz, clock_ppm=clock_ppm)
-        self.range_g, self.upside_down, self.inclination_noise_g = range_g, upside_down, inclination_noise_g
-        self._end = b"\r\n" if crlf else b""
+        super().__init__(imu, **line)
+        self.upside_down, self.inclination_noise_g = upside_down, inclination_noise_g
         self._random = np.random.default_rng([seed, 7])
 
     def banner(self) -> bytes:
         """Part number, serial number, configuration."""
-        ends = bool(self._end)
-        code = self.BITS[self.range_g][0]
+        code = self.RANGE_CODE
         settings = bytearray(22)
-        settings[0] = 0xBD if ends else 0xBC
-        settings[1:5] = b"\x52\x01" + bytes((0x2E | ends, 0x20))  # 250 Hz; temperature, inclination, acceleration
+        settings[0] = 0xBC
+        settings[1:5] = b"\x52\x01\x2e\x20"  # 250 Hz; temperature, inclination, acceleration
         settings[5] = settings[8] = settings[11] = 0x70  # all axes active; rate, acceleration
         settings[17], settings[18] = code << 4 | code, code << 4
-        part = bytes((0xB3 if ends else 0xB1,)) + bytes(15)
-        serial = bytes((0xB7 if ends else 0xB5,)) + b"N" + bytes(14)
-        return b"".join(stim_datagram(each) + self._end for each in (part, serial, bytes(settings)))
+        part, serial = b"\xb1" + bytes(15), b"\xb5N" + bytes(14)
+        return b"".join(stim_datagram(each) for each in (part, serial, bytes(settings)))
 
     def frames_until(self, t_s: float) -> list[Frame]:
         """The frames, which tell of a moment somewhat before they are sent."""
@@ -204,19 +196,18 @@ class Stim300(ImuDevice):
         g = (self.aircraft.truth(sampled_s).force_m_s2 @ self.imu.mounting) / _G
         inclinations = g + self.inclination_noise_g * self._random.standard_normal(g.shape)
         signs = np.array([1.0, 1.0, 1.0] if self.upside_down else [1.0, -1.0, -1.0])
-        bits = self.BITS[self.range_g][1]
         datagrams = []
         readings = self._readings(sampled_s, first)
         for (time, device_s, reading), inclination in zip(readings, inclinations, strict=True):
             rate_deg_s = np.degrees(reading[:3]) * signs
             accel_g = np.asarray(reading[3:]) / _G * signs
-            body = bytes((0xA7,)) + _cluster(rate_deg_s, 14) + _cluster(accel_g, bits)
+            body = bytes((0xA7,)) + _cluster(rate_deg_s, 14) + _cluster(accel_g, self.ACCEL_BITS)
             body += _cluster(inclination * signs, 22)
             degrees = round(self.imu.temperature_degc(time) * 256)
             body += 3 * (struct.pack(">3h", degrees, degrees, degrees) + b"\0")
             ticks = round(device_s * self.TICKS_A_SECOND) % 256
             body += struct.pack(">BH", ticks, round(self.LATENCY_S * 1e6))
-            datagrams.append(stim_datagram(body) + self._end)
+            datagrams.append(stim_datagram(body))
         return datagrams
 
 
@@ -224,3 +215,47 @@ def _cluster(values: Sequence[float] | Array, bits: int) -> bytes:
     """Three values as 24-bit numbers with so many bits after the point, and a status without complaint."""
     counts = [max(-(2**23), min(2**23 - 1, round(float(value) * 2**bits))) for value in values]
     return b"".join(struct.pack(">i", count)[1:] for count in counts) + b"\0"
+
+
+WIT_Z_UP = (180.0, 0.0, 0.0)
+"""Mounting of a WitMotion device with X forward, Y left, Z up: roll, pitch, yaw of its axes seen from the vehicle's."""
+
+
+def wit_packet(kind: int, values: Sequence[float], last: int = 0) -> bytes:
+    """Three numbers cut to 16 bits, a fourth, and the sum."""
+    cut = [max(-32768, min(32767, round(value))) for value in values]
+    body = bytes([0x55, kind]) + struct.pack("<4h", *cut, last)
+    return body + bytes([sum(body) % 256])
+
+
+def wit_angles_deg(aircraft: VirtualAircraft, t_s: float, mounting: Array) -> tuple[float, float, float]:
+    """Roll, pitch and yaw, turned Z-Y-X from east, north, up to the device's own axes, of its apparent attitude."""
+    x, y, z = (mounting.T @ aircraft.truth_at(t_s).force_m_s2).tolist()
+    roll, pitch = math.degrees(math.atan2(y, z)), math.degrees(math.atan2(-x, math.hypot(y, z)))
+    north, east, _ = (aircraft.body_from_ned(t_s).T @ mounting[:, 0]).tolist()
+    return roll, pitch, math.degrees(math.atan2(north, east))
+
+
+class WitMotionImu(ImuDevice):
+    """WitMotion nine-axis device at 200 Hz: 11-byte frames of acceleration, rate, angles, field.
+
+    WT901 data sheet p. 10-14, WT901SDCL p. 13-16. Its axes are those of the IMU's mounting.
+    """
+
+    protocol = "witmotion"
+    baud = 115200
+
+    def encode(self, times_s: Array, first: int) -> list[bytes]:
+        """Return four frames a sample."""
+        return [self._epoch(time, reading) for time, _, reading in self._readings(times_s, first)]
+
+    def _epoch(self, t_s: float, reading: Sequence[float]) -> bytes:
+        degc = round(self.imu.temperature_degc(t_s) * 100.0)
+        angles = wit_angles_deg(self.aircraft, t_s, self.imu.mounting)
+        field_mg = (self.imu.mounting.T @ self.aircraft.field_gauss(t_s) * 1000.0).tolist()
+        return (
+            wit_packet(0x51, [value / _G / 16.0 * 32768.0 for value in reading[3:]], degc)
+            + wit_packet(0x52, [math.degrees(value) / 2000.0 * 32768.0 for value in reading[:3]], degc)
+            + wit_packet(0x53, [angle / 180.0 * 32768.0 for angle in angles])
+            + wit_packet(0x54, field_mg, degc)
+        )

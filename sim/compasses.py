@@ -1,27 +1,25 @@
-"""More compasses: Honeywell's HMR3000 and what else speaks NMEA 0183, and OceanServer's OS5000.
-
-Their tilt is that of `sim.devices.Gradienter`: lag, offset and noise are given in the same way.
-"""
+"""Compasses besides the HMR3300: what else speaks NMEA 0183, OceanServer's OS5000, RION's HCM370B, PNI's TRAX."""
 
 from __future__ import annotations
 
-import math
+import binascii
 import re
+import struct
 from functools import reduce
 from operator import xor
-from typing import Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from sim.aircraft import VirtualAircraft
-from sim.devices import Frame, Gradienter, Law, nmea
+from sim.devices import Compass, Frame, Gradienter, Magnetic, nmea
 
-Sentence = Literal["HPR", "HDG", "HDM", "HDT", "THS", "XDR", "CCD"]
-_COMMAND_LIMIT = 64
+Sentence = Literal["HPR", "HDT"]
+_COMMAND_LIMIT: Final = 64
 
 
-class TiltCompass(Gradienter):
-    """What the compasses here have in common: a magnetic heading, and the tilt of a gradienter."""
+class FluidCompass(Magnetic, Gradienter):
+    """A compass with the tilt of a gradienter: lag, offset and noise are given in the same way."""
 
     def __init__(
         self,
@@ -30,49 +28,20 @@ class TiltCompass(Gradienter):
         seed: int = 0,
         heading_error_deg: float = 0.0,
         heading_noise_deg: float = 0.05,
-        law: Law = "axis",
-        tilt_error_deg: tuple[float, float] = (0.0, 0.0),
-        tilt_noise_deg: float = 0.02,
-        lag_s: float = 0.0,
-        mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        rate_hz: float | None = None,
-        clock_ppm: float = 0.0,
+        noise_deg: float = 0.02,
+        **more: Any,
     ) -> None:
-        pitch_error_deg, roll_error_deg = tilt_error_deg
-        super().__init__(
-            aircraft,
-            seed=seed,
-            law=law,
-            offset_deg=(roll_error_deg, pitch_error_deg),
-            noise_deg=tilt_noise_deg,
-            lag_s=lag_s,
-            mounting_deg=mounting_deg,
-            rate_hz=rate_hz,
-            clock_ppm=clock_ppm,
-        )
+        super().__init__(aircraft, seed=seed, noise_deg=noise_deg, **more)
         self.heading_error_deg, self.heading_noise_deg = heading_error_deg, heading_noise_deg
         self._heading_random = np.random.default_rng([seed, 15])
         self._pending = b""
 
-    def magnetic_deg(self, t_s: float) -> float:
-        """Magnetic heading with error and noise, not wrapped."""
-        _, _, heading = self.aircraft.mounted_angles_rad(t_s, self._mounting)
-        noise = self.heading_noise_deg * float(self._heading_random.standard_normal())
-        return math.degrees(heading) - self.aircraft.site.declination_deg + self.heading_error_deg + noise
 
-    def field_mg(self, t_s: float) -> list[float]:
-        """Magnetic field in milligauss, in the device's own axes: forward, right, down."""
-        declination = math.radians(self.aircraft.site.declination_deg)
-        ned = np.array([280.0 * math.cos(declination), 280.0 * math.sin(declination), 450.0])
-        field: list[float] = (self._mounting.T @ self.aircraft.body_from_ned(t_s) @ ned).tolist()
-        return field
+class NmeaCompass(FluidCompass):
+    """HMR3000 (Honeywell 900240): HPR, and HDT as other makers' compasses send it.
 
-
-class NmeaCompass(TiltCompass):
-    """HMR3000 (Honeywell 900240): any of its sentences, in its order; HDM and THS stand for other makers' compasses.
-
-    It comes from the factory with none enabled. `$PTNT,HPR*78` and the like ask for one. Beyond the alarm level of a
-    tilt, or with `magnetic_alarm`, HPR has empty fields. Tilt is the elevation of the board's axes (CCD, p. 15).
+    It comes from the factory with no sentence enabled. `$PTNT,HPR*78` and the like ask for one. Tilt is the elevation
+    of the board's axes (p. 15).
     """
 
     protocol = "nmea"
@@ -83,89 +52,43 @@ class NmeaCompass(TiltCompass):
         self,
         aircraft: VirtualAircraft,
         *,
-        seed: int = 0,
         sentences: tuple[Sentence, ...] = ("HPR",),
-        deviation_deg: float = 0.0,
-        alarm_deg: float = 40.0,
-        heading_error_deg: float = 0.0,
-        heading_noise_deg: float = 0.05,
-        tilt_error_deg: tuple[float, float] = (0.0, 0.0),
-        tilt_noise_deg: float = 0.02,
         lag_s: float = 0.288,
-        mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        rate_hz: float | None = None,
-        clock_ppm: float = 0.0,
+        **more: Any,
     ) -> None:
-        super().__init__(
-            aircraft,
-            seed=seed,
-            heading_error_deg=heading_error_deg,
-            heading_noise_deg=heading_noise_deg,
-            tilt_error_deg=tilt_error_deg,
-            tilt_noise_deg=tilt_noise_deg,
-            lag_s=lag_s,
-            mounting_deg=mounting_deg,
-            rate_hz=rate_hz,
-            clock_ppm=clock_ppm,
-        )
-        self.sentences, self.deviation_deg, self.alarm_deg = sentences, deviation_deg, alarm_deg
-        self.magnetic_alarm = False
+        super().__init__(aircraft, lag_s=lag_s, **more)
+        self.sentences = sentences
 
     def _lines(self, t_s: float) -> bytes:
+        return b"".join(nmea(self._body(name, t_s)) for name in self.sentences)
+
+    def _body(self, name: Sentence, t_s: float) -> str:
         roll, pitch = self.reading_deg(t_s)
         magnetic = self.magnetic_deg(t_s)
-        return b"".join(nmea(self._body(name, t_s, magnetic, pitch, roll)) for name in self.sentences)
-
-    def _body(self, name: Sentence, t_s: float, magnetic_deg: float, pitch_deg: float, roll_deg: float) -> str:
-        variation = self.aircraft.site.declination_deg
-        if name == "HDG":
-            sensor = _circle(magnetic_deg - self.deviation_deg)
-            return f"HCHDG,{sensor},{_sided(self.deviation_deg)},{_sided(variation)}"
-        if name == "HDM":
-            return f"HCHDM,{_circle(magnetic_deg)},M"
         if name == "HDT":
-            return f"HCHDT,{_circle(magnetic_deg + variation)},T"
-        if name == "THS":
-            return f"GPTHS,{_circle(magnetic_deg + variation)},A"
-        x, y, z = self.field_mg(t_s)
-        if name == "XDR":
-            total = math.sqrt(x * x + y * y + z * z)
-            field = f"G,{x:.1f},,MAGX,G,{y:.1f},,MAGY,G,{z:.1f},,MAGZ,G,{total:.1f},,MAGT"
-            return f"HCXDR,A,{pitch_deg:.1f},D,PITCH,A,{roll_deg:.1f},D,ROLL,{field}"
-        if name == "CCD":
-            tangents = [round(32768.0 * math.tan(math.radians(angle))) for angle in (pitch_deg, roll_deg)]
-            counts = [round(4.0 * each) for each in (x, y, z, math.sqrt(x * x + y * y + z * z))]
-            return f"PTNTCCD,{','.join(map(str, tangents + counts))},{_circle(magnetic_deg)}"
-        pitch, roll = self._alarmed(pitch_deg), self._alarmed(roll_deg)
-        steady = pitch[0] and roll[0] and not self.magnetic_alarm
-        heading = _circle(magnetic_deg) if steady else ""
-        return f"PTNTHPR,{heading},{'P' if self.magnetic_alarm else 'N'},{','.join(pitch)},{','.join(roll)}"
-
-    def _alarmed(self, angle_deg: float) -> tuple[str, str]:
-        return ("", "P") if abs(angle_deg) > self.alarm_deg else (f"{angle_deg:.1f}", "N")
+            return f"HCHDT,{_circle(magnetic + self.aircraft.site.declination_deg)},T"
+        return f"PTNTHPR,{_circle(magnetic)},N,{pitch:.1f},N,{roll:.1f},N"
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """One sentence for each right question; everything else is passed over."""
+        """Answer each right question with its sentence; pass over everything else."""
         answer = b""
         self._pending += data
         while b"\n" in self._pending:
             line, _, self._pending = self._pending.partition(b"\n")
-            match = re.fullmatch(rb"\$((?:PTNT|TNHCQ),(HPR|CCD|HDG|HDT|XDR))\*([0-9A-F]{2})\r", line)
+            match = re.fullmatch(rb"\$((?:PTNT|TNHCQ),(HPR|HDT))\*([0-9A-F]{2})\r", line)
             if match and reduce(xor, match[1], 0) == int(match[3], 16):
-                roll, pitch = self.reading_deg(t_s)
-                name: Sentence = match[2].decode()  # type: ignore[assignment]
-                answer += nmea(self._body(name, t_s, self.magnetic_deg(t_s), pitch, roll))
+                answer += nmea(self._body("HPR" if match[2] == b"HPR" else "HDT", t_s))
         self._pending = self._pending[-_COMMAND_LIMIT:]
         return answer
 
     def frames_until(self, t_s: float) -> list[Frame]:
-        """None while no sentence is enabled."""
+        """Return nothing while no sentence is enabled."""
         self.streaming = bool(self.sentences)
         return super().frames_until(t_s)
 
 
-class Os5000(TiltCompass):
-    """OceanServer OS5000: `$C` sentences (user's guide, format type 0x01); with `vectors` those of field and gravity.
+class Os5000(FluidCompass):
+    """OceanServer OS5000: `$C` sentences (user's guide, format type 0x01).
 
     `<esc>R` and a number set its rate, 0 stops it. Its tilt comes from accelerometers.
     """
@@ -174,44 +97,16 @@ class Os5000(TiltCompass):
     baud = 19200
     default_rate_hz = 10.0
 
-    def __init__(
-        self,
-        aircraft: VirtualAircraft,
-        *,
-        seed: int = 0,
-        vectors: bool = False,
-        heading_error_deg: float = 0.0,
-        heading_noise_deg: float = 0.05,
-        tilt_error_deg: tuple[float, float] = (0.0, 0.0),
-        mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        rate_hz: float | None = None,
-        clock_ppm: float = 0.0,
-    ) -> None:
-        super().__init__(
-            aircraft,
-            seed=seed,
-            heading_error_deg=heading_error_deg,
-            heading_noise_deg=heading_noise_deg,
-            law="euler",
-            tilt_error_deg=tilt_error_deg,
-            mounting_deg=mounting_deg,
-            rate_hz=rate_hz,
-            clock_ppm=clock_ppm,
-        )
-        self.vectors = vectors
+    def __init__(self, aircraft: VirtualAircraft, **more: Any) -> None:
+        super().__init__(aircraft, law="euler", lag_s=0.0, **more)
 
     def _lines(self, t_s: float) -> bytes:
         roll, pitch = self.reading_deg(t_s)
         temperature = self.aircraft.temperature_degc(t_s)
-        body = f"C{_circle(self.magnetic_deg(t_s))}P{pitch:.1f}R{roll:.1f}T{temperature:.1f}"
-        if self.vectors:
-            x, y, z = self.field_mg(t_s)
-            force = self._mounting.T @ self.aircraft.truth_at(t_s).force_m_s2 / -9.80665
-            body += f"Mx{x:.2f}My{y:.2f}Mz{z:.2f}Ax{force[0]:.3f}Ay{force[1]:.3f}Az{force[2]:.3f}"
-        return nmea(body)
+        return nmea(f"C{_circle(self.magnetic_deg(t_s))}P{pitch:.1f}R{roll:.1f}T{temperature:.1f}")
 
     def command(self, data: bytes, t_s: float) -> bytes:
-        """`<esc>R<number><space>` takes effect; the other settings are passed over."""
+        """Obey `<esc>R<number><space>`; pass over the other settings."""
         self._pending += data
         while match := re.search(rb"\x1b([A-Z*])(-?\d{1,6}) ", self._pending):
             self._pending = self._pending[match.end() :]
@@ -226,5 +121,181 @@ def _circle(angle_deg: float) -> str:
     return f"{round(angle_deg * 10.0) % 3600 / 10.0:.1f}"
 
 
-def _sided(angle_deg: float) -> str:
-    return f"{abs(angle_deg):.1f},{'W' if angle_deg < 0.0 else 'E'}"
+# ------------------------------------------------------------------------------------------------- RION
+
+
+def rion_packet(command: int, data: bytes = b"") -> bytes:
+    """0x68, length, address 0, command, data, and the sum of all but the first."""
+    body = bytes([len(data) + 4, 0, command]) + data
+    return b"\x68" + body + bytes([sum(body) % 256])
+
+
+def rion_decimal(angle_deg: float, digits: int, decimals: int) -> bytes:
+    """Two digits a byte, of which the first one is the sign."""
+    text = f"{round(abs(angle_deg) * 10**decimals):0{digits - 1}d}"
+    return bytes.fromhex(("1" if angle_deg < 0.0 and int(text) else "0") + text)
+
+
+class RionCommands:
+    """Collects the commands that a RION device obeys: read (04) and output mode (0C), to address 00 or FF."""
+
+    LONGEST: Final = 16
+
+    def __init__(self) -> None:
+        self._pending = b""
+
+    def take(self, data: bytes) -> list[tuple[int, bytes]]:
+        """Return the whole commands in what has come so far."""
+        commands = []
+        self._pending += data
+        while len(self._pending) >= 2:
+            size = self._pending[1] + 1
+            if self._pending[0] == 0x68 and 5 <= size <= self.LONGEST:
+                if len(self._pending) < size:
+                    break
+                frame = self._pending[:size]
+                if sum(frame[1:-1]) % 256 == frame[-1] and frame[2] in (0x00, 0xFF):
+                    commands.append((frame[3], frame[4:-1]))
+                    self._pending = self._pending[size:]
+                    continue
+            self._pending = self._pending[1:]
+        return commands
+
+
+class RionCompass(Compass):
+    """HCM370B: pitch nose up, roll right side down, heading (magnetic), to a hundredth of a degree; 9600 8N1.
+
+    It comes in the mode in which it only answers; 0C 01 makes it speak by itself, which it remembers (HCM370B and
+    HCM705B manuals).
+    """
+
+    protocol = "rion"
+    baud = 9600
+    default_rate_hz = 5.0
+    STREAM = 22
+
+    def __init__(self, aircraft: VirtualAircraft, *, automatic: bool = False, **more: Any) -> None:
+        super().__init__(aircraft, **more)
+        self.streaming = self.automatic = automatic
+        self._commands = RionCommands()
+
+    def power_on(self, t_s: float) -> bytes:
+        """Start in the mode that was set last."""
+        said = super().power_on(t_s)
+        self.streaming = self.automatic
+        return said
+
+    def reading(self, t_s: float) -> bytes:
+        """Return the answer to 04."""
+        pitch, roll = self.tilt_deg(t_s)
+        hundredths = round(self.magnetic_deg(t_s) * 100.0) % 36000
+        angles = (pitch, roll, hundredths / 100.0)
+        return rion_packet(0x84, b"".join(rion_decimal(angle, 6, 2) for angle in angles))
+
+    def command(self, data: bytes, t_s: float) -> bytes:
+        """Answer whole commands."""
+        answer = b""
+        for command, argument in self._commands.take(data):
+            if command == 0x04:
+                answer += self.reading(t_s)
+            elif command == 0x0C and argument in (b"\0", b"\1"):
+                self.streaming = self.automatic = argument == b"\1"
+                answer += rion_packet(0x8C, b"\0")
+        return answer
+
+
+# -------------------------------------------------------------------------------------------------- PNI
+
+
+def pni_packet(frame_id: int, payload: bytes = b"") -> bytes:
+    """Byte count, frame id, payload, CRC-16/XMODEM."""
+    head = (len(payload) + 5).to_bytes(2, "big") + bytes([frame_id]) + payload
+    return head + binascii.crc_hqx(head, 0).to_bytes(2, "big")
+
+
+class PniCompass(Compass):
+    """PNI TRAX: heading (magnetic), pitch nose up and roll right side down (PNI TRAX manual r06, p. 36-50).
+
+    It comes in poll mode: kGetData is answered with the components that kSetDataComponents has chosen, which a new
+    power-on forgets unless kSave has come. kStartContinuousMode and kStopContinuousMode are obeyed.
+    """
+
+    protocol = "pni"
+    baud = 38400
+    default_rate_hz = 10.0
+    STREAM = 21
+    FACTORY_COMPONENTS: Final = (5, 79)
+    """Heading and its status. What a device really comes with is not documented."""
+
+    def __init__(self, aircraft: VirtualAircraft, *, continuous: bool = False, **more: Any) -> None:
+        super().__init__(aircraft, **more)
+        self.streaming = self.continuous = continuous
+        self.saves = 0
+        """Number of writes to its non-volatile memory."""
+        self.components: tuple[int, ...] = self.FACTORY_COMPONENTS
+        self._saved: tuple[int, ...] = self.FACTORY_COMPONENTS
+
+    def power_on(self, t_s: float) -> bytes:
+        """Forget what was not saved."""
+        said = super().power_on(t_s)
+        self.streaming, self.components, self._pending = self.continuous, self._saved, b""
+        return said
+
+    def reading(self, t_s: float) -> bytes:
+        """Return the answer to kGetData."""
+        known = self._values(t_s)
+        data = bytes([len(self.components)])
+        for component in self.components:
+            value = known[component]
+            data += bytes([component]) + (bytes([value]) if isinstance(value, int) else struct.pack(">f", value))
+        return pni_packet(5, data)
+
+    def _values(self, t_s: float) -> dict[int, float | int]:
+        heading = self.magnetic_deg(t_s)
+        pitch, roll = self.tilt_deg(t_s)
+        g = (self._mounting.T @ self.aircraft.truth_at(t_s).force_m_s2 / 9.80665).tolist()
+        field_ut = (self.field_gauss(t_s) * 100.0).tolist()
+        return {
+            5: round(heading % 360.0, 2) % 360.0,
+            7: self.aircraft.temperature_degc(t_s),
+            8: 0,  # distorted
+            9: 1,  # calibrated
+            **dict(zip((21, 22, 23), g, strict=True)),
+            24: pitch,
+            25: roll,
+            **dict(zip((27, 28, 29), field_ut, strict=True)),
+            79: 1,
+        }
+
+    def command(self, data: bytes, t_s: float) -> bytes:
+        """Obey frames with a right CRC; pass over everything else byte by byte."""
+        answer = b""
+        self._pending += data
+        while len(self._pending) >= 2:
+            size = int.from_bytes(self._pending[:2], "big")
+            if 5 <= size <= _COMMAND_LIMIT:
+                if len(self._pending) < size:
+                    break
+                body, crc = self._pending[: size - 2], self._pending[size - 2 : size]
+                if binascii.crc_hqx(body, 0) == int.from_bytes(crc, "big"):
+                    self._pending = self._pending[size:]
+                    answer += self._obey(body[2], body[3:], t_s)
+                    continue
+            self._pending = self._pending[1:]
+        return answer
+
+    def _obey(self, frame_id: int, payload: bytes, t_s: float) -> bytes:
+        if frame_id == 1:
+            return pni_packet(2, b"TRAX1208")
+        if frame_id == 3 and payload and len(payload) == 1 + payload[0]:
+            if set(payload[1:]) <= set(self._values(t_s)):
+                self.components = tuple(payload[1:])
+        elif frame_id == 4 and not self.streaming:
+            return self.reading(t_s)
+        elif frame_id == 9:
+            self.saves += 1
+            self._saved = self.components
+            return pni_packet(16, b"\0\0")
+        elif frame_id in (21, 22):
+            self.streaming = frame_id == 21
+        return b""

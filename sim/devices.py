@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from functools import reduce
 from operator import xor
-from typing import Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -112,16 +112,40 @@ COUNTS_PER_GAUSS = 4000.0
 """Of the virtual HMR3300's magnetometer lines; the real one's data sheet gives their counts no unit."""
 
 
-class HMR3300(SerialDevice):
-    """Honeywell HMR3300 magnetic compass: `123.4, 18.6, -0.5` CR LF at 8 Hz, 19200 8N1 (Honeywell data sheet).
+class Magnetic:
+    """Magnetic heading and field of a mounted device; mixed into its class."""
 
-    Heading is magnetic; tilt comes from accelerometers and so suffers from every acceleration. `*S` toggles the
-    stream, `*Q` asks for one line while stopped, `*H` and `*M` choose heading or magnetometer lines.
+    aircraft: VirtualAircraft
+    _mounting: Array
+    heading_error_deg: float
+    heading_noise_deg: float
+    _heading_random: np.random.Generator
+
+    def magnetic_deg(self, t_s: float) -> float:
+        """Return the magnetic heading with error and noise, not wrapped."""
+        _, _, heading = self.aircraft.mounted_angles_rad(t_s, self._mounting)
+        noise = self.heading_noise_deg * float(self._heading_random.standard_normal())
+        return math.degrees(heading - self.aircraft.declination_rad(t_s)) + self.heading_error_deg + noise
+
+    def field_gauss(self, t_s: float) -> Array:
+        """Return the magnetic field in the device's axes: forward, right, down."""
+        field: Array = self._mounting.T @ self.aircraft.field_gauss(t_s)
+        return field
+
+
+class Compass(Magnetic, SerialDevice):
+    """A compass whose tilt comes from accelerometers, and so suffers from every acceleration.
+
+    Args:
+        aircraft: the truth.
+        seed: of the noise.
+        heading_error_deg, heading_noise_deg: constant error, and one sigma of the noise of a reading.
+        mounting_deg: roll, pitch, yaw of the device's axes seen from the vehicle's.
+        line: arguments of `SerialDevice`.
     """
 
-    protocol = "hmr3300"
-    baud = 19200
-    default_rate_hz = 8.0
+    STREAM: ClassVar[int]
+    """Number of the device's own stream of random numbers."""
 
     def __init__(
         self,
@@ -130,63 +154,58 @@ class HMR3300(SerialDevice):
         seed: int = 0,
         heading_error_deg: float = 0.0,
         heading_noise_deg: float = 0.05,
-        lag_s: float = 0.0,
-        field_noise_gauss: float = 0.0003,
-        tilt_error_deg: tuple[float, float] = (0.0, 0.0),
         mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        rate_hz: float | None = None,
-        clock_ppm: float = 0.0,
+        **line: Any,
     ) -> None:
-        super().__init__(aircraft, rate_hz=rate_hz, clock_ppm=clock_ppm)
-        self.heading_error_deg, self.heading_noise_deg, self.tilt_error_deg = (
-            heading_error_deg,
-            heading_noise_deg,
-            tilt_error_deg,
-        )
-        self.field_noise_gauss, self.lag_s = field_noise_gauss, lag_s
-        self._followed: tuple[float, float, float] | None = None
-        self.magnetometer_mode = False
+        super().__init__(aircraft, **line)
+        self.heading_error_deg, self.heading_noise_deg = heading_error_deg, heading_noise_deg
         self._mounting = mounting_matrix(*mounting_deg)
-        self._random = np.random.default_rng([seed, 5])
+        self._random = self._heading_random = np.random.default_rng([seed, self.STREAM])
         self._pending = b""
+
+    def tilt_deg(self, t_s: float) -> tuple[float, float]:
+        """Return pitch nose up and roll right side down, as accelerometers show them."""
+        x, y, z = (self._mounting.T @ self.aircraft.truth_at(t_s).force_m_s2).tolist()
+        return math.degrees(math.atan2(x, math.hypot(y, z))), math.degrees(math.atan2(-y, -z))
+
+    @abstractmethod
+    def reading(self, t_s: float) -> bytes:
+        """Return one reading as the device sends it."""
+
+    def encode(self, times_s: Array, first: int) -> list[bytes]:
+        """Return one reading a sample."""
+        return [self.reading(float(time)) for time in times_s]
+
+
+class HMR3300(Compass):
+    """Honeywell HMR3300 magnetic compass: `123.4, 18.6, -0.5` CR LF at 8 Hz, 19200 8N1 (Honeywell data sheet).
+
+    `*S` toggles the stream, `*Q` asks for one line while stopped, `*H` and `*M` choose heading or magnetometer lines.
+    """
+
+    protocol = "hmr3300"
+    baud = 19200
+    default_rate_hz = 8.0
+    STREAM = 5
+
+    def __init__(self, aircraft: VirtualAircraft, **more: Any) -> None:
+        super().__init__(aircraft, **more)
+        self.field_noise_gauss = 0.0003
+        self.magnetometer_mode = False
 
     def banner(self) -> bytes:
         """Model and firmware; the exact words of the real one are not documented."""
         return b"HMR3300 V1.00\r\n"
 
-    def encode(self, times_s: Array, first: int) -> list[bytes]:
-        """One line a sample."""
-        return [self._line(float(time)) for time in times_s]
-
-    def _line(self, t_s: float) -> bytes:
+    def reading(self, t_s: float) -> bytes:
+        """Return one line."""
         if self.magnetometer_mode:
-            field = self._mounting.T @ self.aircraft.field_gauss(t_s)
-            field = field + self.field_noise_gauss * self._random.standard_normal(3)
+            field = self.field_gauss(t_s) + self.field_noise_gauss * self._random.standard_normal(3)
             counts = field * COUNTS_PER_GAUSS
             return ", ".join(str(round(float(count))) for count in counts).encode() + b"\r\n"
-        _, _, heading = self.aircraft.mounted_angles_rad(t_s, self._mounting)
-        noise = self.heading_noise_deg * float(self._random.standard_normal())
-        declination = self.aircraft.declination_rad(t_s)
-        magnetic = self._follow(t_s, math.degrees(heading - declination)) + self.heading_error_deg + noise
-        tenths = round(magnetic * 10.0) % 3600
-        x, y, z = self._mounting.T @ self.aircraft.truth_at(t_s).force_m_s2
-        pitch = math.degrees(math.atan2(x, math.hypot(y, z))) + self.tilt_error_deg[0]
-        roll = math.degrees(math.atan2(-y, -z)) + self.tilt_error_deg[1]
+        tenths = round(self.magnetic_deg(t_s) * 10.0) % 3600
+        pitch, roll = self.tilt_deg(t_s)
         return f"{tenths / 10.0:.1f}, {_tidy(pitch, 1)}, {_tidy(roll, 1)}\r\n".encode()
-
-    def _follow(self, t_s: float, heading_deg: float) -> float:
-        """The heading with its first-order lag; exact for one that turns evenly between two readings."""
-        if self.lag_s <= 0.0:
-            return heading_deg
-        since_s, before, shown = self._followed or (t_s - 1.0, heading_deg, heading_deg)
-        span = max(t_s - since_s, 1e-6)
-        change = math.remainder(heading_deg - before, 360.0)
-        behind = change / span * self.lag_s
-        shown = before + change - behind + (shown - before + behind) * math.exp(-span / self.lag_s)
-        # Brought to the new reading's turn of the circle, so that the next difference is small.
-        shown += heading_deg - (before + change)
-        self._followed = (t_s, heading_deg, shown)
-        return shown
 
     def command(self, data: bytes, t_s: float) -> bytes:
         """Commands end with CR or LF; unknown ones are answered `#I`."""
@@ -201,7 +220,7 @@ class HMR3300(SerialDevice):
             if command == b"*S":
                 self.streaming = not self.streaming
             elif command == b"*Q":
-                answer += b"" if self.streaming else self._line(t_s)
+                answer += b"" if self.streaming else self.reading(t_s)
             elif command in (b"*H", b"*M"):
                 self.magnetometer_mode = command == b"*M"
             elif command:
@@ -235,20 +254,15 @@ class Gradienter(SerialDevice):
         law: Law = "axis",
         offset_deg: tuple[float, float] = (0.0, 0.0),
         noise_deg: float = 0.0005,
-        offset_per_kelvin_deg: tuple[float, float] = (0.0, 0.0),
         lag_s: float = 0.43,
         range_deg: float = 30.0,
         resolution_deg: float = 0.001,
         mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        parity: Literal["none", "even"] = "none",
-        rate_hz: float | None = None,
-        clock_ppm: float = 0.0,
+        **line: Any,
     ) -> None:
-        super().__init__(aircraft, rate_hz=rate_hz, clock_ppm=clock_ppm)
+        super().__init__(aircraft, **line)
         self.law, self.offset_deg, self.noise_deg, self.lag_s = law, offset_deg, noise_deg, lag_s
-        self.offset_per_kelvin_deg = offset_per_kelvin_deg
-        self.range_deg, self.resolution_deg, self.parity = range_deg, resolution_deg, parity
-        self.bits_per_byte = 11 if parity == "even" else 10
+        self.range_deg, self.resolution_deg = range_deg, resolution_deg
         self._mounting = mounting_matrix(*mounting_deg)
         self._random = np.random.default_rng([seed, 6])
         self._fluid: tuple[float, Array] | None = None
@@ -276,10 +290,8 @@ class Gradienter(SerialDevice):
 
     def reading_deg(self, t_s: float) -> tuple[float, float]:
         """What it makes of the tilt at a time, with lag, offset and noise: x, y."""
-        warm = self.aircraft.temperature_degc(t_s) - 25.0
-        shift = np.asarray(self.offset_deg) + warm * np.asarray(self.offset_per_kelvin_deg)
         noise = self.noise_deg * self._random.standard_normal(2)
-        x, y = self._settle(t_s) + shift + noise
+        x, y = self._settle(t_s) + np.asarray(self.offset_deg) + noise
         return float(x), float(y)
 
     def _line(self, axis: str, value_deg: float) -> bytes:
@@ -326,8 +338,8 @@ class ImuDevice(SerialDevice):
 
     default_rate_hz = 200.0
 
-    def __init__(self, imu: ImuModel, *, rate_hz: float | None = None, clock_ppm: float = 0.0) -> None:
-        super().__init__(imu.aircraft, rate_hz=rate_hz, clock_ppm=clock_ppm)
+    def __init__(self, imu: ImuModel, **line: Any) -> None:
+        super().__init__(imu.aircraft, **line)
         self.imu = imu
 
     def _readings(self, times_s: Array, first: int) -> Iterator[tuple[float, float, list[float]]]:
@@ -359,41 +371,6 @@ def vectornav_packet(startup_s: float, reading: Sequence[float], temperature_deg
     """The packet of `VectorNavBinary` for three rates and three specific forces."""
     body = struct.pack("<BHHQ7f", 0x05, 0x0121, 0x0010, round(startup_s * 1e9), *reading, temperature_degc)
     return b"\xfa" + body + struct.pack(">H", binascii.crc_hqx(body, 0))
-
-
-class VectorNavAscii(ImuDevice):
-    """VectorNav's ASCII lines: `$VNYMR` (attitude, magnetic field, accel, rate) or `$VNIMU` (VectorNav UM001).
-
-    VNYMR's factory rate is 40 Hz; its 122 bytes allow 94 Hz at 115200 baud, so 200 Hz needs 460800.
-    """
-
-    protocol = "vectornav"
-
-    def __init__(
-        self,
-        imu: ImuModel,
-        *,
-        message: Literal["VNYMR", "VNIMU"] = "VNYMR",
-        rate_hz: float = 40.0,
-        clock_ppm: float = 0.0,
-    ) -> None:
-        self.message = message
-        self.baud = 115200 if rate_hz <= 80.0 else 460800
-        super().__init__(imu, rate_hz=rate_hz, clock_ppm=clock_ppm)
-
-    def encode(self, times_s: Array, first: int) -> list[bytes]:
-        """One line a sample."""
-        return [self._line(time, reading) for time, _, reading in self._readings(times_s, first)]
-
-    def _line(self, t_s: float, reading: Sequence[float]) -> bytes:
-        rate = ",".join(f"{value:+010.6f}" for value in reading[:3])
-        force = ",".join(f"{value:+07.3f}" for value in reading[3:])
-        field = self.imu.mounting.T @ self.aircraft.field_gauss(t_s)
-        mag = ",".join(f"{value:+08.4f}" for value in field.tolist())
-        if self.message == "VNIMU":
-            return nmea(f"VNIMU,{mag},{force},{rate},{self.imu.temperature_degc(t_s):+05.1f},+101.325")
-        roll, pitch, yaw = (math.degrees(v) for v in self.aircraft.mounted_angles_rad(t_s, self.imu.mounting))
-        return nmea(f"VNYMR,{yaw:+08.3f},{pitch:+08.3f},{roll:+08.3f},{mag},{force},{rate}")
 
 
 class ImuLine(ImuDevice):

@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from sim.aircraft import VirtualAircraft
-from sim.binary_imus import MipImu, Stim300, XsensImu
-from sim.compasses import NmeaCompass, Os5000
+from sim.binary_imus import MipImu, Stim300, WitMotionImu, XsensImu
+from sim.compasses import NmeaCompass, Os5000, PniCompass, RionCompass
 from sim.devices import HMR3300, Gradienter, ImuLine, Law, SerialDevice, VectorNavBinary
-from sim.gradienters import Jewell
+from sim.gradienters import Jewell, RionInclinometer, WitMotionInclinometer
 from sim.imu_model import ImuModel
-from sim.pni import PniCompass
-from sim.rion import RionCompass, RionInclinometer
-from sim.witmotion import WitMotionImu, WitMotionInclinometer
 
 IMUS: dict[str, Callable[[ImuModel], SerialDevice]] = {
     "vectornav": VectorNavBinary,
@@ -25,27 +21,24 @@ IMUS: dict[str, Callable[[ImuModel], SerialDevice]] = {
 }
 """Made from the model whose readings they send."""
 
-GRADIENTERS: dict[str, Callable[[VirtualAircraft, int], SerialDevice]] = {
-    "inclinometer_xy": lambda aircraft, seed: Gradienter(aircraft, seed=seed),
-    "hmr3300": lambda aircraft, seed: HMR3300(aircraft, seed=seed),
-    "rion": lambda aircraft, seed: RionInclinometer(aircraft, seed=seed),
-    "pni": lambda aircraft, seed: PniCompass(aircraft, seed=seed),
-    "witmotion": lambda aircraft, seed: WitMotionInclinometer(aircraft, seed=seed),
-    "stim300": lambda aircraft, seed: Stim300(ImuModel(aircraft, "adis16470", seed=seed), seed=seed),
-    "jewell": lambda aircraft, seed: Jewell(aircraft, seed=seed),
-    "nmea": lambda aircraft, seed: NmeaCompass(aircraft, seed=seed),
-    "os5000": lambda aircraft, seed: Os5000(aircraft, seed=seed),
+COMPASSES: dict[str, Callable[..., SerialDevice]] = {
+    "hmr3300": HMR3300,
+    "pni": PniCompass,
+    "rion": RionCompass,
+    "nmea": NmeaCompass,
+    "os5000": Os5000,
 }
-"""Made from the aircraft on which they sit and a seed; upright, without errors but noise and lag."""
+"""Made from the aircraft on which they sit and `seed`; upright, without errors but noise and lag."""
 
-COMPASSES: dict[str, Callable[[VirtualAircraft, int], SerialDevice]] = {
-    "hmr3300": lambda aircraft, seed: HMR3300(aircraft, seed=seed),
-    "pni": lambda aircraft, seed: PniCompass(aircraft, seed=seed),
-    "rion": lambda aircraft, seed: RionCompass(aircraft, seed=seed),
-    "nmea": lambda aircraft, seed: NmeaCompass(aircraft, seed=seed),
-    "os5000": lambda aircraft, seed: Os5000(aircraft, seed=seed),
+GRADIENTERS: dict[str, Callable[..., SerialDevice]] = {
+    "inclinometer_xy": Gradienter,
+    **COMPASSES,
+    "rion": RionInclinometer,
+    "witmotion": WitMotionInclinometer,
+    "stim300": lambda aircraft, seed: Stim300(ImuModel(aircraft, "adis16470", seed=seed), seed=seed),
+    "jewell": Jewell,
 }
-"""The same."""
+"""Made in the same way; every compass but RION's also serves as a gradienter."""
 
 
 class Fit(NamedTuple):
@@ -104,6 +97,6 @@ def make(model: ImuModel, imu: str, gradienter: str, compass: str, seed: int) ->
         compass: a name of `COMPASSES`.
         seed: of the noise.
     """
-    inertial, magnetic = IMUS[imu](model), COMPASSES[compass](model.aircraft, seed)
+    inertial, magnetic = IMUS[imu](model), COMPASSES[compass](model.aircraft, seed=seed)
     shared = {imu: inertial, compass: magnetic}
-    return Devices(inertial, shared.get(gradienter) or GRADIENTERS[gradienter](model.aircraft, seed), magnetic)
+    return Devices(inertial, shared.get(gradienter) or GRADIENTERS[gradienter](model.aircraft, seed=seed), magnetic)

@@ -20,8 +20,6 @@ from sim.earth import STANDARD_GRAVITY_M_S2, Array, bodies_from_ned
 from sim.motions import Motion
 
 _STEP_S: Final = 2e-3
-_REMEMBERED: Final = 20_000
-"""Answers; those of a second of 200 Hz take 10 kB."""
 
 
 def smooth(u: Array) -> Array:
@@ -191,7 +189,6 @@ class MovingAircraft(VirtualAircraft):
         super().__init__(pose, site, motions=motions)
         self.route = route
         self._stands_until_s = route.start_s - 2.0 * _STEP_S
-        self._known: dict[bytes, Truth] = {}
         self._box = bodies_from_ned(np.radians([[pose.roll_deg, pose.pitch_deg, 0.0]]))[0]
         """Vehicle to box."""
         self._coriolis = 2.0 * np.cross(self._earth_rate_ned, np.eye(3))
@@ -209,22 +206,7 @@ class MovingAircraft(VirtualAircraft):
         pitch = -np.arcsin(np.clip(c[0, 2], -1.0, 1.0))
         return np.column_stack([np.arctan2(c[1, 2], c[2, 2]), pitch, np.arctan2(c[0, 1], c[0, 0])])
 
-    def add(self, motion: Motion) -> None:
-        """Let something happen besides; `motion.start_s` is aircraft time."""
-        super().add(motion)
-        self._known.clear()
-
     def _moving(self, t_s: Array) -> Truth:
-        """Those asked for again (another seed) are remembered."""
-        key = t_s.tobytes()
-        found = self._known.get(key)
-        if found is None:
-            found = self._flown(t_s)
-            if len(self._known) < _REMEMBERED:
-                self._known[key] = found
-        return found
-
-    def _flown(self, t_s: Array) -> Truth:
         turn = self.matrices(t_s)
         # [w x] = -C' C^T for C from NED to body.
         turning = -_derivative(lambda t: self.matrices(t).reshape(len(t), 9), t_s).reshape(-1, 3, 3)

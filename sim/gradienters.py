@@ -1,27 +1,27 @@
-"""More gradienters: Jewell's tiltmeters and BEI's inclinometers, with the commands that their manuals name.
+"""Gradienters with commands of their own: Jewell's tiltmeters, BEI's, RION's and WitMotion's inclinometers.
 
-Both measure as `sim.devices.Gradienter` does. `stored` counts what would have been written to their EEPROM, which
-nobody who only reads them may do.
+`stored` counts what would have been written to the EEPROM, which nobody who only reads a device may do.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Literal
+from typing import Any, Final, Literal
+
+import numpy as np
 
 from sim.aircraft import VirtualAircraft
-from sim.devices import Gradienter, Law, nmea
+from sim.binary_imus import WIT_Z_UP, wit_angles_deg, wit_packet
+from sim.compasses import RionCommands, rion_decimal, rion_packet
+from sim.devices import Gradienter, SerialDevice, nmea
+from sim.earth import Array, mounting_matrix
 
-_COMMAND_LIMIT = 64
-_STORING = ("SO-", "XYC", "XY-SET", "XY-MEMS")
+_COMMAND_LIMIT: Final = 64
+_STORING: Final = ("SO-", "XYC", "XY-SET", "XY-MEMS")
 """Beginnings of a Jewell's commands whose effect outlasts its power."""
 
 
 class Jewell(Gradienter):
-    """Jewell (Applied Geomechanics) tiltmeter: SIM, XDR or ASH lines (Tuff Tilt Digital manual, p. 12 to 18).
-
-    A LILY sticks at 330 microradians: give it `range_deg` accordingly and unit "M".
-    """
+    """Jewell (Applied Geomechanics) tiltmeter: SIM, XDR or ASH lines (Tuff Tilt Digital manual, p. 12 to 18)."""
 
     protocol = "jewell"
     baud = 9600
@@ -31,32 +31,12 @@ class Jewell(Gradienter):
         self,
         aircraft: VirtualAircraft,
         *,
-        seed: int = 0,
         output: Literal["SIM", "XDR", "ASH"] = "SIM",
-        unit: Literal["D", "M"] = "D",
         continuous: bool = True,
-        law: Law = "axis",
-        offset_deg: tuple[float, float] = (0.0, 0.0),
-        noise_deg: float = 0.0005,
-        lag_s: float = 0.43,
-        range_deg: float = 50.0,
-        mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        rate_hz: float | None = None,
-        clock_ppm: float = 0.0,
+        **more: Any,
     ) -> None:
-        super().__init__(
-            aircraft,
-            seed=seed,
-            law=law,
-            offset_deg=offset_deg,
-            noise_deg=noise_deg,
-            lag_s=lag_s,
-            range_deg=range_deg,
-            mounting_deg=mounting_deg,
-            rate_hz=rate_hz,
-            clock_ppm=clock_ppm,
-        )
-        self.output, self.unit, self.continuous = output, unit, continuous
+        super().__init__(aircraft, range_deg=50.0, **more)
+        self.output, self.continuous = output, continuous
         self.streaming = continuous
         self.stored = 0
         self._pending = b""
@@ -72,12 +52,11 @@ class Jewell(Gradienter):
         temperature = f"{self.aircraft.temperature_degc(t_s):07.3f}"
         if self.output == "SIM":
             return f"${x},{y},{temperature},N0000\r\n".encode()
-        body = f"A,{y},{self.unit},N,A,{x},{self.unit},E,C,{temperature},C,T-N0000"
+        body = f"A,{y},D,N,A,{x},D,E,C,{temperature},C,T-N0000"
         return nmea(f"YXXDR,{body}") if self.output == "XDR" else f"$PASHS,XDR,{body}\r\n".encode()
 
     def _clipped(self, value_deg: float) -> str:
-        value_deg = max(-self.range_deg, min(self.range_deg, value_deg))
-        return f"{value_deg if self.unit == 'D' else math.radians(value_deg) * 1e6:07.3f}"
+        return f"{max(-self.range_deg, min(self.range_deg, value_deg)):07.3f}"
 
     def command(self, data: bytes, t_s: float) -> bytes:
         """Commands `*ttssCMD` with CR LF, case-sensitive; of the settings only the output format has an effect."""
@@ -109,8 +88,10 @@ class BeiInclinometer(Gradienter):
     level hold until power-off are stored.
     """
 
-    def __init__(self, aircraft: VirtualAircraft, *, seed: int = 0, polled: bool = False, law: Law = "axis") -> None:
-        super().__init__(aircraft, seed=seed, parity="even", law=law)
+    bits_per_byte = 11
+
+    def __init__(self, aircraft: VirtualAircraft, *, polled: bool = False, **more: Any) -> None:
+        super().__init__(aircraft, **more)
         self.polled = polled
         self.streaming = not polled
         self.setup = False
@@ -141,3 +122,62 @@ class BeiInclinometer(Gradienter):
                 self.setup = True
                 answer += b"P"
         return answer
+
+
+class RionInclinometer(Gradienter):
+    """RION HCA726: the elevation of each axis to a tenth of a millidegree, by MEMS and so without a fluid.
+
+    Only answers. Three bytes after the angles are unknown; they are zero here.
+    """
+
+    protocol = "rion"
+    baud = 9600
+
+    def __init__(self, aircraft: VirtualAircraft, **more: Any) -> None:
+        super().__init__(aircraft, lag_s=0.0, **more)
+        self.streaming = False
+        self._commands = RionCommands()
+
+    def power_on(self, t_s: float) -> bytes:
+        """Start without a word."""
+        said = super().power_on(t_s)
+        self.streaming = False
+        return said
+
+    def _lines(self, t_s: float) -> bytes:
+        x, y = self.reading_deg(t_s)
+        return rion_packet(0x84, rion_decimal(x, 8, 4) + rion_decimal(y, 8, 4) + bytes(3))
+
+    def command(self, data: bytes, t_s: float) -> bytes:
+        """Answer whole commands."""
+        return b"".join(self._lines(t_s) for command, _ in self._commands.take(data) if command == 0x04)
+
+
+class WitMotionInclinometer(SerialDevice):
+    """WitMotion SINxT: angles only, 10 a second, X forward, Y left, Z up."""
+
+    protocol = "witmotion"
+    baud = 9600
+    default_rate_hz = 10.0
+    NOISE_DEG: Final = 0.003
+
+    def __init__(
+        self,
+        aircraft: VirtualAircraft,
+        *,
+        seed: int = 0,
+        mounting_deg: tuple[float, float, float] = WIT_Z_UP,
+        **line: Any,
+    ) -> None:
+        super().__init__(aircraft, **line)
+        self._mounting = mounting_matrix(*mounting_deg)
+        self._random = np.random.default_rng([seed, 23])
+
+    def encode(self, times_s: Array, first: int) -> list[bytes]:
+        """Return one frame a sample."""
+        return [self._frame(float(time)) for time in times_s]
+
+    def _frame(self, t_s: float) -> bytes:
+        angles = np.array(wit_angles_deg(self.aircraft, t_s, self._mounting))
+        angles[:2] += self.NOISE_DEG * self._random.standard_normal(2)
+        return wit_packet(0x53, (angles / 180.0 * 32768.0).tolist())

@@ -158,11 +158,11 @@ async def carry_out(run: Run, folder: Path, number: int) -> Outcome:
         for k, name in enumerate(run.imus)
     }
     devices: dict[str, SerialDevice] = {name: IMUS[name](model) for name, model in imus.items()}
-    compass = devices["compass"] = COMPASSES[run.compass](aircraft, number)
+    compass = devices["compass"] = COMPASSES[run.compass](aircraft, seed=number)
     if run.shared:
         gradienter = compass if run.gradienter == run.compass else devices[run.gradienter]
     else:
-        gradienter = devices["gradienter"] = GRADIENTERS[run.gradienter](aircraft, number)
+        gradienter = devices["gradienter"] = GRADIENTERS[run.gradienter](aircraft, seed=number)
     path_of = {id(device): folder / name for name, device in devices.items()}
     parts = [
         section("imu", devices[name], folder / name, f'[[imu]]\nname = "{name}"\nsource = "serial"', 'profile = "calm"')

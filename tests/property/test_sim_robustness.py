@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.ardupilot.double import ArduPilotDouble
+from sim.binary_imus import WitMotionImu
+from sim.compasses import PniCompass, RionCompass
 from sim.devices import HMR3300, Gradienter, ImuLine, SerialDevice, VectorNavBinary
 from sim.earth import EARTH_RATE_RAD_S, angles_of, body_from_ned
+from sim.gradienters import RionInclinometer, WitMotionInclinometer
 from sim.imu_model import ImuModel
-from sim.pni import PniCompass
 from sim.px4.double import PX4Double
-from sim.rion import RionCompass, RionInclinometer
 from sim.station import Station
-from sim.witmotion import WitMotionImu, WitMotionInclinometer
 from tests.support.virtual_time import run_virtual
 
 TILT = st.floats(-60.0, 60.0)

@@ -64,7 +64,7 @@ def test_every_simulated_family_is_recognised(name: str) -> None:
     device = (
         families.IMUS[name](scenario.serial_imu)
         if name in families.IMUS
-        else {**families.GRADIENTERS, **families.COMPASSES}[name](scenario.aircraft, 3)
+        else {**families.GRADIENTERS, **families.COMPASSES}[name](scenario.aircraft, seed=3)
     )
     device.power_on(0.0)
     data = b"".join(frame.data for frame in device.frames_until(6.0))

@@ -13,9 +13,9 @@ from companion.protocols.inclinometers.rion import RionDecoder, RionDialogue
 from companion.protocols.registry import PROTOCOLS
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
+from sim.compasses import PniCompass, RionCompass
 from sim.devices import SerialDevice
-from sim.pni import PniCompass
-from sim.rion import RionCompass, RionInclinometer
+from sim.gradienters import RionInclinometer
 
 STEP_S = 0.02
 READ = bytes.fromhex("6804000408")
