@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from typing import Final
 
 SECTIONS: Final = (
-    "white", "floors", "methods", "tilt", "warm-up", "integers", "deck", "turning", "by-hand", "power-up",
+    "white", "floors", "tilt", "warm-up", "integers", "deck", "turning", "by-hand", "power-up",
     "mid-warm-up",
 )  # fmt: skip
-HELP: Final = "errors and sigmas of the estimator, beside the physical bound and the firmwares' own calibrations"
+HELP: Final = "errors and sigmas of the estimator, beside the physical bound"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -1,7 +1,7 @@
-"""Calibrations on a deck in waves: the errors, the sigmas, and what the noise that is known exactly would allow.
+"""Calibrations on a deck in waves: the errors and the sigmas.
 
 What the sensors say is made sample by sample by the simulator; the seconds go into `Deck` as they do in the daemon, its
-windows into `solve`. The bound is that of least squares with the sea's true spectrum in place of a fitted one.
+windows into `solve`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from companion.calibration.deck.deck import Deck
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput, Window
-from companion.calibration.noise.allan import PROFILES, floor_variance, noise_profile
+from companion.calibration.noise.allan import PROFILES, noise_profile
 from companion.calibration.request import What
 from companion.calibration.seconds.batch import summary, unrolled
 from companion.calibration.solution.solve import solve
@@ -25,11 +25,11 @@ from companion.errors import CalibrationRefusedError
 from sim.accuracy.stand import ACCEL_BIAS_M_S2, GRAVITY_ANOMALY_M_S2, GYRO_BIAS_RAD_S, NEXT_S, AnomalousSite, local
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter
-from sim.earth import STANDARD_GRAVITY_M_S2, Array
-from sim.imu_model import PARTS, ImuModel
+from sim.earth import Array
+from sim.imu_model import ImuModel
 from sim.motions import Motion, SlowTurn
 from sim.scenario import site_at
-from sim.sea import DAY_S, SURGE, SWELL, Sea, Wave
+from sim.sea import DAY_S, SWELL, Sea, Wave
 
 RATE_HZ: Final = 200
 TILT_HZ: Final = 10
@@ -173,40 +173,3 @@ def _against_the_truth(
     truth = imu.mean_bias(window.end_s, window.end_s + NEXT_S)
     error = np.concatenate([found.gyro_rad_s - truth.gyro_rad_s, found.accel_m_s2 - truth.accel_m_s2])
     return error, np.concatenate([found.gyro_sigma_use_rad_s, found.accel_sigma_use_m_s2])
-
-
-def bound(voyage: Voyage, span_s: int) -> Array:
-    """(6,) the least rms error against the next minutes: what the noise would allow somebody who knew its spectrum.
-
-    Seconds of tilt with the sea's covariance, headings with the compass' noise, constant part and iron, the gyros'
-    white noise; and what no measurement here tells: V(T, H), scale and cross-axis errors, the gradienter's zero,
-    the anomaly of gravity.
-    """
-    times = np.arange(span_s) + 0.5
-    apart = times[:, None] - times
-    spec = PARTS[voyage.part]
-    walk = spec.gyro.white**2 * np.minimum(times[:, None], times)
-    surge = np.zeros_like(apart)
-    for wave in voyage.waves:
-        omega = 2.0 * math.pi * wave.frequency_hz
-        height = (math.radians(wave.sway_deg) * SURGE) ** 2 / 2.0
-        surge += height * np.exp(-np.square(wave.spread * omega * apart) / 2.0) * np.cos(omega * apart)
-    level = surge + walk + np.eye(span_s) * (spec.accel.white / STANDARD_GRAVITY_M_S2) ** 2
-    across = _slope_variance(np.column_stack([np.ones(span_s), times]), level)
-    heading = walk + np.eye(span_s) * math.radians(COMPASS_NOISE_DEG) ** 2 / HEADING_HZ
-    iron = voyage.compass_sigma_deg * math.radians(1.0) * math.sqrt(0.5)
-    turned = math.radians(voyage.turn_deg_s) * times
-    ahead = np.column_stack([np.sin(turned), np.cos(turned)])
-    heading += iron**2 * ahead @ ahead.T
-    upright = _slope_variance(np.column_stack([np.ones(span_s), times]), heading)
-    gyro = floor_variance(spec.gyro.flicker, spec.gyro.walk, span_s, NEXT_S)
-    gyro = gyro + (voyage.gyro_axes_sigma * math.radians(voyage.turn_deg_s)) ** 2
-    accel = floor_variance(spec.accel.flicker, spec.accel.walk, span_s, NEXT_S) + spec.accel.white**2 / span_s
-    zero = (STANDARD_GRAVITY_M_S2 * math.radians(TILT_SIGMA_DEG)) ** 2
-    return np.sqrt(
-        [across + gyro, across + gyro, upright + gyro, zero + accel, zero + accel, accel + GRAVITY_ANOMALY_M_S2**2]
-    )
-
-
-def _slope_variance(regressors: Array, covariance: Array) -> float:
-    return float(np.linalg.inv(regressors.T @ np.linalg.solve(covariance, regressors))[1, 1])

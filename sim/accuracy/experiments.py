@@ -16,7 +16,6 @@ import numpy as np
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import noise_profile
 from companion.errors import CalibrationRefusedError
-from sim.accuracy import peers
 from sim.accuracy.stand import (
     GRAVITY_ANOMALY_M_S2,
     NEXT_S,
@@ -33,7 +32,7 @@ from sim.accuracy.stand import (
     solved,
     stand,
 )
-from sim.earth import Array
+from sim.earth import STANDARD_GRAVITY_M_S2, Array
 from sim.imu_model import MG, AxisNoise, ImuSpec
 
 SPANS_S: Final = (10, 30, 60)
@@ -50,7 +49,6 @@ TILT_DRAWS: Final = 8
 """Of a reference's error, for one stand."""
 FIELD_TILT_DEG: Final = 0.01
 FIELD_HEADING_DEG: Final = 1.0
-METHODS: Final = ("plain mean", "ArduPilot", "PX4, mean", "PX4, in force")
 STEP_RAD_S: Final = 1e-3
 NOISE_LSB: Final = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0)
 
@@ -63,6 +61,12 @@ def many(one: Callable[..., _Found], arguments: Sequence[tuple[object, ...]], jo
         return [one(*each) for each in arguments]
     with ProcessPoolExecutor(jobs) as pool:
         return list(pool.map(one, *zip(*arguments, strict=True), chunksize=max(1, len(arguments) // (8 * jobs))))
+
+
+def plain_mean(rows: Array) -> tuple[Array, Array]:
+    """Bias (6) and its sigma (6) of readings (n, 6): their mean less a level aircraft's on an Earth at rest."""
+    level = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -STANDARD_GRAVITY_M_S2])
+    return rows.mean(axis=0) - level, np.asarray(rows.std(axis=0, ddof=1) / math.sqrt(len(rows)))
 
 
 def whole_seconds(times: Array, rows: Array, window: Window) -> Array:
@@ -98,7 +102,7 @@ def white(seed: int, number: int) -> WhiteRun:
         imu = solved(standing, window).imus[0]
         inside = standing.in_vehicle(whole_seconds(times, rows, window))
         still = inside.mean(axis=0) - standing.in_vehicle(standing.imu.expected(window.start_s))
-        each = (biases(imu) - truth, sigmas_stat(imu), still, peers.plain_mean(inside)[1])
+        each = (biases(imu) - truth, sigmas_stat(imu), still, plain_mean(inside)[1])
         found.append((each[0] / bound, each[1] / bound, each[2] / bound, each[3] / bound))
     error, sigma, plain, plain_sigma = np.array(found).transpose(1, 0, 2)
     return WhiteRun(error, sigma, plain, plain_sigma)
@@ -120,8 +124,6 @@ class FloorRun:
     """sigma_use of the latter."""
     plain: Array
     plain_sigma: Array
-    methods: Array
-    """Errors of `METHODS` (4, 6), from the end of the longest span on; NaN where one has none."""
     tilted: Array
     """Errors of the two horizontal accelerometers in the longest span (references, draws, 2)."""
 
@@ -138,7 +140,7 @@ def floors(part: str, seed: int, number: int) -> FloorRun:
     windows = collected(standing, taken, times, rows, SPANS_S)
     references = References.drawn(FIELD_TILT_DEG, FIELD_HEADING_DEG, standing.random)
     ideal, error, sigma, plain, plain_sigma = [], [], [], [], []
-    inside, truth = rows, np.zeros(6)
+    truth = np.zeros(6)
     for window in windows:
         truth = standing.bias(window.end_s, window.end_s + NEXT_S)
         inside = standing.in_vehicle(whole_seconds(times, rows, window))
@@ -146,7 +148,7 @@ def floors(part: str, seed: int, number: int) -> FloorRun:
         imu = solved(standing, window, references).imus[0]
         error.append(biases(imu) - truth)
         sigma.append(sigmas_use(imu))
-        naive, naive_sigma = peers.plain_mean(inside)
+        naive, naive_sigma = plain_mean(inside)
         plain.append(naive - truth)
         plain_sigma.append(naive_sigma)
     return FloorRun(
@@ -156,21 +158,7 @@ def floors(part: str, seed: int, number: int) -> FloorRun:
         sigma=np.array(sigma),
         plain=np.array(plain),
         plain_sigma=np.array(plain_sigma),
-        methods=_methods(standing, windows[-1].end_s, inside.mean(axis=0)) - truth,
         tilted=_tilted(standing, windows[-1], truth),
-    )
-
-
-def _methods(standing: Stand, end_s: float, mean: Array) -> Array:
-    """The biases that others find at the end of the longest window, or of the same readings."""
-    level, none = np.concatenate([np.zeros(3), peers.LEVEL]), np.full(3, np.nan)
-    return np.array(
-        [
-            mean - level,
-            peers.ardupilot(standing, end_s - 0.5),
-            np.concatenate([peers.px4_mean(standing, end_s - 1.0), none]),
-            peers.px4(standing, end_s - 1.0),
-        ]
     )
 
 

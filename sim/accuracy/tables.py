@@ -13,7 +13,6 @@ from sim.accuracy.experiments import (
     FIELD_HEADING_DEG,
     FIELD_TILT_DEG,
     FLOORED,
-    METHODS,
     NOISE_LSB,
     SPANS_S,
     STEP_RAD_S,
@@ -31,7 +30,7 @@ from sim.accuracy.figures import Claim, Figure, Section, beside, covered, rms
 from sim.accuracy.stand import NEXT_S, POSTURES
 from sim.accuracy.warmup import WARMING, cases, warm
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
-from sim.imu_model import DEG_H, MG, PARTS, UG
+from sim.imu_model import DEG_H, PARTS, UG
 
 UPRIGHT: Final = ("level", "by eye", "5/-3")
 """Where the horizontal accelerometers are the body's x and y."""
@@ -62,13 +61,13 @@ def report(
     if "white" in only:
         progress(f"white noise: {runs} stands")
         found["white"] = _white(many(white, [(seed, number) for number in range(runs)], jobs))
-    if {"floors", "methods", "tilt"} & set(only):
+    if {"floors", "tilt"} & set(only):
         each = max(runs // 5, len(POSTURES))
         progress(f"flicker and walk: {each} stands of each of {len(FLOORED)} parts")
         work = [(part, seed, number) for part in FLOORED for number in range(each)]
         flat = many(floors, work, jobs)
         parts = {part: flat[each * index : each * (index + 1)] for index, part in enumerate(FLOORED)}
-        for name, make in (("floors", _floors), ("methods", _methods), ("tilt", _tilt)):
+        for name, make in (("floors", _floors), ("tilt", _tilt)):
             if name in only:
                 found[name] = make(parts)
     if "warm-up" in only:
@@ -205,40 +204,6 @@ def _floors(parts: dict[str, list[FloorRun]]) -> Section:
     ]
     count = len(next(iter(parts.values())))
     return Section(f"Parts with flicker and walk ({count} stands each)", lines, claims)
-
-
-def _methods(parts: dict[str, list[FloorRun]]) -> Section:
-    names = ("companion", *METHODS)
-    lines = ["gyro, rms deg/h against the bias of the next 180 s; biases of a power-up are 100 deg/h, 1 sigma", ""]
-    lines.append(f"{'':12}" + "".join(f"{name:>14}" for name in names))
-    for part, runs in parts.items():
-        errors = np.concatenate([_stack(runs, "error")[:, -1:], _stack(runs, "methods")], axis=1)
-        found = [rms(errors[:, row, :3]).times(1.0 / DEG_H) for row in range(len(names))]
-        lines.append(f"{part:12}" + "".join(f"{one.value:14.1f}" for one in found))
-    runs = parts["icm42688p"]
-    lines += ["", "accelerometers of an ICM-42688-P, rms mg horizontal / vertical; biases 2 mg, 1 sigma", ""]
-    lines.append(f"{'':10}" + "".join(f"{name:>17}" for name in names if name != METHODS[2]))
-    for posture in UPRIGHT:
-        here = [run for run in runs if run.posture == posture]
-        errors = np.concatenate([_stack(here, "error")[:, -1:], _stack(here, "methods")], axis=1)
-        line = f"{posture:10}"
-        for row, name in enumerate(names):
-            if name == METHODS[2]:
-                continue
-            flat, down = (rms(errors[:, row, part]).times(1.0 / MG) for part in (slice(3, 5), slice(5, 6)))
-            line += f"{_short(flat.value)} / {_short(down.value):>6}".rjust(17)
-        lines.append(line)
-    lines += [
-        "",
-        f"Companion ({_REFERENCES}), plain mean: 60 s.",
-        "ArduPilot: half a second; PX4, mean: one. By eye: level to 0.5 deg, 1 sigma. PX4, in force: a vector",
-        "below 0.01 (rad/s, m/s^2) is not taken, and the accelerometers are levelled by themselves.",
-    ]
-    return Section("Beside what else is done", lines)
-
-
-def _short(value: float) -> str:
-    return f"{value:.3f}" if value < 1.0 else f"{value:.1f}"
 
 
 def _tilt(parts: dict[str, list[FloorRun]]) -> Section:

@@ -28,8 +28,6 @@ AMBIENT_DEGC: Final = (5.0, 40.0)
 SESSION_S: Final = (300.0, 900.0)
 AT_MOST: Final = 1.3
 COVERS: Final = (93.0, 98.0)
-TCAL_K: Final = 10.0
-"""ArduPilot's own calibration over temperature wants at least this."""
 _SHORTEST_S: Final = 3
 _THERMOMETER_K: Final = 0.05
 _TAUS_S: Final = 3.0 ** np.arange(8.0)
@@ -42,10 +40,6 @@ class PowerUpRun:
 
     error: Array
     sigma: Array
-    last: Array
-    """With what the last calibration has left."""
-    tcal: Array
-    """With a cubic learned once, in the first warm-up of enough kelvin, and the last calibration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,14 +133,8 @@ def power_up(part: str, seed: int, number: int) -> PowerUpRun:
     scatter = PARTS[part].gyro.scatter
     aircraft = Aircraft(PARTS[part].gyro, random)
     known: tuple[Point, ...] = ()
-    once: list[Point] = []
     for day in range(DAYS):
-        last = aircraft.day()
-        seen = aircraft.seen(last, day)
-        known = kept((*known, *seen))
-        span = [point.temperature_degc or 0.0 for point in seen]
-        if not once and span and max(span) - min(span) >= TCAL_K:
-            once = seen
+        known = kept((*known, *aircraft.seen(aircraft.day(), day)))
     today = aircraft.day()
     truth = today.bias[0]
     now = Now(
@@ -159,24 +147,10 @@ def power_up(part: str, seed: int, number: int) -> PowerUpRun:
     )
     expected = expect(known, "gyro", now, pose_effect(None), noise_profile(part).gyro)
     assert expected is not None
-    left = last.bias[-10:].mean(axis=0)
     return PowerUpRun(
         error=(np.array(expected.value) - truth) / scatter,
         sigma=np.sqrt(expected.variance) / scatter,
-        last=(left - truth) / scatter,
-        tcal=(left + _cubic(once, today.degc[0]) - _cubic(once, last.degc[-1]) - truth) / scatter,
     )
-
-
-def _cubic(points: list[Point], degc: float) -> Array:
-    """Least squares over one warm-up, and not beyond it."""
-    if not points:
-        return np.zeros(3)
-    at = np.array([point.temperature_degc or 0.0 for point in points])
-    bias = np.array([point.gyro.bias for point in points if point.gyro is not None])
-    middle = at.mean()
-    coefficients = np.polyfit(at - middle, bias, min(3, len(at) - 1))
-    return np.array([np.polyval(each, np.clip(degc, at.min(), at.max()) - middle) for each in coefficients.T])
 
 
 def _vector(values: Array) -> tuple[float, float, float]:
@@ -188,24 +162,20 @@ def section(runs: list[PowerUpRun], each: int) -> Section:
     """So many aircraft of every part."""
     lines = [
         "the gyros' bias at power-up, rms error in deg/h: by the curve, sigma, 2 sigma cover;",
-        "over the scatter;",
-        "what the last calibration has left; that with a cubic learned in one warm-up",
+        "over the scatter",
         "",
-        f"{'':12}{'scatter':>8}{'curve':>8}{'sigma':>8}{'cover':>9}{'ratio':>8}{'last':>8}{'cubic':>8}",
+        f"{'':12}{'scatter':>8}{'curve':>8}{'sigma':>8}{'cover':>9}{'ratio':>8}",
     ]
     claims = []
     for k, part in enumerate(TRIED):
         scatter = PARTS[part].gyro.scatter / DEG_H
         own = runs[each * k : each * (k + 1)]
-        error, sigma, last, tcal = (
-            np.array([getattr(run, n) for run in own]) for n in ("error", "sigma", "last", "tcal")
-        )
+        error, sigma = (np.array([getattr(run, n) for run in own]) for n in ("error", "sigma"))
         ratio, share = rms(error), covered(error, sigma, 2.0).times(100.0)
         mean = float(np.sqrt(np.square(sigma).mean()))
-        before, cubic = rms(last).times(scatter), rms(tcal).times(scatter)
         lines.append(
             f"{part:12}{scatter:8.0f}{ratio.value * scatter:8.1f}{mean * scatter:8.1f}{share.value:7.1f} %"
-            f"{ratio.value:8.2f}{before.value:8.0f}{cubic.value:8.0f}"
+            f"{ratio.value:8.2f}"
         )
         claims.append(Claim(f"power-up, {part}: rms over run-to-run scatter", "", ratio, AT_MOST))
         claims.append(Claim(f"power-up, {part}: 2 sigma cover", "%", share, COVERS[1], COVERS[0]))
