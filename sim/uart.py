@@ -1,13 +1,14 @@
 """What a receiver makes of a serial line that it reads at another speed or with another parity than it was sent.
 
-The line is a function of time: idle high, a low start bit, eight data bits with the least significant first, a parity
-bit if any, a high stop bit. The receiver samples each bit in its middle, as a UART does, from the falling edge that
-begins a frame.
+The line idles high. A frame is a low start bit, eight data bits with the least significant first, a parity bit if any,
+and a high stop bit. The receiver samples each bit in its middle, as a UART does, from the falling edge that begins a
+frame.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -31,90 +32,63 @@ class Setting:
     baud: int
     parity: Parity = "none"
 
-    @property
-    def bits(self) -> int:
-        """Of one frame, from start to stop bit."""
-        return DATA_BITS + (2 if self.parity == "none" else 3)
-
-
-class Waveform:
-    """The level of the line over time: `levels` of `bit_s` each, idle before and after."""
-
-    def __init__(self, levels: Sequence[int], bit_s: float) -> None:
-        self._levels, self._bit_s = levels, bit_s
-
-    @property
-    def end_s(self) -> float:
-        """When the last bit is over."""
-        return len(self._levels) * self._bit_s
-
-    def at(self, t_s: float) -> int:
-        """The level at a time."""
-        index = int(t_s / self._bit_s) if t_s >= 0.0 else -1
-        return self._levels[index] if 0 <= index < len(self._levels) else 1
-
-    def next_fall_s(self, since_s: float) -> float | None:
-        """When the line next goes from high to low at or after a time; None: never."""
-        first = max(int(since_s / self._bit_s - 1e-9), 0)
-        for index in range(first, len(self._levels)):
-            before = self._levels[index - 1] if index else 1
-            if before == 1 and self._levels[index] == 0 and index * self._bit_s >= since_s - 1e-12:
-                return index * self._bit_s
-        return None
-
 
 def parity_bit(byte: int, parity: Parity) -> int:
-    """The bit that makes the number of ones even, or odd."""
+    """Return the bit that makes the number of ones even, or odd."""
     ones = byte.bit_count() % 2
     return ones if parity == "even" else 1 - ones
 
 
-def transmit(data: bytes, setting: Setting, gap_bits: int = 0) -> Waveform:
-    """The line while bytes are sent, with `gap_bits` of idle line between them."""
-    levels: list[int] = [1]
+def transmit(data: bytes, setting: Setting, gap_bits: int = 0) -> list[int]:
+    """Return the levels of the line, one a bit, with `gap_bits` of idle line between bytes."""
+    levels = [1]
     for byte in data:
-        levels.append(0)
-        levels += [byte >> bit & 1 for bit in range(DATA_BITS)]
+        levels += [0, *(byte >> bit & 1 for bit in range(DATA_BITS))]
         if setting.parity != "none":
             levels.append(parity_bit(byte, setting.parity))
         levels += [1] * (1 + gap_bits)
-    return Waveform(levels, 1.0 / setting.baud)
+    return levels
 
 
-def receive(line: Waveform, setting: Setting) -> Iterator[Received]:
-    """The frames that a receiver finds.
+def receive(levels: list[int], sent_baud: int, setting: Setting) -> Iterator[Received]:
+    """Yield the frames that a receiver finds.
 
     A low stop bit is taken for the start bit of the next frame, as the 16550 and its many descendants do (NS16550
     data sheet, line status register, framing error), unless all was low: after such a break it waits for an edge.
     """
-    bit_s = 1.0 / setting.baud
-    now_s = 0.0
-    begun_s: float | None = None
-    while (start_s := begun_s if begun_s is not None else line.next_fall_s(now_s)) is not None:
-        begun_s = None
+    step = sent_baud / setting.baud  # bits of the line for one of the receiver's
+    stop = DATA_BITS + (1 if setting.parity == "none" else 2)
+    now, begun = 0.0, None
+    while True:
+        first = max(math.ceil(now - 1e-9), 1)
+        falls = (at for at in range(first, len(levels)) if levels[at - 1] and not levels[at])
+        start = begun if begun is not None else next(falls, None)
+        begun = None
+        if start is None:
+            return
 
-        def level(bit: float, start_s: float = start_s) -> int:
-            return line.at(start_s + (bit + 0.5) * bit_s)
+        def level(bit: int, start: float = start) -> int:
+            at = int(start + (bit + 0.5) * step + 1e-9)
+            return levels[at] if at < len(levels) else 1
 
         if level(0) == 1:  # shorter than half a bit: noise, not a start
-            now_s = start_s + 0.5 * bit_s
+            now = start + 0.5 * step
             continue
         byte = sum(level(1 + bit) << bit for bit in range(DATA_BITS))
         parity_error = setting.parity != "none" and level(1 + DATA_BITS) != parity_bit(byte, setting.parity)
-        stop = setting.bits - 1
         framing_error = level(stop) == 0
         yield Received(byte, framing_error, parity_error)
         if framing_error and byte:
-            begun_s = start_s + stop * bit_s
+            begun = start + stop * step
         # The middle of the stop bit is where a receiver begins to look for the next edge.
-        now_s = start_s + (stop + 0.5) * bit_s
+        now = start + (stop + 0.5) * step
 
 
 def heard(data: bytes, sent: Setting, read: Setting, gap_bits: int = 0) -> bytes:
-    """What a program on Linux reads: with parity checking on, a byte that fails it or its stop bit is NUL."""
+    """Return what a program on Linux reads: with parity checking on, a byte that fails it or its stop bit is NUL."""
     if sent == read:
         return data
     return bytes(
         0 if read.parity != "none" and (frame.framing_error or frame.parity_error) else frame.byte
-        for frame in receive(transmit(data, sent, gap_bits), read)
+        for frame in receive(transmit(data, sent, gap_bits), sent.baud, read)
     )
