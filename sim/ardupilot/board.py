@@ -49,8 +49,6 @@ class Board(AutopilotDouble):
         parameters: values that differ from the defaults, such as {"INS_GYR_CAL": 0}; set before the first boot.
         up_s: how long it has been running when the simulation begins.
         auxiliary: whether the board has parameters of IMU 4 and 5, and a gyro behind 4 that no message shows.
-        has_position: whether it has a GNSS fix, and so a position and a date.
-        clock_ppm: how much faster its clock runs.
     """
 
     external_nav: YawSource
@@ -66,8 +64,6 @@ class Board(AutopilotDouble):
         parameters: Mapping[str, float] | None = None,
         up_s: float = 30.0,
         auxiliary: bool = False,
-        has_position: bool = True,
-        clock_ppm: float = 0.0,
         seed: int = 0,
     ) -> None:
         if not 1 <= len(imus) <= 3:
@@ -78,8 +74,6 @@ class Board(AutopilotDouble):
             imus,
             channels,
             up_s=up_s,
-            has_position=has_position,
-            clock_ppm=clock_ppm,
             seed=seed,
             tunes_go_on=False,
         )
@@ -154,11 +148,6 @@ class Board(AutopilotDouble):
         for channel in self.channels:
             for number, chunk in enumerate(chunks):
                 self.answer(channel, mavlink.MAVLink_statustext_message(severity, chunk, text_id, number))
-
-    def erase_parameters(self) -> None:
-        """PREFLIGHT_STORAGE 2 or 4: everything is gone, at the next boot the defaults are there."""
-        for name, (value, _) in self._table().items():
-            self.parameters.set(name, value, takes_effect=False)
 
     def _table(self) -> dict[str, tuple[float, int]]:
         return default_parameters(self.version, len(self.imus), auxiliary=self._auxiliary)

@@ -1,20 +1,18 @@
-"""ArduPilot's own calibrations, with what they assume: no Earth rate, a level vehicle, standard gravity."""
+"""ArduPilot's own gyro calibration, which takes the Earth for at rest."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from sim.ardupilot.inertial import InertialPath
 from sim.ardupilot.parameters import ParameterStore, caltemp_name, device_id, gyro_id_name, offset_names
-from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.earth import Array
 
 GYRO_TIME_S = 0.55
 GYRO_GIVES_UP_S = 30.0
-ACCEL_TIME_S = 1.05
-ACCEL_PAUSE_S = 5.0
 AVERAGED_S = 0.5
 
 
@@ -25,7 +23,6 @@ class Calibrations:
     paths: list[InertialPath]
     store: ParameterStore
     random: np.random.Generator
-    last_accel_s: float = field(default=-math.inf)
     gyros_ok: bool = True
     """Whether the last gyro calibration converged; if not, it does not arm."""
 
@@ -65,37 +62,3 @@ class Calibrations:
                 self.store.set(caltemp_name(instance, "GYR"), -300.0)
         self.gyros_ok = converged
         return tuple(name for name, value in self.store.values.items() if value != before[name])
-
-    def simple_accel(self, t_s: float) -> None:
-        """Whatever differs from exactly level becomes the offset; scale 1, trim 0."""
-        for path in self.paths:
-            level = path.board().T @ np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
-            offset = self._mean(path, t_s)[3:] - level
-            for name, value in zip(offset_names(path.instance, "accel"), offset, strict=True):
-                self.store.set(name, float(value))
-            for name in offset_names(path.instance, "scale"):
-                self.store.set(name, 1.0)
-            self.store.set(caltemp_name(path.instance, "ACC"), path.model.temperature_degc(t_s))
-            self.store.set(f"INS_ACC{_number(path)}_ID", device_id(path.instance))
-        for axis in "XYZ":
-            self.store.set(f"AHRS_TRIM_{axis}", 0.0)
-        self.last_accel_s = t_s
-
-    def level(self, t_s: float) -> bool:
-        """The attitude of the autopilot becomes the trim; False (and nothing written) beyond 10 degrees."""
-        x, y, z = self.paths[0].corrected(t_s)[3:]
-        roll, pitch = math.atan2(-y, -z), math.atan2(x, math.hypot(y, z))
-        if max(abs(roll), abs(pitch)) > math.radians(10.0):
-            return False
-        self.store.set("AHRS_TRIM_X", roll)
-        self.store.set("AHRS_TRIM_Y", pitch)
-        return True
-
-    def save_ids(self) -> None:
-        """param5 = 76: what is fitted counts as calibrated."""
-        for path in self.paths:
-            self.store.set(f"INS_ACC{_number(path)}_ID", device_id(path.instance))
-
-
-def _number(path: InertialPath) -> str:
-    return "" if path.instance == 1 else str(path.instance)

@@ -8,10 +8,9 @@ from collections.abc import Callable
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.board import Board
-from sim.ardupilot.calibrations import ACCEL_PAUSE_S, ACCEL_TIME_S, AVERAGED_S, GYRO_GIVES_UP_S, GYRO_TIME_S
-from sim.ardupilot.messages import BUILDERS, STREAM_GROUPS
+from sim.ardupilot.calibrations import AVERAGED_S, GYRO_GIVES_UP_S, GYRO_TIME_S
+from sim.ardupilot.messages import BUILDERS
 from sim.ardupilot.versions import Version, since
-from sim.firmware.channel import Channel
 from sim.firmware.command import Command
 
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = (
@@ -34,12 +33,10 @@ class CommandServer:
         self._double = double
         self._handlers: dict[int, Callable[[Command], int | None]] = {
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_message_interval,
-            mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_message_interval,
             mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
             mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._request_capabilities,
             mavlink.MAV_CMD_PREFLIGHT_CALIBRATION: self._calibrate,
             mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
-            mavlink.MAV_CMD_PREFLIGHT_STORAGE: self._storage,
             mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
             mavlink.MAV_CMD_RUN_PREARM_CHECKS: self._run_prearm_checks,
             mavlink.MAV_CMD_SET_EKF_SOURCE_SET: self._set_source_set,
@@ -51,17 +48,6 @@ class CommandServer:
         result = UNSUPPORTED if handler is None else handler(command)
         if result is not None:
             self._acknowledge(command, result)
-
-    def data_stream(self, channel: Channel, message: mavlink.MAVLink_request_data_stream_message, now_s: float) -> None:
-        """The legacy REQUEST_DATA_STREAM."""
-        rate = message.req_message_rate
-        group = message.req_stream_id
-        groups = STREAM_GROUPS if group == mavlink.MAV_DATA_STREAM_ALL else {group: STREAM_GROUPS.get(group, ())}
-        for ids in groups.values():
-            for message_id in ids:
-                wanted = 1.0 / rate if message.start_stop and rate > 0 else None
-                channel.set_stream(message_id, wanted, now_s)
-        self._double.wake()
 
     def _acknowledge(self, command: Command, result: int, *, delay_s: float = ACK_DELAY_S) -> None:
         answer = mavlink.MAVLink_command_ack_message(
@@ -103,15 +89,6 @@ class CommandServer:
         double.wake()
         return ACCEPTED
 
-    def _get_message_interval(self, command: Command) -> int:
-        message_id = int(command.params[0])
-        stream = command.channel.streams.get(message_id)
-        interval_us = -1 if stream is None else round(stream.interval_s * 1e6)
-        if not self._known(message_id):
-            interval_us = 0
-        self._double.answer(command.channel, mavlink.MAVLink_message_interval_message(message_id, interval_us))
-        return ACCEPTED
-
     def _request_message(self, command: Command) -> int:
         message_id = int(command.params[0])
         if not self._known(message_id):
@@ -133,12 +110,6 @@ class CommandServer:
             return FAILED
         self._double.later(REBOOT_DELAY_S, self._double.reboot)
         return ACCEPTED
-
-    def _storage(self, command: Command) -> int:
-        if command.params[0] in (2.0, 4.0):
-            self._double.erase_parameters()  # with no look at the armed state, as the real one
-            return ACCEPTED
-        return DENIED
 
     def _arm(self, command: Command) -> int:
         double = self._double
@@ -172,7 +143,7 @@ class CommandServer:
 
     def _calibrate(self, command: Command) -> int | None:
         double = self._double
-        gyros, accelerometers = command.params[0] == 1.0, command.params[4]
+        gyros = command.params[0] == 1.0
         if double.armed:
             double.say(mavlink.MAV_SEVERITY_NOTICE, "Disarm to allow calibration")
             return FAILED
@@ -181,21 +152,12 @@ class CommandServer:
                 double.estimator.reset_gyro_bias()
                 return ACCEPTED  # the real one says so too early, while offsets still read zero
             return FAILED
-        if gyros or accelerometers == 2.0:
-            self._start_gyros(command, then_level=accelerometers == 2.0)
+        if gyros:
+            self._start_gyros(command)
             return None
-        if accelerometers == 4.0:
-            if double.aircraft.time_at(command.loop_s) - double.calibrations.last_accel_s < ACCEL_PAUSE_S:
-                return mavlink.MAV_RESULT_TEMPORARILY_REJECTED
-            double.calibrating = True
-            double.later(ACCEL_TIME_S, lambda: self._finish_accel(command))
-            return None
-        if accelerometers == 76.0:
-            double.calibrations.save_ids()
-            return ACCEPTED
         return UNSUPPORTED
 
-    def _start_gyros(self, command: Command, *, then_level: bool) -> None:
+    def _start_gyros(self, command: Command) -> None:
         double = self._double
         double.calibrating = True
         double.say(mavlink.MAV_SEVERITY_INFO, "Calibrating gyros")
@@ -204,33 +166,19 @@ class CommandServer:
         if double.faults.reboot_while_calibrating:
             double.faults.reboot_while_calibrating = False
             double.later(GYRO_TIME_S / 2, double.reboot)
-        double.later(GYRO_TIME_S, lambda: self._finish_gyros(command, then_level=then_level))
+        double.later(GYRO_TIME_S, lambda: self._finish_gyros(command))
 
-    def _finish_gyros(self, command: Command, *, then_level: bool) -> None:
+    def _finish_gyros(self, command: Command) -> None:
         double = self._double
         now_s = double.now_s()
         t_s = double.aircraft.time_at(now_s)
         still = double.aircraft.still_at(t_s) and double.aircraft.still_at(t_s - AVERAGED_S)
         still = still and not double.faults.gyro_calibration_fails
         if not still and now_s - command.loop_s < GYRO_GIVES_UP_S:
-            double.later(0.25, lambda: self._finish_gyros(command, then_level=then_level))
+            double.later(0.25, lambda: self._finish_gyros(command))
             return
         double.announce(double.calibrations.gyros(t_s, converged=still))  # stored even when it has not converged
         double.calibrating = False
-        result = ACCEPTED if still else FAILED
         if still:
             double.estimator.reset_gyro_bias()
-        if still and then_level and not double.calibrations.level(t_s):
-            result = FAILED
-        self._acknowledge(command, result)
-
-    def _finish_accel(self, command: Command) -> None:
-        double = self._double
-        t_s = double.aircraft.time_at(double.now_s())
-        double.calibrating = False
-        if not double.aircraft.still_at(t_s):
-            self._acknowledge(command, FAILED)
-            return
-        double.calibrations.simple_accel(t_s)
-        double.estimator.reset(t_s)
-        self._acknowledge(command, ACCEPTED)
+        self._acknowledge(command, ACCEPTED if still else FAILED)

@@ -37,8 +37,8 @@ class ArduPilotDouble(Board):
     station. `run` sends what is due; answers need only the running loop. Time is the loop's clock.
 
     Not modelled: flight, notches, the learning of a temperature calibration (INS_TCALn_ENABLE = 2), missions,
-    LOG_REQUEST_*, SETUP_SIGNING (`require_signatures` stands for it), 6-position calibration, the 10 s that
-    consistency checks must pass before arming.
+    LOG_REQUEST_*, PREFLIGHT_STORAGE, REQUEST_DATA_STREAM, calibrations of accelerometers and of the level, ODOMETRY,
+    SETUP_SIGNING (`require_signatures` stands for it), the 10 s that consistency checks must pass before arming.
 
     Arguments are those of `Board`.
     """
@@ -185,9 +185,7 @@ class ArduPilotDouble(Board):
             self._parameter_server.list_all(channel)
         elif isinstance(message, mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message):
             self._commands.handle(command_of(channel, message, loop_s))
-        elif isinstance(message, mavlink.MAVLink_request_data_stream_message):
-            self._commands.data_stream(channel, message, loop_s)
-        elif isinstance(message, mavlink.MAVLink_vision_position_estimate_message | mavlink.MAVLink_odometry_message):
+        elif isinstance(message, mavlink.MAVLink_vision_position_estimate_message):
             self.external_nav.take(message, loop_s)
         elif isinstance(message, mavlink.MAVLink_play_tune_message):
             self.buzzer.take(message, loop_s, armed=self.armed)

@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.board import Board
-from sim.firmware.channel import Message
 
 COMPASS = 1
 EXTNAV = 6
@@ -72,32 +70,9 @@ class ExternalNav:
         """Whether the EKF counts this as its source of yaw at present."""
         return self.selected and loop_s - self._fused_s < IN_USE_S
 
-    def take(self, message: Message, loop_s: float) -> None:
-        """A message that may be one."""
-        if isinstance(message, mavlink.MAVLink_vision_position_estimate_message):
-            angles = (message.roll, message.pitch, message.yaw)
-            self._take(message.usec, (message.x, message.y, message.z), angles, message.covariance, loop_s)
-        elif isinstance(message, mavlink.MAVLink_odometry_message):
-            frames = (message.frame_id, message.child_frame_id)
-            if frames != (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD):
-                self.rejected["frame"] += 1
-                return
-            if message.quality < 0:
-                self.rejected["quality"] += 1
-                return
-            w, x, y, z = message.q
-            yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-            position = (message.x, message.y, message.z)
-            self._take(message.time_usec, position, (0.0, 0.0, yaw), message.pose_covariance, loop_s)
-
-    def _take(
-        self,
-        stamp_us: int,
-        position: tuple[float, ...],
-        angles: tuple[float, ...],
-        covariance: Sequence[float],
-        loop_s: float,
-    ) -> None:
+    def take(self, message: mavlink.MAVLink_vision_position_estimate_message, loop_s: float) -> None:
+        """Handle a VISION_POSITION_ESTIMATE."""
+        covariance = message.covariance
         if not self.enabled:
             self.rejected["off"] += 1
             return
@@ -106,21 +81,21 @@ class ExternalNav:
         if not math.isnan(covariance[0]):
             total = covariance[15] + covariance[18] + covariance[20]
             sigma = math.sqrt(total) if total >= 0.0 else math.nan
-        if any(map(math.isnan, position)):
+        if any(map(math.isnan, (message.x, message.y, message.z))):
             self.rejected["position"] += 1
             return
-        stamp_ms = stamp_us // 1000
+        stamp_ms = message.usec // 1000
         if stamp_ms - self._stamp_ms < LEAST_SPACING_MS:
             self.rejected["too soon"] += 1
             return
         self._stamp_ms = stamp_ms
-        if any(map(math.isnan, (*angles, sigma))):
+        if any(map(math.isnan, (message.roll, message.pitch, message.yaw, sigma))):
             self.rejected["angle"] += 1
             return
         self.consumed += 1
         self.sigma_rad = max(min(max(sigma, YAW_NOISE_RAD), 1.5), math.radians(5.0))
         if self.selected:
-            self._fuse(angles[2], loop_s)
+            self._fuse(message.yaw, loop_s)
 
     def _fuse(self, yaw_rad: float, loop_s: float) -> None:
         double = self._double

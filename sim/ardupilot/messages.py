@@ -105,7 +105,7 @@ def ekf_status_report(double: Board, loop_s: float) -> Message:
     external = double.external_nav
     if external.selected and not external.aligned:
         flags |= mavlink.EKF_CONST_POS_MODE
-    elif double.has_position:
+    else:
         flags |= mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_PRED_POS_HORIZ_ABS
         flags |= mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_PRED_POS_HORIZ_REL
     return mavlink.MAVLink_ekf_status_report_message(flags, 0.05, 0.05, 0.05, 0.02, 0.0, 0.0)
@@ -150,20 +150,4 @@ BUILDERS: dict[int, Builder] = {
     mavlink.MAVLINK_MSG_ID_AHRS: ahrs,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: ekf_status_report,
     mavlink.MAVLINK_MSG_ID_VFR_HUD: vfr_hud,
-}
-
-# Groups of the legacy REQUEST_DATA_STREAM: no SCALED_IMU and no HIGHRES_IMU in RAW_SENSORS.
-STREAM_GROUPS: dict[int, tuple[int, ...]] = {
-    mavlink.MAV_DATA_STREAM_RAW_SENSORS: (
-        mavlink.MAVLINK_MSG_ID_RAW_IMU,
-        mavlink.MAVLINK_MSG_ID_SCALED_IMU2,
-        mavlink.MAVLINK_MSG_ID_SCALED_IMU3,
-    ),
-    mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: (
-        mavlink.MAVLINK_MSG_ID_SYS_STATUS,
-        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
-    ),
-    mavlink.MAV_DATA_STREAM_POSITION: (mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,),
-    mavlink.MAV_DATA_STREAM_EXTRA1: (mavlink.MAVLINK_MSG_ID_ATTITUDE,),
-    mavlink.MAV_DATA_STREAM_EXTRA3: (mavlink.MAVLINK_MSG_ID_AHRS, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME),
 }

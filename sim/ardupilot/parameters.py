@@ -123,50 +123,32 @@ def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) 
     table |= {"AHRS_ORIENTATION": (0, INT8), "AHRS_EKF_TYPE": (3, INT8), "CUST_ROT_ENABLE": (0, INT8)}
     for number in (1, 2):
         table |= {f"CUST_ROT{number}_{angle}": (0.0, REAL32) for angle in ("ROLL", "PITCH", "YAW")}
-    for instance in (1, 2, 3):
-        table |= _imu_parameters(instance, exists=instance <= imus)
-    for instance in (4, 5) if auxiliary and since(version, "4.4") else ():
-        table |= _auxiliary_parameters(instance, exists=instance == 4)
+    instances = (1, 2, 3, 4, 5) if auxiliary and since(version, "4.4") else (1, 2, 3)
+    for instance in instances:
+        table |= _imu_parameters(instance, exists=instance <= imus or instance == 4)
     table |= {
         "INS_GYR_CAL": (1, INT8),
-        "INS_ENABLE_MASK": (127, INT8),
-        "INS_FAST_SAMPLE": (1, INT8),
         "INS_GYRO_FILTER": (20, INT16),
         "INS_ACCEL_FILTER": (20, INT16),
         "INS_GYRO_RATE": (0, INT8),
         "INS_ACC_BODYFIX": (2, INT8),
-        "INS_STILL_THRESH": (2.5, REAL32),
-        "INS_TRIM_OPTION": (1, INT8),
         "INS_TCAL_OPTIONS": (0, INT8),
-        "INS_LOG_BAT_MASK": (0, INT8),
-        "BRD_BOOT_DELAY": (0, INT16),
-        "BRD_OPTIONS": (0, INT32),
-        "BRD_RTC_TYPES": (1, INT8),
-        "BRD_SERIAL_NUM": (0, INT32),
         "SERIAL1_PROTOCOL": (2, INT8),
         "SERIAL1_BAUD": (57, INT32),
         "SERIAL2_PROTOCOL": (2, INT8),
         "SERIAL2_BAUD": (57, INT32),
         "SERIAL3_PROTOCOL": (5, INT8),
-        "EK3_ENABLE": (1, INT8),
         "EK3_IMU_MASK": (2 ** min(imus, 3) - 1, INT8),
         **{f"EK3_SRC1_{what}": (value, INT8) for what, value in EKF_SOURCES.items()},
         **{f"EK3_SRC{number}_{what}": (0, INT8) for number in (2, 3) for what in EKF_SOURCES},
-        "EK3_GBIAS_P_NSE": (0.001, REAL32),
-        "EK3_ABIAS_P_NSE": (0.02, REAL32),
-        "EK3_ACC_BIAS_LIM": (1.0, REAL32),
-        "COMPASS_ENABLE": (1, INT8),
         "COMPASS_USE": (1, INT8),
-        "COMPASS_AUTODEC": (1, INT8),
         "COMPASS_DEC": (0.0, REAL32),
         "SCHED_LOOP_RATE": (400, INT16),
         "SCR_ENABLE": (0, INT8),
         "VISO_TYPE": (0, INT8),
-        "GPS1_TYPE" if since(version, "4.6") else "GPS_TYPE": (1, INT8),
         "LOG_BITMASK": (176126, INT32),
         "LOG_DISARMED": (0, INT8),
         "STAT_BOOTCNT": (1, INT16),
-        "STAT_RUNTIME": (0, INT32),
     }
     groups = ("RAW_SENS", "EXT_STAT", "RC_CHAN", "RAW_CTRL", "POSITION", "EXTRA1", "EXTRA2", "EXTRA3", "PARAMS")
     for port in range(2):
@@ -175,36 +157,19 @@ def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) 
 
 
 def _imu_parameters(instance: int, *, exists: bool) -> dict[str, tuple[float, int]]:
-    number = "" if instance == 1 else str(instance)
-    table: dict[str, tuple[float, int]] = dict.fromkeys(offset_names(instance, "gyro"), (0.0, REAL32))
+    if instance > 3:
+        gyro_id, accel_id, use = (f"INS{instance}_{what}" for what in ("GYR_ID", "ACC_ID", "USE"))
+    else:
+        number = "" if instance == 1 else str(instance)
+        gyro_id, accel_id, use = f"INS_GYR{number}_ID", f"INS_ACC{number}_ID", f"INS_USE{number}"
+    # Nothing corrects what the gyro of an auxiliary IMU reads: it comes with offsets.
+    gyro_offset = 2e-4 if exists and instance > 3 else 0.0
+    table: dict[str, tuple[float, int]] = dict.fromkeys(offset_names(instance, "gyro"), (gyro_offset, REAL32))
     table |= dict.fromkeys(offset_names(instance, "scale"), (1.0 if exists else 0.0, REAL32))
     table |= dict.fromkeys(offset_names(instance, "accel"), (0.001 if exists else 0.0, REAL32))
-    table |= {
-        f"INS_GYR{number}_ID": (device_id(instance) if exists else 0, INT32),
-        f"INS_ACC{number}_ID": (device_id(instance) if exists else 0, INT32),
-        f"INS_USE{number}": (1, INT8),
-        f"INS_GYR{instance}_CALTEMP": (-300.0, REAL32),
-        f"INS_ACC{instance}_CALTEMP": (-300.0, REAL32),
-        **_tcal_parameters(instance),
-    }
-    table |= {f"INS_POS{instance}_{axis}": (0.0, REAL32) for axis in AXES}
-    return table
-
-
-def _auxiliary_parameters(instance: int, *, exists: bool) -> dict[str, tuple[float, int]]:
-    table: dict[str, tuple[float, int]] = dict.fromkeys(
-        offset_names(instance, "gyro"), (2e-4 if exists else 0.0, REAL32)
-    )
-    table |= dict.fromkeys(offset_names(instance, "scale"), (1.0 if exists else 0.0, REAL32))
-    table |= dict.fromkeys(offset_names(instance, "accel"), (0.001 if exists else 0.0, REAL32))
-    return table | {
-        f"INS{instance}_GYR_ID": (device_id(instance) if exists else 0, INT32),
-        f"INS{instance}_ACC_ID": (device_id(instance) if exists else 0, INT32),
-        f"INS{instance}_USE": (1, INT8),
-        f"INS{instance}_GYR_CALTEMP": (-300.0, REAL32),
-        f"INS{instance}_ACC_CALTEMP": (-300.0, REAL32),
-        **_tcal_parameters(instance),
-    }
+    table |= dict.fromkeys((gyro_id, accel_id), (device_id(instance) if exists else 0, INT32))
+    table |= {caltemp_name(instance, kind): (-300.0, REAL32) for kind in ("GYR", "ACC")}
+    return table | {use: (1, INT8)} | _tcal_parameters(instance)
 
 
 def _tcal_parameters(instance: int) -> dict[str, tuple[float, int]]:

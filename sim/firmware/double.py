@@ -33,8 +33,6 @@ class AutopilotDouble(abc.ABC):
         imus: the models; the first is IMU 1.
         channels: the companion's port and the ground station's.
         up_s: how long it has been running when the simulation begins.
-        has_position: whether it has a GNSS fix, and so a position and a date.
-        clock_ppm: how much faster its clock runs.
         tunes_go_on: as `Buzzer`.
     """
 
@@ -45,13 +43,10 @@ class AutopilotDouble(abc.ABC):
         channels: tuple[Channel, Channel],
         *,
         up_s: float,
-        has_position: bool,
-        clock_ppm: float,
         seed: int,
         tunes_go_on: bool,
     ) -> None:
         self.aircraft, self.imus = aircraft, tuple(imus)
-        self.has_position, self.clock_ppm = has_position, clock_ppm
         self.faults = Faults()
         self.buzzer = Buzzer(goes_on=tunes_go_on)
         self.armed = False
@@ -176,7 +171,7 @@ class AutopilotDouble(abc.ABC):
     def boot_us(self, loop_s: float) -> int:
         """Microseconds since boot on its own clock."""
         assert self._booted_s is not None
-        return int((loop_s - self._booted_s) * (1.0 + self.clock_ppm * 1e-6) * 1e6)
+        return int((loop_s - self._booted_s) * 1e6)
 
     def boot_ms(self, loop_s: float) -> int:
         """Milliseconds since boot."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import Literal
 
 
 @dataclass(slots=True)
@@ -37,8 +36,6 @@ class Faults:
     """The autopilot's own gyro calibration does not converge."""
     reboot_while_calibrating: bool = False
     """It restarts in the middle of its next own gyro calibration; then False again."""
-    error_port: Literal["asker's", "other"] | None = None
-    """Where the PARAM_ERROR to a read goes: None, as on the real one, whichever link is served first."""
     foreign_write_after: tuple[int, str, float] | None = None
     """(n, name, value): another ground station sets a parameter right after the n-th PARAM_SET from now."""
 

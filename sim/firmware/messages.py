@@ -28,17 +28,14 @@ def magnetic_body(double: AutopilotDouble, t_s: float) -> Array:
 
 def system_time(double: AutopilotDouble, loop_s: float) -> Message:
     """SYSTEM_TIME; the date is known because there is GNSS."""
-    unix_us = 0 if not double.has_position else int(double.unix_s(loop_s) * 1e6)
-    return mavlink.MAVLink_system_time_message(unix_us, double.boot_ms(loop_s))
+    return mavlink.MAVLink_system_time_message(int(double.unix_s(loop_s) * 1e6), double.boot_ms(loop_s))
 
 
 def global_position_int(double: AutopilotDouble, loop_s: float) -> Message:
-    """GLOBAL_POSITION_INT; zeros without a position."""
+    """GLOBAL_POSITION_INT."""
     site = double.aircraft.site
     _, _, yaw = double.estimated_angles_rad(loop_s)
     heading = int(math.degrees(yaw) % 360.0 * 100.0) % 36000
-    if not double.has_position:
-        return mavlink.MAVLink_global_position_int_message(double.boot_ms(loop_s), 0, 0, 0, 0, 0, 0, 0, heading)
     return mavlink.MAVLink_global_position_int_message(
         double.boot_ms(loop_s), round(site.latitude_deg * 1e7), round(site.longitude_deg * 1e7),
         round(site.height_m * 1000.0), 0, 0, 0, 0, heading,
@@ -46,10 +43,8 @@ def global_position_int(double: AutopilotDouble, loop_s: float) -> Message:
 
 
 def gps_raw_int(double: AutopilotDouble, loop_s: float) -> Message:
-    """GPS_RAW_INT: a 3D fix, or none."""
+    """GPS_RAW_INT: a 3D fix."""
     site = double.aircraft.site
-    if not double.has_position:
-        return mavlink.MAVLink_gps_raw_int_message(double.boot_us(loop_s), 1, 0, 0, 0, 65535, 65535, 0, 0, 0)
     return mavlink.MAVLink_gps_raw_int_message(
         double.boot_us(loop_s), 3, round(site.latitude_deg * 1e7), round(site.longitude_deg * 1e7),
         round(site.height_m * 1000.0), 80, 120, 0, 0, 14, round(site.height_m * 1000.0), 1200, 1800,

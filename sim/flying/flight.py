@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import shutil
 import signal
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
@@ -127,15 +126,6 @@ class Flight:
         self.signal(signal.SIGCONT)
         await self._stack.aclose()
 
-    async def ask(self, *words: str) -> dict[str, Any]:
-        """A command of the companion with --json."""
-        process = await asyncio.create_subprocess_exec(
-            *self.daemon.command(*words, "--json"), stdout=asyncio.subprocess.PIPE
-        )
-        output, _ = await process.communicate()
-        answer: dict[str, Any] = json.loads(output)
-        return answer
-
     async def set_up(self) -> None:
         """As `companion autopilot-setup` says, from a ground station, and a restart of the autopilot.
 
@@ -144,7 +134,7 @@ class Flight:
         Raises:
             RuntimeError: the companion is not content.
         """
-        shown, stored = await self.ask("autopilot-setup"), self.plan.stored
+        shown, stored = await self.daemon.ask("autopilot-setup"), self.plan.stored
         only_one = self.plan.set_up == "today"
         content = "not applied" if only_one else "applied"
         if stored is None or not stored.exists():
@@ -164,7 +154,7 @@ class Flight:
             await self.vehicle.power_on()
             self._since_s = asyncio.get_running_loop().time()
             await self.vehicle.sleep(RESTARTED_S)
-            shown = await self.ask("autopilot-setup")
+            shown = await self.daemon.ask("autopilot-setup")
         if shown["state"] != content:
             raise RuntimeError(f"autopilot-setup: {shown}")
 
@@ -191,7 +181,7 @@ class Flight:
             async with asyncio.timeout(PUSHED_WITHIN_S):
                 while not (attitude.get("pushing") and is_ours(self._told())):
                     await asyncio.sleep(0.5)
-                    attitude = (await self.ask("status"))["attitude"]
+                    attitude = (await self.daemon.ask("status"))["attitude"]
         except TimeoutError:
             raise TimeoutError(f"no heading is pushed, or it is not in use: {attitude}") from None
 

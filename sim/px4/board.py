@@ -43,12 +43,8 @@ class Board(AutopilotDouble):
         slots: number n of the CAL_GYROn_/CAL_ACCn_ slot of each IMU, None for no slot; default 0, 1, 2, ...
         external: numbers (0..) of IMUs that are external: they turn with CAL_x_ROT.
         imu_rate_hz: of the integrated samples; streams are quantised by it.
-        flash_storage: a board that saves to flash: while it is armed nothing is saved.
         default_streams: False: nothing but heartbeats and TIMESYNC runs by itself (quick tests).
-        data_rate: bytes per second of the companion's port (MAV_1_RATE); None: enough.
         up_s: how long it has been running when the simulation begins.
-        has_position: whether it has a GNSS fix, and so a position and a date.
-        clock_ppm: how much faster its clock runs.
         thermal: whether there is a module for TC_*.
         console: whether `listener` is built, which some small boards leave out.
     """
@@ -67,12 +63,8 @@ class Board(AutopilotDouble):
         slots: Sequence[int | None] | None = None,
         external: Sequence[int] = (),
         imu_rate_hz: float = 250.0,
-        flash_storage: bool = False,
         default_streams: bool = True,
-        data_rate: float | None = None,
         up_s: float = 30.0,
-        has_position: bool = True,
-        clock_ppm: float = 0.0,
         thermal: Module = "idle",
         console: bool = True,
         seed: int = 0,
@@ -86,11 +78,11 @@ class Board(AutopilotDouble):
         self.ports = (
             PX4Port(
                 system_id, self._handle,
-                defaults=ONBOARD_RATES if default_streams else quiet, period_s=period_s, data_rate=data_rate,
+                defaults=ONBOARD_RATES if default_streams else quiet, period_s=period_s,
             ),
             PX4Port(
                 system_id, self._handle,
-                defaults=NORMAL_RATES if default_streams else quiet, period_s=period_s, data_rate=None,
+                defaults=NORMAL_RATES if default_streams else quiet, period_s=period_s,
             ),
         )  # fmt: skip
         super().__init__(
@@ -98,13 +90,11 @@ class Board(AutopilotDouble):
             imus,
             self.ports,
             up_s=up_s,
-            has_position=has_position,
-            clock_ppm=clock_ppm,
             seed=seed,
             tunes_go_on=True,
         )
         self.system_id, self.version, self.vehicle = system_id, version, vehicle
-        self.flash_storage, self.console = flash_storage, console
+        self.console = console
         self.timesync_answers = 0
         """Answers to its own TIMESYNC requests."""
         ids = [EXTERNAL_IDS[n] if n in external else SIMULATED_IDS[n] for n in range(len(imus))]

@@ -16,7 +16,6 @@ from sim.px4.arm_authorization import ArmAuthorization
 from sim.px4.board import Board
 from sim.px4.calibrations import Calibrations
 from sim.px4.checks import NOT_AUTHORIZED, Checks
-from sim.px4.external_vision import ExternalVision
 from sim.px4.messages import BUILDERS
 from sim.px4.port import HEARTBEAT, PX4Port
 
@@ -30,8 +29,6 @@ ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = (
 ACK_DELAY_S = (0.003, 0.010)
 REBOOT_DELAY_S = 0.4
 DOWN_S = 3.0
-EXTERNAL_ATTITUDE_ESTIMATE = 620
-"""Of the development dialect; known since 1.17."""
 QUEUE = 8
 """Commands that wait while the commander waits for an authorisation; more are lost."""
 _UNANSWERED = {
@@ -51,14 +48,12 @@ class Commander:
         double: Board,
         checks: Checks,
         calibrations: Calibrations,
-        vision: ExternalVision,
         authorization: ArmAuthorization,
     ) -> None:
         self._double, self._checks, self._calibrations = double, checks, calibrations
-        self._vision, self._authorization = vision, authorization
+        self._authorization = authorization
         self._at_the_port: dict[int, Callable[[Command], int | None]] = {
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_message_interval,
-            mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_message_interval,
             mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
         }
         self._handlers: dict[int, Callable[[Command], int | None]] = {
@@ -66,10 +61,7 @@ class Commander:
             mavlink.MAV_CMD_RUN_PREARM_CHECKS: self._run_prearm_checks,
             mavlink.MAV_CMD_PREFLIGHT_CALIBRATION: self._calibrate,
             mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
-            mavlink.MAV_CMD_PREFLIGHT_STORAGE: self._storage,
         }
-        if double.version != "1.16":
-            self._handlers[EXTERNAL_ATTITUDE_ESTIMATE] = self._external_attitude
         self.restart()
 
     def restart(self) -> None:
@@ -138,13 +130,6 @@ class Commander:
         self._double.wake()
         return ACCEPTED
 
-    def _get_message_interval(self, command: Command) -> int:
-        number = int(command.params[0]) if math.isfinite(command.params[0]) else 0
-        stream = command.channel.streams.get(number)
-        interval_us = -1 if stream is None else round(stream.interval_s * 1e6)
-        self._double.answer(command.channel, mavlink.MAVLink_message_interval_message(number & 0xFFFF, interval_us))
-        return ACCEPTED
-
     def _request_message(self, command: Command) -> int:
         number = round(command.params[0]) if math.isfinite(command.params[0]) else 0
         message = self._double.build(number, command.loop_s) if number in BUILDERS else None
@@ -208,23 +193,12 @@ class Commander:
             self._double.say(mavlink.MAV_SEVERITY_CRITICAL, f"Preflight Fail: {failure}")
         return ACCEPTED
 
-    def _external_attitude(self, command: Command) -> int:
-        yaw_deg = command.params[2]
-        if not math.isfinite(yaw_deg):
-            return UNSUPPORTED
-        self._vision.heading_by_command(yaw_deg, command.loop_s)
-        return ACCEPTED
-
     def _calibrate(self, command: Command) -> int:
         double, worker = self._double, self._calibrations
         if double.armed or worker.busy:
             return TEMPORARILY_REJECTED
-        gyros, accelerometers = command.params[0], command.params[4]
-        jobs = {1: worker.six_sides, 2: worker.level, 4: worker.quick_accel}
-        if gyros == 1.0:
+        if command.params[0] == 1.0:
             worker.gyros()
-        elif accelerometers in jobs:
-            jobs[int(accelerometers)]()
         elif command.params[3] != 0.0:
             return UNSUPPORTED
         return ACCEPTED
@@ -236,24 +210,6 @@ class Commander:
         if action not in (1.0, 3.0) or self._double.armed:
             return DENIED
         self._double.later(REBOOT_DELAY_S, lambda: self._double.reboot(DOWN_S))
-        return ACCEPTED
-
-    def _storage(self, command: Command) -> int | None:
-        double, store, action = self._double, self._double.parameters, command.params[0]
-        if double.armed or self._calibrations.busy:
-            return TEMPORARILY_REJECTED
-        if action == 0.0:
-            store.load()
-        elif action == 1.0:
-            store.save()
-            return ACCEPTED
-        elif action in (2.0, 4.0):
-            store.reset()
-        elif action == 3.0:
-            store.reset("CAL_")
-        else:
-            return None
-        double.parameters_changed()
         return ACCEPTED
 
 

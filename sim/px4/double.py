@@ -55,8 +55,8 @@ class Applied(NamedTuple):
 class PX4Double(Board):
     """An autopilot with up to four IMUs on a virtual aircraft; its port is TELEM2 (MAV_1), `ground` is TELEM1 (MAV_0).
 
-    Not modelled: flight, thermal compensation of accelerometers and its own calibration, the 6-side calibration (it
-    fails), magnetometer calibrations, factory calibration storage, MAVFTP, missions, logs, events,
+    Not modelled: flight, thermal compensation of accelerometers and its own calibration, calibrations but the gyros',
+    PREFLIGHT_STORAGE, ODOMETRY, boards that save to flash, the data rate of a port, MAVFTP, missions, logs, events,
     SETUP_SIGNING, the target fields of TIMESYNC.
 
     Arguments are those of `Board`.
@@ -72,7 +72,7 @@ class PX4Double(Board):
         self.authorization = ArmAuthorization(self)
         self.vision = ExternalVision(self)
         self.checks = Checks(self)
-        self.commander: Commander = Commander(self, self.checks, self.calibrations, self.vision, self.authorization)
+        self.commander: Commander = Commander(self, self.checks, self.calibrations, self.authorization)
         self._parameter_server = ParameterServer(self)
         self._voice = Voice(self)
         self.shell = Shell(self)
@@ -236,9 +236,6 @@ class PX4Double(Board):
             self.gyro_rival.parameters_updated(now_s)
 
     def _autosave(self) -> None:
-        if self.flash_storage and self.armed:
-            self.later(1.0, self._autosave)
-            return
         self._saving, self._saved_s = False, self.now_s()
         self.parameters.save()
 

@@ -1,8 +1,7 @@
 """What the double makes of an attitude from outside: external vision as EKF2 uses its yaw.
 
 Facts: PX4 `mavlink_receiver.cpp`, `EKF2.cpp` (UpdateExtVisionSample), `ev_control.cpp`, `ev_yaw_control.cpp`,
-`Timesync.cpp` (2026). Not modelled: position, velocity, frames other than NED (ODOMETRY counts only with a finite
-position in LOCAL_NED), the estimator's yaw covariance.
+`Timesync.cpp` (2026). Not modelled: position, velocity, ODOMETRY, the estimator's yaw covariance.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ LONGEST_GAP_S = 0.2
 STOPS_AFTER_S = 0.4
 RESTARTS_AFTER_S = 1.0
 """Since the last fusion, before it starts again."""
-NORM_TOLERANCE = 1e-5
 CONVERGED_AFTER = 500
 """Accepted TIMESYNC exchanges until stamps are used."""
 LONGEST_ROUND_TRIP_S = 0.010
@@ -92,27 +90,6 @@ class ExternalVision:
                 self.rejected["angle"] += 1
                 return
             self._sample(message.usec, message.yaw, message.covariance[20], message.reset_counter, loop_s)
-        elif isinstance(message, mavlink.MAVLink_odometry_message):
-            kinds = (0, mavlink.MAV_ESTIMATOR_TYPE_VISION, mavlink.MAV_ESTIMATOR_TYPE_VIO)
-            if message.estimator_type not in (*kinds, mavlink.MAV_ESTIMATOR_TYPE_NAIVE):
-                self.rejected["estimator type"] += 1
-                self._double.say(mavlink.MAV_SEVERITY_CRITICAL, "ODOMETRY: estimator_type unsupported\t")
-                return
-            w, x, y, z = message.q
-            if not abs(1.0 - math.sqrt(w * w + x * x + y * y + z * z)) <= NORM_TOLERANCE:
-                self.rejected["norm"] += 1
-                return
-            placed = all(map(math.isfinite, (message.x, message.y, message.z)))
-            if not placed or message.frame_id != mavlink.MAV_FRAME_LOCAL_NED:
-                self.rejected["frame"] += 1
-                return
-            yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-            self._sample(message.time_usec, yaw, message.pose_covariance[20], message.reset_counter, loop_s)
-
-    def heading_by_command(self, yaw_deg: float, loop_s: float) -> None:
-        """MAV_CMD_EXTERNAL_ATTITUDE_ESTIMATE."""
-        self.update(loop_s)
-        self.yaw_error_rad = self._wrong(math.radians(yaw_deg), loop_s)
 
     def _sample(self, stamp_us: int, yaw_rad: float, variance: float, counter: int, loop_s: float) -> None:
         self.update(loop_s)

@@ -70,13 +70,8 @@ def scaled_imu(double: Board, loop_s: float, index: int) -> Message | None:
     magnetic = [truncated_16(float(value)) for value in magnetic_body(double, t_s)]
     temperature = round(double.imus[index].temperature_degc(t_s) * 100.0) or 1  # 0 means "not known"
     boot_ms = double.boot_ms(double.aircraft.loop_time_of(sample_s) + _PUBLISHED_AFTER_S)
-    kind = (
-        mavlink.MAVLink_scaled_imu_message,
-        mavlink.MAVLink_scaled_imu2_message,
-        mavlink.MAVLink_scaled_imu3_message,
-    )
     fields = (*milli_g, *milli_rad, *magnetic, temperature)
-    return kind[index](boot_ms, *fields)
+    return _SCALED_IMU[index](boot_ms, *fields)
 
 
 def attitude(double: Board, loop_s: float) -> Message:
@@ -91,10 +86,8 @@ def timesync(double: Board, loop_s: float) -> Message:
     return mavlink.MAVLink_timesync_message(0, double.boot_us(loop_s) * 1000)
 
 
-def home_position(double: Board, loop_s: float) -> Message | None:
-    """HOME_POSITION: set when there is a position."""
-    if not double.has_position:
-        return None
+def home_position(double: Board, loop_s: float) -> Message:
+    """HOME_POSITION: where it stands."""
     site = double.aircraft.site
     return mavlink.MAVLink_home_position_message(
         round(site.latitude_deg * 1e7), round(site.longitude_deg * 1e7), round(site.height_m * 1000.0),
@@ -112,8 +105,7 @@ def extended_sys_state(double: Board, loop_s: float) -> Message:
 def estimator_status(double: Board, loop_s: float) -> Message:
     """ESTIMATOR_STATUS: what it uses for its heading is not in it."""
     flags = mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_VELOCITY_VERT | mavlink.ESTIMATOR_POS_VERT_ABS
-    if double.has_position:
-        flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_POS_HORIZ_ABS | mavlink.ESTIMATOR_POS_HORIZ_REL
+    flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_POS_HORIZ_ABS | mavlink.ESTIMATOR_POS_HORIZ_REL
     return mavlink.MAVLink_estimator_status_message(
         double.boot_us(loop_s), flags, 0.05, 0.05, 0.05, 0.02, 0.0, 0.0, 0.5, 0.5
     )

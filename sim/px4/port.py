@@ -19,8 +19,6 @@ MAIN_LOOP_S = 0.0015
 """The pause of a port's loop on a fast link."""
 GCS_TIMEOUT_S = 2.5
 TEXT_QUEUE = 8
-_OVERHEAD = 12
-"""Bytes of a MAVLink 2 packet around its payload."""
 
 
 @dataclass(slots=True)
@@ -61,7 +59,6 @@ class PX4Port(Channel):
     Args:
         defaults: rates in Hz of the streams that run by themselves.
         period_s: of the sensor samples: streams are looked at once per sample, so rates are quantised by it.
-        data_rate: bytes per second (MAV_n_RATE) to which the streams are scaled down together; None: enough for all.
     """
 
     # PX4's documents, MAVLink Message Signing (main, 2026): its "unsigned message allowlist".
@@ -79,10 +76,9 @@ class PX4Port(Channel):
         *,
         defaults: Mapping[int, float],
         period_s: float,
-        data_rate: float | None,
     ) -> None:
         super().__init__(system_id, handle)
-        self.defaults, self.period_s, self.data_rate = dict(defaults), period_s, data_rate
+        self.defaults, self.period_s = dict(defaults), period_s
         self.forwards = False
         """MAV_n_FORWARD at the last boot."""
         self.seen: set[tuple[int, int]] = set()
@@ -93,7 +89,6 @@ class PX4Port(Channel):
         """Time, severity and text of what could not be said yet; the oldest is lost."""
         self.text_number = 0
         self.text_next_s = 0.0
-        self._slower = 1.0
 
     def restart(self, now_s: float) -> None:
         """A boot: default streams, nobody seen."""
@@ -123,11 +118,8 @@ class PX4Port(Channel):
         if interval_s is None:
             self.streams.pop(message_id, None)
         else:
-            stream = PacedStream(interval_s, 0.0, now_s)
-            self.streams[message_id] = stream
-        self._scale()
-        for stream_id, other in self.streams.items():
-            self._plan(stream_id, other)
+            stream = self.streams[message_id] = PacedStream(interval_s, 0.0, now_s)
+            self._plan(stream)
 
     def due(self, now_s: float) -> list[int]:
         """Message ids whose time has come."""
@@ -136,27 +128,14 @@ class PX4Port(Channel):
             if stream.next_s <= now_s + 1e-9:
                 due.append(message_id)
                 assert isinstance(stream, PacedStream)
-                interval = self._interval(message_id, stream)
+                interval = stream.interval_s
                 late = now_s - stream.last_s
                 # A little late: the next one is reckoned from when this one was due. Very late: from now.
                 stream.last_s = stream.last_s + interval if 1.5 * interval > late else now_s
-                self._plan(message_id, stream)
+                self._plan(stream)
         return due
 
-    def _interval(self, message_id: int, stream: Stream) -> float:
-        return stream.interval_s if message_id == HEARTBEAT else stream.interval_s * self._slower
-
-    def _plan(self, message_id: int, stream: Stream) -> None:
+    def _plan(self, stream: PacedStream) -> None:
         """The first sample at which it is due, that is 0.3 of a loop's pause before its interval is over."""
-        assert isinstance(stream, PacedStream)
-        wanted_s = stream.last_s + self._interval(message_id, stream) - 0.3 * MAIN_LOOP_S
+        wanted_s = stream.last_s + stream.interval_s - 0.3 * MAIN_LOOP_S
         stream.next_s = (math.floor(wanted_s / self.period_s) + 1) * self.period_s
-
-    def _scale(self) -> None:
-        """All streams but HEARTBEAT go slower by one factor when their sum would exceed the data rate."""
-        rate = sum(
-            (mavlink.mavlink_map[message_id].unpacker.size + _OVERHEAD) / stream.interval_s
-            for message_id, stream in self.streams.items()
-            if message_id != HEARTBEAT
-        )
-        self._slower = 1.0 if self.data_rate is None else max(1.0, rate / max(self.data_rate - 21.0, 1.0))

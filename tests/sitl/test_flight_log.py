@@ -51,7 +51,7 @@ async def flown(craft: str, folder: Path) -> tuple[dict[str, Any], str, list[flo
         *_, log = sorted(flight.vehicle.folder.rglob("*.ulg" if craft == "px4" else "*.BIN"))
         unmoved = folder / "unmoved.param"
         unmoved.write_text("".join(f"{name},{value!r}\n" for name, value in before.items()), encoding="ascii")
-        answer = await flight.ask("flight", str(log), "--offsets", str(unmoved))
+        answer = await flight.daemon.ask("flight", str(log), "--offsets", str(unmoved))
         (record, *_) = RecordStore(flight.folder / "state").history()
     found = answer["flights"][-1]
     return found, record.started_at, (px4_true_error(log) if craft == "px4" else ardupilot_true_error(log))

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.imu_model import DEG_H, MG
-from sim.sitl.observe import SCALED
+from sim.imu_model import DEG_H
 from tests.sitl.craft import Autopilot, Craft
 
 CALIBRATE = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
@@ -92,26 +91,6 @@ def test_a_repeated_gyro_calibration_of_ardupilot_is_answered_early_while_it_sti
     autopilot.run(main)
 
 
-@pytest.mark.only("ardupilot")
-def test_the_simple_accelerometer_calibration_of_ardupilot_takes_the_tilt_for_bias(autopilot: Autopilot) -> None:
-    async def main(craft: Craft) -> None:
-        ground = craft.ground
-        names = tuple(f"INS_ACCOFFS_{axis}" for axis in "XYZ")
-        others = tuple(f"INS_ACC2OFFS_{axis}" for axis in "XYZ")
-        gyros = tuple(f"{name}_{axis}" for name in ("INS_GYROFFS", "INS_GYR2OFFS") for axis in "XYZ")
-        async with ground.restored(*names, *others, *gyros):
-            result = await ground.command(CALIBRATE, 0.0, 0.0, 0.0, 0.0, 4.0, wait_s=35.0)
-            assert result == mavlink.MAV_RESULT_ACCEPTED
-            found = np.array([await ground.get(name) for name in names])
-            error = (found - craft.true_bias(1).accel_m_s2) / MG
-            np.testing.assert_allclose(error, TILT_ERROR_MG, atol=0.5)
-            assert await ground.get("INS_ACCSCAL_X") == 1.0
-            assert await ground.get("AHRS_TRIM_X") == 0.0
-        await craft.reboot()  # it has reset the whole AHRS
-
-    autopilot.run(main, 180.0)
-
-
 @pytest.mark.only("px4")
 def test_the_gyro_calibration_of_px4_says_done_and_leaves_small_biases_whole(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
@@ -126,20 +105,3 @@ def test_the_gyro_calibration_of_px4_says_done_and_leaves_small_biases_whole(aut
                 assert await ground.get(f"CAL_GYRO{instance}_{axis}OFF") == pytest.approx(0.0, abs=1e-6)
 
     autopilot.run(main)
-
-
-@pytest.mark.only("px4")
-def test_the_quick_accelerometer_calibration_of_px4_leaves_horizontal_biases_whole(autopilot: Autopilot) -> None:
-    async def main(craft: Craft) -> None:
-        ground = craft.ground
-        names = tuple(f"CAL_ACC{n}_{axis}{what}" for n in (0, 1) for axis in "XYZ" for what in ("OFF", "SCALE"))
-        async with ground.restored(*names):
-            before = (await ground.imu(SCALED[1], 4.0, rate_hz=250.0)).mean(axis=0)[3:] / MG
-            assert await ground.command(CALIBRATE, 0.0, 0.0, 0.0, 0.0, 4.0) == mavlink.MAV_RESULT_ACCEPTED
-            await asyncio.sleep(5.0)
-            after = (await ground.imu(SCALED[1], 4.0, rate_hz=250.0)).mean(axis=0)[3:] / MG
-            # Noise of a few samples; the bias of 60 mg that ArduPilot's would make of the tilt is not there.
-            np.testing.assert_allclose(after[:2], before[:2], atol=4.0)
-        await craft.reboot()
-
-    autopilot.run(main, 120.0)

@@ -88,25 +88,15 @@ def test_names_of_three_instances_exist_and_acc1offs_does_not() -> None:
                     for name in offset_names(instance, kind):
                         assert len(await stage.companion.read_parameter(name)) == 1
             assert offset_names(1, "accel")[0] == "INS_ACCOFFS_X"
-            stage.double.faults.error_port = "asker's"
-            assert await stage.companion.read_parameter("INS_ACC1OFFS_X") == []
+            assert await stage.companion.set_parameter("INS_ACC1OFFS_X", 1.0) == []
             error = stage.companion.all(mavlink.MAVLink_param_error_message)[0]
             assert (error.param_id, error.error) == ("INS_ACC1OFFS_X", 1)
             assert (error.target_system, error.target_component) == (1, 191)
-            assert await stage.companion.set_parameter("INS_ACC1OFFS_X", 1.0) == []
-            assert len(stage.companion.all(mavlink.MAVLink_param_error_message)) == 2
-
-    run_virtual(main())
-
-
-def test_the_error_to_a_read_leaves_by_whichever_link_is_served_first() -> None:
-    async def main() -> None:
-        async with Stage() as stage:
             for _ in range(16):
-                assert await stage.companion.read_parameter("NO_SUCH") == []
+                assert await stage.companion.read_parameter("INS_ACC1OFFS_X") == []
             errors = [len(each.all(mavlink.MAVLink_param_error_message)) for each in (stage.companion, stage.ground)]
-            assert sum(errors) == 16
-            assert min(errors) > 0
+            # The error to a read leaves by whichever link is served first.
+            assert (sum(errors), min(errors) > 0) == (17, True)
 
     run_virtual(main())
 
@@ -175,17 +165,6 @@ def test_arming_is_forced_by_2989_and_from_4_6_on_by_21196(version: str, word: i
         async with Stage(version=version, parameters=dict.fromkeys(offset_names(1, "accel"), 0.0)) as stage:
             await stage.ground.command(ARM, 1, word)
             assert stage.double.armed == armed
-
-    run_virtual(main())
-
-
-def test_integers_are_cast_and_nan_is_not_stored() -> None:
-    async def main() -> None:
-        async with Stage() as stage:
-            assert await stage.companion.set_parameter("INS_GYR_CAL", 0.6) == [1.0]
-            assert await stage.companion.set_parameter("INS_GYROFFS_X", math.nan) == []
-            assert stage.double.parameter("INS_GYROFFS_X") == 0.0
-            assert stage.double.parameter("INS_ACC_ID") == float(int(stage.double.parameter("INS_ACC_ID")))
 
     run_virtual(main())
 
@@ -304,38 +283,6 @@ def test_a_repeated_gyro_calibration_is_accepted_too_early_while_offsets_read_ze
     run_virtual(main())
 
 
-def test_the_simple_accelerometer_calibration_takes_the_tilt_for_bias() -> None:
-    async def main() -> None:
-        async with Stage(parameters={"INS_ACCSCAL_X": 1.1, "AHRS_TRIM_X": 0.05}) as stage:
-            loop = asyncio.get_running_loop()
-            begun_s = loop.time()
-            assert await stage.companion.command(CALIBRATE, 0, 0, 0, 0, 4) == 0
-            assert 1.0 < loop.time() - begun_s < 1.1
-            found = np.array([stage.double.parameter(name) for name in offset_names(1, "accel")])
-            # Seen on the real firmware at this pose: 87.22, 52.18 and 5.69 mg beyond the true bias.
-            assert (found - ACCEL_BIAS) / MG == pytest.approx([87.2, 52.15, 5.7], abs=0.4)
-            assert stage.double.parameter("INS_ACCSCAL_X") == 1.0
-            assert stage.double.parameter("AHRS_TRIM_X") == 0.0
-            assert await stage.companion.command(CALIBRATE, 0, 0, 0, 0, 4) == mavlink.MAV_RESULT_TEMPORARILY_REJECTED
-
-    run_virtual(main())
-
-
-def test_the_level_calibration_puts_the_tilt_into_the_trim() -> None:
-    async def main() -> None:
-        exact = dict(zip(offset_names(1, "accel"), ACCEL_BIAS, strict=True))
-        async with Stage(parameters=exact) as stage:
-            assert await stage.companion.command(CALIBRATE, 0, 0, 0, 0, 2) == 0
-            trim = np.degrees([stage.double.parameter("AHRS_TRIM_X"), stage.double.parameter("AHRS_TRIM_Y")])
-            assert trim == pytest.approx([-3.0, 5.0], abs=0.01)
-            await asyncio.sleep(60.0)
-            await stage.companion.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_ATTITUDE)
-            attitude = stage.companion.all(mavlink.MAVLink_attitude_message)[-1]
-            assert np.degrees([attitude.roll, attitude.pitch]) == pytest.approx([0.0, 0.0], abs=0.02)
-
-    run_virtual(main())
-
-
 def test_a_calibration_waits_for_stillness_and_is_refused_while_armed() -> None:
     async def main() -> None:
         aircraft = VirtualAircraft(POSE, motions=[Handling(start_s=0.0, duration_s=8.0)])
@@ -379,19 +326,6 @@ def test_two_imus_that_differ_too_much_do_not_arm() -> None:
     run_virtual(main())
 
 
-def test_user_commands_are_unsupported_and_storage_is_denied() -> None:
-    async def main() -> None:
-        async with Stage() as stage:
-            assert await stage.companion.command(mavlink.MAV_CMD_USER_1) == mavlink.MAV_RESULT_UNSUPPORTED
-            assert await stage.companion.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1) == mavlink.MAV_RESULT_DENIED
-            message = mavlink.MAVLink_command_int_message(1, 1, 0, mavlink.MAV_CMD_USER_1, 0, 0, 0, 0, 0, 0, 0, 0, 0)
-            stage.companion.send(message)
-            await asyncio.sleep(0.1)
-            assert stage.companion.all(mavlink.MAVLink_command_ack_message)[-1].result == 3
-
-    run_virtual(main())
-
-
 def test_what_is_addressed_to_an_unheard_component_the_autopilot_does_itself() -> None:
     async def main() -> None:
         async with Stage() as stage:
@@ -425,128 +359,3 @@ def test_once_heard_the_component_gets_its_messages_and_the_autopilot_keeps_out(
             assert len(stage.companion.all(mavlink.MAVLink_command_long_message)) == 1
 
     run_virtual(main())
-
-
-def test_a_reboot_forgets_who_was_heard() -> None:
-    async def main() -> None:
-        async with Stage() as stage:
-            stage.companion.heartbeat()
-            await asyncio.sleep(0.05)
-            stage.double.reboot()
-            await asyncio.sleep(2.0)
-            assert not stage.double.hears(191)
-
-    run_virtual(main())
-
-
-def test_faults_of_parameters() -> None:
-    async def main() -> None:
-        async with Stage() as stage:
-            faults, companion, double = stage.double.faults, stage.companion, stage.double
-            faults.echo_without_effect = True
-            before = double.residual(1, double.now_s()).accel_m_s2
-            assert await companion.set_parameter("INS_ACCOFFS_X", 0.5) == [0.5]
-            assert await companion.read_parameter("INS_ACCOFFS_X") == [0.5]
-            assert double.residual(1, double.now_s()).accel_m_s2 == pytest.approx(before, abs=1e-12)
-            faults.echo_without_effect = False
-
-            faults.refuse = {"INS_ACC*_Y"}
-            assert await companion.set_parameter("INS_ACCOFFS_Y", 0.5) == [pytest.approx(0.001)]
-            assert companion.all(mavlink.MAVLink_param_error_message)[-1].error == 3
-            assert any(text.startswith("Param write denied") for text in companion.texts())
-
-            faults.ignore = {"INS_ACCOFFS_Z"}
-            assert await companion.set_parameter("INS_ACCOFFS_Z", 0.5) == []
-            assert double.parameter("INS_ACCOFFS_Z") == pytest.approx(0.001)
-
-            faults.wrong_echo = {"INS_GYROFFS_Z"}
-            assert await companion.set_parameter("INS_GYROFFS_Z", 0.001) != [pytest.approx(0.001)]
-            assert await companion.read_parameter("INS_GYROFFS_Z") == [pytest.approx(0.001)]
-
-            faults.silent = True
-            assert await companion.read_parameter("INS_GYROFFS_X") == []
-            assert await companion.command(mavlink.MAV_CMD_USER_1, wait_s=0.2) == -1
-            assert len(double.writes) == 4
-
-    run_virtual(main())
-
-
-def test_faults_of_streams() -> None:
-    async def main() -> None:
-        async with Stage() as stage:
-            faults, companion = stage.double.faults, stage.companion
-            await companion.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, 20_000)
-            loop = asyncio.get_running_loop()
-
-            async def kinds(duration_s: float) -> dict[str, int]:
-                await asyncio.sleep(0.02)
-                since_s = loop.time()
-                await asyncio.sleep(duration_s)
-                names = [message.get_type() for t_s, message in companion.heard if t_s >= since_s]
-                return {name: names.count(name) for name in set(names)}
-
-            faults.telemetry_off = True
-            assert await kinds(3.0) == {"HEARTBEAT": 3}
-            faults.telemetry_off, faults.heartbeat_off = False, True
-            assert set(await kinds(3.0)) == {"HIGHRES_IMU"}
-            faults.heartbeat_off, faults.frozen_imu = False, True
-            since_s = loop.time() + 0.02
-            await kinds(1.0)
-            assert len({m.xgyro for m in companion.all(mavlink.MAVLink_highres_imu_message, since_s=since_s)}) == 1
-            faults.int_only = True
-            result = await companion.command(
-                mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, 20_000
-            )
-            assert result == mavlink.MAV_RESULT_DENIED
-            assert "No ap_message for mavlink id (105)" in companion.texts()
-
-    run_virtual(main())
-
-
-def test_faults_in_the_middle_of_a_write() -> None:
-    async def main() -> None:
-        async with Stage() as stage:
-            faults, companion, double = stage.double.faults, stage.companion, stage.double
-            faults.arm_after_writes = 2
-            armed = []
-            for name in ("INS_GYROFFS_X", "INS_GYROFFS_Y"):
-                assert len(await companion.set_parameter(name, 0.001)) == 1
-                armed.append(double.armed)
-            assert armed == [False, True]
-            double.disarm()
-
-            faults.foreign_write_after = (1, "INS_GYROFFS_X", 0.009)
-            await companion.set_parameter("INS_GYROFFS_Z", 0.001)
-            assert double.parameter("INS_GYROFFS_X") == pytest.approx(0.009)
-            assert companion.all(mavlink.MAVLink_param_value_message)[-3].param_value == pytest.approx(0.009)
-
-            faults.reboot_after_writes = 1
-            assert await companion.set_parameter("INS_GYROFFS_Z", 0.004) == []
-            await asyncio.sleep(2.0)
-            assert double.boots == 2
-            assert double.parameter("INS_GYROFFS_Z") == pytest.approx(0.004)
-            assert len(await companion.set_parameter("INS_GYROFFS_Z", 0.005)) == 1
-
-    run_virtual(main())
-
-
-def test_a_fault_of_the_simulator_itself_ends_run_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def main() -> None:
-        stage = Stage()
-
-        def broken(*_: object) -> float:
-            raise ZeroDivisionError
-
-        monkeypatch.setattr(stage.double, "imu_output", broken)
-        running = asyncio.create_task(stage.double.run())
-        await asyncio.sleep(0.05)
-        await stage.companion.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, 20_000)
-        with pytest.raises(ZeroDivisionError):
-            await running
-
-    run_virtual(main())
-
-
-def test_the_number_of_imus_is_checked() -> None:
-    with pytest.raises(ValueError, match="allowed: 1 to 3"):
-        ArduPilotDouble(VirtualAircraft(), [])

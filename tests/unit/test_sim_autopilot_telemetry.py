@@ -15,7 +15,6 @@ from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.ardupilot.double import ArduPilotDouble
 from sim.earth import STANDARD_GRAVITY_M_S2, mounting_matrix
 from sim.imu_model import DEG_H, MG, ImuModel
-from sim.motions import SlowTurn, Vibration
 from sim.station import Station
 from tests.support.virtual_time import run_virtual
 from tests.support.wire import Wire
@@ -225,52 +224,6 @@ def test_scaled_imu2_is_the_second_and_scaled_imu3_is_all_zero_without_a_third()
     play(scene, imus=2)
 
 
-def test_highres_imu_says_the_barometers_temperature_and_time_since_boot() -> None:
-    async def scene(double: ArduPilotDouble, station: Station) -> None:
-        await station.command(SET_INTERVAL, HIGHRES, 10_000)
-        await asyncio.sleep(1.0)
-        t_s, last = station.timed(mavlink.MAVLink_highres_imu_message)[-1]
-        assert last.temperature > 30.0
-        assert (last.id, last.fields_updated) == (0, 8191)
-        assert last.time_usec / 1e6 == pytest.approx(t_s - 1000.0 + 30.0, abs=0.01)
-
-    play(scene)
-
-
-def test_position_date_version_and_attitude_on_request() -> None:
-    async def scene(double: ArduPilotDouble, station: Station) -> None:
-        for message_id in (2, 24, 33, 30, 163, 148, 1):
-            assert await station.command(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id) == 0
-        position = station.all(mavlink.MAVLink_global_position_int_message)[0]
-        assert (position.lat, position.lon, position.alt) == (400_000_000, 1_160_000_000, 50_000)
-        assert station.all(mavlink.MAVLink_gps_raw_int_message)[0].fix_type == 3
-        date = station.all(mavlink.MAVLink_system_time_message)[0]
-        assert date.time_unix_usec / 1e6 == pytest.approx(1_795_219_200.0, abs=1.0)
-        assert date.time_boot_ms == pytest.approx(30_050, abs=20)
-        attitude = station.all(mavlink.MAVLink_attitude_message)[0]
-        # A horizontal accelerometer error of e reads as a tilt of e/g, a good part of it 30 s after the boot.
-        assert math.degrees(attitude.pitch) == pytest.approx(5.0 + math.degrees(1e-3 - 0.001 / 9.80665), abs=5e-3)
-        assert math.degrees(attitude.roll) == pytest.approx(-3.0 + math.degrees(2e-3 + 0.001 / 9.80665), abs=8e-3)
-        assert math.degrees(attitude.yaw) == pytest.approx(40.0, abs=1.0)  # it does not know its gyro bias yet
-        capabilities = station.all(mavlink.MAVLink_autopilot_version_message)[0].capabilities
-        assert capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
-        assert not capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
-        assert not capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
-
-    play(scene)
-
-
-def test_no_fix_means_no_position_and_no_date() -> None:
-    async def scene(double: ArduPilotDouble, station: Station) -> None:
-        for message_id in (2, 24, 33):
-            assert await station.command(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id) == 0
-        assert station.all(mavlink.MAVLink_global_position_int_message)[0].lat == 0
-        assert station.all(mavlink.MAVLink_gps_raw_int_message)[0].fix_type < 2
-        assert station.all(mavlink.MAVLink_system_time_message)[0].time_unix_usec == 0
-
-    play(scene, has_position=False)
-
-
 def test_the_estimator_keeps_a_stale_gyro_bias_after_a_write_for_about_two_minutes() -> None:
     async def yaw_deg(station: Station) -> float:
         await station.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_ATTITUDE)
@@ -298,27 +251,6 @@ def test_the_estimator_keeps_a_stale_gyro_bias_after_a_write_for_about_two_minut
     play(scene)
 
 
-def test_motion_shows_in_the_telemetry_and_fast_vibration_is_filtered() -> None:
-    async def scene(double: ArduPilotDouble, station: Station) -> None:
-        await station.command(SET_INTERVAL, HIGHRES, 10_000)
-        await asyncio.sleep(13.9)
-        readings = highres(station)
-        t_s = readings[:, 0] - 1000.0
-        turning = readings[(t_s > 4.0) & (t_s < 5.0)]
-        assert np.degrees(turning[:, 3]).mean() == pytest.approx(
-            2.0 + np.degrees(GYRO_BIAS[2] - 7.292e-5 * 0.643), abs=2e-3
-        )
-        shaken = readings[(t_s > 11.0) & (t_s < 13.0)]
-        # A second-order 20 Hz low-pass lets (20/87)^2 = 5 % of 87 Hz through.
-        assert 0.5 * 0.053 / math.sqrt(2.0) < shaken[:, 6].std() / 2.0 < 1.5 * 0.053 / math.sqrt(2.0)
-
-    motions = [
-        SlowTurn(start_s=2.0, duration_s=5.0, rate_deg_s=2.0),
-        Vibration(start_s=10.0, duration_s=4.0, frequency_hz=87.0, amplitude_m_s2=2.0),
-    ]
-    play(scene, aircraft=VirtualAircraft(Pose(), Site(40.0, 116.0, 50.0), motions=motions))
-
-
 @pytest.mark.parametrize(
     ("vehicle", "request_us", "result", "rate_hz"),
     [
@@ -341,36 +273,6 @@ def test_rates_are_whole_milliseconds_and_limited_by_the_loop(
         assert too_fast == (result != 0)
 
     play(scene, vehicle=vehicle)
-
-
-def test_several_streams_at_once_stopping_and_asking_for_the_interval() -> None:
-    async def scene(double: ArduPilotDouble, station: Station) -> None:
-        ids = (mavlink.MAVLINK_MSG_ID_RAW_IMU, HIGHRES, mavlink.MAVLINK_MSG_ID_SCALED_IMU2)
-        for message_id in ids:
-            await station.command(SET_INTERVAL, message_id, 5_000)
-        since_s = asyncio.get_running_loop().time()
-        await asyncio.sleep(1.0)
-        assert len(station.all(mavlink.MAVLink_raw_imu_message, since_s=since_s)) == pytest.approx(200, abs=2)
-        assert len(station.all(mavlink.MAVLink_highres_imu_message, since_s=since_s)) == pytest.approx(200, abs=2)
-        assert await station.command(mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, HIGHRES) == 0
-        assert station.all(mavlink.MAVLink_message_interval_message)[-1].interval_us == 5_000
-        assert await station.command(SET_INTERVAL, HIGHRES, -1) == 0
-        since_s = asyncio.get_running_loop().time() + 0.02
-        await asyncio.sleep(1.0)
-        assert station.all(mavlink.MAVLink_highres_imu_message, since_s=since_s) == []
-
-    play(scene, imus=2)
-
-
-def test_the_legacy_stream_has_no_highres_and_no_scaled_imu() -> None:
-    async def scene(double: ArduPilotDouble, station: Station) -> None:
-        station.send(mavlink.MAVLink_request_data_stream_message(1, 1, mavlink.MAV_DATA_STREAM_RAW_SENSORS, 50, 1))
-        await asyncio.sleep(2.0)
-        kinds = {message.get_type() for _, message in station.heard} - {"HEARTBEAT"}
-        assert kinds == {"RAW_IMU", "SCALED_IMU2", "SCALED_IMU3"}
-        assert len(station.all(mavlink.MAVLink_raw_imu_message)) == pytest.approx(100, abs=2)
-
-    play(scene)
 
 
 def test_before_4_6_there_is_no_highres_imu_and_rates_are_capped_silently() -> None:

@@ -44,12 +44,6 @@ def test_hmr3300_lines_are_magnetic_heading_pitch_roll_at_8_hz() -> None:
     assert frames[0].complete_s == pytest.approx(17 * 10 / 19200)
 
 
-def test_hmr3300_heading_wraps_before_360_and_zero_has_no_minus() -> None:
-    for heading, text in ((359.96, "0.0"), (359.94, "359.9"), (-0.04, "0.0"), (0.04, "0.0")):
-        compass = HMR3300(VirtualAircraft(Pose(-0.04, 0.0, heading)), heading_noise_deg=0.0)
-        assert compass.frames_until(0.0)[0].data == f"{text}, 0.0, 0.0\r\n".encode()
-
-
 def test_the_field_is_the_places_and_iron_turns_the_heading_as_it_must() -> None:
     site = Site(40.0, 116.0, 50.0, declination_deg=-7.5, inclination_deg=60.0, field_gauss=0.5)
     level = VirtualAircraft(Pose(heading_deg=0.0), site)
@@ -72,20 +66,6 @@ def test_the_field_is_the_places_and_iron_turns_the_heading_as_it_must() -> None
     np.testing.assert_allclose(
         Iron(dipole_a_m2=(0.0, 10.0, 0.0), dipole_at_m=(0.0, 2.0, 0.0)).ground_ned_gauss, [0, 0.0025, 0]
     )
-
-
-def test_hmr3300_commands() -> None:
-    compass = HMR3300(VirtualAircraft(POSE), heading_noise_deg=0.0)
-    assert compass.frames_until(0.5)
-    assert compass.command(b"*Q\r\n", 0.5) == b""  # only while stopped
-    assert compass.command(b"*S\r", 0.5) == b""
-    assert compass.frames_until(1.0) == []
-    assert compass.command(b"*", 1.0) + compass.command(b"Q\r\n", 1.0) == b"40.0, 5.0, -3.0\r\n"
-    assert compass.command(b"*M\r\n*Q\r\n", 1.0).count(b".") == 0
-    assert compass.command(b"rubbish\r\n", 1.0) == b"#I\r\n"
-    assert compass.command(b"\x00\xff" * 5000, 1.0) == b""
-    compass.command(b"\r\n*S\r\n", 1.0)
-    assert re.fullmatch(rb"(-?\d+, -?\d+, -?\d+\r\n)+", joined(compass.frames_until(2.0)))
 
 
 def test_gradienter_pairs_at_10_hz() -> None:
@@ -133,17 +113,6 @@ def test_gradienter_takes_acceleration_for_tilt_and_its_mounting_into_account() 
     x, y = turned.tilt_deg(np.array([0.0]))[0]
     assert x == pytest.approx(5.0)
     assert y == pytest.approx(2.98859, abs=1e-4)
-
-
-def test_gradienter_commands() -> None:
-    gradienter = Gradienter(VirtualAircraft(POSE), noise_deg=0.0)
-    assert gradienter.command(b"s", 0.0) == b"s"
-    assert gradienter.frames_until(1.0) == []
-    assert gradienter.command(b"R", 1.0) == b"X=-02.989\r\nY=+05.000\r\n"
-    assert gradienter.command(b"V", 1.0).startswith(b"DPL2 V1.8.0")
-    assert gradienter.command(b"fima\x00\xff", 1.0) == b""
-    assert gradienter.command(b"S", 1.0) == b""
-    assert len(gradienter.frames_until(2.0)) == 10
 
 
 def still_imu() -> tuple[VirtualAircraft, ImuModel]:
@@ -212,12 +181,3 @@ def test_the_same_seed_gives_the_same_bytes_however_they_are_fetched(number: int
     parts = [piecewise.frames_until(t_s) for t_s in (0.2, 0.2, 1.7, 1.71, 3.0)]
     assert b"".join(joined(part) for part in parts) == whole
     assert len(whole) > 200
-
-
-def test_a_fast_clock_makes_more_frames_and_is_in_the_device_time() -> None:
-    aircraft = VirtualAircraft()
-    device = VectorNavBinary(ImuModel(aircraft, "perfect"), clock_ppm=1000.0)
-    frames = device.frames_until(100.0)
-    assert len(frames) == 20021
-    (startup_ns,) = struct.unpack("<Q", frames[-1].data[6:14])
-    assert startup_ns == pytest.approx(100.1e9, abs=1e6)

@@ -136,20 +136,6 @@ def test_ardupilot_drops_what_comes_within_20_ms_by_its_stamp() -> None:
     run_virtual(main())
 
 
-def test_ardupilot_takes_odometry_in_its_one_frame_only() -> None:
-    async def main() -> None:
-        async with line(ArduPilotDouble, ARDUPILOT) as on:
-            q = (math.cos(0.5), 0.0, 0.0, math.sin(0.5))
-            on.odometry(mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD, q)
-            await asyncio.sleep(0.05)
-            assert on.double.external_nav.rejected["frame"] == 1
-            on.odometry(mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD, q)
-            await asyncio.sleep(0.05)
-            assert on.wrong_deg() == pytest.approx(math.degrees(1.0) - TRUE_DEG, abs=0.5)
-
-    run_virtual(main())
-
-
 @pytest.mark.parametrize("missing", ["VISO_TYPE", "EK3_SRC1_YAW"])
 def test_without_either_parameter_nothing_is_taken_and_they_count_from_the_boot_on(missing: str) -> None:
     async def main() -> None:
@@ -201,24 +187,5 @@ def test_ekf2_resets_by_the_counter_and_by_failing_and_only_with_its_bit() -> No
             await on.stream(TRUE_DEG + 5.0, 5.0)
             assert not on.double.vision.active
             assert abs(on.wrong_deg()) < 0.5
-
-    run_virtual(main())
-
-
-def test_px4_minds_norm_frame_and_kind_of_odometry() -> None:
-    async def main() -> None:
-        async with line(PX4Double, PX4) as on:
-            rejected = on.double.vision.rejected
-            good = (math.cos(0.5), 0.0, 0.0, math.sin(0.5))
-            ned, body = mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD
-            on.odometry(ned, body, tuple(1.0001 * part for part in good))
-            on.odometry(ned, body, good, position=(NAN,) * 3)
-            on.odometry(ned, body, good, kind=mavlink.MAV_ESTIMATOR_TYPE_GPS)
-            await asyncio.sleep(0.1)
-            assert (rejected["norm"], rejected["frame"], rejected["estimator type"]) == (1, 1, 1)
-            assert on.double.vision.consumed == 0
-            on.odometry(ned, body, good)
-            await asyncio.sleep(0.1)
-            assert on.double.vision.consumed == 1
 
     run_virtual(main())

@@ -9,11 +9,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.flying.ardupilot import state_of
-from sim.flying.cli import main, parser, plans_of
-from sim.flying.flight import is_ours
 from sim.flying.px4 import Truth, source_changes
-from sim.flying.truth import BEHIND_S, FlyingAircraft, State, angles_of_quaternion
-from sim.flying.verdict import Event, Record, figures, row, summary
+from sim.flying.truth import BEHIND_S, FlyingAircraft, State
+from sim.flying.verdict import Event, Record, figures, row
 from sim.imu_model import ImuModel
 from sim.scenario import site_at
 
@@ -73,44 +71,6 @@ def test_what_arrives_late_is_not_lost_to_an_imu() -> None:
     assert (np.array(turned[80:]) - earth).sum() * 0.005 == pytest.approx(3.6, abs=0.02)
 
 
-def test_while_the_firmware_restarts_it_stands() -> None:
-    aircraft = turning(1.0, 1.0)
-    assert aircraft.truth(np.array([6.0])).force_m_s2[0] == pytest.approx([0.0, 0.0, -aircraft.site.gravity_m_s2])
-    aircraft.restart()
-    for k in range(3):
-        aircraft.take(
-            State(k * STEP_S, yawed(0.0), (0.0,) * 3, (0.0, 0.0, -9.8), (0.0,) * 3, (0.0,) * 3), 107.0 + k * STEP_S
-        )
-    assert aircraft.truth(np.array([6.5])).force_m_s2[0] == pytest.approx([0.0, 0.0, -aircraft.site.gravity_m_s2])
-
-
-def test_it_stands_as_it_was_put_down_until_it_is_told_otherwise() -> None:
-    aircraft = FlyingAircraft(site_at(40.0, 116.0, 50.0), heading_deg=30.0, unix_s=1_795_219_200.0)
-    assert np.degrees(aircraft.angles_rad(1.0)) == pytest.approx([0.0, 0.0, 30.0])
-    assert aircraft.truth_at(1.0).force_m_s2 == pytest.approx([0.0, 0.0, -aircraft.site.gravity_m_s2])
-
-
-def test_after_its_first_state_it_stands_as_that_says() -> None:
-    aircraft = FlyingAircraft(site_at(40.0, 116.0, 50.0), heading_deg=30.0, unix_s=1_795_219_200.0)
-    aircraft.begin(100.0)
-    aircraft.take(State(0.0, yawed(1.0), (0.0,) * 3, (0.0, 0.0, -9.8), (0.0,) * 3, (0.0,) * 3), 100.0)
-    for t_s in (-0.1, 0.0, 0.005, 0.2):
-        assert aircraft.angles_rad(t_s) == pytest.approx((0.0, 0.0, 1.0))
-
-
-def test_what_is_asked_for_before_its_first_state_is_at_rest() -> None:
-    """A device that is a little behind, right after a restart of the firmware."""
-    aircraft = turning(1.0, 1.0)
-    assert aircraft.truth_at(-0.5).force_m_s2 == pytest.approx([0.0, 0.0, -aircraft.site.gravity_m_s2])
-
-
-def test_angles_of_a_quaternion() -> None:
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_euler("ZYX", [40.0, 10.0, -20.0], degrees=True).as_quat()
-    assert np.degrees(angles_of_quaternion((w, x, y, z))) == pytest.approx([-20.0, 10.0, 40.0])
-
-
 def test_what_ardupilot_tells_a_slave() -> None:
     line = (
         b'\n{"timestamp":1.500000,"imu":{"gyro":[0.1,0.2,0.3],"accel_body":[1.0,2.0,-9.8]},"position":[4.0,5.0,-6.0],'
@@ -168,18 +128,6 @@ def test_a_plane_is_to_stay_on_its_circle_as_well_as_before() -> None:
     assert figures(circled(outwards_m=4.0)).wrong == ["place above 3 m"]
 
 
-def test_several_flights_in_a_line() -> None:
-    flights = [figures(hovered(yaw_deg=yaw_deg)) for yaw_deg in (1.0, 2.0, 12.0)]
-    for flight in flights:
-        assert flight.fallback_s == math.inf
-    line = summary("kill", "script", [*flights, None])
-    assert line.startswith(
-        "kill, script: 2 of 3 flights good, 1 did not come about; largest (median): yaw 12.6 (2.6) deg,"
-        " other set after inf (inf) s, "
-    )
-    assert summary("kill", "script", [None]) == "kill, script: 0 of 0 flights good, 1 did not come about"
-
-
 @pytest.mark.parametrize(
     ("off", "words"),
     [
@@ -199,30 +147,6 @@ def test_changes_that_nobody_asked_for() -> None:
     record.events = [Event(21.0 + k, "set", str(1 + k % 2)) for k in range(3)]
     record.events += [Event(30.0, "mode", "9"), Event(31.0, "disarmed", "")]
     assert figures(record).wrong == ["3 changes of the source set", "1 changes of mode", "disarmed in the air"]
-
-
-def test_a_record_without_estimates_is_refused() -> None:
-    record = hovered()
-    record.estimate = record.estimate[record.estimate[:, 0] < STRUCK_S]
-    with pytest.raises(ValueError, match="no estimates"):
-        figures(record)
-
-
-def test_every_fault_has_a_wind_of_its_own_and_the_set_ups_share_it() -> None:
-    words = ["--binary", "arducopter", "--fault", "kill", "--fault", "stop", "--set-up", "script", "--set-up", "today"]
-    kill, kill_today, stop, _ = plans_of(parser().parse_args(words))
-    assert (kill.wind, kill.heading_deg) == (kill_today.wind, kill_today.heading_deg) != (stop.wind, stop.heading_deg)
-    assert all(3.0 <= plan.wind[0] <= 8.0 for plan in (kill, stop))
-    assert plans_of(parser().parse_args([*words, "--wind", "7", "90", "--seed", "3"]))[0].wind == (7.0, 90.0)
-
-
-def test_flights_of_a_fault_have_seeds_and_winds_of_their_own() -> None:
-    words = ["--binary", "arducopter", "--fault", "kill", "--fault", "stop", "--flights", "3", "--seed", "5"]
-    plans = plans_of(parser().parse_args(words))
-    assert [(plan.fault, plan.seed) for plan in plans] == [
-        (fault, seed) for fault in ("kill", "stop") for seed in (5, 6, 7)
-    ]
-    assert len({plan.wind for plan in plans}) == 6
 
 
 def test_px4_says_by_its_flags_which_heading_it_uses() -> None:
@@ -277,31 +201,3 @@ def test_what_px4_tells_of_its_truth_is_an_aircraft_that_turns_and_speeds_up() -
     truth.receive(mavlink.MAVLink_hil_state_quaternion_message(0, [1.0, 0, 0, 0], *[0] * 14).pack(codec), 110.0)
     assert truth.boots == 2
     assert not aircraft.has_state
-
-
-@pytest.mark.parametrize(("words", "why"), [
-    (["--binary", "px4", "--fault", "own-compass"], "cannot be turned"),
-    (["--binary", "px4", "--set-up", "today"], "the others are ArduPilot's"),
-    (["--binary", "arducopter", "--set-up", "px4"], "px4 is that of PX4"),
-])  # fmt: skip
-def test_what_a_firmware_cannot_do_is_said_before_it_is_started(
-    words: list[str], why: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(words)
-    assert ended.value.code == 2
-    assert why in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("told", "ours"),
-    [
-        ([], True),
-        (["Heading: compass, none from companion", "Heading: companion"], True),
-        (["Heading: companion", "Heading: gyros, none from companion", "EKF3 IMU0 is using GPS"], False),
-        (["Heading: compass, companion's is not pushed"], False),
-    ],
-)
-def test_the_fault_waits_until_our_heading_is_the_one_in_use(told: list[str], ours: bool) -> None:
-    """The words are those of companion_arming.lua and of the daemon."""
-    assert is_ours(told) is ours

@@ -53,15 +53,6 @@ def test_white_noise_has_the_density_at_any_rate() -> None:
         assert found == pytest.approx(imu.white, rel=0.02)
 
 
-def test_bias_starts_at_what_was_ordered_and_wanders_by_its_seed() -> None:
-    imus = [ImuModel(VirtualAircraft(), "icm42688p", seed=s, gyro_bias_rad_s=(1e-3, 0.0, 0.0)) for s in (1, 1, 2)]
-    assert imus[0].true_bias(0.0).gyro_rad_s == pytest.approx([1e-3, 0.0, 0.0])
-    later = [imu.true_bias(600.0).gyro_rad_s for imu in imus]
-    assert later[0] == pytest.approx(later[1], abs=0.0)
-    assert np.abs(later[0] - later[2]).max() > 0.1 * DEG_H
-    assert 0.5 * DEG_H < np.abs(later[0] - [1e-3, 0.0, 0.0]).max() < 60.0 * DEG_H
-
-
 def test_the_bias_does_not_depend_on_who_asks_when_and_how() -> None:
     asked_late, read_before = (ImuModel(VirtualAircraft(), "adis16405", seed=9) for _ in range(2))
     far = asked_late.true_bias(400.0)
@@ -123,22 +114,6 @@ def test_scale_misalignment_and_mounting_in_the_right_frames() -> None:
     assert mounted.error_in_vehicle(0.0).accel_m_s2 == pytest.approx([0.0, 0.1, 0.0], abs=1e-12)
 
 
-def test_what_was_let_go_of_is_refused_and_changes_nothing_of_the_rest() -> None:
-    imu, other = (ImuModel(VirtualAircraft(), "icm42688p", seed=1) for _ in range(2))
-    imu.true_bias(600.0)
-    imu.forget_before(500.0)
-    assert np.array_equal(imu.mean_bias(500.0, 700.0).gyro_rad_s, other.mean_bias(500.0, 700.0).gyro_rad_s)
-    with pytest.raises(ValueError, match="no longer kept"):
-        imu.true_bias(400.0)
-
-
-def test_a_bias_too_far_back_is_refused_not_invented() -> None:
-    imu = ImuModel(VirtualAircraft(), "icm42688p", seed=1)
-    imu.true_bias(6.0 * 3600.0)
-    with pytest.raises(ValueError, match="no longer kept"):
-        imu.true_bias(1.0)
-
-
 def test_a_piece_follows_its_own_curve_and_the_die_is_as_warm_as_its_thermometer_was_before() -> None:
     board = Board(rise_k=20.0, time_constant_s=300.0)
     temperature = board.switched_on(5.0)
@@ -170,10 +145,3 @@ def test_power_ups_scatter_about_what_is_usual_for_a_piece_and_its_curve_stays()
     assert first.temperature_degc(0.0) == 5.0
     assert np.array_equal(first.curve.powers, second.curve.powers)
     assert (first.true_bias(0.0).gyro_rad_s != second.true_bias(0.0).gyro_rad_s).all()
-
-
-def test_another_power_up_is_seen_behind_another_converter_too() -> None:
-    imu = ImuModel(VirtualAircraft(), "perfect", gyro_bias_rad_s=[1.0, 2.0, 3.0])
-    other = imu.in_steps(0.25, 0.25)
-    imu.turn_on([4.0, 5.0, 6.0], [7.0, 8.0, 9.0])
-    np.testing.assert_array_equal(np.concatenate(other.true_bias(0.0)), [4.0, 5.0, 6.0, 7.0, 8.0, 9.0])

@@ -82,15 +82,6 @@ def test_the_request_goes_out_on_all_links_to_the_authorizer_component_0_with_al
     run_virtual(main())
 
 
-def test_without_the_parameter_nobody_is_asked() -> None:
-    async def main() -> None:
-        async with PX4Stage() as stage:
-            assert (await arm(stage))[0] == 0
-            assert requests(stage.companion) == []
-
-    run_virtual(main())
-
-
 def test_no_answer_denies_after_two_timeouts_with_two_requests() -> None:
     async def main() -> None:
         async with PX4Stage(parameters=ON) as stage:
@@ -153,20 +144,6 @@ def test_accepted_arms_within_milliseconds_of_the_answer_and_says_for_how_long(t
     run_virtual(main())
 
 
-def test_a_validity_of_zero_seconds_still_arms_this_time() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, param2=0)
-            assert (await arm(stage))[0] == 0
-            stage.double.disarm()
-            await asyncio.sleep(0.1)
-            assert (await arm(stage))[0] == 0
-            assert len(firsts(stage.companion)) == 2
-            authorizer.stop()
-
-    run_virtual(main())
-
-
 @pytest.mark.parametrize("target", [(0, 0), (2, 1), (1, 191)])
 def test_an_answer_whose_target_is_not_the_vehicle_is_ignored(target: tuple[int, int]) -> None:
     async def main() -> None:
@@ -211,44 +188,6 @@ def test_a_denial_denies_and_says_the_reason_in_progress(result: int, progress: 
     run_virtual(main())
 
 
-def test_after_a_denial_the_second_request_is_still_repeated() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            authorizer = Authorizer(stage, mavlink.MAV_RESULT_DENIED, progress=4)
-            assert (await arm(stage))[0] == 1
-            await asyncio.sleep(4.0)
-            assert [m.confirmation for _, m in requests(stage.companion)] == [0, 0, 1, 2, 3]
-            authorizer.stop()
-
-    run_virtual(main())
-
-
-def test_an_attempt_within_seconds_of_a_denied_one_asks_only_once() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            authorizer = Authorizer(stage, mavlink.MAV_RESULT_DENIED)
-            for gap_s, asked in ((3.0, 2), (10.0, 1), (0.0, 2)):
-                before = len(firsts(stage.companion))
-                assert (await arm(stage))[0] == 1
-                assert len(firsts(stage.companion)) - before == asked
-                await asyncio.sleep(gap_s)
-            authorizer.stop()
-
-    run_virtual(main())
-
-
-def test_the_second_request_of_an_attempt_can_still_arm() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, after_s=1.6)
-            result, took_s = await arm(stage)
-            assert result == 0
-            assert took_s == pytest.approx(1.61, abs=0.02)
-            authorizer.stop()
-
-    run_virtual(main())
-
-
 @pytest.mark.parametrize(("accepted_s", "armed"), [(0.6, True), (1.6, True), (2.4, False)])
 def test_in_progress_does_not_extend_the_time_out(accepted_s: float, armed: bool) -> None:
     async def main() -> None:
@@ -261,113 +200,5 @@ def test_in_progress_does_not_extend_the_time_out(accepted_s: float, armed: bool
             assert (result == 0) is armed
             working.stop()
             done.stop()
-
-    run_virtual(main())
-
-
-def test_a_longer_time_out_waits_longer() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_TO": 5.0}) as stage:
-            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, after_s=2.0)
-            result, took_s = await arm(stage)
-            assert result == 0
-            assert took_s == pytest.approx(2.01, abs=0.02)
-            authorizer.stop()
-
-    run_virtual(main())
-
-
-def test_one_step_blocks_the_commander_but_not_the_telemetry() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            stage.ground.send(mavlink.MAVLink_command_long_message(1, 1, ARM, 0, 1, 0, 0, 0, 0, 0, 0))
-            await asyncio.sleep(0.1)
-            begun_s = now_s()
-            assert await stage.companion.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 26, 20000) == 0
-            assert now_s() - begun_s < 0.05
-            assert await stage.companion.command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, wait_s=5.0) == 0
-            assert now_s() - begun_s > 1.8
-            assert len(stage.companion.all(mavlink.MAVLink_scaled_imu_message)) > 50
-
-    run_virtual(main())
-
-
-def test_two_steps_deny_the_first_attempt_at_once_and_let_the_second_one_pass() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_MET": 1}) as stage:
-            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED)
-            result, took_s = await arm(stage)
-            assert result == 1
-            assert took_s < 0.02
-            await asyncio.sleep(0.5)
-            assert "Arm auth: Requesting authorization..." in stage.ground.texts()
-            assert len(firsts(stage.companion)) == 1
-            assert (await arm(stage))[0] == 0
-            authorizer.stop()
-
-    run_virtual(main())
-
-
-def test_an_answer_before_any_request_is_ignored() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            stage.companion.send(mavlink.MAVLink_command_ack_message(ASK, 0, 0, 60, 1, 1))
-            await asyncio.sleep(0.1)
-            assert (await arm(stage))[0] == 1
-
-    run_virtual(main())
-
-
-def test_anybodys_answer_counts_but_only_the_authorizers_stops_the_repetitions() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_ID": 10}) as stage:
-            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, station=stage.ground)
-            assert (await arm(stage))[0] == 0
-            await asyncio.sleep(3.0)
-            assert [m.confirmation for _, m in requests(stage.companion)] == [0, 1, 2, 3]
-            authorizer.stop()
-
-    run_virtual(main())
-
-
-def test_a_companion_with_the_vehicles_system_id_can_be_the_authorizer_and_hears_an_unsupported_to_nobody() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED)
-            assert (await arm(stage))[0] == 0
-            await asyncio.sleep(0.1)
-            (ack,) = [m for m in stage.companion.all(mavlink.MAVLink_command_ack_message) if m.command == ASK]
-            assert (ack.result, ack.target_system, ack.target_component) == (3, 0, 0)
-            authorizer.stop()
-
-    run_virtual(main())
-
-
-def test_force_arming_does_not_bypass_it() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            assert (await arm(stage, force=21196.0))[0] == 1
-            assert len(firsts(stage.companion)) == 2
-
-    run_virtual(main())
-
-
-def test_the_parameters_count_at_once_without_a_reboot() -> None:
-    async def main() -> None:
-        async with PX4Stage() as stage:
-            await stage.set("COM_ARM_AUTH_REQ", 1)
-            await stage.set("COM_ARM_AUTH_ID", 42)
-            assert (await arm(stage))[0] == 1
-            assert requests(stage.companion)[0][1].target_system == 42
-
-    run_virtual(main())
-
-
-def test_a_failed_check_is_not_healed_by_an_authorisation() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters={**ON, "COM_ARMABLE": 0}) as stage:
-            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED)
-            assert (await arm(stage))[0] == 1
-            authorizer.stop()
 
     run_virtual(main())

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import math
 
-import numpy as np
 import pytest
 
 from sim.earth import mounting_matrix
-from sim.imu_model import ImuModel
-from tests.support.px4_stage import ACCEL_BIAS, ARM, GYRO_BIAS, LATEST_S, PX4Stage, now_s
+from tests.support.px4_stage import ARM, GYRO_BIAS, LATEST_S, PX4Stage, now_s
 from tests.support.virtual_time import run_virtual
 
 ZERO = pytest.approx([0.0, 0.0, 0.0])
@@ -62,18 +59,6 @@ def test_an_external_imu_turns_with_its_own_rotation_and_with_the_level_offsets(
     run_virtual(main())
 
 
-def test_a_board_rotation_undoes_how_the_board_is_mounted() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters={"SENS_BOARD_ROT": 12}) as plain:  # pitch 180
-            turned = ImuModel(plain.aircraft, "perfect", mounting_deg=(0.0, 180.0, 0.0))
-        async with PX4Stage(parameters={"SENS_BOARD_ROT": 12}, aircraft=plain.aircraft, models=[turned]) as stage:
-            left = stage.double.residual(1, now_s())
-            assert left.gyro_rad_s == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
-            assert left.accel_m_s2 == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
-
-    run_virtual(main())
-
-
 @pytest.mark.parametrize("kind", ["GYRO", "ACC"])
 def test_a_vector_within_0_01_of_the_one_in_use_is_stored_and_read_back_and_ignored(kind: str) -> None:
     async def main() -> None:
@@ -115,23 +100,6 @@ def test_the_first_gyro_load_takes_any_vector_but_an_accelerometer_never_takes_a
             assert stage.double.parameter("CAL_ACC0_XOFF") == pytest.approx(0.005)
             assert stage.double.applied(1).gyro_offset_rad_s == pytest.approx([0.001, 0.002, -0.001])
             assert stage.double.applied(1).accel_offset_m_s2 == ZERO
-
-    run_virtual(main())
-
-
-def test_taking_the_id_away_and_giving_it_back_loads_a_small_gyro_vector_and_no_small_accelerometer_vector() -> None:
-    async def main() -> None:
-        async with PX4Stage() as stage:
-            for kind, vector in (("GYRO", (-0.0015, 0.0, 0.002)), ("ACC", (0.003, 0.002, -0.004))):
-                number = stage.double.parameter(f"CAL_{kind}0_ID")
-                await stage.set(f"CAL_{kind}0_ID", 0)
-                await asyncio.sleep(2.5)
-                await stage.set_vector(0, kind, vector, settle=False)
-                await stage.set(f"CAL_{kind}0_ID", number)
-                await asyncio.sleep(2.5)
-            used = stage.double.applied(1)
-            assert used.gyro_offset_rad_s == pytest.approx([-0.0015, 0.0, 0.002])
-            assert used.accel_offset_m_s2 == ZERO
 
     run_virtual(main())
 
@@ -201,34 +169,5 @@ def test_a_slot_whose_id_is_zero_loses_its_sensor_and_arming_says_accel_0_uncali
             assert stage.double.applied(1).accel_offset_m_s2 == pytest.approx([0.3, 0.0, 0.0])
             await asyncio.sleep(10.0)
             assert await stage.ground.command(ARM, 1) == 0
-
-    run_virtual(main())
-
-
-def test_set_parameter_is_in_use_at_once_as_if_it_had_always_been_so() -> None:
-    async def main() -> None:
-        async with PX4Stage() as stage:
-            stage.double.set_parameter("CAL_GYRO0_XOFF", 0.001)
-            assert stage.double.applied(1).gyro_offset_rad_s[0] == pytest.approx(0.001)
-            assert stage.double.saved_parameter("CAL_GYRO0_XOFF") == pytest.approx(0.001)
-
-    run_virtual(main())
-
-
-def test_a_wrong_number_of_imus_or_slots_is_refused() -> None:
-    async def main() -> None:
-        for options in ({"imus": 5}, {"imus": 2, "slots": (0,)}):
-            with pytest.raises(ValueError, match="allowed"):
-                PX4Stage(**options)
-
-    run_virtual(main())
-
-
-def test_an_offset_that_is_not_a_number_is_stored_and_never_used() -> None:
-    async def main() -> None:
-        async with PX4Stage() as stage:
-            await stage.set_vector(0, "ACC", (math.nan, 0.1, 0.1))
-            assert np.isfinite(stage.double.applied(1).accel_offset_m_s2).all()
-            assert stage.double.residual(1, now_s()).accel_m_s2 == pytest.approx(ACCEL_BIAS, abs=1e-6)
 
     run_virtual(main())

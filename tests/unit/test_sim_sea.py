@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from sim.aircraft import DEFAULT_SITE, Pose, VirtualAircraft
-from sim.devices import HMR3300, Gradienter
-from sim.earth import STANDARD_GRAVITY_M_S2, body_from_ned
-from sim.motions import SlowTurn
-from sim.sea import DAY_S, MOTIONS, Sea, Wave, motions_of
+from sim.earth import body_from_ned
+from sim.sea import MOTIONS, Sea, Wave, motions_of
 
 
 def test_rates_are_the_derivatives_of_the_angles() -> None:
@@ -41,34 +39,6 @@ def test_the_mean_acceleration_of_a_deck_that_turns_is_zero() -> None:
     mean = np.array([0.0, 0.0, DEFAULT_SITE.gravity_m_s2]) + ned.mean(axis=0)
     assert np.abs(mean).max() < 1e-3
     assert ned.std(axis=0).min() > 0.1
-
-
-def test_a_raft_feels_no_tilt() -> None:
-    raft = Sea(surge=1.0, surge_lead_rad=0.0, heave=0.0, waves=(Wave(0.2, 5.0),))
-    aircraft = VirtualAircraft(Pose(), motions=[raft])
-    t_s = np.arange(10.0, 60.0, 0.1)
-    force = aircraft.truth(t_s).force_m_s2 / STANDARD_GRAVITY_M_S2
-    assert np.degrees(np.abs(force[:, :2])).std() < 0.2
-    assert np.degrees(raft.euler_rad(t_s)[0][:, :2]).std() > 3.0
-
-
-def test_a_gradienter_lies_by_what_it_is_pushed() -> None:
-    swaying, pushed = (Sea(surge=surge, heave=0.0) for surge in (0.0, 1.0))
-    t_s = np.arange(10.0, 60.0, 0.1)
-    spread = [
-        Gradienter(VirtualAircraft(Pose(), motions=[sea]), lag_s=0.0).tilt_deg(t_s)[:, 0].std()
-        for sea in (swaying, pushed)
-    ]
-    assert spread[1] < 0.6 * spread[0]
-
-
-def test_a_compass_lags_behind_a_turn() -> None:
-    aircraft = VirtualAircraft(Pose(heading_deg=350.0), motions=[SlowTurn(start_s=-10.0, duration_s=DAY_S)])
-    compass = HMR3300(aircraft, lag_s=0.5, heading_noise_deg=0.0)
-    for frame in compass.frames_until(60.0):
-        shown = float(frame.data.split(b",")[0])
-    behind = (math.degrees(aircraft.angles_rad(frame.sampled_s)[2]) - shown + 180.0) % 360.0 - 180.0
-    assert behind == pytest.approx(0.5, abs=0.06)
 
 
 @pytest.mark.parametrize("name", MOTIONS)

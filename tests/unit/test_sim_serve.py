@@ -19,9 +19,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion import config
 from sim.__main__ import main
 from sim.families import COMPASSES, GRADIENTERS, IMUS
-from sim.imu_model import DEG_H, MG
-from sim.scenario import demo, site_at
-from sim.serve import configuration, describe, parser, serve
+from sim.scenario import demo
+from sim.serve import configuration, serve
 from sim.station import Station
 from sim.udp import open_udp
 
@@ -74,90 +73,6 @@ def test_the_printed_configuration_fits_every_family(tmp_path: Path, imu: str, g
     assert len(served) == len({imu, gradienter, compass})
     for device in scenario.ports.values():
         assert device.aircraft is scenario.aircraft
-
-
-def test_families_are_chosen_on_the_command_line() -> None:
-    chosen = parser().parse_args(["devices", "--gradienter", "hmr3300", "--imu", "imu_line"])
-    assert (chosen.imu, chosen.gradienter, chosen.compass) == ("imu_line", "hmr3300", "hmr3300")
-    with pytest.raises(SystemExit):
-        parser().parse_args(["devices", "--imu", "hmr3300"])
-
-
-def test_the_demo_is_the_documented_place_and_size() -> None:
-    scenario = demo(seed=3)
-    assert scenario.aircraft.site.gravity_m_s2 == pytest.approx(9.801543, abs=1e-6)
-    assert scenario.aircraft.site.declination_deg == pytest.approx(-7.5, abs=0.2)  # about -7.5 near Beijing
-    first, second = (model.true_bias(0.0) for model in scenario.flight_controller_imus)
-    assert first.gyro_rad_s / DEG_H == pytest.approx([162.234, 169.563, 98.289])
-    assert first.accel_m_s2 / MG == pytest.approx([2.4125, 2.1596, 0.89809])
-    assert abs(second.gyro_rad_s - first.gyro_rad_s).max() > 50.0 * DEG_H
-    assert site_at(80.0, 0.0, 0.0, 1_735_689_600.0).declination_deg == pytest.approx(
-        1.28, abs=0.01
-    )  # WMM2025 test value
-    words = describe(scenario, devices=True, autopilot=True)
-    assert "162.2, 169.6, 98.3 deg/h" in words
-    assert "serial IMU (bmi088)" in words
-
-
-def test_the_double_answers_over_udp_to_its_target_and_to_whoever_speaks() -> None:
-    async def scene(*, listening: bool) -> None:
-        double = demo().autopilot
-        station = Station(1, 191)
-        if listening:
-            server = await open_udp(double, listen=("127.0.0.1", 0))
-            client = await open_udp(station, target=server.local)
-        else:
-            client = await open_udp(station, listen=("127.0.0.1", 0))
-            server = await open_udp(double, target=client.local)
-        running = asyncio.create_task(double.run())
-        try:
-            if listening:
-                station.heartbeat()
-            async with asyncio.timeout(30.0):
-                while not station.all(mavlink.MAVLink_heartbeat_message):
-                    await asyncio.sleep(0.01)
-            assert await station.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 105, 10_000) == 0
-            async with asyncio.timeout(30.0):
-                while len(station.all(mavlink.MAVLink_highres_imu_message)) < 20:
-                    await asyncio.sleep(0.01)
-        finally:
-            running.cancel()
-            await asyncio.gather(running, return_exceptions=True)
-            server.close()
-            client.close()
-            await asyncio.sleep(0)
-
-    asyncio.run(scene(listening=True))
-    asyncio.run(scene(listening=False))
-
-
-def test_the_command_line_serves_a_px4_that_answers_as_one() -> None:
-    async def scene() -> None:
-        station = Station(1, 191)
-        client = await open_udp(station, listen=("127.0.0.1", 0))
-        host, port = client.local
-        command = (sys.executable, "-m", "sim", "autopilot", "--firmware", "px4", "--udp", f"{host}:{port}")
-        process = await asyncio.create_subprocess_exec(*command, cwd=ROOT, stdout=asyncio.subprocess.PIPE)
-        try:
-            async with asyncio.timeout(30.0):
-                while not station.all(mavlink.MAVLink_highres_imu_message):
-                    await asyncio.sleep(0.01)
-            assert station.all(mavlink.MAVLink_heartbeat_message)[0].autopilot == mavlink.MAV_AUTOPILOT_PX4
-        finally:
-            process.terminate()
-            await process.communicate()
-            client.close()
-        assert process.returncode == 0
-
-    asyncio.run(scene())
-
-
-def test_udp_wants_one_of_target_and_listen() -> None:
-    async def scene() -> None:
-        with pytest.raises(ValueError, match="either"):
-            await open_udp(demo().autopilot)
-
-    asyncio.run(scene())
 
 
 def test_serving_everything_makes_the_ports_and_takes_them_away(tmp_path: Path) -> None:

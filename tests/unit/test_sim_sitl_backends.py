@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import socket
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +16,10 @@ from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, PARTS, ImuModel
 from sim.motions import Turn
 from sim.sitl.hil_backend import FRAME_HZ, HilBackend
-from sim.sitl.hil_frames import Codec, on_fifo_grid
+from sim.sitl.hil_frames import on_fifo_grid
 from sim.sitl.json_backend import JsonBackend
 from sim.sitl.json_frames import ServoPacket, decode_servos, encode_servos
-from sim.sitl.process import BinaryError, FirmwareProcess, check_binary
+from sim.sitl.process import FirmwareProcess
 from sim.sitl.samples import JUMP_S, SampleBlocks
 
 TILTED = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
@@ -44,11 +43,6 @@ def test_a_servo_packet_has_magic_rate_count_and_channels(channels: int, magic: 
     assert encode_servos(ServoPacket(400, 7, tuple(range(channels)))) == data
 
 
-@pytest.mark.parametrize("data", [b"", b"\0" * 7, b"\0" * 40, packet(1)[:-1], packet(1) + b"\0", packet(1, rate=0)])
-def test_anything_else_is_no_servo_packet(data: bytes) -> None:
-    assert decode_servos(data) is None
-
-
 def test_a_json_frame_is_the_truth_of_the_tilted_aircraft_between_newlines() -> None:
     async def main() -> bytes:
         aircraft, imu = tilted()
@@ -67,56 +61,6 @@ def test_a_json_frame_is_the_truth_of_the_tilted_aircraft_between_newlines() -> 
     np.testing.assert_allclose(frame["imu"]["accel_body"], expected, atol=1e-5)
     np.testing.assert_allclose(np.degrees(frame["attitude"]), [-3.0, 5.0, 40.0], atol=1e-6)
     assert frame["position"] == frame["velocity"] == [0, 0, 0]
-
-
-def test_json_time_grows_by_one_over_the_rate_and_starts_anew_with_the_firmware() -> None:
-    async def main() -> None:
-        aircraft, imu = tilted()
-        async with JsonBackend(aircraft, imu) as backend:
-            times = [json.loads(backend.answer(packet(n), PEER))["timestamp"] for n in range(50)]
-            np.testing.assert_allclose(times, np.arange(1, 51) / 1000, atol=1e-9)
-            assert (backend.boots, backend.frames, backend.lost) == (1, 50, 0)
-            # The same process from another port, as after its own restart; then the count alone goes back.
-            assert json.loads(backend.answer(packet(50), ("127.0.0.1", 40001)))["timestamp"] == 0.001
-            assert json.loads(backend.answer(packet(0), ("127.0.0.1", 40001)))["timestamp"] == 0.001
-            assert backend.boots == 3
-            backend.answer(packet(4), ("127.0.0.1", 40001))
-            assert backend.lost == 3
-
-    asyncio.run(main())
-
-
-def test_a_repeated_servo_packet_gets_the_same_frame_once_a_second_and_no_second_answer_before() -> None:
-    async def main() -> None:
-        aircraft, imu = tilted()
-        async with JsonBackend(aircraft, imu) as backend:
-            first = backend.answer(packet(0), PEER)
-            assert backend.answer(packet(0), PEER) == b""
-            await asyncio.sleep(0.55)
-            assert backend.answer(packet(0), PEER) == first
-            assert (backend.frames, backend.resent, backend.ignored) == (1, 1, 1)
-            assert backend.answer(b"nonsense", PEER) == b""
-
-    asyncio.run(main())
-
-
-def test_every_servo_packet_on_the_socket_gets_one_answer() -> None:
-    async def main() -> None:
-        aircraft, imu = tilted()
-        loop = asyncio.get_running_loop()
-        async with JsonBackend(aircraft, imu) as backend:
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as firmware:
-                firmware.setblocking(False)
-                firmware.connect(("127.0.0.1", backend.port))
-                for count in range(500):
-                    await loop.sock_sendall(firmware, packet(count))
-                    data = await asyncio.wait_for(loop.sock_recv(firmware, 2000), 30.0)
-                    assert json.loads(data)["timestamp"] == pytest.approx((count + 1) / 1000)
-                with pytest.raises(BlockingIOError):
-                    firmware.recv(2000)
-            assert (backend.frames, backend.lost, backend.resent) == (500, 0, 0)
-
-    asyncio.run(main())
 
 
 def test_noise_in_frames_has_the_density_of_the_part_at_any_rate() -> None:
@@ -237,21 +181,6 @@ def test_px4_frames_keep_to_the_wall_clock_and_wait_for_the_answer() -> None:
     asyncio.run(main())
 
 
-def test_a_restarted_px4_begins_at_time_zero_again() -> None:
-    async def main() -> None:
-        aircraft, imu = tilted()
-        async with HilBackend(aircraft, [imu]) as backend:
-            for boot in (1, 2):
-                px4 = FakePx4()
-                await px4.connect(backend.port)
-                await px4.run(20)
-                assert px4.sensors(0)[0].time_usec == 4000
-                assert backend.boots == boot
-                px4.close()
-
-    asyncio.run(main())
-
-
 @pytest.mark.parametrize("part", ["white_only", "icm42688p"])
 def test_sensor_0_has_the_models_mean_after_the_firmware_has_cut_it_to_16_bits(part: str) -> None:
     aircraft = VirtualAircraft(TILTED)
@@ -267,46 +196,6 @@ def test_sensor_0_has_the_models_mean_after_the_firmware_has_cut_it_to_16_bits(p
     expected = imu.expected(0.0)
     np.testing.assert_allclose(mean[:3] / DEG_H, expected[:3] / DEG_H, atol=3.0)
     np.testing.assert_allclose(mean[3:] / MG, expected[3:] / MG, atol=0.02)
-
-
-def test_garbage_from_px4_is_no_answer() -> None:
-    codec = Codec()
-    assert codec.actuator_controls(bytes(range(256)) * 20) == []
-    assert codec.actuator_controls(b"") == []
-
-
-@pytest.mark.parametrize("make", ["missing", "plain"])
-def test_a_binary_that_is_missing_or_not_executable_is_one_clear_line(tmp_path: Path, make: str) -> None:
-    path = tmp_path / "arducopter"
-    if make == "plain":
-        path.write_text("#!/bin/sh\n")
-    with pytest.raises(BinaryError, match=rf"--binary: .*{path}") as caught:
-        check_binary(path)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_file_the_system_cannot_run_is_one_clear_line(tmp_path: Path) -> None:
-    path = tmp_path / "px4"
-    path.write_bytes(b"\x7fELF nonsense")
-    path.chmod(0o755)
-
-    async def main() -> None:
-        with pytest.raises(BinaryError, match=r"px4: cannot be run: Exec format error$"):
-            await FirmwareProcess([str(path)], tmp_path).start()
-
-    asyncio.run(main())
-
-
-def test_a_binary_that_dies_says_its_last_words(tmp_path: Path) -> None:
-    async def main() -> None:
-        process = FirmwareProcess(["/bin/sh", "-c", "echo starting; echo no such model >&2; exit 3"], tmp_path)
-        await process.start()
-        with pytest.raises(BinaryError) as caught:
-            await process.until(lambda: False, 5.0, "a heartbeat")
-        assert "sh ended with exit code 3" in str(caught.value)
-        assert "no such model" in str(caught.value)
-
-    asyncio.run(main())
 
 
 def test_stopping_a_binary_ends_its_children_too_even_if_they_ignore_sigterm(tmp_path: Path) -> None:
@@ -330,19 +219,5 @@ def test_stopping_a_binary_ends_its_children_too_even_if_they_ignore_sigterm(tmp
             return Path(f"/proc/{child}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
         except OSError:
             return False
-
-    asyncio.run(main())
-
-
-def test_a_binary_can_be_started_again_in_the_same_folder(tmp_path: Path) -> None:
-    boots = tmp_path / "boots"
-
-    async def main() -> None:
-        process = FirmwareProcess(["/bin/sh", "-c", "echo x >> boots; sleep 60"], tmp_path)
-        for boot in (1, 2):
-            await process.start()
-            expected = "x\n" * boot
-            await process.until(lambda: boots.exists() and boots.read_text() == expected, 5.0, "the boot")  # noqa: B023
-            await process.stop()
 
     asyncio.run(main())

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import textwrap
 import time
 from pathlib import Path
 
@@ -49,28 +48,6 @@ def test_a_missing_binary_is_one_line_that_names_it(command: str, capsys: pytest
     assert said.err == (
         f"python -m sim {command}: --binary: found no file /nowhere/firmware; give the path of the firmware's binary\n"
     )
-
-
-def test_px4_without_its_etc_folder_says_which_one_is_missing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    binary = executable(tmp_path / "px4", "#!/bin/sh\n")
-    assert main(["px4", "--binary", str(binary), "--etc", str(tmp_path / "etc")]) == 1
-    assert capsys.readouterr().err == (
-        f"python -m sim px4: --etc: found no init.d-posix/rcS in {tmp_path / 'etc'}; give the etc folder of the build\n"
-    )
-
-
-@pytest.mark.real_clock
-def test_a_firmware_that_dies_at_once_is_told_with_its_last_words(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    binary = executable(tmp_path / "arducopter", "#!/bin/sh\necho Bad model >&2\nexit 7\n")
-    assert main(["ardupilot", "--binary", str(binary)]) == 1
-    assert capsys.readouterr().err == textwrap.dedent("""\
-        python -m sim ardupilot: arducopter ended with exit code 7. Its last words:
-          Bad model
-        """)
 
 
 @pytest.mark.parametrize("command", ["ardupilot", "px4"])

@@ -12,9 +12,8 @@ import pytest
 
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.devices import Gradienter
-from sim.earth import body_from_ned, earth_rate_ned_rad_s, mounting_matrix, normal_gravity_m_s2
+from sim.earth import body_from_ned, earth_rate_ned_rad_s, normal_gravity_m_s2
 from sim.motions import Handling, Knock, Motion, SlowTurn, Turn, Vibration
-from sim.thermal import warming
 
 CASES: list[dict[str, Any]] = json.loads(
     (Path(__file__).parents[1] / "vectors" / "method.json").read_text(encoding="utf-8")
@@ -108,34 +107,3 @@ def test_a_turn_stays_and_a_handling_and_a_knock_come_back() -> None:
     assert after.pitch_deg == pytest.approx(-1.0)
     assert after.roll_deg == pytest.approx(-3.0)
     assert after.heading_deg == pytest.approx(350.0 + 30.0 + 1.5 * (10.0 - 2.0) - 360.0)
-
-
-def test_what_is_added_while_running_acts() -> None:
-    aircraft = VirtualAircraft()
-    still = aircraft.truth_at(10.0)
-    assert aircraft.truth_at(20.0) is still
-    aircraft.add(Knock(start_s=20.0))
-    assert abs(aircraft.truth_at(20.1).rate_rad_s[0]) > math.radians(4.0)
-    assert aircraft.truth_at(30.0).force_m_s2 == pytest.approx(still.force_m_s2)
-
-
-def test_time_begins_once_and_maps_both_ways() -> None:
-    aircraft = VirtualAircraft()
-    with pytest.raises(ValueError, match="not begun"):
-        aircraft.loop_time_of(1.0)
-    assert aircraft.time_at(1000.0) == 0.0
-    aircraft.begin(1234.0)
-    assert aircraft.time_at(1060.0) == 60.0
-    assert aircraft.loop_time_of(60.0) == 1060.0
-
-
-def test_temperature_warms_exponentially() -> None:
-    aircraft = VirtualAircraft(temperature_degc=warming(20.0, 45.0, 300.0))
-    assert aircraft.temperature_degc(0.0) == 20.0
-    assert aircraft.temperature_degc(300.0) == pytest.approx(45.0 - 25.0 / math.e)
-
-
-def test_mounting_turns_sensor_axes_into_vehicle_axes() -> None:
-    assert mounting_matrix(0.0, 0.0, 90.0) @ [1.0, 0.0, 0.0] == pytest.approx([0.0, 1.0, 0.0])
-    assert mounting_matrix(180.0, 0.0, 0.0) @ [0.0, 0.0, 1.0] == pytest.approx([0.0, 0.0, -1.0])
-    assert mounting_matrix(0.0, 90.0, 0.0) @ [1.0, 0.0, 0.0] == pytest.approx([0.0, 0.0, -1.0])
