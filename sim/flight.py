@@ -117,50 +117,6 @@ class Shuttle(Route):
         return np.column_stack([roll, pitch, heading])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Drive(Route):
-    """A car on a layout route: starts, bends to both sides, a stop, a slope up and down; it leans a little in bends.
-
-    `legs` are (seconds, speed at their end in m/s, turn in degrees, grade at their end in degrees).
-    """
-
-    legs: tuple[tuple[float, float, float, float], ...] = (
-        (10.0, 8.0, 0.0, 0.0),
-        (15.0, 10.0, 90.0, 0.0),
-        (20.0, 12.0, 0.0, 3.0),
-        (12.0, 7.0, 90.0, 3.0),
-        (20.0, 12.0, -30.0, 0.0),
-        (10.0, 0.0, 0.0, 0.0),
-        (8.0, 0.0, 0.0, 0.0),
-        (12.0, 9.0, 0.0, -2.0),
-        (15.0, 9.0, 120.0, -2.0),
-        (20.0, 12.0, -45.0, 0.0),
-        (18.0, 8.0, 135.0, 1.0),
-        (20.0, 5.0, 0.0, 0.0),
-    )
-    lean_per_g_deg: float = 4.0
-
-    def _profile(self, t_s: Array) -> tuple[Array, Array, Array]:
-        """Speed, heading, grade."""
-        seconds, speeds, turns_deg, grades_deg = np.array(self.legs).T
-        done = smooth((t_s[:, None] - self.start_s - (np.cumsum(seconds) - seconds)) / seconds)
-        speed = done @ np.diff(speeds, prepend=0.0)
-        return speed, done @ np.radians(turns_deg), done @ np.radians(np.diff(grades_deg, prepend=0.0))
-
-    def velocity_m_s(self, t_s: Array) -> Array:
-        """Along heading and grade."""
-        speed, heading, grade = self._profile(t_s)
-        level = speed * np.cos(grade)
-        return np.column_stack([level * np.cos(heading), level * np.sin(heading), -speed * np.sin(grade)])
-
-    def angles_rad(self, t_s: Array) -> Array:
-        """Pitch is the grade; it leans outwards in bends."""
-        speed, heading, grade = self._profile(t_s)
-        turning = _derivative(lambda t: self._profile(t)[1][:, None], t_s)[:, 0]
-        lean = -math.radians(self.lean_per_g_deg) * speed * turning / STANDARD_GRAVITY_M_S2
-        return np.column_stack([lean, grade, heading])
-
-
 def _derivative(function: object, t_s: Array) -> Array:
     assert callable(function)
     h = _STEP_S

@@ -85,7 +85,6 @@ class Flight:
         self.plan, self.vehicle, self.ground, self.link, self.folder = plan, vehicle, ground, link, folder
         self.record = Record(plan.fault, plan.set_up, plan.wind)
         self._since_s = 0.0
-        self._asked_modes = 0
         self._background: list[asyncio.Task[None]] = []
         self._hung_s = 0.0
         """The longest time without news of the firmware since the watch began."""

@@ -39,18 +39,6 @@ def decode_servos(data: bytes) -> ServoPacket | None:
     return ServoPacket(rate, count, channels.unpack_from(data, _HEAD.size))
 
 
-def encode_servos(packet: ServoPacket) -> bytes:
-    """The inverse, for peers that play the firmware; the number of channels chooses the magic.
-
-    Raises:
-        ValueError: neither 16 nor 32 channels.
-    """
-    for magic, channels in _CHANNELS.items():
-        if channels.size == 2 * len(packet.pwm_us):
-            return _HEAD.pack(magic, packet.frame_rate_hz, packet.frame_count) + channels.pack(*packet.pwm_us)
-    raise ValueError(f"servo channels: found {len(packet.pwm_us)}; allowed: 16 or 32")
-
-
 def encode_frame(physics_s: float, sample: Sample) -> bytes:
     """The answer: the first IMU of the sample, the true attitude, and a vehicle that stays at its home position."""
     return (

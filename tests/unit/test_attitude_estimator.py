@@ -18,7 +18,7 @@ from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import ImuSample
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import body_from_ned, mounting_matrix
-from sim.flight import BankedCircles, Drive, MovingAircraft, Shuttle
+from sim.flight import BankedCircles, MovingAircraft, Shuttle
 from sim.imu_model import ImuModel
 from tests.support.extent import extent
 
@@ -91,15 +91,14 @@ def rms(values: list[float]) -> float:
 
 @pytest.mark.parametrize("rate_hz", extent(whole=[50.0, 200.0, 1000.0], a_slice=[50.0, 200.0]))
 def test_a_perfect_imu_gives_the_perfect_attitude(rate_hz: float) -> None:
-    aircraft = MovingAircraft(Drive(start_s=1.0), Pose(2.0, 9.52, 300.0), SOUTH)
+    aircraft = MovingAircraft(Shuttle(start_s=1.0), Pose(2.0, 9.52, 300.0), SOUTH)
     estimator = AttitudeEstimator(settings(SOUTH))
     estimator.align(0.0, aircraft.body_from_ned(0.0), SURE)
     errors = follow(estimator, ImuModel(aircraft, "perfect"), 60.0, rate_hz=rate_hz)
-    # The heading has nothing but the rates, the Earth's rotation included; turning by 200 degrees about a vertical that
-    # the leveller holds wrongly by a degree costs it 0.02.
-    assert max(heading for _, heading in errors) < 0.03
-    # The leveller takes the car's accelerations for tilt, a little.
-    assert max(tilt for tilt, _ in errors) < 1.5
+    # The heading has nothing but the rates, the Earth's rotation included.
+    assert max(heading for _, heading in errors) < 0.005
+    # The leveller takes the accelerations for tilt, a little.
+    assert max(tilt for tilt, _ in errors) < 0.5
 
 
 def test_the_earth_turns_below_an_aircraft_at_rest() -> None:

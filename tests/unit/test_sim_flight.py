@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import EARTH_RATE_RAD_S, STANDARD_GRAVITY_M_S2
-from sim.flight import BankedCircles, Drive, MovingAircraft, Route, Shuttle
+from sim.flight import BankedCircles, MovingAircraft, Route, Shuttle
 
-ROUTES = [BankedCircles(start_s=2.0), Shuttle(start_s=2.0), Drive(start_s=2.0)]
+ROUTES = [BankedCircles(start_s=2.0), Shuttle(start_s=2.0)]
 SITE = Site(latitude_deg=-33.0, longitude_deg=151.0, height_m=20.0, declination_deg=12.0)
 
 
-@pytest.mark.parametrize("route", ROUTES, ids=["circles", "shuttle", "drive"])
+@pytest.mark.parametrize("route", ROUTES, ids=["circles", "shuttle"])
 def test_rates_and_forces_integrate_to_attitude_and_velocity(route: Route) -> None:
     aircraft = MovingAircraft(route, Pose(3.0, 9.52, 200.0), SITE)
     step = 2.5e-3
@@ -45,7 +45,7 @@ def test_rates_and_forces_integrate_to_attitude_and_velocity(route: Route) -> No
     assert velocity == pytest.approx(to_ned @ over_ground, abs=2e-3)
 
 
-@pytest.mark.parametrize("route", ROUTES, ids=["circles", "shuttle", "drive"])
+@pytest.mark.parametrize("route", ROUTES, ids=["circles", "shuttle"])
 def test_until_the_route_begins_it_stands(route: Route) -> None:
     aircraft, standing = MovingAircraft(route, Pose(3.0, -2.0, 77.0), SITE), VirtualAircraft(Pose(0, 0, 0), SITE)
     rate, force = aircraft.truth_at(1.0)

@@ -18,7 +18,7 @@ from sim.motions import Turn
 from sim.sitl.hil_backend import FRAME_HZ, HilBackend
 from sim.sitl.hil_frames import on_fifo_grid
 from sim.sitl.json_backend import JsonBackend
-from sim.sitl.json_frames import ServoPacket, decode_servos, encode_servos
+from sim.sitl.json_frames import ServoPacket, decode_servos
 from sim.sitl.process import FirmwareProcess
 from sim.sitl.samples import JUMP_S, SampleBlocks
 
@@ -32,7 +32,9 @@ def tilted() -> tuple[VirtualAircraft, ImuModel]:
 
 
 def packet(count: int, *, rate: int = 1000, channels: int = 16) -> bytes:
-    return encode_servos(ServoPacket(rate, count, tuple(range(1000, 1000 + channels))))
+    return struct.pack(
+        f"<HHI{channels}H", 18458 if channels == 16 else 29569, rate, count, *range(1000, 1000 + channels)
+    )
 
 
 @pytest.mark.parametrize(("channels", "magic", "size"), [(16, 18458, 40), (32, 29569, 72)])
@@ -40,7 +42,6 @@ def test_a_servo_packet_has_magic_rate_count_and_channels(channels: int, magic: 
     data = struct.pack(f"<HHI{channels}H", magic, 400, 7, *range(channels))
     assert len(data) == size
     assert decode_servos(data) == ServoPacket(400, 7, tuple(range(channels)))
-    assert encode_servos(ServoPacket(400, 7, tuple(range(channels)))) == data
 
 
 def test_a_json_frame_is_the_truth_of_the_tilted_aircraft_between_newlines() -> None:
