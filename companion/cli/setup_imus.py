@@ -15,7 +15,6 @@ from companion.errors import ConfigError, DaemonDeniedError, DaemonUnreachableEr
 from companion.formats import Object
 from companion.setup.draft import Draft, part_key
 
-IMUS_S: Final = 4.0
 COARSE: Final = "It sends whole steps of 206 deg/h and 1 mg: a gyro bias below one step may stay unknown."
 """1 mrad/s and 1 mg: the steps of SCALED_IMU2 and SCALED_IMU3."""
 
@@ -61,7 +60,7 @@ async def ask_autopilot(asking: Asking, draft: Draft, *, by_default: bool) -> Pa
 
     Nothing is written to the autopilot. `by_default`: the answer to the offer where nobody gives one.
     """
-    asking.say("", "Asking the autopilot which IMUs it has. Nothing is changed.")
+    asking.say("", "Asking the autopilot which IMUs it has: up to half a minute. Nothing is changed.")
     from companion.daemon.process.check import answering_imus  # takes seconds on a small board
 
     config = draft.parsed()
@@ -70,7 +69,7 @@ async def ask_autopilot(asking: Asking, draft: Draft, *, by_default: bool) -> Pa
     asked = [*mine, *(Imu(**one) for one in others.values())]
     logging.disable(logging.WARNING)  # the IMUs that do not exist fail to answer
     try:
-        parts = await answering_imus(config, asked, IMUS_S)
+        parts = await answering_imus(config, asked)
     finally:
         logging.disable(logging.NOTSET)
     for imu in asked:

@@ -20,6 +20,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion import cli, config
+from companion.daemon.process.check import answering_imus
 from companion.installation import install as installing
 from sim.firmware.double import AutopilotDouble
 from sim.pty_device import PtyDevice, reader_setting
@@ -68,6 +69,7 @@ async def bench(
     firmware: Firmware = "ardupilot",
     on_wire: bool = False,
     parameters: Mapping[str, float] = MappingProxyType({}),
+    answers_after_s: float = 0.0,
 ) -> AsyncIterator[Bench]:
     """The demonstration's aircraft: devices as from the factory, the autopilot on UDP or on a serial port."""
     made, scenario = Bench(folder), demo(firmware=firmware)
@@ -79,7 +81,7 @@ async def bench(
 
     def told(data: bytes, t_s: float) -> None:
         made.told.append(data)
-        receive(data, t_s)
+        loop.call_later(answers_after_s, receive, data, t_s + answers_after_s)
 
     autopilot.receive = told  # type: ignore[method-assign]
     async with contextlib.AsyncExitStack() as stack:
@@ -207,6 +209,22 @@ def test_a_script_has_gyros_of_an_autopilot_on_a_wire_alone(tmp_path: Path, firm
             assert [imu["name"] for imu in made.configuration()["imu"]] == ["fc", "fc2"]
             assert made.configuration()["storage"]["directory"] == str(tmp_path / "companion-state")
             assert answer["next"][-1].split("   ")[0] == f"companion -c {made.file} calibrate --wait"
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(("firmware", "answers_after_s"), [("ardupilot", 0.0), ("ardupilot", 0.5), ("px4", 0.0)])
+def test_an_autopilot_that_answers_slowly_has_all_its_imus(
+    tmp_path: Path, firmware: Firmware, answers_after_s: float
+) -> None:
+    """PX4 is slow by itself: on the ground its console is asked for the EKF's bias before the samples are."""
+
+    async def main() -> None:
+        async with bench(tmp_path, firmware=firmware, answers_after_s=answers_after_s) as made:
+            imus = "".join(f'[[imu]]\nname = "fc{n}"\nsource = "autopilot"\ninstance = {n}\n' for n in (1, 2, 3))
+            files = f'[storage]\ndirectory = "{tmp_path}/state"\n[control]\nsocket = "{tmp_path}/socket"\n'
+            asked = config.parse(f'[mavlink]\nurl = "udpin:127.0.0.1:{made.udp}"\n{imus}{files}', "asked.toml")
+            assert await answering_imus(asked, asked.imu) == {"fc1": None, "fc2": None}
 
     asyncio.run(main())
 

@@ -80,6 +80,7 @@ class _Source:
 
 
 _NO_HEARTBEAT: Final = "no heartbeat from the autopilot"
+_RESTARTED: Final = "the autopilot restarted"
 
 
 class ImuStream:
@@ -125,6 +126,11 @@ class ImuStream:
         """That of the message which offsets just written are seen by: of PX4 always the integers."""
         seen_by = self._current if self._vehicle.firmware != "px4" or not self._sources else self._sources[-1]
         return None if self._current is None or seen_by is None else seen_by.message.kind
+
+    @property
+    def decided(self) -> bool:
+        """Whether samples come, or every message that could carry them was asked for in vain."""
+        return self.problem not in (self._starting, _NO_HEARTBEAT, _RESTARTED)
 
     @property
     def rate_hz(self) -> float | None:
@@ -318,7 +324,7 @@ class ImuStream:
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event in ("lost", "rebooted"):
-            self._lose("the autopilot restarted" if event == "rebooted" else _NO_HEARTBEAT)
+            self._lose(_RESTARTED if event == "rebooted" else _NO_HEARTBEAT)
             self._restart.set()
         elif event == "found" and self.problem == _NO_HEARTBEAT:
             self.problem = self._starting

@@ -112,6 +112,13 @@ class AutopilotImu:
         return self.stream.problem or (self.problem if self.calibration is None else None)
 
     @property
+    def decided(self) -> bool:
+        """Whether it is known if this IMU exists: its offsets are read and samples come, or one of both has failed."""
+        if self.calibration is None:
+            return self.failures > 0 or (self.stream.decided and bool(self.stream.problem))
+        return self.stream.decided
+
+    @property
     def in_force(self) -> ImuCalibration:
         """What the autopilot subtracts.
 

@@ -32,6 +32,10 @@ STOP_FIRST: Final = "to try other speeds: sudo systemctl stop companion, then co
 ONLY_CHECKING: Final = "only a check is running: start companion run"
 LOST_S: Final = 5.0
 """So long after its last heartbeat, of which there is one a second, an autopilot is gone."""
+HEARTBEAT_WITHIN_S: Final = 4.0
+"""Wait for the first heartbeat, of which there is one a second."""
+IMUS_MOST_S: Final = 30.0
+"""Longest wait for an autopilot to show which IMUs it has: a slow line and lost packets, with all retries."""
 _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
 
@@ -188,7 +192,7 @@ async def run_check(
         say(f"checking: {seconds:g} s, half a minute more for a sensor not understood")
         # The status that a daemon would have after some seconds; nothing is written anywhere.
         service = Service(config, only_listening=ONLY_CHECKING)
-        status = await service.listen(seconds)
+        status = await service.listen(lambda listened_s: listened_s < seconds)
     findings += [Finding("configuration", good=False, words=words) for words in cannot_work(config)]
     findings += [Finding("warning", good=True, words=words) for words in doubtful(config)]
     vehicle = status["vehicle"]
@@ -219,16 +223,22 @@ async def run_check(
     return findings
 
 
-async def answering_imus(config: Config, imus: Sequence[Imu], seconds: float) -> dict[str, str | None]:
+async def answering_imus(config: Config, imus: Sequence[Imu]) -> dict[str, str | None]:
     """Find out which of these autopilot IMUs exist, and their parts by device id (None: not known). Writes nothing.
 
-    An IMU exists if its offsets can be read and its samples come.
+    An IMU exists if its offsets can be read and its samples come. Listening ends when that is decided for every IMU.
 
     Raises:
         CompanionError: something that makes asking itself impossible.
     """
     alone = msgspec.structs.replace(config, imu=list(imus), gradienter=None, compass=None, mqtt=None, web=None)
-    status = await Service(alone, only_listening=ONLY_CHECKING).listen(seconds)
+    service = Service(alone, only_listening=ONLY_CHECKING)
+
+    def undecided(listened_s: float) -> bool:
+        most_s = IMUS_MOST_S if service.core.vehicle.alive else HEARTBEAT_WITHIN_S
+        return listened_s < most_s and not all(imu.decided for imu in service.devices.imus.values())
+
+    status = await service.listen(undecided)
     parts = {profile["imu"]: profile["name"] for profile in status["profiles"]}
     return {device["name"]: parts[device["name"]] for device in status["devices"] if device["good"]}
 

@@ -30,6 +30,8 @@ logger = logging.getLogger(__name__)
 
 SETTLED_WITHIN_S: Final = 20.0
 """A small board takes seconds to start the MQTT process, and a silent broker 10 s to be given up."""
+LISTEN_TURN_S: Final = 0.1
+"""Wait between two decisions whether to listen on, in seconds."""
 
 
 class Service:
@@ -109,16 +111,21 @@ class Service:
     async def _connect(self) -> None:
         await run_transport(self.core.link, self.config.mavlink.url)
 
-    async def listen(self, seconds: float) -> Object:
-        """Open everything, listen, and tell what `status` would; for `companion check`, writes nothing.
+    async def listen(self, goes_on: Callable[[float], bool]) -> Object:
+        """Open everything, listen, and return the status; for `companion check`, writes nothing.
 
+        `goes_on`: whether to continue after so many seconds. Seconds are counted in turns of the loop, each of which
+        reads what has arrived: a process that gets little of the processor listens longer, and not to less.
         `only_listening` must be set.
         """
         self.devices.load()
         tasks = [("mavlink", self._connect), *self.faces.tasks(), *self.devices.tasks(), *self.arming.tasks()]
         running = [asyncio.get_running_loop().create_task(run(), name=name) for name, run in tasks]
         try:
-            await asyncio.sleep(seconds)
+            turns = 0
+            while goes_on(turns * LISTEN_TURN_S):
+                await asyncio.sleep(LISTEN_TURN_S)
+                turns += 1
             await self.faces.settled(SETTLED_WITHIN_S)
             return self.status()
         finally:
