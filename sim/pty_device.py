@@ -77,9 +77,7 @@ class PtyDevice:
         """Pull it out: the path is gone, and whoever has it open gets a hang-up."""
         if self._master is None:
             return
-        self._poll.unregister(self._master)
-        os.close(self._master)
-        self._master = None
+        self._close()
         self.path.unlink(missing_ok=True)
 
     def replug(self) -> None:
@@ -92,6 +90,17 @@ class PtyDevice:
             return
         if self.path.exists() and not self.path.is_symlink():
             raise FileExistsError(f"{self.path}: exists and is no symlink; give a folder of its own")
+        self._open()
+        self._banner = self.device.power_on(self._now_s())
+
+    def _close(self) -> None:
+        assert self._master is not None
+        self._poll.unregister(self._master)
+        os.close(self._master)
+        self._master = None
+
+    def _open(self) -> None:
+        """Make a pseudo-terminal and put its name under the path."""
         master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(master, False)
@@ -104,7 +113,23 @@ class PtyDevice:
         os.close(slave)  # from here on the kernel tells by POLLHUP whether anybody has it open
         self._master = master
         self._poll.register(master, select.POLLHUP)
-        self._banner = self.device.power_on(self._now_s())
+
+    def _unlock(self) -> None:
+        """Make the port free again after a reader that was killed, as a serial port is when its last reader ends.
+
+        The lock of such a reader (TIOCEXCL) stays on a pseudo-terminal as long as its other end is open.
+        """
+        try:
+            slave = os.open(self.path, os.O_RDWR | os.O_NOCTTY)
+        except OSError as error:
+            if error.errno != errno.EBUSY:
+                raise
+            # Only root may open it to take the lock away; nobody else can have it open either.
+            self._close()
+            self._open()
+        else:
+            fcntl.ioctl(slave, termios.TIOCNXCL)
+            os.close(slave)
 
     def _now_s(self) -> float:
         return self._aircraft.time_at(asyncio.get_running_loop().time())
@@ -114,11 +139,16 @@ class PtyDevice:
         return self.device.aircraft
 
     async def _serve(self) -> None:
+        was_opened = False
         while True:
             now_s = self._now_s()
             if self._master is None:
+                was_opened = False
                 await asyncio.sleep(0.05)
                 continue
+            if was_opened and not self.opened:
+                self._unlock()
+            was_opened = self.opened
             if self._banner and self.opened:  # as behind an adapter that powers its device when it is opened
                 self._write(self._banner)
                 self._banner = b""

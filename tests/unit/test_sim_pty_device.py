@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import fcntl
 import os
 import struct
 import termios
@@ -49,6 +51,33 @@ def hung_up(descriptor: int) -> bool:
     except OSError:
         return True
     return True
+
+
+TIOCGEXCL = 0x80045440
+"""<asm-generic/ioctls.h>; the termios module has only the two that set and clear it."""
+
+
+def test_a_reader_that_was_killed_leaves_no_lock(tmp_path: Path) -> None:
+    """The kernel keeps it, and root alone may open what is locked."""
+
+    async def main() -> None:
+        async with PtyDevice(HMR3300(VirtualAircraft(Pose())), path := tmp_path / "compass"):
+            killed = Port(path)
+            fcntl.ioctl(killed.descriptor, termios.TIOCEXCL)
+            await killed.wait_for(1)
+            killed.close()
+            async with asyncio.timeout(30.0):
+                while True:
+                    with contextlib.suppress(OSError):
+                        port = Port(path)
+                        if not any(fcntl.ioctl(port.descriptor, TIOCGEXCL, bytes(4))):
+                            break
+                        port.close()
+                    await asyncio.sleep(0.01)
+            await port.wait_for(1)
+            port.close()
+
+    asyncio.run(main())
 
 
 def test_a_reader_gets_200_frames_a_second_unchanged(tmp_path: Path) -> None:
