@@ -44,6 +44,7 @@ Kind = Literal["sqlite", "postgresql"]
 KINDS: tuple[Kind, ...] = ("sqlite", "postgresql")
 ROOM_MB: dict[Kind, int] = {"sqlite": 2, "postgresql": 24}
 """Of the small disk; PostgreSQL copies its catalogue into each database."""
+NO_MOUNTS = "this user may not mount a small file system"
 
 
 class NotApplicableError(Exception):
@@ -242,7 +243,7 @@ def _on_small_disk(kind: Kind, server: Postgres | None) -> Iterator[tuple[Path, 
     """A small file system, and the address of a new database on it."""
     with small_disk(ROOM_MB[kind]) as folder:
         if folder is None:
-            raise NotApplicableError("this user may not mount a small file system")
+            raise NotApplicableError(NO_MOUNTS)
         if kind == "sqlite":
             yield folder, str(folder / "fleet.sqlite")
         else:

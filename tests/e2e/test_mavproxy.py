@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.ground_line import ground_line
+from tests.support.namespaces import OWN_SHARED_MEMORY
 
 MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
 DOCS = Path(__file__).parents[2] / "docs/ground_stations.md"
@@ -63,8 +64,10 @@ class MavProxy:
 
 @contextlib.asynccontextmanager
 async def mavproxy(folder: Path, port: int, modules: str = MODULES) -> AsyncIterator[MavProxy]:
+    # It needs semaphores, which lie in shared memory.
+    memory = () if os.access("/dev/shm", os.W_OK) else OWN_SHARED_MEMORY
     process = await asyncio.create_subprocess_exec(
-        sys.executable, str(MAVPROXY), f"--master=udpout:127.0.0.1:{port}", "--no-state",
+        *memory, sys.executable, str(MAVPROXY), f"--master=udpout:127.0.0.1:{port}", "--no-state",
         f"--default-modules={modules}", cwd=folder,
         stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
         env={**os.environ, "PYTHONUNBUFFERED": "1", "HOME": str(folder)},

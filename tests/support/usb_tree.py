@@ -11,6 +11,8 @@ from typing import Final
 
 import pytest
 
+from tests.support.namespaces import OWN_MOUNTS, why_no_mounts
+
 UDEVADM: Final = shutil.which("udevadm") or ""
 SOC: Final = "sys/devices/platform/soc"
 # In a mount namespace of its own: the tree as /sys, the rules, and a /dev in which links may be made.
@@ -29,10 +31,7 @@ SYSTEMD_DEVICE_VERIFY_SYSFS=0 exec "$3" test --action=add "$4" 2>&1
 def _why_not() -> str | None:
     if not UDEVADM:
         return "udevadm is not here (Debian: apt-get install udev)"
-    if os.geteuid() != 0:
-        return "putting a made-up /sys before udev needs root"
-    tried = subprocess.run(["unshare", "--mount", "true"], capture_output=True, text=True, check=False)
-    return f"no namespaces for a made-up /sys: {tried.stderr.strip()}" if tried.returncode else None
+    return why_no_mounts()
 
 
 _WHY_NOT: Final = _why_not()
@@ -89,7 +88,7 @@ class UsbTree:
 
     def judge(self, rules: Path, node: str) -> str:
         """What udev says to a node being added."""
-        command = ["unshare", "--mount", "sh", "-c", _TEST, "sh", str(self.root), str(rules), UDEVADM, node]
+        command = [*OWN_MOUNTS, "sh", "-c", _TEST, "sh", str(self.root), str(rules), UDEVADM, node]
         return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
 
     def _node(self, place: str, subsystem: str, uevent: dict[str, str], **attributes: str) -> None:

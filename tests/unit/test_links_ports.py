@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from companion.links.serial.ports import Holder, SerialPort, find_holders, list_ports
+from tests.support.namespaces import OWN_MOUNTS
 
 FTDI_ID = "/dev/serial/by-id/usb-FTDI_FT232R_USB_UART_A50285BI-if00-port0"
 CH340_ID = "/dev/serial/by-id/usb-1a86_USB_Serial-if00-port0"
@@ -204,14 +205,14 @@ def test_who_holds_a_port_of_this_machine() -> None:
 
 def test_a_containers_terminal_of_the_same_name_holds_no_port() -> None:
     own = "mount -t devpts -o newinstance,ptmxmode=0666 devpts /dev/pts && mount --bind /dev/pts/ptmx /dev/ptmx"
-    tried = subprocess.run(["unshare", "--mount", "sh", "-c", own], capture_output=True, text=True, check=False)
+    tried = subprocess.run([*OWN_MOUNTS, "sh", "-c", own], capture_output=True, text=True, check=False)
     if tried.returncode:
         pytest.skip(f"no namespaces for a container: {tried.stderr.strip()}")
     opened = "import os, sys; print(os.ttyname(os.openpty()[1]), flush=True); sys.stdin.read()"
     master, slave = os.openpty()
     try:
         container = subprocess.Popen(
-            ["unshare", "--mount", "sh", "-c", f'{own} && exec "$0" -c "$1"', sys.executable, opened],
+            [*OWN_MOUNTS, "sh", "-c", f'{own} && exec "$0" -c "$1"', sys.executable, opened],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         with container:

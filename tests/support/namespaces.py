@@ -1,0 +1,37 @@
+"""Mount namespaces of a test's own, in which an ordinary user may mount too, where the kernel allows that."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+IS_ROOT: Final = os.geteuid() == 0
+OWN_MOUNTS: Final = ("unshare", "--mount") if IS_ROOT else ("unshare", "--map-root-user", "--mount")
+"""Start of a command that runs in such a namespace."""
+OWN_SHARED_MEMORY: Final = (*OWN_MOUNTS, "sh", "-c", 'mount -t tmpfs tmpfs /dev/shm && exec "$@"', "sh")
+"""Start of a command that runs with an empty, writable /dev/shm."""
+
+
+@functools.cache
+def why_no_mounts() -> str | None:
+    """Return why nothing can be mounted in a namespace here, or None."""
+    command = [*OWN_MOUNTS, "mount", "-t", "tmpfs", "tmpfs", "/tmp"]
+    tried = subprocess.run(command, capture_output=True, text=True, check=False)
+    return f"no namespaces for a mount: {tried.stderr.strip()}" if tried.returncode else None
+
+
+def run_again_with_mounts(test: pytest.Item) -> None:
+    """Run a test once more, in a namespace in which it may mount; skip it where there is none."""
+    why = why_no_mounts()
+    if IS_ROOT or why is not None:
+        pytest.skip(why or "no namespaces for a mount: root may not mount either")
+    command = [*OWN_MOUNTS, sys.executable, "-m", "pytest", "-q", test.nodeid]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "1 passed" in done.stdout
