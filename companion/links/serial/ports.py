@@ -197,13 +197,13 @@ def _holders_by_device(root: Path) -> dict[str, list[Holder]]:
 
 
 def _is_namesake(descriptor: Path, target: str) -> bool:
-    """A container counts its own pseudoterminals from 0; its serial ports are ours."""
+    """Whether a pseudo-terminal is a container's, which counts its own from 0; its serial ports are ours."""
     if not target.startswith("/dev/pts/"):
         return False
     try:
         return descriptor.stat().st_dev != os.stat(target).st_dev
     except OSError:
-        return False
+        return True  # there is none of that name here
 
 
 def _consoles(root: Path) -> set[str]:
