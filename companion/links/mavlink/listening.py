@@ -14,7 +14,10 @@ from companion.protocols.heartbeat import Heartbeat, heartbeats
 USUAL_PORTS: Final = (14540, 14550, 14551)
 """PX4's for companions, the ground stations', and the second one that routers are usually given."""
 LISTEN_S: Final = 3.0
-"""Two heartbeats, and one that is lost."""
+"""Time for two heartbeats, and one that is lost."""
+LISTEN_TURNS: Final = 30
+"""Turns of the loop in that time, each of which reads what has arrived: a process that gets little of the processor
+listens longer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +51,9 @@ async def listen_udp(port: int) -> HeardUdp:
     except OSError as error:
         raise LinkError(f"UDP {port}: {error.strerror or error}") from None
     try:
-        await comes(heard.enough, LISTEN_S)
+        for _ in range(LISTEN_TURNS):
+            if await comes(heard.enough, LISTEN_S / LISTEN_TURNS):
+                break
     finally:
         transport.close()
     return HeardUdp(
