@@ -46,7 +46,8 @@ def test_nothing_heavy_before_the_first_heartbeat(tmp_path: Path, text: str, mos
     assert {
         name for name in NOT_YET if any(found == name or found.startswith(f"{name}.") for found in modules)
     } == set()
-    assert len(modules) <= most, "what is all this imported for before the companion is heard?"
+    # Debian's Python imports it by itself, others have none.
+    assert len(modules - {"sitecustomize"}) <= most, "what is all this imported for before the companion is heard?"
 
 
 SETTLED = """
