@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.ground_line import ground_line
-from tests.support.namespaces import OWN_SHARED_MEMORY
+from tests.support.namespaces import OWN_SHARED_MEMORY, has_shared_memory
 
 MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
 DOCS = Path(__file__).parents[2] / "docs/ground_stations.md"
@@ -65,7 +65,7 @@ class MavProxy:
 @contextlib.asynccontextmanager
 async def mavproxy(folder: Path, port: int, modules: str = MODULES) -> AsyncIterator[MavProxy]:
     # It needs semaphores, which lie in shared memory.
-    memory = () if os.access("/dev/shm", os.W_OK) else OWN_SHARED_MEMORY
+    memory = () if has_shared_memory() else OWN_SHARED_MEMORY
     process = await asyncio.create_subprocess_exec(
         *memory, sys.executable, str(MAVPROXY), f"--master=udpout:127.0.0.1:{port}", "--no-state",
         f"--default-modules={modules}", cwd=folder,

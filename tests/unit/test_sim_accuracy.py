@@ -21,6 +21,7 @@ from sim.accuracy.warmup import WARMING
 from sim.aircraft import VirtualAircraft
 from sim.imu_model import DEG_H, MG, PARTS, ImuModel
 from tests.support.extent import extent
+from tests.support.namespaces import has_shared_memory, run_again_with_mounts
 
 FOUR = 4.0
 
@@ -153,6 +154,9 @@ def test_all_sections_are_made_of_the_same_stands(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.real_clock
-def test_however_many_processes_share_the_work_the_tables_are_the_same() -> None:
+def test_however_many_processes_share_the_work_the_tables_are_the_same(request: pytest.FixtureRequest) -> None:
+    if not has_shared_memory():
+        run_again_with_mounts(request.node)
+        return
     one, two = (report(4, 7, ("white",), processes, lambda _: None) for processes in (1, 2))
     assert one["white"].lines == two["white"].lines
