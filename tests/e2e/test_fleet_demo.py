@@ -32,7 +32,10 @@ def test_one_command_shows_a_fleet(tmp_path: Path) -> None:
     async def main() -> None:
         with (tmp_path / "log").open("wb") as log:
             process = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "sim", "fleet", "--page", f"127.0.0.1:{port}"), stdout=log, stderr=log
+                *(sys.executable, "-m", "sim", "fleet", "--page", f"127.0.0.1:{port}"),
+                stdout=log,
+                stderr=log,
+                env={**os.environ, "TMPDIR": str(tmp_path)},
             )
         try:
             async with asyncio.timeout(90.0):
@@ -55,10 +58,13 @@ def test_one_command_shows_a_fleet(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(MOSQUITTO is None, reason="no Mosquitto")
-def test_broker_and_collector_end_with_it_though_it_is_killed() -> None:
+def test_broker_and_collector_end_with_it_though_it_is_killed(tmp_path: Path) -> None:
     async def main() -> None:
-        command = (sys.executable, "-m", "sim", "fleet", "--page", f"127.0.0.1:{free_port()}")
-        process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "sim", "fleet", "--page", f"127.0.0.1:{free_port()}"),
+            stdout=asyncio.subprocess.PIPE,
+            env={**os.environ, "TMPDIR": str(tmp_path)},
+        )
         try:
             assert process.stdout is not None
             folder = (await process.stdout.readline()).decode().partition("file in ")[2].partition(",")[0]
