@@ -160,7 +160,7 @@ def test_with_a_daemon_running_it_is_asked_and_its_ports_are_left_alone(tmp_path
             )
             try:
                 # Its compass at 19200 hears a compass at 115200; its gradienter at 115200 one at 9600.
-                async with asyncio.timeout(30):
+                async with asyncio.timeout(150.0):
                     while True:
                         said = await companion("-c", str(path), "status", "--json")
                         if said.code == 0 and all(
@@ -175,7 +175,7 @@ def test_with_a_daemon_running_it_is_asked_and_its_ports_are_left_alone(tmp_path
                 # The same device at the speed that the daemon reads: it says itself who that is.
                 compass.line = Setting(19200)
                 compass.frame = tilt_frame
-                async with asyncio.timeout(30):
+                async with asyncio.timeout(150.0):
                     while True:
                         check = await companion("-c", str(path), "check", "--json")
                         said_of = [one["words"] for one in check.json["findings"] if one["name"] == "compass"]
