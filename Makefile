@@ -81,7 +81,7 @@ SEED ?= 7
 campaign: $(VENV)/.dev
 	@$(BIN)/python -m tests.campaign --seed $(SEED) --jobs $(JOBS)
 
-# Some of them alone: PICTURES='wiring demo page report'.
+# Some of them alone: PICTURES='demo page report'.
 PICTURES ?=
 
 pictures: $(VENV)/.dev

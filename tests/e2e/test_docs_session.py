@@ -42,16 +42,6 @@ def shown(expected: list[str], said: str) -> bool:
     return all(any(line.startswith(in_short(wanted)) for line in lines) for wanted in expected if wanted != "...")
 
 
-def test_some_document_has_a_session() -> None:
-    assert WITH_SESSIONS
-
-
-def test_a_line_that_does_not_come_is_noticed() -> None:
-    assert shown(["state: done", "...", "in force: 3 min"], "state:  done, and well\nat arming\nin force: 14 min ago")
-    assert not shown(["in force:", "state: done"], "state: done\nin force: 14 min ago")
-    assert not shown(["state: done"], "state: failed")
-
-
 @pytest.mark.parametrize("path", WITH_SESSIONS, ids=lambda path: str(path.name))
 def test_the_session_happens_as_shown(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -1,4 +1,4 @@
-"""`python -m tests.pictures [wiring] [demo] [page] [report]`: draws them into docs/pictures."""
+"""Draw the documents' pictures from real runs: `python -m tests.pictures [demo] [page] [report]`."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from typing import Final
 from PIL import Image
 
 from tests.e2e.test_commands import companion, flight_line
-from tests.pictures import terminal, wiring
+from tests.pictures import terminal
 from tests.support.browser import Tab, chromium
 
 PICTURES: Final = Path(__file__).parents[2] / "docs/pictures"
 PHONE, PAPER = (390, 780), (760, 900)
 COLOURS: Final = 64
 """So many are enough for letters and bars, and make a quarter of the bytes."""
-NAMES: Final = ("wiring", "demo", "page", "report")
+NAMES: Final = ("demo", "page", "report")
 
 
 def main(names: Sequence[str]) -> int:
@@ -30,12 +30,9 @@ def main(names: Sequence[str]) -> int:
         return 2
     wanted = names or NAMES
     PICTURES.mkdir(exist_ok=True)
-    if "wiring" in wanted:
-        for name, draw in wiring.DRAWINGS.items():
-            _write(PICTURES / f"wiring_{name}.svg", draw())
     if "demo" in wanted:
         lines = asyncio.run(terminal.recorded("sim", "demo"))
-        _write(PICTURES / "demo.svg", terminal.svg("make demo", lines))
+        (PICTURES / "demo.svg").write_text(terminal.svg("make demo", lines), encoding="utf-8")
     if {"page", "report"} & set(wanted):
         with tempfile.TemporaryDirectory(prefix="companion-pictures-") as folder:
             asyncio.run(_from_daemon(Path(folder), wanted))
@@ -77,11 +74,6 @@ def _lighten(path: Path) -> None:
     with Image.open(path) as taken:
         taken.convert("RGB").quantize(COLOURS).save(path, optimize=True)
     print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
-    print(f"{path}: {len(text.encode()) / 1000:.0f} kB")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from companion.protocols.registry import Kind, part_for
+from companion.protocols.registry import PROTOCOLS, Kind, ProtocolInfo, part_for
 from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
 
 IMU = ImuSample(1.0, (0.1, 0.2, 0.3), (0.0, 0.0, -9.8))
@@ -33,3 +33,16 @@ WITH_TILT = CompassSample(1.0, 40.0, pitch_deg=5.0, roll_deg=-3.0)
 )
 def test_a_role_takes_its_part(role: Kind, sample: Sample, part: Sample | None) -> None:
     assert part_for(role, sample) == part
+
+
+def test_a_device_is_the_same_under_each_of_its_roles() -> None:
+    seen: dict[str, ProtocolInfo] = {}
+    for infos in PROTOCOLS.values():
+        for info in infos.values():
+            first = seen.setdefault(info.name, info)
+            assert (first.decoder, first.dialogue, first.baud, first.parity) == (
+                info.decoder,
+                info.dialogue,
+                info.baud,
+                info.parity,
+            )

@@ -109,10 +109,3 @@ def test_the_boards_of_the_field_have_their_wheels() -> None:
 
 def test_the_build_system_is_the_locked_one() -> None:
     assert [str(each) for each in wanted("build")] == PROJECT["build-system"]["requires"]
-
-
-def test_what_is_out_of_step_is_seen() -> None:
-    lines = lock("runtime")
-    assert out_of_step([Requirement("h11>=99")], lines) == ["h11>=99"]
-    assert out_of_step([Requirement("nobody-has-this")], lines) == ["nobody-has-this"]
-    assert out_of_step([Requirement("PyMAVLink>=2.4.50")], lines) == []

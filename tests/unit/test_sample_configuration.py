@@ -80,11 +80,3 @@ def test_every_choice_is_named() -> None:
         for name, annotation in typing.get_type_hints(kind, include_extras=True).items():
             for choice in choices(annotation):
                 assert f'"{choice}"' in comments, f"{kind.__name__}.{name}"
-
-
-def test_every_table_begins_with_a_word_of_explanation() -> None:
-    for block in re.split(r"\n\n+", SAMPLE):
-        kinds = [
-            "word" if line.startswith("# ") else "key" for line in block.splitlines() if not re.match(r"#?\[", line)
-        ]
-        assert not kinds or kinds[0] == "word", block

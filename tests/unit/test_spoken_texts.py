@@ -9,8 +9,6 @@ import ast
 import re
 from collections.abc import Iterator
 
-import pytest
-
 from companion.component.statustext import Severity, as_lines, to_ascii
 from tests.support.messages import FILLED, ROOT, template_of
 
@@ -62,16 +60,3 @@ def test_every_text_that_is_spoken_is_a_line_to_be_heard() -> None:
     assert len(found) > 25
     wrong = {text.replace(FILLED, "…"): why for severity, text in found if (why := unheard(severity, text)) is not None}
     assert not wrong
-
-
-@pytest.mark.parametrize(
-    "source",
-    [
-        'self._say(Severity.WARNING, f"INS_GYR_CAL={value} may rewrite offsets", Weight.NEWS)',
-        'say(Severity.NOTICE, f"sigma {sigma:.1f}")',
-        'self._core.prompt(Tune.WRONG, f"tilt by 20 deg")',
-    ],
-)
-def test_what_nobody_understands_by_ear_would_be_missed(source: str) -> None:
-    assert all(unheard(severity, text) for severity, text in spoken(source))
-    assert spoken(source)
