@@ -22,7 +22,14 @@ from tests.campaign.stage import VARIANTS, Stage
 # A daemon that is killed closes no file.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
-CELLS = slice_of(SEED, 16)
+CELLS = [
+    ("arms-in-write", "writing", SEED),
+    ("kill", "writing", SEED),
+    ("disk-full", "verifying", SEED),
+    ("echoes-only", "writing", SEED),
+    *slice_of(SEED, 12),
+]
+"""The cells that show most of what a write must survive, and a slice of the others."""
 CELLS_A_TEST = 4
 
 
@@ -51,7 +58,7 @@ def test_the_catalogue_is_whole() -> None:
 
 
 def test_a_slice_is_the_same_every_time_and_of_every_room() -> None:
-    assert CELLS == slice_of(SEED, 16) != slice_of(SEED + 1, 16)
+    assert slice_of(SEED, 12) == slice_of(SEED, 12) != slice_of(SEED + 1, 12)
     assert len({FAULTS[name].room for name, _, _ in CELLS}) >= 8
 
 

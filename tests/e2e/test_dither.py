@@ -1,4 +1,4 @@
-"""Integer streams of the autopilot's second IMU: with noise enough, without, and with its offsets dithered."""
+"""Integer streams of the autopilot's second IMU, whose noise is too small, with and without offset dither."""
 
 from __future__ import annotations
 
@@ -11,15 +11,12 @@ import numpy as np
 import pytest
 
 from companion.calibration.means.dither import STEPS
-from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.component.service import JobResult
 from companion.config.sections import Imu, Push
 from companion.daemon.job import Job
 from companion.storage.changes import ChangeLog
 from sim.ardupilot.double import ArduPilotDouble, offset_names
 from sim.imu_model import DEG_H, MG, AxisNoise, ImuModel, ImuSpec
-from sim.motions import Handling
 from sim.px4.double import PX4Double
 from tests.e2e.test_calibration import calibrated, started
 from tests.support.rig import Rig
@@ -29,13 +26,8 @@ from tests.support.wire import Wire
 NAMES = [*offset_names(2, "accel"), *offset_names(2, "gyro")]
 UNDITHERED = ImuSpec(name="quiet", gyro=AxisNoise(white=7.1 * DEG_H), accel=AxisNoise(white=49.5e-3 * MG))
 """Behind the autopilot's filter 0.23 LSB of the gyros, as measured on a real one (autopilots 9.3.1)."""
-DITHERED = ImuSpec(name="noisy", gyro=AxisNoise(white=14.0 * DEG_H), accel=AxisNoise(white=60e-3 * MG))
-"""Behind the same filter 0.45 LSB of the gyros, 0.4 of the accelerometers; white noise only, as the figures asked of
-it are: flicker would be the floor of any estimate."""
 QUIETER = ImuSpec(name="quieter", gyro=AxisNoise(white=2.0 * DEG_H), accel=AxisNoise(white=10e-3 * MG))
 """In PX4's unfiltered samples of 4 ms 0.15 LSB of either."""
-FILTERED = 6.63
-"""Of the autopilot's second-order filter at 20 Hz: sigma of its output over N, root of 44 Hz."""
 CASE_A = ((100.0, -60.0, 170.0), (1.0, -2.0, 3.0))
 """deg/h and mg, autopilots 9.3: inside the dead band of the integers."""
 
@@ -77,44 +69,6 @@ def left_over(rig: Rig) -> tuple[float, float]:
     """The largest residual of the second IMU, deg/h and mg."""
     left = rig.double.residual(2, rig.now_s)
     return float(np.abs(left.gyro_rad_s).max()) / DEG_H, float(np.abs(left.accel_m_s2).max()) / MG
-
-
-def naive_gyro_error_deg_h(rig: Rig, before: np.ndarray) -> float:
-    """Of the mean of integers without end: what cutting does to a Gaussian, from its definition."""
-    mrad = before * 1e3
-    rng = np.random.default_rng(1)
-    sigma = FILTERED * rig.double.imus[1].spec.gyro.white * 1e3
-    read = np.trunc(mrad + sigma * rng.standard_normal((100_000, 3))).mean(axis=0)
-    return float(np.abs(read - mrad).max()) * 1e-3 / DEG_H
-
-
-async def once(rig: Rig) -> tuple[JobResult, Record, float]:
-    """A calibration; and by how much the plain mean of its integers would have been off."""
-    await ready(rig)
-    left, truth = rig.double.residual(2, rig.now_s), rig.aircraft.truth_at(rig.aircraft.time_at(rig.now_s))
-    naive = naive_gyro_error_deg_h(rig, left.gyro_rad_s + truth.rate_rad_s)
-    result, record = await calibrated(rig)
-    return result, record, naive
-
-
-def test_truncated_integers_with_noise_enough_are_within_15_deg_h_and_150_ug_after_a_minute(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with second_imu_only(tmp_path, DITHERED).running() as rig:
-            await rig.until(lambda: rig.service.core.vehicle.system_id == 1, 10.0)
-            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=0.1 * DEG_H, target_accel_sigma_m_s2=0.001 * MG)
-            result, record, naive = await once(rig)
-            assert result.outcome == "done", result
-            assert naive > 60.0
-            gyro_deg_h, accel_mg = left_over(rig)
-            print(f"naive mean {naive:.0f} deg/h off, left {gyro_deg_h:.1f} deg/h and {accel_mg * 1e3:.0f} ug")
-            # Of the gradienter's 0.005 deg comes 0.09 mg; its error in this simulation is smaller.
-            assert gyro_deg_h < 15.0
-            assert accel_mg < 0.15
-            sigma = record.imus[0].gyro_sigma_use_rad_s
-            assert sigma is not None
-            assert max(sigma) < 20.0 * DEG_H
-
-    run_virtual(main())
 
 
 def test_an_undithered_second_imu_is_left_alone_with_the_way_out(tmp_path: Path) -> None:
@@ -183,8 +137,8 @@ def test_with_push_dither_the_undithered_imu_comes_within_a_few_deg_h(tmp_path: 
     run_virtual(main())
 
 
-def px4(folder: Path, *, own_calibration: float) -> Rig:
-    """A PX4 with one IMU that hardly dithers, whose console does not tell the EKF's bias."""
+def px4(folder: Path) -> Rig:
+    """Make a PX4 that calibrates its own gyro, with one IMU whose noise is too small and no EKF bias."""
     rig = Rig(folder, firmware="px4", max_s=12.0, seed=3)
     rig.config = msgspec.structs.replace(rig.config, push=Push(dither=True))
     gyro, accel = CASE_A
@@ -195,67 +149,20 @@ def px4(folder: Path, *, own_calibration: float) -> Rig:
         gyro_bias_rad_s=[value * DEG_H for value in gyro],
         accel_bias_m_s2=[value * MG for value in accel],
     )
-    parameters = {"MAV_1_FORWARD": 1.0, "IMU_GYRO_CAL_EN": own_calibration, "SENS_IMU_AUTOCAL": 0.0}
+    parameters = {"MAV_1_FORWARD": 1.0, "IMU_GYRO_CAL_EN": 1.0, "SENS_IMU_AUTOCAL": 0.0}
     rig.autopilot = PX4Double(rig.aircraft, [model], parameters=parameters, console=False, seed=3)
     rig.wire, rig.radio = Wire(rig.link, rig.autopilot, seed=3), Wire(rig.ground, rig.autopilot.ground, seed=4)
     return rig
 
 
-def test_px4_takes_every_step_of_a_dither_and_comes_within_a_few_deg_h(tmp_path: Path) -> None:
-    """Autopilots 9.3.2: 1.6 deg/h by steps that alternate, each more than the 0.01 that is ignored."""
-
-    async def main() -> None:
-        async with px4(tmp_path, own_calibration=0.0).running() as rig:
-            await rig.ready()
-            result, record = await calibrated(rig)
-            assert result.outcome == "done", result
-            assert any("66 parameter writes" in words for words in record.imus[0].warnings), record.imus[0].warnings
-            left = rig.px4.residual(1, rig.now_s)
-            print(f"left {np.abs(left.gyro_rad_s).max() / DEG_H:.1f} deg/h")
-            assert np.abs(left.gyro_rad_s).max() < 8.0 * DEG_H
-            assert np.abs(left.accel_m_s2).max() < 0.15 * MG
-
-    run_virtual(main())
-
-
 def test_px4_whose_own_calibration_would_overwrite_the_steps_is_not_dithered(tmp_path: Path) -> None:
     async def main() -> None:
-        async with px4(tmp_path, own_calibration=1.0).running() as rig:
+        async with px4(tmp_path).running() as rig:
             await rig.ready()
             _, record = await calibrated(rig)
             warnings = record.imus[0].warnings
             assert any("not dithered: IMU_GYRO_CAL_EN" in words for words in warnings), warnings
             assert len(rig.px4.writes) < 30
-
-    run_virtual(main())
-
-
-@pytest.mark.parametrize("dither", [False, True])
-def test_an_undithered_imu_does_not_keep_the_gate_shut_nor_calibrations_coming(tmp_path: Path, *, dither: bool) -> None:
-    async def main() -> None:
-        rig = second_imu_only(tmp_path, UNDITHERED, dither=dither, max_s=5.0, coarse=True)
-        first = Imu(name="fc", source="autopilot", instance=1, profile="icm42688p")
-        wanted = msgspec.structs.replace(rig.config.calibration, at_arm="gate")
-        rig.config = msgspec.structs.replace(rig.config, imu=[first, *rig.config.imu], calibration=wanted)
-        async with rig.running():
-            await ready(rig)
-            verdicts = set()
-            deadline_s = rig.now_s + 240.0
-            while rig.service.arming.readiness.answer().verdict != "accept" and rig.now_s < deadline_s:
-                dithering = (
-                    rig.service.calibrating.conductor.job is not None
-                    and "dither" in rig.service.calibrating.conductor.job.words
-                )
-                if dithering and not rig.service.calibrating.conductor.job.finished.done():  # type: ignore[union-attr]
-                    verdicts.add(rig.service.arming.readiness.answer().verdict)
-                await asyncio.sleep(0.1)
-            assert rig.service.arming.readiness.answer().verdict == "accept", rig.service.arming.readiness.answer()
-            # With the offsets away from where they belong nobody may arm.
-            assert verdicts == ({"wait"} if dither else set())
-            done = len(rig.service.calibrating.store.history())
-            assert done <= 2
-            await asyncio.sleep(30.0)
-            assert len(rig.service.calibrating.store.history()) == done
 
     run_virtual(main())
 
@@ -289,8 +196,7 @@ def link_lost(rig: Rig, job: Job) -> None:
 
 @pytest.mark.parametrize(
     ("fate", "step"),
-    [(cancelled, step) for step in range(1, STEPS + 1)]
-    + [(fate, step) for fate in (armed, rebooted, link_lost) for step in (1, 2, 7, STEPS)],
+    [(cancelled, 1), (cancelled, 6), (armed, 2), (armed, 7), (rebooted, 7), (link_lost, STEPS)],
 )
 def test_a_dither_that_is_interrupted_leaves_the_offsets_as_they_were(tmp_path: Path, fate: Fate, step: int) -> None:
     async def main() -> None:
@@ -314,7 +220,7 @@ def test_a_dither_that_is_interrupted_leaves_the_offsets_as_they_were(tmp_path: 
     run_virtual(main())
 
 
-@pytest.mark.parametrize("step", range(1, STEPS + 1))
+@pytest.mark.parametrize("step", [2, 7])
 def test_a_daemon_killed_in_the_middle_of_a_dither_puts_the_offsets_back_at_its_next_start(
     tmp_path: Path, step: int
 ) -> None:
@@ -337,43 +243,5 @@ def test_a_daemon_killed_in_the_middle_of_a_dither_puts_the_offsets_back_at_its_
             await again.until(lambda: not again.service.offsets.ledger.pending, 30.0)
             assert offsets(again) == before
         assert not journal.exists()
-
-    run_virtual(main())
-
-
-def test_a_step_during_which_somebody_moves_the_aircraft_is_taken_again(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level("INFO")
-
-    async def main() -> None:
-        async with second_imu_only(tmp_path, UNDITHERED, dither=True, max_s=3.0, coarse=True).running() as rig:
-            await ready(rig)
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
-            await _until_step(rig, job, 3)
-            t_s = rig.aircraft.time_at(rig.now_s)
-            rig.aircraft.add(Handling(start_s=t_s, duration_s=2.0))
-            result = await job.finished
-            assert result.outcome == "done", result
-            gyro_deg_h, accel_mg = left_over(rig)
-            assert gyro_deg_h < 10.0
-            assert accel_mg < 0.2
-            assert any("void" in line.message for line in caplog.records)
-
-    run_virtual(main())
-
-
-def test_an_offset_that_somebody_else_sets_during_the_dither_stays_as_set(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with second_imu_only(tmp_path, UNDITHERED, dither=True, max_s=3.0, coarse=True).running() as rig:
-            await ready(rig)
-            before = offsets(rig)
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
-            await _until_step(rig, job, 3)
-            rig.double.write_as_another_station(NAMES[5], 0.0123)
-            result = await job.finished
-            assert result.outcome == "failed"
-            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
-            assert offsets(rig) == {**before, NAMES[5]: float(np.float32(0.0123))}
 
     run_virtual(main())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,46 +17,35 @@ from companion.storage.state import StateFile, sealed
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
-CHECK = "ARMING_CHECK"
+
+def changes(name: str, before: float) -> bytes:
+    """Encode a journal of one parameter."""
+    return sealed(msgspec.json.encode(ChangeSet(1, (Changed(name, before=before, after=0.001),))))
 
 
-def changes(name: str, before: float, *more: str) -> bytes:
-    found = tuple(Changed(each, before=before, after=0.001) for each in (name, *more))
-    return sealed(msgspec.json.encode(ChangeSet(1, found)))
-
-
-CONTENTS: dict[str, Any] = {
-    "no value of an IMU": changes("INS_GYROFFS_X", 9.5),
-    "no value at all": changes("INS_GYROFFS_X", 1e30),
-    "another parameter": changes(CHECK, 0.0),
-    "no name of a parameter": changes("A" * 40, 0.0),
-    "a name twice": changes("INS_GYROFFS_X", 0.0, "INS_GYROFFS_X"),
-    "too deep": b"[" * 100_000,
-    "a FIFO": os.mkfifo,
-}
-
-
-@pytest.mark.parametrize("what", CONTENTS)
-@pytest.mark.parametrize("name", ["journal.json", "undo-1.json"])
-def test_it_starts_says_so_and_writes_nothing(
-    tmp_path: Path, name: str, what: str, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(
+    ("name", "damage", "reason"),
+    [
+        ("journal.json", lambda path: path.write_bytes(changes("INS_GYROFFS_X", 9.5)), "used"),
+        ("undo-1.json", os.mkfifo, "read"),
+    ],
+    ids=["journal", "undo"],
+)
+def test_a_damaged_file_is_named_and_nothing_of_it_is_written(
+    tmp_path: Path, name: str, damage: Callable[[Path], Any], reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """tests/unit/test_storage_state.py has the other contents and the other files."""
     path = tmp_path / name
-    path.parent.mkdir(exist_ok=True)
-    content = CONTENTS[what]
-    if isinstance(content, bytes):
-        path.write_bytes(content)
-    else:
-        content(path)
+    damage(path)
 
     async def main() -> None:
-        rig = Rig(tmp_path, version="4.6", parameters={"INS_GYROFFS_X": 0.001, CHECK: 0.001})
+        rig = Rig(tmp_path, version="4.6", parameters={"INS_GYROFFS_X": 0.001})
         async with rig.running():
             await rig.ready()
             await asyncio.sleep(10.0)
             (said,) = [words for words in caplog.messages if path.name in words]
             assert said in rig.service.status()["warnings"]
-            assert said.startswith(f"{path}: cannot be {'read' if what == 'a FIFO' else 'used'}: ")
+            assert said.startswith(f"{path}: cannot be {reason}: ")
             assert rig.service.offsets.ledger.fault is None
             assert not rig.service.offsets.ledger.pending
             if name == "undo-1.json":
@@ -69,23 +59,11 @@ def test_it_starts_says_so_and_writes_nothing(
     run_virtual(main())
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "alignment.json",
-        "faces.json",
-        "reboot-owed.json",
-        "biases.json",
-        "automatic.json",
-        "armings.json",
-        "records",
-        "records/000001.json",
-        "flights",
-    ],
-)
-def test_nothing_else_in_the_storage_ends_or_hangs_the_start(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).parent.mkdir(exist_ok=True)
-    os.mkfifo(tmp_path / name)
+def test_a_fifo_in_place_of_any_other_file_does_not_stop_the_start(tmp_path: Path) -> None:
+    (tmp_path / "records").mkdir()
+    names = ("alignment.json", "faces.json", "reboot-owed.json", "biases.json", "automatic.json", "armings.json")
+    for name in (*names, "records/000001.json", "flights"):
+        os.mkfifo(tmp_path / name)
 
     async def main() -> None:
         async with Rig(tmp_path).running() as rig:
