@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import re
 from pathlib import Path
 from typing import Any
 
@@ -72,8 +71,7 @@ async def aligned(rig: Rig, hands: Hands, plan: Plan) -> JobResult:
     return await follow(rig, hands, started(rig.service.calibrating.start_alignment(wanted, "test")))
 
 
-@pytest.mark.parametrize("plan", [Plan("zero"), Plan("zero", headings=4)], ids=["there-and-back", "four"])
-def test_the_horizontal_accelerometers_become_as_good_as_the_turn(tmp_path: Path, plan: Plan) -> None:
+def test_the_horizontal_accelerometers_become_as_good_as_the_turn(tmp_path: Path) -> None:
     made, hands = rig(tmp_path)
 
     async def main() -> None:
@@ -85,7 +83,7 @@ def test_the_horizontal_accelerometers_become_as_good_as_the_turn(tmp_path: Path
             off_mg, sigma_mg = worst_horizontal(before, made)
             assert 1.7 < sigma_mg < 1.8
             assert 1.0 < off_mg < 2.5
-            result = await aligned(made, hands, plan)
+            result = await aligned(made, hands, Plan("zero"))
             assert result.outcome == "done", result
             record = made.service.calibrating.alignment.record
             assert record is not None
@@ -127,66 +125,6 @@ def test_a_spot_that_moved_is_refused_in_words_and_the_old_zero_stays(tmp_path: 
             assert not (tmp_path / "alignment.json").exists()
             await asyncio.sleep(10.0)
             assert "the spot moved" in "".join(made.ground.texts())
-
-    run_virtual(main())
-
-
-def test_tilts_tell_bias_and_scale_apart(tmp_path: Path) -> None:
-    made, hands = rig(tmp_path)
-    tilts = [(20.0, 0.0), (0.0, 20.0), (-20.0, 0.0), (0.0, -20.0)]
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            job = started(made.service.calibrating.start_alignment({"action": "tilts"}, "test"))
-            for stand in (2, 3, 4):
-                await moved(made, hands, job, stand, 90.0)
-            said: list[str] = []
-            for stand, tilt in enumerate(tilts, 5):
-                await made.until(lambda s=stand: job.words.startswith(f"{s} of 8") and "to move" in job.words, 60.0)  # type: ignore[misc]
-                said.append(job.words)
-                hands.tilt(made.aircraft.time_at(made.now_s), *tilt)
-            result = await job.finished
-            assert result.outcome == "done", result
-            assert "not nose up or right side down again" in said[2]
-            record = made.service.calibrating.alignment.record
-            assert record is not None
-            assert np.abs(np.subtract(record.offset_deg, ZERO_DEG)).max() < 2.5 * record.sigma_deg
-            (imu,) = record.imus
-            assert imu.accel_scale.known == (True, True, True)
-            assert (np.abs(imu.accel_scale.value) < 3.0 * np.array(imu.accel_scale.sigma)).all()
-            assert max(imu.accel_scale.sigma) < 1e-3
-            true_mg = made.model.true_bias(made.aircraft.time_at(made.now_s)).accel_m_s2 / MG
-            assert imu.accel_bias_mg.known == (True, True, True)
-            off = np.abs(np.subtract(imu.accel_bias_mg.value, true_mg))
-            assert (off < 3.0 * np.array(imu.accel_bias_mg.sigma)).all()
-            assert imu.accel_bias_mg.sigma[2] < 2.0
-
-    run_virtual(main())
-
-
-def test_without_a_compass_the_gyros_tell_the_turn(tmp_path: Path) -> None:
-    made, hands = rig(tmp_path)
-    made.config = msgspec.structs.replace(made.config, compass=None)
-    del made.devices["compass"]
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            job = started(made.service.calibrating.start_alignment({"action": "zero"}, "test"))
-            await moved(made, hands, job, 2, 100.0)
-            await made.until(lambda: "turn it by" in job.words and "degrees more" in job.words, 60.0)
-            assert re.search(r": (99|100|101) degrees, not 180: turn", job.words)
-            hands.turn(made.aircraft.time_at(made.now_s), 80.0)
-            await moved(made, hands, job, 3, -180.0)
-            result = await job.finished
-            assert result.outcome == "done", result
-            record = made.service.calibrating.alignment.record
-            assert record is not None
-            headings = [stand.heading_deg for stand in record.stands]
-            assert abs(headings[1] - 180.0) < 2.0
-            assert np.abs(np.subtract(record.offset_deg, ZERO_DEG)).max() < 2.5 * record.sigma_deg
-            assert record.sigma_deg < 0.03
 
     run_virtual(main())
 
@@ -252,20 +190,6 @@ def test_what_was_calibrated_with_the_old_zero_is_calibrated_anew_by_itself(tmp_
     run_virtual(main())
 
 
-def test_a_file_that_cannot_be_read_is_said_and_not_used(tmp_path: Path) -> None:
-    (tmp_path / "alignment.json").write_text('{"format_version": 1, "offset_deg": [nan', encoding="utf-8")
-    made, _ = rig(tmp_path)
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            status = made.service.status()["alignment"]
-            assert status["in_force"] is False
-            assert "alignment.json: cannot be used: " in status["unused_because"]
-
-    run_virtual(main())
-
-
 def test_who_may_start_one_and_how_it_ends(tmp_path: Path) -> None:
     made, _ = rig(tmp_path)
 
@@ -306,26 +230,6 @@ def test_who_may_start_one_and_how_it_ends(tmp_path: Path) -> None:
     run_virtual(main())
 
 
-def test_a_client_that_vanishes_stops_nothing(tmp_path: Path) -> None:
-    made, hands = rig(tmp_path)
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            replies = made.service.faces.answer({"command": "align", "action": "zero"})
-            first = await anext(replies)
-            assert first["kind"] == "progress"
-            await replies.aclose()  # type: ignore[attr-defined]
-            job = made.service.calibrating.conductor.job
-            assert job is not None
-            result = await follow(made, hands, job)
-            assert result.outcome == "done", result
-            shown = [r async for r in made.service.faces.answer({"command": "align", "action": "show"})]
-            assert shown[-1]["state"] == "in force"
-
-    run_virtual(main())
-
-
 @pytest.mark.parametrize("told", [True, False])
 def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, told: bool) -> None:
     made, hands = rig(tmp_path)
@@ -349,8 +253,8 @@ def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, to
     run_virtual(main())
 
 
-@pytest.mark.parametrize("mounting_deg", [(0.0, 0.0, 0.0), (0.0, 0.0, 90.0)], ids=["straight", "turned"])
-def test_px4_and_an_imu_of_our_own(tmp_path: Path, mounting_deg: tuple[float, float, float]) -> None:
+def test_px4_and_an_imu_of_our_own(tmp_path: Path) -> None:
+    mounting_deg = (0.0, 0.0, 90.0)
     made, hands = rig(tmp_path, firmware="px4", own_imu=True)
     made.config = replaced(made.config, gradienter={"mounting": mounting_deg})
     made.devices["gradienter"] = Gradienter(

@@ -6,21 +6,20 @@ import asyncio
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.records.history import KEEP_POINTS, KEEP_POWER_UPS, PowerUp
+from companion.calibration.records.history import PowerUp
 from companion.calibration.records.record import Record, Standing
-from companion.cli.show import status_lines, temperature_lines
+from companion.cli.show import status_lines
 from companion.daemon.job import Job
 from companion.daemon.offsets import firmware_calibration
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
-from companion.storage.learned import KEEP_IMUS, BiasStore
-from companion.storage.state import MOST_BYTES
+from companion.storage.learned import BiasStore
 from sim.devices import Gradienter
 from sim.imu_model import DEG_H, MG
 from sim.motions import SlowTurn
@@ -168,34 +167,6 @@ def test_a_gradienter_that_has_moved_is_named_and_a_replay_says_so_without_the_d
     assert again.record.imus == record.imus
 
 
-def test_a_gradienter_that_moves_between_two_calibrations_is_named_without_any_history(tmp_path: Path) -> None:
-    async def main() -> tuple[Record, Record]:
-        async with Rig(tmp_path, own_imu=True, **FEW).running() as rig:
-            await rig.ready()
-            _, good = await calibrated(rig)
-            knocked(rig)
-            await asyncio.sleep(8.0)
-            _, bad = await calibrated(rig)
-            return good, bad
-
-    good, bad = run_virtual(main())
-    assert not any("gradienter" in words for words in good.warnings)
-    assert any(words.startswith("the gradienter has moved by 0.3") for words in bad.warnings), bad
-
-
-def test_another_profile_forgets_in_words(known: Path, tmp_path: Path) -> None:
-    def reprofiled(rig: Rig) -> None:
-        imus = [msgspec.structs.replace(imu, profile="bmi088") if imu.name == "own" else imu for imu in rig.config.imu]
-        rig.config = msgspec.structs.replace(rig.config, imu=tuple(imus))
-
-    (record,), _, _ = power_up(copied(known, tmp_path), 8, before=reprofiled)
-    fc, own = record.imus
-    assert fc.prior is not None
-    assert own.prior is None
-    assert "imu own: profile changed since then: its earlier biases are forgotten" in own.warnings
-    assert len(BiasStore(tmp_path).read()["own"].points) == 1
-
-
 def test_another_imu_in_its_place_has_no_curve_and_the_same_one_keeps_it(known: Path, tmp_path: Path) -> None:
     """The sixth power-up of the one, the first of the other: told by the device id of its gyro."""
     store = BiasStore(copied(known, tmp_path))
@@ -236,24 +207,6 @@ def test_switched_off_nothing_is_asked_but_all_is_remembered(known: Path, tmp_pa
     assert fc.effective is not None
     assert not any("moved" in words for words in (*record.warnings, *fc.warnings))
     assert {name: len(imu.points) for name, imu in BiasStore(tmp_path).read().items()} == {"fc": 6, "own": 5}
-
-
-def test_no_more_is_held_in_memory_than_on_the_disk(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, own_imu=False, **FEW).running() as rig:
-            await rig.ready()
-            await calibrated(rig)
-            memory = rig.service.calibrating.memory
-            (point,) = memory._known["fc"].points
-            for k in range(KEEP_POINTS + 5):
-                await memory.keep({"fc": msgspec.structs.replace(point, started_at=str(k))})
-            assert memory._known["fc"].points == BiasStore(tmp_path).read()["fc"].points
-            assert len(memory._known["fc"].points) == KEEP_POINTS
-            # As many of as many IMUs as are kept can be read again.
-            bytes_each = (tmp_path / "biases.json").stat().st_size / KEEP_POINTS
-            assert bytes_each * KEEP_POINTS * KEEP_POWER_UPS * KEEP_IMUS < MOST_BYTES
-
-    run_virtual(main())
 
 
 def test_a_damaged_file_costs_one_line_and_what_is_undone_is_forgotten(
@@ -307,7 +260,7 @@ def test_who_has_no_compass_and_no_history_is_told_what_was_assumed(tmp_path: Pa
 
 
 @pytest.mark.usefixtures("impatient")
-@pytest.mark.parametrize("rate_deg_s", [-0.15, 0.0, 0.15, 1.0])
+@pytest.mark.parametrize("rate_deg_s", [0.0, 0.15])
 def test_a_turn_that_no_compass_shows_is_bounded_by_earlier_power_ups(
     known: Path, tmp_path: Path, rate_deg_s: float
 ) -> None:
@@ -358,72 +311,7 @@ def test_what_is_seen_while_it_warms_up_is_remembered_although_nobody_calibrates
     run_virtual(main())
 
 
-@pytest.mark.parametrize(("slope_deg_h_k", "slope_mg_k", "closes"), [(1.0, 0.0, False), (54.0, 0.8, True)])
-def test_the_gate_closes_by_what_the_temperature_does_to_this_imu(
-    tmp_path: Path, slope_deg_h_k: float, slope_mg_k: float, closes: bool
-) -> None:
-    """Five kelvin, which without a curve are too many for every part."""
-
-    async def main() -> None:
-        rig = Rig(tmp_path, part="icm42688p", at_arm="gate", up_s=3600.0, **FEW)
-        warmer = 0.0
-        rig.model.temperature_degc = lambda t_s: 20.0 + warmer  # type: ignore[method-assign]
-        async with rig.running():
-            memory, in_force = rig.service.calibrating.memory, rig.service.arming.in_force
-            await rig.ready()
-            await calibrated(rig)
-            (first,) = memory._known["fc"].points[-1:]
-            assert first.gyro is not None
-            assert first.accel is not None
-            random = np.random.default_rng(3)
-            for run in range(1, 9):
-                degc = 10.0 + 3.0 * run
-                bias = random.normal(0.0, 5.0, 3) + slope_deg_h_k * (degc - 20.0)
-                accel = np.add(first.accel.bias, (random.normal(0.0, 0.1, 3) + slope_mg_k * (degc - 20.0)) * MG)
-                day = msgspec.structs.replace(
-                    first,
-                    started_at=f"day {run}",
-                    power_up=since(run),
-                    temperature_degc=degc,
-                    gyro=msgspec.structs.replace(first.gyro, bias=tuple((bias * DEG_H).tolist())),
-                    accel=msgspec.structs.replace(first.accel, bias=tuple(accel.tolist())),
-                )
-                await memory.keep({"fc": day})
-            await asyncio.sleep(10.0)
-            assert [finding.words for finding in in_force.findings(rig.now_s)] == []
-            async for reply in rig.service.faces.answer({"command": "temperature"}):
-                (seen,) = reply["imus"]
-            assert (seen["imu"], seen["power_ups"]) == ("fc", 9)
-            low, *_, high = seen["curve"]
-            assert (low["degc"], high["degc"]) == (13.0, 34.0)
-            rise = np.subtract(high["gyro_deg_h"], low["gyro_deg_h"]) / 21.0
-            np.testing.assert_allclose(rise, slope_deg_h_k, atol=2.0)
-            lines = temperature_lines(reply["imus"])
-            assert lines[0].startswith(f"fc: {len(seen['points'])} still windows, 9 power-ups on ")
-            assert lines[0].endswith(" 13 to 34 degC")
-            assert (seen["now"]["degc"], seen["today"]) == (20.0, 0)
-            true = rig.model.true_bias(rig.aircraft.time_at(rig.now_s)).gyro_rad_s
-            np.testing.assert_allclose(
-                seen["now"]["gyro_deg_h"], true / DEG_H, atol=4.0 * max(seen["now"]["sigma_deg_h"])
-            )
-            # Nobody sees the output while somebody carries it about.
-            in_force.temperatures_degc["fc"], in_force._present = 25.0, {}
-            words = [finding.words for finding in in_force.findings(rig.now_s)]
-            gyros = [word for word in words if word.startswith("gyro")]
-            moved = [float(word.split()[3]) for word in gyros if word.endswith(" deg/h off, 5 K warmer")]
-            assert moved == ([pytest.approx(5.0 * 54.0, rel=0.05)] if closes else [])
-            accels = [word for word in words if word not in gyros]
-            moved = [float(word.split()[3]) for word in accels if word.endswith(" mg off, 5 K warmer")]
-            assert moved == ([pytest.approx(5.0 * 0.8, rel=0.1)] if closes else [])
-            assert len(words) == (2 if closes else 0)
-
-    run_virtual(main())
-
-
-@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_a_calibration_in_mid_warm_up_says_what_the_bias_will_be_when_warm(
-    tmp_path: Path, firmware: Literal["ardupilot", "px4"]
-) -> None:
+def test_a_calibration_in_mid_warm_up_says_what_the_bias_will_be_when_warm(tmp_path: Path) -> None:
     """Eight days before have shown it; 4 K a minute now."""
 
     async def main() -> None:
@@ -433,7 +321,6 @@ def test_a_calibration_in_mid_warm_up_says_what_the_bias_will_be_when_warm(
             part="icm42688p",
             at_arm="off",
             up_s=60.0,
-            firmware=firmware,
             temperature_degc=board,
             imu_rate_hz=100.0,
             **FEW,
@@ -442,7 +329,8 @@ def test_a_calibration_in_mid_warm_up_says_what_the_bias_will_be_when_warm(
             memory = rig.service.calibrating.memory
             await rig.ready()
             await calibrated(rig)
-            (first,) = memory._known["fc"].points[-1:]
+            kept = BiasStore(tmp_path).read()
+            (first,) = kept["fc"].points[-1:]
             assert first.gyro is not None
             assert first.accel is not None
             random, days = np.random.default_rng(3), []
@@ -462,8 +350,8 @@ def test_a_calibration_in_mid_warm_up_says_what_the_bias_will_be_when_warm(
                             accel=msgspec.structs.replace(first.accel, bias=(0.15 * (degc - 25.0) * MG,) * 3),
                         )
                     )
-            memory._known["fc"] = msgspec.structs.replace(memory._known["fc"], points=(*days, first))
-            memory.curves.follow(memory._known)
+            BiasStore(tmp_path).write({"fc": msgspec.structs.replace(kept["fc"], points=(*days, first))})
+            memory.load()
             result, record = await calibrated(rig)
             assert result.outcome == "done", result
             (imu,) = record.imus

@@ -14,7 +14,7 @@ from companion.component.commands import CommandServer
 from tests.campaign.__main__ import SEED, slice_of
 from tests.campaign.catalogue import FAULTS
 from tests.campaign.cell import run_cell
-from tests.campaign.fault import PHASES
+from tests.campaign.fault import PHASES, Phase
 from tests.campaign.hour import run_hour
 from tests.campaign.loop import OWNER
 from tests.campaign.stage import VARIANTS, Stage
@@ -22,7 +22,7 @@ from tests.campaign.stage import VARIANTS, Stage
 # A daemon that is killed closes no file.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
-CELLS = [
+CELLS: list[tuple[str, Phase, int]] = [
     ("arms-in-write", "writing", SEED),
     ("kill", "writing", SEED),
     ("disk-full", "verifying", SEED),

@@ -79,9 +79,7 @@ def test_a_bench_in_order_has_nothing_to_say(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("sends", "keys", "remedy"),
     [
-        pytest.param(Setting(2400), "", "set baud = 2400 in [gradienter]", id="MEAS P-series"),
         pytest.param(Setting(9600, "even"), "", 'set parity = "even" in [gradienter]', id="BEI INC"),
-        pytest.param(Setting(9600), 'parity = "even"', 'set parity = "none" in [gradienter]', id="parity too many"),
         pytest.param(
             Setting(9600, "even"),
             "baud = 115200",
@@ -111,28 +109,6 @@ def test_two_devices_swapped_each_at_its_own_speed(tmp_path: Path) -> None:
             assert told["compass"].startswith(
                 "this is inclinometer_xy, a device for gradienter: give [compass] the port of the compass"
             )
-
-    asyncio.run(main())
-
-
-def test_a_device_of_another_kind(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path, Setting(9600), Setting(19200)) as (gradienter, _):
-            gradienter.frame = compass_frame
-            (finding,) = of(await found(text(tmp_path)), "gradienter")
-            assert "this is hmr3300, a device for compass" in finding.words
-            assert finding.remedy is not None
-            assert finding.remedy.startswith("give [gradienter] the port of the gradienter")
-
-    asyncio.run(main())
-
-
-def test_a_console_on_the_port(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path, Setting(115200), Setting(19200)) as (gradienter, _):
-            gradienter.frame = lambda _: b"\r\nRaspbian GNU/Linux 12 aircraft ttyS0\r\n\r\naircraft login: "
-            (finding,) = of(await found(text(tmp_path)), "gradienter")
-            assert "(115200 8N1) but a login console or kernel messages: another port" in finding.words
 
     asyncio.run(main())
 
@@ -227,17 +203,5 @@ def test_ports_listen_leaves_alone_what_somebody_holds_and_does_not_list_by_open
             assert f"process {os.getpid()}" in heard["reason"]
             listed = await companion("ports", "--json")
             assert "heard" not in json.loads(listed.out)
-
-    asyncio.run(main())
-
-
-def test_ports_listen_says_silence_and_what_is_not_there(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Chatter(tmp_path / "a", tilt_frame) as device:
-            device.muted = True
-            said = await companion("ports", "--listen", str(device.path), str(tmp_path / "b"))
-            assert said.code == 0
-            assert f"{device.path}: silent" in said.out
-            assert "no such device" in said.out
 
     asyncio.run(main())

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from companion.calibration.deck.estimate import DeckWork
 from companion.calibration.records.record import Record
@@ -17,12 +16,11 @@ from companion.component.service import Refusal
 from sim.imu_model import DEG_H, MG
 from sim.motions import SlowTurn
 from sim.sea import DAY_S, Sea, Wave
-from tests.e2e.test_arm_gate import AUTHORISED_BY_US, spied, texts, try_to_arm, tunnelled
+from tests.e2e.test_arm_gate import AUTHORISED_BY_US, texts, try_to_arm
 from tests.e2e.test_calibration import started
 from tests.e2e.test_record_replay import replayed, ring, same
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
-from tests.unit.test_lua_arming_script import LUA, SILENT, Script, received, tunnel
 
 DECK = '[vehicle]\nplatform = "deck"\n'
 BOAT = (Sea(start_s=-20.0, waves=(Wave(0.2, 5.0), Wave(0.05, 1.0)), seed=4),)
@@ -91,38 +89,6 @@ def test_px4_on_a_boat_is_calibrated_by_itself_and_then_arms(tmp_path: Path) -> 
     run_virtual(main())
 
 
-@pytest.mark.skipif(LUA is None, reason="needs lua5.3 (Debian: apt install lua5.3)")
-def test_ardupilots_script_lets_a_boat_arm_once_it_is_calibrated(tmp_path: Path) -> None:
-    """Every verdict of a boat goes through the script that is installed: what it says is whole, and what opens it."""
-
-    script = Script("both")
-
-    async def main() -> None:
-        seen: list[tuple[str, str]] = []
-        async with boat(tmp_path, at_arm="gate").running() as rig:
-            spied(rig)
-            await rig.ready()
-            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=20 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
-            while len(seen) < 200 and [state for state, _ in seen[-10:]] != ["passed"] * 10:
-                await asyncio.sleep(1.0)
-                payload = tunnelled(rig, rig.now_s - 0.6)[-1]
-                script(received(tunnel(7, payload)))
-                seen.append(script("run 1000")[:2])
-                # What the script shows is what the companion said, nothing cut off.
-                assert seen[-1][0] == "passed" or seen[-1][1] == f"Companion: {payload[6:].decode()}"
-        reasons = [reason for state, reason in seen if state != "passed"]
-        assert any(reason.startswith("Companion: wait: at least ") for reason in reasons), reasons
-        assert not any("still" in reason for reason in reasons), reasons
-        assert len(seen) < 200, reasons
-        # It has gone on swaying all the time; without a companion it closes.
-        assert script("run 3400")[:2] == ("failed", SILENT)
-
-    try:
-        run_virtual(main())
-    finally:
-        script.close()
-
-
 def test_the_gate_answers_while_a_small_board_works_for_seconds(tmp_path: Path) -> None:
     async def slow(function: Any, *arguments: Any) -> Any:
         if isinstance(getattr(function, "__self__", None), DeckWork):
@@ -144,40 +110,8 @@ def test_the_gate_answers_while_a_small_board_works_for_seconds(tmp_path: Path) 
     run_virtual(main())
 
 
-SECOND = """
-[[imu]]
-name = "fc2"
-source = "autopilot"
-instance = 2
-profile = "icm42688p"
-"""
-
-
-def test_three_imus_on_a_boat_are_each_calibrated(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with boat(tmp_path, more=DECK + SECOND, own_imu=True).running() as rig:
-            await rig.ready()
-            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=25 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", 900.0))
-            result = await job.finished
-            assert result.outcome == "done", result
-            assert job.record is not None
-            models = {"fc": rig.models[0], "fc2": rig.models[1], "own": rig.own_model}
-            assert {imu.name for imu in job.record.imus} == set(models)
-            for imu in job.record.imus:
-                truth = models[imu.name].mean_bias(
-                    rig.aircraft.time_at(rig.now_s) - 60.0, rig.aircraft.time_at(rig.now_s)
-                )
-                assert imu.gyro_bias_rad_s is not None
-                assert imu.accel_bias_m_s2 is not None
-                assert np.abs(np.subtract(imu.gyro_bias_rad_s, truth.gyro_rad_s)).max() < 60 * DEG_H
-                assert np.abs(np.subtract(imu.accel_bias_m_s2, truth.accel_m_s2)).max() < 1.0 * MG
-
-    run_virtual(main())
-
-
-def test_a_replay_on_a_deck_gives_the_same_records(tmp_path: Path) -> None:
-    """Also from a file of the ring that begins with what the deck has known for minutes."""
+def test_a_replay_on_a_deck_gives_the_same_record(tmp_path: Path) -> None:
+    """The second file of the ring begins with what the deck has known for minutes."""
 
     async def main() -> list[Record]:
         async with boat(tmp_path, more=f"{DECK}[push]\nparameters = false\n", recordings_mb=64).running() as rig:
@@ -192,13 +126,10 @@ def test_a_replay_on_a_deck_gives_the_same_records(tmp_path: Path) -> None:
 
     records = run_virtual(main())
     assert len(records) == 2
-    spans_s = []
-    for path, record in zip(ring(tmp_path), records, strict=False):
-        result = replayed(path)
-        same(result, [record])
-        spans_s.append(result.calibrations[0].record.imus[0].samples / 50.0)
+    result = replayed(ring(tmp_path)[1])
+    same(result, [records[1]])
     # More than the ground's longest stretch and what its gates learn from: 30 and 65 s.
-    assert spans_s[1] > 95.0
+    assert result.calibrations[0].record.imus[0].samples / 50.0 > 95.0
 
 
 def test_where_the_ground_is_meant_the_words_name_the_deck(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ from sim.imu_model import DEG_H, MG, Bias, ImuModel
 from sim.pty_device import PtyDevice
 from sim.scenario import site_at
 from sim.udp import open_udp
+from tests.support.extent import extent
 
 POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
 AT_ONCE = 3
@@ -222,7 +223,7 @@ def within(found: Any, truth: Any, sigma: Any, times: float = 4.0) -> None:
     assert off.max() < times, f"off by {off} sigma"
 
 
-@pytest.mark.parametrize("first", range(0, len(RUNS), AT_ONCE))
+@pytest.mark.parametrize("first", range(0, extent(whole=len(RUNS), a_slice=len(plain_runs())), AT_ONCE))
 def test_families_on_ptys_calibrate_right(tmp_path_factory: pytest.TempPathFactory, first: int) -> None:
     async def main(runs: list[Run]) -> list[Outcome]:
         folders = [tmp_path_factory.mktemp("family") for _ in runs]

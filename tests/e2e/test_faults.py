@@ -159,21 +159,6 @@ def test_a_foreign_write_during_the_verification_is_never_called_verified(tmp_pa
     run_virtual(main())
 
 
-def test_a_check_that_only_listens_starts_nothing(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
-            await rig.ready()
-            rig.service.core.only_listening = "only a check is running"
-            for answer in (
-                rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"),
-                rig.service.calibrating.conductor.start_undo("test"),
-            ):
-                assert isinstance(answer, Refusal)
-                assert "check" in answer.reason
-
-    run_virtual(main())
-
-
 def test_every_imu_that_does_not_take_its_offsets_is_named(tmp_path: Path) -> None:
     async def main() -> None:
         second = '[[imu]]\nname = "fc2"\nsource = "autopilot"\ninstance = 2\nprofile = "icm42688p"\n'

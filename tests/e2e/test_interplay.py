@@ -1,4 +1,4 @@
-"""Parts that are right each for itself, at the same moment: settling and a reboot, a countdown and a write."""
+"""Two events at the same moment: EKF settling and a reboot, a countdown and a write."""
 
 from __future__ import annotations
 
@@ -80,21 +80,6 @@ def test_what_another_station_writes_while_the_ekf_settles_shuts_the_gate_and_st
     run_virtual(main())
 
 
-def test_what_another_station_writes_during_the_check_is_not_overwritten_by_the_next_try(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, **QUICK).running() as rig:
-            await rig.until(lambda: rig.service.calibrating.conductor.state is State.VERIFYING, 90.0)
-            rig.double.write_as_another_station(GYRO_Y, 0.0123)
-            await rig.until(lambda: bool(rig.service.calibrating.store.history(1)), 200.0)
-            assert rig.service.calibrating.store.history(1)[0].state == "failed"
-            await asyncio.sleep(100.0)
-            assert rig.double.parameter(GYRO_Y) == pytest.approx(0.0123)
-            assert Why.CHANGED in whys(rig)
-            assert rig.service.arming.automatic.stopped == "fc was changed"
-
-    run_virtual(main())
-
-
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
 def test_the_gates_countdown_never_counts_up_and_is_kept(tmp_path: Path, firmware: Literal["ardupilot", "px4"]) -> None:
     async def main() -> None:
@@ -114,22 +99,6 @@ def test_the_gates_countdown_never_counts_up_and_is_kept(tmp_path: Path, firmwar
             assert counted == sorted(counted, reverse=True)
             # It may stand still for a moment, where what comes next is not known better.
             assert -4.0 < ends[0] - rig.now_s < 8.0
-
-    run_virtual(main())
-
-
-def test_after_a_boot_that_keeps_the_offsets_the_gate_says_how_long_it_looks(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, **QUICK).running() as rig:
-            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 90.0)
-            rig.autopilot.reboot()
-            said = set()
-            await rig.until(lambda: rig.service.core.vehicle.boots == 1, 10.0)
-            while (answer := rig.service.arming.readiness.answer()).verdict != "accept":
-                said.add(answer.words)
-                await asyncio.sleep(0.25)
-            assert any(words.endswith("s: checking after restart") for words in said)
-            assert not any("again in" in words for words in said)
 
     run_virtual(main())
 

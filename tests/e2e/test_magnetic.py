@@ -1,8 +1,7 @@
-"""A compass in magnetometer mode, from its bytes to the record, in clean and in disturbed fields."""
+"""A compass in magnetometer mode, from its bytes to the record, in a clean and in a disturbed field."""
 
 from __future__ import annotations
 
-import asyncio
 import math
 from pathlib import Path
 from typing import Any
@@ -121,52 +120,3 @@ def test_a_magnet_of_the_aircraft_is_bounded_warned_of_and_widens_the_gyros(tmp_
         assert min(together["magnet"], together["car"]) > 1.5 * together["clean"]
 
     run_virtual(main())
-
-
-def test_a_car_that_parks_beside_it_between_two_calibrations_is_seen(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, max_s=15.0).running() as rig:
-            await rig.ready()
-            _, first = await calibrated(rig)
-            rig.aircraft.iron = Iron(body_gauss=(0.0, 0.03, 0.0))
-            _, second = await calibrated(rig)
-            assert first.magnetic is not None
-            assert second.magnetic is not None
-            assert first.magnetic.wander_deg is not None
-            assert first.magnetic.wander_deg < 0.3
-            assert first.magnetic.heading_bound_deg is None
-            assert first.pose is not None
-            assert second.pose is not None
-            assert first.pose.psi_deg is not None
-            assert second.pose.psi_deg is not None
-            jump_deg = abs(wrap_deg(second.pose.psi_deg - first.pose.psi_deg))
-            assert jump_deg > 3.0
-            assert second.magnetic.wander_deg == pytest.approx(jump_deg, abs=0.3)
-            assert any("gyros do not" in words for words in second.warnings)
-            assert second.pose.sigma_deg.psi is not None
-            assert second.pose.sigma_deg.psi >= jump_deg - 0.3
-
-    run_virtual(main())
-
-
-def test_a_recording_of_a_field_heading_replays_to_the_same_record(tmp_path: Path) -> None:
-    pytest.importorskip("mcap", reason="recordings need the extra")
-    from companion.recording.walk import Recording
-    from companion.replay.engine import Replay
-
-    records: list[Record] = []
-
-    async def main() -> None:
-        async with MagneticRig(tmp_path, recordings_mb=16).running() as rig:
-            records.append(await measured(rig))
-            await asyncio.sleep(3.0)
-
-    run_virtual(main())
-    files = sorted((tmp_path / "recordings").glob("*.mcap"))
-    assert files
-    again = [one for file in files for one in Replay(Recording(file)).run().calibrations]
-    (one,) = again
-    assert one.not_recomputed is None
-    assert one.differences == []
-    assert one.record.magnetic == records[0].magnetic
-    assert one.record.magnetic is not None

@@ -151,38 +151,3 @@ def test_our_parameters_are_listed_without_waiting_for_files(tmp_path: Path) -> 
             assert "timed out" not in station.printed[place:]
 
     asyncio.run(main())
-
-
-def test_over_a_signed_link(tmp_path: Path) -> None:
-    """The passphrase that MAVProxy is told and the one in the companion's key file make the same key."""
-    key, passphrase = tmp_path / "signing.key", "a-long-passphrase-for-the-field"
-    key.write_text(f"{passphrase}\n")
-    key.chmod(0o600)
-
-    async def main() -> None:
-        async with (
-            ground_line(tmp_path, "ardupilot", signing_key=key) as line,
-            mavproxy(tmp_path, line.port) as station,
-        ):
-            await station.prints(r"Detected vehicle 1:191")
-            await station.type("module load signing")
-            await station.prints(r"Loaded module signing")
-            await station.type(f"signing key {passphrase}")
-            await station.prints(r"Setup signing key")
-            await station.type("vehicle 1:191")
-            await station.prints(r"Set vehicle 1:191")
-            await station.type("long MAV_CMD_USER_2 0 0 0 0 0 0 0")
-            await station.prints(r"Got COMMAND_ACK: USER_2: ACCEPTED", within_s=30.0)
-            status = await line.daemon.status()
-            assert status is not None
-            assert status["vehicle"]["signing"]["good"]
-            place = len(station.printed)
-            await station.type("signing key another-passphrase")
-            await station.prints(r"Setup signing key", after=place)
-            refused = line.scenario.autopilot.channels[1].received["bad"]
-            await station.type("long MAV_CMD_USER_2 0 0 0 0 0 0 0")
-            async with asyncio.timeout(40.0):
-                while line.scenario.autopilot.channels[1].received["bad"] == refused:
-                    await asyncio.sleep(0.05)
-
-    asyncio.run(main())

@@ -17,7 +17,7 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
-from tests.e2e.test_commands import DONE, NO_DAEMON, FlightLine, _end, _until_disarmed, companion, flight_line
+from tests.e2e.test_commands import DONE, FlightLine, _end, _until_disarmed, companion, flight_line
 
 COLUMNS, ROWS = 80, 24
 
@@ -143,15 +143,5 @@ def test_in_a_pipe_and_on_a_terminal_through_a_calibration_and_a_restart(tmp_pat
                 plain = re.sub(r"\x1b\[[?0-9;]*[a-zA-Z]", "", frame.partition("\x1b[J")[0]).split("\r\n")
                 assert len(plain) <= ROWS
                 assert max(map(len, plain)) <= COLUMNS
-
-    asyncio.run(main())
-
-
-def test_without_a_daemon_it_says_so_and_ends(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flight_line(tmp_path, daemon=False) as line:
-            said = await companion("-c", str(line.config), "monitor", "--json")
-            assert said.code == NO_DAEMON
-            assert "no daemon answers" in said.json["reason"]
 
     asyncio.run(main())

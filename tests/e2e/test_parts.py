@@ -142,17 +142,6 @@ def test_what_is_configured_holds_whatever_the_ids_say(tmp_path: Path) -> None:
     assert sigma_deg_h(mine) == sigma_deg_h(without)
 
 
-def test_the_warning_names_what_made_the_sigma(tmp_path: Path) -> None:
-    """Unknown part: 30 deg/h of Allan floor at the least; unknown heading at 40 degrees north: 8 deg/h rms."""
-    unnamed = gyros(tmp_path / "a", None, compass=False)
-    named = gyros(tmp_path / "b", None, compass=False, parameters=ids("ardupilot", 0x2B, 0x2B))
-    profile, heading = "gyro sigma is that of an unknown part", "horizontal part of the Earth's rate"
-    assert any(profile in words for words in unnamed.warnings)
-    assert not any(heading in words for words in unnamed.warnings)
-    assert any(heading in words for words in named.warnings)
-    assert not any(profile in words for words in named.warnings)
-
-
 def test_check_says_it(tmp_path: Path) -> None:
     config = parse('[mavlink]\nurl = "udpout:127.0.0.1:9"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n', "x.toml")
     config = msgspec.structs.replace(

@@ -124,47 +124,6 @@ def test_a_calibration_takes_the_residual_out(tmp_path: Path, options: dict[str,
     run_virtual(main())
 
 
-def test_a_slot_that_is_another_imus_is_put_back_and_the_same_job_finds_the_right_one(tmp_path: Path) -> None:
-    async def main() -> None:
-        # The second IMU's slot comes first.
-        async with px4_rig(tmp_path, slots=(1, 0)).running() as rig:
-            await rig.ready()
-            result, record = await calibrated(rig)
-            assert result.outcome == "done", result
-            (fc,) = record.imus
-            assert list(fc.written) == [*names("ACC", 1), *names("GYRO", 1)]
-            assert set(values(rig).values()) == {0.0}
-            assert uses(rig, 2) == ([0.0] * 3, [0.0] * 3)
-            assert in_use_as_stored(rig, 1, slot=1)
-            assert any("CAL_GYRO0 act on the gyro of IMU 2, not of IMU 1" in warning for warning in record.warnings), (
-                record.warnings
-            )
-            # The next job that has something to write knows.
-            assert (await started(rig.service.calibrating.conductor.start_undo("test")).finished).outcome == "done"
-            await asyncio.sleep(2.0)
-            writes = len(rig.px4.writes)
-            result, record = await calibrated(rig)
-            assert result.outcome == "done", result
-            assert {write.name[:9] for write in rig.px4.writes[writes:]} == {"CAL_ACC1_", "CAL_GYRO1"}
-            assert not any("IMU 2" in warning for warning in record.warnings)
-
-    run_virtual(main())
-
-
-def test_two_imus_with_their_slots_exchanged_are_both_right_in_the_end(tmp_path: Path) -> None:
-    async def main() -> None:
-        second = '[[imu]]\nname = "fc2"\nsource = "autopilot"\ninstance = 2\nprofile = "bmi088"\n'
-        async with px4_rig(tmp_path, slots=(1, 0), more=second).running() as rig:
-            await rig.ready()
-            result, record = await calibrated(rig)
-            assert result.outcome == "done", result
-            assert [list(imu.written)[-1] for imu in record.imus] == ["CAL_GYRO1_ZOFF", "CAL_GYRO0_ZOFF"]
-            assert in_use_as_stored(rig, 1, slot=1)
-            assert in_use_as_stored(rig, 2, slot=0)
-
-    run_virtual(main())
-
-
 def test_a_small_accelerometer_vector_is_brought_into_use_before_anything_is_measured(tmp_path: Path) -> None:
     async def main() -> None:
         rig = px4_rig(tmp_path, parameters={"CAL_ACC0_XOFF": 0.006, "CAL_ACC0_YOFF": -0.005})
@@ -284,26 +243,6 @@ def test_the_autopilot_is_rebooted_only_when_asked_and_what_was_written_is_confi
 
 
 # --- rivals
-
-
-def test_rivals_are_told_once_and_named_with_the_key_that_stops_them(tmp_path: Path) -> None:
-    async def main() -> None:
-        rivals = {"IMU_GYRO_CAL_EN": 1.0, "SENS_IMU_AUTOCAL": 1.0}
-        async with px4_rig(tmp_path, parameters=rivals).running() as rig:
-            await rig.ready()
-            await rig.until(lambda: len(rig.ground.texts()) >= 2, 10.0)
-            result, record = await calibrated(rig)
-            assert result.outcome == "done", result
-            texts = rig.ground.texts()
-            assert texts.count("The autopilot may rewrite gyro offsets: set IMU_GYRO_CAL_EN to 0") == 1
-            assert texts.count("The autopilot may rewrite all offsets: set SENS_IMU_AUTOCAL to 0") == 1
-            warnings = rig.service.status()["warnings"]
-            assert [words.split(":")[0] for words in warnings] == ["IMU_GYRO_CAL_EN = 1", "SENS_IMU_AUTOCAL = 1"]
-            assert all("push.stop_rivals = true" in words for words in warnings)
-            assert set(warnings) <= set(record.imus[0].warnings)
-            assert rig.px4.parameter("IMU_GYRO_CAL_EN") == 1
-
-    run_virtual(main())
 
 
 def test_rivals_are_stopped_with_the_biases_and_the_undo_starts_them_again(tmp_path: Path) -> None:

@@ -11,22 +11,18 @@ import logging
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.vehicle.vehicle import ArmState
-from companion.links.mavlink import signing as link_signing
 from companion.links.mavlink.signing import SigningClock, ticks_of
-from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, DENIED, Ground, command_message
+from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, Ground, command_message
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
 KEY, OTHER = bytes(range(100, 132)), bytes(range(32))
 START_S = 1.8e9
-GYRO = {"ardupilot": "INS_GYROFFS_X", "px4": "CAL_GYRO0_XOFF"}
-Firmware = Literal["ardupilot", "px4"]
 
 
 def signed_rig(folder: Path, *, mode: str = "require", key: bytes = KEY, **more: Any) -> Rig:
@@ -54,26 +50,23 @@ def words_of(rig: Rig) -> str:
     return str(rig.service.status()["vehicle"]["summary"])
 
 
-@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_with_one_key_all_works_and_the_key_stays_where_it_is(
-    tmp_path: Path, firmware: Firmware, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_with_one_key_all_works_and_the_key_stays_where_it_is(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
 
     async def main() -> None:
-        rig = signed_rig(tmp_path, firmware=firmware, max_s=12.0, recordings_mb=16)
+        rig = signed_rig(tmp_path, firmware="px4", max_s=12.0, recordings_mb=16)
         # An autopilot without GNSS whose clock stopped with the battery last week.
         rig.autopilot.require_signatures(KEY, now() - 7 * 86400 * 100_000)
         rig.ground.sign(KEY, now())
         async with rig.running():
             await rig.ready()
-            before = rig.autopilot.parameter(GYRO[firmware])
+            before = rig.autopilot.parameter("CAL_GYRO0_XOFF")
             # Somebody gives a key to everybody: ArduPilot forwards what is for all components.
             rig.wire.carry_from_other(rig.ground.pack(mavlink.MAVLink_setup_signing_message(1, 0, list(KEY), now())))
             rig.ground.command(CALIBRATE, 1)
             await rig.until(lambda: bool(rig.ground.finals(CALIBRATE)), 120.0)
             assert rig.ground.finals(CALIBRATE) == [ACCEPTED]
-            assert rig.autopilot.parameter(GYRO[firmware]) != before
+            assert rig.autopilot.parameter("CAL_GYRO0_XOFF") != before
             signing = rig.service.status()["vehicle"]["signing"]
             assert signing["good"]
             assert signing["verified"] > 1000
@@ -121,10 +114,7 @@ def replayed_at_once(ground: Ground, message: mavlink.MAVLink_message) -> bytes:
     return data
 
 
-ATTACKS = (unsigned, with_another_key, replayed, replayed_at_once)
-
-
-@pytest.mark.parametrize("attack", ATTACKS)
+@pytest.mark.parametrize("attack", [unsigned, with_another_key, replayed, replayed_at_once])
 def test_who_has_no_key_starts_nothing_and_changes_nothing(tmp_path: Path, attack: Attack) -> None:
     """On the companion's own wire, behind the autopilot's back."""
 
@@ -150,33 +140,6 @@ def test_who_has_no_key_starts_nothing_and_changes_nothing(tmp_path: Path, attac
             assert parameters.get("CMP_PUSH") == push
             assert rig.ground.acks() == []
             assert sum(rig.service.status()["vehicle"]["signing"]["doubted"].values()) == 3
-
-    run_virtual(main())
-
-
-@pytest.mark.parametrize("attack", [unsigned, with_another_key, replayed])
-def test_nobody_without_the_key_says_that_the_aircraft_is_armed_or_which_it_is(tmp_path: Path, attack: Attack) -> None:
-    async def main() -> None:
-        rig = signed_rig(tmp_path)
-        rig.autopilot.require_signatures(KEY, now())
-        forged = mavlink.MAVLink_heartbeat_message(2, 3, 128 + 81, 0, 4, 3)
-
-        def forge() -> None:
-            # Under the autopilot's own ids.
-            liar = Ground(1, 1)
-            if attack is not unsigned:
-                liar.sign(OTHER if attack is with_another_key else KEY, now() - (attack is replayed) * 3600 * 100_000)
-            rig.wire.carry_from_other(liar.pack(forged))
-
-        async with rig.running():
-            forge()
-            await rig.ready()
-            seen = set()
-            for _ in range(20):
-                forge()
-                await asyncio.sleep(0.1)
-                seen.add(rig.service.core.vehicle.arm_state.value)
-            assert seen == {"disarmed"}
 
     run_virtual(main())
 
@@ -244,27 +207,6 @@ def test_sign_alone_is_for_the_way_there(tmp_path: Path) -> None:
     run_virtual(main())
 
 
-def test_a_signature_does_not_replace_a_permission(tmp_path: Path) -> None:
-    async def main() -> None:
-        rig = signed_rig(tmp_path)
-        rig.text = rig.text.replace("[[imu]]", 'allow = ["254"]\n[[imu]]', 1)
-        from companion.config import parse
-
-        rig.config = parse(rig.text, "rig.toml")
-        rig.autopilot.require_signatures(KEY, now())
-        rig.ground.sign(KEY, now())
-        async with rig.running():
-            await rig.ready()
-            await asyncio.sleep(2.0)
-            rig.ground.command(CALIBRATE, 0)
-            await asyncio.sleep(1.0)
-            assert rig.ground.acks(CALIBRATE) == [DENIED]
-            assert "Calibration refused: 255/190 not in mavlink.allow" in "".join(rig.ground.texts())
-            assert rig.service.status()["vehicle"]["refused"] == {"255/190": 1}
-
-    run_virtual(main())
-
-
 def lines(caplog: pytest.LogCaptureFixture, words: str) -> int:
     return sum(words in record.getMessage() for record in caplog.records)
 
@@ -274,15 +216,12 @@ def no_longer_signing(rig: Rig) -> None:
         channel._codec.signing = mavlink.MAVLinkSigning()
 
 
-@pytest.mark.parametrize("armed", [False, True])
 def test_an_autopilot_that_wants_signatures_is_named_though_nobody_asks_it_for_anything(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, armed: bool
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def main() -> None:
         async with Rig(tmp_path).running() as rig:
             await rig.ready()
-            if armed:
-                rig.autopilot.arm()
             await asyncio.sleep(3.0)
             rig.autopilot.require_signatures(KEY, now())
             await asyncio.sleep(8.0)
@@ -319,14 +258,13 @@ def test_an_autopilot_that_signs_and_takes_unsigned_messages_is_not_complained_o
     run_virtual(main())
 
 
-@pytest.mark.parametrize("mode", ["sign", "require"])
 def test_another_key_is_named_once_and_forgotten_when_the_keys_are_the_same(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, mode: str
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "companion")
 
     async def main() -> None:
-        rig = signed_rig(tmp_path, mode=mode)
+        rig = signed_rig(tmp_path)
         rig.autopilot.require_signatures(KEY, now())
         async with rig.running():
             await rig.ready()
@@ -339,8 +277,7 @@ def test_another_key_is_named_once_and_forgotten_when_the_keys_are_the_same(
             assert "another key" in status["vehicle"]["signing"]["summary"]
             assert not status["vehicle"]["signing"]["good"]
             assert status["headline"]["tone"] != "good"
-            # A headline that is bad anyway tells what is worse.
-            assert mode == "sign" or "another key" in status["headline"]["reason"]
+            assert "another key" in status["headline"]["reason"]
             assert lines(caplog, "the autopilot signs with another key: give both the same one") == 1
             rig.autopilot.require_signatures(KEY, now() + 100 * 100_000)
             await asyncio.sleep(6.0)
@@ -352,62 +289,5 @@ def test_another_key_is_named_once_and_forgotten_when_the_keys_are_the_same(
             rig.wire.unplug()
             await asyncio.sleep(5.0)
             assert "another key" not in str(rig.service.status()["headline"])
-
-    run_virtual(main())
-
-
-def test_forged_packets_between_good_ones_are_no_reason_to_change_keys(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    async def main() -> None:
-        rig = signed_rig(tmp_path)
-        rig.autopilot.require_signatures(KEY, now())
-        liar = Ground(1, 1)
-        liar.sign(OTHER, now())
-        async with rig.running():
-            await rig.ready()
-            for _ in range(100):
-                rig.wire.carry_from_other(liar.pack(mavlink.MAVLink_heartbeat_message(2, 3, 209, 0, 4, 3)))
-                await asyncio.sleep(0.1)
-            assert rig.service.status()["vehicle"]["signing"]["good"]
-            assert lines(caplog, "give both the same one") == 0
-
-    run_virtual(main())
-
-
-def heartbeats_of_autopilot(packets: list[bytes]) -> list[bytes]:
-    return [data for data in packets if data[5:10] == bytes((1, 1, 0, 0, 0))]
-
-
-@pytest.mark.parametrize("mode", ["require", "sign"])
-def test_heartbeats_held_back_on_another_link_do_not_disarm(
-    tmp_path: Path, mode: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The autopilot signs each of its links apart; those of the telemetry radio are played on ours 75 s later."""
-    monkeypatch.setattr(link_signing, "SigningClock", virtual_clock)
-
-    async def main() -> None:
-        rig = signed_rig(tmp_path, mode=mode, imu_rate_hz=10.0)
-        rig.autopilot.require_signatures(KEY, ticks_of(START_S))
-        rig.ground.sign(KEY, ticks_of(START_S))
-        async with rig.running():
-            await rig.ready()
-            vehicle = rig.service.core.vehicle
-            await asyncio.sleep(2.0)
-            # One of them has come in time, so that this link of the autopilot's is known.
-            rig.wire.carry_from_other(heartbeats_of_autopilot(rig.ground.raw)[-1])
-            rig.ground.raw.clear()
-            await asyncio.sleep(10.0)
-            held_back = heartbeats_of_autopilot(rig.ground.raw)
-            assert len(held_back) >= 10
-            rig.autopilot.arm()
-            await asyncio.sleep(75.0)
-            assert vehicle.arm_state is ArmState.ARMED
-            for data in held_back:
-                rig.wire.carry_from_other(data)
-                await asyncio.sleep(0.005)  # it has just come, and no other since
-                assert vehicle.arm_state is ArmState.ARMED
-                await asyncio.sleep(0.5)
-            assert vehicle.conflict is None
 
     run_virtual(main())

@@ -57,18 +57,14 @@ def place(rig: Rig, latitude_deg: float, height_m: float) -> Callable[[], Messag
     return message
 
 
-@pytest.mark.parametrize(
-    ("latitude_deg", "height_m", "words"),
-    [(40.0, 20000.0, "impossible"), (40.0, 8000.0, "height jumped 7950 m"), (0.001, 50.0, "position jumped 4448 km")],
-)
-def test_a_calibration_waits_while_the_place_jumps_and_says_why(
-    tmp_path: Path, latitude_deg: float, height_m: float, words: str
-) -> None:
+def test_a_calibration_waits_while_the_place_jumps_and_says_why(tmp_path: Path) -> None:
+    words = "height jumped 7950 m"
+
     async def main() -> None:
         async with Rig(tmp_path, **QUICK).running() as rig:
             await rig.ready()
             await asyncio.sleep(8.0)
-            async with spoofed(rig, 0.1, place(rig, latitude_deg, height_m)):
+            async with spoofed(rig, 0.1, place(rig, 40.0, 8000.0)):
                 await asyncio.sleep(1.0)
                 job = calibrate(rig)
                 for _ in range(100):
@@ -177,25 +173,5 @@ def test_an_arming_between_two_looks_ends_the_measurement(tmp_path: Path) -> Non
             async with asyncio.timeout(5.0):
                 result = await job.finished
             assert result.reason == "armed; nothing written"
-
-    run_virtual(main())
-
-
-@pytest.mark.parametrize(("firmware", "capability"), [("ardupilot", 16), ("px4", 131072)])
-def test_forged_versions_fail_no_calibration(tmp_path: Path, firmware: Any, capability: int) -> None:
-    """They say that integers travel in the other firmware's way: read so, each device id would be another sensor's."""
-
-    async def main() -> None:
-        nothing = [0] * 8
-        version: Any = mavlink.MAVLink_autopilot_version_message
-        async with Rig(tmp_path, firmware=firmware, imus=1, **QUICK).running() as rig:
-            await rig.ready()
-            forged = version(capability, 0x01020300, 0, 0, 0, nothing, nothing, nothing, 0, 0, 7)
-            async with spoofed(rig, 0.5, lambda: forged):
-                await asyncio.sleep(1.0)
-                job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
-                assert isinstance(job, Job)
-                result = await job.finished
-            assert result.outcome == "done", result.reason
 
     run_virtual(main())

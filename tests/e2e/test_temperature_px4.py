@@ -9,6 +9,7 @@ import pytest
 
 from companion.errors import RequestRefusedError
 from companion.storage.changes import BY_TEMPERATURE, Changed, ChangeLog, ChangeSet, Origin, Undoable
+from companion.storage.learned import BiasStore
 from sim.imu_model import DEG_H
 from sim.px4.defaults import SIMULATED_IDS
 from tests.e2e.test_temperature_write import Warm
@@ -27,7 +28,7 @@ class WarmPx4(Warm):
         """The learned whole gyro bias of the first still window, deg/h."""
         await self.ready()
         await self.rest()
-        point = self.service.calibrating.memory._known["fc"].points[-1]
+        point = BiasStore(self.config.storage.path).read()["fc"].points[-1]
         assert point.gyro is not None
         return np.array(point.gyro.bias) / DEG_H
 

@@ -5,18 +5,12 @@ Slow and plain on purpose: checksums bit by bit, frames tried at every offset.
 
 from __future__ import annotations
 
-import re
 import struct
 from dataclasses import dataclass
 
 # Bytes of each field, by group and bit (VectorNav UM001, binary output tables).
 COMMON_SIZES = (8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8)
 IMU_SIZES = (2, 12, 12, 12, 4, 4, 16, 12, 12, 12, 12, 2)
-_TABLES: dict[bytes, list[tuple[int, ...]]] = {
-    b"\x01": [COMMON_SIZES],
-    b"\x04": [IMU_SIZES],
-    b"\x05": [COMMON_SIZES, IMU_SIZES],
-}
 
 
 def crc16_xmodem(data: bytes) -> int:
@@ -82,38 +76,6 @@ class Found:
     end: int
 
 
-def right_sentences(data: bytes, prefix: bytes) -> list[Found]:
-    """Every `$...*hh` whose checksum is right and that ends a line."""
-    found = []
-    for match in re.finditer(rb"\$(" + prefix + rb"[^$\r\n]*)\*([0-9A-Fa-f]{2}|[0-9A-Fa-f]{4})(?=[\r\n])", data):
-        computed = xor(match[1]) if len(match[2]) == 2 else crc16_xmodem(match[1])
-        if computed == int(match[2], 16):
-            found.append(Found(match.start(), match.end()))
-    return found
-
-
-def right_binaries(data: bytes) -> list[Found]:
-    """Every VectorNav binary frame of groups 1 and 3 whose CRC is right, at whatever offset."""
-    found = []
-    for start in (index for index, byte in enumerate(data) if byte == 0xFA):
-        groups = data[start + 1 : start + 2]
-        tables = _TABLES.get(groups)
-        if tables is None:
-            continue
-        payload = start + 2 + 2 * len(tables)
-        length = 0
-        for index, sizes in enumerate(tables):
-            raw = data[start + 2 + 2 * index : start + 4 + 2 * index]
-            if len(raw) < 2 or int.from_bytes(raw, "little") >= 1 << len(sizes):
-                break
-            length += sum(size for bit, size in enumerate(sizes) if int.from_bytes(raw, "little") >> bit & 1)
-        else:
-            end = payload + length + 2
-            if end <= len(data) and crc16_xmodem(data[start + 1 : end]) == 0:
-                found.append(Found(start, end))
-    return found
-
-
 def pni(frame_id: int, payload: bytes = b"") -> bytes:
     """A frame of a PNI compass (TCM manual, figure 7-1)."""
     body = struct.pack(">H", 5 + len(payload)) + bytes([frame_id]) + payload
@@ -165,65 +127,10 @@ def wit_imu(accel: tuple[int, int, int] = (0, 0, 2048), gyro: tuple[int, int, in
     return wit(0x51, *accel) + wit(0x52, *gyro)
 
 
-def right_pni_data(data: bytes) -> list[Found]:
-    """Every data frame of a PNI compass whose CRC is right, at whatever offset."""
-    found = []
-    for start in range(len(data) - 4):
-        size = int.from_bytes(data[start : start + 2], "big")
-        if 5 <= size <= 200 and data[start + 2] == 5 and start + size <= len(data):
-            body, crc = data[start : start + size - 2], data[start + size - 2 : start + size]
-            if crc16_xmodem(body) == int.from_bytes(crc, "big"):
-                found.append(Found(start, start + size))
-    return found
-
-
 def right_rion_sums(data: bytes) -> list[Found]:
     """Whatever has a RION device's first byte, a length and the right sum, be it a frame or chance."""
     ends = [(at, at + 1 + data[at + 1]) for at in range(len(data) - 1) if data[at] == 0x68 and data[at + 1] >= 4]
     return [Found(at, end) for at, end in ends if end <= len(data) and sum8(data[at + 1 : end - 1]) == data[end - 1]]
-
-
-def right_rion_angles(data: bytes) -> list[Found]:
-    """Every answer with angles whose sum is right and whose digits are digits; of two that overlap the first."""
-    found: list[Found] = []
-    for start in range(len(data) - 13):
-        length = data[start + 1]
-        if data[start] != 0x68 or data[start + 3] != 0x84 or length not in (13, 15):
-            continue
-        if found and start < found[-1].end:
-            continue
-        frame = data[start : start + 1 + length]
-        if len(frame) == 1 + length and sum8(frame[1:-1]) == frame[-1]:
-            digits, each = (frame[4:-1].hex(), 6) if length == 13 else (frame[4:12].hex(), 8)
-            angles = [digits[at : at + each] for at in range(0, len(digits), each)]
-            if digits.isdecimal() and all(map(_can_be, angles, ("01", "01", "0"), (90, 90, 359.99))):
-                found.append(Found(start, start + 1 + length))
-    return found
-
-
-def _can_be(digits: str, signs: str, greatest: float) -> bool:
-    return digits[0] in signs and int(digits[1:4]) + int(digits[4:]) / 10 ** len(digits[4:]) <= greatest
-
-
-def right_wit(data: bytes) -> list[Found]:
-    """Every frame of a WitMotion device whose sum is right and that has another one right behind it."""
-    right = {
-        start
-        for start in range(len(data) - 10)
-        if data[start] == 0x55
-        and 0x50 <= data[start + 1] <= 0x5F
-        and sum8(data[start : start + 10]) == data[start + 10]
-    }
-    return [Found(start, start + 11) for start in sorted(right) if start + 11 in right]
-
-
-def one_after_another(found: list[Found]) -> list[Found]:
-    """Those that a reader takes: a frame that begins inside the one before it is part of that one."""
-    taken: list[Found] = []
-    for each in found:
-        if not taken or each.start >= taken[-1].end:
-            taken.append(each)
-    return taken
 
 
 # ------------------------------------------------------------------------------------------------ MIP, Xbus, STIM300
@@ -254,20 +161,6 @@ def mip_imu(
 ) -> bytes:
     time = struct.pack(">dHH", time_s, 2400, 0)
     return mip([(0x12, time), (0x04, big_floats(*accel_g)), (0x05, big_floats(*gyro))])
-
-
-def right_mips(data: bytes) -> list[Found]:
-    """Every packet whose checksum is right, at whatever offset."""
-    found = []
-    for start in range(len(data) - 5):
-        end = start + 6 + data[start + 3]
-        if (
-            data[start : start + 2] == b"ue"
-            and end <= len(data)
-            and fletcher(data[start : end - 2]) == data[end - 2 : end]
-        ):
-            found.append(Found(start, end))
-    return found
 
 
 def xbus(identifier: int, data: bytes = b"", *, extended: bool = False) -> bytes:
@@ -376,15 +269,3 @@ def stim_bytes(identifier: int) -> int:
         return STIM_SPECIAL_SIZES.get(identifier, 0)
     clusters = sum(letter in "rai" for letter in contents)
     return 1 + clusters * 10 + ("t" in contents) * clusters * 7 + ("x" in contents) * 4 + 3 + 4
-
-
-def right_stims(data: bytes) -> list[Found]:
-    """Every datagram whose CRC is right, at whatever offset."""
-    found = []
-    for start, identifier in enumerate(data):
-        size = stim_bytes(identifier)
-        if size and start + size <= len(data):
-            body, crc = data[start : start + size - 4], data[start + size - 4 : start + size]
-            if crc32_mpeg2(body + bytes(-len(body) % 4)) == int.from_bytes(crc, "big"):
-                found.append(Found(start, start + size))
-    return found

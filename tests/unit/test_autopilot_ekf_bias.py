@@ -145,18 +145,6 @@ def test_while_offsets_are_written_it_is_the_integers() -> None:
     run_virtual(main())
 
 
-def test_without_any_noise_it_is_as_right() -> None:
-    async def main() -> None:
-        async with aboard(part="perfect", rate_hz=38.0) as found:
-            found.samples.clear()
-            await asyncio.sleep(60.0)
-            assert 1900 < len(found.samples) < 2000
-            assert np.abs(found.error(1)[:3]).max() < 2.0
-            assert np.abs(found.error(1)[3:]).max() < 0.01
-
-    run_virtual(main())
-
-
 def test_a_line_that_loses_and_doubles_messages_takes_longer_and_tells_nothing_wrong() -> None:
     async def main() -> None:
         async with aboard(loss=0.07) as found:

@@ -341,52 +341,6 @@ def test_what_is_no_finite_float32_never_leaves(value: float) -> None:
     run_virtual(main())
 
 
-def test_armed_nothing_leaves() -> None:
-    async def main() -> None:
-        autopilot = ScriptedAutopilot(parameters=offsets())
-        async with aboard(autopilot) as (client, _, _):
-            autopilot.armed = True
-            await asyncio.sleep(0.5)
-            with pytest.raises(NotDisarmedError, match="armed"):
-                await client.write(X, 0.5)
-            assert autopilot.sets == []
-
-    run_virtual(main())
-
-
-def test_armed_between_tries_the_repetition_does_not_leave() -> None:
-    async def main() -> None:
-        autopilot = ScriptedAutopilot(parameters=offsets())
-
-        def arm_and_be_silent(name: str, value: float) -> None:
-            autopilot.armed = True
-
-        autopilot.on_set = arm_and_be_silent
-        async with aboard(autopilot) as (client, _, _):
-            with pytest.raises(NotDisarmedError):
-                await client.write(X, 0.5)
-            assert len(autopilot.sets) == 1
-            assert client.writes == 1
-
-    run_virtual(main())
-
-
-def test_heartbeats_stopping_between_tries_the_repetition_does_not_leave() -> None:
-    async def main() -> None:
-        autopilot = ScriptedAutopilot(parameters=offsets())
-        async with aboard(autopilot) as (client, _, _):
-
-            def fall_silent(name: str, value: float) -> None:
-                autopilot.beating = False
-
-            autopilot.on_set = fall_silent
-            with pytest.raises(NotDisarmedError, match="unknown"):
-                await client.write(X, 0.5)
-            assert len(autopilot.sets) == 1
-
-    run_virtual(main())
-
-
 def test_a_restart_in_the_middle_is_named() -> None:
     async def main() -> None:
         autopilot = ScriptedAutopilot(parameters=offsets())

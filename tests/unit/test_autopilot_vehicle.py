@@ -94,7 +94,7 @@ def test_disarmed_is_believed_once_no_armed_heartbeat_has_come_for_three_seconds
     run_virtual(main())
 
 
-@pytest.mark.parametrize(("own_hz", "forger_hz"), [(1.0, 1.0), (1.0, 50.0), (1.0, 5000.0), (5.0, 1.0), (5.0, 5.0)])
+@pytest.mark.parametrize(("own_hz", "forger_hz"), [(1.0, 1.0), (1.0, 500.0), (5.0, 5.0)])
 def test_disarmed_heartbeats_of_a_forger_are_not_believed_and_named(own_hz: float, forger_hz: float) -> None:
     async def main() -> None:
         link = MavlinkLink()

@@ -10,7 +10,6 @@ from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.errors import NotDisarmedError
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, f32, flying_on
 from tests.support.virtual_time import run_virtual
@@ -74,22 +73,6 @@ def test_a_value_that_is_already_there_is_not_written_again() -> None:
             written = await writer.apply([Change(X, 0.001, 0.001), Change(Y, -0.002, -0.5)])
             assert [name for name, _, _ in autopilot.sets] == [Y]
             assert written[X].outcome == "stored"
-
-    run_virtual(main())
-
-
-def test_armed_nothing_is_written() -> None:
-    async def main() -> None:
-        autopilot = ScriptedAutopilot(parameters=BEFORE)
-        async with aboard(autopilot) as (writer, _, _):
-            autopilot.armed = True
-            await asyncio.sleep(0.5)
-            for operation in (writer.apply, writer.restore, writer.undo):
-                with pytest.raises(NotDisarmedError):
-                    await operation(CHANGES)
-            assert autopilot.sets == []
-            assert {w.outcome for w in writer.written.values()} == {"failed"}
-            assert writer.left_changed == ()
 
     run_virtual(main())
 
@@ -305,23 +288,6 @@ def test_a_link_that_dies_in_the_middle_leaves_names_and_ends() -> None:
             assert caught.value.kind == "arm state unknown"
             assert caught.value.left_changed == (X, Y)
             assert caught.value.written[X].read_back is None
-
-    run_virtual(main())
-
-
-def test_a_cancel_puts_back_first() -> None:
-    async def main() -> None:
-        autopilot = ScriptedAutopilot(parameters=BEFORE)
-        async with aboard(autopilot) as (writer, _, _):
-            task = asyncio.create_task(writer.apply(CHANGES))
-            while len(autopilot.sets) < 2:
-                await asyncio.sleep(0.001)
-            task.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await task
-            assert autopilot.parameters == rounded(BEFORE)
-            assert writer.written[X].outcome == "rolled_back"
-            assert writer.left_changed == ()
 
     run_virtual(main())
 

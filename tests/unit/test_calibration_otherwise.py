@@ -111,8 +111,8 @@ def off_in_sigmas(later: Later) -> tuple[list[float], list[float]]:
 
 @pytest.mark.parametrize(
     ("gap_s", "kelvin", "power_ups", "most_deg"),
-    [(60.0, 0.0, 0, 0.005), (600.0, 6.0, 0, 0.1), (60.0, 0.0, 1, 0.15)],
-    ids=["at once", "6 K warmer", "another power-up"],
+    [(600.0, 6.0, 0, 0.1), (60.0, 0.0, 1, 0.15)],
+    ids=["6 K warmer", "another power-up"],
 )
 def test_two_sigma_of_the_tilt_cover_what_time_and_temperature_leave(
     gap_s: float, kelvin: float, power_ups: int, most_deg: float

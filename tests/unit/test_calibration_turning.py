@@ -251,7 +251,7 @@ def test_words_have_as_many_digits_as_it_takes() -> None:
 # ----------------------------------------------------------------------------------------- through and through
 
 
-@pytest.mark.parametrize("rate_deg_s", turning.RATES_DEG_S)
+@pytest.mark.parametrize("rate_deg_s", extent(whole=turning.RATES_DEG_S, a_slice=(0.0, 0.02, 0.15)))
 def test_no_error_above_three_sigmas_is_ever_ready(rate_deg_s: float) -> None:
     count = extent(whole=1000, a_slice=6)
     found = [turning.run(case) for case in turning.cases(rate_deg_s, count, first=100)]

@@ -152,9 +152,7 @@ def test_only_clocks_that_count_from_the_start_by_their_documents_tell_an_age(pr
 @pytest.mark.parametrize(
     "case",
     [
-        Case(False, ramp_deg_h_s=1.0),
         Case(False, ramp_deg_h_s=3.0),
-        Case(True, ramp_deg_h_s=3.0),
         Case(False, curve_s=300.0, late_s=5.0),
         Case(True, curve_s=1200.0, late_s=120.0),
     ],

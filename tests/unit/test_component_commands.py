@@ -25,7 +25,6 @@ from tests.support.component import (
     UNDO,
     UNSUPPORTED,
     Ground,
-    ScriptedJob,
     bench,
     command_message,
 )
@@ -462,21 +461,6 @@ class TestRetransmission:
         run_virtual(main())
 
 
-@pytest.mark.parametrize("command", [CALIBRATE, CANCEL, UNDO, 400])
-def test_the_networks_copy_of_a_packet_is_no_second_request(command: int) -> None:
-    async def main() -> None:
-        async with bench() as b:
-            b.service.takes_s = 0
-            packet = b.ground.pack(command_message(command, 0))
-            for _ in range(3):
-                b.ground.send_raw(packet)
-                await asyncio.sleep(0.1)
-            assert len(b.ground.finals()) == 1
-            assert len(b.service.started) == (command in (CALIBRATE, UNDO))
-
-    run_virtual(main())
-
-
 def test_a_sender_that_never_counts_its_packets_may_press_again() -> None:
     async def main() -> None:
         async with bench() as b:
@@ -557,17 +541,6 @@ def test_a_flood_of_commands_leaves_nothing_behind() -> None:
             server = b.component._commands
             assert len(server._finals) <= 32
             assert len(server._packets) <= 32
-
-    run_virtual(main())
-
-
-def test_a_scripted_job_is_a_job() -> None:
-    """The bench and the Protocol agree, as far as can be seen at run time."""
-
-    async def main() -> None:
-        job = ScriptedJob()
-        job.finish("done", "x")
-        assert (await job.finished).outcome == "done"
 
     run_virtual(main())
 

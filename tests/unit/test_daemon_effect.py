@@ -81,7 +81,7 @@ def test_a_healthy_write_is_not_refused_because_two_seconds_happened_to_agree() 
     assert refused <= 4  # by the scatter of two seconds alone it was one in ten
 
 
-@pytest.mark.parametrize("spans", [(10, 10), (30, 10), (12, 2), (4, 2)])
+@pytest.mark.parametrize("spans", [(10, 10), (4, 2)])
 def test_a_write_in_order_is_refused_in_less_than_one_of_200_and_one_without_effect_is_never_called_verified(
     spans: tuple[int, int],
 ) -> None:

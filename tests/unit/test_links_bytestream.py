@@ -176,28 +176,6 @@ def test_a_fast_stream_is_collected_and_a_byte_after_it_wakes_the_loop(
     asyncio.run(main())
 
 
-def test_a_moment_without_bytes_does_not_end_the_collecting(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
-    monkeypatch.setattr(bytestream, "JUDGED_S", 3600.0)
-
-    async def main() -> None:
-        with plugged(path) as pty:
-            async with running(path, FAST) as port:
-                await port.state(connected=True)
-                await collecting(port, pty)
-                turns = port.link._attempts
-                async with asyncio.timeout(40):
-                    while port.link._attempts < turns + 3:  # nothing came
-                        await asyncio.sleep(0.001)
-                for number in range(5):
-                    os.write(pty.master, bytes([number]))
-                chunk, _ = await asyncio.wait_for(port.chunks.get(), 40)
-                assert chunk == bytes(range(5))
-                assert port.link._collecting is not None
-
-    asyncio.run(main())
-
-
 def test_a_flood_ends_the_collecting_and_the_port_is_read_again_after_it(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -218,36 +196,6 @@ def test_a_flood_ends_the_collecting_and_the_port_is_read_again_after_it(
                     while is_paused(port):
                         await asyncio.sleep(0.001)
                 await collecting(port, pty)
-
-    asyncio.run(main())
-
-
-def test_a_stream_that_is_faster_than_its_line_is_not_dated_by_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
-
-    async def main() -> None:
-        with plugged(path) as pty:
-            async with running(path, 300) as port:  # 100 bytes take more than three seconds
-                await port.state(connected=True)
-                for _ in range(3 * QUICK_READS):
-                    os.write(pty.master, bytes(100))
-                    await port.data(100)
-                    assert port.link._collecting is None
-
-    asyncio.run(main())
-
-
-def test_a_slow_stream_is_read_as_it_comes(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bytestream, "QUICK_S", 0.0)
-
-    async def main() -> None:
-        with plugged(path) as pty:
-            async with running(path) as port:
-                await port.state(connected=True)
-                for _ in range(3 * QUICK_READS):
-                    os.write(pty.master, b"x")
-                    await port.data(1)
-                    assert port.link._collecting is None
 
     asyncio.run(main())
 
@@ -305,17 +253,6 @@ def test_an_unplugged_device_is_closed_at_once_and_found_again_under_another_nam
                     os.write(second.master, b"two")
                     assert await port.data(3) == b"two"
                     assert port.link.reconnects == 1
-
-    asyncio.run(main())
-
-
-def test_a_device_that_is_plugged_in_later_is_found(path: Path) -> None:
-    async def main() -> None:
-        async with running(path) as port:
-            assert "no such device" in await port.state(connected=False)
-            with plugged(path):
-                await port.state(connected=True)
-                assert port.link.reconnects == 0
 
     asyncio.run(main())
 
@@ -470,24 +407,6 @@ def test_a_port_that_dies_as_soon_as_it_is_open_is_not_hammered(path: Path, monk
     pauses = [later - earlier for earlier, later in itertools.pairwise(opened)]
     for pause, least in zip(pauses, (0.2, 0.4, 0.8), strict=False):  # a busy machine takes longer, never shorter
         assert 0.8 * least < pause < least + 5.0
-    assert open_descriptors() == before
-
-
-def test_nothing_leaks_over_many_losses(path: Path) -> None:
-    before = open_descriptors()
-
-    async def main() -> None:
-        async with running(path) as port:
-            for _ in range(5):
-                with plugged(path) as pty:
-                    await port.state(connected=True)
-                    os.write(pty.master, b"x")
-                    await port.data(1)
-                await port.state(connected=False)
-            assert port.link.reconnects == 4
-
-    asyncio.run(main())
-    join_openers()
     assert open_descriptors() == before
 
 

@@ -259,18 +259,6 @@ class TestUdpIn:
 
         asyncio.run(main())
 
-    def test_bytes_that_are_no_mavlink_do_no_harm(self, peer: socket.socket) -> None:
-        async def main() -> None:
-            link = MavlinkLink()
-            async with transport(link, "udpin:127.0.0.1:0") as states:
-                await until(lambda: states.connected)
-                for junk in (b"", b"\0", b"GET / HTTP/1.0\r\n\r\n", os.urandom(1400)):
-                    peer.sendto(junk, ("127.0.0.1", states.port))
-                peer.sendto(bytes(300) + packet(), ("127.0.0.1", states.port))
-                await until(lambda: link.received["HEARTBEAT"] == 1)
-
-        asyncio.run(main())
-
 
 class TestUdpOut:
     def test_speaks_first_and_hears_the_answer(self, peer: socket.socket) -> None:

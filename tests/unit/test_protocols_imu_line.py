@@ -82,26 +82,11 @@ def test_damage_is_counted_by_reason(data: bytes, reason: str) -> None:
     assert rejected == ({reason: 1} if reason else {})
 
 
-@pytest.mark.parametrize("before", [b"$IMU,1,2,", b"$$$", b"\x00\xff\n\n", b"$" + b"x" * 500, b"rst:0x1 (POWERON)"])
-def test_a_line_that_begins_inside_a_rejected_one_is_not_lost(before: bytes) -> None:
-    samples, _ = feed(before + LINE)
-    assert len(samples) == 1
-
-
 def test_a_line_that_another_begins_in_is_counted() -> None:
     decoder = ImuLineDecoder()
     decoder.feed(b"boot\r\n" + LINE + b"???", 1.0)
     decoder.feed(b"$IMU,1$" + b"x" * 161, 1.0)  # a start that is cut short, and one that is two bytes too long
     assert decoder.rejected == {"cut short": 1, "too long": 1}
-
-
-def test_an_interruption_forgets_the_line_under_way() -> None:
-    decoder = ImuLineDecoder()
-    decoder.feed(LINE[:20], 1.0)
-    decoder.interrupted()
-    assert decoder.feed(LINE[20:] + LINE, 2.0) != []
-    assert decoder.accepted == 1
-    assert decoder.rejected == {"cut short": 1}
 
 
 def test_every_single_damaged_bit_is_seen() -> None:

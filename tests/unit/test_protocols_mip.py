@@ -69,14 +69,6 @@ def test_a_field_whose_length_does_not_fit_its_packet_is_rejected(payload: bytes
     assert feed(head + fletcher(head)) == ([], {"field count": 1})
 
 
-def test_a_packet_inside_what_a_false_start_claims_is_not_lost() -> None:
-    for false_start in (b"\x75", b"\x75\x65", b"\x75\x65\x80\xff", PACKET[:-1], b"\x75\x65\x80\x40" + bytes(20)):
-        decoder = MipDecoder()
-        decoder.feed(false_start + PACKET, 1.0)
-        decoder.feed(bytes(MIP_BYTES), 2.0)
-        assert decoder.accepted == 1, false_start
-
-
 def test_every_single_damaged_bit_is_seen() -> None:
     for at in range(len(PACKET) * 8):
         damaged = bytearray(PACKET)
@@ -91,15 +83,6 @@ def test_times_are_those_of_the_packets_ends_even_behind_a_false_start() -> None
     held = MipDecoder(seconds_per_byte=0.001)
     assert held.feed(b"\x75\x65\x80\xff" + PACKET + b"\0", 10.0) == []
     assert [sample.t_s for sample in held.feed(bytes(300), 10.5)] == pytest.approx([10.0 - 0.001])
-
-
-def test_an_interruption_forgets_the_packet_under_way() -> None:
-    decoder = MipDecoder()
-    decoder.feed(PACKET[:20], 1.0)
-    decoder.interrupted()
-    decoder.feed(PACKET[20:] + PACKET, 2.0)
-    assert decoder.accepted == 1
-    assert decoder.rejected["cut short"] == 1
 
 
 def test_the_device_clock_is_the_time_of_week() -> None:

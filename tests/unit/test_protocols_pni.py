@@ -118,12 +118,6 @@ def test_a_little_endian_heading_never_passes_for_a_small_one() -> None:
     assert decoder.accepted >= 3598
 
 
-def test_noise_in_front_costs_nothing_but_itself() -> None:
-    for noise in (b"\0", b"\0\0", b"\0\x10", b"\0\x10\x06", b"\xff\0", b"\0\x0b\x05\x01\x05", GOOD[:9], GOOD[3:]):
-        decoder = PniDecoder()
-        assert decoder.feed(noise + GOOD + bytes(200), 1.0) == [SAMPLE]
-
-
 @pytest.mark.parametrize("at", range(len(GOOD)))
 def test_no_changed_byte_passes(at: int) -> None:
     for bit in range(8):
@@ -136,11 +130,3 @@ def test_replies_and_echoes_are_counted_as_such() -> None:
     decoder = PniDecoder()
     assert decoder.feed(pni(1) + pni(4) + pni(3, b"\1\5") + pni(2, b"TRAX1208") + pni(16, b"\0\0") + pni(23), 1.0) == []
     assert decoder.rejected == {"echo of a command": 3, "reply": 3}
-
-
-def test_an_interruption_forgets_the_frame_under_way() -> None:
-    decoder = PniDecoder()
-    decoder.feed(GOOD[:7], 1.0)
-    decoder.interrupted()
-    assert decoder.rejected == {"cut short": 1}
-    assert decoder.feed(GOOD, 1.0) == [SAMPLE]

@@ -104,16 +104,3 @@ def test_no_changed_byte_passes(at: int) -> None:
         bad[at] = value
         if value != GOOD[at] and at != 2:
             assert RionDecoder().feed(bytes(bad) + bytes(60), 1.0) == []
-
-
-def test_a_false_start_costs_nothing_but_itself() -> None:
-    for noise in (b"\x68", b"\x68\x0d", b"\x68\x0d\x00", b"\x68\x32\x00\x94", b"\x68\x68", GOOD[:8], GOOD[5:]):
-        assert RionDecoder().feed(noise + GOOD + bytes(60), 1.0) == [SAMPLE]
-
-
-def test_an_interruption_forgets_the_frame_under_way() -> None:
-    decoder = RionDecoder()
-    decoder.feed(GOOD[:7], 1.0)
-    decoder.interrupted()
-    assert decoder.rejected == {"cut short": 1}
-    assert decoder.feed(GOOD, 1.0) == [SAMPLE]
