@@ -218,30 +218,3 @@ def test_a_dither_that_is_interrupted_leaves_the_offsets_as_they_were(tmp_path: 
                 assert job.record is not None
 
     run_virtual(main())
-
-
-@pytest.mark.parametrize("step", [2, 7])
-def test_a_daemon_killed_in_the_middle_of_a_dither_puts_the_offsets_back_at_its_next_start(
-    tmp_path: Path, step: int
-) -> None:
-    journal = tmp_path / "journal.json"
-
-    async def main() -> None:
-        rig = second_imu_only(tmp_path, UNDITHERED, dither=True, max_s=3.0, coarse=True)
-        before = offsets(rig)
-        async with rig.running():
-            await ready(rig)
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
-            await _until_step(rig, job, step)
-            kept, in_force = journal.read_bytes(), offsets(rig)
-        # The rig's end was orderly and a kill is not: what was on disk and in the autopilot at that instant.
-        journal.write_bytes(kept)
-        again = second_imu_only(tmp_path, UNDITHERED, dither=True, max_s=3.0, coarse=True)
-        for name, value in in_force.items():
-            again.double.set_parameter(name, value)
-        async with again.running():
-            await again.until(lambda: not again.service.offsets.ledger.pending, 30.0)
-            assert offsets(again) == before
-        assert not journal.exists()
-
-    run_virtual(main())

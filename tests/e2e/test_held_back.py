@@ -20,6 +20,7 @@ from sim.devices import Gradienter
 from sim.imu_model import MG
 from tests.e2e.test_automatic import calibrated_by_itself, values
 from tests.e2e.test_bias_memory import knocked
+from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -87,9 +88,7 @@ def test_accelerometers_are_held_back_when_the_gradienter_has_moved_until_somebo
             await rig.until(lambda: rig.service.calibrating.conductor.state is State.DONE, 60.0)
             assert accelerometers(rig) == before
             assert rig.service.arming.in_force.held_back is not None
-            job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
-            assert isinstance(job, Job)
-            assert (await job.finished).outcome == "done"
+            assert (await calibrated(rig))[0].outcome == "done"
             asked = rig.service.calibrating.store.history(1)[0]
             written = {"GYR" in name for name in asked.imus[0].written}
             # The gyros' are written again only where that betters them.
@@ -108,9 +107,7 @@ def test_what_somebody_asked_for_is_true_from_then_on_also_for_calibrations_by_i
         async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
             before = await held_back(rig)
             conductor, store = rig.service.calibrating.conductor, rig.service.calibrating.store
-            job = conductor.start_calibration(What.BOTH, "test")
-            assert isinstance(job, Job)
-            assert (await job.finished).outcome == "done"
+            assert (await calibrated(rig))[0].outcome == "done"
             asked = accelerometers(rig)
             assert all(asked[name] != value for name, value in before.items())
             for _ in range(2):
@@ -135,9 +132,7 @@ def test_an_undo_of_what_was_asked_for_makes_the_earlier_ones_count_again(tmp_pa
         async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
             before = await held_back(rig)
             conductor, known = rig.service.calibrating.conductor, rig.service.calibrating.store
-            job = conductor.start_calibration(What.BOTH, "test")
-            assert isinstance(job, Job)
-            assert (await job.finished).outcome == "done"
+            assert (await calibrated(rig))[0].outcome == "done"
             undo = conductor.start_undo("test")
             assert isinstance(undo, Job)
             assert (await undo.finished).outcome == "done"
@@ -191,9 +186,7 @@ def test_who_asks_in_the_middle_is_not_answered_with_half_of_it(tmp_path: Path) 
             assert isinstance(refused, Refusal)
             assert refused.kind == "busy"
             await conductor.job.finished
-            job = conductor.start_calibration(What.BOTH, "test")
-            assert isinstance(job, Job)
-            assert (await job.finished).outcome == "done"
+            assert (await calibrated(rig))[0].outcome == "done"
             assert any("ACC" in name for name in rig.service.calibrating.store.history(1)[0].imus[0].written)
 
     run_virtual(main())
@@ -206,9 +199,7 @@ def test_a_request_that_comes_first_is_written_with_the_warning(tmp_path: Path) 
             before = accelerometers(rig)
             knocked(rig)
             await asyncio.sleep(20.0)
-            job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
-            assert isinstance(job, Job)
-            assert (await job.finished).outcome == "done"
+            assert (await calibrated(rig))[0].outcome == "done"
             assert all(accelerometers(rig)[name] != value for name, value in before.items())
             assert "Held back" not in "".join(rig.ground.texts())
             assert "The gradienter has moved" in "".join(rig.ground.texts())

@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.component.service import JobResult, Refusal
-from companion.daemon.job import Job
 from companion.storage.changes import ChangeLog
+from tests.e2e.test_calibration import calibrated, started
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -39,18 +37,6 @@ def px4_rig(folder: Path, **options: Any) -> Rig:
         "part": "bmi088",
     }
     return Rig(folder, firmware="px4", **(quick | options))
-
-
-def started(answer: Job | Refusal) -> Job:
-    assert isinstance(answer, Job), answer
-    return answer
-
-
-async def calibrated(rig: Rig, *, reboot: bool = False) -> tuple[JobResult, Record]:
-    job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", reboot=reboot))
-    result = await job.finished
-    assert job.record is not None
-    return result, job.record
 
 
 def values(rig: Rig, wanted: list[str] = ALL) -> dict[str, float]:

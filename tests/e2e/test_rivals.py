@@ -8,11 +8,10 @@ from typing import Any
 
 import pytest
 
-from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.component.service import JobResult
 from companion.daemon.job import Job
 from sim.ardupilot.double import offset_names
+from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -22,14 +21,6 @@ STOP = "[push]\nstop_rivals = true\n"
 
 def quick(folder: Path, **options: Any) -> Rig:
     return Rig(folder, **({"min_still_s": 4.0, "max_s": 8.0, "feed_s": 0.2, "imu_rate_hz": 50.0, "imus": 1} | options))
-
-
-async def calibrated(rig: Rig, *, reboot: bool = False, what: What = What.BOTH) -> tuple[JobResult, Record]:
-    job = rig.service.calibrating.conductor.start_calibration(what, "test", reboot=reboot)
-    assert isinstance(job, Job), job
-    result = await job.finished
-    assert job.record is not None
-    return result, job.record
 
 
 def gyro(rig: Rig) -> list[float]:
