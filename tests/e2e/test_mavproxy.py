@@ -132,22 +132,3 @@ def test_what_the_documentation_says_to_type(tmp_path: Path) -> None:
             await station.prints(r"AP: Calibration refused: armed: disarm first", after=place)
 
     asyncio.run(main())
-
-
-def test_our_parameters_are_listed_without_waiting_for_files(tmp_path: Path) -> None:
-    """MAVProxy asks for a file of parameters first; who has none has to say so, or it is waited for."""
-
-    async def main() -> None:
-        async with (
-            ground_line(tmp_path, "ardupilot") as line,
-            mavproxy(tmp_path, line.port, f"{MODULES},ftp") as station,
-        ):
-            await station.prints(r"Received \d+ parameters")
-            await station.type("vehicle 1:191")
-            await station.prints(r"Set vehicle 1:191")
-            place = len(station.printed)
-            await station.type("param fetch")
-            await station.prints(r"Received \d+ parameters", after=place)
-            assert "timed out" not in station.printed[place:]
-
-    asyncio.run(main())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,11 +12,10 @@ import pytest
 
 from companion.autopilot.parameters.change import Change
 from companion.cli.show import undo_line
-from companion.component.service import JobResult, Refusal
+from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
 from companion.storage.changes import MOST_STEPS, ChangeLog, ChangeSet, Origin, Undoable
 from sim.ardupilot.double import offset_names
-from tests.e2e.test_automatic import SLOW, calibrated_by_itself
 from tests.e2e.test_calibration import started
 from tests.support.component import ACCEPTED, DENIED, UNDO
 from tests.support.rig import Rig, inline
@@ -232,38 +230,6 @@ def test_what_somebody_else_has_changed_stops_it_is_named_and_passed_over_by_for
     run_virtual(main())
 
 
-def test_calibrations_by_themselves_one_after_the_other_leave_the_faces_in_reach(tmp_path: Path) -> None:
-    """Each start of this autopilot measures the gyros anew, over what was written before."""
-    faces = step(FIRST, "faces", dict(WRITES)["faces"])
-    ChangeLog(tmp_path).undo_of(1).write(Undoable(1, (faces,)))
-    parameters = FIRST | {each.parameter: each.after or 0.0 for each in faces.changes}
-
-    async def main() -> None:
-        made = Rig(tmp_path, at_arm="warn", parameters=parameters | {"INS_GYR_CAL": 1.0}, **SLOW)
-        async with made.running():
-            by_itself = made.service.calibrating.store.history
-            await calibrated_by_itself(made)
-            made.double.reboot()
-            await made.until(lambda: made.service.core.vehicle.boots == 1, 10.0)
-            await made.until(lambda: made.service.arming.in_force.reading() is None, 20.0)
-            measured_at_boot = {name: read(made)[name] for name in GYROS}
-            await calibrated_by_itself(made, 2)
-            await made.until(lambda: made.service.calibrating.conductor.running is None, 200.0)
-            assert steps(made) == ["auto calibration", "faces"]
-            assert {name: read(made)[name] for name in GYROS} != measured_at_boot
-            assert (await undone(made)).outcome == "done"
-            # What the boot had measured was there before ours; our own of before the boot is gone for ever.
-            assert {name: read(made)[name] for name in GYROS} == measured_at_boot
-            assert {name: read(made)[name] for name in ACCELS} == dict.fromkeys(ACCELS, parameters[ACCELS[0]])
-            assert [bool(record.undone_at) for record in by_itself()] == [True, True]
-            assert (await undone(made)).reason == "6 old values back: faces"
-            assert {name: read(made)[name] for name in (*ACCELS, *SCALES)} == {
-                name: FIRST[name] for name in (*ACCELS, *SCALES)
-            }
-
-    run_virtual(main())
-
-
 def test_right_after_the_start_it_waits_until_the_autopilot_is_heard(tmp_path: Path) -> None:
     wanted = written(tmp_path)
 
@@ -319,22 +285,6 @@ def test_the_latest_of_several_that_are_one_step_can_be_taken_out_of_it_again(be
     assert both.without(second).without(second) == both.without(second)
     assert both.without(joined).steps == ()
     assert both.without(step(now, "level", dict.fromkeys(TRIM, 0.02), 3)) is both
-
-
-def test_what_an_older_version_has_kept_is_undone(tmp_path: Path) -> None:
-    single = step(FIRST, "", dict(WRITES)["faces"])
-    changes = [{"parameter": each.parameter, "before": each.before, "after": each.after} for each in single.changes]
-    (tmp_path / "undo-1.json").write_text(json.dumps({"system_id": 1, "changes": changes}))
-    parameters = FIRST | {each.parameter: each.after or 0.0 for each in single.changes}
-
-    async def main() -> None:
-        async with Rig(tmp_path, parameters=parameters).running() as rig:
-            await rig.ready()
-            assert (await undone(rig)).reason == "6 old values back"
-            assert read(rig) == FIRST
-            assert isinstance(rig.service.calibrating.conductor.start_undo("test"), Refusal)
-
-    run_virtual(main())
 
 
 def test_a_prediction_of_an_older_version_is_in_the_history_and_is_undone(tmp_path: Path) -> None:
