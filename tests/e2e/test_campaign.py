@@ -42,7 +42,7 @@ def test_a_slice_of_the_table(first: int) -> None:
 
 
 def test_a_few_minutes_of_the_hour() -> None:
-    hour = run_hour(SEED, minutes=2.0)
+    hour = run_hour(SEED, minutes=3.0)
     assert [words for words in hour.problems if "grew" not in words] == []  # minutes are too few to tell growth
     assert hour.longest_silence_s < 2.0
 
