@@ -115,9 +115,6 @@ def test_the_heading_follows_the_aircraft_through_a_turn(tmp_path: Path, firmwar
             roll, pitch, _ = rig.aircraft.angles_rad(rig.aircraft.time_at(rig.now_s))
             assert (last.roll, last.pitch) == pytest.approx((roll, pitch), abs=math.radians(1.0))
             assert flying.theirs_deg() < 3.0
-            if firmware == "px4":
-                # The stamps are on the clock that answers TIMESYNC.
-                assert 0.0 < rig.px4.vision.late_s < 0.02
 
     run_virtual(main())
 
@@ -223,6 +220,18 @@ def test_a_new_alignment_that_turns_the_heading_is_a_reset(tmp_path: Path) -> No
             await flying.sleep(3.0)
             assert flying.witness.of(Vision)[-1].reset_counter == 1
             assert flying.theirs_deg() < 2.0
+
+    run_virtual(main())
+
+
+def test_px4_converges_on_our_clock(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight(tmp_path, firmware="px4") as flying:
+            await flying.sleep(60.0)
+            vision = flying.rig.px4.vision
+            assert vision.converged
+            assert vision.active
+            assert 0.0 < vision.late_s < 0.02
 
     run_virtual(main())
 
