@@ -88,6 +88,7 @@ def run_child(make: Callable[[ChildSettings], ChildWork], *, memory_mib: int) ->
 
 async def _run(work: ChildWork) -> None:
     loop = asyncio.get_running_loop()
+    loop.set_exception_handler(_on_error)
     working = loop.create_task(work.run(), name="work")
     reporting = loop.create_task(_report(work), name="report")
 
@@ -103,6 +104,13 @@ async def _run(work: ChildWork) -> None:
     for result in await asyncio.gather(working, reporting, return_exceptions=True):
         if isinstance(result, Exception):
             raise result
+
+
+def _on_error(loop: asyncio.AbstractEventLoop, context: Object) -> None:
+    """Log an error that reached the event loop; end where memory ran out, in whichever callback."""
+    if isinstance(context.get("exception"), MemoryError):
+        os._exit(1)
+    loop.default_exception_handler(context)
 
 
 async def _report(work: ChildWork) -> None:
