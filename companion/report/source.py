@@ -11,8 +11,9 @@ from companion.calibration.noise.allan import PROFILES
 from companion.calibration.records.flight_evidence import moved
 from companion.calibration.records.flight_record import AXES, Flight, KeptFlight
 from companion.calibration.records.record import Arming, Record
-from companion.calibration.solution.by_temperature import ByTemperature, by_temperature
+from companion.calibration.solution.by_temperature import ByTemperature
 from companion.calibration.solution.prior import curve_of
+from companion.calibration.solution.temperature_summary import by_temperature
 from companion.errors import StorageError
 from companion.report.calibration_page import Material
 from companion.storage.flights import FlightStore

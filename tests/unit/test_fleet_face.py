@@ -20,8 +20,8 @@ import pytest
 from companion.calibration.noise.allan import PROFILES
 from companion.calibration.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
 from companion.calibration.records.record import Arming, Magnetic
-from companion.calibration.solution.by_temperature import by_temperature
 from companion.calibration.solution.prior import curve_of
+from companion.calibration.solution.temperature_summary import by_temperature
 from companion.config.sections import Location
 from companion.errors import StorageError
 from companion.mqtt import fleet as face_module

@@ -14,8 +14,9 @@ import pytest
 
 from companion.calibration.noise.allan import PROFILES
 from companion.calibration.records.history import Point
-from companion.calibration.solution.by_temperature import ByTemperature, by_temperature
+from companion.calibration.solution.by_temperature import ByTemperature
 from companion.calibration.solution.prior import curve_of
+from companion.calibration.solution.temperature_summary import by_temperature
 from companion.cli.show import temperature_lines
 from companion.physics.units import DEG_H, MG
 from companion.report.by_temperature import biases_by_temperature

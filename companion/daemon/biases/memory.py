@@ -303,7 +303,7 @@ class BiasMemory:
     def temperature(self) -> list[Object]:
         """For `companion temperature`; blocking."""
         # What nobody asked for costs the start nothing.
-        from companion.calibration.solution.by_temperature import by_temperature
+        from companion.calibration.solution.temperature_summary import by_temperature
 
         self.follow()
         unix_s = time.time()
