@@ -23,6 +23,11 @@ class Work:
         with self.log.open("a", encoding="utf-8") as log:
             log.write(words + "\n")
 
+    def hoard(self) -> None:
+        """Fill the memory."""
+        hoard = bytearray(1_000_000_000)
+        self.note(f"has {len(hoard)} bytes")
+
     async def run(self) -> None:
         """Work until cancelled."""
         self.note(f"started {os.getpid()}")
@@ -35,8 +40,9 @@ class Work:
                 case "deaf":
                     signal.signal(signal.SIGTERM, signal.SIG_IGN)
                 case "greedy":
-                    hoard = [bytearray(1_000_000) for _ in range(1000)]
-                    self.note(f"has {len(hoard)} MB")
+                    self.hoard()
+                case "greedy callback":
+                    asyncio.get_running_loop().call_soon(self.hoard)
                 case "garbage":
                     sys.stdout.buffer.write(b"{" * 1_000_000 + b"\n")
                     sys.stdout.buffer.flush()

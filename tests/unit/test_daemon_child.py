@@ -78,6 +78,7 @@ def test_a_child_reports_and_ends_in_order(tmp_path: Path, monkeypatch: pytest.M
     [
         ("crash", "the process ended with code 1"),
         ("greedy", "the process needed more memory than it may have"),
+        ("greedy callback", "the process needed more memory than it may have"),
         ("hang", "the process gave no sign of life for 1 s: ended"),
         ("garbage", "the process reported what is not understood: "),
     ],

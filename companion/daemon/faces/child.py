@@ -85,7 +85,7 @@ class Child:
                 # Counted, not read from the clock: a daemon that stood still itself must not blame its child.
                 silent_s, heard = (silent_s + REPORT_EVERY_S if heard is self._report else 0.0), self._report
                 if silent_s >= (SILENT_S if heard is not None else FIRST_REPORT_S):
-                    process.kill()
+                    _kill(process)
                     return f"the process gave no sign of life for {silent_s:.0f} s: ended"
             return await reading
         finally:
@@ -100,7 +100,7 @@ class Child:
                     self._restart.up(f"process {process.pid} runs")
                 self._report = msgspec.json.decode(line, type=dict[str, object])
         except ValueError as error:
-            process.kill()
+            _kill(process)
             return f"the process reported what is not understood: {error}"
         return _ended(await process.wait())
 
@@ -118,11 +118,19 @@ async def _end(process: Process) -> None:
             async with asyncio.timeout(END_WITHIN_S):
                 await process.wait()
         except TimeoutError:
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
+            _kill(process)
             await process.wait()
     if process.stdin is not None:
         process.stdin.close()
+    if process.stdout is not None:
+        # A pipe that still holds what nobody read stays open.
+        await process.stdout.read()
+
+
+def _kill(process: Process) -> None:
+    """Kill a process, which may have ended meanwhile."""
+    with contextlib.suppress(ProcessLookupError):
+        process.kill()
 
 
 def _ended(code: int) -> str:

@@ -109,7 +109,7 @@ async def _run(work: ChildWork) -> None:
 def _on_error(loop: asyncio.AbstractEventLoop, context: Object) -> None:
     """Log an error that reached the event loop; end where memory ran out, in whichever callback."""
     if isinstance(context.get("exception"), MemoryError):
-        os._exit(1)
+        os._exit(OUT_OF_MEMORY)
     loop.default_exception_handler(context)
 
 
