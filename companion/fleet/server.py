@@ -1,4 +1,4 @@
-"""Serves the pages over HTTP: read only, on this computer alone or to whoever has the password."""
+"""Serves the pages over HTTP: read only, on this computer alone or to clients with the password."""
 
 from __future__ import annotations
 
@@ -6,10 +6,18 @@ import asyncio
 import base64
 import logging
 import secrets
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import Final, NoReturn
 
 import sqlalchemy as sa
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from companion.config.rules import bind_problem
 from companion.errors import ConfigError
@@ -19,22 +27,19 @@ from companion.fleet.rendering import Renderer
 from companion.links.system.connection import Backoff, Reconnection
 from companion.storage.state import read_regular
 from companion.web.access import Access, is_loopback, page_url, split_address
-from companion.web.exchange import BadRequestError, Exchange, Request, Response
+from companion.web.listener import listening
 
 logger = logging.getLogger(__name__)
 
-MAX_CONNECTIONS: Final = 48
 LEAST_PASSWORD: Final = 12
 WRONG_PASSWORD_S: Final = 2.0
 AGAIN_S: Final = 30
-"""After so long a browser looks again."""
+"""Period after which a browser loads the first page again."""
 SOON_S: Final = 2
-"""The same, where there was nothing to be seen."""
+"""Period after which a browser tries again when the database could not be read."""
 CERTIFICATE_S: Final = 60.0
-"""How often its files are looked at."""
-HANDSHAKE_S: Final = 10.0
-_HTML: Final = "text/html; charset=utf-8"
-_ALWAYS: Final = (
+"""Period at which the certificate's files are checked for a change."""
+_HEADERS: Final = (
     ("X-Content-Type-Options", "nosniff"),
     ("X-Frame-Options", "DENY"),
     ("Referrer-Policy", "no-referrer"),
@@ -44,7 +49,7 @@ _ALWAYS: Final = (
 
 
 def read_password(path: Path) -> str:
-    """The password of a file.
+    """Read the password from a file.
 
     Raises:
         ConfigError: it cannot be read, or is too short.
@@ -82,16 +87,17 @@ class Server:
             )
         if certificate is None and not is_loopback(self._host):
             logger.warning("page: whoever listens on the network can read its password: --cert and --key prevent it")
-        self._password, self._certificate = password, certificate
-        self._access = Access("", handed_out=True)
+        self._certificate = certificate
         self._engine = engine_of(database, reads_only=True)
         self._pages = Renderer(self._engine)
-        self._open = 0
+        self._app = Starlette(
+            routes=[Route("/{path:path}", self._page)], middleware=[Middleware(_Door, password=password)]
+        )
         self._reconnection = Reconnection("page", Backoff(first_s=1.0, cap_s=30.0), worth_s=10.0)
 
     @property
     def url(self) -> str:
-        """Where to look."""
+        """Address for a browser."""
         return page_url(self._host, self._port, "http" if self._certificate is None else "https")
 
     async def run(self) -> NoReturn:
@@ -99,84 +105,60 @@ class Server:
         await self._reconnection.keep(self._serve)
 
     async def _serve(self) -> str:
-        tls: dict[str, Any] = {}
-        if self._certificate is not None:
-            tls = {"ssl": self._certificate.context}
-            tls |= {"ssl_handshake_timeout": HANDSHAKE_S, "ssl_shutdown_timeout": HANDSHAKE_S}
+        context = None if self._certificate is None else self._certificate.context
         try:
-            server = await asyncio.start_server(self._accept, self._host, self._port, **tls)
+            async with listening(self._app, self._host, self._port, _HEADERS, context) as self._port:
+                self._reconnection.up(self.url)
+                while True:
+                    await asyncio.sleep(CERTIFICATE_S)
+                    if self._certificate is not None:
+                        await asyncio.to_thread(self._certificate.look_again)
         except OSError as error:
             return f"{self._host}:{self._port}: {error.strerror or error}"
-        self._port = server.sockets[0].getsockname()[1]
-        self._reconnection.up(self.url)
-        try:
-            while server.is_serving():
-                await asyncio.sleep(CERTIFICATE_S)
-                if self._certificate is not None:
-                    await asyncio.to_thread(self._certificate.look_again)
         finally:
-            server.close()
             self._engine.dispose()
-        return "closed"
 
-    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._open >= MAX_CONNECTIONS:
-            writer.transport.abort()
-            return
-        self._open += 1
+    async def _page(self, request: Request) -> Response:
         try:
-            await self._exchange(Exchange(reader, writer, _ALWAYS))
-            writer.close()
-            async with asyncio.timeout(10.0):
-                await writer.wait_closed()
-        except (OSError, TimeoutError):
-            pass  # gone, or too slow
-        except Exception:
-            logger.exception("a request of the page failed")
-        finally:
-            self._open -= 1
-            writer.transport.abort()
-
-    async def _exchange(self, exchange: Exchange) -> None:
-        try:
-            request = await exchange.request()
-        except BadRequestError as error:
-            await exchange.respond(_text(error.status, str(error)))
-            return
-        if request is not None:
-            await exchange.respond(await self.respond(request))
-
-    async def respond(self, request: Request) -> Response:
-        """The answer to a request."""
-        if self._password is None:
-            if (refused := self._access.refuses_host(request.headers)) is not None:
-                return _text(421, refused)
-        elif not self._knows(request):
-            if "authorization" in request.headers:
-                await asyncio.sleep(WRONG_PASSWORD_S)
-            answer = ("WWW-Authenticate", 'Basic realm="companion fleet", charset="UTF-8"')
-            return _text(401, "the page needs its password; any user name will do", answer)
-        if request.method not in ("GET", "HEAD"):
-            return _text(405, "only GET is known here", ("Allow", "GET, HEAD"))
-        try:
-            found = await self._pages.get(request.path)
+            found = await self._pages.get(request.url.path)
         except sa.exc.SQLAlchemyError as error:
             logger.warning("page: the database cannot be read: %s", why(error))
             words = "the database cannot be read at the moment; the collector's log says why"
-            return _text(503, words, ("Refresh", str(SOON_S)))
+            return _text(503, words, {"Refresh": str(SOON_S)})
         if found is None:
             return _text(404, "nothing is here")
-        again = (("Refresh", str(AGAIN_S)),) if request.path == "/" else ()
-        return Response(200, found, _HTML, again)
-
-    def _knows(self, request: Request) -> bool:
-        scheme, _, given = request.headers.get("authorization", "").partition(" ")
-        try:
-            _, _, password = base64.b64decode(given, validate=True).partition(b":")
-        except ValueError:
-            return False
-        return scheme.lower() == "basic" and secrets.compare_digest(password, (self._password or "").encode())
+        again = {"Refresh": str(AGAIN_S)} if request.url.path == "/" else None
+        return Response(found, headers=again, media_type="text/html")
 
 
-def _text(status: int, words: str, *headers: tuple[str, str]) -> Response:
-    return Response(status, f"{words}\n".encode(), "text/plain; charset=utf-8", headers)
+class _Door:
+    """Admits requests with the password; without one, those for this computer's own name."""
+
+    def __init__(self, app: ASGIApp, password: str | None) -> None:
+        self._app, self._password = app, password
+        self._access = Access("", handed_out=True)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers, app = Headers(scope=scope), self._app
+        if self._password is None:
+            if (refused := self._access.refuses_host(headers)) is not None:
+                app = _text(421, refused)
+        elif not _knows(headers.get("authorization", ""), self._password):
+            if "authorization" in headers:
+                await asyncio.sleep(WRONG_PASSWORD_S)
+            answer = {"WWW-Authenticate": 'Basic realm="companion fleet", charset="UTF-8"'}
+            app = _text(401, "the page needs its password; any user name will do", answer)
+        await app(scope, receive, send)
+
+
+def _knows(authorization: str, password: str) -> bool:
+    scheme, _, given = authorization.partition(" ")
+    try:
+        _, _, found = base64.b64decode(given, validate=True).partition(b":")
+    except ValueError:
+        return False
+    return scheme.lower() == "basic" and secrets.compare_digest(found, password.encode())
+
+
+def _text(status: int, words: str, headers: Mapping[str, str] | None = None) -> Response:
+    return PlainTextResponse(f"{words}\n", status, headers)

@@ -1,0 +1,141 @@
+"""Serve a web application at one address with uvicorn: for the page and for the fleet's page.
+
+A connection carries one request, and ends when it is answered or `ANSWERED_WITHIN_S` are over. Beyond `MAX_CONNECTIONS`
+the oldest connection makes way for the next one. A stream is exempt from both: its application bounds it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import ssl
+from collections.abc import AsyncIterator, Callable
+from typing import Any, Final
+
+from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.config import Config
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.server import ServerState
+
+Headers = tuple[tuple[str, str], ...]
+
+ANSWERED_WITHIN_S: Final = 20.0
+"""Request, work and answer together; an action takes 10 s at most."""
+MAX_CONNECTIONS: Final = 48
+MAX_HEAD_BYTES: Final = 8192
+MAX_BODY_BYTES: Final = 4096
+KERNEL_BYTES: Final = 64 * 1024
+UNHEARD_MS: Final = 10_000
+"""The kernel gives up a client that acknowledges nothing for this long: out of range, or asleep."""
+HANDSHAKE_WITHIN_S: Final = 10.0
+
+
+class Connection(H11Protocol):
+    """Connection of one client; its request's handler finds it in `request.state.connection`."""
+
+    def __init__(self, config: Config, state: ServerState, unanswered: dict[Connection, None]) -> None:
+        super().__init__(config, state, {"connection": self})
+        self._unanswered = unanswered
+        self._deadline: asyncio.TimerHandle | None = None
+        self._on_lost: Callable[[], object] | None = None
+        self._lost = False
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as in H11Protocol
+        """Begin the deadline, and make the oldest connection end where there are too many."""
+        super().connection_made(transport)
+        endpoint = transport.get_extra_info("socket")
+        endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BYTES)
+        endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNHEARD_MS)
+        if len(self._unanswered) >= MAX_CONNECTIONS:
+            next(iter(self._unanswered)).abort()
+        self._unanswered[self] = None
+        self._deadline = self.loop.call_later(ANSWERED_WITHIN_S, self.abort)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the connection."""
+        self._exempt()
+        self._lost = True
+        super().connection_lost(exc)
+        if self._on_lost is not None:
+            self._on_lost()
+
+    def keep_open(self, on_lost: Callable[[], object]) -> None:
+        """Exempt a connection that carries a stream; call `on_lost` at its end."""
+        self._exempt()
+        if self._lost:
+            on_lost()
+        else:
+            self._on_lost = on_lost
+
+    def abort(self) -> None:
+        """End the connection at once, whatever is still to be sent."""
+        self._exempt()
+        self.transport.abort()
+
+    def _exempt(self) -> None:
+        self._unanswered.pop(self, None)
+        if self._deadline is not None:
+            self._deadline.cancel()
+
+
+@contextlib.asynccontextmanager
+async def listening(
+    app: ASGIApp, host: str, port: int, headers: Headers, certificate: ssl.SSLContext | None = None
+) -> AsyncIterator[int]:
+    """Serve the application, with `headers` on every answer; yield the port.
+
+    Raises:
+        OSError: the address cannot be used.
+    """
+    config = Config(
+        _guarded(app),
+        http=Connection,
+        ws="none",
+        lifespan="off",
+        interface="asgi3",
+        log_config=None,
+        # A client can cause any number of warnings.
+        log_level="error",
+        access_log=False,
+        proxy_headers=False,
+        server_header=False,
+        headers=[("Connection", "close"), *headers],
+        h11_max_incomplete_event_size=MAX_HEAD_BYTES,
+    )
+    config.load()
+    state, unanswered = ServerState(), dict[Connection, None]()
+    state.default_headers = config.encoded_headers
+    tls: dict[str, Any] = {}
+    if certificate is not None:
+        tls = {"ssl": certificate, "ssl_handshake_timeout": HANDSHAKE_WITHIN_S}
+        tls["ssl_shutdown_timeout"] = HANDSHAKE_WITHIN_S
+    # Not by uvicorn.Server: it takes over the signals, ends the process where an address is in use, and wakes up ten
+    # times a second.
+    loop = asyncio.get_running_loop()
+    server = await loop.create_server(lambda: Connection(config, state, unanswered), host, port, **tls)
+    try:
+        yield server.sockets[0].getsockname()[1]
+    finally:
+        server.close()
+        for connection in list(state.connections):
+            connection.transport.abort()
+        await asyncio.sleep(0)
+        for task in list(state.tasks):
+            task.cancel()
+        await asyncio.gather(*state.tasks, return_exceptions=True)
+
+
+def _guarded(app: ASGIApp) -> ASGIApp:
+    """Keep from uvicorn what it would log as a fault and go on with."""
+
+    async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await app(scope, receive, send)
+        except asyncio.CancelledError:
+            pass  # the server is closing
+        except MemoryError as error:
+            # A child process ends itself then (companion.links.system.child).
+            asyncio.get_running_loop().call_exception_handler({"message": "out of memory", "exception": error})
+
+    return guarded
