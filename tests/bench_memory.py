@@ -163,7 +163,9 @@ async def of_companion(folder: Path, calibrations: int) -> dict[str, Memory]:
     try:
         everything = EVERYTHING + broker.section()
         async with live_aircraft(folder, everything), daemon(folder) as (process_id, control):
-            heard = await status_when(control, lambda now: bool(now["vehicle"]["armed"] == "disarmed"))
+            heard = await status_when(
+                control, lambda now: bool(now["vehicle"]["armed"] == "disarmed" and now["page"]["url"])
+            )
             async with visited(int(heard["page"]["url"].rstrip("/").rpartition(":")[2])):
                 await asyncio.sleep(SETTLED_S)
                 found["companion, everything on, started"] = memory(process_id)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
@@ -16,6 +16,7 @@ from companion.formats import Object
 from companion.web.server import Page
 
 OPEN_WITHIN_S: Final = 5.0
+EVERY_S: Final = 0.5
 SHOWN_S: Final = 1.0
 """Within which a page that looks has the last state."""
 
@@ -33,7 +34,7 @@ class PageAsking(Asking):
         self._question: Object | None = None
         self._answered: asyncio.Future[str] | None = None
         self._number = 0
-        self._page = Page(bind, storage, self._take, self._status, asyncio.to_thread)
+        self._page = Page(bind, storage, self._answer)
 
     async def __aenter__(self) -> Self:
         """Open the page.
@@ -84,8 +85,14 @@ class PageAsking(Asking):
         self._answered = asyncio.get_running_loop().create_future()
         return await self._answered
 
-    async def _take(self, request: Object, _face: str) -> AsyncIterator[Object]:
-        """The page's one request: an answer, to the question that it has seen."""
+    async def _answer(self, request: Object) -> AsyncGenerator[Object, None]:
+        """Answer the page as a daemon's control socket would: its status, and the operator's answer to the question."""
+        if request.get("command") == "status":
+            yield {"kind": "result", "status": self._status()}
+            return
+        while request.get("command") == "monitor":
+            yield {"kind": "progress", "status": self._status()}
+            await asyncio.sleep(EVERY_S)
         words = request.get("words")
         if request.get("command") != "answer" or not isinstance(words, str):
             raise CalibrationRefusedError("there is no configuration yet: answer the questions first")
@@ -94,7 +101,7 @@ class PageAsking(Asking):
         self._answered.set_result(words)
         yield {"kind": "result", "reason": "taken"}
 
-    async def _status(self) -> Object:
+    def _status(self) -> Object:
         question = None if self._question is None else {**self._question, "number": self._number}
         if question is None:
             latest = next((line for line in reversed(self._lines) if line.strip()), "")

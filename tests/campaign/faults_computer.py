@@ -197,7 +197,7 @@ async def tamper_journal(scene: Scene) -> None:
     await begin_again(scene)
 
 
-# --- control socket and page
+# --- control socket
 
 
 async def _hold(scene: Scene, writers: list[asyncio.StreamWriter]) -> None:
@@ -275,53 +275,6 @@ async def control_deaf(scene: Scene) -> None:
         writer.write(request)
         writers.append(writer)
         del reader
-    await _hold(scene, writers)
-
-
-def _page(scene: Scene) -> tuple[str, int]:
-    page = scene.stage.service.faces.page
-    assert page is not None
-    return "127.0.0.1", page._port
-
-
-async def page_garbage(scene: Scene) -> None:
-    host = f"Host: 127.0.0.1:{_page(scene)[1]}\r\n".encode()
-    for data in (
-        b"\0\xff" * 500,
-        b"GET / HTTP/9.9\r\n\r\n",
-        b"GET /" + b"a" * 20000 + b" HTTP/1.1\r\n\r\n",
-        b"POST /calibrate HTTP/1.1\r\n" + host + b"Content-Length: 99999999\r\n\r\n{}",
-        b"POST /undo HTTP/1.1\r\n" + host + b"Content-Length: 2\r\n\r\n{}",
-        b"POST /calibrate HTTP/1.1\r\nHost: evil.example\r\nContent-Length: 2\r\n\r\n{}",
-        b"GET /../../etc/passwd HTTP/1.1\r\n" + host + b"\r\n",
-        b"GET / HTTP/1.1\r\n" + host + b"Transfer-Encoding: chunked\r\n\r\nzzz\r\n",
-        b"\r\n" * 2000,
-    ):
-        reader, writer = await asyncio.open_connection(*_page(scene))
-        with contextlib.suppress(ConnectionError, TimeoutError):
-            writer.write(data)
-            await asyncio.wait_for(reader.read(1 << 16), 8.0)
-        writer.transport.abort()
-
-
-async def page_loris(scene: Scene) -> None:
-    writers = []
-    for _ in range(60):
-        with contextlib.suppress(OSError):
-            _, writer = await asyncio.open_connection(*_page(scene))
-            writer.write(b"GET / HTTP/1.1\r\nHost: ")
-            writers.append(writer)
-    await _hold(scene, writers)
-
-
-async def page_deaf(scene: Scene) -> None:
-    """Viewers that look at nothing."""
-    writers = []
-    for _ in range(10):
-        _, writer = await asyncio.open_connection(*_page(scene))
-        writer.transport.pause_reading()  # type: ignore[attr-defined]
-        writer.write(f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{_page(scene)[1]}\r\n\r\n".encode())
-        writers.append(writer)
     await _hold(scene, writers)
 
 
@@ -433,17 +386,5 @@ def faults() -> list[Fault]:
             control_deaf,
             hang_up,
             lasts_s=(6.0, 10.0),
-        ),
-        Fault("page-garbage", "faces", "nonsense at the page", page_garbage),
-        Fault(
-            "page-slow-loris",
-            "faces",
-            "60 requests to the page that never end",
-            page_loris,
-            hang_up,
-            lasts_s=(6.0, 9.0),
-        ),
-        Fault(
-            "page-deaf", "faces", "ten viewers of the page that read nothing", page_deaf, hang_up, lasts_s=(6.0, 10.0)
         ),
     ]

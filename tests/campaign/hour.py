@@ -91,13 +91,12 @@ def run_hour(seed: int, minutes: float = 60.0) -> Hour:
             witness = Witness(stage)
             async with stage.running_all():
                 await stage.ready()
-                lookers = [asyncio.create_task(_looks(stage, face)) for face in (_control, _page)]
+                looker = asyncio.create_task(_looks(stage))
                 try:
                     await _operate(stage, hour, minutes)
                 finally:
-                    for looker in lookers:
-                        looker.cancel()
-                    await asyncio.gather(*lookers, return_exceptions=True)
+                    looker.cancel()
+                    await asyncio.gather(looker, return_exceptions=True)
             hour.problems += witness.faults
             hour.writes, hour.longest_silence_s = witness.writes, witness.longest_silence_s
             if witness.longest_silence_s > judge.SILENT_S:
@@ -178,11 +177,11 @@ def _sample(stage: Stage, minute: int, fault: str) -> Sample:
     return Sample(minute, pages * 4096 / 2**20, len(gc.get_objects()), stage.census(), fault)
 
 
-async def _looks(stage: Stage, face: object) -> None:
+async def _looks(stage: Stage) -> None:
     """Somebody who looks all the time, and comes back when thrown out."""
     while True:
         with contextlib.suppress(OSError, TimeoutError):
-            reader, writer = await face(stage)  # type: ignore[operator]
+            reader, writer = await _control(stage)
             try:
                 while await reader.read(65536):
                     pass
@@ -194,14 +193,6 @@ async def _looks(stage: Stage, face: object) -> None:
 async def _control(stage: Stage) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     reader, writer = await asyncio.open_unix_connection(str(stage.config.control.path))
     writer.write(b'{"command": "monitor"}\n')
-    return reader, writer
-
-
-async def _page(stage: Stage) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    page = stage.service.faces.page
-    assert page is not None
-    reader, writer = await asyncio.open_connection("127.0.0.1", page._port)
-    writer.write(f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{page._port}\r\n\r\n".encode())
     return reader, writer
 
 

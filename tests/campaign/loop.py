@@ -8,18 +8,12 @@ import os
 import socket
 import weakref
 from collections.abc import Callable, Coroutine
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
 from tests.campaign import loopback
 from tests.support.virtual_time import VirtualTimeLoop
 
 T = TypeVar("T")
-
-REAL_GRACE_S: Final = 0.002
-"""How long the kernel may take to carry bytes from one TCP socket of this process to another."""
-GRACE_EVERY_S: Final = 0.1
-"""Virtual time between two waits for the kernel: at every jump of the clock they would be a minute for three virtual
-ones. So much later a page is served at the most; its own time limits are seconds."""
 
 OWNER: contextvars.ContextVar[str] = contextvars.ContextVar("owner", default="stage")
 """Inherited by every task and callback: which daemon started it, directly or not."""
@@ -33,15 +27,6 @@ class CampaignLoop(VirtualTimeLoop):
     def __init__(self) -> None:
         super().__init__()
         self.set_task_factory(_owned)
-        self._real: weakref.WeakSet[asyncio.Transport] = weakref.WeakSet()
-        self._next_grace_s = 0.0
-        self._jumping.grace_s = self._grace_s
-
-    def _grace_s(self) -> float:
-        if self.time() < self._next_grace_s or all(transport.is_closing() for transport in self._real):
-            return 0.0
-        self._next_grace_s = self.time() + GRACE_EVERY_S
-        return REAL_GRACE_S
 
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., Any], *args: Any
@@ -53,13 +38,6 @@ class CampaignLoop(VirtualTimeLoop):
         except Exception as error:  # noqa: BLE001 - handed to whoever awaits it
             future.set_exception(error)
         return future
-
-    async def create_connection(self, *what: Any, **options: Any) -> Any:
-        """As asyncio's; whoever looks at the page, which is on TCP, is waited for. Unix sockets carry at once."""
-        transport, protocol = await super().create_connection(*what, **options)
-        if transport.get_extra_info("socket").family != socket.AF_UNIX:
-            self._real.add(transport)
-        return transport, protocol
 
     async def sock_connect(self, sock: socket.socket, address: Any) -> None:
         """As asyncio's, but ports of `loopback` are within this process."""

@@ -1,7 +1,7 @@
 """The whole daemon, all faces on, on a virtual aircraft; it can be killed at any instant and started again.
 
-On top of `Rig`: devices behind `tcp://`, so that plugs can be pulled; a control socket and a page; a disk and
-a wall clock that can go wrong. Everything in one event loop on virtual time.
+On top of `Rig`: devices behind `tcp://`, so that plugs can be pulled; a control socket; a disk and a wall clock that
+can go wrong. Everything in one event loop on virtual time.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class Stage(Rig):
         self.root = root
         self.store = root / "store1"
         self.plugs = {name: Plug() for name in ("gradienter", "compass", "own")}
-        more = f'[control]\nsocket = "{root}/c1"\n[web]\nbind = "127.0.0.1:0"\n'
+        more = f'[control]\nsocket = "{root}/c1"\n'
         super().__init__(
             self.store,
             seed=seed,

@@ -16,7 +16,7 @@ from sim.imu_model import MG, ImuModel
 from sim.motions import Turn, Vibration
 from tests.e2e.test_align_faces import SCALES, read
 from tests.e2e.test_align_turn import STEEP, true_mg
-from tests.e2e.test_page import WEB, press
+from tests.e2e.test_page import press
 from tests.support.by_hand import Meddle, alone, follow
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -100,7 +100,7 @@ NAMED = (
 
 def test_all_that_goes_wrong_on_all_sides_and_then_on_the_spot(tmp_path: Path) -> None:
     """Some five seconds of processor: two long alignments, on one aircraft, for each of a dozen mishaps."""
-    made, hands = alone(tmp_path, placement_deg=0.02, propped_deg=4.0, imu_rate_hz=10.0, parameters=SCALES, more=WEB)
+    made, hands = alone(tmp_path, placement_deg=0.02, propped_deg=4.0, imu_rate_hz=10.0, parameters=SCALES)
     clumsy = Clumsy(made, hands)
 
     def stands_done() -> int:
@@ -141,7 +141,7 @@ def test_all_that_goes_wrong_on_all_sides_and_then_on_the_spot(tmp_path: Path) -
 
 
 def test_an_imu_that_is_exchanged_between_the_stands_is_named_and_nothing_is_written(tmp_path: Path) -> None:
-    made, hands = alone(tmp_path, propped_deg=1.0, placement_deg=0.02, imu_rate_hz=10.0, more=WEB)
+    made, hands = alone(tmp_path, propped_deg=1.0, placement_deg=0.02, imu_rate_hz=10.0)
     other = ImuModel(made.aircraft, "icm42688p", seed=9, accel_bias_m_s2=[8.0 * MG, -9.0 * MG, 7.0 * MG])
 
     async def main() -> None:

@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import re
+from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from companion.calibration.request import What
-from companion.web.exchange import Request
 from sim.motions import Handling
 from tests.e2e.test_calibration import calibrated, started
+from tests.support import page
 from tests.support.rig import POSE, Rig
 from tests.support.virtual_time import run_virtual
-
-WEB = '[web]\nbind = "127.0.0.1:0"\n'
 
 
 async def press(rig: Rig, button: str, /, **body: Any) -> tuple[int, str]:
     """What somebody is told who presses a button."""
-    page = rig.service.faces.page
-    assert page is not None
-    headers = {
-        "host": "127.0.0.1",
-        "content-type": "application/json",
-        "x-companion-token": page.access.token,
-    }
-    response = await page.respond(Request("POST", f"/{button}", headers, json.dumps(body).encode()))
-    assert response is not None
-    return response.status, json.loads(response.body)["reason"]
+
+    async def ask(request: dict[str, Any]) -> AsyncGenerator[dict[str, Any], None]:
+        async for reply in rig.service.faces.answer(request | {"face": "page"}):
+            yield reply
+
+    return await page.press(ask, button, **body)
 
 
 async def at_the_socket(rig: Rig, command: str) -> str:
@@ -75,7 +69,7 @@ class Watch:
 
 def test_buttons_do_what_the_command_line_does_and_are_refused_in_the_same_words(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, max_s=12.0, more=WEB).running() as rig:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
             await rig.ready()
             assert rig.service.status()["why_no_undo"] is not None
             assert await press(rig, "undo") == (409, await at_the_socket(rig, "undo"))

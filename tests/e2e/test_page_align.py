@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from companion.web.server import Page
+from companion.web import viewers
 from tests.e2e.test_align_faces import rig
-from tests.e2e.test_page import WEB, headline, press
+from tests.e2e.test_page import headline, press
 from tests.support.browser import PHONE, Tab, chromium, find
+from tests.support.page import page
 from tests.support.virtual_time import run_virtual
 
 Object = dict[str, Any]
 
 
 def test_who_follows_the_pictures_alone_makes_the_stands_and_a_page_opened_later_knows_them(tmp_path: Path) -> None:
-    made, hands = rig(tmp_path, more=WEB)
+    made, hands = rig(tmp_path)
 
     def shown() -> Object:
         return made.service.status()["stands"] or {"number": 0}
@@ -96,29 +96,16 @@ TIPS = """(() => { const down = name => document.querySelector('#how .' + name).
 
 @pytest.mark.skipif(find() is None, reason="chromium is not installed: apt-get install chromium")
 def test_the_page_shows_how_to_hold_it_and_asks_for_what_is_pressed(tmp_path: Path) -> None:
-    now = {"status": status(None)}
-    asked: list[Object] = []
-
-    async def answer(request: Object, _face: str) -> AsyncIterator[Object]:
-        asked.append(request)
-        yield {"kind": "result", "reason": "started", "records": []}
-
-    async def look() -> Object:
-        return now["status"]
-
-    async def on_the_spot(function: Any, *arguments: Any) -> Any:
-        return function(*arguments)
-
-    async def show(tab: Tab, what: Object, until: str) -> None:
-        now["status"] = what
-        await tab.until(until)
-
     async def main() -> None:
-        served = Page("127.0.0.1:0", tmp_path, answer, look, on_the_spot)
-        task = asyncio.create_task(served.run())
-        async with chromium(tmp_path / "profile") as browser:
+        async with page(tmp_path) as visit, chromium(tmp_path / "profile") as browser:
+
+            async def show(tab: Tab, what: Object, until: str) -> None:
+                visit.companion.status = lambda: what
+                await tab.until(until)
+
+            visit.companion.status = lambda: status(None)
             tab = await browser.tab()
-            await tab.open(served.url, PHONE)
+            await tab.open(visit.page.url, PHONE)
             await tab.until("document.querySelector('#word span')?.textContent === 'WAITING'")
             assert await tab.value("$('stands').hidden && $('known').getAttribute('visibility') === 'hidden'")
             assert await tab.value("$('unknown').getAttribute('visibility')") == "visible"
@@ -127,9 +114,9 @@ def test_the_page_shows_how_to_hold_it_and_asks_for_what_is_pressed(tmp_path: Pa
             await tab.value("$('align').open = true; $('write').checked = true")
             await tab.value("document.querySelector('#align button').scrollIntoView({block: 'center'})")
             await tab.touch("#align button.hold")
-            await tab.until("!$('said').hidden && $('said').textContent === 'align faces --write: started'")
+            await tab.until("!$('said').hidden && $('said').textContent === 'align faces --write: calibration started'")
             await tab.lift()
-            assert asked[-1] == {"command": "align", "action": "faces", "write": True, "wait": False}
+            assert visit.companion.asked[-1] == {"command": "align", "action": "faces", "write": True, "wait": False}
 
             down = stand((-1.0, 0.0, 0.0))
             await show(tab, status(down, progress=20), "!$('stands').hidden")
@@ -159,13 +146,30 @@ def test_the_page_shows_how_to_hold_it_and_asks_for_what_is_pressed(tmp_path: Pa
             # Closed and opened again, it goes on where it was.
             before = await tab.value("$('stands').innerText")
             await tab.open("about:blank", PHONE)
-            await tab.open(served.url, PHONE)
+            await tab.open(visit.page.url, PHONE)
             await tab.until("document.querySelector('#stands:not([hidden])')")
             assert await tab.value("$('stands').innerText") == before
             ended = turn | {"outcome": "done", "words": "accel bias known to 0.12 mg: written"}
             await show(tab, status(ended), "$('result').textContent.endsWith('written')")
             assert await tab.value("$('now').offsetParent") is None
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(main())
+
+
+@pytest.mark.skipif(find() is None, reason="chromium is not installed: apt-get install chromium")
+def test_a_page_without_room_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewers, "MAX_VIEWERS", 1)
+
+    async def main() -> None:
+        async with page(tmp_path) as visit, chromium(tmp_path / "profile") as browser:
+            visit.companion.status = lambda: status(None)
+            first = await visit.view(f"?token={visit.page.access.token}")
+            await first.begin()
+            tab = await browser.tab()
+            await tab.open(visit.page.url, PHONE)
+            await tab.until("document.querySelector('#word span')?.textContent === 'NO LINK'")
+            await tab.until("$('reason').textContent.startsWith('1 are looking already; the token makes room')")
+            first.writer.close()
+            await tab.until("document.querySelector('#word span')?.textContent === 'WAITING'")
 
     asyncio.run(main())

@@ -20,7 +20,16 @@ from companion.calibration.records.record import Record, from_json
 from companion.storage.learned import BiasStore
 from companion.storage.records import RecordStore
 from tests.e2e.test_calibration import calibrated
-from tests.e2e.test_commands import DONE, FAILED, FlightLine, _end, _until_disarmed, companion, flight_line
+from tests.e2e.test_commands import (
+    DONE,
+    FAILED,
+    FlightLine,
+    _end,
+    _until_disarmed,
+    _until_status,
+    companion,
+    flight_line,
+)
 from tests.support.browser import DESKTOP, PHONE, Tab, chromium, find
 from tests.support.histories import windows_of_days
 from tests.support.rig import Rig
@@ -66,6 +75,7 @@ async def scene(
         flight_line(folder, more=f'[web]\nbind = "{bind}"\n', still_s=still_s) as line,
         chromium(folder / "profile") as browser,
     ):
+        await _until_status(line.config, "where the page is", lambda status: bool(status["page"]["url"]))
         status = await companion("-c", str(line.config), "status", "--json")
         port = re.search(r":(\d+)/$", status.json["page"]["url"])
         assert port is not None

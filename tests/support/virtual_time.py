@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import selectors
-from collections.abc import Callable, Coroutine
+from collections.abc import Coroutine
 from typing import Any, Final, TypeVar
 
 T = TypeVar("T")
@@ -24,8 +24,6 @@ class JumpingSelector(selectors.EpollSelector):
         self.now_s = 1000.0
         self._second_began_s = self.now_s
         self._turns = 0
-        self.grace_s: Callable[[], float] = lambda: 0.0
-        """So long, on the real clock, a descriptor may take before the clock jumps: for peers behind real sockets."""
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         self._turns += 1
@@ -36,8 +34,6 @@ class JumpingSelector(selectors.EpollSelector):
             raise RuntimeError(msg)
         ready = super().select(0)
         if ready or timeout == 0:
-            return ready
-        if (grace_s := self.grace_s()) and (ready := super().select(grace_s)):
             return ready
         if timeout is None:
             msg = "deadlock: every task waits for something that no timer will bring"

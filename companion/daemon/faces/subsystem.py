@@ -33,7 +33,6 @@ from companion.samples import Triad
 
 if TYPE_CHECKING:
     from companion.daemon.faces.child import Child, StartChild
-    from companion.web.server import Page
 
 
 LARGEST: Final = 1e6
@@ -41,6 +40,8 @@ MONITOR_EVERY_S: Final = 0.5
 POSE_EVERY_S: Final = 0.2
 FACES: Final = {"page": "the page's", "mqtt": "mqtt", "fleet": "fleet"}
 """Child processes by their name in a request, and as a record names the requester ("cancelled by mqtt cancel")."""
+_NO_PAGE: Final[Object] = {"url": None, "viewers": 0, "wrong_tokens": 0}
+"""Keys of the page's status while its process reports nothing."""
 
 
 class Faces(Subsystem):
@@ -77,12 +78,7 @@ class Faces(Subsystem):
             self._handlers |= subsystem.commands()
         self._start_child = child
         self.mqtt = None if core.config.mqtt is None else self._child("mqtt", "companion.mqtt")
-        self.page: Page | None = None
-        if core.config.web is not None:
-            from companion.web.server import Page
-
-            bind, folder = core.config.web.bind, core.config.storage.path
-            self.page = Page(bind, folder, self.answer, self.refresh, core.offload)
+        self.page = None if core.config.web is None else self._child("page", "companion.web")
 
     def _child(self, name: str, module: str) -> Child:
         # Imported only where a child is configured: the start of the daemon is short.
@@ -153,7 +149,7 @@ class Faces(Subsystem):
             "headline": msgspec.to_builtins(self._headlines.now()),
             "vehicle": self._vehicle(),
             **self._mqtt_status(),
-            "page": None if self.page is None else self.page.status(),
+            "page": None if self.page is None else _NO_PAGE | self.page.status(),
             "spoken": [spoken._asdict() for spoken in self._core.texts.spoken],
         }
 

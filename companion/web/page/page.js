@@ -207,7 +207,7 @@ function figures(imu) {
   return `${imu.name}:` + part(imu.gyro_bias_rad_s, imu.gyro_sigma_use_rad_s, DEG_H, 1, ["gyro", "°/h"], "gyro")
     + part(imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, MG, 2, ["accelerometer", "mg"], "accel") + (written ? ` ${written} parameters written` : "");
 }
-// Plots are drawn by the daemon, as in its reports, and only for who looks.
+// Plots are drawn by the page's process, as in reports, and only for who looks.
 async function temperature() {
   const it = $("temperature");
   if (!it.open || document.hidden) return;
@@ -224,6 +224,7 @@ setInterval(temperature, DRAWN_MS);
 
 // --- listening
 
+let refused = null; // why there is no room for this page
 function listen() {
   if (source) source.close();
   // With the token there is room among many who only look.
@@ -237,14 +238,15 @@ function listen() {
     $("version").textContent = "companion " + hello.version;
     shownRecords = null;
   });
-  source.onmessage = event => { heardAt = Date.now(); show(JSON.parse(event.data)); };
+  source.addEventListener("refused", event => { refused = JSON.parse(event.data).reason; });
+  source.onmessage = event => { heardAt = Date.now(); refused = null; show(JSON.parse(event.data)); };
   source.onerror = () => { source.close(); source = null; setTimeout(() => source || listen(), AGAIN_MS); };
 }
 setInterval(() => {
   const silent = Date.now() - heardAt;
   if (silent < GONE_MS) return;
-  headline("gone", "NO LINK", heardAt ? `no word from the companion for ${Math.round(silent / 1000)} s: off, or out of range?`
-    : "no word from the companion yet");
+  headline("gone", "NO LINK", refused || (heardAt ? `no word from the companion for ${Math.round(silent / 1000)} s: off, or out of range?`
+    : "no word from the companion yet"));
   $("progress").hidden = true;
   for (const button of document.querySelectorAll("#keys button, #align button")) button.disabled = true;
   if (source && silent > 2 * GONE_MS && heardAt) { heardAt = Date.now() - GONE_MS; listen(); }

@@ -1,0 +1,29 @@
+"""Process of the page: `python -m companion.web`, a child of the daemon and a client of its control socket."""
+
+from __future__ import annotations
+
+from companion.links.system.child import ChildSettings, ChildWork, run_child
+
+MEMORY_MIB = 96
+
+
+def _page(settings: ChildSettings) -> ChildWork:
+    # Imported here: by now the process is nice, so that the daemon's start does not wait for it.
+    from collections.abc import AsyncGenerator
+
+    from companion.formats import Object
+    from companion.links.system.control_client import ask
+    from companion.web.server import Page
+
+    config = settings.config
+    if config.web is None:
+        raise ValueError("no [web] in the configuration")
+
+    def ask_daemon(request: Object) -> AsyncGenerator[Object, None]:
+        return ask(config.control.path, request | {"face": "page"})
+
+    return Page(config.web.bind, config.storage.path, ask_daemon)
+
+
+if __name__ == "__main__":
+    run_child(_page, memory_mib=MEMORY_MIB)
