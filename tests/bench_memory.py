@@ -89,6 +89,14 @@ def memory(process_id: int) -> Memory:
     return Memory(*(value / 1024.0 for value in (kib["Rss"], kib["Pss"], own, most)))
 
 
+def child_of(process_id: int, module: str) -> int:
+    """The process of `python -m MODULE` that this one has started."""
+    for child in Path(f"/proc/{process_id}/task/{process_id}/children").read_text().split():
+        if module in Path(f"/proc/{child}/cmdline").read_text().split("\0"):
+            return int(child)
+    raise LookupError(module)
+
+
 def _kib(text: str) -> Mapping[str, int]:
     rows = (line.split() for line in text.splitlines() if line.endswith(" kB"))
     return {row[0].rstrip(":"): int(row[1]) for row in rows}
@@ -168,7 +176,9 @@ async def of_companion(folder: Path, calibrations: int) -> dict[str, Memory]:
             )
             async with visited(int(heard["page"]["url"].rstrip("/").rpartition(":")[2])):
                 await asyncio.sleep(SETTLED_S)
+                page_id = child_of(process_id, "companion.web")
                 found["companion, everything on, started"] = memory(process_id)
+                found["page's process, started"] = memory(page_id)
                 await status_when(control, lambda now: bool(now["arming"]["verdict"] == "accept"))
                 for number in range(1, calibrations + 1):
                     next_s = asyncio.get_running_loop().time() + PERIOD_S
@@ -176,6 +186,7 @@ async def of_companion(folder: Path, calibrations: int) -> dict[str, Memory]:
                     assert record["state"] == "done", record["reason"]
                     await asyncio.sleep(SETTLED_S)
                     found[f"companion, everything on, calibrations: {number}"] = memory(process_id)
+                    found[f"page's process, calibrations: {number}"] = memory(page_id)
                     if number < calibrations:
                         await asyncio.sleep(max(0.0, next_s - asyncio.get_running_loop().time()))
                 after = await status_when(control, lambda now: bool(now["mqtt"]["connected"]))

@@ -1,9 +1,9 @@
-"""Who may look, and who may press a button.
+"""Rules of who may look at the page, and who may press a button.
 
-Looking is open to whoever reaches the address. An action needs a token in a header that a foreign site cannot set:
-on the board itself the page is handed one that lives as long as the daemon; from anywhere else a person types the one
-in the storage folder, once. A foreign site that turns its own name into our address (DNS rebinding) is met by
-looking at the Host header: only addresses, "localhost" and the board's own names are ours.
+Everybody who reaches the address may look. An action needs a token in a header that a foreign site cannot set: on the
+board itself the page gets one that lives as long as its process; elsewhere a person types the token of the storage
+folder, once. Against a foreign site that turns its own name into our address (DNS rebinding), the Host header may name
+only addresses, "localhost" and the board's own names.
 """
 
 from __future__ import annotations
@@ -33,30 +33,30 @@ _OWN_ENDINGS: Final = ("", ".local", ".lan", ".home.arpa", ".internal")
 
 
 def split_address(bind: str) -> tuple[str, int]:
-    """HOST and PORT of "HOST:PORT" or "[HOST]:PORT", as the configuration has been checked to be."""
+    """Split "HOST:PORT" or "[HOST]:PORT", which the configuration has checked."""
     host, _, port = bind.rpartition(":")
     return host.strip("[]"), int(port)
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only programs on this board can reach it."""
+    """Return whether only programs on this board can reach an address."""
     return host == "localhost" or ipaddress.ip_address(host).is_loopback
 
 
 def page_url(host: str, port: int, scheme: str = "http") -> str:
-    """Where to look; with an address for all networks, by the board's name."""
+    """Return the URL for a browser; an address for all networks becomes the board's name."""
     if host in ("0.0.0.0", "::"):  # noqa: S104 - compared, not bound
         host = f"{socket.gethostname().partition('.')[0]}.local"
     return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
 
 
 def new_token() -> str:
-    """Such as "k7xm-p2qd-9rtw"."""
+    """Make a token such as "k7xm-p2qd-9rtw"."""
     return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(_GROUP)) for _ in range(_GROUPS))
 
 
 def kept_token(directory: Path) -> str:
-    """The token of the storage folder; made, readable by the owner alone, where there is none yet.
+    """Read the token of the storage folder; make one that only the owner can read where there is none.
 
     Raises:
         StorageError: it can be neither read nor made.
@@ -79,12 +79,12 @@ def kept_token(directory: Path) -> str:
 
 
 def _bare(token: str) -> str:
-    """As it counts: gaps, dashes and capitals are a matter of keyboards."""
+    """Strip gaps and dashes, and lower capitals: they are a matter of keyboards."""
     return re.sub(r"[\s-]", "", token).lower()
 
 
 class Access:
-    """The rules for one address: the token that an action needs, and whether the page gets it by itself."""
+    """Rules of one address: the token that an action needs, and whether the page gets it by itself."""
 
     def __init__(self, token: str, *, handed_out: bool) -> None:
         self.token, self.handed_out = token, handed_out
@@ -92,7 +92,7 @@ class Access:
         self._names = {"localhost", *(name + ending for ending in _OWN_ENDINGS if name)}
 
     def refuses_host(self, headers: Mapping[str, str]) -> str | None:
-        """Why a request is not meant for us, in one line; None when it is."""
+        """Return why a request is not meant for us, in one line; None: it is."""
         host = headers.get("host", "")
         match = re.fullmatch(r"(\[[0-9a-f:.]+\]|[^:\[\]/@\s]+)(?::\d{1,5})?", host.lower())
         if match is not None:
@@ -102,7 +102,7 @@ class Access:
         return f"not known here as {host[:80]!r}: use the board's address in numbers, or its own name"
 
     def refuses_stranger(self, headers: Mapping[str, str]) -> str | None:
-        """Why a request that another site makes a browser send is not answered; None when it is our page's own."""
+        """Return why a request comes from another site's page; None: it comes from our own."""
         if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
             return "asked by another site"
         origin, host = headers.get("origin"), headers.get("host", "")
@@ -111,12 +111,12 @@ class Access:
         return None
 
     def refuses_token(self, headers: Mapping[str, str]) -> str | None:
-        """Why no action may be started; None when one may."""
+        """Return why no action may be started; None: one may."""
         given = _bare(headers.get(TOKEN_HEADER, ""))
         if not given:
             return "needs the token: companion web-token, on the board, shows it"
         if not secrets.compare_digest(given.encode(), _bare(self.token).encode()):
             if self.handed_out:
-                return "the companion was restarted: try again"
+                return "the page was restarted: try again"
             return "wrong token: companion web-token, on the board, shows the right one"
         return None

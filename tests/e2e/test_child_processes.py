@@ -67,12 +67,13 @@ class HostileBroker:
 
 @contextlib.asynccontextmanager
 async def beside(rig: Rig) -> AsyncIterator[Child]:
-    """The rig with its MQTT child as a real process, which asks by the control socket."""
+    """The rig with its child, MQTT's or the page's, as a real process, which asks by the control socket."""
     rig.start_child, rig.offload = Child, asyncio.to_thread
     async with rig.running(), ControlServer(rig.config.control.path, rig.service.faces.answer):
         await rig.ready()
-        assert rig.service.faces.mqtt is not None
-        yield rig.service.faces.mqtt
+        child = rig.service.faces.mqtt or rig.service.faces.page
+        assert child is not None
+        yield child
 
 
 async def calibrated(rig: Rig, during: State | None = None, fault: Callable[[], None] = lambda: None) -> str:

@@ -295,6 +295,10 @@ def test_a_laptop_beyond_the_board_needs_the_token(tmp_path: Path) -> None:
             assert stat.S_IMODE(file.stat().st_mode) == 0o600
             shown = await companion("-c", str(here.line.config), "web-token")
             assert f"#token={token}" in shown.out
+            check = await companion("-c", str(here.line.config), "check", "--json")
+            (page,) = (one for one in check.json["findings"] if one["name"] == "page")
+            assert page["good"]
+            assert page["words"].endswith(" (buttons: companion web-token)")
             assert await pixels_needed(tab) == 0
 
             async def hold() -> None:

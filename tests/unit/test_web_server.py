@@ -664,7 +664,7 @@ def test_who_has_the_token_is_let_in_whoever_guesses_meanwhile(
 def test_on_the_board_itself_an_old_token_is_no_guess(tmp_path: Path) -> None:
     async def visitor(visit: Visit) -> None:
         old = await visit.ask("POST", "/cancel", b"{}", **visit.good_headers | {"X_Companion_Token": "2" * 12})
-        assert (old.status, old.json["reason"]) == (403, "the companion was restarted: try again")
+        assert (old.status, old.json["reason"]) == (403, "the page was restarted: try again")
         none = await visit.ask("POST", "/cancel", b"{}", **visit.good_headers | {"X_Companion_Token": None})
         assert none.status == 403
         assert visit.page.status()["wrong_tokens"] == 0

@@ -206,7 +206,7 @@ async def run_check(
     findings += [Finding("warning", good=True, words=words) for words in status["warnings"]]
     ground = status["ground_stations"]
     findings.append(Finding("ground stations", good=ground["good"], words=ground["summary"]))
-    for name in ("mqtt", "fleet"):
+    for name in ("mqtt", "fleet", *(["page"] if is_running else [])):
         if (face := status[name]) is not None:
             findings.append(Finding(name, good=face["good"], words=face["summary"]))
     findings += [_profile(profile) for profile in status["profiles"]]
