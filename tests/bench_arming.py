@@ -1,4 +1,4 @@
-"""How long a question at arming waits for the daemon's answer, on an idle machine and on one with too much to do.
+"""How long a question at arming waits for the daemon's answer: idle, busy, and with a crowd at the page.
 
 The daemon is a process of its own with two integer IMUs of a PX4 double, a serial IMU, gradienter and compass, in gate
 mode. Between the two sits a relay that puts MAV_CMD_ARM_AUTHORIZATION_REQUEST into the autopilot's bytes and takes the
@@ -41,6 +41,28 @@ async def main():
     await asyncio.Event().wait()
 asyncio.run(main())
 """
+CROWD: Final = """
+import asyncio, sys
+async def visitor(number):
+    while True:
+        try:
+            reader, writer = await asyncio.open_connection("127.0.0.1", int(sys.argv[1]))
+            if number % 3 == 0:
+                writer.write(b"GET / HTTP/1.1\\r\\nHost: 127.0.0.1\\r\\nX: ")
+                for _ in range(1600):
+                    writer.write(bytes(65536))
+                    await writer.drain()
+            elif number % 3 == 1:
+                writer.write(b"GET / HTTP/1.1\\r\\nHost: 127.0.0.1\\r\\n\\r\\n")
+            await reader.read()
+            writer.close()
+        except OSError:
+            await asyncio.sleep(0.1)
+async def main():
+    await asyncio.gather(*(visitor(number) for number in range(1000)))
+asyncio.run(main())
+"""
+"""A thousand visitors of the page: a third sends 100 MB of headers, a third loads the page, a third says nothing."""
 
 
 class Relay:
@@ -187,6 +209,8 @@ def main() -> None:
         wanted = (folder / "sim.log").read_text()
         wanted = wanted.replace(f"udpin:{udp}", f"udpin:127.0.0.1:{relay.daemon_port}")
         wanted += '\n[calibration]\nat_arm = "gate"\n[push]\ndither = true\n'
+        page_port = free_port()
+        wanted += f'[web]\nbind = "127.0.0.1:{page_port}"\n'
         wanted += '\n[[imu]]\nname = "fc2"\nsource = "autopilot"\ninstance = 2\nprofile = "icm42688p"\n'
         config.write_text(wanted)
         command = ["nice", "-n", str(given.nice), sys.executable, "-m", "companion", "-c", str(config), "run"]
@@ -204,6 +228,9 @@ def main() -> None:
         with load(given.busy):
             relay.run(5.0, ask=False)
             measure(relay, f"{given.busy} busy processes", given.seconds, print)
+        with running([sys.executable, "-c", CROWD, str(page_port)]):
+            relay.run(5.0, ask=False)
+            measure(relay, "a crowd at the page", given.seconds, print)
 
 
 if __name__ == "__main__":

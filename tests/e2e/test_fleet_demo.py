@@ -204,6 +204,6 @@ def test_a_database_that_cannot_be_read_is_said_and_asked_again(tmp_path: Path) 
                 connection.execute("DROP TABLE aircraft")
             status, answer = await get(port)
             assert status == 503
-            assert "Refresh: 2\r\n" in answer  # a phone that looked too soon is not left with it
+            assert "refresh: 2\r\n" in answer  # a phone that looked too soon is not left with it
 
     asyncio.run(main())
