@@ -29,7 +29,8 @@ chmod -R a+rX "$root/opt/companion/src"
 ln -s ../python/bin/python3 "$root/opt/companion/bin/python3"
 cat >"$root/opt/companion/bin/companion" <<'END'
 #!/bin/sh
-PYTHONPATH=/opt/companion/src:/opt/companion/site PYTHONDONTWRITEBYTECODE=1 \
+# This Python's own library, not the machine's of the same name, with which its modules need not fit.
+LD_LIBRARY_PATH=/opt/companion/python/lib PYTHONPATH=/opt/companion/src:/opt/companion/site PYTHONDONTWRITEBYTECODE=1 \
     exec /opt/companion/bin/python3 -m companion "$@"
 END
 chmod a+rx "$root/opt/companion/bin/companion"
