@@ -7,7 +7,7 @@ from typing import Final
 from companion.links.system.child import ChildSettings, ChildWork, run_child
 
 MEMORY_MIB: Final = 80
-"""Twice the most that was measured: 22 MiB with a viewer, 39 with 16 deaf viewers and a thousand hostile connections."""
+"""Twice the largest use measured: 22 MiB with a viewer, 39 with 16 deaf viewers and 1000 hostile connections."""
 
 
 def _page(settings: ChildSettings) -> ChildWork:
