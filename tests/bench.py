@@ -30,8 +30,7 @@ from companion.component.arm_authorisation import ArmAuthoriser
 from companion.daemon.job import Job
 from companion.links.mavlink.link import MavlinkLink
 from companion.protocols.registry import Kind
-from companion.recording.walk import Recording
-from companion.replay.engine import Replay
+from companion.replay.engine import replay
 from companion.samples import ImuSample
 from companion.storage.learned import BiasStore, KnownImu
 from tests import bench_attitude, bench_daemon, bench_learning, bench_reading, bench_replay, bench_start
@@ -125,7 +124,7 @@ def _replay_speed(path: Path) -> float:
     best = 0.0
     for _ in range(ROUNDS):
         start_s = time.process_time()
-        result = Replay(Recording(path)).run()
+        result = replay([path])
         best = max(best, result.seconds / (time.process_time() - start_s))
     return best
 

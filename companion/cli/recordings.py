@@ -23,12 +23,15 @@ MOST_LINES = 20
 
 def add_commands(add: AddCommand) -> None:
     """Add both to the parser of the command line."""
-    recorder = add("record", record, "record everything to a file until Ctrl-C (the last half hour is kept anyway)")
+    recorder = add("record", record, "record everything to a file until Ctrl-C (the last hour is kept anyway)")
     recorder.add_argument("file", nargs="?", type=Path, metavar="FILE", help="default: one beside the daemon's own")
     recorder.add_argument("--seconds", type=seconds, metavar="S", help="default: until Ctrl-C, --stop or 1 GB")
     recorder.add_argument("--stop", action="store_true", help="end a recording that runs")
     player = add("replay", replay, "run a recording, or anybody's log of an IMU at rest, through the same estimator")
-    player.add_argument("file", type=Path, metavar="FILE", help="a recording (.mcap), or a log (CSV; .ulg, .bin)")
+    player.add_argument(
+        "files", nargs="+", type=Path, metavar="FILE",
+        help="a recording (.mcap), or several that follow on one another; or a log (CSV; .ulg, .bin)",
+    )  # fmt: skip
     replay_log.add_options(player)
 
 
@@ -49,24 +52,27 @@ async def record(options: argparse.Namespace) -> int:
 
 async def replay(options: argparse.Namespace) -> int:
     """`companion replay`."""
-    from companion.recording.walk import is_text
     from companion.replay.autopilot_logs import reader_of
+    from companion.replay.recording import is_text
 
-    try:
-        is_log = reader_of(options.file) is not None or is_text(options.file)
-    except OSError as error:
-        raise ConfigError(f"companion replay: {options.file}: {error.strerror or error}") from None
-    if is_log:
-        return replay_log.replay(options)
-    return _replay_recording(options)
+    logs = []
+    for file in options.files:
+        try:
+            logs += [file] if reader_of(file) is not None or is_text(file) else []
+        except OSError as error:
+            raise ConfigError(f"companion replay: {file}: {error.strerror or error}") from None
+    if not logs:
+        return _replay_recording(options)
+    if len(options.files) > 1:
+        raise ConfigError(f"companion replay: found {len(options.files)} files; allowed with a log: one")
+    return replay_log.replay(options, logs[0])
 
 
 def _replay_recording(options: argparse.Namespace) -> int:
-    from companion.recording.walk import Recording
-    from companion.replay.engine import Replay
+    from companion.replay import engine
 
     began_s = time.monotonic()
-    result = Replay(Recording(options.file)).run()
+    result = engine.replay(options.files)
     took_s = time.monotonic() - began_s
     different = [difference for each in result.calibrations for difference in each.differences]
     lines = _lines(result)
@@ -85,15 +91,16 @@ def _replay_recording(options: argparse.Namespace) -> int:
 
 def _lines(result: Result) -> list[str]:
     """For people; the last line is the verdict."""
+    from companion.replay.calibrations import TOLERANCE_SIGMAS
+
     lines: list[str] = []
-    different = recomputed = 0
+    different = 0
+    worst = [each.worst_sigmas for each in result.calibrations if each.worst_sigmas is not None]
     for each in result.calibrations:
         lines.append(f"calibration of {each.record.started_at}")
         lines += show.record_lines(msgspec.to_builtins(each.record))
         if each.not_recomputed is not None:
             lines.append(f"not recomputed: {each.not_recomputed}")
-        else:
-            recomputed += 1
         different += bool(each.differences)
         lines += [f"DIFFERENT {difference}" for difference in each.differences[:MOST_LINES]]
         if len(each.differences) > MOST_LINES:
@@ -105,5 +112,6 @@ def _lines(result: Result) -> list[str]:
     elif different:
         lines.append(f"{different} of {len(result.calibrations)} calibrations came out different")
     else:
-        lines.append(f"{recomputed} of {len(result.calibrations)} calibrations recomputed, the same to the last bit")
+        agree = f"; biases within {TOLERANCE_SIGMAS:g} sigma (at most {max(worst):.1g})" if worst else ""
+        lines.append(f"{len(worst)} of {len(result.calibrations)} calibrations recomputed{agree}")
     return lines

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -87,16 +88,16 @@ def add_table_options(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def replay(options: argparse.Namespace) -> int:
+def replay(options: argparse.Namespace, file: Path) -> int:
     """The biases that the estimator finds in it."""
     from companion.replay.estimate import estimate
 
     given = _given(options)
-    log = _log(options)
+    log = _log(options, file)
     if given.platform == "deck" and (
         log.poses is None or (log.poses.tilt_deg is None and log.poses.heading_deg is None)
     ):
-        raise StorageError(f"{options.file}: neither tilt nor heading in it: a deck's turn would look like a bias")
+        raise StorageError(f"{file}: neither tilt nor heading in it: a deck's turn would look like a bias")
     if options.windows is not None:
         return _windows(options, log, given)
     found = estimate(log, given)
@@ -106,16 +107,16 @@ def replay(options: argparse.Namespace) -> int:
     return conclude(options, answer, lines, good=found.record.state == "done")
 
 
-def _log(options: argparse.Namespace) -> StillLog:
+def _log(options: argparse.Namespace, file: Path) -> StillLog:
     from companion.replay.log_files import read_logs
 
-    logs = read_logs([options.file], options.columns, options.rate)
+    logs = read_logs([file], options.columns, options.rate)
     named = [log for log in logs if options.imu in (None, log.imu)]
     if len(named) == 1:
         return named[0]
     names = ", ".join(log.imu for log in logs)
     if named or options.imu is None:
-        raise ConfigError(f"{options.file}: found IMUs {names}; allowed: one; say which with --imu")
+        raise ConfigError(f"{file}: found IMUs {names}; allowed: one; say which with --imu")
     raise StorageError(f"no IMU {options.imu!r} in these files; there are: {names}")
 
 

@@ -117,6 +117,17 @@ def imu_input(imu: Imu, kind: StreamKind | None, grid: tuple[float, float] = (0.
     )
 
 
+def collector(config: Config) -> RollingCollector:
+    """Return the collector of a configuration, before anything has been heard of the autopilot's IMUs."""
+    return RollingCollector(
+        settings(config),
+        [imu_input(imu, None) for imu in config.imu],
+        gradienter_model(config.gradienter),
+        compass_model(config.compass),
+        on_deck=config.vehicle.platform == "deck",
+    )
+
+
 def gradienter_model(gradienter: Gradienter | None) -> GradienterModel | None:
     """How the gradienter's readings become the direction of up."""
     if gradienter is None:
@@ -284,16 +295,16 @@ def parts_of(sample: Sample, roles: Sequence[Role]) -> Iterator[tuple[Role, Samp
             yield role, part
 
 
-def collect(collector: RollingCollector, role: Role, part: Sample) -> TiltSample | CompassSample | None:
+def collect(into: RollingCollector, role: Role, part: Sample) -> TiltSample | CompassSample | None:
     """Give the collector what a role has taken; the reading of the pose that counts, or came of it, if any."""
     match part:
         case ImuSample():
-            collector.add_imu(role.name, part)
+            into.add_imu(role.name, part)
         case TiltSample():
-            collector.add_tilt(part)
+            into.add_tilt(part)
             return part
         case CompassSample():
-            return part if collector.add_compass(part) else None
+            return part if into.add_compass(part) else None
         case MagSample():
-            return collector.add_field(part)
+            return into.add_field(part)
     return None

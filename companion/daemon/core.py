@@ -25,7 +25,6 @@ from companion.configured.profiles import Profiles
 from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners
-from companion.recording.journal import RecordedCollector
 
 CATCH_UPS: Final = 3
 """While an estimate is worked out the next one may become due; it must not be left to the event loop."""
@@ -80,7 +79,9 @@ class Core:
         self.link = link or MavlinkLink(system_id=system_id or 1, component_id=config.mavlink.component_id)
         self.vehicle = Vehicle(self.link, system_id=system_id, is_carried=self._is_carried)
         self.parameters = ParameterClient(self.link, self.vehicle)
-        self.profiles, self.collector, self.machine = Profiles(config), RecordedCollector(config), Machine()
+        self.profiles, self.collector, self.machine = Profiles(config), models.collector(config), Machine()
+        self.on_tick: Listeners[[float]] = Listeners()
+        """Notified of the time of every tick, before the collector."""
         self.wanted, self.texts = Wanted(config), StatusText(self.link)
         self.tunes = Tunes(self.link, self.vehicle, lambda: self.wanted.tunes, self.texts.woken)
 
@@ -101,7 +102,9 @@ class Core:
     async def keep_ticking(self) -> None:
         """Tell the collector the time until cancelled: the only one in the daemon who does."""
         while True:
-            self.collector.tick(asyncio.get_running_loop().time())
+            now_s = asyncio.get_running_loop().time()
+            self.on_tick.tell(now_s)
+            self.collector.tick(now_s)
             await asyncio.sleep(TICK_S)
 
     async def catch_up(self, *, since_s: float | None = None) -> None:

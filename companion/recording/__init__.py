@@ -1,1 +1,1 @@
-"""Recordings: everything that came and went, in the order of events, so that a calibration can be replayed exactly."""
+"""Recordings: the bytes that came in, and what else a calibration was made from, as MCAP files."""

@@ -1,8 +1,7 @@
-"""The thread's side of recording: MCAP files, one or a ring of them.
+"""The thread's side of recording: MCAP files, one or a ring of them. Nothing here is called on the event loop.
 
-MCAP because every tool for looking at robots' data opens it, and because it can be cut anywhere: chunks are compressed
-each for itself, and one is finished and handed to the disk at every `write`, once a second. Nothing here is called on
-the event loop.
+An MCAP file may be cut anywhere: each chunk is compressed by itself, and one is finished and synced at every `write`,
+once a second.
 """
 
 from __future__ import annotations
@@ -17,11 +16,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any, Final
 
-import msgspec
-
 from companion.errors import StorageError
-from companion.recording import topics
-from companion.recording.past import Message, Past, breathing
+from companion.recording import messages
+from companion.recording.messages import Message, Start
 
 CHUNK_BYTES: Final = 256 * 1024
 """A second of a busy aircraft has less."""
@@ -39,15 +36,15 @@ _NAME = re.compile(r"(\d{6,})\.mcap")
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Beginning:
-    """What a file says first, should it begin now."""
+    """What a file holds before its messages, should it begin now."""
 
     t_s: float
-    unix_s: float
-    """The host's clock at `t_s`."""
-    versions: dict[str, str]
+    offset_ns: int
+    """UTC minus the daemon's clock, fixed when the daemon started: setting the host's clock makes no jump."""
     config: bytes
     """JSON."""
-    past: Past
+    states: Sequence[Message]
+    """States in force at `t_s`."""
 
 
 Opener = Callable[[Path], IO[bytes]]
@@ -97,8 +94,6 @@ class RecordingFile:
 
         self.path = path
         self.messages = 0
-        self.past_bytes = 0
-        """How much of it is of before it was begun, about."""
         self._free_bytes = free_bytes
         self._file: IO[bytes] | None = None
         try:
@@ -109,14 +104,13 @@ class RecordingFile:
             raise StorageError(f"{path}: there is no folder {path.parent}; make it, or name another") from None
         except OSError as error:
             raise StorageError(f"{path}: cannot be created by the companion: {error.strerror or error}") from None
-        # Without an index of messages, whose size would grow with the file's and not with what is looked for.
+        # Without an index of messages: it would hold as many entries as the file has messages.
         self._writer: Any = Writer(
             self._file,
             chunk_size=CHUNK_BYTES,
             compression=CompressionType.ZSTD,
             index_types=IndexType.CHUNK | IndexType.ATTACHMENT | IndexType.METADATA,
         )
-        self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._begun: Beginning | None = None
 
@@ -125,8 +119,8 @@ class RecordingFile:
         """Its size so far."""
         return 0 if self._file is None else int(self._file.tell())
 
-    def write(self, messages: Sequence[Message], beginning: Beginning) -> None:
-        """Add messages, finish the chunk and bring it to the disk; the past comes before the first.
+    def write(self, batch: Sequence[Message], beginning: Beginning, *, continues: bool = False) -> None:
+        """Add messages, finish the chunk and sync it; the beginning comes before the first.
 
         Raises:
             StorageError: the disk refuses; the file ends here, and what it has can be replayed.
@@ -137,8 +131,8 @@ class RecordingFile:
             if self._free_bytes(self.path.parent) < RESERVE_BYTES:
                 raise OSError(errno.ENOSPC, f"less than {RESERVE_BYTES >> 20} MB free on the disk")
             if self._begun is None:
-                self._begin(beginning)
-            for message in breathing(messages):
+                self._begin(beginning, Start(continues=continues))
+            for message in batch:
                 self._add(*message)
             self._writer.flush()
             self._sync()
@@ -165,38 +159,29 @@ class RecordingFile:
         finally:
             self._abandon()
 
-    def _begin(self, beginning: Beginning) -> None:
+    def _begin(self, beginning: Beginning, start: Start) -> None:
         self._begun = beginning
-        self._writer.start(profile="", library=f"companion {beginning.versions['companion']}")
+        table = {**versions(), "offset_ns": str(beginning.offset_ns)}
+        self._writer.start(profile="", library=f"companion {table['companion']}")
         started_ns = self._ns(beginning.t_s)
-        versions = {**beginning.versions, "t_s": repr(beginning.t_s), "unix_s": repr(beginning.unix_s)}
-        self._writer.add_metadata(topics.METADATA, versions)
-        self._writer.add_attachment(started_ns, started_ns, topics.CONFIG, "application/json", beginning.config)
-        for message in breathing(beginning.past.beginning(beginning.t_s)):
+        self._writer.add_metadata(messages.METADATA, table)
+        self._writer.add_attachment(started_ns, started_ns, messages.CONFIG, "application/json", beginning.config)
+        self._add(messages.START, beginning.t_s, messages.encode(start))
+        for message in beginning.states:
             self._add(*message)
-        self.past_bytes = self.bytes_written
 
     def _ns(self, t_s: float) -> int:
-        """UTC in nanoseconds of a time on the loop's clock; a host's clock that is set meanwhile changes nothing."""
-        if self._begun is None:
-            return 0
-        return max(0, int((self._begun.unix_s + (t_s - self._begun.t_s)) * 1e9))
+        """Return UTC in nanoseconds of a time on the daemon's clock; a replay subtracts the same whole offset."""
+        return 0 if self._begun is None else max(0, round(t_s * 1e9) + self._begun.offset_ns)
 
     def _add(self, topic: str, t_s: float, data: bytes) -> None:
         channel = self._channels.get(topic)
         if channel is None:
-            channel = self._channels[topic] = self._register(topic)
+            channel = self._writer.register_channel(topic, messages.encoding(topic), 0)
+            self._channels[topic] = channel
         at_ns = self._ns(t_s)
         self.messages += 1
         self._writer.add_message(channel, at_ns, data, at_ns, self.messages & 0xFFFFFFFF)
-
-    def _register(self, topic: str) -> int:
-        name, schema = topics.schema_of(topic)
-        if name not in self._schemas:
-            data = msgspec.json.encode(schema)
-            self._schemas[name] = self._writer.register_schema(name, "jsonschema", data)
-        channel: int = self._writer.register_channel(topic, "json", self._schemas[name])
-        return channel
 
     def _sync(self) -> None:
         if self._file is not None:
@@ -249,6 +234,8 @@ class Ring:
         self.bytes_in_all = 0
         self._opener, self._free_bytes = opener, free_bytes
         self._current: RecordingFile | None = None
+        self._continues = False
+        """Whether the next file begins where the one before ended."""
 
     @property
     def path(self) -> Path | None:
@@ -257,12 +244,10 @@ class Ring:
 
     @property
     def is_full(self) -> bool:
-        """Whether the present file has had its share, beside the past that it begins with."""
-        if self._current is None:
-            return False
-        return self._current.bytes_written - self._current.past_bytes >= self.most_bytes // PARTS
+        """Whether the present file has had its share."""
+        return self._current is not None and self._current.bytes_written >= self.most_bytes // PARTS
 
-    def write(self, messages: Sequence[Message], beginning: Beginning) -> None:
+    def write(self, batch: Sequence[Message], beginning: Beginning) -> None:
         """Add messages to the present file; after `close` to the next one.
 
         Raises:
@@ -274,14 +259,16 @@ class Ring:
             else:
                 self._make_room()
             if self._current is not None:
-                self._current.write(messages, beginning)
+                self._current.write(batch, beginning, continues=self._continues)
+            self._continues = True
             self._make_room()
         except StorageError:
-            self._current = None
+            self._current, self._continues = None, False
             raise
         except OSError as error:
             with contextlib.suppress(StorageError):
                 self.close()
+            self._continues = False
             raise StorageError(f"{self.folder}: {error.strerror or error}") from error
 
     def close(self) -> None:
@@ -328,7 +315,7 @@ class Ring:
 
 
 def versions() -> dict[str, str]:
-    """What a replay has to be the same in for the last bit to be the same."""
+    """Return the version of the format, and what else may make a replay differ in the last digits."""
     import platform
     import sys
 
@@ -337,7 +324,7 @@ def versions() -> dict[str, str]:
     from companion import __version__
 
     return {
-        "format": topics.FORMAT_VERSION,
+        "format": messages.FORMAT_VERSION,
         "companion": __version__,
         "python": ".".join(map(str, sys.version_info[:3])),
         "numpy": numpy.__version__,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
@@ -10,24 +11,15 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.autopilot.telemetry import imu_messages
-from companion.config.sections import Config, Noise
+from companion.config.sections import Config
 from companion.errors import StorageError
-from companion.recording import topics
-from companion.recording.walk import Attachment, Message, Metadata, Recording, is_text
+from companion.recording import messages
 from companion.replay import autopilot_logs, csv_log
 from companion.replay.log import NAME, StillLog
+from companion.replay.playback import UNUSABLE, Playback, config_of
+from companion.replay.recording import Head, Message, Recording, is_text
+from companion.samples import ImuSample
 
-TRUNCATED: Final = frozenset(
-    message.kind.message
-    for every in (imu_messages.ARDUPILOT, imu_messages.PX4)
-    for messages in every.values()
-    for message in messages
-    if message.kind.truncates
-)
-"""Messages of whole mrad/s and mg: their steps hide what a profile is about."""
-BREAKING: Final = frozenset({"reset", "imu"})
-"""Events of the journal after which readings cannot be compared with those before."""
 CONTINUED_S: Final = 60.0
 """A recording that begins within so much of another's end, on the same clock, goes on with it."""
 
@@ -55,74 +47,81 @@ def read_logs(
     return _joined(found)
 
 
+class _Columns:
+    """Samples of one IMU while they are read."""
+
+    def __init__(self) -> None:
+        self.rows = array("d")
+        self.breaks_s: list[float] = []
+        self.last_s = -math.inf
+        self.truncated = False
+
+    def add(self, sample: ImuSample) -> None:
+        """Add a sample, unless its time goes back."""
+        if sample.t_s > self.last_s:
+            self.last_s = sample.t_s
+            degc = math.nan if sample.temperature_degc is None else sample.temperature_degc
+            self.rows.extend((sample.t_s, *sample.gyro_rad_s, *sample.accel_m_s2, degc))
+
+
 def _read_recording(path: Path) -> list[StillLog]:
-    imu_entry = msgspec.json.Decoder(topics.ImuEntry)
-    journal = msgspec.json.Decoder(topics.JournalEntry)
-    breaks: list[float] = []
-    entries: dict[str, list[topics.ImuEntry]] = {}
-    truncated: set[str] = set()
-    profiles: dict[str, str | Noise | None] = {}
-    offset_s: float | None = None
-    for item in Recording(path).items(lambda topic: topic == topics.JOURNAL or topic.startswith(topics.IMU)):
-        if isinstance(item, Message):
+    found: dict[str, _Columns] = {}
+    playback: Playback | None = None
+    head: Head | None = None
+    config: Config | None = None
+    for item in Recording(path).items():
+        if isinstance(item, Head):
+            head, config = item, config_of(item, path)
+            playback = Playback(config)
+            found = {imu.name: _Columns() for imu in config.imu}
+        elif playback is not None:
             try:
-                entry = (journal if item.topic == topics.JOURNAL else imu_entry).decode(item.data)
-            except msgspec.MsgspecError as error:
+                _add(playback, item, found)
+            except UNUSABLE as error:
                 raise StorageError(
                     f"{path}: a message on {item.topic} cannot be used by this version ({error})"
                 ) from None
-            if isinstance(entry, topics.JournalEntry):
-                if entry.event in BREAKING:
-                    breaks.append(entry.t_s)
-                continue
-            name = item.topic.removeprefix(topics.IMU)
-            own = entries.setdefault(name, [])
-            if entry.message in TRUNCATED:
-                truncated.add(name)
-            elif not own or entry.t_s > own[-1].t_s:
-                own.append(entry)
-        elif isinstance(item, Metadata) and item.name == topics.METADATA:
-            offset_s = _offset(item.table)
-        elif isinstance(item, Attachment) and item.name == topics.CONFIG:
-            profiles = _profiles(item.data)
-    if not entries:
+    found = {name: each for name, each in found.items() if each.rows or each.truncated}
+    if head is None or config is None or not found:
         raise StorageError(f"{path}: no samples of an IMU in it")
+    profiles = {imu.name: imu.profile for imu in config.imu}
+    offset_s = head.offset_ns / 1e9
     logs = []
-    for name, own in entries.items():
-        t_s = np.array([entry.t_s for entry in own], dtype=np.float64)
-        rows = np.array([(*entry.gyro_rad_s, *entry.accel_m_s2) for entry in own], dtype=np.float64).reshape(-1, 6)
-        temperatures = [math.nan if entry.temperature_degc is None else entry.temperature_degc for entry in own]
+    for name, columns in found.items():
+        table = np.frombuffer(columns.rows, dtype=np.float64).reshape(-1, 8)
         logs.append(
             StillLog(
                 imu=name,
                 files=(path.name,),
-                began_unix_s=None if offset_s is None or not own else own[0].t_s + offset_s,
-                t_s=t_s,
-                readings=rows,
-                temperature_degc=np.array(temperatures, dtype=np.float64),
+                began_unix_s=float(table[0, 0]) + offset_s if len(table) else None,
+                t_s=table[:, 0].copy(),
+                readings=table[:, 1:7].copy(),
+                temperature_degc=table[:, 7].copy(),
                 profile=profiles.get(name),
-                truncated=name in truncated and not own,
+                truncated=columns.truncated and not len(table),
                 clock_offset_s=offset_s,
-                breaks_s=tuple(breaks),
+                breaks_s=tuple(columns.breaks_s),
             )
         )
     return logs
 
 
-def _offset(table: dict[str, str]) -> float | None:
-    try:
-        return float(table["unix_s"]) - float(table["t_s"])
-    except (KeyError, ValueError):
-        return None
-
-
-def _profiles(data: bytes) -> dict[str, str | Noise | None]:
-    """By IMU; a configuration of another version only costs the comparison."""
-    try:
-        config = msgspec.json.decode(data, type=Config)
-    except msgspec.MsgspecError:
-        return {}
-    return {imu.name: imu.profile for imu in config.imu}
+def _add(playback: Playback, message: Message, found: dict[str, _Columns]) -> None:
+    """Take the samples of a message; readings behind another state cannot be compared with those before."""
+    if message.topic == messages.START:
+        playback.begin()
+    if not playback.wants(message.topic):
+        return
+    for role, part in playback.take(message.topic, message.data, message.t_s):
+        if isinstance(part, ImuSample):
+            state = playback.state(role.name)
+            columns = found[role.name]
+            if state is not None and state.input.truncates:
+                columns.truncated = True
+            else:
+                columns.add(part)
+    if message.topic.startswith(messages.IMU):
+        found[message.topic.removeprefix(messages.IMU)].breaks_s.append(message.t_s)
 
 
 def _joined(logs: Iterable[StillLog]) -> list[StillLog]:

@@ -15,8 +15,7 @@ from companion.calibration.request import What
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from companion.daemon.stands.align_steps import Plan
-from companion.recording.walk import Recording
-from companion.replay.engine import Replay
+from companion.replay.engine import replay
 from sim.aircraft import Pose
 from sim.ardupilot.double import offset_names
 from sim.devices import HMR3300, Gradienter
@@ -290,6 +289,6 @@ def test_a_recording_replays_with_the_zero_that_was_in_force(tmp_path: Path) -> 
 
     run_virtual(main())
     paths = sorted((tmp_path / "recordings").glob("0*.mcap"))
-    (found,) = [each for path in paths for each in Replay(Recording(path)).run().calibrations]
+    (found,) = replay(paths).calibrations
     assert found.record.alignment is not None
     assert found.differences == []

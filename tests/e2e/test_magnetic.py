@@ -120,3 +120,24 @@ def test_a_magnet_of_the_aircraft_is_bounded_warned_of_and_widens_the_gyros(tmp_
         assert min(together["magnet"], together["car"]) > 1.5 * together["clean"]
 
     run_virtual(main())
+
+
+def test_a_recording_of_a_field_heading_replays_to_the_same_record(tmp_path: Path) -> None:
+    pytest.importorskip("mcap", reason="recordings need the extra")
+    from companion.replay.engine import replay
+
+    records: list[Record] = []
+
+    async def main() -> None:
+        async with MagneticRig(tmp_path, recordings_mb=16).running() as rig:
+            records.append(await measured(rig))
+            await asyncio.sleep(3.0)
+
+    run_virtual(main())
+    files = sorted((tmp_path / "recordings").glob("*.mcap"))
+    assert files
+    (one,) = replay(files).calibrations
+    assert one.not_recomputed is None
+    assert one.differences == []
+    assert one.record.magnetic == records[0].magnetic
+    assert one.record.magnetic is not None

@@ -18,20 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.solution.site import Whereabouts
-from companion.calibration.turning.watch import Turn
 from companion.config import parse
 from companion.config.sections import Config
-from companion.configured import models
-from companion.recording import journal, topics
-from companion.recording.files import Beginning, RecordingFile, versions
-from companion.recording.journal import Entry, Journal, Means
-from companion.recording.past import Past
-from companion.samples import ImuSample
+from companion.recording import messages
+from companion.recording.files import Beginning, RecordingFile
+from companion.recording.messages import Message
 
 Floats = NDArray[np.float64]
 
 START_S: Final = 5000.25
-UNIX_S: Final = 1.8e9
+OFFSET_NS: Final = 1_800_000_000 * 10**9
 GYRO_BIAS: Final = (0.0008, -0.0005, 0.0003)
 """rad/s, of every IMU."""
 ACCEL: Final = (0.85, 0.47, -9.74)
@@ -90,8 +86,8 @@ def vectornav_frames(device_s: Floats, rows: Floats, temperature_degc: float = 2
     return frames
 
 
-def _imu(name: str, seconds: float, rate_hz: float, read_s: float, seed: int) -> Iterator[Entry]:
-    """A serial IMU: what each read brought, and the samples that came of it."""
+def _imu(name: str, seconds: float, rate_hz: float, read_s: float, seed: int) -> Iterator[Message]:
+    """Give what each read of a serial IMU brought."""
     rng = np.random.default_rng(seed + 100)
     device_s, rows = readings(seconds, rate_hz, seed)
     device_s = device_s + 12.0
@@ -101,55 +97,30 @@ def _imu(name: str, seconds: float, rate_hz: float, read_s: float, seed: int) ->
         # An adapter that hands over every so often.
         came_s = np.ceil(came_s / read_s) * read_s
     came_s = came_s + rng.exponential(1e-4, len(came_s)) * (read_s == 0.0)
-    came_s = np.maximum.accumulate(came_s)
-    start, count = 0, len(frames)
-    times, devices, values = came_s.tolist(), device_s.tolist(), rows.tolist()
-    while start < count:
-        t_s, end = times[start], start + 1
-        while end < count and times[end] == t_s:
-            end += 1
-        yield topics.SERIAL + name, t_s, msgspec.json.encode, (topics.RawBytes(t_s, b"".join(frames[start:end])),)
-        for k in range(start, end):
-            gx, gy, gz, ax, ay, az = values[k]
-            sample = ImuSample(t_s, (gx, gy, gz), (ax, ay, az), 25.0, None, devices[k])
-            yield topics.IMU + name, t_s, topics.imu_json, (sample, None)
-        start = end
+    times = np.maximum.accumulate(came_s).tolist()
+    for t_s, some in itertools.groupby(zip(times, frames, strict=True), key=lambda each: each[0]):
+        yield messages.SERIAL + name, t_s, b"".join(frame for _, frame in some)
 
 
-def _gradienter(seconds: float) -> Iterator[Entry]:
+def _gradienter(seconds: float) -> Iterator[Message]:
     rng = np.random.default_rng(7)
     for k in range(round(seconds * 10.0)):
-        t_s = START_S + 0.05 + 0.1 * k
         x, y = -3.0 + rng.normal(0.0, 0.002), 5.0 + rng.normal(0.0, 0.002)
-        yield (
-            topics.SERIAL + "gradienter",
-            t_s,
-            msgspec.json.encode,
-            (topics.RawBytes(t_s, f"X={x:+07.3f}\r\nY={y:+07.3f}\r\n".encode()),),
-        )
-        yield topics.GRADIENTER, t_s, msgspec.json.encode, (topics.TiltEntry(t_s, x, y),)
+        line = f"X={x:+07.3f}\r\nY={y:+07.3f}\r\n".encode()
+        yield messages.SERIAL + "gradienter", START_S + 0.05 + 0.1 * k, line
 
 
-def _compass(seconds: float) -> Iterator[Entry]:
+def _compass(seconds: float) -> Iterator[Message]:
     rng = np.random.default_rng(8)
     for k in range(round(seconds * 8.0)):
-        t_s = START_S + 0.07 + 0.125 * k
-        heading = 40.0 + rng.normal(0.0, 0.2)
-        yield (
-            topics.SERIAL + "compass",
-            t_s,
-            msgspec.json.encode,
-            (topics.RawBytes(t_s, f"{heading:.1f}, 5.0, -3.0\r\n".encode()),),
-        )
-        yield topics.COMPASS, t_s, msgspec.json.encode, (topics.CompassEntry(t_s, heading, 5.0, -3.0),)
+        line = f"{40.0 + rng.normal(0.0, 0.2):.1f}, 5.0, -3.0\r\n".encode()
+        yield messages.SERIAL + "compass", START_S + 0.07 + 0.125 * k, line
 
 
-def _ticks(seconds: float) -> Iterator[Entry]:
-    """Once a second the seconds before end, and means are taken."""
+def _ticks(seconds: float) -> Iterator[Message]:
+    """Give one a second, which ends the seconds before."""
     for k in range(1, int(seconds)):
-        t_s = START_S + k + 0.4
-        yield topics.JOURNAL, t_s, journal._event, (t_s, "tick", None)
-        yield topics.JOURNAL, t_s, journal._event, (t_s, "window", Means(k, None, {}, Turn()))
+        yield messages.TICK, START_S + k + 0.4, b""
 
 
 def write_recording(path: Path, *, seconds: float, rate_hz: float = 1000.0, imus: int = 1, read_s: float = 0.0) -> int:
@@ -163,13 +134,9 @@ def write_recording(path: Path, *, seconds: float, rate_hz: float = 1000.0, imus
         read_s: the reads of the IMUs' ports come so far apart; 0: one a frame.
     """
     names = [f"imu{k}" for k in range(imus)]
-    settings = config(names)
-    begin_s, past = START_S - 0.01, Past(60.0, ())
-    first = Journal()
-    for imu in settings.imu:
-        first.set_in_force(begin_s, "imu", models.imu_input(imu, None))
-    first.set_in_force(begin_s, "place", Whereabouts(40.0, 116.0, 50.0, "config", None))
-    first.begin(begin_s)
+    begin_s = START_S - 0.01
+    place = messages.encode(Whereabouts(40.0, 116.0, 50.0, "config", None))
+    beginning = Beginning(begin_s, OFFSET_NS, msgspec.json.encode(config(names)), [(messages.PLACE, begin_s, place)])
     file = RecordingFile(path)
     streams = [
         *(_imu(name, seconds, rate_hz, read_s, seed) for seed, name in enumerate(names)),
@@ -177,11 +144,8 @@ def write_recording(path: Path, *, seconds: float, rate_hz: float = 1000.0, imus
         _compass(seconds),
         _ticks(seconds),
     ]
-    beginning = Beginning(begin_s, UNIX_S, versions(), msgspec.json.encode(settings), past)
-    file.write(past.messages(first.drain()), beginning)
-    entries = heapq.merge(*streams, key=lambda entry: entry[1])
-    for _, second in itertools.groupby(entries, key=lambda entry: int(entry[1])):
-        file.write(past.messages(list(second)), beginning)
+    for _, second in itertools.groupby(heapq.merge(*streams, key=lambda each: each[1]), key=lambda each: int(each[1])):
+        file.write(list(second), beginning)
     file.close()
     return imus * round(seconds * rate_hz)
 

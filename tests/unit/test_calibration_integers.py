@@ -14,7 +14,7 @@ from companion.calibration.means.windows import ImuEstimate, ImuInput, imu_estim
 from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.seconds.batch import MAX_LEVELS, Batch, BatchSource
 from companion.physics.units import DEG_H, MG
-from companion.recording.journal import encode
+from companion.recording.messages import encode
 from tests.support.still_aircraft import QUIET, imu, settings
 
 Floats = NDArray[np.float64]

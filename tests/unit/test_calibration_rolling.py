@@ -14,7 +14,7 @@ from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.noise.allan import AllanModel, NoiseProfile
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG, DEG_H, MG
-from companion.recording.journal import encode
+from companion.recording.messages import encode
 from companion.samples import ImuSample, TiltSample
 from tests.support.still_aircraft import (
     BIAS,

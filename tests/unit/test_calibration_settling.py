@@ -24,7 +24,7 @@ from companion.configured.models import compass_model, gradienter_model
 from companion.errors import CalibrationRefusedError
 from companion.physics.gradienter import attitude_from_readings
 from companion.protocols.registry import PROTOCOLS
-from companion.recording.journal import encode
+from companion.recording.messages import encode
 from companion.samples import ImuSample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter, VectorNavBinary

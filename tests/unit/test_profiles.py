@@ -10,23 +10,24 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.telemetry.imu_messages import ARDUPILOT
 from companion.calibration.noise.allan import PROFILES, AllanModel, noise_profile
 from companion.cli import main as companion
 from companion.config import parse
 from companion.config.sections import Config, Noise
+from companion.configured import models
 from companion.configured.profiles import Profiles
 from companion.errors import ConfigError, StorageError
-from companion.recording import journal, topics
-from companion.recording.files import Beginning, RecordingFile, versions
-from companion.recording.journal import Entry
-from companion.recording.past import Past
+from companion.recording.files import Beginning, RecordingFile
+from companion.recording.messages import IMU, MAVLINK, ImuState, Message, encode
 from companion.replay.log_files import read_logs
-from companion.samples import ImuSample
 from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, check_name, saved_profile
 from companion.storage.state import MOST_BYTES, sealed, unsealed
 from sim.__main__ import main as simulator
 from tests.support.made_noise import DEG_H, adis16405, write_csv
+from tests.unit.test_daemon_plan import CALIBRATION
 
 GYRO = AllanModel(7e-5, 2e-5, 1e-6)
 ACCEL = AllanModel(5e-4, 2e-4, 1e-5)
@@ -380,27 +381,42 @@ def recording(
     path: Path,
     t_s: list[float],
     imu: str,
-    message: str | None,
+    message: str = "HIGHRES_IMU",
     unix_s: float = 1.7e9,
     written_s: float | None = None,
 ) -> Path:
     """A recording of noise; at `written_s` the daemon wrote offsets, which moved the gyros by 100 deg/h."""
     config = parse(SMALLEST.format("bmi088"), "x.toml")
-    past = Past(60.0, (imu,))
-    begin = Beginning(t_s[0], unix_s + t_s[0], versions(), msgspec.json.encode(config), past)
-    rng = np.random.default_rng(1)
-    entries: list[Entry] = []
+    (instance, kind) = next(
+        (instance, each.kind) for instance, all_ in ARDUPILOT.items() for each in all_ if each.kind.message == message
+    )
+    state = ImuState(
+        sender=(1, 1),
+        firmware="ardupilot",
+        instance=instance,
+        message=message,
+        input=models.imu_input(config.imu[0], kind),
+        calibration=CALIBRATION,
+    )
+    rng, sender = np.random.default_rng(1), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    entries: list[Message] = []
     for t in t_s:
         gyro, accel = rng.normal(0.0, 1e-3, 3).tolist(), (rng.normal(0.0, 0.02, 3) - [0.0, 0.0, 9.8]).tolist()
         if written_s is not None and t >= written_s:
             gyro[1] += 100.0 * DEG_H
-        if t == written_s:
-            event = topics.JournalEntry(t, "reset", journal.encode(("offsets written", None)))
-            entries.append((topics.JOURNAL, t, msgspec.json.encode, (event,)))
-        sample = ImuSample(t, tuple(gyro), tuple(accel), 25.0)
-        entries.append((topics.IMU + imu, t, topics.imu_json, (sample, message)))
+        if t in {t_s[0], written_s}:
+            entries.append((IMU + imu, t, encode(state)))
+        device_s = t - 90.0
+        degc = mavlink.MAVLink_scaled_imu_message(round(device_s * 1e3), 0, 0, -1000, 0, 0, 0, 0, 0, 0, 2500)
+        (ax, ay, az), (gx, gy, gz) = accel, gyro
+        floats = mavlink.MAVLink_highres_imu_message(
+            round(device_s * 1e6), ax, ay, az, gx, gy, gz, 0, 0, 0, 0, 0, 0, 0, fields_updated=63
+        )
+        second = mavlink.MAVLink_scaled_imu2_message(round(device_s * 1e3), 0, 0, -1000, 0, 0, 0, 0, 0, 0, 2500)
+        data = b"".join(bytes(each.pack(sender)) for each in (degc, floats, second))
+        entries.append((MAVLINK, t, data))
     file = RecordingFile(path)
-    file.write(past.messages(entries), begin)
+    file.write(entries, Beginning(t_s[0] if t_s else 0.0, round(unix_s * 1e9), msgspec.json.encode(config), ()))
     file.close()
     return path
 
@@ -424,7 +440,7 @@ def test_recordings_that_follow_on_each_other_are_one_session(tmp_path: Path) ->
 def test_a_recording_is_learned_from_and_compared_with_its_own_profile(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = recording(tmp_path / "1.mcap", seconds(100, 180), "fc", None)
+    path = recording(tmp_path / "1.mcap", seconds(100, 180), "fc")
     code, answer, _ = run(capsys, path)
     assert code == 0
     (imu,) = answer["imus"]
@@ -436,8 +452,8 @@ def test_a_recording_is_learned_from_and_compared_with_its_own_profile(
 
 
 def test_written_offsets_are_no_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A step of 100 deg/h would be flicker of that size; where it was is in the journal."""
-    path = recording(tmp_path / "1.mcap", seconds(100, 1300), "fc", None, written_s=700.0)
+    """A step of 100 deg/h would be flicker of that size; where it was is in the recording."""
+    path = recording(tmp_path / "1.mcap", seconds(100, 1300), "fc", written_s=700.0)
     (log,) = read_logs([path])
     assert [(log.t_s[part][0], log.t_s[part][-1]) for part in log.pieces()] == [(100.0, 699.875), (700.0, 1299.875)]
     assert [(log.t_s[part][0], log.t_s[part][-1]) for part in log.pieces(650.0)] == [(750.0, 1299.875)]
@@ -458,8 +474,7 @@ def test_whole_thousandths_are_refused(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_a_recording_without_an_imu_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "none.mcap"
-    path.write_bytes(b"\x89MCAP0\r\n")
+    path = recording(tmp_path / "none.mcap", [], "fc")
     code, _, err = run(capsys, path)
     assert code == 1
     assert "no samples of an IMU in it" in err

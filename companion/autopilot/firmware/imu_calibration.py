@@ -240,6 +240,15 @@ class ImuCalibration:
         change = self.thermal.taken_off(then_degc)[half] - self.thermal.taken_off(degc)[half]
         return self.orientation @ (change if triad == "gyro" else np.asarray(self.accel_scale) * change)
 
+    def corrects_like(self, other: ImuCalibration) -> bool:
+        """Whether both correct the same sensors alike."""
+        return (
+            self.corrections == other.corrections
+            and self.thermal == other.thermal
+            and (self.gyro_id, self.accel_id) == (other.gyro_id, other.accel_id)
+            and np.array_equal(self.orientation, other.orientation)
+        )
+
     def contradicts(self, values: Mapping[str, float]) -> bool:
         """Whether one of these parameters corrects this IMU and has another value there."""
         known = {**self.corrections, **self.thermal.values}

@@ -21,9 +21,10 @@ from typing import Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.telemetry.imu_messages import Reading
+from companion.autopilot.telemetry.imu_samples import EkfBiasReading
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink
+from companion.links.system.listeners import Listeners
 from companion.links.system.waiting import comes
 
 logger = logging.getLogger(__name__)
@@ -48,8 +49,6 @@ _JUMP: Final = 0.5 * _UNITS
 """From one look to the next: 100 deg/h, 0.5 mg."""
 _STEADY: Final = 0.02 * _UNITS
 """Within a second, before it is used: 4 deg/h, 0.02 mg."""
-_WALK: Final = np.repeat([2.4e-6, 3e-5], 3)
-"""In a second, at rest: 0.5 deg/h, 3 micro-g (seen on the real one: 0.2 to 0.5 deg/h)."""
 
 _LONGEST: Final = 8192
 _PROMPT: Final = re.compile("(nsh|pxh)> ")
@@ -76,6 +75,10 @@ class EkfBias:
         """The IMU (1..) that HIGHRES_IMU shows; None while its bias is not known."""
         self.settled = asyncio.Event()
         """Set once the bias is known, or the first answer did not tell it."""
+        self.reading: EkfBiasReading | None = None
+        """Latest reading; `known_of` says whether it may be used."""
+        self.on_read: Listeners[EkfBiasReading] = Listeners()
+        """Notified of every reading."""
         self._link, self._vehicle = link, vehicle
         self._held, self._misses = 0, 0
         self._text, self._asked, self._number = "", "", -1
@@ -85,24 +88,14 @@ class EkfBias:
         """IMUs (1..) by the device ids of accelerometer and gyro."""
         self._primary: int | None = None
         self._at_bias = False
-        self._bias, self._variance, self._read_s = np.full(6, np.nan), np.zeros(6), -math.inf
 
     def known_of(self, instance: int) -> bool:
-        """Whether HIGHRES_IMU shows this IMU (1..) and `restored` gives its readings."""
+        """Whether HIGHRES_IMU shows this IMU (1..) and `reading` restores its readings."""
         return self.instance == instance and not self._age_s > _OLD_S
-
-    def restored(self, reading: Reading) -> tuple[Reading, tuple[float, ...]]:
-        """A HIGHRES_IMU as it was before the bias was taken off, and the variances of that bias (6), SI units."""
-        values = (np.array(reading.gyro_rad_s + reading.accel_m_s2) + self._bias).tolist()
-        row = [float(f"{value:.9g}") for value in values]  # as a recording keeps them
-        variance = self._variance + np.square(_WALK) * self._age_s
-        gyro, accel = (row[0], row[1], row[2]), (row[3], row[4], row[5])
-        return Reading(reading.t_device_s, gyro, accel, None), tuple(variance.tolist())
 
     def forget(self) -> None:
         """Start anew."""
-        self.instance = self._primary = None
-        self._bias = np.full(6, np.nan)
+        self.instance = self._primary = self.reading = None
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
@@ -140,7 +133,7 @@ class EkfBias:
 
     @property
     def _age_s(self) -> float:
-        return asyncio.get_running_loop().time() - self._read_s
+        return math.inf if self.reading is None else asyncio.get_running_loop().time() - self.reading.read_s
 
     async def _look(self) -> float:
         """Read once; seconds to the next look."""
@@ -187,12 +180,14 @@ class EkfBias:
         texts = found.groups()[1:4] + found.groups()[5:8]
         steps = np.array([10.0 ** -len(text.partition(".")[2]) for text in texts])
         bias = np.array([float(text) for text in texts])
-        moved = np.abs(bias - self._bias)
+        moved = np.abs(bias - (np.full(6, np.nan) if self.reading is None else self.reading.bias))
         most = _STEADY if self.instance is None else _JUMP
         steady = bool((moved <= np.maximum(most, 1.5 * steps)).all())
-        self._bias, self._read_s = bias, asyncio.get_running_loop().time()
-        self._variance = np.square(steps) / 12.0 + np.square(moved) / 4.0
+        variance = np.square(steps) / 12.0 + np.square(moved) / 4.0
+        now_s = asyncio.get_running_loop().time()
+        self.reading = EkfBiasReading(tuple(bias.tolist()), tuple(variance.tolist()), now_s)
         self.instance = instance if steady and not self._held else None
+        self.on_read.tell(self.reading)
 
     async def _print(self, topic: str, pattern: re.Pattern[str], *which: str) -> re.Match[str] | None:
         """Have the console print what is published; None: it did not in time, or something else."""

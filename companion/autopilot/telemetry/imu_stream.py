@@ -17,7 +17,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.telemetry import imu_messages
 from companion.autopilot.telemetry.ekf_bias import EkfBias
-from companion.autopilot.telemetry.imu_messages import ImuMessage, Reading, StreamKind
+from companion.autopilot.telemetry.imu_messages import ImuMessage, StreamKind
+from companion.autopilot.telemetry.imu_samples import TEMPERATURE_AGE_S, ImuSamples
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.system.waiting import comes
@@ -49,7 +50,6 @@ _BESIDE_CONSOLE: Final = 0.85
 _TEMPERATURE_RATE_HZ: Final = 2.0
 _SEEN_BY_RATE_HZ: Final = 4.0
 """Of PX4's integers beside its floats: a write looks who is there for 0.4 s (`daemon.offsets.px4_writes`)."""
-_TEMPERATURE_AGE_S: Final = 5.0
 _ABSENT_AFTER: Final = 10
 """Readings of nothing but zeros in a row, and there is no such IMU."""
 
@@ -66,7 +66,6 @@ class _Source:
     recent: int = 0
     zeros: int = 0
     reason: str = ""
-    device_s: float = -math.inf
 
     @property
     def name(self) -> str:
@@ -116,8 +115,7 @@ class ImuStream:
         self._link = link
         self._sources: list[_Source] = []
         self._current: _Source | None = None
-        self.temperature: tuple[float, float] | None = None
-        """Of the IMU, degC, and when it was told; None: not since the restart."""
+        self._reader = ImuSamples()
         self._restart = asyncio.Event()
         self._arrived = asyncio.Event()
 
@@ -177,7 +175,7 @@ class ImuStream:
         self._sources = [_Source(message, self._rates_hz) for message in messages]
         if messages[0] is imu_messages.PX4_FLOATS and self._rates_hz[0] < SLOWER_RATES_HZ[0]:
             self._sources[0].rates_hz = [_BESIDE_CONSOLE * self._rates_hz[0], *self._rates_hz[1:]]
-        self.temperature = None
+        self._reader = ImuSamples()
         while not self._restart.is_set():
             found = await self._find()
             if found is None:
@@ -254,7 +252,8 @@ class ImuStream:
                 await self._ask_for_temperature(source)
             if now_s - source.last_s < SILENCE_S:
                 silent_asks = 0
-                if self._degc(now_s) is None and now_s - temperature_s > _TEMPERATURE_AGE_S:
+                unknown = self._reader.temperature_degc(now_s) is None
+                if unknown and now_s - temperature_s > TEMPERATURE_AGE_S:
                     temperature_s = now_s
                     await self._ask_for_temperature(source)
                 better_s = await self._ask_for_better(source, better_s)
@@ -303,11 +302,6 @@ class ImuStream:
         """Not while it wants a bias that is not known, or is of another IMU."""
         return source.message is not imu_messages.PX4_FLOATS or self._ekf_bias.known_of(self._instance)
 
-    def _degc(self, now_s: float) -> float | None:
-        """Of the IMU, unless that was told too long ago."""
-        known = self.temperature
-        return None if known is None or now_s - known[1] > _TEMPERATURE_AGE_S else known[0]
-
     async def _pause(self, seconds: float) -> bool:
         """Wait, but not beyond the loss or restart of the autopilot; True when that came."""
         loop = asyncio.get_running_loop()
@@ -343,28 +337,16 @@ class ImuStream:
             source.zeros = min(source.zeros + 1, _ABSENT_AFTER)
             self._arrived.set()
             return
-        if -0.5 < reading.t_device_s - source.device_s <= 0.0:
-            return  # repeated or late
-        source.device_s, source.last_s, source.zeros, source.reason = reading.t_device_s, t_s, 0, ""
+        if not self._reader.accept(source.name, reading, t_s):
+            return
+        source.last_s, source.zeros, source.reason = t_s, 0, ""
         source.recent += 1
         self._arrived.set()
-        if reading.temperature_degc is not None:
-            self.temperature = (reading.temperature_degc, t_s)
         if source is self._current:
-            if source.message is imu_messages.PX4_FLOATS:
-                self._hand_on(*self._ekf_bias.restored(reading), t_s)
-            else:
-                self._hand_on(reading, None, t_s)
-
-    def _hand_on(self, reading: Reading, shared_variance: tuple[float, ...] | None, t_s: float) -> None:
-        self.samples += 1
-        self.problem = ""
-        self._on_sample(
-            ImuSample(
-                t_s, reading.gyro_rad_s, reading.accel_m_s2, self._degc(t_s), None, reading.t_device_s,
-                shared_variance=shared_variance,
-            )
-        )  # fmt: skip
+            self.samples += 1
+            self.problem = ""
+            bias = self._ekf_bias.reading if source.message is imu_messages.PX4_FLOATS else None
+            self._on_sample(self._reader.sample(reading, t_s, bias))
 
     def _lose(self, problem: str) -> None:
         self._switch(None)

@@ -70,6 +70,8 @@ class RollingCollector(Intake):
         self._trace = TraceLog()
         self._restarts = 0
         self._swell = Swell()
+        self.on_second: list[Callable[[], object]] = []
+        """Called when every source has closed a second, from within the call that closed it: they only take note."""
         for imu in imus:
             self.set_imu(imu)
 
@@ -250,9 +252,13 @@ class RollingCollector(Intake):
             # Nobody closed anything for so long that nothing of it is left.
             self._break()
             self._next = last - 1
+        if last < self._next:
+            return
         for slot in range(self._next, last + 1):
             self._judge(slot, sources)
-        self._next = max(self._next, last + 1)
+        self._next = last + 1
+        for notify in tuple(self.on_second):
+            notify()
 
     def _judge(self, slot: int, sources: list[Source]) -> None:
         # Every gate sees every second: one that is skipped learns nothing.

@@ -58,7 +58,7 @@ class Calibrating(Subsystem):
         self.store = RecordStore(config.storage.path)
         self.alignment = AlignmentInForce(config, core.offload)
         self.memory = BiasMemory(core, imus, devices.sensors, self.alignment)
-        measuring = Measuring(core, imus)
+        self.measuring = measuring = Measuring(core, imus)
         self.faces = FacesInForce(core, imus)
         own = OwnAttitude(core.vehicle, wanted=config.compass is None)
         self.solver = Solver(core, self.alignment, self.faces, own)

@@ -12,8 +12,6 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from companion.autopilot.firmware.firmwares import part_of, read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, rivals_of
 from companion.autopilot.firmware.px4 import SlotMemory
@@ -65,6 +63,10 @@ class AutopilotImu:
         """Told of every sample that counts, before the collector: for what must not wait."""
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
         """Told of every reading: what was read before, unless we have written since, and what is in force now."""
+        self.on_change: Listeners[[]] = Listeners()
+        """Notified after `calibration` or `input` has changed."""
+        self.input = models.imu_input(core.profiles.imu(self.name), None)
+        """What the collector knows of its stream."""
         self._slots, self._ekf_bias, self._profiles = slots, ekf_bias, core.profiles
         self._vehicle, self._parameters, self._collector = core.vehicle, core.parameters, core.collector
         self._known: ImuCalibration | None = None
@@ -99,6 +101,7 @@ class AutopilotImu:
         """While we write its offsets ourselves: no samples count, and nobody reads in between."""
         self._ours += 1
         self.calibration = self._known = None
+        self.on_change.tell()
         try:
             with self._ekf_bias.held():
                 yield
@@ -154,7 +157,7 @@ class AutopilotImu:
             self._kind_changed(self.stream.kind)
         self.on_read.tell(known, fresh)
         now_s = asyncio.get_running_loop().time()
-        holds = assumed is not None and same(assumed, fresh)
+        holds = assumed is not None and assumed.corrects_like(fresh)
         if announced is not None and holds:
             words = "%s: %s = %.6g was announced and is not in force"
             logger.warning(words, self.name, announced.name, announced.value)
@@ -166,6 +169,7 @@ class AutopilotImu:
                 self.upsets, self.upset = self.upsets + 1, why
                 self._ekf_bias.step()
             self._collector.reset(why, self.name)
+        self.on_change.tell()
         return holds
 
     def _on_sample(self, sample: ImuSample) -> None:
@@ -177,13 +181,15 @@ class AutopilotImu:
             self._collector.add_imu(self.name, sample)
 
     def _kind_changed(self, kind: StreamKind | None) -> None:
-        message = None if kind is None else kind.message
-        self._collector.set_imu(models.imu_input(self._profiles.imu(self.name), kind, self._grid), message)
+        self.input = models.imu_input(self._profiles.imu(self.name), kind, self._grid)
+        self._collector.set_imu(self.input)
+        self.on_change.tell()
 
     def _invalidate(self, why: str) -> None:
         self.calibration = None
         self.problem = f"reading its offsets again ({why})"
         self._collector.reset(why, self.name)
+        self.on_change.tell()
         self._stale.set()
 
     def _upset(self, why: str) -> None:
@@ -263,13 +269,3 @@ def not_ready(vehicle: Vehicle, imus: Mapping[str, AutopilotImu]) -> str | None:
         if imu.obstacle is not None:
             return f"waiting for imu {imu.name}: {imu.obstacle}"
     return None
-
-
-def same(one: ImuCalibration, other: ImuCalibration) -> bool:
-    """Whether both correct the same sensors alike."""
-    return (
-        one.corrections == other.corrections
-        and one.thermal == other.thermal
-        and (one.gyro_id, one.accel_id) == (other.gyro_id, other.accel_id)
-        and np.array_equal(one.orientation, other.orientation)
-    )

@@ -33,12 +33,12 @@ class Devices(Subsystem):
         self.slots = SlotMemory()
         rate_hz = models.imu_rate_hz(core.config) if imu_rate_hz is None else imu_rate_hz
         imus = [imu for imu in core.config.imu if imu.source == "autopilot"]
-        self._ekf_bias = EkfBias(core.link, core.vehicle)
+        self.ekf_bias = EkfBias(core.link, core.vehicle)
         # On a deck the integers are moved enough, and the console's answers on a slow line would delay readings.
         self._asks = bool(imus) and (rate_hz >= models.IMU_RATE_HZ or core.config.vehicle.platform == "ground")
         if not self._asks:
-            self._ekf_bias.settled.set()
-        self.imus = {imu.name: AutopilotImu(core, imu, self.slots, self._ekf_bias, rate_hz) for imu in imus}
+            self.ekf_bias.settled.set()
+        self.imus = {imu.name: AutopilotImu(core, imu, self.slots, self.ekf_bias, rate_hz) for imu in imus}
         self.sensors = [SerialSensor(device, self._take, core.offload) for device in serial_devices(core.config)]
         self.watch = SensorWatch(self.sensors, core.collector, self._corrected, core.say)
         self.signing = LinkSigning(core.config, core.link, core.vehicle, core.say, core.offload)
@@ -100,7 +100,7 @@ class Devices(Subsystem):
             ("collector", self._core.keep_ticking),
             ("signing", self.signing.run),
             ("reach", self.reach.run),
-            *([("ekf-bias", self._ekf_bias.run)] if self._asks else []),
+            *([("ekf-bias", self.ekf_bias.run)] if self._asks else []),
             *((imu.name, imu.run) for imu in self.imus.values()),
             *(((sensor.name, sensor.run) for sensor in self.sensors) if ports else ()),
             *([("sensor-watch", self.watch.run)] if ports else []),

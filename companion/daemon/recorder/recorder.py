@@ -1,7 +1,8 @@
-"""Keeps the last half hour or so of everything in a ring of files, and records to a file on request.
+"""Keeps the last hour and a half of all inputs in a ring of files, and records to a file on request.
 
-Sensing and MAVLink never wait for it: what happens goes into bounded queues, a thread empties them once a second, and
-a disk that is full, slow or gone costs recordings only.
+It listens to the inputs of a calibration: bytes of the devices and of the link, ticks, the parameters in force, windows
+and records. Sensing and MAVLink never wait for it: messages go into a bounded queue, a thread empties that once a
+second, and a disk that is full, slow or gone costs recordings only.
 """
 
 from __future__ import annotations
@@ -10,20 +11,20 @@ import asyncio
 import dataclasses
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final, TypeVar
 
 import msgspec
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.autopilot.telemetry.imu_samples import EkfBiasReading
 from companion.calibration.means.windows import Window
+from companion.calibration.records.record import to_json
 from companion.calibration.request import What, is_time_limit
 from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.site import Whereabouts
 from companion.component.service import JobResult
-from companion.config.sections import Config
 from companion.configured import models
 from companion.daemon.calibrating.solver import Given
 from companion.daemon.calibrating.subsystem import Calibrating
@@ -34,7 +35,7 @@ from companion.daemon.job import Job
 from companion.errors import StorageError
 from companion.formats import Object
 from companion.links.mavlink.link import Direction
-from companion.recording import topics
+from companion.recording import messages
 from companion.recording.files import (
     Beginning,
     RecordingFile,
@@ -43,59 +44,33 @@ from companion.recording.files import (
     disk_shortage,
     is_available,
     unused_path,
-    versions,
 )
-from companion.recording.journal import Journal, KeyFilter, Offsets, Solved
-from companion.recording.past import Message, Past
+from companion.recording.messages import ImuState, Measured, Message, Solved
+from companion.recording.tape import KeyFilter, Tape
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 FLUSH_S: Final = 1.0
-"""What a power cut costs."""
+"""Interval of writes, and what a power cut costs."""
 RETRY_S: Final = 60.0
 DEFAULT_MB: Final = 64
-"""Default size of the ring: some 35 minutes of a 200 Hz IMU beside 100 Hz telemetry."""
+"""Default size of the ring: some 100 minutes of a 200 Hz IMU beside 100 Hz telemetry."""
 MOST_FILE_BYTES: Final = 4 << 30
 """Size at which a recording of a stated length ends: no more fits into a file on many USB sticks."""
 MOST_OPEN_END_BYTES: Final = 1 << 30
-"""Size at which a recording without a stated length ends: nine hours of a 200 Hz IMU beside 100 Hz telemetry."""
+"""Size at which a recording without a stated length ends: 27 hours of a 200 Hz IMU beside 100 Hz telemetry."""
 PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
-"""How long the daemon's end waits for the disk at most."""
+"""The longest that the daemon's end waits for the disk."""
 INTERNAL: Final = "internal error; the log has the details"
 HOW_TO_INSTALL: Final = (
     "recording needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
 )
 
 
-class Surroundings:
-    """What a replay needs to know of the world, and the raw bytes do not say in one place."""
-
-    def __init__(self, config: Config, vehicle: Vehicle, imus: Iterable[AutopilotImu], journal: Journal) -> None:
-        self._journal = journal
-        self._config, self._vehicle, self._imus = config, vehicle, {imu.name: imu for imu in imus}
-        self._seen: dict[str, ImuCalibration | None] = dict.fromkeys(self._imus)
-        self._where: Whereabouts | None = None
-
-    def read_offsets(self) -> Offsets:
-        """What the autopilot takes off each of its IMUs; None where that is not known."""
-        return {name: imu.calibration for name, imu in self._imus.items()}
-
-    def update(self, now_s: float) -> None:
-        """Note what has changed."""
-        offsets = self.read_offsets()
-        if any(offsets[name] is not before for name, before in self._seen.items()):
-            self._seen = offsets
-            self._journal.set_in_force(now_s, "offsets", offsets)
-        where = models.whereabouts(self._config, self._vehicle)
-        if self._where is None or _coarse(where) != _coarse(self._where):
-            self._where = where
-            self._journal.set_in_force(now_s, "place", where)
-
-
 def _coarse(where: Whereabouts) -> tuple[object, ...]:
-    """As far as a change of the place matters: a GNSS receiver is never quite still."""
+    """Round a place, so that the noise of a GNSS receiver is no change."""
     degrees = [None if value is None else round(value, 3) for value in (where.latitude_deg, where.longitude_deg)]
     return *degrees, None if where.height_m is None else round(where.height_m, -1), where.source, where.date
 
@@ -116,16 +91,15 @@ class _OnRequest:
 
 
 class Recorder(Subsystem):
-    """Taps everything that a replay needs."""
+    """Records the inputs of calibrations."""
 
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating) -> None:
-        config, collector, link = core.config, core.collector, core.link
+        config = core.config
         self.fault: str | None = None
         """Why the ring is not written, in one line; None while all is well."""
-        self._collector, self._journal, self._offload = collector, collector.journal, core.offload
-        self._alignment, self._conductor = calibrating.alignment, calibrating.conductor
-        autopilots = (imu.name for imu in config.imu if imu.source == "autopilot")
-        self._past = Past(models.longest_window_s(config), autopilots)
+        self.tape = Tape()
+        self._core, self._offload, self._conductor = core, core.offload, calibrating.conductor
+        self._alignment = calibrating.alignment
         self._folder = config.storage.path / "recordings"
         megabytes = config.storage.recordings_mb
         self._ring: Ring | None = None
@@ -134,56 +108,88 @@ class Recorder(Subsystem):
         elif megabytes:
             self.fault = HOW_TO_INSTALL
         self._ring_again_s = 0.0
-        self._part_ends = False
-        """What is in the journal now ends its file."""
-        self._taken_s = 0.0
-        """When the journal was emptied last: what came before is the past of a file that begins now."""
+        self._offset_ns: int | None = None
         self._config_json = msgspec.json.encode(config)
         self._on_request: _OnRequest | None = None
         self._flushing = asyncio.Lock()
-        self._around = Surroundings(config, core.vehicle, devices.imus.values(), self._journal)
+        self._where: Whereabouts | None = None
         self._no_keys = KeyFilter()
-        link.on_bytes.add(self._on_mavlink)
+        core.link.on_bytes.add(self._on_mavlink)
+        core.on_tick.add(self._on_tick)
         for sensor in devices.sensors:
             sensor.on_bytes.add(self._on_serial)
+        for imu in devices.imus.values():
+            imu.on_change.add(partial(self._on_imu, imu))
+        devices.ekf_bias.on_read.add(self._on_ekf_bias)
+        calibrating.measuring.on_measured.add(self._on_measured)
         calibrating.solving.on_solved.add(self._on_solved)
         calibrating.conductor.on_ended.add(self._on_ended)
 
-    # --- what happens
+    # --- inputs
 
     def _on_mavlink(self, direction: Direction, data: bytes | None, t_s: float | None) -> None:
-        if direction == "in":
-            if data is None:
-                self._no_keys.restart()
-            else:
-                data = self._no_keys(data)
-        if self._journal.is_on:
-            now_s = asyncio.get_running_loop().time() if t_s is None else t_s
-            self._journal.raw(topics.MAVLINK_IN if direction == "in" else topics.MAVLINK_OUT, now_s, data)
+        if direction == "out":
+            return
+        if data is None:
+            self._no_keys.restart()
+        else:
+            data = self._no_keys(data)
+        if self.tape.is_on:
+            self.tape.put(messages.MAVLINK, _now_s() if t_s is None else t_s, data or b"")
 
     def _on_serial(self, name: str, data: bytes | None, t_s: float) -> None:
-        self._journal.raw(topics.SERIAL + name, t_s, data)
+        self.tape.put(messages.SERIAL + name, t_s, data or b"")
+
+    def _on_tick(self, now_s: float) -> None:
+        self.tape.put(messages.TICK, now_s, b"")
+
+    def _on_imu(self, imu: AutopilotImu) -> None:
+        vehicle, kind = self._core.vehicle, imu.stream.kind
+        state = ImuState(
+            sender=(vehicle.system_id or 0, vehicle.component_id),
+            firmware=vehicle.firmware,
+            instance=imu.instance,
+            message=None if kind is None else kind.message,
+            input=imu.input,
+            calibration=imu.calibration,
+        )
+        self.tape.put_state(messages.IMU + imu.name, _now_s(), messages.encode(state))
+
+    def _on_ekf_bias(self, reading: EkfBiasReading) -> None:
+        self.tape.put_state(messages.EKF_BIAS, _now_s(), messages.encode(reading))
+
+    def _on_measured(self, window: Window) -> None:
+        collector = self._core.collector
+        measured = Measured(
+            start_s=window.start_s,
+            end_s=window.end_s,
+            wander_deg=collector.wander_deg,
+            begun_s=collector.begun_s,
+            turn=collector.turn,
+        )
+        self.tape.put(messages.MEASURED, _now_s(), messages.encode(measured))
 
     def _on_solved(self, measured: Window, refined: Window, given: Given, what: What, expectation: Expectation) -> None:
-        """A calibration's biases have been worked out; what from, besides the readings."""
         used = self._alignment.used
         solved = Solved(
-            window=self._collector.number_of(measured),
-            refined=refined if refined is not measured else None,
             where=given.where,
-            otherwise=given.otherwise,
             what=what.name,
-            offsets=self._around.read_offsets(),
             alignment=None if used is None else (*used.offset_deg, used.sigma_deg),
+            otherwise=given.otherwise,
             expectation=expectation,
+            dithered=refined is not measured,
         )
-        self._journal.event(asyncio.get_running_loop().time(), "solved", solved)
+        self.tape.put(messages.SOLVED, _now_s(), messages.encode(solved))
 
     def _on_ended(self, job: Job, _result: JobResult) -> None:
-        if job.record is None or not job.record.is_worth_keeping:
-            return
-        self._journal.record(job.record, asyncio.get_running_loop().time())
-        self._part_ends = True
+        if job.record is not None and job.record.is_worth_keeping:
+            self.tape.put(messages.RECORD, _now_s(), to_json(job.record))
+
+    def _note_place(self) -> None:
+        where = models.whereabouts(self._core.config, self._core.vehicle)
+        if self._where is None or _coarse(where) != _coarse(self._where):
+            self._where = where
+            self.tape.put_state(messages.PLACE, _now_s(), messages.encode(where))
 
     # --- to the disk
 
@@ -201,7 +207,7 @@ class Recorder(Subsystem):
                     self.fault = INTERNAL
                     if self._on_request is not None:
                         await self._end(self._on_request, self.fault, state="failed")
-                    self._journal.end()
+                    self.tape.end()
                     await asyncio.Event().wait()
         finally:
             await self._flush()
@@ -214,46 +220,41 @@ class Recorder(Subsystem):
                     logger.warning("recordings: %s", error)
 
     async def _turn(self) -> None:
-        if self._ring is not None and not self._journal.is_on:
+        if self._ring is not None and not self.tape.is_on:
             self._begin()
         await asyncio.sleep(FLUSH_S)
-        if self._journal.is_on:
-            self._around.update(asyncio.get_running_loop().time())
+        if self.tape.is_on:
+            self._note_place()
         await self._flush()
 
     def _begin(self) -> None:
-        now_s = asyncio.get_running_loop().time()
-        self._around.update(now_s)
-        self._journal.begin(now_s)
-        self._taken_s = now_s
+        self._note_place()
+        self.tape.begin(_now_s())
 
     async def _flush(self) -> None:
         async with self._flushing:
-            journal, loop = self._journal, asyncio.get_running_loop()
-            if not journal.is_on:
+            tape, now_s = self.tape, _now_s()
+            if not tape.is_on:
                 return
-            if journal.lost:
-                level = logging.WARNING if journal.lost == journal.lost_in_all else logging.DEBUG  # once is enough
-                logger.log(level, "recordings: the disk is too slow, %d messages lost; begun anew", journal.lost)
+            if self._offset_ns is None:
+                self._offset_ns = time.time_ns() - round(now_s * 1e9)
+            if tape.lost:
+                level = logging.WARNING if tape.lost == tape.lost_in_all else logging.DEBUG  # once is enough
+                logger.log(level, "recordings: the disk is too slow, %d messages lost; begun anew", tape.lost)
                 self._begin()
-            beginning = Beginning(
-                self._taken_s, time.time() - (loop.time() - self._taken_s), versions(), self._config_json, self._past
-            )
-            self._taken_s = loop.time()
-            entries, part_ends, self._part_ends = journal.drain(), self._part_ends, False
-            messages = await self._in_thread(self._past.messages, entries)
-            await self._flush_ring(messages, beginning, part_ends=part_ends)
+            batch = tape.drain(now_s)
+            beginning = Beginning(batch.since_s, self._offset_ns, self._config_json, batch.states)
+            await self._flush_ring(batch.messages, beginning)
             if self._on_request is not None:
-                await self._flush_file(self._on_request, messages, beginning)
-            await self._in_thread(self._past.keep, entries, messages, self._taken_s)
+                await self._flush_file(self._on_request, batch.messages, beginning)
 
-    async def _flush_ring(self, messages: list[Message], beginning: Beginning, *, part_ends: bool) -> None:
+    async def _flush_ring(self, batch: list[Message], beginning: Beginning) -> None:
         ring = self._ring
-        if ring is None or asyncio.get_running_loop().time() < self._ring_again_s:
+        if ring is None or _now_s() < self._ring_again_s:
             return
         try:
-            await self._in_thread(ring.write, messages, beginning)
-            if part_ends or (ring.is_full and not self._conductor.state.busy):
+            await self._in_thread(ring.write, batch, beginning)
+            if ring.is_full and not self._conductor.state.busy:
                 await self._in_thread(ring.close)
         except StorageError as error:
             self._stop_ring(str(error))
@@ -281,19 +282,19 @@ class Recorder(Subsystem):
             raise StorageError(INTERNAL) from error
 
     def _stop_ring(self, why: str) -> None:
-        self._ring_again_s = asyncio.get_running_loop().time() + RETRY_S
+        self._ring_again_s = _now_s() + RETRY_S
         # Said once: it may stay so for the whole day.
         logger.log(logging.WARNING if self.fault is None else logging.DEBUG, "recordings: %s", why)
         self.fault = why
 
-    async def _flush_file(self, recording: _OnRequest, messages: list[Message], beginning: Beginning) -> None:
+    async def _flush_file(self, recording: _OnRequest, batch: list[Message], beginning: Beginning) -> None:
         try:
-            await self._in_thread(recording.file.write, messages, beginning)
+            await self._in_thread(recording.file.write, batch, beginning)
             shortage = await self._in_thread(disk_shortage, recording.file.path.parent)
         except StorageError as error:
             await self._end(recording, str(error), state="failed")
             return
-        if recording.until_s is not None and asyncio.get_running_loop().time() >= recording.until_s:
+        if recording.until_s is not None and _now_s() >= recording.until_s:
             await self._end(recording, "recorded as long as was asked for")
             return
         state = "done" if recording.until_s is None else "failed"
@@ -324,7 +325,7 @@ class Recorder(Subsystem):
         recording = await self._start(name, seconds)
         most = f"; ends at {recording.most_bytes >> 30} GB" if seconds is None else ""
         while not recording.ended.done():
-            now_s = asyncio.get_running_loop().time() - recording.since_s
+            now_s = _now_s() - recording.since_s
             yield {
                 "kind": "progress",
                 "state": "recording",
@@ -348,8 +349,8 @@ class Recorder(Subsystem):
             raise
         now_s = loop.time()
         until_s = None if seconds is None else now_s + seconds
-        recording = self._on_request = _OnRequest(file, self._journal.lost_in_all, now_s, until_s, loop.create_future())
-        if not self._journal.is_on:
+        recording = self._on_request = _OnRequest(file, self.tape.lost_in_all, now_s, until_s, loop.create_future())
+        if not self.tape.is_on:
             self._begin()
         logger.info("recording to %s", path)
         return recording
@@ -362,13 +363,13 @@ class Recorder(Subsystem):
     async def _end(self, recording: _OnRequest, why: str, state: str = "done") -> None:
         self._on_request = None
         if self._ring is None:
-            self._journal.end()
+            self.tape.end()
         size = recording.file.bytes_written
         try:
             await self._in_thread(recording.file.close)
         except StorageError as error:
             why, state = str(error), "failed"
-        seconds = asyncio.get_running_loop().time() - recording.since_s
+        seconds = _now_s() - recording.since_s
         logger.log(logging.INFO if state == "done" else logging.WARNING, "recording ended: %s", why)
         recording.ended.set_result(
             {
@@ -379,7 +380,7 @@ class Recorder(Subsystem):
                 "bytes": size,
                 "most_bytes": recording.most_bytes,
                 "messages": recording.file.messages,
-                "lost": self._journal.lost_in_all - recording.lost_before,
+                "lost": self.tape.lost_in_all - recording.lost_before,
             }
         )
 
@@ -390,7 +391,7 @@ class Recorder(Subsystem):
         ring, asked = self._ring, self._on_request
         recording: Object = {
             "fault": self.fault,
-            "lost": self._journal.lost_in_all,
+            "lost": self.tape.lost_in_all,
             "ring": None
             if ring is None
             else {"directory": str(ring.folder), "bytes": ring.bytes_in_all, "most_bytes": ring.most_bytes},
@@ -398,9 +399,13 @@ class Recorder(Subsystem):
             if asked is None
             else {
                 "path": str(asked.file.path),
-                "seconds": round(asyncio.get_running_loop().time() - asked.since_s, 1),
+                "seconds": round(_now_s() - asked.since_s, 1),
                 "bytes": asked.file.bytes_written,
-                "lost": self._journal.lost_in_all - asked.lost_before,
+                "lost": self.tape.lost_in_all - asked.lost_before,
             },
         }
         return {"recording": recording}
+
+
+def _now_s() -> float:
+    return asyncio.get_running_loop().time()

@@ -21,6 +21,7 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.job import Job
 from companion.errors import AutopilotError, CalibrationRefusedError
+from companion.links.system.listeners import Listeners
 
 POLL_S: Final = 0.2
 """A complete second is looked at when it is; this is how often for whatever else may change."""
@@ -41,6 +42,8 @@ class Measuring:
         self._upsets: dict[str, int] = {}
         """By IMU, how many there had been before this calibration."""
         self._said, self._said_s = "", -math.inf
+        self.on_measured: Listeners[Window] = Listeners()
+        """Notified of every window, in the moment in which it is taken."""
 
     def begin(self) -> None:
         """A calibration begins, which may measure more than once."""
@@ -85,7 +88,7 @@ class Measuring:
         collector = self._core.collector
         collector.retarget(self._wanted(job.what))
         failures = {name: imu.failures for name, imu in self._imus.items()}
-        stop = collector.seconds.add(job.look_again)
+        collector.on_second.append(job.look_again)
         try:
             while True:
                 status, waiting_for, hold_still_s = await self.read_state(job, "armed; nothing written")
@@ -96,12 +99,14 @@ class Measuring:
                 if waiting_for is None and status.enough:
                     self._machine.on(Event.ENOUGH)
                     job.progress(MEASURED_PERCENT, "working out the biases")
-                    return await self._core.window()
+                    window = await self._core.window()
+                    self.on_measured.tell(window)
+                    return window
                 if waiting_for or status.left:
                     self.tell(job, words, SAY_WAITING_EVERY_S if waiting_for else SAY_LEFT_EVERY_S)
                 await job.pause(POLL_S)
         finally:
-            stop()
+            collector.on_second.remove(job.look_again)
 
     def tell(self, job: Job, words: str, every_s: float = SAY_WAITING_EVERY_S) -> None:
         """Tell whoever has asked what is waited for: news, and not too often."""

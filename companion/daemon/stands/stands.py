@@ -22,7 +22,7 @@ from companion.component.service import JobResult
 from companion.component.statustext import LINE_BYTES, Severity
 from companion.component.tunes import Tune
 from companion.daemon.core import Core
-from companion.daemon.devices.autopilot_imu import AutopilotImu, same
+from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.daemon.stands import align_steps
 from companion.daemon.stands.align_steps import LEVEL, Hold, Plan, Seen
@@ -301,7 +301,7 @@ class Stands:
     def _check_known(self) -> None:
         for name, imu in self._imus.items():
             first, now = self._first.get(name), imu.calibration
-            if first is None or now is None or same(first, now):
+            if first is None or now is None or first.corrects_like(now):
                 continue
             for old, new in ((first.accel_id, now.accel_id), (first.gyro_id, now.gyro_id)):
                 if old != new:

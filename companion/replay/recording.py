@@ -1,0 +1,178 @@
+"""Reads a recording front to back, as far as it goes: a power cut or a broken copy may end it anywhere.
+
+The `mcap` library does the parsing. Lengths are checked before it unpacks anything, since it believes what a file says.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any, Final
+
+import msgspec
+
+from companion.errors import StorageError
+from companion.recording import messages
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+MOST_BYTES: Final = 4 * 1024 * 1024
+"""The most bytes of a record, and of a chunk unpacked; ours have less than one MiB, and 2.3 in a flood of bytes."""
+MOST_TIMES: Final = 100
+"""The most that all chunks together may unpack to, in sizes of the file, beside one chunk; ours reach four."""
+_NEEDS_MORE: Final = (
+    "a recording needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
+)
+
+
+class Message(msgspec.Struct, frozen=True, gc=False):
+    """One message on a topic."""
+
+    topic: str
+    t_s: float
+    """Time on the daemon's clock."""
+    data: bytes
+
+
+class Head(msgspec.Struct, frozen=True):
+    """Versions, clock and configuration; comes before the first message."""
+
+    versions: dict[str, str]
+    offset_ns: int
+    """UTC minus the daemon's clock."""
+    config: bytes
+    """JSON."""
+
+
+class _DamagedError(Exception):
+    """The rest cannot be read; its argument says why."""
+
+
+def is_text(path: Path) -> bool:
+    """Return whether a file is no recording but looks like a log in text.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        head = file.read(len(MAGIC))
+    return bool(head) and not MAGIC.startswith(head) and b"\0" not in head
+
+
+class Recording:
+    """An MCAP file of ours.
+
+    Raises:
+        StorageError: one line: it cannot be read, is empty, or is no MCAP file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.cut_short: str | None = None
+        """After reading: why it ended before its end; None when it is whole."""
+        try:
+            with path.open("rb") as file:
+                head = file.read(len(MAGIC))
+        except OSError as error:
+            raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
+        if not head:
+            raise StorageError(f"{path}: the file is empty")
+        if not MAGIC.startswith(head):
+            raise StorageError(f"{path}: not a recording (MCAP), nor any log that is known")
+
+    def items(self, wanted: Callable[[str], bool] = lambda topic: True) -> Iterator[Head | Message]:
+        """Give the head, then the messages on wanted topics in the order of writing, until the end or a cut.
+
+        Raises:
+            StorageError: one line: another program or another version wrote it.
+        """
+        try:
+            import zstandard
+            from mcap import exceptions, records, stream_reader
+        except ImportError:
+            raise StorageError(_NEEDS_MORE) from None
+        table: dict[str, str] | None = None
+        head: Head | None = None
+        topics: dict[int, str] = {}
+        try:
+            with self.path.open("rb") as file:
+                for record in _records(file, self.path.stat().st_size):
+                    if isinstance(record, records.Metadata) and record.name == messages.METADATA:
+                        table = record.metadata
+                        self._check_format(table)
+                    elif isinstance(record, records.Attachment) and record.name == messages.CONFIG and table:
+                        head = Head(table, int(table["offset_ns"]), record.data)
+                        yield head
+                    elif isinstance(record, records.Channel):
+                        topics.pop(record.id, None)
+                        if wanted(record.topic):
+                            topics[record.id] = record.topic
+                    elif isinstance(record, records.Message) and head is not None and record.channel_id in topics:
+                        t_s = (record.log_time - head.offset_ns) / 1e9
+                        yield Message(topics[record.channel_id], t_s, record.data)
+        except OSError as error:
+            raise StorageError(f"{self.path}: cannot be read: {error.strerror or error}") from None
+        except (exceptions.EndOfFile, exceptions.InvalidMagic, struct.error):
+            self.cut_short = "cut, or damaged near its end"
+        except (
+            _DamagedError, exceptions.McapError, stream_reader.CRCValidationError, zstandard.ZstdError,
+            KeyError, OverflowError, ValueError,
+        ) as error:  # fmt: skip
+            self.cut_short = f"damaged: {' '.join(str(error).split())[:200]}"
+        if head is None:
+            cut = self.cut_short
+            whose = f"{cut}, before anything was recorded" if cut else "an MCAP file, but not a recording of companion"
+            raise StorageError(f"{self.path}: {whose}")
+
+    def _check_format(self, table: dict[str, str]) -> None:
+        if (found := table.get("format")) != messages.FORMAT_VERSION:
+            version = table.get("companion")
+            raise StorageError(
+                f"{self.path}: found recording format {found}; allowed: {messages.FORMAT_VERSION};"
+                f" companion {version}, which wrote it, replays it"
+            )
+
+
+class _Bounded:
+    """A file of which no read is larger than a record may be: the library believes the lengths of texts."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+
+    def read(self, length: int) -> bytes:
+        """Read so many bytes."""
+        if length > MOST_BYTES:
+            raise _DamagedError(f"found {length} bytes in one piece; allowed: {MOST_BYTES}")
+        return self._file.read(length)
+
+
+def _records(file: IO[bytes], size: int) -> Iterator[Any]:
+    """Give all records but chunks, whose records are given in their place."""
+    from mcap.records import Chunk, DataEnd
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    room = MOST_BYTES + MOST_TIMES * size
+    source: Any = _Bounded(file)
+    for record in StreamReader(source, emit_chunks=True, record_size_limit=MOST_BYTES).records:
+        if isinstance(record, Chunk):
+            room -= _checked_size(record)
+            if room < 0:
+                raise _DamagedError(f"unpacks to more than {MOST_TIMES} times its size")
+            yield from breakup_chunk(record, validate_crc=True)
+        elif isinstance(record, DataEnd):
+            return
+        else:
+            yield record
+
+
+def _checked_size(chunk: Any) -> int:
+    """Return how much a chunk unpacks to; the zstd frame reserves what it says of itself, whatever the chunk says."""
+    import zstandard
+
+    size: int = chunk.uncompressed_size
+    if chunk.compression not in ("zstd", ""):
+        raise _DamagedError(f"compressed by {chunk.compression}, which is not read here")
+    inside = zstandard.frame_content_size(chunk.data) if chunk.compression else len(chunk.data)
+    if size > MOST_BYTES or inside > size:
+        raise _DamagedError(f"found {max(size, inside)} bytes in one piece; allowed: {MOST_BYTES}")
+    return size
