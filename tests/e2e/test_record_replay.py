@@ -87,6 +87,9 @@ def same(result: Result, records: list[Record]) -> None:
         for imu, before in zip(each.record.imus, kept.imus, strict=True):
             for name in ("gyro_bias_rad_s", "accel_bias_m_s2"):
                 sigma = getattr(before, name.replace("bias", "sigma_use"))
+                if getattr(before, name) is None:
+                    assert getattr(imu, name) is None
+                    continue
                 off = np.subtract(getattr(imu, name), getattr(before, name)) / sigma
                 assert np.abs(off).max() <= TOLERANCE_SIGMAS
                 assert getattr(imu, name.replace("bias", "sigma_use")) == pytest.approx(sigma, rel=0.01)
@@ -101,9 +104,9 @@ def same(result: Result, records: list[Record]) -> None:
         {"firmware": "ardupilot", "own_imu": True},
         {"firmware": "px4", "seed": 3},
         {"loss": 0.05, "duplicate": 0.05, "own_imu": True, "seed": 4, "feed_s": 0.07},
-        {"law": "euler", "vehicle": "plane", "seed": 5},
+        {"law": "euler", "vehicle": "plane", "seed": 5, "device_rate_hz": 0.8},
     ],
-    ids=["ardupilot", "px4, a saved profile", "a bad link", "plane"],
+    ids=["ardupilot", "px4, a saved profile", "a bad link", "plane, slow sensors"],
 )
 def test_a_replay_gives_the_recorded_biases(tmp_path: Path, options: dict[str, Any]) -> None:
     paths, records = record(tmp_path, min_still_s=5.0, max_s=8.0, **options)
@@ -184,6 +187,22 @@ def test_moved_armed_unplugged_restarted_and_over_several_files(tmp_path: Path) 
         replay([paths[0], *others])
 
 
+def test_a_window_begins_where_the_recorded_one_began_though_arming_is_not_recorded(tmp_path: Path) -> None:
+    async def during(rig: Rig) -> None:
+        # So that it ends long before the window is full.
+        rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=1.0, target_accel_sigma_m_s2=1.0)
+        await asyncio.sleep(12.0)
+        rig.double.arm()
+        await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.ARMED, 5.0)
+        rig.double.disarm()
+        await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.DISARMED, 5.0)
+        result, _ = await calibrated(rig)
+        assert result.outcome == "done", result
+
+    paths, records = record(tmp_path, during, min_still_s=5.0, max_s=30.0)
+    same(replay(paths), records)
+
+
 def test_a_calibration_that_fails_before_anything_is_known_replays_as_it_was(tmp_path: Path) -> None:
     async def during(rig: Rig) -> None:
         rig.unplugged.add("gradienter")
@@ -196,9 +215,10 @@ def test_a_calibration_that_fails_before_anything_is_known_replays_as_it_was(tmp
     assert again.not_recomputed == "it ended before anything was worked out"
 
 
-def test_a_dithered_calibration_is_not_recomputed_and_says_so(tmp_path: Path) -> None:
-    async def main() -> None:
-        rig = second_imu_only(tmp_path, UNDITHERED, dither=True, max_s=10.0)
+@pytest.mark.parametrize("dither", [False, True])
+def test_integers_are_replayed_as_such_but_for_a_dither_which_no_recording_holds(tmp_path: Path, dither: bool) -> None:
+    async def main() -> list[Record]:
+        rig = second_imu_only(tmp_path, UNDITHERED, dither=dither, max_s=10.0)
         storage = msgspec.structs.replace(rig.config.storage, recordings_mb=64)
         rig.config = msgspec.structs.replace(rig.config, storage=storage)
         async with rig.running():
@@ -206,10 +226,15 @@ def test_a_dithered_calibration_is_not_recomputed_and_says_so(tmp_path: Path) ->
             result, _ = await calibrated(rig)
             assert result.outcome == "done", result
             await asyncio.sleep(1.5)
+        return rig.service.calibrating.store.history()
 
-    run_virtual(main())
-    (found,) = replay(ring(tmp_path)).calibrations
-    assert found.not_recomputed == "its means came from an offset dither"
+    (kept,) = run_virtual(main())
+    result = replay(ring(tmp_path))
+    (found,) = result.calibrations
+    if dither:
+        assert found.not_recomputed == "its means came from an offset dither"
+    else:
+        same(result, [kept])
 
 
 def test_without_a_calibration_in_it_a_recording_gives_the_estimate_of_its_end(tmp_path: Path) -> None:
