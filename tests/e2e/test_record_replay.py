@@ -7,6 +7,7 @@ import json
 import logging
 import random
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -703,6 +704,14 @@ def test_the_command_ends_with_0_when_biases_agree_and_with_1_when_they_do_not(
     nudged = rewritten(path, tmp_path / "o.mcap", lambda topic, data: other if topic == messages.RECORD else data)
     assert companion(["replay", str(nudged)]) == 1
     assert "DIFFERENT imus[own].gyro_bias_rad_s[0]: recorded" in capsys.readouterr().out
+
+
+def test_without_the_extra_a_replay_says_what_to_install(
+    usual: tuple[Path, Record], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    assert companion(["replay", str(usual[0])]) == 1
+    assert "a recording needs more than is installed: pip install '.[recording]'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("content", [b"", MAGIC[:3], MAGIC, b"\x7fELF\0\0\0\0"])

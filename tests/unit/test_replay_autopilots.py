@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import resource
 import struct
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -103,6 +104,15 @@ def test_what_px4_flies_by_and_its_sensors_are_imus_of_their_own(
     assert "no IMU 'sensor7' in these files; there are: sensor1, sensor_combined" in capsys.readouterr().err
 
 
+def test_without_the_extra_it_says_what_to_install(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_ulog(tmp_path / "log.ulg", {("sensor_combined", 0): (TIMES, readings(1))})
+    monkeypatch.setitem(sys.modules, "pyulog", None)
+    assert companion(["replay", str(path)]) == 1
+    assert "a log of PX4 needs more than is installed: pip install '.[recording]'" in capsys.readouterr().err
+
+
 def test_every_imu_of_ardupilot_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_dataflash(tmp_path / "00000001.BIN", {0: (TIMES, readings(1)), 1: (TIMES + 1e-4, readings(3))})
     for instance, seed in ((0, 1), (1, 3)):
@@ -188,13 +198,6 @@ def circling() -> bytes:
     return head + said + struct.pack("<Hc", end - 2, b"?") + bytes(5000)
 
 
-def nested() -> bytes:
-    formats = [b"sensor_combined:a[60000] x;", b"a:b[60000] x;", b"b:float[60000] x;"]
-    parts = [ulog_message(b"F", each) for each in formats]
-    added = ulog_message(b"A", struct.pack("<BH", 0, 0) + b"sensor_combined")
-    return b"".join([b"ULog\x01\x12\x35\x01", bytes(8), ulog_message(b"B", bytes(40)), *parts, added, bytes(100)])
-
-
 def without_length() -> bytes:
     def named(number: int, length: int, name: bytes) -> bytes:
         return b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, length, name, b"BBnNZ", b"Type,Length,Name")
@@ -202,11 +205,20 @@ def without_length() -> bytes:
     return named(0x80, 89, b"FMT") + named(0x81, 0, b"IMU") + b"\xa3\x95\x81" + bytes(2000)
 
 
-@pytest.mark.parametrize("data", [circling(), nested(), without_length()], ids=["circling", "nested", "no length"])
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (circling(), "not a readable log of PX4: its messages lead back to where they began"),
+        (without_length(), "no samples of an IMU in it"),
+    ],
+    ids=["circling", "no length"],
+)
 @pytest.mark.usefixtures("little_memory")
-def test_a_log_without_end_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], data: bytes) -> None:
+def test_a_log_without_end_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], data: bytes, words: str
+) -> None:
     path = tmp_path / "log"
     path.write_bytes(data)
     assert companion(["replay", str(path)]) == 1
     said = capsys.readouterr()
-    assert said.err == f"companion: {path}: no samples of an IMU in it\n"
+    assert said.err == f"companion: {path}: {words}\n"
