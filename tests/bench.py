@@ -28,9 +28,9 @@ from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.component.arm_authorisation import ArmAuthoriser
 from companion.daemon.job import Job
+from companion.lab.replay.engine import replay
 from companion.links.mavlink.link import MavlinkLink
 from companion.protocols.registry import Kind
-from companion.replay.engine import replay
 from companion.samples import ImuSample
 from companion.storage.learned import BiasStore, KnownImu
 from tests import bench_attitude, bench_daemon, bench_learning, bench_reading, bench_replay, bench_start

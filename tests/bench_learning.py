@@ -14,9 +14,9 @@ from typing import Final, TypeVar
 import numpy as np
 
 from companion.calibration.noise.allan import noise_profile
-from companion.calibration.profiling.coverage import Kept, coverage
-from companion.calibration.profiling.profile_fit import Rests, fit_profile, rests
-from companion.replay.csv_log import read
+from companion.lab.logs.csv_log import read
+from companion.lab.profiling.coverage import Kept, coverage
+from companion.lab.profiling.profile_fit import Rests, fit_profile, rests
 from tests.support.made_noise import DEG_H, adis16405, write_csv
 
 SECONDS: Final = 10080

@@ -20,11 +20,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from companion.replay.csv_log import read
-from companion.replay.engine import replay
-from companion.replay.estimate import Given, estimate
-from companion.replay.log_files import read_logs
-from companion.replay.recording import Recording
+from companion.lab.logs.csv_log import read
+from companion.lab.logs.log_files import read_logs
+from companion.lab.logs.recording import Recording
+from companion.lab.replay.engine import replay
+from companion.lab.replay.estimate import Given, estimate
 from tests.support.long_recordings import write_log, write_recording
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

@@ -27,7 +27,7 @@ from companion.errors import StorageError
 from companion.physics.units import unit_of
 
 if TYPE_CHECKING:
-    from companion.flight.flight import Knowledge
+    from companion.lab.flight.flight import Knowledge
     from companion.storage.flights import FlightStore
 
 
@@ -48,7 +48,7 @@ def add_commands(add: AddCommand) -> None:
 async def flight(options: argparse.Namespace) -> int:
     """`companion flight`."""
     from companion.calibration.records.flight_evidence import surely_moved
-    from companion.flight.flight import flights, read
+    from companion.lab.flight.flight import flights, read
 
     path = options.file
     known, store = _knowledge(options)
@@ -87,8 +87,8 @@ class _Progress:
 
 def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | None]:
     """What the companion has on disk, and where it keeps flights; None: this user may not look."""
-    from companion.flight.flight import Knowledge
-    from companion.flight.in_force import parameter_file
+    from companion.lab.flight.flight import Knowledge
+    from companion.lab.flight.in_force import parameter_file
     from companion.storage.flights import FlightStore
     from companion.storage.learned import BiasStore
     from companion.storage.records import RecordStore

@@ -283,9 +283,9 @@ async def report(options: argparse.Namespace) -> int:
 
 
 def _make(options: argparse.Namespace, directory: Path) -> tuple[Path | None, list[str]]:
-    from companion.report.calibration_page import calibration_page
-    from companion.report.flight_page import flight_page
-    from companion.report.source import flight, material
+    from companion.lab.report.calibration_page import calibration_page
+    from companion.lab.report.flight_page import flight_page
+    from companion.lab.report.source import flight, material
     from companion.storage.state import write_atomically
 
     now = datetime.datetime.now(tz=datetime.UTC)

@@ -25,9 +25,9 @@ from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
     from companion.calibration.noise.allan import AllanModel, NoiseProfile
-    from companion.calibration.profiling.coverage import Kept
-    from companion.calibration.profiling.profile_fit import AxisFinding, Finding, Rests
-    from companion.replay.log import StillLog
+    from companion.lab.logs.log import StillLog
+    from companion.lab.profiling.coverage import Kept
+    from companion.lab.profiling.profile_fit import AxisFinding, Finding, Rests
 
 LEAST_SHARE: Final = 0.90
 """The least share of minutes within 2 sigma for a profile to be saved."""
@@ -85,8 +85,8 @@ def add_command(add: AddCommand) -> None:
 
 async def profile(options: argparse.Namespace) -> int:
     """`companion profile`."""
-    from companion.replay.log import NAME
-    from companion.replay.log_files import read_logs
+    from companion.lab.logs.log import NAME
+    from companion.lab.logs.log_files import read_logs
     from companion.storage.profiles import ProfileStore, check_name
 
     store = None
@@ -155,8 +155,8 @@ def _learn(
         CalibrationRefusedError: the recordings tell nothing of it.
     """
     from companion.calibration.noise.allan import noise_profile
-    from companion.calibration.profiling.coverage import coverage
-    from companion.calibration.profiling.profile_fit import fit_profile, joined, learn_warm_up, rests
+    from companion.lab.profiling.coverage import coverage
+    from companion.lab.profiling.profile_fit import fit_profile, joined, learn_warm_up, rests
 
     whole = [log for log in logs if not log.truncated]
     if not whole:

@@ -15,7 +15,7 @@ from companion.cli.terminal import AddCommand, conclude, print_lines, seconds
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
-    from companion.replay.engine import Result
+    from companion.lab.replay.engine import Result
 
 MOST_LINES = 20
 """Of differences, for people; --json has them all."""
@@ -52,8 +52,8 @@ async def record(options: argparse.Namespace) -> int:
 
 async def replay(options: argparse.Namespace) -> int:
     """`companion replay`."""
-    from companion.replay.autopilot_logs import reader_of
-    from companion.replay.recording import is_text
+    from companion.lab.logs.autopilot_logs import reader_of
+    from companion.lab.logs.recording import is_text
 
     logs = []
     for file in options.files:
@@ -69,7 +69,7 @@ async def replay(options: argparse.Namespace) -> int:
 
 
 def _replay_recording(options: argparse.Namespace) -> int:
-    from companion.replay import engine
+    from companion.lab.replay import engine
 
     began_s = time.monotonic()
     result = engine.replay(options.files)
@@ -91,7 +91,7 @@ def _replay_recording(options: argparse.Namespace) -> int:
 
 def _lines(result: Result) -> list[str]:
     """For people; the last line is the verdict."""
-    from companion.replay.calibrations import TOLERANCE_SIGMAS
+    from companion.lab.replay.calibrations import TOLERANCE_SIGMAS
 
     lines: list[str] = []
     different = 0

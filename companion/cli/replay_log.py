@@ -15,9 +15,9 @@ from companion.errors import ConfigError, StorageError
 from companion.physics.units import unit_of
 
 if TYPE_CHECKING:
-    from companion.replay.estimate import Given, Used
-    from companion.replay.log import StillLog
-    from companion.replay.windows import Windows
+    from companion.lab.logs.log import StillLog
+    from companion.lab.replay.estimate import Given, Used
+    from companion.lab.replay.windows import Windows
 
 MOST_LINES = 12
 """Of pieces that were not used, for people; --json has them all."""
@@ -90,7 +90,7 @@ def add_table_options(parser: argparse._ActionsContainer) -> None:
 
 def replay(options: argparse.Namespace, file: Path) -> int:
     """The biases that the estimator finds in it."""
-    from companion.replay.estimate import estimate
+    from companion.lab.replay.estimate import estimate
 
     given = _given(options)
     log = _log(options, file)
@@ -108,7 +108,7 @@ def replay(options: argparse.Namespace, file: Path) -> int:
 
 
 def _log(options: argparse.Namespace, file: Path) -> StillLog:
-    from companion.replay.log_files import read_logs
+    from companion.lab.logs.log_files import read_logs
 
     logs = read_logs([file], options.columns, options.rate)
     named = [log for log in logs if options.imu in (None, log.imu)]
@@ -121,7 +121,7 @@ def _log(options: argparse.Namespace, file: Path) -> StillLog:
 
 
 def _given(options: argparse.Namespace) -> Given:
-    from companion.replay.estimate import Given
+    from companion.lab.replay.estimate import Given
     from companion.rotations import ROTATIONS_DEG
     from companion.storage.profiles import given_profile
 
@@ -141,7 +141,7 @@ def _given(options: argparse.Namespace) -> Given:
 
 
 def _windows(options: argparse.Namespace, log: StillLog, given: Given) -> int:
-    from companion.replay.windows import windows
+    from companion.lab.replay.windows import windows
 
     found = windows(log, given, options.windows)
     reason = "" if found.axes else "no two windows in a row that can be calibrated"

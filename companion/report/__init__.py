@@ -1,1 +1,1 @@
-"""Pages about calibrations, each one file that needs nothing else: no network, no scripts, light and dark."""
+"""Building blocks of HTML pages, shared by reports, the live page and the fleet."""

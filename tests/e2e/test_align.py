@@ -15,7 +15,7 @@ from companion.calibration.request import What
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from companion.daemon.stands.align_steps import Plan
-from companion.replay.engine import replay
+from companion.lab.replay.engine import replay
 from sim.aircraft import Pose
 from sim.ardupilot.double import offset_names
 from sim.devices import HMR3300, Gradienter

@@ -17,7 +17,7 @@ from companion.calibration.records.record import Record, Standing
 from companion.cli.show import status_lines
 from companion.daemon.job import Job
 from companion.daemon.offsets import firmware_calibration
-from companion.replay.engine import replay
+from companion.lab.replay.engine import replay
 from companion.storage.learned import BiasStore
 from sim.devices import Gradienter
 from sim.imu_model import DEG_H, MG

@@ -13,7 +13,7 @@ from companion.calibration.deck.estimate import DeckWork
 from companion.calibration.records.record import Record
 from companion.calibration.request import What
 from companion.component.service import Refusal
-from companion.replay.engine import replay
+from companion.lab.replay.engine import replay
 from sim.imu_model import DEG_H, MG
 from sim.motions import SlowTurn
 from sim.sea import DAY_S, Sea, Wave

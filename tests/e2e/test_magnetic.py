@@ -124,7 +124,7 @@ def test_a_magnet_of_the_aircraft_is_bounded_warned_of_and_widens_the_gyros(tmp_
 
 def test_a_recording_of_a_field_heading_replays_to_the_same_record(tmp_path: Path) -> None:
     pytest.importorskip("mcap", reason="recordings need the extra")
-    from companion.replay.engine import replay
+    from companion.lab.replay.engine import replay
 
     records: list[Record] = []
 

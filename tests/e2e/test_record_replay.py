@@ -26,12 +26,12 @@ from companion.config.sections import Config, Noise
 from companion.daemon.recorder import recorder as recorder_module
 from companion.errors import StorageError
 from companion.formats import Object
+from companion.lab.logs.recording import MAGIC, Message, Recording
+from companion.lab.replay.calibrations import TOLERANCE_SIGMAS
+from companion.lab.replay.engine import Result, replay
 from companion.recording import messages
 from companion.recording import tape as tape_module
 from companion.recording.files import Ring
-from companion.replay.calibrations import TOLERANCE_SIGMAS
-from companion.replay.engine import Result, replay
-from companion.replay.recording import MAGIC, Message, Recording
 from sim.imu_model import DEG_H
 from tests.e2e.test_calibration import calibrated
 from tests.e2e.test_dither import UNDITHERED, second_imu_only

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from companion.calibration.records.record import Record
+from companion.lab.replay.engine import Result, replay
 from companion.recording import messages
-from companion.replay.engine import Result, replay
 from tests.e2e.test_record_replay import rewritten
 from tests.support.long_recordings import GYRO_BIAS, NOISE, write_recording
 

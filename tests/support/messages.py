@@ -49,6 +49,7 @@ ELSEWHERE = {
     "companion/cli/monitor.py": "the frame of the monitor: docs/page.md",
     "companion/ground": "printed on the ground laptop, each with what to do: docs/ground_stations.md",
     "companion/report": "labels of pages",
+    "companion/lab/report": "labels of pages",
     "companion/fleet/acl.py": "lines of brokers' files; what is no aircraft and its user, with what is allowed",
     "companion/fleet/contract.py": "reasons in the table of what was rejected, with what was found and what is allowed",
     "companion/fleet/imu_pages.py": "labels of pages: docs/fleet.md",

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.noise.allan import noise_profile
-from companion.calibration.profiling.profile_fit import fit_profile, rests, seconds_of
 from companion.calibration.request import What
 from companion.calibration.seconds.batch import summary
 from companion.calibration.solution.site import Whereabouts, local_earth
@@ -19,6 +18,7 @@ from companion.calibration.solution.solve import solve
 from companion.calibration.stillness.gates import ImuGate
 from companion.calibration.stillness.own_noise import OwnNoise
 from companion.errors import CalibrationRefusedError
+from companion.lab.profiling.profile_fit import fit_profile, rests, seconds_of
 from tests.support.extent import extent
 from tests.support.made_noise import DEG, DEG_H, MG, filtered
 from tests.support.recordings import shared

@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import AllanModel, NoiseProfile, allan_model, noise_profile
-from companion.calibration.profiling.coverage import Kept, coverage, keeps
-from companion.calibration.profiling.profile_fit import Finding, Rest, Rests, fit_profile, rests, seconds_of
 from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.errors import CalibrationRefusedError
+from companion.lab.profiling.coverage import Kept, coverage, keeps
+from companion.lab.profiling.profile_fit import Finding, Rest, Rests, fit_profile, rests, seconds_of
 from tests.support.made_noise import DEG, DEG_H, FLICKER_OF_FLOOR, MG, adis16405, slow
 from tests.support.recordings import Recording, px4, shared, xio, xsens_counts
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from companion.flight.inertial import Increments, Navigation, World, drift, increments, lag_s, windows
-from companion.flight.split import LENGTH_S, SHORT_S, split
+from companion.lab.flight.inertial import Increments, Navigation, World, drift, increments, lag_s, windows
+from companion.lab.flight.split import LENGTH_S, SHORT_S, split
 from companion.physics.frames import rotations, running_products
 from companion.physics.units import DEG, DEG_H, MG
 from tests.support.flown import Flown, earth_rate, fly, gravity

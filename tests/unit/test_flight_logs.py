@@ -225,7 +225,7 @@ def cut_off(flown: Flown, at_s: float) -> Flown:
 def test_a_log_too_long_for_memory_is_thinned_and_nobody_is_told_to_log_more(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("companion.flight.log.MOST_ROWS", 4096)
+    monkeypatch.setattr("companion.lab.flight.log.MOST_ROWS", 4096)
     _, answer = said(capsys, log, *storage(tmp_path))
     imu = answer["flights"][0]["imus"][0]
     assert imu["rate_hz"] < 60.0

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from companion.cli import main as companion
 from companion.config import parse
+from companion.lab.logs.recording import MAGIC, Message, Recording
 from companion.recording import messages
 from companion.recording.files import versions
-from companion.replay.recording import MAGIC, Message, Recording
 
 MB = 1 << 20
 MOST = 128 * MB

@@ -20,9 +20,9 @@ from companion.config.sections import Config, Noise
 from companion.configured import models
 from companion.configured.profiles import Profiles
 from companion.errors import ConfigError, StorageError
+from companion.lab.logs.log_files import read_logs
 from companion.recording.files import Beginning, RecordingFile
 from companion.recording.messages import IMU, MAVLINK, ImuState, Message, encode
-from companion.replay.log_files import read_logs
 from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, check_name, saved_profile
 from companion.storage.state import MOST_BYTES, sealed, unsealed
 from sim.__main__ import main as simulator

@@ -14,12 +14,12 @@ from mcap.reader import make_reader
 
 from companion.calibration.solution.site import Whereabouts
 from companion.errors import StorageError
+from companion.lab.logs.recording import Message, Recording
 from companion.recording import tape as tape_module
 from companion.recording.files import RESERVE_BYTES, Beginning, RecordingFile, Ring
 from companion.recording.messages import PLACE, START, decode, encode
 from companion.recording.messages import Message as Written
 from companion.recording.tape import Tape
-from companion.replay.recording import Message, Recording
 
 MB = 1 << 20
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from companion.cli import main as companion
-from companion.replay.csv_log import HEADER, read
+from companion.lab.logs.csv_log import HEADER, read
 from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.scenario import site_at

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from companion.cli import main as companion
-from companion.replay.estimate import Given, estimate
-from companion.replay.log import StillLog
+from companion.lab.logs.log import StillLog
+from companion.lab.replay.estimate import Given, estimate
 from tests.support.made_noise import DEG_H, MG, Floats, adis16405, write_csv
 
 SECONDS, RATE_HZ = 3600, 10

@@ -5,9 +5,9 @@ from __future__ import annotations
 import msgspec
 import pytest
 
+from companion.lab.report.seconds import runs
 from companion.physics.units import DEG_H
 from companion.report.page import Point, clock_is_sound, history, unix_s
-from companion.report.seconds import runs
 from tests.support.histories import PER_K_DEG_H, record, white_trace
 
 

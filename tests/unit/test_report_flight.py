@@ -12,9 +12,9 @@ import pytest
 
 from companion.calibration.records.flight_record import AXES, Drift, KeptFlight
 from companion.cli import main
-from companion.report.calibration_page import calibration_page
-from companion.report.flight_page import flight_page
-from companion.report.source import material
+from companion.lab.report.calibration_page import calibration_page
+from companion.lab.report.flight_page import flight_page
+from companion.lab.report.source import material
 from companion.storage.flights import FlightStore
 from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.records import RecordStore

@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 
 from companion.calibration.records.record import Magnetic
 from companion.cli import main
+from companion.lab.report import calibration_page as calibration
+from companion.lab.report.calibration_page import calibration_page
+from companion.lab.report.source import material
 from companion.physics.units import DEG_H, MG
-from companion.report import calibration_page as calibration
 from companion.report import page, svg
-from companion.report.calibration_page import calibration_page
-from companion.report.source import material
 from companion.samples import Vector
 from companion.storage.records import RecordStore
 from tests.support.histories import a_season, arming, imu_record, record, white_trace

@@ -26,7 +26,7 @@ NOT_YET = (
     "aiomqtt", "companion.mqtt", "companion.daemon.heading.attitude_service",
     "companion.daemon.process.check", "companion.storage.fleet_items",
     "companion.cli.setup", "companion.ground", "companion.installation", "companion.setup",
-    "companion.replay", "companion.report", "csv", "email", "http", "importlib.metadata", "lxml", "lz4", "mavsdk",
+    "companion.lab", "companion.report", "csv", "email", "http", "importlib.metadata", "lxml", "lz4", "mavsdk",
     "mcap", "multiprocessing", "numpy.fft", "numpy.ma", "numpy.polynomial", "numpy.random", "numpy.testing", "paho",
     "pymavlink.mavutil", "rich", "sqlite3", "unittest", "urllib.request", "xml", "zipfile", "zstandard",
 )  # fmt: skip

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.autopilot.vehicle.vehicle import Firmware
-from companion.flight.inertial import Navigation
+from companion.lab.flight.inertial import Navigation
+from companion.lab.logs.blocks import DROPOUTS, PARAMETERS, Block
 from companion.physics.frames import Floats
-from companion.replay.blocks import DROPOUTS, PARAMETERS, Block
 
 MOST_ROWS: Final = 1 << 19
 """Of a message and instance: 20 minutes at 400 Hz; of a longer log each two, four ... are one mean."""

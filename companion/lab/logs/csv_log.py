@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import StorageError
+from companion.lab.logs.log import LAST_S, NAME, Poses, StillLog
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG, G
-from companion.replay.log import LAST_S, NAME, Poses, StillLog
 
 IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 TILT: Final = ("tilt_x", "tilt_y")

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.replay.blocks import PARAMETERS, Block, Kept, Progress, columns, nobody, pieces
+from companion.lab.logs.blocks import PARAMETERS, Block, Kept, Progress, columns, nobody, pieces
 
 MAGIC: Final = b"\xa3\x95\x80"
 """It begins with what says how such beginnings are made."""

@@ -13,11 +13,11 @@ import numpy as np
 
 from companion.config.sections import Config
 from companion.errors import StorageError
+from companion.lab.logs import autopilot_logs, csv_log
+from companion.lab.logs.log import NAME, StillLog
+from companion.lab.logs.playback import UNUSABLE, Playback, config_of
+from companion.lab.logs.recording import Head, Message, Recording, is_text
 from companion.recording import messages
-from companion.replay import autopilot_logs, csv_log
-from companion.replay.log import NAME, StillLog
-from companion.replay.playback import UNUSABLE, Playback, config_of
-from companion.replay.recording import Head, Message, Recording, is_text
 from companion.samples import ImuSample
 
 CONTINUED_S: Final = 60.0

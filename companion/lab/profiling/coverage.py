@@ -14,8 +14,8 @@ import numpy as np
 
 from companion.calibration.means.windows import ImuInput, estimates
 from companion.calibration.noise.allan import NoiseProfile, allan_variance
-from companion.calibration.profiling.profile_fit import CHANNELS, LEAST_STILL_S, MIN_SECONDS, Rest, fit_profile
 from companion.calibration.seconds.batch import Batch
+from companion.lab.profiling.profile_fit import CHANNELS, LEAST_STILL_S, MIN_SECONDS, Rest, fit_profile
 from companion.physics.frames import Floats
 from companion.samples import TRIADS, Triad, rows_of
 

@@ -15,10 +15,10 @@ import msgspec
 import numpy as np
 
 from companion.errors import StorageError
+from companion.lab.logs import dataflash, ulog
+from companion.lab.logs.blocks import DROPOUTS, Block
+from companion.lab.logs.log import LAST_S, StillLog
 from companion.physics.frames import Floats
-from companion.replay import dataflash, ulog
-from companion.replay.blocks import DROPOUTS, Block
-from companion.replay.log import LAST_S, StillLog
 
 _LARGEST: Final = 1e6
 """What is larger is no reading, in SI units."""

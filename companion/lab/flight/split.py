@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from companion.calibration.records.flight_record import AXES, Split, Term
-from companion.flight.inertial import Window
+from companion.lab.flight.inertial import Window
 from companion.physics.frames import Floats
 from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG, MG

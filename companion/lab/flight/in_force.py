@@ -17,7 +17,7 @@ from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.calibration.records.record import Record
 from companion.errors import AutopilotError, StorageError
-from companion.flight.log import FlownImu
+from companion.lab.flight.log import FlownImu
 from companion.physics.frames import Floats
 from companion.samples import Triad
 

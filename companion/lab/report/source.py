@@ -15,7 +15,7 @@ from companion.calibration.solution.by_temperature import ByTemperature
 from companion.calibration.solution.prior import curve_of
 from companion.calibration.solution.temperature_summary import by_temperature
 from companion.errors import StorageError
-from companion.report.calibration_page import Material
+from companion.lab.report.calibration_page import Material
 from companion.storage.flights import FlightStore
 from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.profiles import ProfileStore

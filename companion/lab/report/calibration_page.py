@@ -12,6 +12,7 @@ import msgspec
 from companion.calibration.collector.trace import Trace
 from companion.calibration.records.record import Arming, ImuRecord, Outcome, Record, outcome_word
 from companion.calibration.solution.by_temperature import ByTemperature
+from companion.lab.report.seconds import stillness
 from companion.physics.units import UNITS
 from companion.report.by_temperature import biases_by_temperature
 from companion.report.markup import Child, Markup, cell, join, number, row, tag
@@ -29,7 +30,6 @@ from companion.report.page import (
     page,
     with_sigma,
 )
-from companion.report.seconds import stillness
 from companion.samples import TRIADS, Triad
 
 _ARMED: Final = attrgetter("armed_at", "state", "reason")

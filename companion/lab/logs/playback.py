@@ -13,9 +13,9 @@ from companion.autopilot.telemetry.imu_samples import EkfBiasReading, ImuSamples
 from companion.config.sections import Config
 from companion.configured.models import Role, parts_of, serial_devices
 from companion.errors import StorageError
+from companion.lab.logs import recording
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.recording.messages import EKF_BIAS, IMU, MAVLINK, SERIAL, ImuState, decode
-from companion.replay import recording
 from companion.samples import ImuSample, Sample
 
 UNUSABLE: Final = (

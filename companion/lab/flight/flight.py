@@ -18,17 +18,17 @@ from companion.calibration.records.flight_record import Drift, Flight, ImuFlight
 from companion.calibration.records.record import Record
 from companion.calibration.solution.prior import curve_of
 from companion.errors import AutopilotError, StorageError
-from companion.flight import ardupilot_log, inertial, px4_log
-from companion.flight.in_force import calibration_in, moment, with_others, written_in
-from companion.flight.inertial import Increments, Navigation, Window, World
-from companion.flight.log import Boot, FlownImu
-from companion.flight.split import LENGTH_S, SHORT_S, split
+from companion.lab.flight import ardupilot_log, inertial, px4_log
+from companion.lab.flight.in_force import calibration_in, moment, with_others, written_in
+from companion.lab.flight.inertial import Increments, Navigation, Window, World
+from companion.lab.flight.log import Boot, FlownImu
+from companion.lab.flight.split import LENGTH_S, SHORT_S, split
+from companion.lab.logs.autopilot_logs import read_ulog, reader_of
+from companion.lab.logs.blocks import Progress
 from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
 from companion.physics.frames import Floats
 from companion.physics.statistics import MAD_TO_SIGMA
 from companion.physics.units import DEG_H, MG
-from companion.replay.autopilot_logs import read_ulog, reader_of
-from companion.replay.blocks import Progress
 from companion.storage.learned import KnownImu
 
 SPANS_S: Final = (10.0, 30.0, 60.0)

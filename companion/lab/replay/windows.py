@@ -16,13 +16,13 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.calibration.profiling.coverage import Held
 from companion.calibration.records.record import ImuRecord
 from companion.errors import StorageError
+from companion.lab.logs.log import StillLog
+from companion.lab.profiling.coverage import Held
+from companion.lab.replay.estimate import Given, estimate
 from companion.physics.frames import Floats, roll_pitch_from_up, rotation_matrix
 from companion.physics.units import DEG
-from companion.replay.estimate import Given, estimate
-from companion.replay.log import StillLog
 
 MOST_WINDOWS: Final = 100_000
 """Eleven days of the shortest; a clock that jumps makes more."""

@@ -8,11 +8,11 @@ from typing import Final
 
 import numpy as np
 
-from companion.flight.inertial import Navigation, joined
-from companion.flight.log import Boot, Estimated, FlownImu, Place, Start, ascending, changes, starts
+from companion.lab.flight.inertial import Navigation, joined
+from companion.lab.flight.log import Boot, Estimated, FlownImu, Place, Start, ascending, changes, starts
+from companion.lab.logs.blocks import US, Progress
+from companion.lab.logs.ulog import ulog
 from companion.physics.frames import Floats
-from companion.replay.blocks import US, Progress
-from companion.replay.ulog import ulog
 
 
 def _elements(name: str, count: int = 3) -> tuple[str, ...]:

@@ -10,12 +10,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.flight.inertial import joined
-from companion.flight.log import Boot, Estimated, FlownImu, Place, Start, changes, starts
+from companion.lab.flight.inertial import joined
+from companion.lab.flight.log import Boot, Estimated, FlownImu, Place, Start, changes, starts
+from companion.lab.logs.blocks import Progress
+from companion.lab.logs.dataflash import dataflash
 from companion.physics.frames import Floats
 from companion.physics.units import DEG
-from companion.replay.blocks import Progress
-from companion.replay.dataflash import dataflash
 
 _ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "IMU": ("I", ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ", "T", "GH", "AH")),

@@ -21,12 +21,12 @@ from companion.calibration.solution.draft import Draft
 from companion.configured import models
 from companion.configured.models import collect
 from companion.errors import StorageError
+from companion.lab.logs.playback import UNUSABLE, Playback, config_of
+from companion.lab.logs.recording import Head, Message, Recording
+from companion.lab.replay.calibrations import Calibrations, Offsets, Replayed
 from companion.recording import messages
 from companion.recording.files import versions
 from companion.recording.messages import ImuState, Start, decode
-from companion.replay.calibrations import Calibrations, Offsets, Replayed
-from companion.replay.playback import UNUSABLE, Playback, config_of
-from companion.replay.recording import Head, Message, Recording
 
 FOLLOWS_S: Final = 3.0
 """The longest gap between two files that follow on one another: more means that one between them is missing."""

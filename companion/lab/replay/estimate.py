@@ -26,9 +26,9 @@ from companion.calibration.solution.site import Remedies, Whereabouts, local_ear
 from companion.calibration.solution.solve import solve
 from companion.config.sections import Mounting, Noise, Platform
 from companion.errors import CalibrationRefusedError
+from companion.lab.logs.log import Poses, StillLog
 from companion.physics.frames import Floats, rotation_matrix
 from companion.physics.gradienter import Law
-from companion.replay.log import Poses, StillLog
 from companion.samples import CompassSample, ImuSample, TiltSample, Vector
 
 MIN_STILL_S: Final = 5.0

@@ -1,0 +1,1 @@
+"""Readers of recordings and of logs, one for each format."""

@@ -1,0 +1,1 @@
+"""Reports of calibrations and flights as HTML files."""
