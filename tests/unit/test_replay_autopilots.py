@@ -21,8 +21,8 @@ from sim.imu_model import DEG_H, MG, ImuModel
 from sim.scenario import site_at
 from tests.support.autopilot_files import ulog_message, write_dataflash, write_ulog
 from tests.support.made_noise import Floats, adis16405
+from tests.support.recordings import shared
 
-SAMPLE = Path(__file__).parents[3] / "shared" / "data" / "px4_pyulog" / "sample.ulg"
 SECONDS, RATE_HZ = 30, 100
 WHERE = ["--pitch-deg", "0", "--roll-deg", "0", "--heading-deg", "0", "--latitude-deg", "40", "--height-m", "50"]
 
@@ -57,15 +57,15 @@ def assert_near(record: dict[str, Any], seed: int) -> None:
         assert (np.abs(off) / imu[key.format("sigma_use")]).max() < 3.5
 
 
-@pytest.mark.skipif(not SAMPLE.is_file(), reason=f"no recording of a real PX4 at {SAMPLE}")
-def test_a_real_log_of_px4_is_read_as_another_reader_reads_it(capsys: pytest.CaptureFixture[str]) -> None:
-    (log,) = read_logs([SAMPLE])
-    table = ULog(str(SAMPLE), ["sensor_combined"]).get_dataset("sensor_combined").data
+def test_a_real_log_of_px4_is_read_to_its_end(capsys: pytest.CaptureFixture[str]) -> None:
+    path = shared("px4_pyulog/sample.ulg")
+    (log,) = read_logs([path])
+    table = ULog(str(path), ["sensor_combined"]).get_dataset("sensor_combined").data
     np.testing.assert_allclose(log.t_s, table["timestamp"] * 1e-6, rtol=0.0, atol=1e-9)
     for k in range(3):
         np.testing.assert_array_equal(log.readings[:, k], table[f"gyro_rad[{k}]"])
         np.testing.assert_array_equal(log.readings[:, 3 + k], table[f"accelerometer_m_s2[{k}]"])
-    code, record = replay(capsys, SAMPLE)
+    code, record = replay(capsys, path)
     assert code == 0
     used = record["log"]
     # It was handled for 8 s.
