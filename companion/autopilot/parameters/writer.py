@@ -101,7 +101,9 @@ class ParameterWriter:
             except _Failure as failure:
                 await self._fail(items, failure)
             except asyncio.CancelledError:
-                await self._put_back(items, leave_foreign=False)
+                # In a task of its own: in a cancelled one asyncio.timeout raises CancelledError when it expires, before
+                # Python 3.11.4, and the rest would not be put back. Debian 12 has 3.11.2.
+                await asyncio.create_task(self._put_back(items, leave_foreign=False))
                 logger.warning("writing was cancelled; left changed: %s", ", ".join(self.left_changed) or "nothing")
                 raise
             for item in items:

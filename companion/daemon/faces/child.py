@@ -114,12 +114,11 @@ async def _end(process: Process) -> None:
     if process.returncode is None:
         with contextlib.suppress(ProcessLookupError):
             process.terminate()
-        try:
-            async with asyncio.timeout(END_WITHIN_S):
-                await process.wait()
-        except TimeoutError:
+        # Not asyncio.timeout, which cannot expire in a cancelled task before Python 3.11.4.
+        ended = asyncio.ensure_future(process.wait())
+        if not (await asyncio.wait([ended], timeout=END_WITHIN_S))[0]:
             _kill(process)
-            await process.wait()
+            await ended
     if process.stdin is not None:
         process.stdin.close()
     if process.stdout is not None:
