@@ -17,7 +17,7 @@ help:
 	@echo 'make quick   unit and property tests without real clock and processes (about a minute on two cores)'
 	@echo 'make test    all tests (under seven minutes on two cores); DURATIONS=1 notes how long each takes'
 	@echo 'make long    the whole of what make test plays a slice of, with new dice (half an hour and more)'
-	@echo 'make check   formatting, lint, types, import directions'
+	@echo 'make check   formatting, lint, types, import directions, sizes'
 	@echo 'make format  put the code into the one format'
 	@echo 'make bench   speed, as ratios within one run'
 	@echo 'make accuracy  how good a calibration is, beside the bound and what else is done (about ten minutes on two cores)'
@@ -65,6 +65,7 @@ check: $(VENV)/.dev
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
+	@$(BIN)/python packaging/sizes.py
 
 format: $(VENV)/.dev
 	@$(BIN)/ruff format .
