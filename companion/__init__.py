@@ -1,3 +1,3 @@
 """Field self-calibration of gyro and accelerometer biases for small aircraft."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
