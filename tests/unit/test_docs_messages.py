@@ -18,8 +18,8 @@ TROUBLE = ROOT / "docs/troubleshooting.md"
 ALSO = ROOT / "docs/service.md"
 
 AT_A_DESK = (
-    "companion/cli", "companion/setup", "companion/flight", "companion/replay", "companion/recording",
-    "companion/fleet", "companion/calibration/profiling", "companion/calibration/records/flight_record.py",
+    "companion/cli", "companion/setup", "companion/lab", "companion/recording", "companion/fleet",
+    "companion/calibration/solution/temperature_summary.py", "companion/calibration/records/flight_record.py",
     "companion/calibration/records/flight_evidence.py", "companion/calibration/solution/by_temperature.py",
     "companion/calibration/alignment/missing.py", "companion/autopilot/firmware/heading_parameters.py",
     "companion/autopilot/firmware/port_parameters.py", "companion/configured/profiles.py",

@@ -23,7 +23,8 @@ from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
 NOT_YET = (
-    "aiomqtt", "companion.mqtt", "companion.daemon.heading.attitude_service",
+    "aiomqtt", "anyio", "companion.mqtt", "companion.web", "h11", "starlette", "uvicorn",
+    "companion.daemon.heading.attitude_service",
     "companion.daemon.process.check", "companion.storage.fleet_items",
     "companion.cli.setup", "companion.ground", "companion.installation", "companion.setup",
     "companion.lab", "companion.report", "csv", "email", "http", "importlib.metadata", "lxml", "lz4", "mavsdk",
