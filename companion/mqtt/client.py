@@ -45,8 +45,9 @@ MQTT_5: Final = 5
 """The numbers of the two protocols on the wire."""
 MAX_PACKET_BYTES: Final = 64 * 1024
 """The longest message that the broker may send us (MQTT 5)."""
-MAX_WAITING: Final = 64
-"""The most messages received and not handled yet; more are dropped."""
+MAX_WAITING: Final = 1000
+"""The most messages received and not handled yet; more are dropped without an answer. aiomqtt fills this queue faster
+than it empties it: a flood of some hundred requests has to fit. With 64 KiB each they fit the process's memory."""
 _REFUSED: Final = 128
 LONG_BYTES: Final = 4096
 """What is shorter is no reason for a broker to end a connection."""
