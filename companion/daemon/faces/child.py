@@ -111,19 +111,25 @@ StartChild = Callable[[str, str, ChildSettings], Child]
 
 async def _end(process: Process) -> None:
     """Ask the process to end, and kill it where it does not."""
+    # A pipe that still holds what nobody read stays open, and keeps `wait` from returning.
+    drained = asyncio.ensure_future(_drain(process))
     if process.returncode is None:
         with contextlib.suppress(ProcessLookupError):
             process.terminate()
-        # Not asyncio.timeout, which cannot expire in a cancelled task before Python 3.11.4.
-        ended = asyncio.ensure_future(process.wait())
-        if not (await asyncio.wait([ended], timeout=END_WITHIN_S))[0]:
-            _kill(process)
-            await ended
+    # Not asyncio.timeout, which cannot expire in a cancelled task before Python 3.11.4.
+    ended = asyncio.ensure_future(process.wait())
+    if not (await asyncio.wait([ended], timeout=END_WITHIN_S))[0]:
+        _kill(process)
+        await ended
     if process.stdin is not None:
         process.stdin.close()
-    if process.stdout is not None:
-        # A pipe that still holds what nobody read stays open.
-        await process.stdout.read()
+    await drained
+
+
+async def _drain(process: Process) -> None:
+    """Read and discard what the process still writes."""
+    while process.stdout is not None and await process.stdout.read(REPORT_LIMIT):
+        pass
 
 
 def _kill(process: Process) -> None:
