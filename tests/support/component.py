@@ -90,7 +90,8 @@ class Ground:
         found: list[str] = []
         for _, message in self.received:
             if isinstance(message, mavlink.MAVLink_statustext_message):
-                whole = f"{found.pop()}{message.text[3:]}" if message.text.startswith("... ") else message.text
+                is_rest = message.text.startswith("... ") and bool(found)
+                whole = f"{found.pop()}{message.text[3:]}" if is_rest else message.text
                 found.append(whole)
         return found
 
