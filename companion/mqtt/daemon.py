@@ -20,6 +20,8 @@ AGAIN_S: Final = 1.0
 ANSWER_WITHIN_S: Final = 10.0
 CLOCKS_AGREE_S: Final = 2.0
 
+MONITOR: Final[Object] = {"command": "monitor", "pose": True}
+"""Request for the stream, whose first reply holds the status and the last record."""
 Ask = Callable[[Object], AsyncGenerator[Object, None]]
 """Sends a request to the control socket and yields the replies."""
 
@@ -60,27 +62,28 @@ class Daemon:
             await asyncio.sleep(AGAIN_S)
 
     async def _read(self) -> None:
-        async with contextlib.aclosing(self.ask({"command": "monitor", "pose": True})) as replies:
+        async with contextlib.aclosing(self.ask(MONITOR)) as replies:
             while True:
                 async with asyncio.timeout(SILENT_S):
                     reply = await anext(replies, None)
-                if reply is None or reply["kind"] == "error":
-                    raise DaemonUnreachableError("the stream has ended" if reply is None else str(reply["reason"]))
-                self.alive, self.pose = True, reply["pose"]
-                self.record = reply.get("record", self.record)
-                if "status" in reply:
-                    self._accept(reply["status"])
-                self.news.set()
+                self._accept(reply)
 
     async def refresh(self) -> None:
-        """Ask for the status now; keep the old one where no answer comes."""
+        """Read the status and the last record now; keep the old ones where no answer comes."""
         with contextlib.suppress(CompanionError, TimeoutError):
-            self._accept((await self.result({"command": "status"}))["status"])
+            async with asyncio.timeout(SILENT_S), contextlib.aclosing(self.ask(MONITOR)) as replies:
+                self._accept(await anext(replies, None))
 
-    def _accept(self, status: Object) -> None:
-        self.status = status
-        unix_s = status["vehicle"]["unix_time_s"]
-        self.clock_agrees = unix_s is not None and abs(unix_s - time.time()) < CLOCKS_AGREE_S
+    def _accept(self, reply: Object | None) -> None:
+        if reply is None or reply["kind"] == "error":
+            raise DaemonUnreachableError("the stream has ended" if reply is None else str(reply["reason"]))
+        self.alive, self.pose = True, reply["pose"]
+        self.record = reply.get("record", self.record)
+        if "status" in reply:
+            self.status = reply["status"]
+            unix_s = self.vehicle["unix_time_s"]
+            self.clock_agrees = unix_s is not None and abs(unix_s - time.time()) < CLOCKS_AGREE_S
+        self.news.set()
 
     async def result(self, request: Object) -> Object:
         """Return the final reply to a short request.

@@ -9,6 +9,7 @@ import logging
 import sys
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from companion.calibration.machine import State
@@ -111,6 +112,26 @@ def test_a_cancel_from_another_face_is_seen_here(tmp_path: Path) -> None:
                 await watcher.response("field/heron", "calibrate", "y", "cancelled")
                 said = await watcher.response("field/heron", "cancel", None)
                 assert said["reason"] == "cancelled by mqtt cancel"
+
+    asyncio.run(main())
+
+
+def test_the_record_of_a_calibration_that_the_stop_cancels_is_published(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with broker(tmp_path) as one, peer(one) as watcher:
+            rig = Rig(tmp_path, min_still_s=3.0, max_s=60.0, more=one.section())
+            rig.offload = asyncio.to_thread
+            rig.config = msgspec.structs.replace(
+                rig.config, calibration=msgspec.structs.replace(rig.config.calibration, target_gyro_sigma_deg_h=0.01)
+            )
+            async with rig.running():
+                await until_connected(rig.service)
+                await rig.ready()
+                await watcher.publish("companion/1/request/calibrate", {"transaction": "x"})
+                await watcher.until("companion/1/calibration/progress", says("collecting"), 60.0)
+            kept = await watcher.until("companion/1/calibration/state")
+            assert kept.json["state"] == "cancelled"
+            await watcher.until("companion/1/status", is_(b"offline"))
 
     asyncio.run(main())
 
