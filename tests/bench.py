@@ -21,13 +21,13 @@ from typing import Any, Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.collector.outlook import Settings
-from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.means.windows import ImuInput
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.request import What
 from companion.component.arm_authorisation import ArmAuthoriser
 from companion.daemon.job import Job
+from companion.estimation.collector.outlook import Settings
+from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.means.windows import ImuInput
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.request import What
 from companion.lab.replay.engine import replay
 from companion.links.mavlink.link import MavlinkLink
 from companion.protocols.registry import Kind

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from companion.attitude.estimator import AttitudeEstimator, AttitudeSettings
-from companion.calibration.noise.allan import noise_profile
+from companion.estimation.noise.allan import noise_profile
 from companion.physics.units import DEG_H
 from companion.samples import ImuSample
 

@@ -13,7 +13,7 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from companion.calibration.noise.allan import noise_profile
+from companion.estimation.noise.allan import noise_profile
 from companion.lab.logs.csv_log import read
 from companion.lab.profiling.coverage import Kept, coverage
 from companion.lab.profiling.profile_fit import Rests, fit_profile, rests

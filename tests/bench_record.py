@@ -20,8 +20,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from companion.calibration.request import What
 from companion.component.service import Refusal
+from companion.estimation.request import What
 from companion.storage.state import write_atomically
 from sim.pty_device import PtyDevice
 from sim.scenario import Scenario

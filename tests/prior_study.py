@@ -16,12 +16,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.noise.allan import AllanModel
-from companion.calibration.records.history import Measured, Point, PowerUp
-from companion.calibration.records.record import Pose, PoseSigma, Site
-from companion.calibration.solution.joint import Weighed, weigh
-from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, PoseEffect, expect, pose_effect
-from companion.calibration.solution.solve import ImuSolution, Shared, Solution
+from companion.estimation.noise.allan import AllanModel
+from companion.estimation.records.history import Measured, Point, PowerUp
+from companion.estimation.records.record import Pose, PoseSigma, Site
+from companion.estimation.solution.joint import Weighed, weigh
+from companion.estimation.solution.prior import Expectation, ExpectedImu, Now, PoseEffect, expect, pose_effect
+from companion.estimation.solution.solve import ImuSolution, Shared, Solution
 from companion.samples import TRIADS
 
 Array = NDArray[np.float64]

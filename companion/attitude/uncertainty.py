@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from companion.attitude.quaternion import Triple
-from companion.calibration.noise.allan import AllanModel
+from companion.estimation.noise.allan import AllanModel
 from companion.physics.frames import Array, Matrix
 
 SCALE_SHARE: Final = 0.003

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from companion.calibration.records.flight_record import (
+from companion.cli.terminal import AddCommand, conclude, print_lines, storage_path
+from companion.errors import StorageError
+from companion.estimation.records.flight_record import (
     HEADS,
     UNSEEN,
     Flight,
@@ -22,8 +24,6 @@ from companion.calibration.records.flight_record import (
     legend,
     next_flight,
 )
-from companion.cli.terminal import AddCommand, conclude, print_lines, storage_path
-from companion.errors import StorageError
 from companion.physics.units import unit_of
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def add_commands(add: AddCommand) -> None:
 
 async def flight(options: argparse.Namespace) -> int:
     """`companion flight`."""
-    from companion.calibration.records.flight_evidence import surely_moved
+    from companion.estimation.records.flight_evidence import surely_moved
     from companion.lab.flight.flight import flights, read
 
     path = options.file

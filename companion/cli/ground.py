@@ -70,7 +70,7 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
 
 
 async def _calibrate(options: argparse.Namespace) -> int:
-    from companion.calibration.request import What
+    from companion.estimation.request import What
 
     what = What.GYROS if options.gyros else What.ACCELEROMETERS if options.accelerometers else What.BOTH
     return await _on_the_link(options, lambda one: one.calibrate(what, options.timeout, reboot=options.reboot))

@@ -24,7 +24,7 @@ from companion.errors import CalibrationRefusedError, ConfigError, StorageError
 from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
-    from companion.calibration.noise.allan import AllanModel, NoiseProfile
+    from companion.estimation.noise.allan import AllanModel, NoiseProfile
     from companion.lab.logs.log import StillLog
     from companion.lab.profiling.coverage import Kept
     from companion.lab.profiling.profile_fit import AxisFinding, Finding, Rests
@@ -127,7 +127,7 @@ async def profile(options: argparse.Namespace) -> int:
 
 
 def _compared(options: argparse.Namespace) -> NoiseProfile | None:
-    from companion.calibration.noise.allan import noise_profile
+    from companion.estimation.noise.allan import noise_profile
     from companion.storage.profiles import given_profile
 
     if options.profile is None:
@@ -154,7 +154,7 @@ def _learn(
     Raises:
         CalibrationRefusedError: the recordings tell nothing of it.
     """
-    from companion.calibration.noise.allan import noise_profile
+    from companion.estimation.noise.allan import noise_profile
     from companion.lab.profiling.coverage import coverage
     from companion.lab.profiling.profile_fit import fit_profile, joined, learn_warm_up, rests
 
@@ -302,7 +302,7 @@ def _figures(model: AllanModel) -> tuple[float, float, float]:
 
 def _cell(axis: AxisFinding, which: int, unit: float, digits: int) -> str:
     """A figure with its standard error, or its upper limit where it is not told."""
-    from companion.calibration.noise.allan import FLOOR_OF_FLICKER
+    from companion.estimation.noise.allan import FLOOR_OF_FLICKER
 
     factor = (1.0, FLOOR_OF_FLICKER, 1.0)[which] / unit
     digits += 2 * (which == 2)
@@ -322,7 +322,7 @@ def _temperatures(logs: Sequence[StillLog]) -> tuple[float, float] | None:
 
 
 def _to_save(result: Result, name: str) -> Any:
-    from companion.calibration.noise.allan import WARM_UP
+    from companion.estimation.noise.allan import WARM_UP
     from companion.storage.profiles import FORMAT_VERSION, SavedProfile, Source
 
     finding = result.finding

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from companion.calibration.records.flight_record import Flight, figure
-from companion.calibration.records.record import Magnetic, outcome_word
+from companion.estimation.records.flight_record import Flight, figure
+from companion.estimation.records.record import Magnetic, outcome_word
 from companion.formats import Object
 from companion.physics.units import DEG_H, MG
 

@@ -27,11 +27,11 @@ from typing import Final, NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion import __version__
-from companion.calibration.request import What
 from companion.component import requests
 from companion.component.service import CalibrationService, Job, Refusal
 from companion.component.statustext import Say, Severity, Weight
 from companion.config.sections import Senders
+from companion.estimation.request import What
 from companion.links.mavlink.link import MavlinkLink
 
 logger = logging.getLogger(__name__)

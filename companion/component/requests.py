@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.request import What
+from companion.estimation.request import What
 
 CommandMessage = mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message
 

@@ -11,7 +11,7 @@ from typing import Final, Literal, Protocol
 
 import msgspec
 
-from companion.calibration.request import What
+from companion.estimation.request import What
 
 MEASURED_PERCENT: Final = 70.0
 """Progress of a calibration: below this it measures, from here on it works out and writes."""

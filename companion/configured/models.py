@@ -10,15 +10,15 @@ from typing import Final, Literal
 from companion.autopilot.firmware.port_parameters import baud_of
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.collector.outlook import Settings
-from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.deck.deck import KEPT_S
-from companion.calibration.means.pose import CompassModel, GradienterModel
-from companion.calibration.means.windows import ImuInput
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.records.record import AlignmentUsed
-from companion.calibration.solution.site import Whereabouts
 from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu
+from companion.estimation.collector.outlook import Settings
+from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.deck.deck import KEPT_S
+from companion.estimation.means.pose import CompassModel, GradienterModel
+from companion.estimation.means.windows import ImuInput
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.records.record import AlignmentUsed
+from companion.estimation.solution.site import Whereabouts
 from companion.links.serial.bytestream import PortSettings
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H, MG

@@ -6,9 +6,9 @@ import functools
 
 import msgspec
 
-from companion.calibration.noise.allan import PROFILES, predicted_sigma
 from companion.config.sections import UNKNOWN, Config, Imu, Noise, Profile
 from companion.configured.models import longest_window_s, settings
+from companion.estimation.noise.allan import PROFILES, predicted_sigma
 from companion.physics.units import DEG_H
 from companion.storage.profiles import ProfileStore
 

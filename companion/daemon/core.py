@@ -11,17 +11,17 @@ import msgspec
 
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.calibration.collector.outlook import Settings
-from companion.calibration.machine import Machine
-from companion.calibration.means.windows import Window
-from companion.calibration.records.record import Record
-from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.component.tunes import Tune, Tunes
 from companion.config.sections import AtArm, Config
 from companion.configured import models
 from companion.configured.profiles import Profiles
+from companion.estimation.collector.outlook import Settings
+from companion.estimation.machine import Machine
+from companion.estimation.means.windows import Window
+from companion.estimation.records.record import Record
+from companion.estimation.solution.draft import Draft
+from companion.estimation.solution.site import LocalEarth, local_earth
 from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners

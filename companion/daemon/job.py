@@ -8,12 +8,12 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.records.align_record import AlignmentRecord, FacesRecord, TurnRecord
-from companion.calibration.records.record import Record, WrittenParameter
-from companion.calibration.request import What
-from companion.calibration.solution.doubt import Doubt
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
+from companion.estimation.records.align_record import AlignmentRecord, FacesRecord, TurnRecord
+from companion.estimation.records.record import Record, WrittenParameter
+from companion.estimation.request import What
+from companion.estimation.solution.doubt import Doubt
 from companion.links.system.waiting import comes
 from companion.samples import Triad
 from companion.storage.changes import BY_TEMPERATURE, ChangeSet

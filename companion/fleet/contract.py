@@ -13,8 +13,8 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 import msgspec
 
-from companion.calibration.records.flight_record import KeptFlight
-from companion.calibration.solution.by_temperature import ByTemperature
+from companion.estimation.records.flight_record import KeptFlight
+from companion.estimation.solution.by_temperature import ByTemperature
 from companion.physics.units import DEG_H, MG
 
 FORMAT_VERSION: Final = 1

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import sqlalchemy as sa
 
-from companion.calibration.solution.by_temperature import ByTemperature, Expected, ExpectedForces, Seen
+from companion.estimation.solution.by_temperature import ByTemperature, Expected, ExpectedForces, Seen
 from companion.fleet.judging import Part, parts_of
 from companion.fleet.models import Scatter, Typical, typical_part
 from companion.fleet.schema import Moment, aircraft, parts

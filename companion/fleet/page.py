@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import sqlalchemy as sa
 
-from companion.calibration.solution.by_temperature import Seen
+from companion.estimation.solution.by_temperature import Seen
 from companion.fleet.imu_pages import by_temperature, curves, model_links
 from companion.fleet.schema import Moment, findings, rejected
 from companion.fleet.schema import aircraft as known

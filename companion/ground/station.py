@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.request import What
 from companion.component.commands import MAV_RESULT_CANCELLED, NOTHING_RAN
 from companion.component.own_parameters import AT_ARM, RESULTS
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.errors import ConfigError, NobodyHeardError
+from companion.estimation.request import What
 from companion.ground import heard
 from companion.ground.exchange import Answer, Exchange
 from companion.ground.heard import FRESH_S, Heard, Target, Text, Vehicle

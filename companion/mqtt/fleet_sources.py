@@ -11,8 +11,8 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.records.record import Record
 from companion.errors import StorageError
+from companion.estimation.records.record import Record
 from companion.storage.changes import PREDICTION
 from companion.storage.fleet_items import Clock, Entry, FleetItems, Item, Mark
 from companion.storage.flights import FlightStore

@@ -22,8 +22,8 @@ from typing import Final, Protocol
 
 import msgspec
 
-from companion.calibration.request import What, is_time_limit
 from companion.errors import CompanionError
+from companion.estimation.request import What, is_time_limit
 from companion.formats import Object
 from companion.mqtt.daemon import Ask
 from companion.printable import printable

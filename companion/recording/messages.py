@@ -14,11 +14,11 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.telemetry.imu_samples import EkfBiasReading
 from companion.autopilot.vehicle.vehicle import Firmware
-from companion.calibration.means.windows import ImuInput
-from companion.calibration.solution.otherwise import Otherwise
-from companion.calibration.solution.prior import Expectation
-from companion.calibration.solution.site import Whereabouts
-from companion.calibration.turning.watch import Turn
+from companion.estimation.means.windows import ImuInput
+from companion.estimation.solution.otherwise import Otherwise
+from companion.estimation.solution.prior import Expectation
+from companion.estimation.solution.site import Whereabouts
+from companion.estimation.turning.watch import Turn
 
 FORMAT_VERSION: Final = "4"
 METADATA: Final = "companion"

@@ -7,7 +7,7 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.solution.by_temperature import ByTemperature, Expected
+from companion.estimation.solution.by_temperature import ByTemperature, Expected
 from companion.physics.units import UNITS
 from companion.report import svg
 from companion.report.markup import Child, Markup, tag

@@ -12,7 +12,7 @@ from typing import Final
 import msgspec
 
 from companion import __version__
-from companion.calibration.records.record import Record
+from companion.estimation.records.record import Record
 from companion.physics.units import UNITS
 from companion.report import svg
 from companion.report.markup import Child, Markup, join, number, tag

@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 from typing import Final
 
-from companion.calibration.records.flight_record import FORMAT_VERSION, Flight, KeptFlight
 from companion.errors import StorageError
+from companion.estimation.records.flight_record import FORMAT_VERSION, Flight, KeptFlight
 from companion.storage.state import StateFile, numbers_in, remove_durably
 
 logger = logging.getLogger(__name__)

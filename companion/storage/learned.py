@@ -8,8 +8,8 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.records import align_record, history
-from companion.calibration.records.record import Arming
+from companion.estimation.records import align_record, history
+from companion.estimation.records.record import Arming
 from companion.storage.state import BoundedList, StateFile
 
 

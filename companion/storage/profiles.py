@@ -13,10 +13,10 @@ from typing import Final
 import msgspec
 
 from companion import formats
-from companion.calibration.noise.allan import PROFILES, AllanModel, NoiseProfile, noise_profile
 from companion.config import CATALOGUE, no_profile
 from companion.config.sections import Noise
 from companion.errors import ConfigError, StorageError
+from companion.estimation.noise.allan import PROFILES, AllanModel, NoiseProfile, noise_profile
 from companion.storage.state import UNREADABLE, named_in, read_regular, sealed, unsealed, write_atomically
 
 logger = logging.getLogger(__name__)

@@ -12,10 +12,10 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.collector import trace as traces
-from companion.calibration.collector.trace import Trace
-from companion.calibration.records.record import Record, from_json, to_json
 from companion.errors import StorageError
+from companion.estimation.collector import trace as traces
+from companion.estimation.collector.trace import Trace
+from companion.estimation.records.record import Record, from_json, to_json
 from companion.storage.changes import ChangeSet
 from companion.storage.state import (
     UNREADABLE,

@@ -10,14 +10,14 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.alignment.align_model import Ground, ImuStand, Stand
-from companion.calibration.alignment.faces import Face, Sides, faces
-from companion.calibration.alignment.spot import mounting, turned
-from companion.calibration.collector.outlook import Settings
-from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.means.windows import ImuInput, ImuWindow
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.seconds.counting import Counted, TurnCounter
+from companion.estimation.alignment.align_model import Ground, ImuStand, Stand
+from companion.estimation.alignment.faces import Face, Sides, faces
+from companion.estimation.alignment.spot import mounting, turned
+from companion.estimation.collector.outlook import Settings
+from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.means.windows import ImuInput, ImuWindow
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.seconds.counting import Counted, TurnCounter
 from companion.samples import ImuSample
 from sim.accuracy.stand import GRAVITY_ANOMALY_M_S2, NEXT_S, RATE_HZ, AnomalousSite, local, sites
 from sim.aircraft import Pose, Site, VirtualAircraft

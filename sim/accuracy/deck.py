@@ -14,14 +14,14 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.deck.deck import Deck
-from companion.calibration.means.pose import CompassModel, GradienterModel
-from companion.calibration.means.windows import ImuInput, Window
-from companion.calibration.noise.allan import PROFILES, noise_profile
-from companion.calibration.request import What
-from companion.calibration.seconds.batch import summary, unrolled
-from companion.calibration.solution.solve import solve
 from companion.errors import CalibrationRefusedError
+from companion.estimation.deck.deck import Deck
+from companion.estimation.means.pose import CompassModel, GradienterModel
+from companion.estimation.means.windows import ImuInput, Window
+from companion.estimation.noise.allan import PROFILES, noise_profile
+from companion.estimation.request import What
+from companion.estimation.seconds.batch import summary, unrolled
+from companion.estimation.solution.solve import solve
 from sim.accuracy.stand import ACCEL_BIAS_M_S2, GRAVITY_ANOMALY_M_S2, GYRO_BIAS_RAD_S, NEXT_S, AnomalousSite, local
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from companion.calibration.noise.allan import PROFILES, floor_variance
+from companion.estimation.noise.allan import PROFILES, floor_variance
 from sim.accuracy.deck import DeckRun, Voyage, sail
 from sim.accuracy.experiments import many
 from sim.accuracy.figures import Claim, Figure, Section, covered, rms

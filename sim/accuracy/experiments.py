@@ -13,9 +13,9 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from companion.calibration.means.windows import ImuInput, Window
-from companion.calibration.noise.allan import noise_profile
 from companion.errors import CalibrationRefusedError
+from companion.estimation.means.windows import ImuInput, Window
+from companion.estimation.noise.allan import noise_profile
 from sim.accuracy.stand import (
     GRAVITY_ANOMALY_M_S2,
     NEXT_S,

@@ -8,12 +8,12 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.means.windows import ImuInput
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.records.history import by_power_up, kept
-from companion.calibration.solution.at_end import Pair, at_end, foretold
-from companion.calibration.solution.prior import ExpectedImu, curve_of, follow
-from companion.calibration.temperature.along import settling
+from companion.estimation.means.windows import ImuInput
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.records.history import by_power_up, kept
+from companion.estimation.solution.at_end import Pair, at_end, foretold
+from companion.estimation.solution.prior import ExpectedImu, curve_of, follow
+from companion.estimation.temperature.along import settling
 from sim.accuracy.figures import Claim, Section, covered, rms
 from sim.accuracy.stand import POSTURES, References, collected, samples, sites, solved, stand
 from sim.accuracy.temperature import AMBIENT_DEGC, COVERS, DAYS, TRIED, Aircraft

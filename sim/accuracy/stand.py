@@ -17,13 +17,13 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.collector.outlook import Settings
-from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.means.pose import CompassModel, GradienterModel
-from companion.calibration.means.windows import ImuInput, Window
-from companion.calibration.request import What
-from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
-from companion.calibration.solution.solve import ImuSolution, Solution, solve
+from companion.estimation.collector.outlook import Settings
+from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.means.pose import CompassModel, GradienterModel
+from companion.estimation.means.windows import ImuInput, Window
+from companion.estimation.request import What
+from companion.estimation.solution.site import LocalEarth, Whereabouts, local_earth
+from companion.estimation.solution.solve import ImuSolution, Solution, solve
 from companion.physics.gradienter import Law
 from companion.samples import CompassSample, ImuSample, TiltSample
 from sim.aircraft import Pose, Site, VirtualAircraft

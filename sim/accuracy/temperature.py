@@ -13,9 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.records.history import Measured, Point, PowerUp, kept
-from companion.calibration.solution.prior import Now, expect, pose_effect
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.records.history import Measured, Point, PowerUp, kept
+from companion.estimation.solution.prior import Now, expect, pose_effect
 from sim.accuracy.figures import Claim, Section, covered, rms
 from sim.earth import Array
 from sim.imu_model import DEG_H, PARTS, AxisNoise

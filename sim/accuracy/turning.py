@@ -16,13 +16,13 @@ from typing import Final, Literal
 
 import numpy as np
 
-from companion.calibration.collector.outlook import Settings
-from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.means.pose import CompassModel, GradienterModel
-from companion.calibration.means.windows import ImuInput
-from companion.calibration.noise.allan import NoiseProfile, allan_model, noise_profile
-from companion.calibration.request import What
-from companion.calibration.solution.solve import solve
+from companion.estimation.collector.outlook import Settings
+from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.means.pose import CompassModel, GradienterModel
+from companion.estimation.means.windows import ImuInput
+from companion.estimation.noise.allan import NoiseProfile, allan_model, noise_profile
+from companion.estimation.request import What
+from companion.estimation.solution.solve import solve
 from companion.physics.units import DEG_H, MG
 from companion.samples import CompassSample, ImuSample, TiltSample
 from sim.accuracy.experiments import many

@@ -14,8 +14,8 @@ from typing import Any, Final
 import aiomqtt
 import msgspec
 
-from companion.calibration.records.flight_record import AXES, Drift, ImuFlight, Split, Stages, Term
-from companion.calibration.records.record import Arming, ImuRecord, Record, WrittenParameter
+from companion.estimation.records.flight_record import AXES, Drift, ImuFlight, Split, Stages, Term
+from companion.estimation.records.record import Arming, ImuRecord, Record, WrittenParameter
 from companion.fleet.collector import connected, stop
 from companion.fleet.contract import FORMAT_VERSION
 from companion.physics.units import DEG_H, MG

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from companion.calibration.machine import State
+from companion.estimation.machine import State
 from sim.motions import Handling
 from tests.campaign import witness as judge
 from tests.campaign.fault import Fault, Phase, Scene

@@ -1,7 +1,7 @@
 """The fleet's fault table: what is killed, full, wrong or told twice between aircraft and database.
 
 A real Mosquitto, the collector as processes, SQLite and PostgreSQL; `python -m tests.campaign --fleet`. Afterwards the
-database has what each aircraft truly had, once. The aircraft's own part of it is in tests/unit/test_fleet_face.py.
+database has what each aircraft truly had, once. The aircraft's own part of it is in tests/unit/fleet/test_face.py.
 """
 
 from __future__ import annotations

@@ -18,10 +18,10 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from companion.calibration.machine import Event, State
 from companion.config import parse
 from companion.daemon.faces.control import ControlServer
 from companion.daemon.process.service import Service
+from companion.estimation.machine import Event, State
 from companion.links.mavlink.link import MavlinkLink
 from sim.devices import Frame, SerialDevice, VectorNavBinary
 from tests.campaign import loopback

@@ -10,11 +10,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.records.record import Record
-from companion.calibration.request import What
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from companion.daemon.stands.align_steps import Plan
+from companion.estimation.records.record import Record
+from companion.estimation.request import What
 from companion.lab.replay.engine import replay
 from sim.aircraft import Pose
 from sim.ardupilot.double import offset_names

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.calibration.records.align_record import FacesRecord, TurnRecord
 from companion.component.service import JobResult
 from companion.daemon.job import Job
+from companion.estimation.records.align_record import FacesRecord, TurnRecord
 from sim.hands import Hands
 from sim.imu_model import MG, ImuModel
 from sim.motions import Turn, Vibration

@@ -11,14 +11,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.records.align_record import FacesRecord
-from companion.calibration.records.record import Record
-from companion.calibration.request import What
 from companion.cli.client import stands_lines
 from companion.cli.show import status_lines
 from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.daemon.stands.by_hand import ByHand
+from companion.estimation.records.align_record import FacesRecord
+from companion.estimation.records.record import Record
+from companion.estimation.request import What
 from sim.ardupilot.double import offset_names
 from sim.hands import Hands
 from sim.imu_model import MG

@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.records.align_record import TurnRecord
 from companion.cli.client import stands_lines
 from companion.component.service import Refusal
 from companion.daemon.job import Job
+from companion.estimation.records.align_record import TurnRecord
 from sim.aircraft import Pose
 from sim.ardupilot.double import offset_names
 from sim.earth import mounting_matrix

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.machine import State
 from companion.config.sections import AtArm
+from companion.estimation.machine import State
 from sim.motions import Handling
 from tests.support.component import Ground
 from tests.support.rig import Rig

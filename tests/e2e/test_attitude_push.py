@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.request import What
 from companion.daemon.heading.attitude_service import AttitudeService
 from companion.daemon.job import Job
+from companion.estimation.request import What
 from sim.aircraft import Pose
 from sim.flight import BankedCircles
 from sim.motions import Turn

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.machine import State
-from companion.calibration.request import What
 from companion.component.service import Refusal
 from companion.daemon.arming import automatic
 from companion.daemon.job import Job
+from companion.estimation.machine import State
+from companion.estimation.request import What
 from sim.imu_model import DEG_H, MG
 from tests.e2e.test_calibration import FC_PARAMETERS
 from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, CANCELLED, UNDO

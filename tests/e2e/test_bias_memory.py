@@ -12,11 +12,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.records.history import PowerUp
-from companion.calibration.records.record import Record, Standing
 from companion.cli.show import status_lines
 from companion.daemon.job import Job
 from companion.daemon.offsets import firmware_calibration
+from companion.estimation.records.history import PowerUp
+from companion.estimation.records.record import Record, Standing
 from companion.lab.replay.engine import replay
 from companion.storage.learned import BiasStore
 from sim.devices import Gradienter

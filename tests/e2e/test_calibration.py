@@ -12,10 +12,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.records.record import Record
-from companion.calibration.request import What
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
+from companion.estimation.records.record import Record
+from companion.estimation.request import What
 from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H, MG
 from tests.support.component import ACCEPTED, CALIBRATE, UNDO

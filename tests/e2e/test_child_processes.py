@@ -12,11 +12,11 @@ from typing import Final, Self
 
 import pytest
 
-from companion.calibration.machine import State
-from companion.calibration.request import What
 from companion.daemon.faces.child import Child
 from companion.daemon.faces.control import ControlServer
 from companion.daemon.job import Job
+from companion.estimation.machine import State
+from companion.estimation.request import What
 from sim.motions import Handling
 from tests.support.broker import broker, peer
 from tests.support.mqtt_daemon import is_

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from companion.calibration.records.record import ImuRecord, Record, WrittenParameter
+from companion.estimation.records.record import ImuRecord, Record, WrittenParameter
 from sim.pty_device import PtyDevice
 from sim.scenario import Scenario, demo
 from sim.serve import configuration

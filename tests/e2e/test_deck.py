@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from companion.calibration.deck.estimate import DeckWork
-from companion.calibration.records.record import Record
-from companion.calibration.request import What
 from companion.component.service import Refusal
+from companion.estimation.deck.estimate import DeckWork
+from companion.estimation.records.record import Record
+from companion.estimation.request import What
 from companion.lab.replay.engine import replay
 from sim.imu_model import DEG_H, MG
 from sim.motions import SlowTurn

@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.means.dither import STEPS
-from companion.calibration.request import What
 from companion.config.sections import Imu, Push
 from companion.daemon.job import Job
+from companion.estimation.means.dither import STEPS
+from companion.estimation.request import What
 from companion.storage.changes import ChangeLog
 from sim.ardupilot.double import ArduPilotDouble, offset_names
 from sim.imu_model import DEG_H, MG, AxisNoise, ImuModel, ImuSpec

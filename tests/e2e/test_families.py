@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.noise.allan import PROFILES
-from companion.calibration.records.record import ImuRecord, Record
-from companion.calibration.request import What
 from companion.config import parse
 from companion.configured import models
 from companion.daemon.job import Job
 from companion.daemon.process.service import Service
+from companion.estimation.noise.allan import PROFILES
+from companion.estimation.records.record import ImuRecord, Record
+from companion.estimation.request import What
 from companion.protocols.registry import PROTOCOLS
 from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, saved_profile
 from sim.aircraft import Pose, VirtualAircraft

@@ -1,7 +1,7 @@
 """Faults around a write that neither the campaign nor a unit test shows.
 
-The campaign (tests/campaign) plays each fault in each phase; tests/unit/test_autopilot_writer.py and
-tests/unit/test_daemon_ledger.py show how old values are restored.
+The campaign (tests/campaign) plays each fault in each phase; tests/unit/autopilot/test_writer.py and
+tests/unit/daemon/test_ledger.py show how old values are restored.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.calibration.machine import State
-from companion.calibration.means.windows import Window
-from companion.calibration.request import What
 from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.daemon.stands.measuring import Measuring
+from companion.estimation.machine import State
+from companion.estimation.means.windows import Window
+from companion.estimation.request import What
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from sim.ardupilot.double import ArduPilotDouble, offset_names
 from sim.imu_model import DEG_H, MG

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.machine import State
-from companion.calibration.request import What
 from companion.component.service import JobResult, Refusal
+from companion.estimation.machine import State
+from companion.estimation.request import What
 from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H
 from tests.e2e.test_calibration import FC_PARAMETERS, calibrated, started

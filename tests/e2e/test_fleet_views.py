@@ -12,7 +12,7 @@ import msgspec
 import pytest
 import sqlalchemy as sa
 
-from companion.calibration.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
+from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
 from companion.fleet import page, schema
 from companion.fleet.database import engine_of
 from companion.fleet.store import Message, Store

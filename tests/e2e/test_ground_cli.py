@@ -1,6 +1,6 @@
 """`companion ground ...` as a person types it: real processes, the real daemon, MAVSDK, a double of the autopilot.
 
-What a lost, late or foreign answer does: tests/unit/test_ground_exchange.py and tests/unit/test_ground_station.py.
+What a lost, late or foreign answer does: tests/unit/ground/test_exchange.py and tests/unit/ground/test_station.py.
 """
 
 from __future__ import annotations

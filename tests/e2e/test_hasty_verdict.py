@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from companion.autopilot.parameters.verify import Verdict
-from companion.calibration.machine import State
 from companion.daemon.offsets import effect
+from companion.estimation.machine import State
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

@@ -9,12 +9,12 @@ from typing import Any
 import msgspec
 import pytest
 
-from companion.calibration.machine import State
-from companion.calibration.request import What
 from companion.cli.show import monitor_lines, record_lines
 from companion.component.service import Refusal
 from companion.daemon.arming import automatic
 from companion.daemon.job import Job
+from companion.estimation.machine import State
+from companion.estimation.request import What
 from companion.storage.learned import BiasStore
 from sim.devices import Gradienter
 from sim.imu_model import MG

@@ -34,7 +34,7 @@ def changes(name: str, before: float) -> bytes:
 def test_a_damaged_file_is_named_and_nothing_of_it_is_written(
     tmp_path: Path, name: str, damage: Callable[[Path], Any], reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """tests/unit/test_storage_state.py has the other contents and the other files."""
+    """tests/unit/storage/test_state.py has the other contents and the other files."""
     path = tmp_path / name
     damage(path)
 

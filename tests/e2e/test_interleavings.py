@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.records.record import Record
+from companion.estimation.records.record import Record
 from tests.e2e.test_calibration import FC_PARAMETERS
 from tests.support.component import CALIBRATE, CANCEL, IN_PROGRESS, UNDO
 from tests.support.extent import extent

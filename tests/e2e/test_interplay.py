@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.machine import State
-from companion.calibration.records.validity import Why
-from companion.calibration.request import What
 from companion.component.service import Refusal
+from companion.estimation.machine import State
+from companion.estimation.records.validity import Why
+from companion.estimation.request import What
 from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H
 from tests.support.rig import Rig

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from companion.calibration.machine import State
-from companion.calibration.records.validity import Why
-from companion.calibration.request import What
 from companion.cli.show import history_lines
+from companion.estimation.machine import State
+from companion.estimation.records.validity import Why
+from companion.estimation.request import What
 from tests.e2e.test_calibration import calibrated, started
 from tests.e2e.test_faults import values
 from tests.support.rig import Rig

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.records.record import Record
 from companion.cli.show import record_lines, status_lines
 from companion.config import parse
+from companion.estimation.records.record import Record
 from companion.physics.frames import wrap_deg
 from sim.aircraft import Iron
 from sim.devices import COUNTS_PER_GAUSS, HMR3300

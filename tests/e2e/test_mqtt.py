@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from companion.calibration.machine import State
+from companion.estimation.machine import State
 from tests.support.broker import BEST, Heard, broker, hurry, peer
 from tests.support.children import mqtt_of
 from tests.support.mqtt_daemon import (

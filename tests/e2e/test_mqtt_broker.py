@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from companion.calibration.machine import State
 from companion.config import parse
 from companion.daemon.process.service import Service
+from companion.estimation.machine import State
 from companion.mqtt import client as link
 from companion.mqtt import process
 from tests.support.broker import BEST, KINDS, Broker, Kind, broker, hurry, peer

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.calibration.machine import State
 from companion.cli import show
+from companion.estimation.machine import State
 from sim.motions import Handling
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig

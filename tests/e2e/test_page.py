@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from companion.calibration.request import What
+from companion.estimation.request import What
 from sim.motions import Handling
 from tests.e2e.test_calibration import calibrated, started
 from tests.support import page

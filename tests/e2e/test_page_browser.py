@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import msgspec
 import pytest
 
-from companion.calibration.records.record import Record, from_json
+from companion.estimation.records.record import Record, from_json
 from companion.storage.learned import BiasStore
 from companion.storage.records import RecordStore
 from tests.e2e.test_calibration import calibrated

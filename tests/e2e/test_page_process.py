@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from companion.calibration.machine import State
 from companion.daemon.faces.child import Child
+from companion.estimation.machine import State
 from tests.e2e.test_child_processes import beside, calibrated, rig_of
 from tests.support.page import parsed
 

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from companion.autopilot.firmware.firmwares import part_of
-from companion.calibration.means.windows import Hidden, ImuWindow
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.records.record import ImuRecord
-from companion.calibration.request import What
-from companion.calibration.solution.site import IN_CONFIGURATION
-from companion.calibration.solution.solve import wide_gyros
 from companion.config import parse
 from companion.config.sections import Noise
 from companion.daemon.process.check import run_check
+from companion.estimation.means.windows import Hidden, ImuWindow
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.records.record import ImuRecord
+from companion.estimation.request import What
+from companion.estimation.solution.site import IN_CONFIGURATION
+from companion.estimation.solution.solve import wide_gyros
 from sim.imu_model import DEG_H
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import GYRO_BIAS_DEG_H, Rig

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.request import What
+from companion.estimation.request import What
 from companion.storage.changes import ChangeLog
 from tests.e2e.test_calibration import calibrated, started
 from tests.support.rig import Rig

@@ -20,11 +20,11 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.records.record import Record, to_json
 from companion.cli import main as companion
 from companion.config.sections import Config, Noise
 from companion.daemon.recorder import recorder as recorder_module
 from companion.errors import StorageError
+from companion.estimation.records.record import Record, to_json
 from companion.formats import Object
 from companion.lab.logs.recording import MAGIC, Message, Recording
 from companion.lab.replay.calibrations import TOLERANCE_SIGMAS

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.records.record import Record
+from companion.estimation.records.record import Record
 from companion.lab.replay.engine import Result, replay
 from companion.recording import messages
 from tests.e2e.test_record_replay import rewritten

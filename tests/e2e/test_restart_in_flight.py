@@ -15,9 +15,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.records.history import PowerUp
-from companion.calibration.records.record import Record
 from companion.config import parse
+from companion.estimation.records.history import PowerUp
+from companion.estimation.records.record import Record
 from companion.storage.learned import BiasStore
 from companion.storage.records import RecordStore
 from sim.companion_process import CompanionProcess

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from companion.calibration.request import What
 from companion.daemon.job import Job
+from companion.estimation.request import What
 from sim.ardupilot.double import offset_names
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.request import What
 from companion.config import parse
 from companion.configured import models
 from companion.daemon.job import Job
+from companion.estimation.request import What
 from sim.imu_model import DEG_H, MG
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

@@ -1,7 +1,7 @@
 """Faults of a serial line on real ports: named and counted while they last, data again within 3 s of their end.
 
 The daemon's own sensor reads ptys and sockets in real time; sim/uart.py shows what a UART makes of another speed or
-parity. Faults that bytes alone show: tests/unit/test_stream_health.py.
+parity. Faults that bytes alone show: tests/unit/protocols/test_stream_health.py.
 """
 
 from __future__ import annotations

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.request import What
 from companion.component.service import Refusal
 from companion.daemon.job import Job
+from companion.estimation.request import What
 from sim.imu_model import MG
 from tests.support.rig import ACCEL_BIAS_MG, Rig
 from tests.support.virtual_time import run_virtual

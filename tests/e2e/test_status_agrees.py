@@ -6,7 +6,7 @@ import asyncio
 from pathlib import Path
 from typing import Any
 
-from companion.calibration.machine import State
+from companion.estimation.machine import State
 from companion.physics.units import DEG_H
 from sim.imu_model import DEG_H as SIM_DEG_H
 from tests.e2e.test_calibration import calibrated

@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.records.history import PowerUp
 from companion.errors import RequestRefusedError
+from companion.estimation.records.history import PowerUp
 from companion.storage.learned import BiasStore
 from sim.imu_model import DEG_H, MG
 from tests.support.rig import GYRO_BIAS_DEG_H, Rig

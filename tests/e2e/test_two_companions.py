@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from companion.calibration.request import What
 from companion.component.service import Refusal
+from companion.estimation.request import What
 from tests.e2e.test_calibration import calibrated
 from tests.e2e.test_faults import values
 from tests.e2e.test_undo import undone

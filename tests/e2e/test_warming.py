@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.records.record import ImuRecord
+from companion.estimation.records.record import ImuRecord
 from sim.imu_model import DEG_H
 from tests.e2e.test_automatic import calibrated_by_itself
 from tests.e2e.test_calibration import calibrated

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.request import What
 from companion.component.service import Refusal
 from companion.daemon.calibrating.why_not import MOST_REQUESTERS, StartLimit
 from companion.daemon.job import Job
+from companion.estimation.request import What
 from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, TEMPORARILY_REJECTED
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

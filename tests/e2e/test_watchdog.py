@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
-from companion.calibration.request import What
 from companion.component.service import Refusal
 from companion.daemon.process.supervisor import Supervisor
+from companion.estimation.request import What
 from companion.links.system.service_manager import ServiceManager
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.means.pose import CompassModel, FieldUnit
-from companion.calibration.means.windows import Window
-from companion.calibration.request import What
-from companion.calibration.solution.site import Whereabouts, local_earth
-from companion.calibration.solution.solve import Solution, solve
+from companion.estimation.means.pose import CompassModel, FieldUnit
+from companion.estimation.means.windows import Window
+from companion.estimation.request import What
+from companion.estimation.solution.site import Whereabouts, local_earth
+from companion.estimation.solution.solve import Solution, solve
 from companion.physics.frames import wrap_deg
 from companion.physics.units import DEG
 from sim.aircraft import Iron

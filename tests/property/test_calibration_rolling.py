@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.calibration.collector.outlook import Status
-from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.noise.robust import huber_line, huber_mean
-from companion.calibration.seconds.batch import BatchSource
 from companion.errors import CalibrationRefusedError
+from companion.estimation.collector.outlook import Status
+from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.noise.robust import huber_line, huber_mean
+from companion.estimation.seconds.batch import BatchSource
 from companion.physics.frames import rotation_matrix
 from companion.rotations import ROTATION_NAMES
 from companion.samples import CompassSample, ImuSample, TiltSample

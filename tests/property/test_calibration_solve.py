@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.calibration.means.pose import CompassModel, GradienterModel
-from companion.calibration.means.windows import Window
-from companion.calibration.request import What
-from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
-from companion.calibration.solution.solve import ImuSolution, Solution, solve
 from companion.errors import CalibrationRefusedError
+from companion.estimation.means.pose import CompassModel, GradienterModel
+from companion.estimation.means.windows import Window
+from companion.estimation.request import What
+from companion.estimation.solution.site import LocalEarth, Whereabouts, local_earth
+from companion.estimation.solution.solve import ImuSolution, Solution, solve
 from companion.physics.frames import Array
 from companion.physics.units import DEG, DEG_H, MG
 from tests.support.windows import about, ideal_window, ned_from_body

@@ -11,8 +11,8 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.calibration.records.record import Arming
 from companion.daemon.offsets.reboot_owed import owed_in
+from companion.estimation.records.record import Arming
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from companion.storage.learned import SIGNING_FILE, BiasStore, Done, alignment_in, faces_in, signing_time_in
 from companion.storage.records import RecordStore

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.records.history import Point, PowerUp
+from companion.estimation.records.history import Point, PowerUp
 from companion.physics.frames import vector
 from companion.storage.learned import BiasStore
 from sim.companion_process import CompanionProcess

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from companion.calibration.noise.allan import AllanModel, predicted_sigma
+from companion.estimation.noise.allan import AllanModel, predicted_sigma
 
 
 def use_variance(model: AllanModel, mean_s: float, horizon_s: float) -> float:

@@ -11,10 +11,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from companion.calibration.collector.rolling import RollingCollector
 from companion.configured.models import Role, SerialDevice
 from companion.daemon.devices.sensor_watch import SensorWatch
 from companion.daemon.devices.sensors import SerialSensor
+from companion.estimation.collector.rolling import RollingCollector
 from companion.protocols.registry import PROTOCOLS
 from companion.samples import Sample
 from sim.devices import nmea

@@ -10,13 +10,13 @@ from typing import Literal, NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.request import What
 from companion.component.component import Component
 from companion.component.own_parameters import Parameter
 from companion.component.service import ArmAnswer, Job, JobResult, Refusal
 from companion.component.statustext import StatusText
 from companion.component.tunes import Tunes
 from companion.config.sections import EVERYBODY, Senders
+from companion.estimation.request import What
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.wire import Wire
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from companion.calibration.records.flight_record import (
+from companion.estimation.records.flight_record import (
     AXES,
     Drift,
     Flight,

@@ -10,9 +10,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from companion.calibration.collector.trace import Trace, VerdictTrace
-from companion.calibration.records.history import Measured, Point, PowerUp, kept
-from companion.calibration.records.record import (
+from companion.estimation.collector.trace import Trace, VerdictTrace
+from companion.estimation.records.history import Measured, Point, PowerUp, kept
+from companion.estimation.records.record import (
     Arming,
     ImuRecord,
     Pose,

@@ -17,9 +17,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.solution.site import Whereabouts
 from companion.config import parse
 from companion.config.sections import Config
+from companion.estimation.solution.site import Whereabouts
 from companion.recording import messages
 from companion.recording.files import Beginning, RecordingFile
 from companion.recording.messages import Message

@@ -8,7 +8,7 @@ import math
 import msgspec
 import numpy as np
 
-from companion.calibration.means.pose import (
+from companion.estimation.means.pose import (
     CompassModel,
     FieldHeading,
     FieldUnit,
@@ -16,8 +16,8 @@ from companion.calibration.means.pose import (
     GradienterModel,
     HeadingWindow,
 )
-from companion.calibration.means.windows import Window
-from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
+from companion.estimation.means.windows import Window
+from companion.estimation.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.samples import MagSample, TiltSample
 from tests.support.windows import Array, ideal_window, ned_from_body
 

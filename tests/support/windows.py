@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.means.pose import HeadingWindow, TiltWindow
-from companion.calibration.means.windows import ImuWindow, Window
+from companion.estimation.means.pose import HeadingWindow, TiltWindow
+from companion.estimation.means.windows import ImuWindow, Window
 
 Array = NDArray[np.float64]
 RATE_RAD_S = 7.292115e-5

@@ -19,8 +19,8 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, Thermal, vector_changes
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import Parameters, read_integer
-from companion.calibration.temperature.polynomial import ZERO, Polynomial
 from companion.errors import AutopilotError
+from companion.estimation.temperature.polynomial import ZERO, Polynomial
 from companion.physics.frames import vector
 from companion.samples import Vector
 

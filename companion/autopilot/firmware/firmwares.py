@@ -24,9 +24,9 @@ from companion.autopilot.firmware.imu_calibration import (
 from companion.autopilot.firmware.px4 import SLOTS, SlotMemory
 from companion.autopilot.parameters.reading import SCALES, Parameters
 from companion.autopilot.vehicle.vehicle import Firmware
-from companion.calibration.records.record import Outcome, WrittenParameter
 from companion.config.sections import Profile
 from companion.errors import AutopilotError, AutopilotRebootedError
+from companion.estimation.records.record import Outcome, WrittenParameter
 from companion.samples import Triad
 
 _SETTLE_S: Final[dict[Firmware, float]] = {

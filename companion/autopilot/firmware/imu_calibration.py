@@ -24,9 +24,9 @@ from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import Parameters, read_integer
 from companion.autopilot.parameters.wire import float32, same_float32
 from companion.autopilot.vehicle.vehicle import Firmware
-from companion.calibration.solution.solve import ImuSolution
-from companion.calibration.temperature.polynomial import NOTHING, Polynomial
 from companion.errors import CalibrationRefusedError
+from companion.estimation.solution.solve import ImuSolution
+from companion.estimation.temperature.polynomial import NOTHING, Polynomial
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, MG
 from companion.samples import Triad, Vector

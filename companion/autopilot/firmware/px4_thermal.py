@@ -15,8 +15,8 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import Thermal
 from companion.autopilot.firmware.px4 import SLOTS, THERMAL_ENABLE, thermal_names
 from companion.autopilot.parameters.reading import Parameters, read_integer
-from companion.calibration.temperature.polynomial import NOTHING, Polynomial
 from companion.errors import AutopilotError
+from companion.estimation.temperature.polynomial import NOTHING, Polynomial
 from companion.physics.frames import vector
 
 

@@ -6,8 +6,8 @@ import dataclasses
 from typing import ClassVar, Literal
 
 from companion.autopilot.parameters.wire import float32
-from companion.calibration.records.record import WrittenParameter
 from companion.errors import AutopilotError, NotDisarmedError
+from companion.estimation.records.record import WrittenParameter
 
 FailureKind = Literal[
     "refused",

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Final, Protocol
 
 from companion.autopilot.parameters.change import Change
-from companion.calibration.records.record import Outcome, WrittenParameter
+from companion.estimation.records.record import Outcome, WrittenParameter
 
 POLL_S: Final = 1.1
 """PX4's readers of parameters let 1 s pass between two looks (autopilots 9.2): after this long each has seen a value.

@@ -22,7 +22,6 @@ from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.items import POLL_S, FarProbe, Item, ItemVector, by_vector
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.vehicle import ArmState, Moment, Vehicle
-from companion.calibration.records.record import WrittenParameter
 from companion.errors import (
     AutopilotError,
     AutopilotRebootedError,
@@ -32,6 +31,7 @@ from companion.errors import (
     ParameterRefusedError,
     StorageError,
 )
+from companion.estimation.records.record import WrittenParameter
 
 logger = logging.getLogger(__name__)
 

@@ -18,8 +18,8 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.solution.otherwise import OwnHeading
-from companion.calibration.solution.site import UNKNOWN_DECLINATION_SIGMA_DEG
+from companion.estimation.solution.otherwise import OwnHeading
+from companion.estimation.solution.site import UNKNOWN_DECLINATION_SIGMA_DEG
 from companion.physics.frames import Array, body_from_ned
 from companion.physics.units import DEG
 

@@ -11,11 +11,11 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.vehicle.vehicle import VehicleEvent
-from companion.calibration.records.record import Arming, Record
 from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.readiness import Readiness
 from companion.daemon.core import Core
 from companion.errors import StorageError
+from companion.estimation.records.record import Arming, Record
 from companion.formats import utc_now
 from companion.storage.learned import armings_in
 

@@ -21,7 +21,6 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.records.validity import Why
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.in_force import InForce
@@ -31,6 +30,7 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import NO_CALIBRATION, Job
 from companion.errors import AutopilotError, StorageError
+from companion.estimation.records.validity import Why
 from companion.storage.state import BoundedList
 
 logger = logging.getLogger(__name__)

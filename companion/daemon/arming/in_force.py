@@ -16,23 +16,6 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.firmwares import outcomes_of
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.records.record import ImuRecord, Record
-from companion.calibration.records.validity import (
-    Finding,
-    Held,
-    Limits,
-    Present,
-    Seen,
-    Why,
-    held_of,
-    judge,
-    worst_axis,
-    worth_writing,
-)
-from companion.calibration.request import What
-from companion.calibration.solution.doubt import Doubt
-from companion.calibration.solution.solve import Solution
 from companion.component.service import JobResult
 from companion.config.sections import Config, Imu
 from companion.configured import models
@@ -45,6 +28,23 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.errors import CalibrationRefusedError
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.records.record import ImuRecord, Record
+from companion.estimation.records.validity import (
+    Finding,
+    Held,
+    Limits,
+    Present,
+    Seen,
+    Why,
+    held_of,
+    judge,
+    worst_axis,
+    worth_writing,
+)
+from companion.estimation.request import What
+from companion.estimation.solution.doubt import Doubt
+from companion.estimation.solution.solve import Solution
 from companion.physics.frames import vector
 from companion.samples import TRIADS, Triad
 

@@ -13,10 +13,10 @@ import msgspec
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.records.validity import Why
 from companion.component.service import JobResult
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import NO_CALIBRATION, Job
+from companion.estimation.records.validity import Why
 
 logger = logging.getLogger(__name__)
 

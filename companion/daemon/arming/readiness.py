@@ -13,8 +13,6 @@ from typing import Final, Literal
 
 from companion.autopilot.firmware.firmwares import settle_s
 from companion.autopilot.vehicle.ekf import ADJUSTING
-from companion.calibration.machine import State
-from companion.calibration.records.validity import Why
 from companion.component.service import ArmAnswer
 from companion.config.sections import AtArm
 from companion.daemon.arming.automatic import Automatic
@@ -24,6 +22,8 @@ from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core
 from companion.daemon.offsets.effect import LOOK_S
 from companion.daemon.offsets.reboot_owed import RebootOwed
+from companion.estimation.machine import State
+from companion.estimation.records.validity import Why
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad
 

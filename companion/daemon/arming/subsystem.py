@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator, Mapping, Sequence
 
 import msgspec
 
-from companion.calibration.records.record import ImuRecord
 from companion.daemon.arming.armings import Armings, with_armings
 from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.gate_setup import GateSetup
@@ -19,6 +18,7 @@ from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import StorageError
+from companion.estimation.records.record import ImuRecord
 from companion.formats import Object
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector

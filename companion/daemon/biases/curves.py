@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from companion.calibration.means.warming import Warming
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.records.history import Point, by_power_up
-from companion.calibration.solution.prior import curve_of, follow
-from companion.calibration.temperature.along import Along, Settling, settling
-from companion.calibration.temperature.curve import Curve, State
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.estimation.means.warming import Warming
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.records.history import Point, by_power_up
+from companion.estimation.solution.prior import curve_of, follow
+from companion.estimation.temperature.along import Along, Settling, settling
+from companion.estimation.temperature.curve import Curve, State
 from companion.physics.frames import Array, vector
 from companion.samples import Triad, Vector
 from companion.storage.learned import KnownImu

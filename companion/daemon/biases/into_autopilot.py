@@ -13,10 +13,6 @@ from companion.autopilot.firmware.ardupilot_tcal import thermal_changes
 from companion.autopilot.firmware.firmwares import why_no_thermal_write
 from companion.autopilot.firmware.imu_calibration import Thermal
 from companion.autopilot.parameters.wire import same_float32
-from companion.calibration.machine import Event
-from companion.calibration.means.windows import Window
-from companion.calibration.temperature.curve import Curve
-from companion.calibration.temperature.polynomial import Polynomial, of_curve
 from companion.component.service import MEASURED_PERCENT
 from companion.daemon.biases.memory import LOOK_K, BiasMemory
 from companion.daemon.core import Core
@@ -27,6 +23,10 @@ from companion.daemon.offsets.plan import Plan, Target, left_in
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.measuring import Measuring
 from companion.errors import CalibrationRefusedError
+from companion.estimation.machine import Event
+from companion.estimation.means.windows import Window
+from companion.estimation.temperature.curve import Curve
+from companion.estimation.temperature.polynomial import Polynomial, of_curve
 from companion.storage.changes import BY_TEMPERATURE
 
 

@@ -16,11 +16,18 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.firmware.imu_calibration import whole_of
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.records.history import Point, kept
-from companion.calibration.solution.doubt import Doubt
-from companion.calibration.solution.joint import Weighed, Whole, points, weigh
-from companion.calibration.solution.prior import (
+from companion.daemon.biases.curves import Curves
+from companion.daemon.biases.whose import Whose, changed
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.devices.sensors import SerialSensor
+from companion.daemon.stands.alignment import AlignmentInForce
+from companion.errors import AutopilotError, StorageError
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.records.history import Point, kept
+from companion.estimation.solution.doubt import Doubt
+from companion.estimation.solution.joint import Weighed, Whole, points, weigh
+from companion.estimation.solution.prior import (
     Expectation,
     Expected,
     ExpectedImu,
@@ -29,14 +36,7 @@ from companion.calibration.solution.prior import (
     expect_today,
     pose_effect,
 )
-from companion.calibration.solution.solve import ImuSolution, Shared, Solution
-from companion.daemon.biases.curves import Curves
-from companion.daemon.biases.whose import Whose, changed
-from companion.daemon.core import Core
-from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.devices.sensors import SerialSensor
-from companion.daemon.stands.alignment import AlignmentInForce
-from companion.errors import AutopilotError, StorageError
+from companion.estimation.solution.solve import ImuSolution, Shared, Solution
 from companion.formats import Object
 from companion.physics.frames import vector
 from companion.samples import TRIADS, Triad
@@ -303,7 +303,7 @@ class BiasMemory:
     def temperature(self) -> list[Object]:
         """For `companion temperature`; blocking."""
         # What nobody asked for costs the start nothing.
-        from companion.calibration.solution.temperature_summary import by_temperature
+        from companion.estimation.solution.temperature_summary import by_temperature
 
         self.follow()
         unix_s = time.time()

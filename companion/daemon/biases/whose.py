@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.calibration.records.align_record import ImuAlignmentRecord
-from companion.calibration.records.history import PowerUp
 from companion.config.sections import Noise
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensors import SerialSensor
 from companion.daemon.stands.alignment import AlignmentInForce
+from companion.estimation.records.align_record import ImuAlignmentRecord
+from companion.estimation.records.history import PowerUp
 from companion.storage.learned import this_boot
 
 _IN_WORDS: Final = {

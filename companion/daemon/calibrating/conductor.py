@@ -14,10 +14,6 @@ from typing import Literal
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
-from companion.calibration.collector.outlook import Settings
-from companion.calibration.machine import Event, State
-from companion.calibration.request import What
-from companion.calibration.solution.draft import in_words
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.component.tunes import Tune
@@ -29,6 +25,10 @@ from companion.daemon.job import Job, JobCancelledError, Undone
 from companion.daemon.offsets.ledger import Recovery
 from companion.daemon.stands.by_hand import ByHand
 from companion.errors import CompanionError
+from companion.estimation.collector.outlook import Settings
+from companion.estimation.machine import Event, State
+from companion.estimation.request import What
+from companion.estimation.solution.draft import in_words
 from companion.links.system.listeners import Listeners
 from companion.storage.changes import AUTOMATIC, BY_HAND, ChangeSet
 

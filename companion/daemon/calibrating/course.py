@@ -14,14 +14,6 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.parameters.change import WriteFailedError
-from companion.calibration.machine import Event
-from companion.calibration.means.windows import Window
-from companion.calibration.records.history import Point
-from companion.calibration.request import What
-from companion.calibration.solution.draft import Draft, unseen_turn, when_warm
-from companion.calibration.solution.joint import Weighed, weigh
-from companion.calibration.solution.prior import Expectation
-from companion.calibration.solution.solve import Solution
 from companion.component.service import WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.component.tunes import Tune
@@ -37,6 +29,14 @@ from companion.daemon.offsets.effect import TELEMETRY
 from companion.daemon.offsets.plan import Planner
 from companion.daemon.offsets.push import WATCHING, Pusher
 from companion.daemon.stands.measuring import Measuring
+from companion.estimation.machine import Event
+from companion.estimation.means.windows import Window
+from companion.estimation.records.history import Point
+from companion.estimation.request import What
+from companion.estimation.solution.draft import Draft, unseen_turn, when_warm
+from companion.estimation.solution.joint import Weighed, weigh
+from companion.estimation.solution.prior import Expectation
+from companion.estimation.solution.solve import Solution
 from companion.links.system.listeners import Listeners
 from companion.samples import Triad
 

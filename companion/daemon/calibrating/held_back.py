@@ -11,8 +11,8 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.records.validity import Finding, Held, Present, Why, worst_axis
-from companion.calibration.solution.doubt import Doubt
+from companion.estimation.records.validity import Finding, Held, Present, Why, worst_axis
+from companion.estimation.solution.doubt import Doubt
 from companion.samples import Triad
 
 Key = tuple[str, Triad]

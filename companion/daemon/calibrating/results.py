@@ -6,11 +6,11 @@ import logging
 
 import msgspec
 
-from companion.calibration.records.record import Record
 from companion.component.statustext import Severity
 from companion.daemon.biases.memory import BiasMemory
 from companion.daemon.core import Core
 from companion.errors import StorageError
+from companion.estimation.records.record import Record
 from companion.formats import utc_now
 from companion.storage.changes import ChangeSet
 from companion.storage.records import RecordStore

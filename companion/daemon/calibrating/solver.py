@@ -9,16 +9,16 @@ from typing import NamedTuple
 
 from companion.autopilot.firmware.heading_parameters import COMPASS
 from companion.autopilot.vehicle.own_attitude import OwnAttitude
-from companion.calibration.means.windows import Window
-from companion.calibration.request import What
-from companion.calibration.solution.otherwise import NOTHING, Otherwise, OwnHeading
-from companion.calibration.solution.site import Whereabouts, local_earth
-from companion.calibration.solution.solve import Solution, solve
 from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.stands.alignment import AlignmentInForce
 from companion.daemon.stands.faces_in_force import FacesInForce
 from companion.errors import AutopilotError
+from companion.estimation.means.windows import Window
+from companion.estimation.request import What
+from companion.estimation.solution.otherwise import NOTHING, Otherwise, OwnHeading
+from companion.estimation.solution.site import Whereabouts, local_earth
+from companion.estimation.solution.solve import Solution, solve
 
 
 class Given(NamedTuple):

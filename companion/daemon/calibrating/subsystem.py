@@ -10,8 +10,6 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.vehicle.own_attitude import OwnAttitude
-from companion.calibration.records.record import Record
-from companion.calibration.request import What, is_time_limit
 from companion.component.service import Refusal
 from companion.daemon.biases.into_autopilot import IntoAutopilot
 from companion.daemon.biases.memory import BiasMemory
@@ -38,6 +36,8 @@ from companion.daemon.stands.measuring import Measuring
 from companion.daemon.stands.stands import Stands
 from companion.daemon.stands.turning import TurnAsked, Turning
 from companion.errors import CalibrationRefusedError, RequestRefusedError
+from companion.estimation.records.record import Record
+from companion.estimation.request import What, is_time_limit
 from companion.formats import Object
 from companion.links.system.waiting import comes
 from companion.storage.records import RecordStore

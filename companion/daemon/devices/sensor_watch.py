@@ -12,10 +12,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.seconds.batch import Batch
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.sensors import SerialSensor
+from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import Array, Matrix
 from companion.protocols.stream_health import Trouble
 

@@ -8,9 +8,6 @@ from collections.abc import Sequence
 from companion.autopilot.firmware.imu_calibration import accel_taken_off
 from companion.autopilot.firmware.px4 import SlotMemory
 from companion.autopilot.telemetry.ekf_bias import EkfBias
-from companion.calibration.means.pose import up_in_vehicle
-from companion.calibration.solution.site import IN_CONFIGURATION
-from companion.calibration.stillness.plausible import misplaced
 from companion.configured import models
 from companion.configured.models import Role, collect, serial_devices
 from companion.daemon.core import Core, Subsystem, Task
@@ -19,6 +16,9 @@ from companion.daemon.devices.reach import Reach
 from companion.daemon.devices.sensor_watch import UNTOUCHED, Corrected, SensorWatch
 from companion.daemon.devices.sensors import SensorRole, SerialSensor
 from companion.daemon.devices.signing import LinkSigning
+from companion.estimation.means.pose import up_in_vehicle
+from companion.estimation.solution.site import IN_CONFIGURATION
+from companion.estimation.stillness.plausible import misplaced
 from companion.formats import Object
 from companion.links.system.listeners import Listeners
 from companion.physics.units import G

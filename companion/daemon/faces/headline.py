@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final, Literal
 import msgspec
 
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.machine import State
 from companion.daemon.arming.readiness import BY_ITSELF
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.conductor import Conductor
@@ -20,6 +19,7 @@ from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import Job
 from companion.daemon.offsets.effect import TELEMETRY
+from companion.estimation.machine import State
 
 if TYPE_CHECKING:
     from companion.daemon.heading.attitude_service import AttitudeService

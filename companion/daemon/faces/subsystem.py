@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final, get_args
 
 import msgspec
 
-from companion.calibration.records.record import ImuRecord
 from companion.component.component import Component
 from companion.component.own_parameters import AT_ARM, RESULTS, Parameter
 from companion.component.service import JobResult
@@ -27,6 +26,7 @@ from companion.daemon.heading.subsystem import Heading
 from companion.daemon.job import Job
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import ConfigError
+from companion.estimation.records.record import ImuRecord
 from companion.formats import Object
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad

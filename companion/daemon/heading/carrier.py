@@ -20,18 +20,18 @@ from companion.attitude.quaternion import Quaternion, Triple, conjugate, from_ma
 from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD
 from companion.autopilot.firmware.firmwares import outcomes_of
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
-from companion.calibration.means.pose import CompassModel, GradienterModel, vehicle_heading_rad
-from companion.calibration.means.windows import Window
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.records.record import ImuRecord
-from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
-from companion.calibration.solution.truth import truth_of
 from companion.config.sections import Config, Imu
 from companion.configured import models
 from companion.daemon.arming.in_force import InForce
 from companion.daemon.core import Core
 from companion.daemon.stands.alignment import AlignmentInForce
 from companion.errors import CalibrationRefusedError
+from companion.estimation.means.pose import CompassModel, GradienterModel, vehicle_heading_rad
+from companion.estimation.means.windows import Window
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.records.record import ImuRecord
+from companion.estimation.solution.site import LocalEarth, Whereabouts, local_earth
+from companion.estimation.solution.truth import truth_of
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.physics.units import DEG, MG
 from companion.samples import CompassSample, ImuSample, Sample, Triad, Vector

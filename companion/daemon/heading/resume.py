@@ -18,14 +18,14 @@ from companion.attitude.quaternion import to_matrix
 from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_bias
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.records.record import ImuRecord, Record
-from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.configured import models
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.heading.carrier import Carrier, Stand, settings_of
 from companion.daemon.heading.health import HEADING_UNKNOWN, THEIR_TILT_DEG, Difference, disagreements
+from companion.estimation.records.record import ImuRecord, Record
+from companion.estimation.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.physics.frames import vector
 from companion.physics.units import DEG
 from companion.samples import Vector

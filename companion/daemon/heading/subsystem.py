@@ -18,14 +18,14 @@ from companion.autopilot.firmware.heading_parameters import (
 )
 from companion.autopilot.firmware.imu_calibration import read_rivals
 from companion.autopilot.firmware.port_parameters import baud_of, port_names, port_rows
-from companion.calibration.means.pose import up_in_vehicle, vehicle_heading_rad
-from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.configured import models
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.stands.alignment import AlignmentInForce
+from companion.estimation.means.pose import up_in_vehicle, vehicle_heading_rad
+from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.formats import Object
 from companion.physics.frames import roll_pitch_from_up
 from companion.physics.units import DEG

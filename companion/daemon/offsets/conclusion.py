@@ -14,9 +14,6 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.commands import result_name
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.machine import Event
-from companion.calibration.means.windows import Window
-from companion.calibration.solution.draft import Draft
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core
 from companion.daemon.job import GoOn, Job, JobCancelledError
@@ -26,6 +23,9 @@ from companion.daemon.offsets.plan import Plan
 from companion.daemon.offsets.push import POLL_S, heartbeat, not_as_written
 from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.errors import AutopilotError, AutopilotRebootedError, NotDisarmedError, ParameterTimeoutError
+from companion.estimation.machine import Event
+from companion.estimation.means.windows import Window
+from companion.estimation.solution.draft import Draft
 
 logger = logging.getLogger(__name__)
 

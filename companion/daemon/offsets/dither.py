@@ -19,18 +19,18 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Moment
-from companion.calibration.collector.intake import LIMITS_IMU
-from companion.calibration.machine import Event
-from companion.calibration.means.dither import SECONDS, STEPS, Dithered, Step, combine, shifts_lsb, why_void
-from companion.calibration.means.windows import ImuWindow, Window
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.seconds.batch import Batch, BatchSource
-from companion.calibration.solution.draft import Draft
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job, JobCancelledError
 from companion.daemon.offsets.ledger import Ledger
 from companion.errors import AutopilotError, CalibrationRefusedError, CompanionError
+from companion.estimation.collector.intake import LIMITS_IMU
+from companion.estimation.machine import Event
+from companion.estimation.means.dither import SECONDS, STEPS, Dithered, Step, combine, shifts_lsb, why_void
+from companion.estimation.means.windows import ImuWindow, Window
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.seconds.batch import Batch, BatchSource
+from companion.estimation.solution.draft import Draft
 from companion.physics.frames import Array
 from companion.samples import ImuSample
 from companion.storage.changes import Changed, ChangeSet

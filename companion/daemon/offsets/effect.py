@@ -20,14 +20,14 @@ from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import Observation, Verdict, judge
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import ArmState, Moment
-from companion.calibration.collector.rolling import MIN_BATCHES
-from companion.calibration.means.windows import ImuWindow, Window
-from companion.calibration.noise.allan import AllanModel, floor_variance, noise_profile
 from companion.config.sections import Noise
 from companion.daemon.core import Core
 from companion.daemon.offsets.plan import Plan, Target
 from companion.daemon.offsets.px4_writes import FarMean, Px4Writes, step_from_far
 from companion.errors import CalibrationRefusedError
+from companion.estimation.collector.rolling import MIN_BATCHES
+from companion.estimation.means.windows import ImuWindow, Window
+from companion.estimation.noise.allan import AllanModel, floor_variance, noise_profile
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad, Vector

@@ -34,12 +34,12 @@ from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.writer import ParameterWriter, kind_of
 from companion.autopilot.vehicle.ekf import SETTLED_RAD_S, EkfWatch
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.records.record import WrittenParameter
-from companion.calibration.solution.draft import Draft
 from companion.config.sections import Platform
 from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.offsets.plan import Plan
 from companion.errors import AutopilotError, CompanionError
+from companion.estimation.records.record import WrittenParameter
+from companion.estimation.solution.draft import Draft
 from companion.physics.units import DEG_H
 from companion.storage.changes import ChangeSet
 

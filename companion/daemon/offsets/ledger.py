@@ -20,12 +20,12 @@ from companion.autopilot.parameters.change import Change, NothingWrittenError, W
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.records.record import WrittenParameter
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core, Offload
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
+from companion.estimation.records.record import WrittenParameter
 from companion.formats import Object, utc_now
 from companion.links.system.listeners import Listeners
 from companion.storage.changes import ChangeLog, ChangeSet, Interruptions, Undoable

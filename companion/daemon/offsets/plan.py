@@ -16,15 +16,15 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes
 from companion.autopilot.firmware.px4 import SlotMemory, warnings_about
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.telemetry.imu_stream import StreamKind
-from companion.calibration.means.windows import ImuWindow
-from companion.calibration.records.record import Outcome, WrittenParameter
-from companion.calibration.records.validity import RESIDUAL_SIGMAS
-from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.offsets.rivalry import Rivalry
 from companion.errors import AutopilotError
+from companion.estimation.means.windows import ImuWindow
+from companion.estimation.records.record import Outcome, WrittenParameter
+from companion.estimation.records.validity import RESIDUAL_SIGMAS
+from companion.estimation.solution.draft import Draft
+from companion.estimation.solution.solve import ImuSolution, Shared, Solution
 from companion.physics.frames import Array, vector
 from companion.physics.units import MG
 from companion.samples import Triad, Vector, rows_of

@@ -13,9 +13,6 @@ from companion.autopilot.parameters.verify import Verdict
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.calibration.machine import Event
-from companion.calibration.means.windows import Window
-from companion.calibration.solution.draft import Draft
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
@@ -27,6 +24,9 @@ from companion.daemon.offsets.plan import Plan, Target
 from companion.daemon.offsets.px4_writes import Px4Writes
 from companion.daemon.offsets.reboot_owed import RebootOwed
 from companion.errors import AutopilotError, NotDisarmedError, StorageError
+from companion.estimation.machine import Event
+from companion.estimation.means.windows import Window
+from companion.estimation.solution.draft import Draft
 from companion.storage.changes import ChangeSet, Origin
 
 DISARMED_WITHIN_S: Final = 10.0

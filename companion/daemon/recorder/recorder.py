@@ -19,11 +19,6 @@ from typing import Final, TypeVar
 import msgspec
 
 from companion.autopilot.telemetry.imu_samples import EkfBiasReading
-from companion.calibration.means.windows import Window
-from companion.calibration.records.record import to_json
-from companion.calibration.request import What, is_time_limit
-from companion.calibration.solution.prior import Expectation
-from companion.calibration.solution.site import Whereabouts
 from companion.component.service import JobResult
 from companion.configured import models
 from companion.daemon.calibrating.solver import Given
@@ -33,6 +28,11 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import Job
 from companion.errors import StorageError
+from companion.estimation.means.windows import Window
+from companion.estimation.records.record import to_json
+from companion.estimation.request import What, is_time_limit
+from companion.estimation.solution.prior import Expectation
+from companion.estimation.solution.site import Whereabouts
 from companion.formats import Object
 from companion.links.mavlink.link import Direction
 from companion.recording import messages

@@ -9,8 +9,6 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import output_step
 from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.parameters.change import Change
-from companion.calibration.means.windows import ImuWindow, Window
-from companion.calibration.solution.draft import Draft
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
@@ -18,6 +16,8 @@ from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.plan import Plan, Target, left_in
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import CalibrationRefusedError
+from companion.estimation.means.windows import ImuWindow, Window
+from companion.estimation.solution.draft import Draft
 
 
 class AccelWrites:

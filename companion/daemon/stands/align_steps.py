@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.records.align_record import Kind
+from companion.estimation.records.align_record import Kind
 from companion.physics.frames import Array
 from companion.physics.units import DEG
 

@@ -8,13 +8,6 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.alignment.align import Alignment, align, in_words
-from companion.calibration.alignment.align_model import Stand
-from companion.calibration.machine import Event
-from companion.calibration.means.pose import GradienterModel, up_in_vehicle, vehicle_heading_rad
-from companion.calibration.means.windows import Window
-from companion.calibration.records.align_record import AlignmentRecord, imu_record, stand_record
-from companion.calibration.solution.site import LocalEarth
 from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.job import Job
@@ -23,6 +16,13 @@ from companion.daemon.stands.alignment import AlignmentInForce
 from companion.daemon.stands.stands import Stands
 from companion.daemon.stands.taken import Taken, ground, readable
 from companion.errors import CalibrationRefusedError
+from companion.estimation.alignment.align import Alignment, align, in_words
+from companion.estimation.alignment.align_model import Stand
+from companion.estimation.machine import Event
+from companion.estimation.means.pose import GradienterModel, up_in_vehicle, vehicle_heading_rad
+from companion.estimation.means.windows import Window
+from companion.estimation.records.align_record import AlignmentRecord, imu_record, stand_record
+from companion.estimation.solution.site import LocalEarth
 from companion.formats import utc_now
 from companion.physics.units import DEG
 

@@ -6,12 +6,12 @@ import logging
 
 import msgspec
 
-from companion.calibration.means.pose import GradienterModel
-from companion.calibration.records.align_record import AlignmentRecord, GradienterSettings
-from companion.calibration.records.record import AlignmentUsed
 from companion.config.sections import Config
 from companion.configured import models
 from companion.daemon.core import Offload
+from companion.estimation.means.pose import GradienterModel
+from companion.estimation.records.align_record import AlignmentRecord, GradienterSettings
+from companion.estimation.records.record import AlignmentUsed
 from companion.links.system.listeners import Listeners
 from companion.storage.learned import alignment_in
 

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 import msgspec
 
 from companion.autopilot.parameters.wire import same_float32
-from companion.calibration.records.align_record import AlignmentRecord, FacesRecord, TurnRecord
 from companion.component.service import JobResult
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.errors import StorageError
+from companion.estimation.records.align_record import AlignmentRecord, FacesRecord, TurnRecord
 from companion.formats import Object, utc_now
 from companion.storage.changes import PREDICTION, ChangeSet
 from companion.storage.learned import KEEP_DONE, Done, alignments_in

@@ -8,13 +8,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.calibration.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Sides
-from companion.calibration.means.windows import Window
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.records.align_record import FacesImuRecord, FacesRecord, Running
-from companion.calibration.solution.otherwise import aged_m_s2
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.estimation.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Sides
+from companion.estimation.means.windows import Window
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.records.align_record import FacesImuRecord, FacesRecord, Running
+from companion.estimation.solution.otherwise import aged_m_s2
 from companion.formats import Object
 from companion.physics.frames import Array
 from companion.physics.units import MG

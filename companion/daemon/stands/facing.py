@@ -13,13 +13,6 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import whole_accelerometer
 from companion.autopilot.parameters.change import Change
-from companion.calibration.alignment.faces import BIAS, SCALE, Face, Faces, faces
-from companion.calibration.alignment.missing import Missing, missing, seen_before, up_of
-from companion.calibration.machine import Event
-from companion.calibration.means.windows import ImuWindow, Window
-from companion.calibration.records.align_record import FaceRecord, FacesImuRecord, FacesRecord, faces_imu_record
-from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.site import LocalEarth
 from companion.component.statustext import Severity
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -29,6 +22,13 @@ from companion.daemon.stands.align_steps import LEVEL, Hold
 from companion.daemon.stands.faces_in_force import FacesInForce
 from companion.daemon.stands.stands import Asked, Stands
 from companion.errors import CalibrationRefusedError
+from companion.estimation.alignment.faces import BIAS, SCALE, Face, Faces, faces
+from companion.estimation.alignment.missing import Missing, missing, seen_before, up_of
+from companion.estimation.machine import Event
+from companion.estimation.means.windows import ImuWindow, Window
+from companion.estimation.records.align_record import FaceRecord, FacesImuRecord, FacesRecord, faces_imu_record
+from companion.estimation.solution.draft import Draft
+from companion.estimation.solution.site import LocalEarth
 from companion.physics.frames import Array, vector
 from companion.physics.units import MG
 

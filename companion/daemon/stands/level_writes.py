@@ -19,16 +19,16 @@ from companion.autopilot.firmware.ardupilot import TRIM
 from companion.autopilot.firmware.px4 import LEVEL, read_level
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
 from companion.autopilot.vehicle.own_attitude import OwnAttitude
-from companion.calibration.alignment.spot import Mounting
-from companion.calibration.machine import Event
-from companion.calibration.means.windows import Window
-from companion.calibration.records.record import Outcome, WrittenParameter
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.job import Job, JobCancelledError
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import AutopilotError, CalibrationRefusedError
+from companion.estimation.alignment.spot import Mounting
+from companion.estimation.machine import Event
+from companion.estimation.means.windows import Window
+from companion.estimation.records.record import Outcome, WrittenParameter
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix
 from companion.storage.changes import ChangeSet, Origin
 

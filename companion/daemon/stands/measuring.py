@@ -10,10 +10,6 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.collector.outlook import Settings, Status
-from companion.calibration.machine import Event, State
-from companion.calibration.means.windows import Window
-from companion.calibration.request import What
 from companion.component.service import MEASURED_PERCENT
 from companion.component.statustext import Severity
 from companion.configured import models
@@ -21,6 +17,10 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.job import Job
 from companion.errors import AutopilotError, CalibrationRefusedError
+from companion.estimation.collector.outlook import Settings, Status
+from companion.estimation.machine import Event, State
+from companion.estimation.means.windows import Window
+from companion.estimation.request import What
 from companion.links.system.listeners import Listeners
 
 POLL_S: Final = 0.2

@@ -15,9 +15,6 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.calibration.collector.outlook import Glance
-from companion.calibration.machine import Event
-from companion.calibration.means.windows import Window
 from companion.component.service import JobResult
 from companion.component.statustext import LINE_BYTES, Severity
 from companion.component.tunes import Tune
@@ -29,6 +26,9 @@ from companion.daemon.stands.align_steps import LEVEL, Hold, Plan, Seen
 from companion.daemon.stands.measuring import POLL_S, Measuring
 from companion.daemon.stands.taken import Taken
 from companion.errors import CalibrationRefusedError
+from companion.estimation.collector.outlook import Glance
+from companion.estimation.machine import Event
+from companion.estimation.means.windows import Window
 from companion.physics.frames import Array
 from companion.physics.units import DEG
 

@@ -9,12 +9,12 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.alignment.align_model import Ground, ImuStand, Stand
-from companion.calibration.means.pose import CompassModel
-from companion.calibration.means.windows import ImuWindow, Window
-from companion.calibration.solution.site import LocalEarth
 from companion.daemon.stands.align_steps import Seen
 from companion.errors import CalibrationRefusedError
+from companion.estimation.alignment.align_model import Ground, ImuStand, Stand
+from companion.estimation.means.pose import CompassModel
+from companion.estimation.means.windows import ImuWindow, Window
+from companion.estimation.solution.site import LocalEarth
 from companion.physics.units import DEG
 
 READING_SIGMA_DEG: Final = 0.005

@@ -9,15 +9,6 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import changes_for, whole_bias
-from companion.calibration.alignment.align import Alignment, in_words
-from companion.calibration.alignment.align_model import Stand
-from companion.calibration.alignment.spot import Mounting, mounting, turned
-from companion.calibration.machine import Event
-from companion.calibration.means.windows import Window
-from companion.calibration.records.align_record import BoardRecord, TurnRecord, stand_record, turn_imu_record
-from companion.calibration.records.record import WrittenParameter
-from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.site import LocalEarth
 from companion.component.statustext import Severity
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -29,6 +20,15 @@ from companion.daemon.stands.level_writes import LevelWrites
 from companion.daemon.stands.stands import Stands
 from companion.daemon.stands.taken import Taken, ground, readable
 from companion.errors import CalibrationRefusedError
+from companion.estimation.alignment.align import Alignment, in_words
+from companion.estimation.alignment.align_model import Stand
+from companion.estimation.alignment.spot import Mounting, mounting, turned
+from companion.estimation.machine import Event
+from companion.estimation.means.windows import Window
+from companion.estimation.records.align_record import BoardRecord, TurnRecord, stand_record, turn_imu_record
+from companion.estimation.records.record import WrittenParameter
+from companion.estimation.solution.draft import Draft
+from companion.estimation.solution.site import LocalEarth
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG, MG
 from companion.storage.changes import Origin

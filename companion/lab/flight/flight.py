@@ -13,11 +13,11 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.calibration.noise.allan import PROFILES, noise_profile
-from companion.calibration.records.flight_record import Drift, Flight, ImuFlight, Moment, Stages, Term
-from companion.calibration.records.record import Record
-from companion.calibration.solution.prior import curve_of
 from companion.errors import AutopilotError, StorageError
+from companion.estimation.noise.allan import PROFILES, noise_profile
+from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, Moment, Stages, Term
+from companion.estimation.records.record import Record
+from companion.estimation.solution.prior import curve_of
 from companion.lab.flight import ardupilot_log, inertial, px4_log
 from companion.lab.flight.in_force import calibration_in, moment, with_others, written_in
 from companion.lab.flight.inertial import Increments, Navigation, Window, World

@@ -15,8 +15,8 @@ from companion.autopilot.firmware.px4 import SlotMemory
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.vehicle import Firmware
-from companion.calibration.records.record import Record
 from companion.errors import AutopilotError, StorageError
+from companion.estimation.records.record import Record
 from companion.lab.flight.log import FlownImu
 from companion.physics.frames import Floats
 from companion.samples import Triad

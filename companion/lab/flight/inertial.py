@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.calibration.records.flight_record import Drift
+from companion.estimation.records.flight_record import Drift
 from companion.physics.frames import Floats, rotations, running_products
 
 STEP_S: Final = 0.02

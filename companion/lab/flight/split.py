@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.records.flight_record import AXES, Split, Term
+from companion.estimation.records.flight_record import AXES, Split, Term
 from companion.lab.flight.inertial import Window
 from companion.physics.frames import Floats
 from companion.physics.statistics import student_quantile

@@ -12,9 +12,9 @@ from typing import Any, Final, Self
 import msgspec
 import numpy as np
 
-from companion.calibration.means.windows import ImuInput, estimates
-from companion.calibration.noise.allan import NoiseProfile, allan_variance
-from companion.calibration.seconds.batch import Batch
+from companion.estimation.means.windows import ImuInput, estimates
+from companion.estimation.noise.allan import NoiseProfile, allan_variance
+from companion.estimation.seconds.batch import Batch
 from companion.lab.profiling.profile_fit import CHANNELS, LEAST_STILL_S, MIN_SECONDS, Rest, fit_profile
 from companion.physics.frames import Floats
 from companion.samples import TRIADS, Triad, rows_of

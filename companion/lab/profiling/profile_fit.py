@@ -21,7 +21,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.noise.allan import (
+from companion.errors import CalibrationRefusedError
+from companion.estimation.noise.allan import (
     FLOOR_OF_FLICKER,
     WARM_UP_K,
     AllanModel,
@@ -29,12 +30,11 @@ from companion.calibration.noise.allan import (
     floor_variance,
     slope_variance,
 )
-from companion.calibration.noise.allan_fit import AxisFit, curve, fit_axis, not_negative
-from companion.calibration.seconds.batch import Batch, summary
-from companion.calibration.stillness.gates import ImuGate
-from companion.calibration.stillness.own_noise import learned_of
-from companion.calibration.stillness.stretch import Stretch
-from companion.errors import CalibrationRefusedError
+from companion.estimation.noise.allan_fit import AxisFit, curve, fit_axis, not_negative
+from companion.estimation.seconds.batch import Batch, summary
+from companion.estimation.stillness.gates import ImuGate
+from companion.estimation.stillness.own_noise import learned_of
+from companion.estimation.stillness.stretch import Stretch
 from companion.physics.frames import Floats
 from companion.samples import TRIADS, rows_of
 

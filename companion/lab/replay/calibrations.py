@@ -9,20 +9,20 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
-from companion.calibration.collector.measurement import Measurement
-from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.means.windows import Window
-from companion.calibration.records.record import AlignmentUsed, Record
-from companion.calibration.request import What
-from companion.calibration.solution.draft import Draft, in_words
-from companion.calibration.solution.joint import weigh
-from companion.calibration.solution.otherwise import NOTHING, Otherwise
-from companion.calibration.solution.site import Whereabouts, local_earth
-from companion.calibration.solution.solve import ImuSolution, Solution, solve
 from companion.config.sections import Config
 from companion.configured import models
 from companion.configured.models import aligned
 from companion.errors import CalibrationRefusedError
+from companion.estimation.collector.measurement import Measurement
+from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.means.windows import Window
+from companion.estimation.records.record import AlignmentUsed, Record
+from companion.estimation.request import What
+from companion.estimation.solution.draft import Draft, in_words
+from companion.estimation.solution.joint import weigh
+from companion.estimation.solution.otherwise import NOTHING, Otherwise
+from companion.estimation.solution.site import Whereabouts, local_earth
+from companion.estimation.solution.solve import ImuSolution, Solution, solve
 from companion.physics.frames import Array
 from companion.recording.messages import Measured, Solved
 

@@ -15,12 +15,12 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.records.record import Record, from_json
-from companion.calibration.solution.draft import Draft
 from companion.configured import models
 from companion.configured.models import collect
 from companion.errors import StorageError
+from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.records.record import Record, from_json
+from companion.estimation.solution.draft import Draft
 from companion.lab.logs.playback import UNUSABLE, Playback, config_of
 from companion.lab.logs.recording import Head, Message, Recording
 from companion.lab.replay.calibrations import Calibrations, Offsets, Replayed

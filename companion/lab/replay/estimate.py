@@ -11,21 +11,21 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.calibration.collector.measurement import Measurement
-from companion.calibration.collector.outlook import Settings
-from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.deck.deck import EVERY_S
-from companion.calibration.deck.estimate import MAX_S, MIN_S
-from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
-from companion.calibration.means.windows import ImuInput, Window
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.records.record import Record
-from companion.calibration.request import What
-from companion.calibration.solution.draft import Draft, in_words
-from companion.calibration.solution.site import Remedies, Whereabouts, local_earth
-from companion.calibration.solution.solve import solve
 from companion.config.sections import Mounting, Noise, Platform
 from companion.errors import CalibrationRefusedError
+from companion.estimation.collector.measurement import Measurement
+from companion.estimation.collector.outlook import Settings
+from companion.estimation.collector.rolling import RollingCollector
+from companion.estimation.deck.deck import EVERY_S
+from companion.estimation.deck.estimate import MAX_S, MIN_S
+from companion.estimation.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
+from companion.estimation.means.windows import ImuInput, Window
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.records.record import Record
+from companion.estimation.request import What
+from companion.estimation.solution.draft import Draft, in_words
+from companion.estimation.solution.site import Remedies, Whereabouts, local_earth
+from companion.estimation.solution.solve import solve
 from companion.lab.logs.log import Poses, StillLog
 from companion.physics.frames import Floats, rotation_matrix
 from companion.physics.gradienter import Law

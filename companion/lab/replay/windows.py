@@ -16,8 +16,8 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.calibration.records.record import ImuRecord
 from companion.errors import StorageError
+from companion.estimation.records.record import ImuRecord
 from companion.lab.logs.log import StillLog
 from companion.lab.profiling.coverage import Held
 from companion.lab.replay.estimate import Given, estimate

@@ -9,9 +9,9 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.collector.trace import Trace
-from companion.calibration.records.record import Arming, ImuRecord, Outcome, Record, outcome_word
-from companion.calibration.solution.by_temperature import ByTemperature
+from companion.estimation.collector.trace import Trace
+from companion.estimation.records.record import Arming, ImuRecord, Outcome, Record, outcome_word
+from companion.estimation.solution.by_temperature import ByTemperature
 from companion.lab.report.seconds import stillness
 from companion.physics.units import UNITS
 from companion.report.by_temperature import biases_by_temperature

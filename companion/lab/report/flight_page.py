@@ -7,8 +7,8 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from companion.calibration.records.flight_evidence import surely_moved
-from companion.calibration.records.flight_record import (
+from companion.estimation.records.flight_evidence import surely_moved
+from companion.estimation.records.flight_record import (
     HEADS,
     UNSEEN,
     Drift,

@@ -6,7 +6,7 @@ from typing import Final, Literal
 
 import msgspec
 
-from companion.calibration.collector.trace import Trace, VerdictTrace
+from companion.estimation.collector.trace import Trace, VerdictTrace
 from companion.report import svg
 from companion.report.markup import Child, Markup, tag
 from companion.report.page import card

@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from companion.calibration.noise.allan import PROFILES
-from companion.calibration.records.flight_evidence import moved
-from companion.calibration.records.flight_record import AXES, Flight, KeptFlight
-from companion.calibration.records.record import Arming, Record
-from companion.calibration.solution.by_temperature import ByTemperature
-from companion.calibration.solution.prior import curve_of
-from companion.calibration.solution.temperature_summary import by_temperature
 from companion.errors import StorageError
+from companion.estimation.noise.allan import PROFILES
+from companion.estimation.records.flight_evidence import moved
+from companion.estimation.records.flight_record import AXES, Flight, KeptFlight
+from companion.estimation.records.record import Arming, Record
+from companion.estimation.solution.by_temperature import ByTemperature
+from companion.estimation.solution.prior import curve_of
+from companion.estimation.solution.temperature_summary import by_temperature
 from companion.lab.report.calibration_page import Material
 from companion.storage.flights import FlightStore
 from companion.storage.learned import BiasStore, KnownImu

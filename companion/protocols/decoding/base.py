@@ -242,7 +242,7 @@ ACCEL_LIMIT_M_S2 = 2000.0
 """204 g; the widest range of a part with a gyro in it is 200 g."""
 TEMPERATURE_LIMIT_DEGC = 200.0
 ANY_TEMPERATURE = 800.0
-"""Of an IMU, in kelvin or tenths too: `calibration/temperature/thermometer.py` names what cannot be degC."""
+"""Of an IMU, in kelvin or tenths too: `estimation/temperature/thermometer.py` names what cannot be degC."""
 
 
 def numbers(fields: list[bytes]) -> list[float]:

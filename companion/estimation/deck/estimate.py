@@ -1,0 +1,314 @@
+"""From the seconds of a deck to the same window as of a still stretch, so that everything after it is one path.
+
+An IMU's means in it are those that it would have at rest: at the gradienter's mean tilt, and under the Earth's rate
+alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.errors import CalibrationRefusedError
+from companion.estimation.deck.fluid import Compared, Level, compare
+from companion.estimation.deck.smoother import Believed, Found, smooth
+from companion.estimation.deck.stream import ImuSecond
+from companion.estimation.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
+from companion.estimation.means.warming import drifting
+from companion.estimation.means.windows import ImuInput, ImuWindow, Window
+from companion.estimation.noise.allan import AllanModel, floor_variance, slope_variance
+from companion.physics.frames import Array, Floats, Matrix, body_from_ned, vector
+from companion.physics.gradienter import up_jacobian
+from companion.physics.units import DEG, MG
+
+MIN_S: Final = 60
+"""Some waves: before it nothing is said to be enough."""
+MIN_LOOK_S: Final = 40
+"""A look at what a write has done; its sigma says how little that is."""
+MAX_S: Final = 1200
+SCALE_SIGMA: Final = 0.003
+"""Scale and cross-axis errors of common gyros (0.5 % at the most): so much of a steady turn may pass for a bias."""
+COMPASS_SHARE: Final = math.sqrt(0.5)
+"""Of a compass' sigma, the part that changes with the heading; the other part is the same on all headings."""
+FROZEN_S: Final = 20
+"""No sensor that is swayed says exactly the same for so long."""
+_SWAYS_RAD_S: Final = 0.3 * DEG
+"""Of roll and pitch, over such a while."""
+_SAME: Final = 1e-9
+_DITHERED: Final = 1.5
+"""Integers spread over so many steps by the swaying hide nothing."""
+_UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
+_LEAST_ACCEL_M_S2: Final = 0.1 * MG
+"""Of the comparison with the gradienter; what its zero is wrong by turns everything alike and comes in `solve`."""
+_MIDDLE: Final = 0.37
+"""Of K^2 T: what a slope, weighed most in its middle, misses of a bias that walks; no averaging takes it away."""
+_FLICKER_TO_COME: Final = 0.75
+"""Of B^2: what flicker does in the next minutes that its past does not tell. With what it did in the window, as a
+random walk of B / sqrt(T), it is the flicker's part of V(T, H)."""
+_UPRIGHT: Final = 0.5
+"""Square of an axis' part along the vertical."""
+_GRAVITY_M_S2: Final = 9.8
+
+
+class ByHeading(msgspec.Struct, frozen=True, kw_only=True):
+    """What headings will go on telling of a bias about the vertical."""
+
+    turn_rad_s: float
+    iron_rad: float
+    """Compass error that changes with the heading, one sigma of its sine and cosine."""
+    heading_white: float
+    """N of the headings, rad * sqrt(s)."""
+    gyro: AllanModel
+
+
+class Known(msgspec.Struct, frozen=True):
+    """How well a triad is known: largest variances of the axes."""
+
+    use: float
+    white: float
+    """What more seconds take away."""
+    by_heading: ByHeading | None = None
+    """Where the worst axis is one that the compass tells of."""
+
+
+class DeckFound(msgspec.Struct, frozen=True):
+    """A window, and how far it is."""
+
+    window: Window
+    known: tuple[Known, ...]
+    """Gyros and accelerometers of one IMU after another."""
+
+
+class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
+    """An estimate that is due; `run` touches nothing that changes, and may be called in another thread."""
+
+    imus: Sequence[ImuInput]
+    seconds: Sequence[Sequence[ImuSecond]]
+    levels: Sequence[Mapping[int, Level]]
+    headings: Mapping[int, float]
+    slots: range
+    gradienter: GradienterModel | None
+    compass: CompassModel | None
+    horizon_s: float
+    reference_deg: tuple[float, float] | None
+    """The tilt to give the accelerometers' means at, as the gradienter reads it; None: the mean of the window."""
+    since_s: float | None
+    """The window's own beginning, where it is not that of all seconds."""
+
+    def run(self) -> DeckFound | CalibrationRefusedError:
+        """Work it out: a third of a second for ten minutes of one IMU on a desktop."""
+        try:
+            return self._run()
+        except (CalibrationRefusedError, np.linalg.LinAlgError) as error:
+            return CalibrationRefusedError(str(error))
+
+    def _run(self) -> DeckFound:
+        readings = {slot: level.reading for levels in self.levels[:1] for slot, level in levels.items()}
+        frozen = self._frozen("gradienter", readings)
+        all_levels = [[one for slot, one in levels.items() if slot not in frozen] for levels in self.levels]
+        frozen = self._frozen("compass", {slot: np.array([heading]) for slot, heading in self.headings.items()})
+        headings = np.array([math.nan if slot in frozen else self.headings.get(slot, math.nan) for slot in self.slots])
+        reference = self.reference_deg
+        if self.gradienter is not None:
+            if any(len(levels) < MIN_LOOK_S // 2 for levels in all_levels):
+                raise CalibrationRefusedError(f"no reading from gradienter in {len(self.slots)} s")
+            if reference is None:
+                x, y = np.mean([one.reading for one in all_levels[0]], axis=0).tolist()
+                reference = (x, y)
+        found = [
+            self._imu(imu, seconds, levels, headings, reference)
+            for imu, seconds, levels in zip(self.imus, self.seconds, all_levels, strict=True)
+        ]
+        last = found[0][2] if found else None
+        window = Window(
+            start_s=float(self.slots[0]),
+            end_s=self.slots[-1] + 1.0,
+            imus=tuple(window for window, _, _ in found),
+            tilt=None
+            if reference is None
+            else TiltWindow(
+                x_deg=reference[0], y_deg=reference[1], x_sigma_deg=0.0, y_sigma_deg=0.0, temperature_degc=None
+            ),
+            heading=None if self.compass is None or last is None else self._heading(last, self.compass),
+            turn_rad_s=None if last is None else vector(last.turn_rad_s),
+        )
+        return DeckFound(window, tuple(known for _, triads, _ in found for known in triads))
+
+    def _frozen(self, name: str, readings: Mapping[int, Floats]) -> set[int]:
+        """Seconds in which a sensor said the same over and over while it was swayed.
+
+        Raises:
+            CalibrationRefusedError: so it does still.
+        """
+        if not self.imus:
+            return set()
+        rates = {one.slot: one.mean[:3] @ self.imus[0].rotation.T for one in self.seconds[0]}
+        found: set[int] = set()
+        for run in _runs(readings):
+            swayed = [rates[slot][:2] for slot in run if slot in rates]
+            if len(run) < FROZEN_S or not swayed or np.std(swayed, axis=0).max() < _SWAYS_RAD_S:
+                continue
+            if run[-1] >= self.slots[-1] - 1:
+                raise CalibrationRefusedError(f"{name} is stuck: the same for {len(run)} s while it sways")
+            found.update(run)
+        return found
+
+    def _imu(
+        self,
+        imu: ImuInput,
+        seconds: Sequence[ImuSecond],
+        levels: Sequence[Level],
+        headings: Floats,
+        reference: tuple[float, float] | None,
+    ) -> tuple[ImuWindow, tuple[Known, Known], Found]:
+        gradienter = self.gradienter
+        span_s = float(len(seconds))
+        compared = None if gradienter is None else compare(levels)
+        believed = self._believed(imu, seconds, reference, compared)
+        forward = np.array([1.0, 0.0, 0.0]) if self.compass is None else self.compass.vehicle_from_sensor[:, 0]
+        found = smooth([one.passage for one in seconds], headings, forward, believed)
+        direction, own = _felt(found, gradienter, reference, compared)
+        gyro_own = found.gyro_covariance
+        mean_rate = np.linalg.norm(found.turn_rad_s)
+        steps = _hidden_steps(imu, seconds)
+        going_on = np.square(found.ramp_rad_s2 * self.horizon_s / 2.0) / 3.0
+        gyro, accel = imu.profile.gyro, imu.profile.accel
+        to_come = _FLICKER_TO_COME * gyro.flicker**2 + gyro.walk**2 * self.horizon_s / 3.0
+        # A random walk can be followed and flicker cannot: never better than a mean at rest.
+        at_rest = float(floor_variance(gyro.flicker, gyro.walk, span_s, self.horizon_s))
+        gyro_floor = np.maximum(to_come, at_rest - np.diag(gyro_own))
+        gyro_floor = gyro_floor + steps[:3] + going_on + (SCALE_SIGMA * mean_rate) ** 2
+        accel_floor = steps[3:] + float(floor_variance(accel.flicker, accel.walk, span_s, self.horizon_s))
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = gyro_own + np.diag(gyro_floor)
+        covariance[3:, 3:] = own + np.diag(accel_floor)
+        use = np.sqrt(np.diag(covariance))
+        heading_rad = math.atan2(found.body_to_ned[-1, 1, 0], found.body_to_ned[-1, 0, 0])
+        temperatures = [one.temperature_degc for one in seconds if one.temperature_degc is not None]
+        window = ImuWindow(
+            name=imu.name,
+            samples=sum(one.samples for one in seconds),
+            duration_s=span_s,
+            gyro_rad_s=vector(found.gyro_rad_s),
+            accel_m_s2=vector(direction),
+            gyro_sigma_stat_rad_s=vector(np.sqrt(np.diag(gyro_own))),
+            accel_sigma_stat_m_s2=vector(np.sqrt(np.diag(own))),
+            gyro_sigma_use_rad_s=vector(use[:3]),
+            accel_sigma_use_m_s2=vector(use[3:]),
+            temperature_degc=float(np.mean(temperatures)) if temperatures else None,
+            warnings=(),
+            drifting=drifting(imu.name, np.append(found.ramp_rad_s2, np.zeros(3)), temperatures),
+            named=imu.profile.is_named,
+            covariance=covariance,
+            # Of its level axes: along the heading, to the right of it, and down.
+            by_earth=found.by_earth @ body_from_ned(0.0, 0.0, heading_rad).T,
+        )
+        worst = int(np.argmax(use[:3]))
+        gyros = Known(
+            float(use[worst] ** 2),
+            max(float(np.diag(gyro_own).max()) - wandered(gyro, span_s), 0.0),
+            self._by_heading(found, worst, believed, gyro),
+        )
+        return window, (gyros, Known(float(use[3:].max() ** 2), float(np.diag(own).max()))), found
+
+    def _by_heading(self, found: Found, worst: int, believed: Believed, gyro: AllanModel) -> ByHeading | None:
+        down = found.body_to_ned[-1][2]
+        if self.compass is None or down[worst] ** 2 < _UPRIGHT:
+            return None
+        headings = np.unwrap(np.arctan2(found.body_to_ned[:, 1, 0], found.body_to_ned[:, 0, 0]))
+        return ByHeading(
+            turn_rad_s=float(np.polyfit(np.arange(len(headings)), headings, 1)[0]),
+            iron_rad=believed.compass_sigma_rad,
+            heading_white=found.heading_sigma_rad * math.sqrt(len(self.slots)),
+            gyro=msgspec.structs.replace(gyro, white=believed.gyro_white),
+        )
+
+    def _believed(
+        self,
+        imu: ImuInput,
+        seconds: Sequence[ImuSecond],
+        reference: tuple[float, float] | None,
+        compared: Compared | None,
+    ) -> Believed:
+        gradienter, compass = self.gradienter, self.compass
+        accel, accel_sigma = np.zeros(3), _UNKNOWN_ACCEL_M_S2
+        if gradienter is not None and compared is not None and reference is not None:
+            off = np.array(reference) - compared.difference_deg
+            accel = _GRAVITY_M_S2 * (gradienter.up(*off.tolist()) - gradienter.up(*reference))
+            accel_sigma = _LEAST_ACCEL_M_S2
+        model = imu.profile.gyro
+        white = model.white
+        if not imu.profile.is_named:
+            white = max(white, math.sqrt(float(np.mean([one.white2 for one in seconds]))))
+        slope = slope_variance(np.array(model.flicker), np.array(model.walk), float(len(seconds)))
+        return Believed(
+            accel_m_s2=accel,
+            accel_sigma_m_s2=accel_sigma,
+            compass_sigma_rad=0.0 if compass is None else compass.sigma_deg * COMPASS_SHARE * DEG,
+            gyro_white=white,
+            gyro_walk=followed_walk(model, float(len(seconds))),
+            gyro_slope=math.sqrt(float(slope)),
+            compass_lag_s=0.0 if compass is None else compass.lag_s,
+            accel_white=imu.profile.accel.white,
+        )
+
+    def _heading(self, found: Found, compass: CompassModel) -> HeadingWindow | None:
+        if not self.headings:
+            return None
+        pointing = found.body_to_ned[-1] @ compass.vehicle_from_sensor[:, 0]
+        return HeadingWindow(
+            heading_deg=math.atan2(pointing[1], pointing[0]) / DEG % 360.0, sigma_deg=found.heading_sigma_rad / DEG
+        )
+
+
+def followed_walk(gyro: AllanModel, span_s: float) -> float:
+    """K of a random walk that wanders in such a window as the bias does, rad/s / sqrt(s)."""
+    return math.hypot(gyro.walk, gyro.flicker / math.sqrt(span_s))
+
+
+def wandered(gyro: AllanModel, span_s: float) -> float:
+    """Variance that no averaging takes away."""
+    return _MIDDLE * followed_walk(gyro, span_s) ** 2 * span_s
+
+
+def _runs(readings: Mapping[int, Floats]) -> list[list[int]]:
+    """Seconds one after another with the same reading."""
+    found: list[list[int]] = []
+    last: Floats | None = None
+    for slot, reading in readings.items():
+        if last is None or np.abs(reading - last).max() > _SAME:
+            found.append([])
+        found[-1].append(slot)
+        last = reading
+    return found
+
+
+def _felt(
+    found: Found, gradienter: GradienterModel | None, reference: tuple[float, float] | None, compared: Compared | None
+) -> tuple[Array, Matrix]:
+    """The accelerometers' mean as it would be at rest at the reference's tilt, (3,), and its covariance (3, 3)."""
+    size = found.force_m_s2
+    if gradienter is None or reference is None or compared is None:
+        up = -found.body_to_ned[:, 2].mean(axis=0)
+        up /= np.linalg.norm(up)
+        return size * up, np.outer(up, up) * found.force_sigma_m_s2**2
+    x, y = (np.array(reference) - compared.difference_deg).tolist()
+    right, up = gradienter.up(*reference), gradienter.up(x, y)
+    by_reading = size * DEG * gradienter.vehicle_from_sensor @ up_jacobian(gradienter.law, x, y)
+    covariance = by_reading @ compared.covariance_deg2 @ by_reading.T
+    return size * up / float(up @ right), covariance + np.outer(right, right) * found.force_sigma_m_s2**2
+
+
+def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:
+    """(6,) variance of what integers hide that the swaying does not spread, and of what is off in all; vehicle axes."""
+    steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
+    means = np.array([one.mean for one in seconds])
+    spread = np.sqrt(means.var(axis=0) + np.mean([one.variance for one in seconds], axis=0))
+    hidden = np.where(spread < _DITHERED * steps, np.square(steps / 2.0), 0.0)
+    hidden = hidden + np.mean([one.shared_variance for one in seconds], axis=0)
+    turn = np.square(imu.rotation)
+    return np.concatenate([turn @ hidden[:3], turn @ hidden[3:]])

@@ -1,0 +1,316 @@
+"""Minutes of a swaying, turning IMU against what is known of its surroundings: gyro biases and the mean of "up".
+
+The gyros, integrated from second to second, carry the attitude along. In the axes of the Earth the mean specific force
+is gravity: what waves do to it comes and goes (`waves`), so a level that drifts away is a bias of the horizontal gyros.
+The compass does the same for the vertical one. Everything is linear in what is unknown once the attitude is near, so it
+is weighted least squares, repeated until it is: that gives for constants what a Kalman smoother gives.
+
+Unknown: the attitude at the start (3), the gyro bias (3), what the accelerometers' bias is still believed to be wrong
+by (3), how the compass' error changes with the heading (2: sine and cosine, as iron carried along makes it), and where
+it is plain to see a ramp of the gyro bias (3). The Earth's rotation is taken off later, where the latitude is known;
+`by_earth` says what it has done to the bias.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from companion.estimation.deck.waves import Wander, Waves, fit_waves, whitened
+from companion.physics.frames import (
+    Array,
+    Floats,
+    Matrix,
+    body_from_ned,
+    roll_pitch_from_up,
+    rotations,
+    running_products,
+    skew,
+)
+
+EARTH_RATE_NORTH_RAD_S: Final = 5.2e-5
+"""W cos L halfway between the equator and 65 degrees: what is left of it, once the latitude is known, is linear."""
+RAMP_T: Final = 5.0
+"""A ramp is believed from so many of its sigmas on, as at rest (`noise.robust`)."""
+_ROUNDS: Final = 7
+_NEAR: Final = 0.1
+"""A round that moves the biases by less, in sigmas, is the last."""
+_START, _GYRO, _ACCEL, _COMPASS, _RAMP = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11), slice(11, 14)
+_UNKNOWNS: Final = 14
+_NO_RAMP: Final = 11
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Believed:
+    """What is known beforehand; one sigma each."""
+
+    accel_m_s2: Array
+    """(3,) of the accelerometers' bias, from the comparison with the gradienter."""
+    accel_sigma_m_s2: float
+    compass_sigma_rad: float
+    """Of the part of the compass' error that changes with the heading."""
+    gyro_white: float
+    """N of the gyros, rad/s * sqrt(s): the largest of the axes."""
+    gyro_walk: float
+    """K of a random walk that wanders in such a window as the bias does, rad/s / sqrt(s)."""
+    gyro_slope: float
+    """One sigma of the slope that flicker and random walk of the bias make where there is no ramp; rad/s^2."""
+    compass_lag_s: float
+    accel_white: float
+    """N of the accelerometers, m/s^2 * sqrt(s)."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """Rates in the body's axes (FRD), attitudes in NED."""
+
+    gyro_rad_s: Array
+    """(3,) bias at the end of the window, were there no rotation of the Earth."""
+    gyro_covariance: Matrix
+    """(3, 3) of that."""
+    by_earth: Matrix
+    """(3, 3): `gyro_rad_s` is the bias and this times the Earth's rate (NED)."""
+    ramp_rad_s2: Array
+    """(3,) zero where none is plain."""
+    turn_rad_s: Array
+    """(3,) how fast it turned on the mean."""
+    force_m_s2: float
+    """Mean specific force along the vertical, up."""
+    force_sigma_m_s2: float
+    body_to_ned: Floats
+    """(n + 1, 3, 3) at the knots; north is the compass'."""
+    heading_sigma_rad: float
+    """Of the heading at the end, as far as averaging goes."""
+
+
+class _Stretch:
+    """The passages as arrays."""
+
+    def __init__(self, passages: Sequence[Passage]) -> None:
+        columns = zip(*passages, strict=True)
+        self.spans, self.turn, self.turned, self.velocity, self.by_bias = map(np.array, columns)
+
+    @property
+    def ends(self) -> Floats:
+        """(n + 1,) times of the knots, from zero."""
+        return np.concatenate([[0.0], np.cumsum(self.spans)])
+
+    @property
+    def rate(self) -> Array:
+        """(3,) the mean by the gyros, with their bias: swaying comes back."""
+        whole = self.turn.sum(axis=0)
+        turned = np.array([whole[2, 1] - whole[1, 2], whole[0, 2] - whole[2, 0], whole[1, 0] - whole[0, 1]]) / 2.0
+        return np.asarray(turned / self.spans.sum())
+
+    def attitudes(self, start: Matrix, bias: Array) -> Floats:
+        """(n + 1, 3, 3) body to NED, by gyros with this bias."""
+        steps = rotations(-(self.turned @ bias)) @ self.turn
+        earth = rotations(-np.outer(self.ends, [EARTH_RATE_NORTH_RAD_S, 0.0, 0.0]))
+        return np.asarray(earth @ running_products(np.concatenate([start[None], steps])))
+
+    def forces(self, attitudes: Floats, gyro: Array, accel: Array) -> Floats:
+        """(n, 3) mean specific force of every passage, NED."""
+        # The second order in the bias of gravity's own part: 0.6 mg at 3 deg/s.
+        bent = np.cross(gyro, np.cross(gyro, self.velocity)) * np.square(self.spans[:, None]) / 6.0
+        felt = self.velocity + self.by_bias @ gyro + bent - self.turned @ accel
+        return np.asarray(np.einsum("nij,nj->ni", attitudes[:-1], felt) / self.spans[:, None])
+
+
+def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: Array, believed: Believed) -> Found:
+    """Work it out, of at least ten passages, one after another without a gap.
+
+    `headings_rad` (n,) are the compass' over the middle of each, NaN where there is none; `compass_forward` (3,) is its
+    forward axis in the vehicle's.
+    """
+    stretch = _Stretch(passages)
+    known = headings_rad[np.isfinite(headings_rad)]
+    up = stretch.velocity[: len(passages) // 4 + 1].sum(axis=0)
+    start = body_from_ned(*roll_pitch_from_up(up), float(known[0]) if len(known) else 0.0).T
+    bias, ramp = _coarse_bias(stretch, start, headings_rad), np.zeros(3)
+    noise: tuple[Waves, Waves] | None = None
+    for _ in range(_ROUNDS):
+        attitudes = stretch.attitudes(start, bias)
+        forces = stretch.forces(attitudes, bias, believed.accel_m_s2)
+        system = _System.of(stretch, attitudes, forces, (headings_rad, compass_forward), believed.compass_lag_s)
+        answer = system.solve(noise, believed, _NO_RAMP)
+        noise = system.noise(answer)
+        start = rotations(answer.values[_START]) @ start
+        bias = bias + answer.values[_GYRO]
+        if (np.square(answer.values[_GYRO]) < _NEAR**2 * np.diag(answer.covariance)[_GYRO]).all():
+            break
+    assert noise is not None
+    ramping = system.solve(noise, believed, _UNKNOWNS)
+    chance = np.sqrt(np.diag(ramping.covariance)[_RAMP] + believed.gyro_slope**2)
+    if (np.abs(ramping.values[_RAMP]) > RAMP_T * chance).any():
+        ramping = system.solve(system.noise(ramping), believed, _UNKNOWNS)
+        bias = bias + ramping.values[_GYRO]
+        answer, ramp = ramping, ramping.values[_RAMP]
+    force, force_sigma = _mean_up(-forces[:, 2], stretch.spans, believed.accel_white)
+    # What the Earth was taken to do beforehand is put back: `by_earth` is of all of it.
+    bias = bias + answer.by_earth[_GYRO] @ np.array([EARTH_RATE_NORTH_RAD_S, 0.0, 0.0])
+    return Found(
+        gyro_rad_s=bias,
+        gyro_covariance=answer.covariance[_GYRO, _GYRO],
+        by_earth=answer.by_earth[_GYRO],
+        ramp_rad_s2=ramp,
+        turn_rad_s=stretch.rate - bias,
+        force_m_s2=force,
+        force_sigma_m_s2=force_sigma,
+        body_to_ned=attitudes,
+        heading_sigma_rad=math.sqrt(noise[1].variance / max(len(known), 1)),
+    )
+
+
+def _coarse_bias(stretch: _Stretch, start: Matrix, headings_rad: Floats) -> Array:
+    """(3,) near enough for what is linear only near by: swaying comes back, and how far it turns the compass says.
+
+    A firmware's own calibration on a boat leaves degrees a second.
+    """
+    known = np.isfinite(headings_rad)
+    if known.sum() < 2:
+        return stretch.rate
+    turn = np.polyfit(stretch.ends[1:][known], np.unwrap(headings_rad[known]), 1)[0]
+    return np.asarray(stretch.rate - turn * start[2])
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Answer:
+    values: Array
+    covariance: Matrix
+    by_earth: Matrix
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _System:
+    """Regressors and readings of the three channels: force to the north, to the east (over g), and heading; rad."""
+
+    columns: Floats
+    """(3, n, unknowns + 3): the last three are the Earth's rate."""
+    readings: Floats
+    """(3, n)."""
+    step_s: float
+
+    @classmethod
+    def of(
+        cls, stretch: _Stretch, attitudes: Floats, forces: Floats, compass: tuple[Floats, Array], lag_s: float
+    ) -> _System:
+        headings_rad, forward = compass
+        up = -float(forces[:, 2].mean())
+        turned = attitudes[:-1] @ stretch.turned
+        ends = stretch.ends
+        middle = (ends[1:] + ends[:-1]) / 2.0
+        drift = np.cumsum(turned, axis=0) - turned / 2.0
+        steps = turned * (middle - ends[-1])[:, None, None]
+        ramping = np.cumsum(steps, axis=0) - steps / 2.0
+        pointing = attitudes @ forward
+        at_knots = np.unwrap(np.arctan2(pointing[:, 1], pointing[:, 0]))
+        azimuth = np.interp(middle - lag_s, ends, at_knots)
+        columns = np.zeros((3, len(middle), _UNKNOWNS + 3))
+        # psi turns the attitude in NED: force = F + psi x F, so north sees psi_east, and east minus psi_north.
+        for channel, axis, sign in ((0, 1, 1.0), (1, 0, -1.0), (2, 2, 1.0)):
+            columns[channel, :, axis] = sign
+            columns[channel, :, _GYRO] = -sign * drift[:, axis]
+            columns[channel, :, _RAMP] = -sign * ramping[:, axis]
+            columns[channel, :, _UNKNOWNS + axis] = -sign * middle
+        columns[:2, :, _ACCEL] = (turned[:, :2] / stretch.spans[:, None, None] / up).transpose(1, 0, 2)
+        columns[2, :, _COMPASS] = np.column_stack([np.sin(azimuth), np.cos(azimuth)])
+        off = np.remainder(headings_rad - azimuth + math.pi, 2.0 * math.pi) - math.pi
+        return cls(columns, np.array([forces[:, 0] / up, forces[:, 1] / up, off]), float(stretch.spans.mean()))
+
+    def solve(self, noise: tuple[Waves, Waves] | None, believed: Believed, unknowns: int) -> _Answer:
+        """Least squares, weighted by the noise; without it, by a guess."""
+        wander = Wander(believed.gyro_white**2 * self.step_s, believed.gyro_walk**2 * self.step_s**3)
+        level, heading = noise or (Waves(np.zeros(0), 0.02**2), Waves(np.zeros(0), 0.01**2))
+        pairs = [
+            np.column_stack([columns, readings]) for columns, readings in zip(self.columns, self.readings, strict=True)
+        ]
+        width = pairs[0].shape[1]
+        both = whitened(np.hstack(pairs[:2]), level, wander)
+        rows = np.vstack([both[:, :width], both[:, width:], whitened(pairs[2], heading, wander)])
+        rows = rows[~np.isnan(rows[:, -1])]
+        regressors, earth = rows[:, :unknowns], rows[:, _UNKNOWNS:-1]
+        information = regressors.T @ regressors
+        information[range(_ACCEL.start, _ACCEL.stop), range(_ACCEL.start, _ACCEL.stop)] += believed.accel_sigma_m_s2**-2
+        information[range(_COMPASS.start, _COMPASS.stop), range(_COMPASS.start, _COMPASS.stop)] += (
+            max(believed.compass_sigma_rad, 1e-6) ** -2
+        )
+        # Units from rad/s^2 to rad: scaled, so that nothing is lost.
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
+        covariance = np.linalg.inv(information * np.outer(scale, scale) + 1e-12 * np.eye(unknowns)) * np.outer(
+            scale, scale
+        )
+        # The waves' own terms are fitted too: what few rows leave is widened by what was spent on them.
+        spent = unknowns + len(level.terms) + len(heading.terms)
+        covariance_found = covariance * (len(rows) / max(len(rows) - spent, len(rows) / 4.0))
+        values = np.zeros(_UNKNOWNS)
+        values[:unknowns] = covariance @ (regressors.T @ rows[:, -1])
+        return _Answer(values, covariance_found, covariance @ (regressors.T @ earth))
+
+    def noise(self, answer: _Answer) -> tuple[Waves, Waves]:
+        """What is left over, as waves: the two levels together, the heading."""
+        left = [
+            readings - columns[:, :_UNKNOWNS] @ answer.values
+            for columns, readings in zip(self.columns, self.readings, strict=True)
+        ]
+        heading = left[2][np.isfinite(left[2])]
+        if len(heading) == 0:
+            heading = np.zeros(1)
+        return fit_waves([one - one.mean() for one in left[:2]]), fit_waves([heading - heading.mean()])
+
+
+def _mean_up(up: Floats, spans: Floats, white: float) -> tuple[float, float]:
+    """The mean of a force that waves go through, and its sigma.
+
+    What goes up comes down: not the acceleration of the waves but their height is a stationary series, and the mean
+    force is the bend of a parabola through it. Taken by itself the acceleration would have a power at zero frequency
+    that no sea has.
+    """
+    step, ends = float(spans.mean()), np.cumsum(spans) - spans.sum()
+    height = np.cumsum(np.cumsum(up * spans)) * step
+    line = np.column_stack([np.ones(len(ends)), ends, ends * ends / 2.0])
+    left = height - line @ np.linalg.lstsq(line, height, rcond=None)[0]
+    rows = whitened(np.column_stack([line, height]), fit_waves([left]), Wander(rate=white**2 * step**3))
+    covariance = np.linalg.inv(rows[:, :3].T @ rows[:, :3])
+    return float(covariance[2] @ (rows[:, :3].T @ rows[:, 3])), math.sqrt(covariance[2, 2])
+
+
+class Passage(NamedTuple):
+    """A second of a moving IMU, from one knot to the next; "start" is the body's frame (FRD) at its beginning."""
+
+    span_s: float
+    turn: Matrix
+    """(3, 3) from the body's axes at the end to those at the start, as the gyros have it."""
+    turned: Matrix
+    """(3, 3) integral of that over the time, in s: a bias b turns the start by -turned @ b."""
+    velocity_m_s: Floats
+    """(3,) integral of the specific force in the axes of the start."""
+    velocity_by_bias: Matrix
+    """(3, 3) d velocity / d (gyro bias): m/s per rad/s."""
+
+
+def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> Passage:
+    """Integrate n + 1 samples, of which the first was the last one of the passage before (trapezoids).
+
+    Times (n + 1,) ascend, n is at least 1; rates and forces are (n + 1, 3) in the body's axes. Rates are integrated as
+    rotations, so that coning and sculling are in the result and not in its error (Forster, Carlone, Dellaert,
+    Scaramuzza, IEEE Trans. Robotics 33(1), 2017, section VI).
+    """
+    steps = np.diff(times_s)
+    rates = (rates_rad_s[1:] + rates_rad_s[:-1]) / 2.0
+    turns = running_products(rotations(rates * steps[:, None]))
+    whole = np.concatenate([np.eye(3)[None], turns])
+    half = (whole[1:] + whole[:-1]) / 2.0 * steps[:, None, None]
+    turned = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(half, axis=0)])
+    felt = np.einsum("nij,nj->ni", whole, forces_m_s2)
+    by_bias = skew(felt) @ turned
+    return Passage(
+        span_s=float(times_s[-1] - times_s[0]),
+        turn=turns[-1],
+        turned=turned[-1],
+        velocity_m_s=((felt[1:] + felt[:-1]) / 2.0 * steps[:, None]).sum(axis=0),
+        velocity_by_bias=((by_bias[1:] + by_bias[:-1]) / 2.0 * steps[:, None, None]).sum(axis=0),
+    )

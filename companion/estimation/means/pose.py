@@ -1,0 +1,262 @@
+"""Gradienter and compass: how readings become up and a heading of the vehicle, and their means (method 1.2 and 3.5).
+
+The compass' own heading is used where it sends one, unless it is set to be worked out here, from its field vector and
+the gradienter's tilt. A field alone, without a gradienter, gives none: nothing else at hand tells tilt well enough
+(tan I times its error, 2.5 times at 68 degrees).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Final, Literal
+
+import msgspec
+import numpy as np
+
+from companion.estimation.noise.allan import white_noise
+from companion.estimation.noise.robust import huber_mean
+from companion.estimation.seconds.batch import Batch, BatchSource
+from companion.estimation.seconds.resolution import decimal, few_distinct
+from companion.physics.frames import Array, Floats, Matrix, body_from_ned, roll_pitch_from_up, vector
+from companion.physics.gradienter import Law, up_in_sensor
+from companion.physics.magnetic import heading_rad
+from companion.physics.units import DEG
+from companion.samples import CompassSample, MagSample, TiltSample
+
+LEVEL_COSINE: Final = math.cos(2.0 * DEG)
+"""Data sheets give a compass' error "level" and "tilted" without a border: only what a table is counts as level."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class GradienterModel:
+    """How a gradienter's readings become the direction of up in the vehicle: law, zero offset, mounting, sigma."""
+
+    law: Law
+    vehicle_from_sensor: Matrix
+    offset_deg: tuple[float, float]
+    sigma_deg: float
+    lag_s: float = 0.0
+    """By which it follows the truth."""
+
+    def up(self, x_deg: float, y_deg: float) -> Array:
+        """Up in the vehicle's axes, (3,), by readings without an offset: which zero is in force may be known later.
+
+        Raises:
+            ValueError: the readings cannot belong together.
+        """
+        return self.vehicle_from_sensor @ up_in_sensor(self.law, x_deg, y_deg)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class CompassModel:
+    """How a compass reading becomes a true heading: reference, offset, mounting, sigma."""
+
+    magnetic: bool
+    vehicle_from_sensor: Matrix
+    offset_deg: float
+    sigma_deg: float
+    counts_per_gauss: float | None = None
+    """Of a device that gives its field in counts; None: only their direction means something."""
+    prefers_field: bool = False
+    """The heading is worked out from the field even where the device gives one of its own."""
+    tilted_sigma_deg: float | None = None
+    """Where it does not stand level; None: as `sigma_deg`."""
+    lag_s: float = 0.0
+    """By which it follows the truth."""
+
+    def sigma_at(self, up: Array) -> float:
+        """Its sigma in degrees where `up`, shape (3,), is up in the vehicle's axes."""
+        upright = float(-(self.vehicle_from_sensor.T @ up)[2])
+        if self.tilted_sigma_deg is None or upright >= LEVEL_COSINE:
+            return self.sigma_deg
+        return self.tilted_sigma_deg
+
+
+def up_in_vehicle(model: GradienterModel, x_deg: float, y_deg: float) -> Array:
+    """Up in the vehicle's axes, shape (3,), from the gradienter's two readings; raises as `GradienterModel.up`."""
+    return model.up(x_deg - model.offset_deg[0], y_deg - model.offset_deg[1])
+
+
+def vehicle_heading_rad(compass: CompassModel, heading_deg: float, up: Array) -> float:
+    """Heading of the vehicle, from the compass' own north (magnetic or true), not wrapped.
+
+    A compass gives the azimuth of its own forward axis. The azimuth that this axis has when the vehicle heads
+    north, at the tilt it has, is what the mounting adds.
+    """
+    gamma, theta = roll_pitch_from_up(up)
+    forward_ned = body_from_ned(gamma, theta, 0.0).T @ compass.vehicle_from_sensor[:, 0]
+    mounted_rad = math.atan2(forward_ned[1], forward_ned[0])
+    return (heading_deg + compass.offset_deg) * DEG - mounted_rad
+
+
+class TiltWindow(msgspec.Struct, frozen=True, kw_only=True):
+    """Means of the gradienter in its own axes; sigmas are statistical."""
+
+    x_deg: float
+    y_deg: float
+    x_sigma_deg: float
+    y_sigma_deg: float
+    temperature_degc: float | None
+
+
+class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
+    """Mean on the circle of the compass' heading in [0, 360); sigma is statistical."""
+
+    heading_deg: float
+    sigma_deg: float
+    from_field: bool = False
+    """Worked out from the device's field and the gradienter's tilt; else the device's own."""
+    wander_deg: float | None = None
+    """By how much it has changed while nothing else said that the aircraft turned; None: not watched long enough."""
+
+
+FieldUnit = Literal["gauss", "counts"]
+
+
+class FieldWindow(msgspec.Struct, frozen=True, kw_only=True):
+    """Mean of the magnetic field in the compass' own axes; sigmas are statistical."""
+
+    field: tuple[float, float, float]
+    sigma: tuple[float, float, float]
+    unit: FieldUnit
+
+
+def tilt_window(batches: Sequence[Batch]) -> TiltWindow:
+    """The gradienter's window from its good batches, at least one."""
+    mean, sigma = _pose_mean(batches, np.array([batch.mean for batch in batches]))
+    temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
+    return TiltWindow(
+        x_deg=float(mean[0]),
+        y_deg=float(mean[1]),
+        x_sigma_deg=float(sigma[0]),
+        y_sigma_deg=float(sigma[1]),
+        temperature_degc=float(np.mean(temperatures)) if temperatures else None,
+    )
+
+
+def heading_window(batches: Sequence[Batch], *, from_field: bool, wander_deg: float | None) -> HeadingWindow:
+    """The compass' window from its good batches, at least one."""
+    first = batches[0].mean
+    turned = np.array([np.mod(batch.mean - first + 180.0, 360.0) - 180.0 for batch in batches])
+    mean, sigma = _pose_mean(batches, turned)
+    return HeadingWindow(
+        heading_deg=float(np.mod(mean[0] + first[0], 360.0)),
+        sigma_deg=float(sigma[0]),
+        from_field=from_field,
+        wander_deg=wander_deg,
+    )
+
+
+def _pose_mean(batches: Sequence[Batch], values: Floats) -> tuple[Floats, Floats]:
+    slots = np.array([batch.slot for batch in batches], dtype=np.int64)
+    variance = np.square(white_noise(slots, values)) / len(values) + np.square(_resolution(batches)) / 12.0
+    return huber_mean(values), np.asarray(np.sqrt(variance))
+
+
+def _resolution(batches: Sequence[Batch]) -> Floats:
+    """Step of a reading that shows fewer than 3 values: their distance, or that of the last decimal it prints."""
+    low = np.min([batch.low for batch in batches], axis=0)
+    high = np.max([batch.high for batch in batches], axis=0)
+    few = few_distinct(np.array([batch.distinct for batch in batches]))
+    return np.where(few, np.where(high > low, high - low, decimal(low, high)), 0.0)
+
+
+OLDEST_TILT_S: Final = 1.0
+"""A tilt older than this is none; the slowest gradienters send five readings in that time."""
+OWN_HEADING_S: Final = 2.0
+"""After so long without a heading of its own a compass is taken for one that sends its field only."""
+_LIMITS: Final = (1e6,) * 3
+
+
+class FieldHeading:
+    """Takes tilts and fields, gives headings of the compass' own forward axis from magnetic north."""
+
+    def __init__(self, compass: CompassModel, gradienter: GradienterModel | None, keep: int) -> None:
+        self._compass, self._gradienter = compass, gradienter
+        self._keep = keep
+        self._tilt: tuple[float, float, float] | None = None
+        self._own_s: float | None = None
+        self._begun_s: float | None = None
+        self.unit: FieldUnit = "gauss"
+        self.batches = BatchSource(_LIMITS, keep)
+        self.from_field = False
+        """Whether the latest heading that counts was worked out here."""
+        self.hint = ""
+        """Why there is none from the field although one is needed; empty while there is."""
+
+    def take_tilt(self, sample: TiltSample) -> None:
+        """Take a reading of the gradienter."""
+        self._tilt = (sample.t_s, sample.x_deg, sample.y_deg)
+
+    def takes_own(self, sample: CompassSample) -> bool:
+        """Take a heading of the device's own; whether it is the one that counts."""
+        if self._compass.prefers_field:
+            return False
+        self._own_s, self.from_field, self.hint = sample.t_s, False, ""
+        return True
+
+    def add(self, sample: MagSample) -> CompassSample | None:
+        """Take a field; the heading that it gives, where that is the one that counts."""
+        field = self._in_unit(sample)
+        if field is None:
+            return None
+        self.batches.add(sample.t_s, (float(field[0]), float(field[1]), float(field[2])))
+        if self._begun_s is None:
+            self._begun_s = sample.t_s
+        since_s = self._begun_s if self._own_s is None else self._own_s
+        if not self._compass.prefers_field and abs(sample.t_s - since_s) < OWN_HEADING_S:
+            return None
+        up = self._up(sample.t_s)
+        if up is None:
+            return None
+        try:
+            heading = heading_rad(field, self._compass.vehicle_from_sensor.T @ up)
+        except ValueError:
+            self.hint = "compass field is vertical: no heading"
+            return None
+        self.from_field, self.hint = True, ""
+        return CompassSample(sample.t_s, heading / DEG % 360.0)
+
+    def window(self, slots: Sequence[int]) -> FieldWindow | None:
+        """The mean field of these seconds; None where nothing came in them."""
+        found = [self.batches.batches[slot] for slot in slots if slot in self.batches.batches]
+        if not found:
+            return None
+        mean, sigma = _pose_mean(found, np.array([batch.mean for batch in found]))
+        return FieldWindow(field=vector(mean), sigma=vector(sigma), unit=self.unit)
+
+    def _in_unit(self, sample: MagSample) -> Array | None:
+        unit: FieldUnit = "gauss"
+        if sample.field_gauss is not None:
+            field = np.array(sample.field_gauss, dtype=np.float64)
+        elif sample.counts is None:
+            return None
+        elif self._compass.counts_per_gauss is not None:
+            field = np.array(sample.counts, dtype=np.float64) / self._compass.counts_per_gauss
+        else:
+            field, unit = np.array(sample.counts, dtype=np.float64), "counts"
+        if not np.isfinite(field).all():
+            return None
+        if unit != self.unit:
+            # Means over both would be neither.
+            self.unit, self.batches = unit, BatchSource(_LIMITS, self._keep)
+        return field
+
+    def _up(self, t_s: float) -> Array | None:
+        """Up in the vehicle's axes now; without one, `hint` says why."""
+        if not self._compass.magnetic:
+            self.hint = 'compass sends its field only, and that shows magnetic north, not reference = "true"'
+        elif self._gradienter is None:
+            self.hint = "compass sends its field only: a heading from it needs a gradienter"
+        elif self._tilt is None or not abs(t_s - self._tilt[0]) <= OLDEST_TILT_S:
+            self.hint = "compass sends its field only: no tilt from the gradienter to work out the heading"
+        else:
+            try:
+                up = up_in_vehicle(self._gradienter, self._tilt[1], self._tilt[2])
+                if np.isfinite(up).all():
+                    return up
+            except ValueError as error:
+                self.hint = str(error)
+        return None

@@ -1,0 +1,385 @@
+"""From the batches of a still stretch to means with honest sigmas.
+
+Two sigmas a reading: `sigma_stat` is what averaging left, `sigma_use` what the next H seconds can expect of the
+sensor. Method 2.2, 2.4, 2.5 and 3.2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.estimation.means.integers import IntegerColumns, integer_columns
+from companion.estimation.means.losses import lost, refuse_broken
+from companion.estimation.means.pose import FieldWindow, HeadingWindow, TiltWindow
+from companion.estimation.means.quantised import EDGE_RMS
+from companion.estimation.means.warming import Lines, Warming, drifting, warming
+from companion.estimation.noise.allan import (
+    FLOOR_OF_FLICKER,
+    NoiseProfile,
+    allan_variance,
+    floor_variance,
+    slope_variance,
+    white_noise,
+)
+from companion.estimation.noise.robust import RAMP_BATCHES, huber_line, is_ramp, robust_mean
+from companion.estimation.seconds.batch import Batch
+from companion.estimation.turning.watch import Turn
+from companion.physics.frames import Floats, vector
+from companion.physics.units import DEG_H, MG
+from companion.samples import Triad, Vector
+
+WHITE_SHARE: Final = 0.09
+"""White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
+_ALLAN_SPANS: Final = 5
+_LOST_WARNING: Final = 0.01
+_ALLAN_SIGNIFICANT: Final = 3.0
+"""ADEV^2 at T/5 over what white noise explains: the upper 5 % point with its about four degrees of freedom."""
+
+
+class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU as the collector needs to know it."""
+
+    name: str
+    rotation: NDArray[np.float64]
+    """3x3, sensor to vehicle FRD."""
+    profile: NoiseProfile
+    gyro_step_rad_s: float = 0.0
+    """Quantisation of the stream; 0 for floats."""
+    accel_step_m_s2: float = 0.0
+    truncates: bool = False
+    """Whether the stream truncates toward zero instead of rounding."""
+    gyro_grid_rad_s: float = 0.0
+    """Steps of its own that the sensor's readings had before they became integers of the stream; 0: much finer."""
+    accel_grid_m_s2: float = 0.0
+    clock_from_start: bool = False
+    """Whether the time in its samples (`t_device_s`) counts from when its device was switched on."""
+
+
+def integer_steps(imu: ImuInput) -> Floats | None:
+    """(6,) steps of a stream of truncated integers, whose seconds must keep their counts; None for others."""
+    if not imu.truncates or imu.gyro_step_rad_s == imu.accel_step_m_s2 == 0.0:
+        return None
+    steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
+    return np.where(steps > 0.0, steps, 1.0)
+
+
+def _edges(imu: ImuInput) -> tuple[float, float]:
+    """Rms displacement of the integers' edges, in steps, by a grid below; each lies anywhere between two lines."""
+    pairs = ((imu.gyro_grid_rad_s, imu.gyro_step_rad_s), (imu.accel_grid_m_s2, imu.accel_step_m_s2))
+    gyro, accel = (grid / step / math.sqrt(12.0) if step > 0.0 else 0.0 for grid, step in pairs)
+    return gyro, accel
+
+
+class Hidden(msgspec.Struct, frozen=True):
+    """What the integer readings of one triad do not tell."""
+
+    words: str
+    useless: bool
+    """It is no measurement; else good to half a step."""
+
+
+class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
+    """Means of one IMU over one still stretch; axes are the vehicle's FRD."""
+
+    name: str
+    samples: int
+    duration_s: float
+    gyro_rad_s: Vector
+    accel_m_s2: Vector
+    gyro_sigma_stat_rad_s: Vector
+    accel_sigma_stat_m_s2: Vector
+    gyro_sigma_use_rad_s: Vector
+    """sqrt(V(T, H)) of the sensor alone; what the pose adds comes in `solve`."""
+    accel_sigma_use_m_s2: Vector
+    temperature_degc: float | None
+    warnings: tuple[str, ...]
+    drifting: tuple[str, ...] = ()
+    """What is to be said of its drift, unless it is known where that leads."""
+    hidden: dict[Triad, Hidden] = {}
+    """By triad, where the noise spreads the integers too little for a mean."""
+    dithered: bool = False
+    """Its means come from a dither, in which the telemetry followed every step of the offsets."""
+    named: bool = True
+    """Its part is known."""
+    covariance: NDArray[np.float64] | None = None
+    """Of a deck: 6x6 of all axes. Likewise the next."""
+    by_earth: NDArray[np.float64] | None = None
+    """3x3, what the gyro means hold of the Earth's rate (ahead, right, down)."""
+    mounting: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    """Rows of the rotation from the sensor's axes."""
+    warming: Warming | None = None
+    """What may be hidden of a warm-up; None: nothing."""
+
+    def refused(self, part: Triad) -> str | None:
+        """Why a triad's means are no measurement although they have a figure; None when they are one."""
+        found = self.hidden.get(part)
+        return found.words if found is not None and found.useless else None
+
+
+class Window(msgspec.Struct, frozen=True, kw_only=True):
+    """One still stretch: everything that a calibration is computed from."""
+
+    start_s: float
+    end_s: float
+    imus: tuple[ImuWindow, ...]
+    tilt: TiltWindow | None
+    heading: HeadingWindow | None
+    field: FieldWindow | None = None
+    """Of a compass that gives the field too; its seconds are those of the others, as far as it sent in them."""
+    turn_rad_s: Vector | None = None
+    """Of a deck's mean turn, its axis levelled by the gradienter's readings without an offset."""
+    powered_s: dict[str, float] = {}
+    """By IMU, for how long it has been switched on at least, at the end."""
+    turn: Turn = Turn()
+    """What else was known of the platform's own rate, where it stands still."""
+
+
+class Estimate(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU in its own axes; arrays are (6,), gyro in rad/s, then accelerometer in m/s^2."""
+
+    mean: Floats
+    stat_variance: Floats
+    use_variance: Floats
+    white_variance: Floats
+    """The part of `use_variance` that more seconds take away."""
+    white: Floats
+    """N in force: measured, or the profile's where that is larger."""
+    flicker: Floats
+    walk: Floats
+    lines: Lines
+    half_step: NDArray[np.bool_]
+    """Fewer than 3 distinct readings; of a stream of integers, too few outside the two commonest."""
+    undecided: NDArray[np.bool_]
+    """Integers whose mean is unknown yet: more seconds may bring the rare reading that tells."""
+    useless: NDArray[np.bool_]
+    """Integers around zero whose mean is unknown: it says no more than that it is less than a step."""
+    edge_rms: Floats
+    """Of integers: displacement of their edges, in steps, for which sigma allows (`quantised.shape_variance`)."""
+
+
+class ImuEstimate(msgspec.Struct, frozen=True):
+    """Of one IMU, and its window."""
+
+    own: Estimate
+    window: ImuWindow
+
+
+def estimates(
+    imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float
+) -> list[Estimate]:
+    """Every IMU over the same good seconds, at least 2.
+
+    All columns of all IMUs go through each step at once: numpy's cost is by the call, not by the column. A ramp is
+    evaluated at the end of the window, `end_s`, and never later; `horizon_s` is H of V(T, H).
+    """
+    models = [model for imu in imus for model in (imu.profile.gyro, imu.profile.accel)]
+    slots = np.array([batch.slot for batch in batches[0]], dtype=np.int64)
+    values = _columns([[batch.mean for batch in item] for item in batches])
+    seconds = float(len(slots))
+    steps = np.repeat([step for imu in imus for step in (imu.gyro_step_rad_s, imu.accel_step_m_s2)], 3)
+    edges = np.repeat([_edges(imu) for imu in imus], 3)
+    whole = integer_columns(batches, steps, np.repeat([imu.truncates for imu in imus], 6), edges)
+    values = np.where(whole.of, whole.values, values)
+    flicker = np.repeat([model.flicker for model in models], 3)
+    walk = np.repeat([model.walk for model in models], 3)
+    # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
+    named = np.repeat([imu.profile.is_named for imu in imus], 6)
+    wander = np.where(named, slope_variance(flicker, walk, end_s - slots[0]), 0.0)
+    mean, leverage, slope, level, hidden = _levelled(slots, values, end_s, whole, wander)
+    measured = np.maximum(white_noise(slots, level), whole.least)
+    white = np.maximum(measured, np.repeat([model.white for model in models], 3))
+    flicker = _flicker(slots, level, measured, flicker)
+    quantum, half_step = _quantisation(batches, steps)
+    quantum, half_step = np.where(whole.of, whole.hidden, quantum), np.where(whole.of, whole.unknown, half_step)
+    shared = _columns([[batch.shared_variance for batch in item] for item in batches])
+    quantum = np.sqrt(np.square(quantum) + shared.mean(axis=0))
+    # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
+    # by anything from nothing to slope * H / 2.
+    going_on = np.square(slope * horizon_s / 2.0) / 3.0
+    stat = np.square(measured) * leverage + np.square(quantum)
+    white_part = np.square(white) * leverage
+    rest = floor_variance(flicker, walk, seconds, horizon_s) + np.square(quantum)
+    use = white_part + rest + going_on
+    of_line = np.square(white) / max(float(np.square(slots - slots.mean()).sum()), 1.0) + wander
+    of_line = np.where(np.isnan(hidden), np.inf, of_line + 3.0 * np.square(quantum / (end_s - slots[0])))
+    lines = Lines(
+        hidden=np.nan_to_num(hidden),
+        hidden_variance=np.where(slope != 0.0, 0.0, of_line),
+        ramp=slope,
+        variance=of_line,
+        level_variance=np.square(white) / seconds + rest,
+    )
+    figures = {
+        "mean": mean,
+        "stat_variance": stat,
+        "use_variance": use,
+        "white_variance": white_part,
+        "white": white,
+        "flicker": flicker,
+        "walk": walk,
+        "half_step": half_step,
+        "undecided": whole.unknown,
+        "useless": whole.useless,
+        "edge_rms": whole.edge_rms,
+    }
+    return [
+        Estimate(lines=Lines(*(each[part] for each in lines)), **{name: each[part] for name, each in figures.items()})
+        for part in (slice(at, at + 6) for at in range(0, 6 * len(imus), 6))
+    ]
+
+
+def _levelled(
+    slots: NDArray[np.int64], values: Floats, end_s: float, whole: IntegerColumns, wander: Floats
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Means, or the ends of ramps; their leverages; slopes, zero but of ramps; the values without those; other slopes.
+
+    The others are zero of ramps, and NaN where the window is too short for a line.
+    """
+    mean = robust_mean(values, whole.huber_c, whole.least)
+    leverage = np.full(values.shape[1], 1.0 / len(values))
+    if len(values) < RAMP_BATCHES:
+        return mean, leverage, np.zeros(values.shape[1]), values, np.full(values.shape[1], np.nan)
+    times = slots.astype(np.float64) + 0.5
+    line = huber_line(times, values, end_s, whole.huber_c, whole.least)
+    ramps = is_ramp(line, len(values), wander)
+    slope = np.where(ramps, line.slope, 0.0)
+    level = values - slope * (times - times.mean())[:, None]
+    leverage = np.where(ramps, line.end_leverage, leverage)
+    return np.where(ramps, line.end, mean), leverage, slope, level, np.asarray(line.slope - slope)
+
+
+def _columns(values: list[list[Floats]]) -> Floats:
+    """(imus, seconds, 6) as (seconds, 6 * imus)."""
+    stacked = np.array(values)
+    return np.asarray(stacked.transpose(1, 0, 2).reshape(stacked.shape[1], -1))
+
+
+def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: Floats) -> Floats:
+    """B of every column: the profile's, or what the Allan deviation at T/5 says more than it and white noise."""
+    span = int(slots[-1] - slots[0] + 1) // _ALLAN_SPANS
+    if span < 2:
+        return profile
+    variance, _ = allan_variance(slots, values, span)
+    explained = np.square(white) / span
+    more = np.where(variance > _ALLAN_SIGNIFICANT * explained, variance - explained, 0.0)
+    return np.maximum(np.sqrt(more) / FLOOR_OF_FLICKER, profile)
+
+
+def _quantisation(batches: Sequence[Sequence[Batch]], steps: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """What a rounded reading's steps may hide, as one sigma a column, and where there are fewer than 3 distinct values.
+
+    Half a step for fewer than 3 distinct values; else the bound that noise of sigma leaves, (q / pi) exp(-2 pi^2
+    sigma^2 / q^2) (method 2.2 and 2.5).
+    """
+    low = _columns([[batch.low for batch in item] for item in batches]).min(axis=0)
+    high = _columns([[batch.high for batch in item] for item in batches]).max(axis=0)
+    distinct = np.array([[batch.distinct for batch in item] for item in batches]).max(axis=1).ravel()
+    known = steps > 0.0
+    few = np.where(known, high - low < 1.5 * steps, distinct < 3)
+    # A stream of floats may carry coarse steps all the same: then the step is what lies between its two values.
+    half = np.where(known, steps, high - low) / 2.0
+    variance = _columns([[batch.variance for batch in item] for item in batches]).mean(axis=0)
+    divisor = np.where(known, steps, 1.0)
+    bound = steps / math.pi * np.exp(-2.0 * math.pi**2 * variance / np.square(divisor))
+    return np.where(few, half, bound), few
+
+
+def imu_estimates(
+    imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float, rejected: int
+) -> list[ImuEstimate]:
+    """The windows of all IMUs from their good batches, which are of the same seconds.
+
+    Raises:
+        CalibrationRefusedError: an axis never changes, or most samples were lost.
+    """
+    if not imus:
+        return []
+    for imu, own in zip(imus, batches, strict=True):
+        refuse_broken(imu.name, (imu.gyro_step_rad_s, imu.accel_step_m_s2), own)
+    found = estimates(imus, batches, end_s=end_s, horizon_s=horizon_s)
+    return [
+        ImuEstimate(own, _imu_window(imu, seconds, own, rejected))
+        for imu, seconds, own in zip(imus, batches, found, strict=True)
+    ]
+
+
+def _imu_window(imu: ImuInput, batches: Sequence[Batch], found: Estimate, rejected: int) -> ImuWindow:
+    temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
+    rotation = np.asarray(imu.rotation, dtype=np.float64)
+    gyro, accel = slice(0, 3), slice(3, 6)
+    return ImuWindow(
+        name=imu.name,
+        samples=sum(batch.n for batch in batches),
+        duration_s=float(len(batches)),
+        gyro_rad_s=vector(rotation @ found.mean[gyro]),
+        accel_m_s2=vector(rotation @ found.mean[accel]),
+        gyro_sigma_stat_rad_s=_turned(rotation, found.stat_variance[gyro]),
+        accel_sigma_stat_m_s2=_turned(rotation, found.stat_variance[accel]),
+        gyro_sigma_use_rad_s=_turned(rotation, found.use_variance[gyro]),
+        accel_sigma_use_m_s2=_turned(rotation, found.use_variance[accel]),
+        temperature_degc=float(np.mean(temperatures)) if temperatures else None,
+        warnings=tuple(_warnings(imu, batches, found, rejected)),
+        hidden=_hidden(imu, found),
+        named=imu.profile.is_named,
+        mounting=(vector(rotation[0]), vector(rotation[1]), vector(rotation[2])),
+        warming=warming(rotation, found.lines, imu.profile.warm_up, batches),
+        drifting=drifting(imu.name, found.lines.ramp, temperatures),
+    )
+
+
+def _turned(rotation: Floats, variance: Floats) -> Vector:
+    """Sigmas of independent axes after a rotation."""
+    return vector(np.sqrt(np.square(rotation) @ variance))
+
+
+def _hidden(imu: ImuInput, own: Estimate) -> dict[Triad, Hidden]:
+    found: dict[Triad, Hidden] = {}
+    part: Triad
+    for part, triad, step, grid, unit in (
+        ("gyro", slice(0, 3), f"{imu.gyro_step_rad_s / DEG_H:.0f} deg/h", imu.gyro_grid_rad_s / DEG_H, "deg/h"),
+        ("accel", slice(3, 6), f"{imu.accel_step_m_s2 / MG:.1f} mg", imu.accel_grid_m_s2 / MG, "mg"),
+    ):
+        undecided, useless_axes = own.undecided[triad], own.useless[triad]
+        if undecided.any():
+            useless = bool(useless_axes.any())
+            axes = _axes(useless_axes if useless else undecided)
+            what = "not known: bias and" if useless else "half a step unknown:"
+            found[part] = Hidden(
+                f"{part} {imu.name} {axes}: {what} noise smaller than its telemetry's steps of {step}; push.dither ="
+                " true measures it",
+                useless,
+            )
+        elif grid > 0.0 and (own.edge_rms[triad] > EDGE_RMS).any():
+            found[part] = Hidden(
+                f"{part} {imu.name}: the sensor has coarse steps of its own ({grid:.3g} {unit}) below"
+                " the integers, sigma widened; push.dither = true takes them away",
+                useless=False,
+            )
+    return found
+
+
+def _axes(which: NDArray[np.bool_]) -> str:
+    return "".join(axis for axis, is_it in zip("xyz", which.tolist(), strict=True) if is_it)
+
+
+def _warnings(imu: ImuInput, batches: Sequence[Batch], own: Estimate, rejected: int) -> list[str]:
+    found: list[str] = []
+    few, uneven = own.half_step & ~own.undecided, own.edge_rms > EDGE_RMS
+    parts = (("gyro", slice(0, 3), imu.gyro_grid_rad_s), ("accel", slice(3, 6), imu.accel_grid_m_s2))
+    for part, triad, grid in parts:
+        if axes := _axes(few[triad]):
+            found.append(f"{part} {imu.name} {axes}: fewer than 3 distinct readings, half a step may be hidden")
+        if not grid and (axes := _axes(uneven[triad])):
+            why = "a coarser step inside the sensor?"
+            found.append(f"{part} {imu.name} {axes}: integers not spread like noise ({why}), sigma widened")
+    if (share := lost(batches)) > _LOST_WARNING:
+        found.append(f"imu {imu.name} lost {share:.0%} of its samples")
+    if rejected:
+        found.append(f"{rejected} of {rejected + len(batches)} s were not still and are left out")
+    return found

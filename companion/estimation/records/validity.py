@@ -1,0 +1,199 @@
+"""Is the calibration in force still good?
+
+What was found right (written and seen, or measured to be right as it is) ages: the bias wanders, the temperature
+changes, somebody changes the offsets. All limits come from the error budget (method 2.2 and 3.2):
+
+- age: so long as the wandering expected of the sensor's Allan profile stays below `DRIFT_SIGMAS` sigma_use, and never
+  longer than the configured limit (30 minutes);
+- temperature: where the curve of the bias over it is known, `DRIFT_SIGMAS` sigma as well; else 3 K, configurable;
+- the rolling window: what is left in the output now may differ from what it must be by `RESIDUAL_SIGMAS` of what
+  both were known with.
+
+Age and temperature count from the last time that a still window agreed, so that an aircraft that stands about for an
+hour keeps its calibration without a single write.
+"""
+
+from __future__ import annotations
+
+import enum
+import functools
+import math
+from typing import Final
+
+import msgspec
+
+from companion.estimation.noise.allan import AllanModel, floor_variance
+from companion.estimation.records.record import ImuRecord
+from companion.physics.units import UNITS
+from companion.samples import Triad, Vector
+
+DRIFT_SIGMAS: Final = 2.0
+RESIDUAL_SIGMAS: Final = 3.0
+WORTH_SIGMAS: Final = 2.0
+"""A new write must be worth more than this many sigma_use: below, it would mostly write the noise of today."""
+
+_LONGEST_S: Final = 24 * 3600.0
+_NONE: Final[Vector] = (0.0, 0.0, 0.0)
+_DIGITS: Final[dict[Triad, int]] = {"gyro": 0, "accel": 2}
+
+
+class Why(enum.Enum):
+    """Why a calibration does not, or does no longer, count as good; the values are what people read."""
+
+    NEVER = "not calibrated yet"
+    UNDONE = "calibration was undone"
+    REBOOTED = "autopilot restarted"
+    REPLACED = "boot reset gyro offsets"
+    ALIGNED = "gradienter aligned since then"
+    CHANGED = "changed by someone else"
+    FAILED = "last calibration failed"
+    UNSEEN = "offsets written but not seen to work"
+    OLD = "calibration too old"
+    TEMPERATURE = "temperature changed"
+    RESIDUAL = "biases moved"
+
+
+class Limits(msgspec.Struct, frozen=True, kw_only=True):
+    """What a pilot may set."""
+
+    max_age_s: float
+    max_temperature_change_k: float
+
+
+class Held(msgspec.Struct, frozen=True, kw_only=True):
+    """The gyros or accelerometers of one IMU: what its output must show while the calibration is good."""
+
+    calibrated_s: float | None
+    """When it was calibrated; None where the offsets were only measured to be right as they are."""
+    confirmed_s: float
+    """When that was seen last."""
+    temperature_degc: float | None
+    """Then."""
+    sigma_use: Vector
+    """rad/s or m/s^2; what was promised."""
+    sigma: Vector
+    """The same without a warm-up to come, which moves old and new offsets alike: what is compared."""
+    expected: Vector
+    """Output minus truth while all is well: zero where the autopilot corrects, else the whole bias."""
+    seen: bool
+    """Whether its effect was seen in the telemetry."""
+    averaged_s: float
+    """T of V(T, H)."""
+
+
+def held_of(
+    imu: ImuRecord, triad: Triad, now_s: float, averaged_s: float, *, corrected: bool, seen: bool
+) -> Held | None:
+    """State of one triad right after its calibration; None where that found nothing. `corrected`: by the autopilot."""
+    bias = imu.gyro_bias_rad_s if triad == "gyro" else imu.accel_bias_m_s2
+    sigma, settled = imu.sigma_in_force(triad), imu.settled_sigma(triad)
+    if sigma is None or settled is None or bias is None:
+        return None
+    return Held(
+        calibrated_s=now_s,
+        confirmed_s=now_s,
+        temperature_degc=imu.temperature_degc,
+        sigma_use=sigma,
+        sigma=settled,
+        expected=_NONE if corrected else bias,
+        seen=seen,
+        averaged_s=averaged_s,
+    )
+
+
+class Present(msgspec.Struct, frozen=True, kw_only=True):
+    """What the rolling window says now: output minus truth at this pose (rad/s or m/s^2, vehicle FRD)."""
+
+    residual: Vector
+    sigma_use: Vector
+    sigma: Vector
+    """Both as in `Held`."""
+
+
+class Seen(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known now."""
+
+    now_s: float
+    """By the clock of `Held`."""
+    temperature_degc: float | None = None
+    present: Present | None = None
+    """From a still window, if there is one."""
+    drift: tuple[Vector, Vector] | None = None
+    """By how much the bias has moved with the temperature since `Held`, and its variance; None: not known."""
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One reason against the calibration; `words` fit one line at the flight line."""
+
+    why: Why
+    words: str
+
+
+@functools.lru_cache(maxsize=128)
+def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
+    """The horizon H at which the expected wandering, V(T, H) without its white part, reaches DRIFT_SIGMAS sigma_use.
+
+    At most a day (method 2.2); of `sigma`, as in `Held`, the smallest axis counts, `averaged_s` is T.
+    """
+    allowed = (DRIFT_SIGMAS * min(sigma)) ** 2
+
+    def drift(horizon_s: float) -> float:
+        return float(floor_variance(model.flicker, model.walk, averaged_s, horizon_s))
+
+    low_s, high_s = 1.0, _LONGEST_S
+    if drift(high_s) <= allowed:
+        return high_s
+    if drift(low_s) >= allowed:
+        return low_s
+    while high_s / low_s > 1.01:
+        middle_s = math.sqrt(low_s * high_s)
+        low_s, high_s = (middle_s, high_s) if drift(middle_s) <= allowed else (low_s, middle_s)
+    return low_s
+
+
+def judge(triad: Triad, name: str, held: Held, model: AllanModel, limits: Limits, seen: Seen) -> list[Finding]:
+    """Everything that speaks against one triad's calibration now; empty while it is good."""
+    present, drift, temperature_degc = seen.present, seen.drift, seen.temperature_degc
+    (unit, words, _), digits = UNITS[triad], _DIGITS[triad]
+    found: list[Finding] = []
+    if not held.seen:
+        found.append(Finding(Why.UNSEEN, f"{triad} {name}: new offsets not seen to work"))
+    if present is not None and (worst := worst_axis(held, present)) is not None:
+        found.append(Finding(Why.RESIDUAL, f"{triad} {name} is off by {worst / unit:.{digits}f} {words}"))
+    if held.temperature_degc is not None and temperature_degc is not None:
+        change = temperature_degc - held.temperature_degc
+        warmer = "warmer" if change > 0 else "colder"
+        if drift is not None:
+            moved = max(math.sqrt(mean**2 + variance) for mean, variance in zip(*drift, strict=True))
+            if moved > DRIFT_SIGMAS * max(held.sigma):
+                off = f"{triad} {name}: about {moved / unit:.{digits}f} {words} off"
+                found.append(Finding(Why.TEMPERATURE, f"{off}, {abs(change):.0f} K {warmer}"))
+        elif abs(change) > limits.max_temperature_change_k:
+            found.append(Finding(Why.TEMPERATURE, f"imu {name}: {abs(change):.0f} K {warmer} than calibrated"))
+    limit_s = min(limits.max_age_s, age_limit_s(model, held.sigma, held.averaged_s))
+    if (age_s := seen.now_s - held.confirmed_s) > limit_s:
+        found.append(Finding(Why.OLD, f"calibrated {age_s / 60:.0f} min ago, limit {limit_s / 60:.0f}"))
+    return found
+
+
+def _off(present: Present, expected: Vector, then: Vector, sigmas: float, floor: float = 0.0) -> list[float]:
+    """By how much the axes are off that are so by more than so many sigmas of what both sides were known with."""
+    return [
+        residual - wanted
+        for residual, wanted, was, now in zip(present.residual, expected, then, present.sigma, strict=True)
+        if abs(residual - wanted) > max(sigmas * math.hypot(was, now), floor)
+    ]
+
+
+def worst_axis(held: Held, present: Present) -> float | None:
+    """The largest difference, signed, beyond RESIDUAL_SIGMAS of what both sides were known with; None: all agree."""
+    return max(_off(present, held.expected, held.sigma, RESIDUAL_SIGMAS), key=abs, default=None)
+
+
+def worth_writing(present: Present, held: Held | None, floor: float) -> bool:
+    """Whether new offsets would better any axis by more than WORTH_SIGMAS of what is known, and more than the floor.
+
+    The calibration in force was not known better than its own sigma; the floor is in the same unit.
+    """
+    expected, then = (_NONE, _NONE) if held is None else (held.expected, held.sigma)
+    return bool(_off(present, expected, then, WORTH_SIGMAS, floor))

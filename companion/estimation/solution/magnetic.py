@@ -1,0 +1,242 @@
+"""How good a compass heading can be: what its field, its steadiness and the Earth's field say of it.
+
+A disturbance of the field has three parts. Along the field and in the dip it shows, as a wrong strength F and a wrong
+inclination I; across the meridian it turns the heading and shows in nothing. So the visible parts say how large the
+invisible one may be: drawn with one unknown size, it exceeds `BOUND_OF_TWO` times their root of squares in one case of
+twenty. Its effect is dB / (F cos I) (method 3.5: 1.3 uT make 4 degrees at I = 68 degrees,
+where a norm gate of 5 % sees nothing). What the model WMM2025 itself does not know counts as visible disturbance.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Final
+
+import numpy as np
+
+from companion.estimation.means.pose import CompassModel, FieldWindow, HeadingWindow, vehicle_heading_rad
+from companion.estimation.records.record import Magnetic
+from companion.estimation.solution.site import LocalEarth
+from companion.physics.earth import MagneticField
+from companion.physics.frames import Array, Matrix, wrap_deg
+from companion.physics.magnetic import (
+    BOUND_OF_ONE,
+    BOUND_OF_TWO,
+    deflection_bound_deg,
+    heading_by_up,
+    heading_rad,
+    inclination_by_up,
+    inclination_rad,
+)
+from companion.physics.units import DEG
+
+STRENGTH_GATE: Final = 0.02
+INCLINATION_GATE_DEG: Final = 1.0
+"""Beyond these a warning is given (method 3.5); what counts is the bound."""
+UNIT_GATE: Final = 0.5
+"""Farther off the Earth's field than this it is no disturbance but a wrong unit or scale."""
+WANDER_WARNING_DEG: Final = 1.5
+DEVICE_WARNING_DEG: Final = 3.0
+"""Three sigma of an HMR3300 that is level."""
+USELESS_DEG: Final = 60.0
+"""A heading that may be so far off says nothing that the gyros' equation could use."""
+_NINETY_FIVE: Final = 1.96
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Heading:
+    """The true heading of the vehicle, how sure it is, and why."""
+
+    heading_rad: float
+    sigma_rad: float
+    """Without what a wrong tilt adds, which `heading_by_up` tells."""
+    heading_by_up: Array
+    """Gradient by up in the vehicle's axes, (3,): zero for a device's own heading."""
+    is_usable: bool
+    magnetic: Magnetic
+    warnings: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Field:
+    """What the mean field says."""
+
+    strength_gauss: float | None
+    inclination_rad: float | None
+    heading_rad: float | None
+    """Of the vehicle, by the compass' north, with our tilt compensation."""
+    bound_deg: float | None = None
+    """By how much a disturbance may turn it."""
+
+
+def assess(
+    window: HeadingWindow,
+    field: FieldWindow | None,
+    compass: CompassModel,
+    local: LocalEarth,
+    up: Array,
+    up_covariance: Matrix | None,
+    may_turn_deg: float = 0.0,
+) -> Heading:
+    """The heading of the vehicle from the compass' window, and everything that bounds its error.
+
+    `up_covariance` None: up is not from a gradienter, and no inclination can be told. `may_turn_deg` is how far the
+    aircraft itself may have turned, unseen, within the window.
+    """
+    heading = vehicle_heading_rad(compass, window.heading_deg, up)
+    found = _Field(None, None, None) if field is None else _look(field, compass, local, up, up_covariance)
+    gradient, vertical = np.zeros(3), False
+    if window.from_field and field is not None:
+        try:
+            gradient = heading_by_up(compass.vehicle_from_sensor @ np.array(field.field), up)
+        except ValueError:
+            vertical = True
+    difference = None
+    if not window.from_field and found.heading_rad is not None:
+        difference = wrap_deg((heading - found.heading_rad) / DEG)
+    declination_sigma_deg = local.declination_sigma_deg if compass.magnetic else 0.0
+    wander_deg = window.wander_deg or 0.0
+    bound_deg = None
+    if found.bound_deg is not None:
+        tilt_deg = 0.0 if up_covariance is None else math.sqrt(gradient @ up_covariance @ gradient) / DEG
+        chance_deg = _NINETY_FIVE * math.hypot(tilt_deg, window.sigma_deg, declination_sigma_deg)
+        bound_deg = min(math.hypot(max(found.bound_deg, abs(difference or 0.0)), wander_deg, chance_deg), 180.0)
+    sigma_deg = math.hypot(max(compass.sigma_at(up), wander_deg), window.sigma_deg, declination_sigma_deg)
+    # Where there is a field to be told from the Earth's, or a north that the compass could show.
+    use = local.field.compass_use if compass.magnetic and local.field is not None else "good"
+    useless = vertical or (bound_deg or 0.0) > USELESS_DEG or use == "none"
+    if useless:
+        bound_deg = 180.0
+    return Heading(
+        heading_rad=heading + (local.declination_deg * DEG if compass.magnetic else 0.0),
+        # A heading is never surer than what is known of its error.
+        sigma_rad=max(sigma_deg, bound_deg or 0.0) * DEG,
+        heading_by_up=gradient,
+        is_usable=not useless,
+        magnetic=Magnetic(
+            heading_bound_deg=_rounded(bound_deg, 2),
+            heading_from="field" if window.from_field else "device",
+            field_gauss=_rounded(found.strength_gauss, 5),
+            field_expected_gauss=None if local.field is None else _rounded(local.field.strength_gauss, 5),
+            inclination_deg=None if found.inclination_rad is None else _rounded(found.inclination_rad / DEG, 3),
+            inclination_expected_deg=None if local.field is None else _rounded(local.field.inclination_deg, 3),
+            device_minus_field_deg=_rounded(difference, 2),
+            wander_deg=_rounded(window.wander_deg, 2),
+        ),
+        warnings=(
+            *(["compass field is vertical: no heading"] if vertical else []),
+            *_near_pole(use),
+            *_disturbed(found, local.field, bound_deg, useless=useless, use=use),
+            *_unsteady(window, difference, may_turn_deg),
+            *_unchecked(field, up_covariance),
+        ),
+    )
+
+
+def _look(
+    field: FieldWindow, compass: CompassModel, local: LocalEarth, up: Array, up_covariance: Matrix | None
+) -> _Field:
+    """What the mean field says, and how far a disturbance that would look like this may turn the heading."""
+    vector = compass.vehicle_from_sensor @ np.array(field.field)
+    size = float(np.linalg.norm(vector))
+    strength = size if field.unit == "gauss" else None
+    if up_covariance is None or size == 0.0:
+        return _Field(strength, None, None)
+    inclination = inclination_rad(vector, up)
+    try:
+        own = heading_rad(np.array(field.field), compass.vehicle_from_sensor.T @ up)
+        by_up = inclination_by_up(vector, up)
+    except ValueError:
+        return _Field(strength, inclination, None, 180.0 if local.field is not None else None)
+    own = vehicle_heading_rad(compass, own / DEG, up)
+    expected = local.field
+    if expected is None:
+        return _Field(strength, inclination, own)
+    noise = float(np.linalg.norm(field.sigma)) / size
+    dip_sigma_rad = math.sqrt((expected.inclination_sigma_deg * DEG) ** 2 + by_up @ up_covariance @ by_up + noise**2)
+    whole = expected.strength_gauss
+    if strength is None:
+        seen = math.hypot(whole * (inclination - expected.inclination_deg * DEG), whole * dip_sigma_rad)
+        unseen, across = BOUND_OF_ONE * seen, whole * math.cos(inclination)
+    else:
+        across = strength * math.cos(inclination)
+        seen = math.hypot(
+            across - expected.horizontal_gauss,
+            strength * math.sin(inclination) - expected.down_gauss,
+            whole * dip_sigma_rad,
+            math.hypot(expected.strength_sigma_gauss, noise * size),
+        )
+        unseen = BOUND_OF_TWO * seen
+    return _Field(strength, inclination, own, deflection_bound_deg(unseen, across))
+
+
+def _near_pole(use: str) -> list[str]:
+    if use == "none":
+        return ["too near the magnetic pole for a compass: heading unknown, gyro sigma widened"]
+    return ["near the magnetic pole: the compass heading is weak"] if use == "poor" else []
+
+
+def _disturbed(
+    found: _Field, earths: MagneticField | None, bound_deg: float | None, *, useless: bool, use: str
+) -> list[str]:
+    """In what the field is not the Earth's, and what that makes of the heading."""
+    if earths is None:
+        return []
+    warnings, parts = [], []
+    if found.strength_gauss is not None:
+        off = found.strength_gauss / earths.strength_gauss - 1.0
+        if abs(off) > UNIT_GATE:
+            warnings.append(
+                f"compass field is {found.strength_gauss:.3g} gauss, the Earth's {earths.strength_gauss:.3g}: wrong"
+                " counts_per_gauss, or a magnet"
+            )
+        if abs(off) > STRENGTH_GATE:
+            parts.append(f"{abs(off) * 100.0:.0f} % {'above' if off > 0.0 else 'below'} the Earth's")
+    if found.inclination_rad is not None:
+        dip = found.inclination_rad / DEG - earths.inclination_deg
+        if abs(dip) > INCLINATION_GATE_DEG:
+            # Towards the nadir in the north and towards the zenith in the south is steeper.
+            steeper = dip * math.copysign(1.0, earths.inclination_deg) > 0.0
+            parts.append(f"{abs(dip):.1f} deg {'steeper' if steeper else 'flatter'} than the Earth's")
+    if not parts:
+        if useless and use != "none":
+            warnings.append(
+                "compass field too flat or too steep to show a heading: heading unknown, gyro sigma widened"
+            )
+        return warnings
+    consequence = ""
+    if useless:
+        consequence = "heading useless; "
+    elif bound_deg is not None:
+        consequence = f"heading may be off by {bound_deg:.0f} deg; "
+    return [*warnings, f"compass field {' and '.join(parts)}: {consequence}move away from iron"]
+
+
+def _unchecked(field: FieldWindow | None, up_covariance: Matrix | None) -> list[str]:
+    warnings = []
+    if field is not None and field.unit == "counts":
+        warnings.append("compass field in counts: only its direction is checked (counts_per_gauss is not set)")
+    if field is not None and up_covariance is None:
+        warnings.append("compass field without a gradienter: heading error bound unknown")
+    return warnings
+
+
+def _unsteady(window: HeadingWindow, difference: float | None, may_turn_deg: float) -> list[str]:
+    warnings = []
+    if window.wander_deg is not None and window.wander_deg > WANDER_WARNING_DEG:
+        moves = f"compass moves by {window.wander_deg:.1f} deg"
+        if window.wander_deg > may_turn_deg:
+            warnings.append(f"{moves}, gyros do not: iron or current near it?")
+        else:
+            warnings.append(f"{moves}: iron or current near it, or the aircraft turns slowly")
+    if difference is not None and abs(difference) > DEVICE_WARNING_DEG:
+        warnings.append(
+            f"compass' own heading is {abs(difference):.0f} deg off the one from its field and the gradienter:"
+            " heading may be off as much"
+        )
+    return warnings
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)

@@ -1,0 +1,335 @@
+"""Prediction of today's bias from earlier calibrations (method 3.3).
+
+Run to run a MEMS bias scatters (an ADIS16405 by 70 deg/h and 2 mg, method 1.3). The prediction for today is the
+mean of the earlier power-ups, or their curve over temperature (`temperature.curve`). Its sigma is that of *one more*
+power-up: the scatter, widened as Student's for few points, and the error of the mean.
+
+From three power-ups on the prediction guards (`joint`), from five on it may take part in the estimate. Within one
+power-up the bias is the one it started with, moved by temperature and drift: that guards best, and takes no part.
+
+An accelerometer's bias depends on the attitude at which it is measured: f = (I + S) (I - [m x]) g u + b
+(`align_model`). In one pose u, scale, shear and misalignment times 1 g look like a bias. A calibration finds the
+*effective* bias at its attitude; at u' it is larger by g (S - [m x]) (u' - u). A multi-pose alignment knows S and m;
+otherwise they are as large as its priors say (method 2.3: 0.5 % of scale make 5 mg).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Final, Literal
+
+import msgspec
+import numpy as np
+
+from companion.estimation.alignment.align_model import Priors
+from companion.estimation.means.warming import Path
+from companion.estimation.noise.allan import AllanModel, floor_variance
+from companion.estimation.records.align_record import Determined, ImuAlignmentRecord
+from companion.estimation.records.history import Measured, Point, PowerUp, believed
+from companion.estimation.records.record import Effective
+from companion.estimation.temperature.along import WARM_AFTER, Along, Settling, along
+from companion.estimation.temperature.curve import Curve, Node, PowerUpNodes, fit
+from companion.physics.frames import Array, Floats, Matrix, skew, symmetric, vector
+from companion.physics.statistics import student_quantile
+from companion.physics.units import DEG, DEG_H, MG, G
+from companion.samples import Triad, Vector
+
+LEVEL: Final = np.array([0.0, 0.0, -1.0])
+WORTH_SAYING_M_S2: Final = 1.0 * MG
+"""Least effect of the attitude in a warning; a wheel on a stone makes less."""
+_SIGMAS: Final = 2.0
+_PRIORS: Final = Priors()
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class PoseEffect:
+    """Matrix S - [m x] of one IMU: mean and one sigma of each element, both (3, 3)."""
+
+    mean: Matrix
+    sigma: Matrix
+    misalignment_mean: Matrix
+    misalignment_sigma: Matrix
+    source: Literal["assumed", "alignment"]
+
+    def change(self, gravity_m_s2: float, at: Array, then: Array) -> tuple[Array, Array]:
+        """Give the bias at `at` less the bias at `then`, and one sigma of that; each (3,), m/s^2."""
+        by = gravity_m_s2 * (at - then)
+        mean = (self.mean + self.misalignment_mean) @ by
+        variance = (np.square(self.sigma) + np.square(self.misalignment_sigma)) @ np.square(by)
+        return mean, np.sqrt(variance)
+
+    def effective(self, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> Effective:
+        """Make the entry of the record, without misalignment, which turns the axes and is no bias of the sensor.
+
+        Args:
+            gravity_m_s2: local gravity.
+            up: unit vector, the attitude of the calibration, (3,).
+            sigma_use_m_s2: sigma of the bias at this attitude, (3,).
+        """
+        # The mean is known but not subtracted from what is written, so it counts in full.
+        whole = np.sqrt(np.square(self.mean) + np.square(self.sigma))
+        to_level = np.square(gravity_m_s2 * (LEVEL - up))
+        own = np.square(whole) @ np.square(gravity_m_s2 * up)
+        return Effective(
+            scale_from=self.source,
+            scale_sigma_m_s2=vector(gravity_m_s2 * np.diag(whole)),
+            level_sigma_m_s2=vector(np.sqrt(np.square(sigma_use_m_s2) + np.square(whole) @ to_level)),
+            sensor_sigma_m_s2=vector(np.sqrt(np.square(sigma_use_m_s2) + own)),
+        )
+
+    def warning(self, name: str, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> str | None:
+        """Warn a pilot who has calibrated a tilted aircraft; None: it stood about level."""
+        whole = np.square(self.mean) + np.square(self.sigma)
+        moves = np.sqrt(whole @ np.square(gravity_m_s2 * (LEVEL - up)))
+        if not (moves > np.maximum(WORTH_SAYING_M_S2, _SIGMAS * sigma_use_m_s2)).any():
+            return None
+        return (
+            f"accel {name}: effective at this attitude; level again it may be off by {moves.max() / MG:.1f} mg, since"
+            " its scale error looks like a bias: calibrate level (companion align tilts tells the scale)"
+        )
+
+
+def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:
+    """Give the known scale, shear and misalignment of one IMU."""
+    none: Determined | None = None
+    scale, scale_sigma = _known(aligned.accel_scale if aligned else none, 1.0, _PRIORS.scale)
+    shear, shear_sigma = _known(aligned.accel_shear if aligned else none, 1.0, _PRIORS.shear)
+    turn, turn_sigma = _known(aligned.misalignment_deg if aligned else none, DEG, _PRIORS.misalignment_deg * DEG)
+    return PoseEffect(
+        mean=np.diag(scale) + symmetric(shear),
+        sigma=np.diag(scale_sigma) + symmetric(shear_sigma),
+        misalignment_mean=-skew(turn),
+        misalignment_sigma=symmetric(turn_sigma[::-1]),
+        source="alignment" if aligned is not None and any(aligned.accel_scale.known) else "assumed",
+    )
+
+
+def _known(found: Determined | None, unit: float, assumed: float) -> tuple[Array, Array]:
+    if found is None:
+        return np.zeros(3), np.full(3, assumed)
+    known = np.array(found.known)
+    return np.where(known, found.value, 0.0) * unit, np.where(known, np.array(found.sigma) * unit, assumed)
+
+
+GUARDS_FROM: Final = 3
+"""Least earlier power-ups of a guard."""
+WEIGHS_FROM: Final = 5
+"""Least earlier power-ups that take part in the estimate."""
+GATE_SIGMAS: Final = 4.0
+TEMPERATURE_SIGMA_K: Final = 10.0
+"""Temperature change between two calibrations of one power-up, where no temperature is known."""
+CATALOGUE_SCATTER: Final[dict[Triad, float]] = {"gyro": 70.0 * DEG_H, "accel": 2.0 * MG}
+"""Run-to-run scatter of method 1.3; it only weighs the points against one another."""
+CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2 * MG}
+"""Slope over temperature of a BMI088, the worse one of method 2.1."""
+_KNOWN: Final = 0.5
+"""Largest sigma of a usable curve's slope, as a share of the catalogue's slope."""
+_UNEXPLAINED: Final = 0.1
+"""Largest unexplained share of the changes within power-ups. With the IMU's own thermometer it is 0.05 and less (except
+for one simulated aircraft in some hundreds); with that of the air, a heater or a processor 0.1 to 1 and more."""
+_IN_RUN_MEAN_S: Final = 30.0
+_SHORTEST_GAP_S: Final = 180.0
+
+
+class Expected(msgspec.Struct, frozen=True, kw_only=True):
+    """Prediction of one triad's whole bias today, vehicle FRD, rad/s or m/s^2."""
+
+    value: Vector
+    variance: Vector
+    """Variance of today's bias about the prediction, without the gradienter's zero."""
+    limit: float
+    """Limit of the gate in sigmas: 4, or an equally improbable one where the scatter is known from few points."""
+    power_ups: int
+    weighs: bool
+    """True if the prediction may take part in the estimate."""
+    by_temperature: bool = False
+    same_zero: float = 0.0
+    """Share that was measured with today's zero of the gradienter, so that its error is in both."""
+    other_zero_rad: float = 0.0
+    """One sigma of the error from other zeros."""
+
+
+class ExpectedImu(msgspec.Struct, frozen=True, kw_only=True):
+    """Predictions for one IMU."""
+
+    name: str
+    earlier: dict[Triad, Expected | None] = {}
+    """Prediction from earlier power-ups."""
+    today: dict[Triad, Expected | None] = {}
+    """Prediction from a calibration earlier in this power-up."""
+    along: dict[Triad, Along | None] = {}
+    """Prediction by the curve for a window in which the temperature changed."""
+    effect: PoseEffect | None = None
+    """Effect of the attitude on the accelerometers' bias."""
+
+
+class Expectation(msgspec.Struct, frozen=True, kw_only=True):
+    """Predictions for all IMUs of a calibration."""
+
+    imus: tuple[ExpectedImu, ...] = ()
+    zero_is_known: bool = False
+    """True if the sigma of the gradienter's zero was measured or configured, and is no cautious guess."""
+
+
+class Now(msgspec.Struct, frozen=True, kw_only=True):
+    """Present state of one IMU."""
+
+    unix_s: float
+    power_up: PowerUp
+    temperature_degc: float | None
+    k_s: float = 0.0
+    up: Vector
+    gravity_m_s2: float
+    zero: str | None
+
+
+def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, model: AllanModel) -> Expected | None:
+    """Predict today's bias from the earlier power-ups; None: they are too few."""
+    groups = [
+        group for group in believed(points, triad) if not any(point.power_up.is_same(now.power_up) for point in group)
+    ]
+    if len(groups) < GUARDS_FROM:
+        return None
+    # Where a temperature is missing, all count as measured at the same one.
+    told = now.temperature_degc is not None and _told(groups)
+    seen = [[_of(point, triad) for point in group] for group in groups]
+    here = [_here(group, found, triad, now, effect) for group, found in zip(groups, seen, strict=True)]
+    zeros = [group[-1].zero_sigma_rad * now.gravity_m_s2 if triad == "accel" else 0.0 for group in groups]
+    nodes = [
+        PowerUpNodes(
+            [_node(point, bias, _white(one), told=told) for point, one, bias in zip(group, found, biases, strict=True)],
+            common_variance=float(np.square(pose).mean()) + zero**2,
+        )
+        for group, found, (biases, pose), zero in zip(groups, seen, here, zeros, strict=True)
+    ]
+    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad])
+    assert curve is not None
+    degc = now.temperature_degc or 0.0
+    value, variance = curve.at(degc, now.k_s) if told else curve.at(0.0)
+    # An error that all power-ups share, of one attitude or one place, does not average out.
+    pose = np.array([each.mean(axis=0) for _, each in here])
+    shared = [one.sigma_shared for found in seen for one in found]
+    together = np.square(curve.shares @ pose) + np.max(np.square(shared), axis=0)
+    same, other = _zeros([group[-1] for group in groups], curve.shares, now.zero) if triad == "accel" else (0.0, 0.0)
+    return Expected(
+        value=vector(value),
+        variance=vector(variance + together),
+        limit=student_quantile(GATE_SIGMAS, curve.freedom),
+        power_ups=len(groups),
+        weighs=len(groups) >= WEIGHS_FROM and (not told or curve.beyond_k(degc) == 0.0),
+        by_temperature=curve.order > 0,
+        same_zero=same,
+        other_zero_rad=other,
+    )
+
+
+def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve | None:
+    """Fit how a bias follows the temperature within a power-up; None: too little is known."""
+    groups = believed(points, triad)
+    if len(groups) < WEIGHS_FROM or not _told(groups):
+        return None
+    nodes = [PowerUpNodes([_along(group[0], point, triad) for point in group]) for group in groups]
+    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad], may_be_mean=False)
+    assert curve is not None
+    low, high = curve.span_degc
+    _, variance = curve.change((low, 0.0), (low + 1.0, 0.0))
+    known = high > low and variance.max() < (_KNOWN * CATALOGUE_PER_K[triad]) ** 2
+    return curve if known and curve.unexplained < _UNEXPLAINED else None
+
+
+def _along(first: Point, point: Point, triad: Triad) -> Node:
+    """Make a node of a power-up; an accelerometer's variance grows with the change of attitude from the first."""
+    found = _of(point, triad)
+    variance = _white(found)
+    if triad == "accel":
+        _, sigma = pose_effect(None).change(G, np.array(point.up), np.array(first.up))
+        variance += float(np.square(sigma).mean())
+    return _node(point, np.array(found.bias), variance, told=True)
+
+
+def follow(curve: Curve, path: Path, settles: Settling | None, model: AllanModel) -> Along:
+    """Predict by a curve the bias over a window, and when the IMU is warm."""
+    wander = 0.0 if settles is None else _in_run(model, max(WARM_AFTER * settles.tau_s, _SHORTEST_GAP_S))
+    return along(curve, path.states, path.span_s, path.variance, settles, wander)
+
+
+def _white(found: Measured) -> float:
+    return float(np.square(found.sigma_stat).mean())
+
+
+def _told(groups: Sequence[Sequence[Point]]) -> bool:
+    return all(point.temperature_degc is not None for group in groups for point in group)
+
+
+def _in_run(model: AllanModel, gap_s: float = _SHORTEST_GAP_S) -> float:
+    """Give the variance by which a bias wanders within a power-up."""
+    return float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * gap_s))
+
+
+def expect_today(
+    last: Point, triad: Triad, now: Now, effect: PoseEffect, model: AllanModel, curve: Curve | None = None
+) -> Expected | None:
+    """Predict the bias from an earlier calibration in this power-up; None: it did not measure this triad.
+
+    The `curve` predicts the change with the temperature; without one, the catalogue's slope widens the sigma.
+    """
+    found = last.of(triad)
+    if found is None:
+        return None
+    bias, pose = _here([last], [found], triad, now, effect)
+    kelvin = TEMPERATURE_SIGMA_K
+    if last.temperature_degc is not None and now.temperature_degc is not None:
+        kelvin = now.temperature_degc - last.temperature_degc
+    change, of_change = np.zeros(3), np.full(3, (CATALOGUE_PER_K[triad] * kelvin) ** 2)
+    if curve is not None and last.temperature_degc is not None and now.temperature_degc is not None:
+        change, of_change = curve.change((last.temperature_degc, last.k_s), (now.temperature_degc, now.k_s))
+    drift = _in_run(model, max(abs(now.unix_s - last.unix_s), _SHORTEST_GAP_S))
+    variance = np.square(found.sigma_use) + np.square(found.sigma_shared) + np.square(pose[0]) + of_change + drift
+    same = triad == "accel" and last.zero == now.zero
+    return Expected(
+        value=vector(bias[0] + change),
+        variance=vector(variance),
+        limit=GATE_SIGMAS,
+        power_ups=1,
+        weighs=False,
+        same_zero=1.0 if same else 0.0,
+        other_zero_rad=last.zero_sigma_rad if triad == "accel" and not same else 0.0,
+    )
+
+
+def _of(point: Point, triad: Triad) -> Measured:
+    found = point.of(triad)
+    assert found is not None  # `believed` returns only these
+    return found
+
+
+def _node(point: Point, bias: Array, variance: float, *, told: bool) -> Node:
+    degc, k_s = (point.temperature_degc or 0.0, point.k_s) if told else (0.0, 0.0)
+    return Node(degc, vector(bias), variance, k_s)
+
+
+def _here(
+    points: Sequence[Point], found: Sequence[Measured], triad: Triad, now: Now, effect: PoseEffect
+) -> tuple[Floats, Floats]:
+    """Convert biases to today's attitude, and give one sigma of the conversion; each (points, 3)."""
+    bias = np.array([one.bias for one in found])
+    pose = np.zeros_like(bias)
+    if triad == "accel":
+        up: Array = np.array(now.up)
+        for k, point in enumerate(points):
+            change, pose[k] = effect.change(now.gravity_m_s2, up, np.array(point.up))
+            bias[k] += change
+    return bias, pose
+
+
+def _zeros(points: Sequence[Point], share: Floats, today: str | None) -> tuple[float, float]:
+    """Give the share that was measured with today's zero, and one sigma of the error of the others."""
+    shares: dict[str | None, float] = {}
+    sigmas: dict[str | None, float] = {}
+    for point, part in zip(points, share, strict=True):
+        shares[point.zero] = shares.get(point.zero, 0.0) + float(part)
+        sigmas[point.zero] = point.zero_sigma_rad
+    same = shares.pop(today, 0.0)
+    return same, math.hypot(*(part * sigmas[zero] for zero, part in shares.items()), 0.0)

@@ -1,0 +1,141 @@
+"""Where the aircraft stands, what gravity and the Earth's rotation are there, and how sure that is.
+
+What is not known widens the sigmas; it is never silently replaced by a default (each gap leaves a warning).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import math
+from typing import Final
+
+import numpy as np
+
+from companion.estimation.records.record import Site
+from companion.physics import earth
+from companion.physics.frames import Array, Matrix
+
+# A gravity anomaly of 30 mGal is what Somigliana's formula leaves (method 2.1).
+GRAVITY_MODEL_SIGMA_M_S2: Final = 3.0e-4
+GRAVITY_BY_HEIGHT_1_S2: Final = 3.086e-6
+UNKNOWN_HEIGHT_SIGMA_M: Final = 1000.0
+# Declination over the inhabited Earth stays within some 20 degrees: sigma when nobody knows the position.
+UNKNOWN_DECLINATION_SIGMA_DEG: Final = 12.0
+
+# Averages over the sphere, for a latitude nobody knows: sin L is uniform in [-1, 1], E cos L = pi / 4.
+_MEAN_COS: Final = math.pi / 4
+_VARIANCE_COS: Final = 2 / 3 - math.pi**2 / 16
+_VARIANCE_SIN: Final = 1 / 3
+_MEAN_GRAVITY_M_S2: Final = 9.7976
+_GRAVITY_SIGMA_M_S2: Final = 0.0155
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Uncertain:
+    """A vector that is known up to a covariance: `mean` shape (3,), `covariance` shape (3, 3)."""
+
+    mean: Array
+    covariance: Matrix
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Remedies:
+    """What a user can do about what is missing: in the configuration, or where a command asks for an estimate."""
+
+    latitude: str = "set vehicle.latitude_deg or wait for GPS"
+    height: str = "set vehicle.height_m or wait for GPS"
+    no_heading: str = "no compass"
+    part: str = "say its part (profile), or learn it (companion profile)"
+    mounting: str = "mounting = \"{}\" (an autopilot's own IMU: its board orientation), or the gradienter's is wrong"
+    any_bias: str = "calibration.any_bias = true takes it all the same"
+
+
+IN_CONFIGURATION: Final = Remedies()
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Whereabouts:
+    """What is known of place and date, and who said so ("configuration", "autopilot", ...)."""
+
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    height_m: float | None = None
+    source: str | None = None
+    date: datetime.date | None = None
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class LocalEarth:
+    """Gravity, Earth rate (NED) and declination at the site, each with its sigma, and what was missing."""
+
+    site: Site
+    gravity_m_s2: float
+    gravity_sigma_m_s2: float
+    rate_ned_rad_s: Array
+    rate_ned_covariance: Matrix
+    declination_deg: float
+    declination_sigma_deg: float
+    warnings: tuple[str, ...]
+    field: earth.MagneticField | None = None
+    """The Earth's magnetic field by its model; None without position and date."""
+    remedies: Remedies = IN_CONFIGURATION
+
+    def rate_in_body(self, body_from_ned: Matrix, *, heading_known: bool) -> Uncertain:
+        """In body axes; with an unknown heading the horizontal part may point anywhere, and its mean is zero."""
+        mean, covariance = self.rate_ned_rad_s, self.rate_ned_covariance
+        if not heading_known:
+            mean_square_north = mean[0] ** 2 + covariance[0, 0]
+            mean = np.array([0.0, 0.0, mean[2]])
+            covariance = np.diag([mean_square_north / 2, mean_square_north / 2, covariance[2, 2]])
+        return Uncertain(body_from_ned @ mean, body_from_ned @ covariance @ body_from_ned.T)
+
+
+def local_earth(where: Whereabouts, remedies: Remedies = IN_CONFIGURATION) -> LocalEarth:
+    """Everything the equations need of a place."""
+    warnings: list[str] = []
+    covariance = np.zeros((3, 3))
+    gravity: float | None = None
+    if where.latitude_deg is None:
+        warnings.append(f"latitude unknown: Earth rate and gravity uncertain ({remedies.latitude})")
+        rate = np.array([earth.EARTH_RATE_RAD_S * _MEAN_COS, 0.0, 0.0])
+        covariance = earth.EARTH_RATE_RAD_S**2 * np.diag([_VARIANCE_COS, 0.0, _VARIANCE_SIN])
+        used_gravity, gravity_sigma = _MEAN_GRAVITY_M_S2, _GRAVITY_SIGMA_M_S2
+    else:
+        rate = earth.earth_rate_ned_rad_s(where.latitude_deg)
+        used_gravity = gravity = earth.gravity_m_s2(where.latitude_deg, where.height_m or 0.0)
+        gravity_sigma = GRAVITY_MODEL_SIGMA_M_S2
+        if where.height_m is None:
+            warnings.append(f"height unknown: gravity uncertain by 0.3 mg ({remedies.height})")
+            gravity_sigma = math.hypot(gravity_sigma, UNKNOWN_HEIGHT_SIGMA_M * GRAVITY_BY_HEIGHT_1_S2)
+    field = _magnetic_field(where, warnings)
+    return LocalEarth(
+        site=Site(
+            latitude_deg=where.latitude_deg,
+            height_m=where.height_m,
+            gravity_m_s2=gravity,
+            declination_deg=None if field is None else field.declination_deg,
+            source=where.source,
+        ),
+        gravity_m_s2=used_gravity,
+        gravity_sigma_m_s2=gravity_sigma,
+        rate_ned_rad_s=rate,
+        rate_ned_covariance=covariance,
+        declination_deg=0.0 if field is None else field.declination_deg,
+        declination_sigma_deg=UNKNOWN_DECLINATION_SIGMA_DEG if field is None else field.declination_sigma_deg,
+        warnings=tuple(warnings),
+        field=field,
+        remedies=remedies,
+    )
+
+
+def _magnetic_field(where: Whereabouts, warnings: list[str]) -> earth.MagneticField | None:
+    if where.latitude_deg is None or where.longitude_deg is None or where.date is None:
+        return None
+    first, last = earth.WMM_VALID_YEARS
+    if not first <= where.date.year < last:
+        warnings.append(
+            f"the date {where.date.isoformat()} lies outside the magnetic model ({first:.0f} to {last:.0f}):"
+            " declination of its nearest year used"
+        )
+    return earth.magnetic_field(where.latitude_deg, where.longitude_deg, where.height_m or 0.0, where.date)

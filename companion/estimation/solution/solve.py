@@ -1,0 +1,360 @@
+"""From the averages of one still stretch to biases with covariances.
+
+The gradienter gives the direction of up, the compass the heading, the site gravity and the Earth's rate; what each
+sensor should have read follows, and the rest is its bias. "Bias" is the effective one at this pose: a scale error
+times 1 g on the vertical axis cannot be told from a bias in one pose (method 2.3) and is what the
+autopilot's offset has to carry here; it is not part of sigma.
+
+The bias equations of the paper in their corrected form:
+
+| paper | printed                                           | here                                                |
+|-------|---------------------------------------------------|-----------------------------------------------------|
+| (2)   | gravity in body axes                              | specific force: minus gravity, at rest g * up       |
+| (3)   | accelerometer = gravity + bias                    | accelerometer = specific force + bias               |
+| (4)   | dN = -mean + g sin, dE with cos cos, dU + g cos   | bias = mean - g * up, one vector equation           |
+| (5)   | T11, T12 with wrong signs; latitude in row 2      | physics.frames.body_from_ned (orthogonal)           |
+| (6)   | -mean - T Omega                                   | bias = mean - C_n^b w_ie^n                          |
+
+Coded as printed, (4) returns the negative of the north bias and (6) minus the bias less twice the Earth's rate
+(method 1.3). Everything is FRD and NED; `up` is the unit vector of specific force at rest.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.config.sections import Platform
+from companion.errors import CalibrationRefusedError
+from companion.estimation.means.pose import CompassModel, GradienterModel
+from companion.estimation.means.warming import Warming
+from companion.estimation.means.windows import Hidden, ImuWindow, Window
+from companion.estimation.records.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site, WhenWarm
+from companion.estimation.request import What
+from companion.estimation.solution.otherwise import NOTHING, Otherwise
+from companion.estimation.solution.site import LocalEarth, Remedies
+from companion.estimation.solution.truth import Truth, truth_of
+from companion.estimation.stillness.plausible import implausible
+from companion.estimation.turning.watch import Turn
+from companion.physics.frames import Array, Matrix, roll_pitch_from_up, skew
+from companion.physics.units import DEG
+from companion.samples import Triad
+
+_ON_DECK: Final = "on a deck gyros need a compass: without one a slow turn looks like a bias"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class ImuSolution:
+    """What is left in one IMU's output: mean minus truth, in vehicle FRD, shape (3,); None: not asked for or unknown.
+
+    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of a prediction of the next minutes, without what a
+    warm-up may do in them: that moves the bias under old and new offsets alike, and no comparison must count it.
+    """
+
+    name: str
+    samples: int
+    temperature_degc: float | None
+    """At the end of the window, where it is known to have changed."""
+    gyro_rad_s: Array | None
+    accel_m_s2: Array | None
+    sigma_stat: Array
+    """(6,) as the covariance; what averaging left."""
+    covariance: Matrix
+    warnings: tuple[str, ...]
+    drifting: tuple[str, ...] = ()
+    """What is to be said of its drift, or what it will be when warm."""
+    warm_up_variance: Array = dataclasses.field(default_factory=lambda: np.zeros(6))
+    k_s: float = 0.0
+    """How fast its temperature rose."""
+    warming: Warming | None = None
+    """What its window tells of slopes; None: nothing."""
+    when_warm: WhenWarm | None = None
+    dithered: bool = False
+    """The telemetry was seen to follow this IMU's offsets step by step."""
+    prior: Prior | None = None
+    """What was known from before, and what became of it."""
+    effective: Effective | None = None
+    """What the accelerometers' bias is worth at another attitude."""
+
+    @property
+    def gyro_sigma_use_rad_s(self) -> Array:
+        """One sigma per axis, shape (3,)."""
+        return np.sqrt(np.diag(self.use_covariance)[:3])
+
+    @property
+    def accel_sigma_use_m_s2(self) -> Array:
+        """One sigma per axis, shape (3,)."""
+        return np.sqrt(np.diag(self.use_covariance)[3:])
+
+    @property
+    def mean_degc(self) -> float | None:
+        """Over the window."""
+        path = None if self.warming is None else self.warming.path
+        return self.temperature_degc if path is None else path.mean_degc
+
+    @property
+    def use_covariance(self) -> Matrix:
+        """The warm-up in it: sigma_use is the root of its diagonal."""
+        return self.covariance + np.diag(self.warm_up_variance)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Shared:
+    """The errors that all IMUs of one stretch have in common: one attitude, one gravity, one Earth's rate."""
+
+    up: Array
+    gravity_m_s2: float
+    covariance: Matrix
+    """6x6 (gyro rad/s, accelerometer m/s^2), part of every IMU's own and the cross-covariance of any two."""
+    by_reading: Matrix | None
+    """d (accelerometer bias) / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
+    reading_sigma_rad: tuple[float, float]
+    zero_sigma_rad: float
+    """Of the gradienter's zero, the same in every calibration."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The biases of all IMUs from one still stretch."""
+
+    pose: Pose
+    site: Site
+    imus: tuple[ImuSolution, ...]
+    warnings: tuple[str, ...]
+    shared: Shared
+    unknown: tuple[tuple[str, Triad], ...] = ()
+    """IMUs and triads that were asked for and whose readings do not tell; the IMU's warnings say why."""
+    magnetic: Magnetic | None = None
+    """How good the heading can be; None without a compass."""
+    turn: Turn = dataclasses.field(default_factory=Turn)
+    """What was known of the platform's own rate."""
+    platform: Platform = "ground"
+    cross: Mapping[tuple[str, str], Matrix] = dataclasses.field(default_factory=dict)
+    """Cross-covariance (6x6) of every two IMUs, in their order."""
+
+
+def accelerometer_bias(mean_m_s2: Array, up: Array, gravity_m_s2: float) -> Array:
+    """Equation (4), corrected: mean reading minus the specific force at rest; shape (3,), FRD, m/s^2."""
+    return mean_m_s2 - gravity_m_s2 * up
+
+
+def gyro_bias(mean_rad_s: Array, earth_rate_body_rad_s: Array) -> Array:
+    """Equation (6), corrected: mean reading minus the Earth's rotation in body axes; shape (3,), FRD, rad/s."""
+    return mean_rad_s - earth_rate_body_rad_s
+
+
+def solve(
+    window: Window,
+    local: LocalEarth,
+    gradienter: GradienterModel | None,
+    compass: CompassModel | None,
+    what: What,
+    platform: Platform = "ground",
+    *,
+    any_bias: bool = False,
+    otherwise: Otherwise = NOTHING,
+) -> Solution:
+    """Work out the biases of every IMU of the window; with `any_bias` also such as no part has.
+
+    What is known `otherwise` of the attitude fills in where there is no gradienter, or no compass.
+
+    Raises:
+        CalibrationRefusedError: the readings cannot be right together, accelerometers were asked for without
+            a gradienter, or gyros on a deck without a heading.
+    """
+    warnings = list(local.warnings)
+    gradienter = gradienter if window.tilt is not None else None
+    compass = compass if window.heading is not None else None
+    if what.accelerometers and gradienter is None:
+        if what is What.ACCELEROMETERS:
+            raise CalibrationRefusedError(
+                "accelerometers need a gradienter: without one the tilt is unknown; configure [gradienter] or"
+                " calibrate the gyros only"
+            )
+        warnings.append("no gradienter: gyros only, accelerometers not calibrated")
+    if platform == "deck":
+        # It turns: of a yaw nobody knows when it was true.
+        otherwise = msgspec.structs.replace(otherwise, heading=None)
+    truth = truth_of(window, gradienter, compass, local, warnings, otherwise)
+    unknown_heading = None
+    if compass is None and truth.heading_rad is None:
+        unknown_heading = local.rate_in_body(np.eye(3), heading_known=False).covariance
+    warnings += wide_gyros(window.imus, unknown_heading, local.remedies)
+    believed = window.imus if any_bias else tuple(believable(imu, truth.up, local) for imu in window.imus)
+    sailing = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)
+    shared = _shared(truth, local, window.turn, 0.0 if gradienter is None else gradienter.sigma_deg * DEG, sailing)
+    # A deck may turn, and a steady turn shows in nothing but the heading.
+    turn_unseen = platform == "deck" and what.gyros and truth.heading_rad is None
+    if turn_unseen:
+        if what is What.GYROS or gradienter is None:
+            raise CalibrationRefusedError(_ON_DECK)
+        warnings.append(f"{_ON_DECK}; not calibrated")
+    wanted: dict[Triad, bool] = {
+        "gyro": what.gyros and not turn_unseen,
+        "accel": what.accelerometers and gradienter is not None,
+    }
+    asked = [triad for triad, is_wanted in wanted.items() if is_wanted]
+    tipped = _tipped(window, gradienter, truth, sailing)
+    imus = tuple(
+        _estimate(imu, truth, local, shared, asked, tipped, window.powered_s.get(imu.name, 0.0)) for imu in believed
+    )
+    if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
+        refusals = dict.fromkeys(words for imu in believed for words in untold(imu, asked))
+        if refusals:
+            raise CalibrationRefusedError("; ".join(refusals))
+    unknown = [(imu.name, triad) for triad in asked for imu in believed if imu.refused(triad)]
+    if turn_unseen:
+        unknown += [(imu.name, "gyro") for imu in window.imus]
+    return Solution(
+        pose=_pose(truth),
+        site=local.site,
+        imus=imus,
+        warnings=tuple(warnings),
+        unknown=tuple(unknown),
+        magnetic=truth.magnetic,
+        shared=shared,
+        turn=window.turn,
+        platform=platform,
+        cross=dict.fromkeys(itertools.combinations((imu.name for imu in imus), 2), shared.covariance),
+    )
+
+
+def _pose(truth: Truth) -> Pose:
+    gamma, theta = roll_pitch_from_up(truth.up)
+    up, covariance, heading = truth.up, truth.up_covariance, truth.heading_rad
+    by_gamma = np.array([0.0, up[2], -up[1]]) / (up[1] ** 2 + up[2] ** 2)
+    known = truth.tilt_from is not None
+    return Pose(
+        tilt_from=truth.tilt_from,
+        heading_from=truth.heading_from,
+        theta_deg=theta / DEG if known else None,
+        gamma_deg=gamma / DEG if known else None,
+        psi_deg=(heading / DEG) % 360.0 if heading is not None else None,
+        sigma_deg=PoseSigma(
+            theta=math.sqrt(covariance[0, 0] / (1.0 - up[0] ** 2)) / DEG if known else None,
+            gamma=math.sqrt(by_gamma @ covariance @ by_gamma) / DEG if known else None,
+            psi=truth.heading_sigma_rad / DEG if truth.heading_sigma_rad is not None else None,
+        ),
+    )
+
+
+def _shared(truth: Truth, local: LocalEarth, turn: Turn, zero_sigma_rad: float, turn_rad_s: Array) -> Shared:
+    """What one attitude, gravity, Earth's rate and turn of the platform add to the errors of all; method 2.1.
+
+    An attitude error eps makes db_a = eps x f and db_g = eps x w = -[w x] eps; the cross term is kept, since one tilt
+    error makes both. What remains unknown of the Earth's rate (latitude, or a heading never measured) comes in with
+    its own covariance, and so does what the platform may turn by itself.
+    """
+    rate, up = truth.earth_rate(local), truth.up
+    jacobian = np.vstack([-skew(rate.mean + turn_rad_s), -skew(local.gravity_m_s2 * up)])
+    covariance = jacobian @ truth.attitude_covariance_rad2 @ jacobian.T
+    covariance[:3, :3] += rate.covariance + turn.covariance(up)
+    covariance[3:, 3:] += np.outer(up, up) * local.gravity_sigma_m_s2**2
+    return Shared(
+        up=up,
+        gravity_m_s2=local.gravity_m_s2,
+        covariance=covariance,
+        by_reading=None if truth.up_by_reading is None else -local.gravity_m_s2 * truth.up_by_reading,
+        reading_sigma_rad=truth.reading_sigma_rad,
+        zero_sigma_rad=zero_sigma_rad,
+    )
+
+
+def _tipped(window: Window, gradienter: GradienterModel | None, truth: Truth, turn_rad_s: Array) -> Array:
+    """What the gyro means of a deck hold of its turn because its axis is another one than the readings alone said."""
+    if window.turn_rad_s is None or window.tilt is None or gradienter is None:
+        return np.zeros(3)
+    said = gradienter.up(window.tilt.x_deg, window.tilt.y_deg)
+    return np.cross(np.cross(said, truth.up), turn_rad_s)
+
+
+def _estimate(
+    imu: ImuWindow,
+    truth: Truth,
+    local: LocalEarth,
+    shared: Shared,
+    asked: Collection[Triad],
+    tipped: Array,
+    powered_s: float,
+) -> ImuSolution:
+    gyro = accel = None
+    if "gyro" in asked and imu.refused("gyro") is None:
+        gyro = gyro_bias(np.array(imu.gyro_rad_s), _earth_seen(imu, truth, local) + tipped)
+    if "accel" in asked and imu.refused("accel") is None:
+        accel = accelerometer_bias(np.array(imu.accel_m_s2), truth.up, local.gravity_m_s2)
+    own = imu.covariance
+    if own is None:
+        own = np.diag(np.square([*imu.gyro_sigma_use_rad_s, *imu.accel_sigma_use_m_s2]))
+    covariance = shared.covariance + own
+    path = None if imu.warming is None or imu.dithered else imu.warming.path
+    unseen = np.zeros(6) if imu.warming is None else imu.warming.unseen(powered_s)
+    return ImuSolution(
+        name=imu.name,
+        samples=imu.samples,
+        temperature_degc=imu.temperature_degc if path is None else path.degc[2],
+        gyro_rad_s=gyro,
+        accel_m_s2=accel,
+        sigma_stat=np.array([*imu.gyro_sigma_stat_rad_s, *imu.accel_sigma_stat_m_s2]),
+        covariance=covariance,
+        warm_up_variance=unseen,
+        k_s=0.0 if imu.warming is None else imu.warming.rate_k_s,
+        warnings=(*imu.warnings, *untold(imu, asked)),
+        drifting=(*imu.drifting, *widened(imu, asked, powered_s, np.diag(covariance))),
+        # A dither's means come after the window.
+        warming=None if imu.dithered else imu.warming,
+        dithered=imu.dithered,
+    )
+
+
+def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
+    """What the gyro means hold of the Earth's rate: all of it as the aircraft stood, or what turning left of it."""
+    if imu.by_earth is None or truth.heading_rad is None:
+        return truth.earth_rate(local).mean
+    c, s = math.cos(truth.heading_rad), math.sin(truth.heading_rad)
+    north, east, down = local.rate_ned_rad_s.tolist()
+    return np.asarray(imu.by_earth @ np.array([c * north + s * east, c * east - s * north, down]))
+
+
+def believable(imu: ImuWindow, up: Array, local: LocalEarth) -> ImuWindow:
+    """The same; what cannot be is hidden, with the words that say why and what to do. `up` (3,), vehicle FRD."""
+    means = np.array(imu.gyro_rad_s), np.array(imu.accel_m_s2)
+    found = implausible(imu.name, *means, local.gravity_m_s2 * up, np.array(imu.mounting), local.remedies.mounting)
+    hidden = {triad: Hidden(f"{words}; {local.remedies.any_bias}", useless=True) for triad, words in found.items()}
+    return msgspec.structs.replace(imu, hidden={**imu.hidden, **hidden}) if hidden else imu
+
+
+def untold(imu: ImuWindow, asked: Collection[Triad]) -> list[str]:
+    """What this IMU's readings do not tell, or not well, of what is asked for."""
+    return list(dict.fromkeys(hidden.words for triad, hidden in imu.hidden.items() if triad in asked))
+
+
+def widened(imu: ImuWindow, asked: Collection[Triad], powered_s: float, variance: Array) -> list[str]:
+    """Why its sigma is wide, where that is for a warm-up; `variance` (6,): what is in it besides."""
+    if imu.warming is None or "gyro" not in asked or imu.refused("gyro") is not None:
+        return []
+    words = imu.warming.in_words(imu.name, powered_s, variance)
+    return [words] if words else []
+
+
+def wide_gyros(imus: Sequence[ImuWindow], earth_covariance: Matrix | None, remedies: Remedies) -> list[str]:
+    """Name what makes the gyros' sigma wide: an unknown heading, or a part that nobody has named.
+
+    `earth_covariance` (3, 3) is what is not known of the Earth's rate, (rad/s)^2; None where the heading is known.
+    """
+    earth = 0.0 if earth_covariance is None else float(np.diag(earth_covariance).max())
+    by_part = [
+        imu.name
+        for imu in imus
+        # Where integers hide the mean, that made it, and is said.
+        if not imu.named and "gyro" not in imu.hidden and float(np.square(imu.gyro_sigma_use_rad_s).max()) > earth
+    ]
+    found = [f"imu {name}: gyro sigma is that of an unknown part: {remedies.part}" for name in by_part]
+    if earth_covariance is not None and len(by_part) < len(imus):
+        found.append(f"{remedies.no_heading}: the horizontal part of the Earth's rate is unknown, gyro sigma widened")
+    return found

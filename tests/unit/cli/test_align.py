@@ -1,0 +1,122 @@
+"""`companion align` without a daemon: its usage, its exit codes, and how a kept alignment survives."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from companion import cli, config
+from companion.cli.client import stands_lines
+from companion.errors import StorageError
+from companion.estimation.records.align_record import AlignmentRecord, GradienterSettings
+from companion.storage.learned import alignment_in
+from companion.storage.state import unsealed
+
+CONFIG = '[mavlink]\nurl = "tcp:h:1"\n[[imu]]\nname = "a"\nsource = "autopilot"\n[control]\nsocket = "{}"\n'
+RECORD = AlignmentRecord(
+    kind="zero",
+    measured_at="2026-11-21T21:24:42.236+00:00",
+    gradienter=GradienterSettings(
+        port="/dev/g", protocol="inclinometer_xy", law="slope", mounting=(0.0, 0.0, 90.0), offset_deg=(0.01, 0.02)
+    ),
+    offset_deg=(0.11, -0.05),
+    sigma_deg=0.0125,
+    covariance_deg2=((1.5e-4, 0.0), (0.0, 1.5e-4)),
+    slope_deg=0.5,
+    checked=True,
+    chi_square=9.8,
+    freedom=31,
+    temperature_degc=None,
+    stands=(),
+    imus=(),
+)
+
+
+@pytest.mark.parametrize("words", [[], ["zero", "--show"], ["zero", "--headings", "3"], ["zero", "--timeout", "-1"]])
+def test_usage(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        cli.main(["align", *words])
+    assert end.value.code == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_no_daemon(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is to be typed starts just this one: with the file that was named, or the service where there is one."""
+    file = tmp_path / "my c.toml"
+    file.write_text(CONFIG.format(tmp_path / "none.sock"), encoding="utf-8")
+    assert cli.main(["-c", str(file), "align", "zero", "--json"]) == 3
+    told = capsys.readouterr()
+    assert json.loads(told.out)["state"] == "unreachable"
+    assert told.err.endswith(f"(no such socket); start it with: companion -c '{file}' run\n")
+    monkeypatch.setattr(config, "DEFAULT_PATH", file)
+    for serves, start in ((False, "companion run"), (True, "sudo systemctl start companion")):
+        monkeypatch.setattr("companion.installation.install.is_service", lambda serves=serves: serves)
+        assert cli.main(["status"]) == 3
+        assert capsys.readouterr().err.endswith(f"; start it with: {start}\n")
+
+
+def test_the_lines_for_the_configuration_hold_the_whole_offset() -> None:
+    lines = stands_lines(msgspec.to_builtins(RECORD))
+    assert "    offset_deg = [0.1200, -0.0300]" in lines
+    assert "    sigma_deg = 0.0125" in lines
+    # 0.0125 deg of g.
+    assert any("0.22 mg" in line for line in lines)
+
+
+def test_a_record_comes_back_as_it_was_and_nonsense_does_not(tmp_path: Path) -> None:
+    store = alignment_in(tmp_path / "state")
+    assert store.read() is None
+    store.write(RECORD)
+    assert store.read() == RECORD
+    path = tmp_path / "state" / "alignment.json"
+    whole = unsealed(path.read_bytes())
+    for broken in (
+        whole[:100],
+        b"",
+        whole.replace(b'"sigma_deg":0.0125', b'"sigma_deg":0'),
+        whole.replace(b'"sigma_deg":0.0125', b'"sigma_deg":-1'),
+        whole.replace(b'"sigma_deg":0.0125', b'"sigma_deg":1e300'),
+        whole.replace(b'"format_version":1', b'"format_version":2'),
+        b"\xff" * 50,
+    ):
+        path.write_bytes(broken)
+        with pytest.raises(StorageError, match=r"alignment\.json: cannot be used: "):
+            store.read()
+    store.clear()
+    store.clear()
+    assert store.read() is None
+
+
+KILLED = """
+import sys
+from pathlib import Path
+import msgspec
+from companion.storage.learned import alignment_in
+store = alignment_in(Path(sys.argv[1]))
+record = store.read()
+print("begun", flush=True)
+while True:
+    store.write(record)
+"""
+
+
+def test_kill_in_the_middle_of_writing_leaves_a_whole_record(tmp_path: Path) -> None:
+    store = alignment_in(tmp_path)
+    store.write(RECORD)
+    for _ in range(5):
+        writer = subprocess.Popen(
+            [sys.executable, "-c", KILLED, str(tmp_path)], stdout=subprocess.PIPE, env={**os.environ}
+        )
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        writer.send_signal(signal.SIGKILL)
+        writer.wait()
+        writer.stdout.close()
+        assert store.read() == RECORD

@@ -1,0 +1,123 @@
+"""A step in the telemetry is judged by the noise there really is, and not by what a few seconds of it look like."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from companion.autopilot.firmware.ardupilot import parameters_of
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.parameters.change import Change
+from companion.autopilot.parameters.verify import Verdict
+from companion.daemon.offsets.effect import Sides, judge_vectors
+from companion.estimation.means.windows import ImuWindow
+
+NOISE_RAD_S = 1e-4
+"""Of a second's mean."""
+STEP_RAD_S = 2e-5
+
+
+def calibration() -> ImuCalibration:
+    zero = (0.0, 0.0, 0.0)
+    return ImuCalibration(
+        instance=1,
+        parameters=parameters_of(1),
+        gyro_offset_rad_s=zero,
+        accel_offset_m_s2=zero,
+        accel_scale=(1.0, 1.0, 1.0),
+        gyro_id=1,
+        accel_id=1,
+        orientation=np.eye(3),
+    )
+
+
+def window(seconds: Any, offset: Any) -> ImuWindow:
+    """What a window of second means tells: (n, 3) in rad/s; sigma from their own scatter."""
+    mean = seconds.mean(axis=0) - offset
+    sigma = seconds.std(axis=0, ddof=1) / np.sqrt(len(seconds))
+    return ImuWindow(
+        name="fc",
+        samples=50 * len(seconds),
+        duration_s=float(len(seconds)),
+        gyro_rad_s=tuple(mean.tolist()),
+        accel_m_s2=(0.0, 0.0, -9.8),
+        gyro_sigma_stat_rad_s=tuple(sigma.tolist()),
+        accel_sigma_stat_m_s2=(1e-3, 1e-3, 1e-3),
+        gyro_sigma_use_rad_s=tuple((sigma + 1e-9).tolist()),
+        accel_sigma_use_m_s2=(1e-3, 1e-3, 1e-3),
+        temperature_degc=None,
+        warnings=(),
+    )
+
+
+def verdict_of(
+    rng: np.random.Generator, spans: tuple[int, int], noise: Any, step: Any, *, used: bool = True
+) -> Verdict:
+    """Of a write that moves the output by `step` (3,), or does not although it was stored."""
+    before = window(rng.normal(0.0, noise, (spans[0], 3)), 0.0)
+    after = window(rng.normal(0.0, noise, (spans[1], 3)), step if used else np.zeros(3))
+    changes = [Change(name, 0.0, float(each)) for name, each in zip(parameters_of(1).gyro_offset, step, strict=True)]
+    (verdict,) = judge_vectors(
+        Sides(before, after, np.asarray(step), None), calibration(), changes, None, "icm42688p", {}
+    )
+    return verdict
+
+
+def judged(rng: np.random.Generator, seconds_after: int, *, used: bool = True) -> bool:
+    before = window(rng.normal(0.0, NOISE_RAD_S, (12, 3)), 0.0)
+    after = window(rng.normal(0.0, NOISE_RAD_S, (seconds_after, 3)), STEP_RAD_S if used else -0.01)
+    changes = [Change(name, 0.0, STEP_RAD_S) for name in parameters_of(1).gyro_offset]
+    sides = Sides(before, after, np.array(before.gyro_rad_s) + 1e-9, None)
+    (verdict,) = judge_vectors(sides, calibration(), changes, None, "icm42688p", {})
+    return verdict.ok
+
+
+def test_a_healthy_write_is_not_refused_because_two_seconds_happened_to_agree() -> None:
+    rng = np.random.default_rng(4)
+    refused = sum(not judged(rng, 2) for _ in range(400))
+    assert refused <= 4  # by the scatter of two seconds alone it was one in ten
+
+
+@pytest.mark.parametrize("spans", [(10, 10), (4, 2)])
+def test_a_write_in_order_is_refused_in_less_than_one_of_200_and_one_without_effect_is_never_called_verified(
+    spans: tuple[int, int],
+) -> None:
+    rng, count = np.random.default_rng(7), 400
+    sigma = NOISE_RAD_S * np.sqrt(1 / spans[0] + 1 / spans[1])
+    refused = dict.fromkeys((0.5, 1.0, 2.0, 5.0, 30.0), 0)
+    for size in refused:
+        for _ in range(count):
+            step = size * sigma * rng.choice((-1.0, 1.0), 3)
+            refused[size] += not verdict_of(rng, spans, NOISE_RAD_S, step).ok
+            without = verdict_of(rng, spans, NOISE_RAD_S, step, used=False)
+            assert not without.ok or without.hidden, f"{size} sigma: verified, without effect"
+            assert size < 30.0 or not without.ok or spans[1] < 5, f"{size} sigma: not seen to be without effect"
+    assert sum(refused.values()) < 0.005 * count * len(refused), refused
+
+
+def test_a_noisy_axis_does_not_hide_what_a_quiet_one_shows() -> None:
+    rng = np.random.default_rng(8)
+    noise = np.array([30.0, 1.0, 1.0]) * NOISE_RAD_S
+    step = np.array([0.0, 12.0, 0.0]) * NOISE_RAD_S * np.sqrt(2 / 10)
+    seen = sum(verdict_of(rng, (10, 10), noise, step).axes[1].word == "seen" for _ in range(100))
+    assert seen >= 80
+
+
+def test_a_step_that_is_not_the_one_written_is_refused_all_the_same() -> None:
+    rng = np.random.default_rng(5)
+    assert not any(judged(rng, 2, used=False) for _ in range(50))
+
+
+def test_what_is_known_of_the_noise_after_the_write_still_counts() -> None:
+    rng = np.random.default_rng(6)
+    before = window(rng.normal(0.0, 1e-9, (12, 3)), 0.0)
+    after = msgspec.structs.replace(
+        window(rng.normal(0.0, 1e-9, (10, 3)), STEP_RAD_S + 3e-5), gyro_sigma_stat_rad_s=(1e-4, 1e-4, 1e-4)
+    )
+    changes = [Change(name, 0.0, STEP_RAD_S) for name in parameters_of(1).gyro_offset]
+    sides = Sides(before, after, np.array(before.gyro_rad_s) + 1e-9, None)
+    (verdict,) = judge_vectors(sides, calibration(), changes, None, "icm42688p", {})
+    assert verdict.ok

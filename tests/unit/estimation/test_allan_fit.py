@@ -1,0 +1,136 @@
+"""N, B and K against noise that was made from them, deviations against allantools, their scatter against algebra."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from companion.estimation.noise.allan_fit import AxisFit, Curve, _scatter, curve, fit_axis
+from tests.support.made_noise import FLICKER_OF_FLOOR, slow
+
+Floats = NDArray[np.float64]
+
+
+def curve_of(values: Floats) -> Curve:
+    found = curve(np.arange(len(values)), values[:, None] if values.ndim == 1 else values)
+    assert found is not None
+    return found
+
+
+def test_the_deviations_are_those_of_allantools() -> None:
+    import allantools  # most of a second, as scipy.stats: not at every collection
+
+    values = slow(np.random.default_rng(1), 3000, 2.0, 0.05, 9.0)
+    found = curve_of(values)
+    taus, deviations, _, _ = allantools.oadev(values, rate=1.0, data_type="freq", taus=list(found.spans))
+    assert list(taus) == list(found.spans)
+    assert found.spans[-1] > 900 / 2
+    np.testing.assert_allclose(np.sqrt(found.variance[:, 0]), deviations, rtol=1e-9)
+
+
+def by_matrices(covariance: Floats, a: int, b: int) -> float:
+    """Covariance of two overlapping Allan variances of Gaussian seconds: 2 tr(A S B S), with nothing left out."""
+
+    def form(span: int) -> Floats:
+        rows = len(covariance) - 2 * span + 1
+        differences = np.zeros((rows, len(covariance)))
+        for row in range(rows):
+            differences[row, row : row + span] = -1.0 / span
+            differences[row, row + span : row + 2 * span] = 1.0 / span
+        return differences.T @ differences / (2.0 * rows)
+
+    return float(2.0 * np.trace(form(a) @ covariance @ form(b) @ covariance))
+
+
+@pytest.mark.parametrize("squares", [(1.0, 0.0), (0.0, 1.0), (1.0, 0.3)], ids=["white", "walk", "both"])
+def test_how_variances_scatter_is_the_algebra_of_gaussian_squares(squares: tuple[float, float]) -> None:
+    length, spans = 40, (1, 2, 4, 8)
+    index = np.arange(length)
+    # A random walk averaged over whole seconds: min(i, j) + 1/2 between two of them, i + 1/3 of one.
+    walk = np.minimum(index[:, None], index[None, :]) + 0.5 - np.eye(length) / 6.0
+    white2, walk2 = squares
+    expected = [[by_matrices(white2 * np.eye(length) + walk2 * walk, a, b) for b in spans] for a in spans]
+    # By products of N^2, B^2, K^2: (N N, N B, N K, B B, B K, K K).
+    found = np.tensordot([white2**2, 0.0, white2 * walk2, 0.0, 0.0, walk2**2], _scatter(length, spans), axes=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def fits(seed: int, runs: int, seconds: int, white: float, floor: float, walk: float) -> list[AxisFit]:
+    rng = np.random.default_rng(seed)
+    made = [slow(rng, seconds, floor * FLICKER_OF_FLOOR, walk, white) for _ in range(runs)]
+    return [fit_axis([curve_of(values)], 0) for values in made]
+
+
+@pytest.mark.parametrize(
+    ("white", "floor", "walk"),
+    [(147.0, 27.0, 1.5), (7.1, 3.0, 0.16), (35.6, 2.0, 0.5), (1.0, 0.0, 0.0)],
+    ids=["ADIS16405", "ICM-42688-P", "little flicker", "white only"],
+)  # fmt: skip
+def test_the_figures_come_back_and_their_errors_are_as_said(white: float, floor: float, walk: float) -> None:
+    truth = np.square([white, floor * FLICKER_OF_FLOOR, walk])
+    found = fits(3, 40, 4000, white, floor, walk)
+    off = np.array([np.square(fit.figures) - truth for fit in found])
+    said = np.array([fit.sigmas for fit in found])
+    pulls = off / said
+    # Those that cannot become negative: on average right, and by so much as is said. Of 40, rms is good to 11 %.
+    free = truth > 3.0 * said.mean(axis=0)
+    assert free[0]
+    assert np.abs(pulls[:, free].mean(axis=0)).max() < 0.55
+    assert np.sqrt(np.square(pulls[:, free]).mean(axis=0)) == pytest.approx(1.0, abs=0.35)
+    upper = np.array([fit.upper for fit in found])
+    # One-sided 95 %: of 40, at least 34 (1 % of the draws have fewer).
+    assert ((np.square(upper) >= truth * (1.0 - 1e-9)).sum(axis=0) > 33).all()
+    known = np.array([fit.known for fit in found])
+    assert known[:, 0].all()
+    # What is not there is not told, and what is there by three standard errors is.
+    assert (known[:, truth == 0.0].mean(axis=0) < 0.13).all()
+    assert (known[:, truth > 5.0 * said.mean(axis=0)].mean(axis=0) > 0.9).all()
+    assert not any(fit.excess for fit in found)
+
+
+def test_more_sessions_tell_more_and_each_has_its_own_level() -> None:
+    rng = np.random.default_rng(5)
+    parts = [slow(rng, 1800, 3.0 * FLICKER_OF_FLOOR, 0.16, 7.1) + 1000.0 * number for number in range(8)]
+    one, all_of_them = fit_axis([curve_of(parts[0])], 0), fit_axis([curve_of(each) for each in parts], 0)
+    assert all_of_them.sigmas[1] < one.sigmas[1] / 2.0
+    assert all_of_them.figures[1] / FLICKER_OF_FLOOR == pytest.approx(3.0, rel=0.15)
+
+
+def test_holes_do_not_bias_the_figures() -> None:
+    rng = np.random.default_rng(6)
+    kept = np.sort(rng.permutation(6000)[:4800])
+    figures = []
+    for _ in range(10):
+        values = slow(rng, 6000, 3.0 * FLICKER_OF_FLOOR, 0.16, 7.1)
+        found = curve(kept, values[kept, None])
+        assert found is not None
+        figures.append(fit_axis([found], 0).figures)
+    white, flicker, _ = np.mean(figures, axis=0)
+    assert white == pytest.approx(7.1, rel=0.03)
+    assert flicker / FLICKER_OF_FLOOR == pytest.approx(3.0, rel=0.1)
+
+
+def test_a_minute_tells_white_noise_and_nothing_else() -> None:
+    for fit in fits(7, 20, 60, 7.1, 3.0, 0.16):
+        assert fit.figures[0] == pytest.approx(7.1, rel=0.5)
+        assert not fit.known[2]
+        assert math.isinf(fit.upper[2]) or fit.upper[2] > 0.16
+
+
+def test_something_periodic_is_named_with_its_time() -> None:
+    values = slow(np.random.default_rng(8), 3600, 3.0 * FLICKER_OF_FLOOR, 0.16, 7.1)
+    values += 10.0 * np.sin(2.0 * np.pi * np.arange(3600) / 40.0)
+    fit = fit_axis([curve_of(values)], 0)
+    assert fit.excess is not None
+    span, ratio = fit.excess
+    assert span in (8, 16, 32)
+    assert ratio > 1.2
+
+
+def test_what_never_changes_cannot_be_fitted() -> None:
+    with pytest.raises(ValueError, match="never change"):
+        fit_axis([curve_of(np.ones(100))], 0)
+    assert curve(np.arange(5), np.zeros((5, 1))) is None

@@ -1,0 +1,258 @@
+"""The smoother of a deck, against the simulator's truth."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from companion.errors import CalibrationRefusedError
+from companion.estimation.deck.deck import Deck
+from companion.estimation.deck.estimate import DeckFound
+from companion.estimation.deck.fluid import Fluid, Level
+from companion.estimation.deck.smoother import passage
+from companion.estimation.deck.waves import Wander, Waves, fit_waves, whitened
+from companion.estimation.means.pose import CompassModel, GradienterModel
+from companion.estimation.means.windows import ImuInput
+from companion.estimation.noise.allan import PROFILES
+from companion.estimation.seconds.batch import Batch, summary
+from companion.physics.frames import rotations, running_products
+from sim.accuracy.deck import Voyage, feed, sail
+from sim.aircraft import Pose, Site, VirtualAircraft
+from sim.earth import Array, body_from_ned
+from sim.imu_model import DEG_H, MG, ImuModel
+from sim.motions import SlowTurn
+from sim.sea import DAY_S, Sea, Wave
+
+UNITS = np.array([DEG_H] * 3 + [MG] * 3)
+AROUND = (
+    GradienterModel("axis", np.eye(3), (0.0, 0.0), 0.01, lag_s=0.4),
+    CompassModel(magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=1.0),
+)
+
+
+def attitude(aircraft: VirtualAircraft, t_s: float) -> Array:
+    """Body to NED."""
+    return body_from_ned(*aircraft.angles_rad(t_s)).T
+
+
+def test_a_second_of_a_sea_turns_as_the_aircraft_has_turned() -> None:
+    # A steep sea: five seconds of it cone by far more than the tolerance.
+    sea = Sea(waves=(Wave(0.5, 15.0),), seed=2)
+    aircraft = VirtualAircraft(Pose(3.0, -2.0, 40.0), Site(latitude_deg=90.0), motions=[sea])
+    times = 20.0 + np.arange(1001) / 200.0
+    rates, forces = aircraft.truth(times)
+    # At the pole the Earth turns about the vertical alone.
+    earth = np.array([body_from_ned(*aircraft.angles_rad(t))[:, 2] for t in times.tolist()]) * -7.292115e-5
+    found = passage(times, rates - earth, forces)
+    turn = attitude(aircraft, 20.0).T @ attitude(aircraft, 25.0)
+    assert math.degrees(math.acos((np.trace(turn) - 1.0) / 2.0)) > 3.0
+    assert math.degrees(np.linalg.norm(turn - found.turn)) < 1e-3
+    # The bias that is put in comes out as its derivatives say.
+    bias = np.radians([0.05, -0.04, 0.03])
+    biased = passage(times, rates - earth + bias, forces)
+    corrected = rotations(-biased.turned @ bias) @ biased.turn
+    assert math.degrees(np.linalg.norm(corrected - found.turn)) < 0.02 * math.degrees(np.linalg.norm(bias)) * 5.0
+    change = biased.velocity_m_s + biased.velocity_by_bias @ bias - found.velocity_m_s
+    assert np.linalg.norm(change) < 0.02 * np.linalg.norm(biased.velocity_m_s - found.velocity_m_s)
+
+
+def test_running_products_are_products() -> None:
+    turns = rotations(np.random.default_rng(1).normal(size=(13, 3)))
+    whole = np.eye(3)
+    for turn, found in zip(turns, running_products(turns), strict=True):
+        whole = whole @ turn
+        assert np.allclose(whole, found)
+
+
+def test_the_fluid_follows_as_a_first_order_lag_does() -> None:
+    model = GradienterModel("axis", np.eye(3), (0.0, 0.0), 0.01, lag_s=0.4)
+    times = np.arange(4000) / 200.0
+    roll = np.radians(5.0) * np.sin(2.0 * math.pi * 0.2 * times)
+    forces = 9.8 * np.column_stack([np.zeros_like(roll), -np.sin(roll), -np.cos(roll)])
+    shown = Fluid(model).follow(times, forces)[:, 0]
+    phase = 2.0 * math.pi * 0.2 * 0.4
+    expected = 5.0 / math.hypot(1.0, phase) * np.sin(2.0 * math.pi * 0.2 * times - math.atan(phase))
+    assert np.abs(shown - expected)[1000:].max() < 0.01
+
+
+def test_whitened_waves_are_white_and_their_mean_is_known_better() -> None:
+    random = np.random.default_rng(7)
+    off = []
+    for _ in range(40):
+        times = np.arange(200.0)
+        wave = sum(np.sin(2.0 * math.pi * f * times + p) for f, p in random.uniform([0.15, 0.0], [0.25, 6.3], (12, 2)))
+        series = wave + 0.05 * random.normal(size=200)
+        white = whitened(np.column_stack([np.ones(200), series]), fit_waves([series - series.mean()]))
+        information = white[:, 0] @ white[:, 0]
+        assert information**-0.5 < 0.2 * series.std() / math.sqrt(200.0)
+        off.append(white[:, 0] @ white[:, 1] / information * math.sqrt(information))
+    assert np.square(off).mean() < 1.5
+
+
+def test_swell_that_hardly_changes_is_whitened_over_twenty_minutes() -> None:
+    """Narrow waves, all but foretold: the model of the height of a moored boat, as it was fitted to one."""
+    terms = [
+        4.774980136949905,
+        -11.841161559993463,
+        19.9937660649504,
+        -24.313602755882155,
+        21.255105743534443,
+        -12.241978382468044,
+        2.315901496088353,
+        3.5244808631778817,
+        -4.281165587738682,
+        2.497118840727361,
+        -0.7263566715225211,
+        0.04286322557964397,
+    ]
+    waves, wander = Waves(np.array(terms), 0.00011775293682860711), Wander(rate=2.3564148394118062e-07)
+    times = np.arange(1260.0) - 1260.0
+    line = np.column_stack([np.ones(1260), times, np.square(times) / 2.0])
+    white = whitened(line, waves, wander)
+    sigma = math.sqrt(np.linalg.inv(white.T @ white)[2, 2])
+    # The accelerometer's own noise, twice integrated, is the least: sqrt(rate / 1260 s).
+    assert math.sqrt(2.3564e-7 / 1260.0) < sigma < 10.0 * math.sqrt(2.3564e-7 / 1260.0)
+
+
+@pytest.mark.parametrize(
+    ("voyage", "gyro_deg_h", "accel_mg"),
+    [
+        (Voyage(), 40.0, 1.0),
+        (Voyage(waves=(Wave(0.1, 8.0),), turn_deg_s=-0.5, part="bmi088"), 60.0, 1.0),
+    ],
+    ids=["sea", "swell"],
+)
+def test_two_minutes_give_biases_within_what_is_claimed(voyage: Voyage, gyro_deg_h: float, accel_mg: float) -> None:
+    for seed in range(3):
+        found = sail(voyage, [120], seed)
+        error, sigma = found.error[0] / UNITS, found.sigma[0] / UNITS
+        assert np.abs(error / sigma).max() < 4.0
+        assert np.abs(error[:3]).max() < gyro_deg_h
+        assert np.abs(error[3:5]).max() < accel_mg
+        assert sigma[:3].max() < gyro_deg_h
+
+
+def test_what_goes_up_comes_down_and_the_vertical_accelerometer_is_known_by_it() -> None:
+    found = [sail(Voyage(), [120], seed) for seed in range(20, 26)]
+    error, sigma = (np.array([getattr(one, name)[0][5] for one in found]) / MG for name in ("error", "sigma"))
+    assert sigma.max() < 0.06
+    assert 0.25 < np.sqrt(np.square(error / sigma).mean()) < 1.6
+
+
+@pytest.mark.parametrize("stuck", ["gradienter", "compass"])
+def test_a_sensor_that_repeats_itself_on_a_swaying_deck_is_named(stuck: str) -> None:
+    deck = Deck(*AROUND)
+    deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["icm42688p"]))
+    aircraft = VirtualAircraft(Pose(), Site(latitude_deg=45.0), motions=Voyage().motions(8))
+    imu = ImuModel(aircraft, "icm42688p", seed=8)
+    feed(deck, imu, 91, np.random.default_rng(8), 1.0)
+    assert isinstance(deck.work(range(1, 91), 180.0).run(), DeckFound)
+    for slot in range(65, 91):
+        if stuck == "compass":
+            deck._headings[slot] = deck._headings[65]
+        else:
+            level = deck._streams["imu"].levels[slot]
+            first = deck._streams["imu"].levels[65].reading
+            off = level.difference + first - level.reading
+            deck._streams["imu"].levels[slot] = Level(first, off, level.slope)
+    found = deck.work(range(1, 91), 180.0).run()
+    assert isinstance(found, CalibrationRefusedError)
+    assert str(found) == f"{stuck} is stuck: the same for 26 s while it sways"
+
+
+def test_windows_end_the_more_rarely_the_longer_they_are() -> None:
+    deck = Deck(None, None)
+    deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["unknown"]))
+    ends = []
+    for slot in range(1500):
+        times = slot + np.arange(4) / 4.0
+        rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.8], (4, 1))
+        deck.take_imu("imu", summary(slot, times, rows), times, rows)
+        slots = deck.slots()
+        assert len(slots) <= 1200
+        ends.append(slots.stop)
+    assert sorted(ends[20:]) == ends[20:]
+    steps = np.diff(sorted(set(ends[20:])))
+    assert steps[:10].max() == 10
+    assert steps[-10:].min() == 60
+
+
+def quiet_second(slot: int, begin: float = 0.0) -> tuple[Array, Array]:
+    times = slot + begin + np.arange(round((1.0 - begin) * 100)) / 100.0
+    rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.8], (len(times), 1))
+    return times, rows
+
+
+def test_a_gap_begins_the_seconds_anew() -> None:
+    deck = Deck(None, None)
+    deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["unknown"]))
+    for slot in range(25):
+        times, rows = quiet_second(slot)
+        deck.take_imu("imu", summary(slot, times, rows), times, rows)
+    assert deck.slots() == range(1, 20)
+    times, rows = quiet_second(25, begin=0.7)
+    deck.take_imu("imu", summary(25, times, rows), times, rows)
+    assert deck.seconds == 0
+    for slot in range(26, 41):
+        times, rows = quiet_second(slot)
+        deck.take_imu("imu", summary(slot, times, rows), times, rows)
+    assert deck.slots() == range(26, 40)
+
+
+def test_half_a_circle_leaves_no_part_of_the_earths_rate() -> None:
+    # On the equator the Earth's rate lies in the horizon, and comes from ahead at first and from astern at last; near
+    # the pole it stands upright. What else makes an error is the same at both.
+    def error(latitude_deg: float) -> Array:
+        voyage = Voyage(waves=(), turn_deg_s=1.5, part="perfect", gyro_axes_sigma=0.0, latitude_deg=latitude_deg)
+        return np.array(sail(voyage, [120], 1).error[0][:2]) / DEG_H
+
+    assert np.abs(error(0.0) - error(80.0)).max() < 0.3
+    # And that is the gradienter's zero (1 sigma: 0.01 deg): so far the turn's axis is off.
+    assert np.abs(error(0.0)).max() < 3.0 * math.radians(0.01) * 1.5 * 3600.0
+
+
+def test_a_turn_is_of_the_deck_and_not_of_the_gyros() -> None:
+    slow = SlowTurn(start_s=-20.0, duration_s=DAY_S, rate_deg_s=0.05)
+    assert slow.euler_rad(np.array([100.0]))[1][0, 2] == pytest.approx(math.radians(0.05))
+    found = sail(Voyage(waves=(Wave(0.2, 1.0),), turn_deg_s=0.05), [120], 5)
+    assert abs(found.error[0][2]) < 0.2 * math.radians(0.05)
+
+
+def test_what_a_firmwares_own_calibration_leaves_on_a_boat_is_found_as_well_as_a_small_bias() -> None:
+    large, small = (sail(voyage, (60,), 3) for voyage in (Voyage(gyro_bias_rad_s=math.radians(3.0)), Voyage()))
+    np.testing.assert_allclose(large.error / UNITS, small.error / UNITS, atol=3.0)
+    np.testing.assert_allclose(large.error[:, 3:] / MG, small.error[:, 3:] / MG, atol=0.15)
+    np.testing.assert_allclose(large.sigma, small.sigma, rtol=0.2)
+
+
+class OfPairs(Deck):
+    """All readings of its IMU, which lies turned by 90 degrees, are off by the same, and say how far about."""
+
+    rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    sigma = np.array([100.0, 0.0, 30.0, 5.0, 0.0, 2.0]) * UNITS
+
+    def __init__(self, gradienter: GradienterModel, compass: CompassModel, seed: int) -> None:
+        super().__init__(gradienter, compass)
+        self.off = self.sigma * np.random.default_rng([seed, 8]).standard_normal(6)
+
+    def set_imu(self, imu: ImuInput) -> None:
+        super().set_imu(msgspec.structs.replace(imu, rotation=self.rotation))
+
+    def take_imu(self, name: str, batch: Batch, times: Array, rows: Array) -> None:
+        rows = np.hstack([rows[:, :3] @ self.rotation, rows[:, 3:] @ self.rotation]) + self.off
+        found = msgspec.structs.replace(summary(batch.slot, times, rows), shared_variance=np.square(self.sigma))
+        super().take_imu(name, found, times, rows)
+
+
+def test_what_all_floats_have_wrong_in_common_is_in_sigma_as_large_as_it_is() -> None:
+    voyage = Voyage(waves=(), turn_deg_s=0.0)
+    runs = [sail(voyage, [30], seed, functools.partial(OfPairs, seed=seed)) for seed in range(16)]
+    sigma = np.mean([run.sigma[0] for run in runs], axis=0) / UNITS
+    ratio = np.sqrt(np.mean([np.square(run.error[0] / run.sigma[0]) for run in runs], axis=0))
+    assert sigma[3:] == pytest.approx([0.15, 5.0, 2.0], abs=0.05)  # ahead of the aircraft is the sensor's second axis
+    assert sigma[1] > 100.0 > 50.0 > sigma[0]
+    assert ratio[[1, 2, 4, 5]] == pytest.approx(1.0, abs=0.4)

@@ -1,0 +1,457 @@
+"""All IMUs and what was known of them as one estimate: against a stacked least squares, under turns and exchanges."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import itertools
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import linalg
+
+from companion.estimation.means.pose import CompassModel, GradienterModel
+from companion.estimation.records.history import PowerUp
+from companion.estimation.request import What
+from companion.estimation.solution.draft import Draft
+from companion.estimation.solution.joint import Weighed, Whole, points, weigh
+from companion.estimation.solution.prior import Expectation, Expected, ExpectedImu
+from companion.estimation.solution.site import Whereabouts, local_earth
+from companion.estimation.solution.solve import ImuSolution, Shared, Solution, solve
+from companion.estimation.turning.watch import Turn
+from companion.samples import Triad
+from tests.prior_study import BY_READING, DEG, DEG_H, LEVEL, MG, G, imu_solution, shared_errors, solution
+from tests.support.windows import about, ideal_window, ned_from_body
+
+Array = NDArray[np.float64]
+ZERO_RAD = 0.1 * DEG
+
+
+def expected(value: Array, sigma: float, **others: Any) -> Expected:
+    x, y, z = (float(one) for one in value)
+    known = {"limit": 4.5, "power_ups": 8, "weighs": True, **others}
+    return Expected(value=(x, y, z), variance=(sigma**2,) * 3, **known)
+
+
+def imus(
+    accels: Sequence[Array], shared: Shared, *, gyros: Sequence[Array] | None = None, own: float = 0.05 * MG
+) -> list[ImuSolution]:
+    """Whose own noise is all white, so that the best weights are those of the plain equations."""
+    stat = np.array([20.0 * DEG_H] * 3 + [own] * 3)
+    return [
+        imu_solution(
+            f"imu{k}",
+            np.zeros(3) if gyros is None else gyros[k],
+            accel,
+            stat,
+            shared.covariance + np.diag(np.square(stat)),
+        )
+        for k, accel in enumerate(accels)
+    ]
+
+
+def whole_of(of: Solution) -> Whole:
+    return {imu.name: (imu.gyro_rad_s, imu.accel_m_s2) for imu in of.imus}
+
+
+def weighed(of: Solution, known: Sequence[ExpectedImu]) -> Weighed:
+    return weigh(of, whole_of(of), Expectation(imus=tuple(known), zero_is_known=True))
+
+
+def accel_of(imu: ImuSolution) -> Array:
+    assert imu.accel_m_s2 is not None
+    return imu.accel_m_s2
+
+
+def gyro_of(imu: ImuSolution) -> Array:
+    assert imu.gyro_rad_s is not None
+    return imu.gyro_rad_s
+
+
+# --- the algebra
+
+
+@pytest.mark.parametrize("same", [0.0, 0.3, 1.0])
+def test_it_is_the_least_squares_solution_of_the_stacked_system(same: float) -> None:
+    random = np.random.default_rng(5)
+    shared = shared_errors(ZERO_RAD)
+    tilt = BY_READING @ random.normal(0, ZERO_RAD, 2)
+    accels = [random.normal(0, 2 * MG, 3) for _ in range(3)]
+    priors = [accel + same * tilt + random.normal(0, 0.3 * MG, 3) for accel in accels]
+    other_rad, sigma, own = 0.02 * DEG, 0.4 * MG, 0.05 * MG
+    of = solution(imus([accel + tilt for accel in accels], shared), shared)
+    known = [
+        ExpectedImu(name=f"imu{k}", earlier={"accel": expected(prior, sigma, same_zero=same, other_zero_rad=other_rad)})
+        for k, prior in enumerate(priors)
+    ]
+    found = weighed(of, known)
+    assert found.doubts == ()
+    # Unknowns: three biases, today's zero, the other zeros' error. Every row divided by its sigma.
+    rows, right = [], []
+
+    def row(coefficients: dict[int, Array], value: Array, by: float) -> None:
+        block = np.zeros((len(value), 13))
+        for column, matrix in coefficients.items():
+            block[:, column : column + matrix.shape[1]] = matrix
+        rows.append(block / by)
+        right.append(value / by)
+
+    for k in range(3):
+        row({3 * k: np.eye(3), 9: BY_READING}, accel_of(of.imus[k]), own)
+        row({3 * k: np.eye(3), 9: same * BY_READING, 11: BY_READING}, priors[k], sigma)
+    row({9: np.eye(2)}, np.zeros(2), ZERO_RAD)
+    row({11: np.eye(2)}, np.zeros(2), other_rad)
+    stacked = np.vstack(rows)
+    best = linalg.lstsq(stacked, np.concatenate(right))[0]
+    covariance = linalg.inv(stacked.T @ stacked)
+    for k, imu in enumerate(found.solution.imus):
+        np.testing.assert_allclose(accel_of(imu), best[3 * k : 3 * k + 3], atol=1e-6 * MG)
+        np.testing.assert_allclose(
+            imu.covariance[3:, 3:], covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], atol=1e-6 * MG**2
+        )
+        assert imu.prior is not None
+        assert imu.prior.accel is not None
+        assert imu.prior.accel.used
+        np.testing.assert_allclose(imu.prior.accel.measured_m_s2, accel_of(of.imus[k]))
+    for (i, one), (j, other) in itertools.combinations(enumerate(found.solution.imus), 2):
+        np.testing.assert_allclose(
+            found.solution.cross[one.name, other.name][3:, 3:],
+            covariance[3 * i : 3 * i + 3, 3 * j : 3 * j + 3],
+            atol=1e-6 * MG**2,
+        )
+    if same == 1.0:
+        # What is the same in all of them is not averaged away: the zero's error stays as it was.
+        assert found.solution.imus[0].accel_sigma_use_m_s2[0] > 0.95 * G * ZERO_RAD
+    if same == 0.0:
+        # Three IMUs tell the tilt better than the gradienter does.
+        assert found.solution.imus[0].accel_sigma_use_m_s2[0] < 0.4 * G * ZERO_RAD
+
+
+def test_gyros_are_weighed_each_for_itself() -> None:
+    shared = shared_errors(0.0)
+    gyros = [np.array([10.0, 20.0, 30.0]) * DEG_H, np.zeros(3)]
+    of = solution(imus([np.zeros(3)] * 2, shared, gyros=gyros), shared)
+    found = weighed(of, [ExpectedImu(name="imu0", earlier={"gyro": expected(np.zeros(3), 20.0 * DEG_H)})]).solution
+    np.testing.assert_allclose(gyro_of(found.imus[0]), gyros[0] / 2.0)
+    np.testing.assert_allclose(found.imus[0].gyro_sigma_use_rad_s, 20.0 * DEG_H / np.sqrt(2.0))
+    np.testing.assert_allclose(gyro_of(found.imus[1]), 0.0)
+    assert found.imus[1].prior is None
+
+
+def test_a_record_has_no_covariance_of_what_is_not_known() -> None:
+    shared = shared_errors(0.0)
+    whole, gyros, none = imus([np.zeros(3)] * 3, shared)
+    gyros = dataclasses.replace(gyros, accel_m_s2=None)
+    none = dataclasses.replace(none, gyro_rad_s=None, accel_m_s2=None)
+    began = datetime.datetime(2026, 5, 1, tzinfo=datetime.UTC)
+    record = Draft(began, solution=solution([whole, gyros, none], shared)).record("done", "", 1.0)
+    first, second, third = (imu.covariance for imu in record.imus)
+    assert first is not None
+    assert second is not None
+    assert all(value is not None for row in first for value in row)
+    assert [[value is not None for value in row] for row in second] == [[True] * 3 + [False] * 3] * 3 + [
+        [False] * 6
+    ] * 3
+    assert third is None
+    assert [cross.imus for cross in record.cross_covariance] == [("imu0", "imu1")]
+
+
+def test_what_two_imus_have_in_common_does_not_count_in_their_difference() -> None:
+    shared = shared_errors(ZERO_RAD, noise_rad=0.01 * DEG, gravity_sigma=0.3 * MG)
+    of = solution(imus([np.zeros(3)] * 2, shared), shared)
+    one, other = of.imus
+    cross = of.cross["imu0", "imu1"]
+    apart = (one.covariance + other.covariance - cross - cross.T)[3:, 3:]
+    np.testing.assert_allclose(apart, 2 * np.eye(3) * (0.05 * MG) ** 2, atol=1e-12)
+    assert one.accel_sigma_use_m_s2[0] > 20 * np.sqrt(apart[0, 0])
+
+
+def test_nothing_known_changes_nothing() -> None:
+    shared = shared_errors(ZERO_RAD)
+    of = solution(imus([np.ones(3) * MG], shared), shared)
+    found = weighed(of, [])
+    np.testing.assert_array_equal(accel_of(found.solution.imus[0]), accel_of(of.imus[0]))
+    np.testing.assert_array_equal(found.solution.imus[0].covariance, of.imus[0].covariance)
+    assert found.doubts == ()
+
+
+def test_a_cautious_sigma_of_the_zero_is_no_reason_to_believe_the_past() -> None:
+    shared = shared_errors(ZERO_RAD)
+    of = solution(imus([np.array([1.5, 0.0, 0.0]) * MG], shared), shared)
+    known = (ExpectedImu(name="imu0", earlier={"accel": expected(np.zeros(3), 0.4 * MG, other_zero_rad=0.01 * DEG)}),)
+    guessed = weigh(of, whole_of(of), Expectation(imus=known, zero_is_known=False)).solution
+    vouched = weigh(of, whole_of(of), Expectation(imus=known, zero_is_known=True)).solution
+    assert accel_of(guessed.imus[0])[0] > 1.49 * MG
+    assert accel_of(vouched.imus[0])[0] < 0.2 * MG
+
+
+def test_what_a_compass_does_not_know_of_a_turn_earlier_power_ups_know_better() -> None:
+    random, scatter, turns = np.random.default_rng(8), 70.0 * DEG_H, 70.0 * DEG_H
+    shared = shared_errors(ZERO_RAD)
+    shared.covariance[2, 2] += turns**2
+    errors, sigmas = [], []
+    for _ in range(300):
+        # Both gyros of an aircraft that turns, or not, by as much as its compass cannot exclude.
+        biases, turn = random.normal(0.0, scatter, (2, 3)), np.array([0.0, 0.0, random.normal(0.0, turns)])
+        read = [bias + turn + random.normal(0.0, 20.0 * DEG_H, 3) for bias in biases]
+        of = solution(imus([np.zeros(3)] * 2, shared, gyros=read), shared)
+        of = dataclasses.replace(of, turn=Turn(sigma_rad_s=turns, by="compass"))
+        known = [ExpectedImu(name=f"imu{k}", earlier={"gyro": expected(np.zeros(3), scatter)}) for k in range(2)]
+        for imu, bias in zip(weighed(of, known).solution.imus, biases, strict=True):
+            errors.append((gyro_of(imu) - bias)[2])
+            sigmas.append(imu.gyro_sigma_use_rad_s[2])
+    rms = float(np.sqrt(np.mean(np.square(errors))))
+    assert rms == pytest.approx(float(np.mean(sigmas)), rel=0.1)
+    # Of two gyros' sums and differences: 1 / (1/70^2 + 1/(2 70^2 + 20^2)), and 1 / (1/70^2 + 1/20^2).
+    together, apart = 1 / (1 / 70**2 + 1 / (2 * 70**2 + 20**2)), 1 / (1 / 70**2 + 1 / 20**2)
+    assert float(np.mean(sigmas)) / DEG_H == pytest.approx(np.sqrt((together + apart) / 2.0), rel=0.01)
+
+
+# --- symmetries
+
+
+def _turned_case(turn: Array, order: Sequence[int]) -> tuple[Solution, Weighed]:
+    random = np.random.default_rng(6)
+    by_reading = turn @ BY_READING
+    covariance = np.zeros((6, 6))
+    covariance[3:, 3:] = by_reading @ by_reading.T * ZERO_RAD**2
+    shared = Shared(turn @ LEVEL, G, covariance, by_reading, (0.0, 0.0), ZERO_RAD)
+    accels = [random.normal(0, 2 * MG, 3) for _ in range(3)]
+    gyros = [random.normal(0, 100 * DEG_H, 3) for _ in range(3)]
+    stat = np.array([20.0 * DEG_H] * 3 + [0.05 * MG] * 3)
+    found, known = [], []
+    for k in range(3):
+        found.append(
+            imu_solution(f"imu{k}", turn @ gyros[k], turn @ accels[k], stat, covariance + np.diag(np.square(stat)))
+        )
+        known.append(
+            ExpectedImu(
+                name=f"imu{k}",
+                earlier={
+                    "gyro": expected(turn @ (gyros[k] + random.normal(0, 30 * DEG_H, 3)), 40.0 * DEG_H),
+                    "accel": expected(turn @ (accels[k] + random.normal(0, 0.5 * MG, 3)), 0.7 * MG, same_zero=0.5),
+                },
+            )
+        )
+    of = solution([found[k] for k in order], shared)
+    return of, weighed(of, known)
+
+
+TURNS = [
+    np.array(matrix, dtype=np.float64)
+    for matrix in (
+        np.eye(3),
+        [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+        [[0, 0, 1], [1, 0, 0], [0, 1, 0]],
+        [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    )
+]
+
+
+@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 0, 2)])
+def test_turning_everything_and_exchanging_imus_turns_and_exchanges_the_result(
+    turn: Array, order: tuple[int, ...]
+) -> None:
+    _, plain = _turned_case(np.eye(3), (0, 1, 2))
+    of, found = _turned_case(turn, order)
+    assert [imu.name for imu in found.solution.imus] == [f"imu{k}" for k in order]
+    by_name = {imu.name: imu for imu in plain.solution.imus}
+    both = linalg.block_diag(turn, turn)
+    for imu in found.solution.imus:
+        np.testing.assert_allclose(gyro_of(imu), turn @ gyro_of(by_name[imu.name]), atol=1e-9 * DEG_H)
+        np.testing.assert_allclose(accel_of(imu), turn @ accel_of(by_name[imu.name]), atol=1e-9 * MG)
+        np.testing.assert_allclose(imu.covariance, both @ by_name[imu.name].covariance @ both.T, atol=1e-15)
+    for (one, other), block in found.solution.cross.items():
+        same = plain.solution.cross
+        straight = same[one, other] if (one, other) in same else same[other, one].T
+        np.testing.assert_allclose(block, both @ straight @ both.T, atol=1e-15)
+    assert len(of.cross) == 3
+
+
+# --- whose fault a contradiction is
+
+
+def doubted(
+    shifts: Sequence[Array], *, triad: Triad = "accel", sigmas: Sequence[float] | None = None, **others: Any
+) -> Weighed:
+    """IMUs whose readings differ by these shifts (mg, or deg/h) from what was known of each."""
+    unit = MG if triad == "accel" else DEG_H
+    shared = shared_errors(0.05 * DEG, gravity_sigma=0.03 * MG)
+    moved = [np.asarray(shift) * unit for shift in shifts]
+    nothing = [np.zeros(3)] * len(shifts)
+    accels, gyros = (moved, nothing) if triad == "accel" else (nothing, moved)
+    of = solution(imus(accels, shared, gyros=gyros), shared)
+    usual = [0.3 if triad == "accel" else 60.0] * len(shifts) if sigmas is None else sigmas
+    known = []
+    for k, sigma in enumerate(usual):
+        one = expected(np.zeros(3), sigma * unit, **{"same_zero": 1.0 if triad == "accel" else 0.0, **others})
+        known.append(ExpectedImu(name=f"imu{k}", earlier={triad: one}))
+    return weighed(of, known)
+
+
+def tilted(x_deg: float, y_deg: float) -> Array:
+    return np.asarray(BY_READING @ np.array([x_deg, y_deg]) * DEG / MG)
+
+
+def test_nothing_is_doubted_while_all_is_usual() -> None:
+    assert doubted([np.array([0.3, -0.5, 0.2]), np.array([-0.4, 0.1, 0.0])]).doubts == ()
+
+
+def test_all_accelerometers_off_by_one_tilt_are_the_gradienters_fault() -> None:
+    found = doubted([tilted(0.2, -0.25) + 0.2, tilted(0.2, -0.25) - 0.1, tilted(0.2, -0.25)])
+    (doubt,) = found.doubts
+    assert doubt.cause == "gradienter"
+    assert doubt.names == ("imu0", "imu1", "imu2")
+    assert "moved by 0.3" in doubt.words
+    assert "x +0.2" in doubt.words
+    assert "y -0.2" in doubt.words
+    assert "align zero" in doubt.words
+    assert doubt.words in found.solution.warnings
+    assert all(imu.prior is not None and imu.prior.accel is not None for imu in found.solution.imus)
+    assert not any(imu.prior.accel.used for imu in found.solution.imus if imu.prior and imu.prior.accel)
+
+
+def test_who_cannot_tell_is_not_weighed_with_a_gradienter_that_has_moved() -> None:
+    found = doubted([tilted(0.3, 0.0), tilted(0.3, 0.0), tilted(0.3, 0.0)], sigmas=[0.3, 0.3, 20.0])
+    assert [doubt.names for doubt in found.doubts] == [("imu0", "imu1")]
+    assert [imu.prior.accel.used for imu in found.solution.imus if imu.prior and imu.prior.accel] == [False] * 3
+
+
+def test_another_zero_than_before_is_said_to_be_another_zero() -> None:
+    found = doubted([tilted(0.5, 0.0)] * 2, same_zero=0.0, other_zero_rad=0.013 * DEG)
+    (doubt,) = found.doubts
+    assert doubt.cause == "gradienter"
+    assert "differs from the one before" in doubt.words
+
+
+def test_one_accelerometer_off_while_the_others_agree_is_that_one() -> None:
+    found = doubted([tilted(0.2, -0.25), np.zeros(3), np.full(3, 0.1)])
+    (doubt,) = found.doubts
+    assert (doubt.cause, doubt.names) == ("imu", ("imu0",))
+    assert "imu1, imu2 agrees" in doubt.words
+    assert doubt.words in found.solution.imus[0].warnings
+    assert found.solution.imus[1].warnings == ()
+    # Of two, too: the other one knows that the tilt has not changed.
+    (doubt,) = doubted([np.zeros(3), tilted(0.3, 0.0)]).doubts
+    assert (doubt.cause, doubt.names) == ("imu", ("imu1",))
+
+
+def test_two_off_alike_are_not_the_gradienters_fault_while_a_third_sees_no_tilt() -> None:
+    found = doubted([tilted(0.3, 0.0), tilted(0.3, 0.0), np.zeros(3)])
+    assert [(doubt.cause, doubt.names) for doubt in found.doubts] == [("imu", ("imu0",)), ("imu", ("imu1",))]
+
+
+def test_what_is_unusual_and_no_contradiction_yet_takes_no_part() -> None:
+    usual, unusual = doubted([np.full(3, 80.0)], triad="gyro"), doubted([np.full(3, 160.0)], triad="gyro")
+    assert usual.doubts == unusual.doubts == ()
+    used = [
+        imu.prior.gyro.used for found in (usual, unusual) for imu in found.solution.imus if imu.prior and imu.prior.gyro
+    ]
+    assert used == [True, False]
+
+
+def test_where_the_others_cannot_tell_both_are_said() -> None:
+    (doubt,) = doubted([tilted(0.2, -0.25), tilted(0.1, 0.0)], sigmas=[0.3, 20.0]).doubts
+    assert (doubt.cause, doubt.names) == ("unclear", ("imu0",))
+    assert "or the gradienter has moved" in doubt.words
+    (doubt,) = doubted([tilted(0.2, -0.25)]).doubts
+    assert doubt.cause == "unclear"
+
+
+def test_one_accelerometer_off_as_no_tilt_could_make_it_is_that_one() -> None:
+    (doubt,) = doubted([np.array([3.0, 0.0, 4.0])]).doubts
+    assert doubt.cause == "imu"
+    (doubt,) = doubted([np.array([3.0, 0.0, 4.0]), np.array([-3.0, 2.0, -1.0])]).doubts[:1]
+    assert doubt.cause == "imu"
+
+
+def test_all_verticals_off_alike_are_the_places_fault() -> None:
+    found = doubted([np.array([0.0, 0.0, -2.5]), np.array([0.1, 0.0, -2.6])])
+    (doubt,) = found.doubts
+    assert doubt.cause == "gravity"
+    assert "height and latitude" in doubt.words
+    # Up is -z: the readings have grown.
+    assert "+2.5 mg" in doubt.words or "+2.6 mg" in doubt.words
+
+
+def test_all_gyros_off_alike_turn() -> None:
+    turn = np.array([100.0, -200.0, 600.0])
+    (doubt,) = doubted([turn, turn + 20.0], triad="gyro").doubts
+    assert doubt.cause == "turn"
+    (doubt,) = doubted([turn, np.zeros(3)], triad="gyro").doubts
+    assert (doubt.cause, doubt.names) == ("imu", ("imu0",))
+
+
+# --- what later calibrations know
+
+
+def test_what_is_remembered_is_what_was_measured_not_what_became_of_it() -> None:
+    shared = shared_errors(ZERO_RAD, gravity_sigma=0.3 * MG)
+    of = solution(imus([np.ones(3) * MG], shared), shared)
+    known = [ExpectedImu(name="imu0", earlier={"accel": expected(np.zeros(3), 0.3 * MG)})]
+    found = weighed(of, known)
+    assert abs(accel_of(found.solution.imus[0])[0]) < 0.9 * MG
+    kept = points(
+        of,
+        whole_of(of),
+        found.doubts,
+        started_at="now",
+        unix_s=1.0,
+        power_ups={"imu0": PowerUp(host="here", since_unix_s=None)},
+        zero="zero",
+    )["imu0"]
+    assert kept.accel is not None
+    np.testing.assert_allclose(kept.accel.bias, MG)
+    assert kept.accel.sigma_use == (0.000490333,) * 3  # 0.05 mg, in 9 decimals
+    np.testing.assert_allclose(kept.accel.sigma_shared, [0.0, 0.0, 0.3 * MG], atol=1e-9)
+    assert kept.zero_sigma_rad == ZERO_RAD
+
+
+# --- what a solution says of the errors in common
+
+
+@pytest.mark.parametrize("law", ["axis", "slope", "euler"])
+def test_the_gradienters_share_is_how_its_readings_move_the_bias(law: Literal["axis", "slope", "euler"]) -> None:
+    mounting = about(2, 0.5) @ about(1, 0.2)
+    local = local_earth(Whereabouts(latitude_deg=40.0, longitude_deg=116.0, height_m=50.0, source="test"))
+    window = ideal_window(
+        ned_body=ned_from_body(12.0, -7.0, 40.0),
+        body_gradienter=mounting,
+        law=law,
+        latitude_deg=40.0,
+        gravity_m_s2=local.gravity_m_s2,
+        heading_deg=40.0,
+        gyro_bias=np.zeros(3),
+        accel_bias=np.zeros(3),
+        sigma=1e-4,
+    )
+    assert window.tilt is not None
+    both = msgspec.structs.replace(
+        window,
+        imus=(window.imus[0], msgspec.structs.replace(window.imus[0], name="own")),
+        tilt=msgspec.structs.replace(window.tilt, x_sigma_deg=0.004, y_sigma_deg=0.002),
+    )
+    gradienter = GradienterModel(law, mounting, (0.0, 0.0), 0.02)
+    compass = CompassModel(False, np.eye(3), 0.0, 1.0)
+    found = solve(both, local, gradienter, compass, What.BOTH)
+    shared = found.shared
+    assert shared.by_reading is not None
+    step = 1e-5
+    assert both.tilt is not None
+    for column, key in enumerate(("x_deg", "y_deg")):
+        moved = msgspec.structs.replace(both.tilt, **{key: getattr(both.tilt, key) + step / DEG})
+        other = solve(msgspec.structs.replace(both, tilt=moved), local, gradienter, compass, What.BOTH)
+        np.testing.assert_allclose(
+            (accel_of(other.imus[0]) - accel_of(found.imus[0])) / step, shared.by_reading[:, column], atol=1e-3
+        )
+    sigma = np.hypot([0.004, 0.002], 0.02) * DEG
+    up = shared.up[:, None] * local.gravity_sigma_m_s2
+    by_tilt = shared.by_reading @ np.diag(sigma**2) @ shared.by_reading.T
+    np.testing.assert_allclose(shared.covariance[3:, 3:], by_tilt + up @ up.T, rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(found.cross["fc", "own"], shared.covariance)
+    np.testing.assert_allclose(found.imus[0].covariance - shared.covariance, 1e-8 * np.eye(6), atol=1e-15)

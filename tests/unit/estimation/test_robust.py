@@ -1,0 +1,119 @@
+"""Huber's mean and line against their definitions and against the figures of the method."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from companion.estimation.noise.robust import HUBER_C, huber_line, huber_mean, robust_mean, slope_limit
+
+
+def test_huber_mean_solves_its_own_equation() -> None:
+    """Sum of psi(r / s) is zero, psi clipped at c, s the MAD about the median."""
+    rng = np.random.default_rng(1)
+    values = rng.standard_t(2.0, (61, 3))
+    found = huber_mean(values)
+    for column in range(3):
+        x = values[:, column]
+        scale = 1.4826 * np.median(np.abs(x - np.median(x)))
+        psi = np.clip((x - found[column]) / scale, -HUBER_C, HUBER_C)
+        assert abs(psi.mean()) < 2e-4
+
+
+def test_huber_mean_is_the_mean_of_what_has_no_outliers() -> None:
+    values = np.array([[1.0, 5.0], [2.0, 5.0], [3.0, 5.0]])
+    assert huber_mean(values) == pytest.approx([2.0, 5.0])
+    assert huber_mean(values[:1]) == pytest.approx([1.0, 5.0])
+
+
+def test_one_knock_hardly_moves_the_mean() -> None:
+    """60 s with a knock of 3 s: the mean is lost, Huber is not (method 2.4)."""
+    rng = np.random.default_rng(2)
+    values = rng.normal(0.0, 1.0, (60, 1))
+    clean = float(huber_mean(values)[0])
+    values[20:23] += 300.0
+    assert abs(values.mean()) > 10.0
+    # Three values of bounded influence c move it by 3 c / 60.
+    assert abs(float(huber_mean(values)[0]) - clean) < 0.15
+
+
+def test_huber_keeps_its_efficiency_on_clean_data() -> None:
+    rng = np.random.default_rng(3)
+    values = rng.normal(size=(60, 4000))
+    assert float(huber_mean(values).var()) * 60.0 == pytest.approx(1.0 / 0.95, rel=0.06)
+
+
+def test_most_values_equal_does_not_divide_by_zero() -> None:
+    values = np.array([[0.0], [0.0], [0.0], [0.0], [1.0]])
+    assert 0.0 <= float(huber_mean(values)[0]) < 0.3
+
+
+def test_line_without_noise_is_exact() -> None:
+    times = np.arange(12.0) + 0.5
+    line = huber_line(times, np.stack([3.0 + 0.25 * times, 7.0 - 0.0 * times], axis=1), 12.0)
+    assert line.end == pytest.approx([6.0, 7.0])
+    assert line.slope == pytest.approx([0.25, 0.0])
+    assert abs(line.t_statistic[0]) > 1e3
+    assert line.t_statistic[1] == 0.0
+
+
+def test_line_survives_a_knock_and_its_end_has_the_said_variance() -> None:
+    rng = np.random.default_rng(4)
+    times = np.arange(40.0) + 0.5
+    values = 0.5 * times[:, None] + rng.normal(0.0, 1.0, (40, 3000))
+    line = huber_line(times, values, 40.0)
+    # About four times the variance of a mean: twice its sigma.
+    assert float(line.end_leverage.mean()) * 40.0 == pytest.approx(4.0, rel=0.15)
+    assert float(np.mean(np.square(line.end - 20.0))) == pytest.approx(float(line.end_leverage.mean()), rel=0.12)
+    values[37:] += 500.0
+    knocked = huber_line(times, values, 40.0)
+    assert float(np.abs(knocked.end - line.end).max()) < 6.0
+    assert float(np.abs(knocked.end - line.end).mean()) < 1.5
+
+
+def test_t_statistic_of_noise_is_students() -> None:
+    rng = np.random.default_rng(5)
+    line = huber_line(np.arange(30.0), rng.normal(size=(30, 4000)), 30.0)
+    assert float(line.t_statistic.std()) == pytest.approx(1.0, abs=0.2)
+    assert float(np.mean(np.abs(line.t_statistic) > 5.0)) < 1e-3
+
+
+@pytest.mark.parametrize(("count", "within"), [(10, 0.05), (30, 0.03), (60, 0.025)])
+def test_the_robust_mean_is_within_a_few_per_cent_of_the_bound_where_nothing_knocks(count: int, within: float) -> None:
+    """The bound is the plain mean's 1 / sqrt(n), attained by it in Gaussian noise (method 2.2)."""
+    rng = np.random.default_rng(count)
+    values = rng.normal(size=(count, 20_000))
+    found = float(np.sqrt(np.mean(np.square(robust_mean(values))))) * np.sqrt(count)
+    assert found < 1.0 + within
+    assert found < float(np.sqrt(np.mean(np.square(huber_mean(values))))) * np.sqrt(count)
+
+
+def test_the_robust_mean_forgets_a_knock_that_hubers_feels() -> None:
+    rng = np.random.default_rng(7)
+    values = rng.normal(size=(60, 4000))
+    values[20:23] += 300.0
+    knocked = np.sqrt(np.mean(np.square(robust_mean(values)))) * np.sqrt(60.0)
+    # What is left is a mean of 57.
+    assert knocked == pytest.approx(np.sqrt(60.0 / 57.0), rel=0.05)
+    assert float(np.sqrt(np.mean(np.square(huber_mean(values))))) * np.sqrt(60.0) > 1.2
+
+
+def test_the_robust_mean_of_equal_values_is_their_value_and_moves_with_them() -> None:
+    assert robust_mean(np.full((5, 2), 7.0)) == pytest.approx([7.0, 7.0])
+    values = np.random.default_rng(8).standard_t(2.0, (21, 5))
+    assert robust_mean(3.0 * values + 2.0) == pytest.approx(3.0 * robust_mean(values) + 2.0)
+    assert robust_mean(np.array([[0.0], [0.0], [0.0], [0.0], [1.0]])) == pytest.approx([0.0], abs=0.3)
+
+
+@pytest.mark.parametrize("count", [8, 10, 15])
+def test_the_limit_of_a_slope_in_a_short_window_is_students(count: int) -> None:
+    from scipy import stats
+
+    assert slope_limit(count) == pytest.approx(stats.t.isf(0.5e-4, count - 2), rel=0.03)
+    assert slope_limit(60) == 5.0
+
+
+def test_chance_seldom_makes_a_slope_of_ten_seconds() -> None:
+    line = huber_line(np.arange(10.0), np.random.default_rng(9).normal(size=(10, 20_000)), 10.0)
+    assert float(np.mean(np.abs(line.t_statistic) > slope_limit(10))) < 1e-3
+    assert float(np.mean(np.abs(line.t_statistic) > 5.0)) > 2e-3

@@ -1,0 +1,130 @@
+"""Bad thermometers are named and not believed; thermometers that are merely calm, coarse or heated are."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from companion.autopilot.telemetry import imu_messages
+from companion.estimation.temperature.thermometer import Thermometers
+
+Degc = Callable[[int], float | None]
+
+
+def warm(t_s: int) -> float:
+    """A board of 31 degC that comes from 11, with its noise."""
+    return round(31.0 - 20.0 * math.exp(-t_s / 300.0) + 0.02 * math.sin(37.0 * t_s), 2)
+
+
+def shown(seconds: int, **by: Degc) -> tuple[Thermometers, dict[str, list[float | None]]]:
+    thermometers = Thermometers()
+    found: dict[str, list[float | None]] = {name: [] for name in by}
+    for slot in range(seconds):
+        for name, degc in by.items():
+            found[name].append(thermometers.believed(name, slot, degc(slot)))
+    return thermometers, found
+
+
+@pytest.mark.parametrize(
+    ("degc", "words"),
+    [
+        (lambda t_s: warm(t_s) + 273.15, r"shows 3\d\d\.\d\d, allowed -40 to 105 degC \(in kelvin or tenths\?\)"),
+        (lambda t_s: warm(t_s) * 10.0, r"shows 3\d\d\.\d\d, allowed .* tenths\?\)"),
+        (lambda t_s: 110.0 + warm(t_s) / 10.0, r"shows 113\.\d\d, allowed -40 to 105 degC \(in degF or tenths\?\)"),
+        (lambda t_s: -300.0, r"shows -300.00, allowed -40 to 105 degC; nothing"),
+        (lambda t_s: 24.37 + 0.03, "is stuck at 24.40 degC, while that of own moved by 1[0-9] K"),
+        (lambda t_s: 24.47, "is stuck at 24.47 degC, while that of own moved by 1[0-9] K"),
+        (lambda t_s: 45.23, "is stuck at 45.23 degC, while that of own moved by 1[0-9] K"),
+        (lambda t_s: 25.0, "is stuck at 25.00 degC, while that of own moved by 1[0-9] K"),
+        (lambda t_s: warm(t_s) + (40.0 if t_s % 100 == 99 else 0.0), "jumps: more than 5 K within a second"),
+    ],
+)
+def test_a_bad_one_is_named_with_what_was_found_and_not_believed(degc: Degc, words: str) -> None:
+    thermometers, found = shown(1000, fc=degc, own=warm)
+    line = thermometers.trouble("fc")
+    assert line.startswith("imu fc: its thermometer ")
+    assert line.endswith("; nothing is learned by it")
+    assert "\n" not in line
+    assert len(line) < 130
+    assert re.search(words, line), line
+    assert found["fc"][-1] is None
+    assert found["own"][5:] == [warm(t_s) for t_s in range(5, 1000)]
+    assert thermometers.trouble("own") == ""
+
+
+@pytest.mark.parametrize(
+    ("degc", "other"),
+    [
+        (lambda t_s: 31.25, lambda t_s: 30.5),  # both boards have come to rest, steps of 1/8 K
+        (lambda t_s: 31.13, lambda t_s: 31.13),  # as hundredths
+        (lambda t_s: 24.0, lambda t_s: 24.0 + t_s // 600),  # steps of 1 K beside a board that warms a little
+        (lambda t_s: 45.0, warm),  # heated, steps of 1 K
+        (lambda t_s: 45.0 + 0.01 * (t_s % 3), warm),  # heated, fine steps
+        (lambda t_s: 62.12, warm),  # heated, eighths as hundredths
+        (lambda t_s: -18.4 + 0.001 * t_s, lambda t_s: 65.0),  # winter beside a heated one
+        (lambda t_s: 25.0 if t_s < 500 else 45.0 + 0.01 * (t_s % 2), lambda t_s: None),  # one jump: another source
+        (lambda t_s: 0.01, lambda t_s: 0.01),
+    ],
+)
+def test_a_calm_coarse_or_heated_one_is_believed(degc: Degc, other: Degc) -> None:
+    thermometers, found = shown(3000, fc=degc, own=other)
+    assert thermometers.trouble("fc") == ""
+    assert found["fc"][-1] == degc(2999)
+
+
+def test_one_alone_is_stuck_after_hours_and_good_again_when_it_moves() -> None:
+    thermometers, _ = shown(3 * 3600, fc=lambda t_s: 31.27)
+    assert thermometers.trouble("fc") == ""
+    assert thermometers.believed("fc", 3 * 3600, 31.27) is None
+    assert "is stuck at 31.27 degC for 3 h" in thermometers.trouble("fc")
+    assert thermometers.believed("fc", 3 * 3600 + 1, 31.28) == 31.28
+    assert thermometers.trouble("fc") == ""
+
+
+def test_jumps_are_forgiven_after_ten_minutes() -> None:
+    thermometers, found = shown(800, fc=lambda t_s: warm(t_s) + (40.0 if t_s == 100 else 0.0))
+    assert found["fc"][100:102] == [None, None]
+    assert found["fc"][600] is None
+    assert found["fc"][799] == warm(799)
+    assert thermometers.trouble("fc") == ""
+
+
+def test_without_a_temperature_an_imu_is_named_after_seconds() -> None:
+    thermometers, _ = shown(10, fc=lambda t_s: None)
+    assert not thermometers.has_none("fc")
+    assert thermometers.believed("fc", 11, None) is None
+    assert thermometers.has_none("fc")
+    assert not thermometers.has_none("own")
+    assert thermometers.trouble("fc") == ""
+    assert thermometers.believed("fc", 12, 20.0) == 20.0
+    assert not thermometers.has_none("fc")
+
+
+def test_nothing_from_the_wire_makes_it_raise() -> None:
+    random = np.random.default_rng(0)
+    thermometers = Thermometers()
+    odd = [None, math.nan, math.inf, -math.inf, 1e308, -1e308, 0.0, -0.0, 5e-324, 31.0]
+    for _ in range(3000):
+        slot, name = int(random.integers(-5, 5000)), str(random.choice(["fc", "own", "third"]))
+        found = thermometers.believed(name, slot, odd[random.integers(len(odd))])
+        assert found is None or -40.0 <= found <= 105.0
+        thermometers.trouble(name)
+
+
+def test_of_the_autopilots_messages_only_those_that_carry_the_imus_temperature_give_one() -> None:
+    from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+    nine = (0.0, 0.0, -9.8, 0.01, 0.0, 0.0, 0.0, 0.0, 0.0)
+    floats = mavlink.MAVLink_highres_imu_message(5, *nine, 1013.0, 0.0, 50.0, 32.6, 0x3F)
+    found = imu_messages.HIGHRES.decode(floats)
+    assert not isinstance(found, str)
+    assert found.temperature_degc is None  # the air's, or the barometer's
+    for sent, degc in ((2513, 25.13), (0, None), (1, 0.01), (-1250, -12.5)):
+        whole = mavlink.MAVLink_scaled_imu_message(5, 0, 0, -1000, 1, 0, 0, 0, 0, 0, sent)
+        found = imu_messages.SCALED.decode(whole)
+        assert not isinstance(found, str)
+        assert found.temperature_degc == (None if degc is None else pytest.approx(degc))

@@ -1,0 +1,155 @@
+"""When a calibration no longer counts (method 2.2 and 3.2)."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.estimation.noise.allan import PROFILES, AllanModel
+from companion.estimation.records.validity import (
+    DRIFT_SIGMAS,
+    Held,
+    Limits,
+    Present,
+    Seen,
+    Why,
+    age_limit_s,
+    judge,
+    worth_writing,
+)
+from companion.physics.units import DEG_H
+from companion.samples import Vector
+from tests.support.allan import use_variance
+
+GYRO = PROFILES["icm42688p"].gyro
+LIMITS = Limits(max_age_s=1800.0, max_temperature_change_k=3.0)
+SIGMA = (5.0 * DEG_H,) * 3
+HELD = Held(
+    calibrated_s=0.0,
+    confirmed_s=0.0,
+    temperature_degc=25.0,
+    sigma_use=SIGMA,
+    sigma=SIGMA,
+    expected=(0.0, 0.0, 0.0),
+    seen=True,
+    averaged_s=30.0,
+)
+
+
+def whys(
+    held: Held = HELD,
+    now_s: float = 10.0,
+    temperature_degc: float | None = 25.0,
+    present: Present | None = None,
+    drift: tuple[Vector, Vector] | None = None,
+) -> set[Why]:
+    seen = Seen(now_s=now_s, temperature_degc=temperature_degc, present=present, drift=drift)
+    found = judge("gyro", "fc", held, GYRO, LIMITS, seen)
+    return {finding.why for finding in found}
+
+
+def output(x_deg_h: float) -> Present:
+    return Present(residual=(x_deg_h * DEG_H, 0.0, 0.0), sigma_use=SIGMA, sigma=SIGMA)
+
+
+def test_a_fresh_verified_calibration_has_nothing_against_it() -> None:
+    assert whys() == set()
+    assert whys(present=output(0.0)) == set()
+
+
+def test_half_an_hour_is_the_age_limit_of_method_3_item_8() -> None:
+    assert whys(now_s=1799.0) == set()
+    assert whys(now_s=1801.0) == {Why.OLD}
+
+
+def test_three_kelvin_is_the_temperature_limit_either_way_and_an_unknown_temperature_none() -> None:
+    assert whys(temperature_degc=27.9) == set()
+    assert whys(temperature_degc=28.1) == {Why.TEMPERATURE}
+    assert whys(temperature_degc=21.9) == {Why.TEMPERATURE}
+    assert whys(temperature_degc=None) == set()
+
+
+def test_where_the_curve_over_temperature_is_known_it_says_how_far_the_bias_is_off() -> None:
+    def by(mean_deg_h: float, sigma_deg_h: float) -> set[Why]:
+        mean, variance = mean_deg_h * DEG_H, (sigma_deg_h * DEG_H) ** 2
+        return whys(temperature_degc=35.0, drift=((0.0, mean, 0.0), (variance,) * 3))
+
+    # sigma is 5 deg/h: twice that may be missing.
+    assert by(8.0, 4.0) == set()
+    assert by(-9.0, 5.0) == {Why.TEMPERATURE}
+    assert by(0.0, 11.0) == {Why.TEMPERATURE}
+    seen = Seen(now_s=10.0, temperature_degc=20.0, drift=((90.0 * DEG_H, 0.0, 0.0), (0.0,) * 3))
+    (finding,) = judge("gyro", "fc", HELD, GYRO, LIMITS, seen)
+    assert finding.words == "gyro fc: about 90 deg/h off, 5 K colder"
+
+
+def test_an_output_off_by_more_than_three_sigma_of_both_sides_is_stale() -> None:
+    # sqrt(5^2 + 5^2) deg/h times three is 21.2 deg/h.
+    assert whys(present=output(21.0)) == set()
+    assert whys(present=output(-21.4)) == {Why.RESIDUAL}
+
+
+def test_an_imu_that_nobody_corrects_is_judged_by_the_change_of_its_whole_bias() -> None:
+    held = msgspec.structs.replace(HELD, expected=(100.0 * DEG_H, 0.0, 0.0))
+    assert whys(held, present=output(101.0)) == set()
+    assert whys(held, present=output(0.0)) == {Why.RESIDUAL}
+
+
+def test_offsets_that_nobody_saw_working_do_not_count() -> None:
+    assert whys(msgspec.structs.replace(HELD, seen=False)) == {Why.UNSEEN}
+
+
+@pytest.mark.parametrize("profile", PROFILES.values(), ids=lambda profile: profile.name)
+def test_the_age_limit_is_where_the_expected_wandering_reaches_two_sigma(profile: object) -> None:
+    gyro = profile.gyro  # type: ignore[attr-defined]
+    sigma = math.sqrt(use_variance(gyro, 30.0, 180.0))
+    limit_s = age_limit_s(gyro, (sigma,) * 3, 30.0)
+    wandering = math.sqrt(use_variance(AllanModel(0.0, gyro.flicker, gyro.walk), 30.0, limit_s))
+    assert wandering == pytest.approx(DRIFT_SIGMAS * sigma, rel=0.02)
+    assert limit_s > 180.0  # what was promised for the next 180 s must hold so long
+
+
+def test_a_sensor_that_wanders_fast_has_a_shorter_limit_than_half_an_hour() -> None:
+    restless = AllanModel(0.0, 0.0, 2.0 * DEG_H)  # deg/h per root second: 5 deg/h in a few seconds
+    sigma = math.sqrt(use_variance(restless, 10.0, 10.0))
+    held = msgspec.structs.replace(HELD, sigma_use=(sigma,) * 3, averaged_s=10.0)
+    found = judge("gyro", "fc", held, restless, LIMITS, Seen(now_s=120.0))
+    assert [finding.why for finding in found] == [Why.OLD]
+
+
+@given(
+    flicker=st.floats(1e-9, 1e-3),
+    walk=st.floats(0.0, 1e-4),
+    sigma=st.floats(1e-9, 1e-2),
+    averaged_s=st.floats(2.0, 600.0),
+)
+def test_the_age_limit_is_always_between_a_second_and_a_day(
+    flicker: float, walk: float, sigma: float, averaged_s: float
+) -> None:
+    assert 1.0 <= age_limit_s(AllanModel(0.0, flicker, walk), (sigma,) * 3, averaged_s) <= 86400.0
+
+
+def test_a_write_is_worth_it_beyond_two_sigma_and_beyond_the_floor() -> None:
+    assert not worth_writing(output(9.9), None, 0.0)
+    assert worth_writing(output(10.1), None, 0.0)
+    assert not worth_writing(output(10.1), None, 12.0 * DEG_H)
+    # What is in force was not known any better: sqrt(5^2 + 5^2) deg/h times two is 14.1.
+    assert not worth_writing(output(14.0), HELD, 0.0)
+    assert worth_writing(output(-14.3), HELD, 0.0)
+    own = msgspec.structs.replace(HELD, expected=(100.0 * DEG_H, 0.0, 0.0))
+    assert not worth_writing(output(100.0), own, 0.0)
+
+
+def test_a_warm_up_to_come_is_in_the_promise_and_in_no_comparison() -> None:
+    wide = (200.0 * DEG_H,) * 3
+    young = msgspec.structs.replace(HELD, sigma_use=wide)
+    assert whys(young) == whys(HELD)
+    off = msgspec.structs.replace(output(60.0), sigma_use=wide)
+    assert whys(young, present=off) == {Why.RESIDUAL}
+    assert worth_writing(off, young, 0.0)
+    assert worth_writing(off, None, 0.0)
+    assert age_limit_s(GYRO, young.sigma, 30.0) == age_limit_s(GYRO, HELD.sigma, 30.0)

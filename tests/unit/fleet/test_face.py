@@ -1,0 +1,743 @@
+"""The fleet's face on virtual time: what was kept reaches a collector whole, in order and once, whatever happens."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import datetime
+import json
+import os
+import random
+import sqlite3
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import msgspec
+import pytest
+
+from companion.config.sections import Location
+from companion.errors import StorageError
+from companion.estimation.noise.allan import PROFILES
+from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
+from companion.estimation.records.record import Arming, Magnetic
+from companion.estimation.solution.prior import curve_of
+from companion.estimation.solution.temperature_summary import by_temperature
+from companion.mqtt import fleet as face_module
+from companion.mqtt.fleet import AircraftFleet
+from companion.mqtt.fleet_sources import Sources
+from companion.storage import fleet_items
+from companion.storage.flights import FlightStore
+from companion.storage.learned import Done
+from companion.storage.profiles import ProfileStore
+from companion.storage.records import RecordStore
+from companion.storage.state import BoundedList, sealed, write_atomically
+from tests.support.extent import extent
+from tests.support.fleet import CRANE, HERON, Aircraft, check
+from tests.support.histories import arming, record, windows_of_days
+from tests.support.namespaces import run_again_with_mounts
+from tests.support.small_disk import small_disk
+from tests.support.virtual_time import run_virtual
+from tests.unit.lab.test_profiles import saved
+
+MODEL = PROFILES["icm42688p"]
+
+
+async def until(what: Callable[[], object], within_s: float = 3600.0) -> None:
+    async with asyncio.timeout(within_s):
+        while not what():
+            await asyncio.sleep(0.5)
+
+
+async def until_told(face: AircraftFleet, within_s: float = 3600.0) -> None:
+    """Until the face has looked, and all is confirmed."""
+    await asyncio.sleep(15.0)
+    await until(lambda: not face.status()["waiting"], within_s)
+
+
+def virtually(main: Coroutine[Any, Any, None]) -> None:
+    run_virtual(main)
+
+
+def begun(collector_items: list[Any]) -> list[str]:
+    return [item["body"]["started_at"] for item in collector_items if item["kind"] == "calibration"]
+
+
+def starts(*numbers: int) -> list[str]:
+    return [record(number).started_at for number in numbers]
+
+
+def keep(folder: Path, *numbers: int) -> None:
+    for number in numbers:
+        RecordStore(folder).save(record(number))
+
+
+# --- nothing is lost
+
+
+def test_a_history_from_before_goes_once_and_in_order(tmp_path: Path) -> None:
+    keep(tmp_path, *range(50))
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        for _ in range(2):
+            async with aircraft.running() as face:
+                aircraft.connection.connect()
+                await until_told(face)
+                await asyncio.sleep(60.0)
+            aircraft.connection.disconnect()
+        collector = aircraft.collector
+        assert [key[2] for key in collector.deliveries] == list(range(1, 51))
+        assert begun(collector.of(HERON)) == starts(*range(50))
+        assert {item["clock"] for item in collector.of(HERON)} == {"unknown"}
+        assert (collector.hellos[-1]["first"], collector.hellos[-1]["last"]) == (1, 50)
+        assert collector.hellos[-1]["name"] == "Heron 7"
+
+    virtually(main())
+
+
+def test_half_a_year_offline_with_a_restart_every_week(tmp_path: Path) -> None:
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        days = extent(whole=180, a_slice=60)
+        for day in range(0, days, 6):
+            async with aircraft.running():
+                await asyncio.sleep(11.0)
+                keep(tmp_path, *range(day, day + 6))
+                await asyncio.sleep(random.Random(day).choice([0.0, 1.0, 10.0]))  # switched off, perhaps at once
+        async with aircraft.running() as face:
+            await asyncio.sleep(20.0)
+            assert face.status()["waiting"] == days
+            assert f"{days} items waiting for the fleet, never confirmed so far" in face.status()["summary"]
+            aircraft.connection.connect()
+            await until_told(face)
+            assert face.status()["summary"].startswith("no items waiting for the fleet, last confirmed 20")
+        assert begun(aircraft.collector.of(HERON)) == starts(*range(days))
+        assert [key[2] for key in aircraft.collector.deliveries] == list(range(1, days + 1))
+
+    virtually(main())
+
+
+def test_a_broker_that_takes_everything_and_is_wiped_frees_nothing(tmp_path: Path) -> None:
+    keep(tmp_path, *range(20))
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        connection, collector = aircraft.connection, aircraft.collector
+        connection.loses = lambda: True
+        async with aircraft.running() as face:
+            connection.connect()
+            await asyncio.sleep(200.0)
+            assert not connection.outbox._answers, "the broker has taken all that was sent"
+            assert face.status()["waiting"] == 20
+            connection.disconnect()
+            await asyncio.sleep(100.0)
+            connection.loses = lambda: False
+            connection.connect()
+            await until_told(face)
+        assert begun(collector.of(HERON)) == starts(*range(20))
+        assert [key[2] for key in collector.deliveries] == list(range(1, 21))
+
+    virtually(main())
+
+
+def test_a_collector_that_is_away_is_written_to_ever_more_rarely_and_then_gets_all_in_order(
+    tmp_path: Path,
+) -> None:
+    keep(tmp_path, *range(40))
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        collector = aircraft.collector
+        collector.confirms = lambda item: False
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await asyncio.sleep(10_000.0)
+            assert len(collector.deliveries) < 8 * (10_000 / 600 + 5)
+            collector.confirms = lambda item: True
+            await until_told(face)
+            await asyncio.sleep(700.0)
+        assert begun(collector.of(HERON)) == starts(*range(40))
+
+    virtually(main())
+
+
+@pytest.mark.parametrize("seed", range(extent(whole=50, a_slice=2)))
+def test_lost_doubled_reordered_and_cut_off(tmp_path: Path, seed: int) -> None:
+    """A bad radio, a collector that confirms what it likes, a daemon that is switched off at any time."""
+    dice = random.Random(seed)
+    keep(tmp_path, *range(30))
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        connection, collector = aircraft.connection, aircraft.collector
+        connection.loses = lambda: dice.random() < 0.3
+        collector.confirms = lambda item: dice.random() < 0.7
+        number = 30
+        for _ in range(8):
+            async with aircraft.running():
+                for _ in range(dice.randrange(1, 6)):
+                    (connection.disconnect if connection.connected else connection.connect)()
+                    await asyncio.sleep(dice.expovariate(1 / 20.0))
+                    keep(tmp_path, number)
+                    number += 1
+                    if collector.database and dice.random() < 0.5:
+                        collector.confirm(*dice.choices(sorted(collector.database), k=5))
+        connection.loses, collector.confirms = lambda: False, lambda item: True
+        async with aircraft.running() as face:
+            if not connection.connected:
+                connection.connect()
+            await until_told(face)
+        assert begun(collector.of(HERON)) == starts(*range(number))
+        assert [item["sequence"] for item in collector.of(HERON)] == list(range(1, number + 1))
+
+    virtually(main())
+
+
+def test_a_collector_restored_from_last_weeks_backup_gets_what_it_lacks(tmp_path: Path) -> None:
+    keep(tmp_path, *range(30))
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        collector = aircraft.collector
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await until_told(face)
+            lost = [key for key in collector.database if 12 <= key[2] <= 20 or key[2] == 25]
+            for key in lost:
+                del collector.database[key]
+            collector.deliveries.clear()
+            epoch = collector.hellos[-1]["epoch"]
+            collector.say(HERON, "wanted", epoch, [[12, 20], [25, 25], [900, 1000]])
+            await until(lambda: len(collector.database) == 30)
+            await asyncio.sleep(100.0)
+            assert [key[2] for key in collector.deliveries] == [*range(12, 21), 25]
+            assert face.status()["waiting"] == 0
+        assert begun(collector.of(HERON)) == starts(*range(30))
+
+    virtually(main())
+
+
+def test_nonsense_foreign_epochs_and_retained_words_change_nothing(tmp_path: Path) -> None:
+    keep(tmp_path, *range(5))
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        connection, collector = aircraft.connection, aircraft.collector
+        collector.confirms = lambda item: False
+        async with aircraft.running() as face:
+            connection.connect()
+            await asyncio.sleep(15.0)
+            epoch = collector.hellos[-1]["epoch"]
+            good = {"format_version": 1, "epoch": epoch, "sequences": [[1, 5]]}
+            nonsense = [
+                b"", b"\xff", b"[]", b"null", b"{}", b"[" * 5000, b'{"epoch": 1}',
+                *(
+                    json.dumps({**good, **wrong}).encode()
+                    for wrong in (
+                        {"format_version": 2}, {"epoch": "0" * 16}, {"sequences": [[5, 1]]}, {"sequences": [[0, 5]]},
+                        {"sequences": [[1]]}, {"sequences": [[1, 2**70]]}, {"sequences": [[1, 5]] * 257},
+                        {"sequences": "all"}, {"sequences": [["1", "5"]]},
+                    )
+                ),
+            ]  # fmt: skip
+            for payload in nonsense:
+                connection.deliver(f"fleet/{HERON}/confirmed", payload)
+                connection.deliver(f"fleet/{CRANE}/confirmed", json.dumps(good).encode())
+                await asyncio.sleep(1.0)
+                assert face.status()["waiting"] == 5, payload
+                connection.deliver(f"fleet/{HERON}/wanted", payload)
+                await asyncio.sleep(1.0)
+            connection.deliver(f"fleet/{HERON}/confirmed", json.dumps(good).encode(), retained=True)
+            await asyncio.sleep(20.0)
+            assert face.status()["waiting"] == 5
+            connection.deliver(f"fleet/{HERON}/confirmed", json.dumps(good).encode())
+            await asyncio.sleep(5.0)
+            assert face.status()["waiting"] == 0
+
+    virtually(main())
+
+
+def test_what_the_broker_keeps_of_the_hello_is_as_of_now(tmp_path: Path) -> None:
+    """Or a collector from a backup would not know what it lacks."""
+    keep(tmp_path, 0)
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        outbox = aircraft.connection.outbox
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await until_told(face)
+            keep(tmp_path, 1, 2, 3)
+            await until_told(face)
+            await asyncio.sleep(15.0)
+            assert json.loads(outbox.kept(f"fleet/{HERON}/hello") or b"")["last"] == 4
+            assert len(aircraft.collector.hellos) == 2
+
+    virtually(main())
+
+
+def test_it_says_hello_again_when_it_is_asked_and_when_its_epoch_is_not_known(tmp_path: Path) -> None:
+    keep(tmp_path, 0)
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        collector = aircraft.collector
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await until_told(face)
+            (hello,) = collector.hellos
+            for epoch in (hello["epoch"], "0" * 16):
+                await asyncio.sleep(20.0)
+                collector.hellos.clear()
+                for _ in range(5):
+                    collector.say(HERON, "wanted", epoch, [])
+                    await asyncio.sleep(1.0)
+                assert len(collector.hellos) == 1, "and not for each of a flood"
+                assert collector.hellos[0] | {"at": ""} == hello | {"at": ""}
+
+    virtually(main())
+
+
+def test_items_that_nobody_confirms_hold_up_no_other(tmp_path: Path) -> None:
+    keep(tmp_path, *range(30))
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        collector = aircraft.collector
+        collector.confirms = lambda item: item["sequence"] > 10
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await until(lambda: face.status()["waiting"] == 10)
+        assert begun(collector.of(HERON)) == starts(*range(10, 30))
+
+    virtually(main())
+
+
+# --- whose, and when
+
+
+def test_a_board_moved_to_another_airframe(tmp_path: Path) -> None:
+    keep(tmp_path, 0, 1)
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        collector = aircraft.collector
+        async with aircraft.running():
+            await asyncio.sleep(15.0)
+            keep(tmp_path, 2)
+        keep(tmp_path, 3)  # written, and switched off before the fleet had looked
+        aircraft.vehicle.uid = CRANE
+        async with aircraft.running() as face:
+            await asyncio.sleep(15.0)
+            keep(tmp_path, 4)
+            aircraft.connection.connect()
+            await until_told(face)
+            assert {each["aircraft"]: each["last"] for each in collector.hellos} == {HERON: 4, CRANE: 2}
+            aircraft.vehicle.uid = aircraft.vehicle.version = None  # another one, and nobody knows yet which
+            keep(tmp_path, 5)
+            await asyncio.sleep(15.0)
+            assert len(collector.database) == 6
+            aircraft.vehicle.uid = HERON
+            await until_told(face)
+        assert begun(collector.of(HERON)) == starts(0, 1, 2, 3, 5)
+        assert begun(collector.of(CRANE)) == starts(4)
+        (event,) = [item for item in collector.of(CRANE) if item["kind"] == "event"]
+        assert event["body"] == {"what": "airframe changed", "before": HERON}
+        (event,) = [item for item in collector.of(HERON) if item["kind"] == "event"]
+        assert event["body"] == {"what": "airframe changed", "before": CRANE}
+        assert len({item["epoch"] for item in collector.database.values()}) == 2
+
+    virtually(main())
+
+
+def test_what_was_recorded_of_another_system_before_is_not_its(tmp_path: Path) -> None:
+    for number, system_id in enumerate((1, 2, None)):
+        RecordStore(tmp_path).save(record(number, system_id=system_id))
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await until_told(face)
+        assert begun(aircraft.collector.of(HERON)) == starts(0, 2)
+
+    virtually(main())
+
+
+def test_without_a_unique_id_nothing_is_kept_and_that_is_said(tmp_path: Path) -> None:
+    keep(tmp_path, 0)
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path, uid=None)
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await asyncio.sleep(60.0)
+            assert face.status()["good"] is False
+            assert "tells no unique id" in face.status()["summary"]
+            aircraft.vehicle.uid = HERON
+            await until_told(face)
+            assert face.status()["good"] is True
+        assert begun(aircraft.collector.of(HERON)) == starts(0)
+
+    virtually(main())
+
+
+def test_another_imu_is_an_event(tmp_path: Path) -> None:
+    for number, ids in enumerate(((11, 12), (11, 12), (21, 12), (None, None), (21, 12))):
+        one = record(number)
+        imus = [msgspec.structs.replace(imu, gyro_id=ids[0], accel_id=ids[1]) for imu in one.imus if imu.name == "fc"]
+        RecordStore(tmp_path).save(msgspec.structs.replace(one, imus=tuple(imus)))
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await until_told(face)
+        assert aircraft.collector.kinds() == ["calibration"] * 2 + ["event"] + ["calibration"] * 3
+        assert aircraft.collector.of(HERON)[2]["body"] == {
+            "what": "imu exchanged",
+            "imu": "fc",
+            "before": {"gyro_id": 11, "accel_id": 12},
+            "now": {"gyro_id": 21, "accel_id": 12},
+        }
+
+    virtually(main())
+
+
+@pytest.mark.parametrize(("off_s", "clock"), [(0.0, "good"), (365 * 86400.0, "unknown"), (None, "unknown")])
+def test_a_clock_is_good_where_gnss_agrees_and_never_for_what_was_before(
+    tmp_path: Path, off_s: float | None, clock: str
+) -> None:
+    """Wrong by a year or not, the order is that of the sequences."""
+    keep(tmp_path, 5, 3, 4)
+
+    async def main() -> None:
+        now = datetime.datetime.now(tz=datetime.UTC)
+        aircraft = Aircraft(tmp_path)
+        aircraft.vehicle.unix_time_s = None if off_s is None else now.timestamp() + off_s
+        async with aircraft.running() as face:
+            await asyncio.sleep(1.0)
+            at = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
+            RecordStore(tmp_path).save(record(0, started_at=at))
+            aircraft.connection.connect()
+            await until_told(face)
+        told = aircraft.collector.of(HERON)
+        assert begun(told) == [*starts(5, 3, 4), at]
+        assert [item["clock"] for item in told] == ["unknown"] * 3 + [clock]
+
+    virtually(main())
+
+
+# --- what is told
+
+
+def test_everything_that_the_disk_has_and_each_change_once(tmp_path: Path) -> None:
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path, location="full")
+        collector = aircraft.collector
+        store, armed = RecordStore(tmp_path), BoundedList(tmp_path / "armings.json", Arming, 200)
+        by_hand = BoundedList(tmp_path / "by-hand.json", Done, 50)
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            first, second = record(0), record(1)
+            path = store.save(first)
+            armed.append(arming(first))
+            await until_told(face)
+            assert collector.kinds() == ["calibration", "arming"]
+            assert collector.of(HERON)[1]["body"] == msgspec.to_builtins(arming(first))
+            # An undo changes the record; a second one is another item.
+            undone = msgspec.structs.replace(first, undone_at="2026-05-01T07:00:00.000+00:00")
+            write_atomically(path, sealed(msgspec.json.encode(undone)))
+            store.save(second)
+            armed.append(arming(second, good=False))
+            level = Done(
+                what="level", state="done", measured_at="2026-05-02T07:00:00.000+00:00", reason="0.1 deg", system_id=1,
+                written={"AHRS_TRIM_X": 0.01},
+            )  # fmt: skip
+            predicted = msgspec.structs.replace(level, what="gyro prediction", state="predicted")
+            by_hand.write([predicted, level])
+            ProfileStore(tmp_path).write(saved("mine"))
+            await until_told(face)
+            os.utime(path, (1.0, 1.0))  # copied back, say: another time, the same content
+            await until_told(face)
+            assert collector.kinds()[2:] == ["undo", "calibration", "alignment", "arming", "profile"]
+            undo, _, alignment, _, profile = (item["body"] for item in collector.of(HERON)[2:])
+            assert undo == {"what": "calibration", "of": first.started_at, "undone_at": undone.undone_at}
+            assert alignment == {**msgspec.to_builtins(level), "record": None}
+            assert profile["name"] == "mine"
+            by_hand.write([msgspec.structs.replace(level, undone_at="2026-05-02T08:00:00.000+00:00")])
+            ProfileStore(tmp_path).write(msgspec.structs.replace(saved("mine"), saved_at="2026-05-03T00:00:00+00:00"))
+            await until_told(face)
+            assert collector.kinds()[7:] == ["undo", "profile"]
+            assert collector.of(HERON)[7]["body"]["what"] == "level"
+        async with aircraft.running() as face:
+            await until_told(face)
+        assert len(collector.database) == 9
+
+    virtually(main())
+
+
+def test_what_is_written_in_the_same_tick_as_what_was_read_is_found(tmp_path: Path) -> None:
+    """A file system's clock ticks every few milliseconds."""
+    items = fleet_items.FleetItems(tmp_path)
+    sources = Sources(tmp_path, items)
+    assert [sources.has_news() for _ in range(4)] == [True, True, False, False]
+    keep(tmp_path, 0)
+    stamp = (tmp_path / "records").stat().st_mtime_ns
+    assert sources.has_news()
+    keep(tmp_path, 1)
+    os.utime(tmp_path / "records", ns=(stamp, stamp))
+    assert [sources.has_news() for _ in range(3)] == [True, False, False]
+    items.close()
+
+
+def test_a_flight_is_told_once_however_often_its_log_is_read(tmp_path: Path) -> None:
+    def flight(key: str, system_id: int = 1) -> KeptFlight:
+        stages = Stages(armed_s=10.0, motors_s=11.0, take_off_s=12.0, landing_s=99.0, disarmed_s=100.0)
+        term = Term(1e-4, 1e-5)
+        axis = Split(
+            axis="gyro x", in_flight=term, ekf=None, turn_on=None, temperature=None, motors=None, vibration=None,
+            trend=None,
+        )  # fmt: skip
+        imu = ImuFlight(
+            imu=1, rate_hz=400.0, calibration=None, gyro_id=7, set_gyro_rad_s=None, set_accel_m_s2=None, axes=(axis,),
+            drift={"flown": [Drift(30.0, 5, 12.0, 20.0)]}, notes=(),
+        )  # fmt: skip
+        found = Flight(
+            key=key, system_id=system_id, began_at="2026-05-01T08:00:00+00:00", stages=stages, reference="ekf",
+            imus=(imu,), notes=(),
+        )  # fmt: skip
+        return KeptFlight(log="00000012.BIN", read_at="2026-05-01T09:00:00+00:00", flight=found)
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        collector, store = aircraft.collector, FlightStore(tmp_path)
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            store.save(flight("a"))
+            await until_told(face)
+            store.save(flight("b"))
+            store.save(flight("other", system_id=9))
+            store.save(msgspec.structs.replace(flight("a"), read_at="2026-05-02T09:00:00+00:00"))
+            await until_told(face)
+        bodies = [item["body"] for item in collector.of(HERON)]
+        assert bodies == [json.loads(msgspec.json.encode(flight(key))) for key in "ab"]
+        assert {item["at"] for item in collector.of(HERON)} == {"2026-05-01T08:00:00Z"}
+
+    virtually(main())
+
+
+def test_a_curve_is_told_when_it_is_another_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(face_module, "CURVES_AFTER_S", 15.0)
+    monkeypatch.setattr(face_module, "CURVES_EVERY_S", 60.0)
+
+    def shown(power_ups: int) -> dict[str, Any]:
+        row = {"degc": 20.0, "gyro_deg_h": [1.0, 2.0, 3.0], "sigma_deg_h": [1.0, 1.0, 1.0]}
+        return {
+            "imu": "fc", "summary": f"{power_ups} power-ups", "power_ups": power_ups, "days": 3, "points": [1, 2],
+            "curve": [row] if power_ups else [], "accel_curve": [], "needs": None, "today": 1, "now": row,
+        }  # fmt: skip
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        for power_ups in (0, 4, 4, 5):
+            aircraft.curves = [shown(power_ups)]
+            async with aircraft.running():
+                await asyncio.sleep(20.0)
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await until_told(face)
+            points = windows_of_days(12)
+            real = by_temperature(
+                "fc",
+                points,
+                curve_of(points, "gyro", MODEL.gyro),
+                curve_of(points, "accel", MODEL.accel),
+                power_up=None,
+            )
+            aircraft.curves = [msgspec.to_builtins(real)]
+            await asyncio.sleep(100.0)
+        told = [item["body"] for item in aircraft.collector.of(HERON)]
+        assert [body["power_ups"] for body in told] == [4, 5, real.power_ups]
+        assert "points" not in told[0]
+        assert len(told[2]["curve"]) == len(real.curve) > 3
+
+    virtually(main())
+
+
+MAGNETIC = Magnetic(
+    heading_bound_deg=2.0, heading_from="device", field_gauss=0.51234, field_expected_gauss=0.51111,
+    inclination_deg=61.23, inclination_expected_deg=61.27, device_minus_field_deg=None, wander_deg=None,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("location", "site", "field"),
+    [
+        ("off", (None, None, None, None), (None, None, None, None)),
+        ("1km", (40.12, 100.0, 9.802, -7.1), (0.512, 0.511, 61.2, 61.3)),
+        ("full", (40.12345, 51.0, 9.80154, -7.11), (0.51234, 0.51111, 61.23, 61.27)),
+    ],
+)
+def test_how_much_of_the_place_is_told(
+    tmp_path: Path, location: Location, site: tuple[float | None, ...], field: tuple[float | None, ...]
+) -> None:
+    one = record(0)
+    assert one.site is not None
+    place = msgspec.structs.replace(one.site, latitude_deg=40.12345, height_m=51.0)
+    field_is = "compass field is 0.7 gauss, the Earth's {}: wrong counts_per_gauss, or a magnet"
+    warnings = (field_is.format("0.511"),)
+    RecordStore(tmp_path).save(msgspec.structs.replace(one, site=place, magnetic=MAGNETIC, warnings=warnings))
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path, location=location)
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await until_told(face)
+        (item,) = aircraft.collector.of(HERON)
+        told, magnetic = item["body"]["site"], item["body"]["magnetic"]
+        names = ("latitude_deg", "height_m", "gravity_m_s2", "declination_deg")
+        assert tuple(told[name] for name in names) == site
+        names = ("field_gauss", "field_expected_gauss", "inclination_deg", "inclination_expected_deg")
+        assert tuple(magnetic[name] for name in names) == field
+        assert magnetic["heading_bound_deg"] == 2.0
+        assert item["body"]["warnings"] == [field_is.format("0.511" if location == "full" else "?")]
+
+    virtually(main())
+
+
+# --- the disk
+
+
+def test_a_full_disk_is_said_and_nothing_is_missing_afterwards(tmp_path: Path) -> None:
+    keep(tmp_path, 0)
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await until_told(face)
+            connection = face._items._connection
+            assert isinstance(connection, sqlite3.Connection)
+            pages = connection.execute("PRAGMA page_count").fetchone()[0]
+            connection.execute(f"PRAGMA max_page_count = {pages}")  # SQLite takes it for a full disk
+            opened = face._items._opened
+
+            def full() -> sqlite3.Connection:
+                db = opened()
+                db.execute(f"PRAGMA max_page_count = {pages}")
+                return db
+
+            face._items._opened = full  # type: ignore[method-assign]
+            keep(tmp_path, *range(1, 9))
+            await asyncio.sleep(30.0)
+            assert face.status()["good"] is False
+            assert "database or disk is full" in face.status()["summary"]
+            aircraft.collector.say(HERON, "wanted", aircraft.collector.hellos[-1]["epoch"], [[1, 1]])
+            await asyncio.sleep(5.0)
+            assert len(aircraft.collector.deliveries) >= 2, "what is there is sent all the same"
+            face._items._opened = opened  # type: ignore[method-assign]
+            face._items.close()
+            await until_told(face)
+            assert face.status()["good"] is True
+        assert begun(aircraft.collector.of(HERON)) == starts(*range(9))
+
+    virtually(main())
+
+
+def test_a_real_file_system_of_two_megabytes_that_others_fill(request: pytest.FixtureRequest) -> None:
+    with small_disk(2) as folder:
+        if folder is None:
+            run_again_with_mounts(request.node)
+            return
+        filler = folder / "filler"
+
+        async def main() -> None:
+            aircraft = Aircraft(folder)
+            async with aircraft.running() as face:
+                aircraft.connection.connect()
+                keep(folder, 0)
+                await until_told(face)
+                with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
+                    for _ in range(1 << 12):
+                        file.write(b"x" * 1024)
+                with filler.open("r+b") as file:
+                    file.truncate(filler.stat().st_size - 40_000)
+                kept = [0]
+                with contextlib.suppress(StorageError):
+                    for number in range(1, 200):
+                        keep(folder, number)
+                        kept.append(number)
+                await until(lambda: "full" in face.status()["summary"], 600.0)
+                assert 2 <= len(kept) < 100, "some were kept, until the disk was full"
+                filler.unlink()
+                await until_told(face)
+                assert face.status()["good"] is True
+            # What the aircraft could keep of itself has arrived, each once and in order.
+            assert begun(aircraft.collector.of(HERON)) == starts(*kept)
+
+        virtually(main())
+
+
+@pytest.mark.parametrize("damage", [b"nonsense", b"SQLite format 3\0" + b"\xff" * 4096])
+def test_a_damaged_file_is_set_aside_and_all_is_told_anew(tmp_path: Path, damage: bytes) -> None:
+    keep(tmp_path, 0, 1)
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        collector = aircraft.collector
+        async with aircraft.running() as face:
+            aircraft.connection.connect()
+            await until_told(face)
+        (tmp_path / fleet_items.FILE).write_bytes(damage)
+        async with aircraft.running() as face:
+            await until(lambda: len(collector.database) == 4)
+            await until_told(face)
+        assert (tmp_path / "fleet.sqlite.unusable").read_bytes() == damage
+        one, two = {item["epoch"] for item in collector.database.values()}
+        bodies = [[item["body"] for key, item in sorted(collector.database.items()) if key[1] == e] for e in (one, two)]
+        assert bodies[0] == bodies[1]
+
+    virtually(main())
+
+
+def test_damage_within_an_item_is_no_end(tmp_path: Path) -> None:
+    keep(tmp_path, 0)
+
+    async def main() -> None:
+        aircraft = Aircraft(tmp_path)
+        async with aircraft.running() as face:
+            await asyncio.sleep(15.0)
+            face._items.close()
+            with contextlib.closing(sqlite3.connect(tmp_path / fleet_items.FILE, isolation_level=None)) as db:
+                db.execute("UPDATE item SET body = x'ff00'")
+            sent: list[bytes] = []
+            aircraft.collector.take = lambda topic, payload: sent.append(payload)  # type: ignore[method-assign]
+            aircraft.connection.connect()
+            await asyncio.sleep(10.0)
+            assert json.loads(sent[-1])["body"] == {}
+            assert face.status()["good"] is True
+
+    virtually(main())
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"sequence": 0}, {"aircraft": "1"}, {"kind": "other"}, {"body": {}}, {"clock": "bad"}, {"at": "2026-05-01"},
+        {"format_version": 2},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_the_contract_refuses_what_is_wrong(wrong: dict[str, Any]) -> None:
+    """Or it would prove nothing."""
+    body = {"what": "level", "of": "2026-05-01T00:00:00Z", "undone_at": "2026-05-01T00:00:00Z"}
+    good = {
+        "format_version": 1, "aircraft": HERON, "epoch": "0" * 16, "sequence": 1, "kind": "undo",
+        "at": "2026-05-01T00:00:00Z", "clock": "good", "body": body,
+    }  # fmt: skip
+    check("item", msgspec.json.encode(good))
+    with pytest.raises(jsonschema.ValidationError):
+        check("item", msgspec.json.encode(good | wrong))

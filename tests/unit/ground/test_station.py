@@ -1,0 +1,293 @@
+"""What people on the ground are told, whatever becomes of their request: the real component, and no MAVSDK."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import cast
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.component.service import Refusal
+from companion.component.statustext import Severity, Weight
+from companion.errors import ConfigError, NobodyHeardError
+from companion.estimation.request import What
+from companion.ground.display import Display
+from companion.ground.heard import Target
+from companion.ground.link import GroundLink
+from companion.ground.station import Station
+from tests.support.component import Bench, bench
+from tests.support.ground_wire import StationOnTheWire, is_final
+from tests.support.virtual_time import run_virtual
+
+
+class Notes:
+    """A display that remembers."""
+
+    def __init__(self) -> None:
+        self.stages: list[str] = []
+        self.texts: list[str] = []
+
+    def progress(self, percent: int, text: str) -> None:
+        if self.stages[-1:] != [text]:
+            self.stages.append(text)
+
+    def text(self, text: str, *, urgent: bool) -> None:
+        self.texts.append(text)
+
+
+def station_on(wire: StationOnTheWire, notes: Notes | None = None) -> Station:
+    # As much of a GroundLink as a station uses.
+    return Station(cast("GroundLink", wire), "udpin:0.0.0.0:14550", cast("Display", notes or Notes()))
+
+
+def beat(wire: StationOnTheWire, system_id: int, component_id: int, kind: int, autopilot: int) -> None:
+    fields = {"type": kind, "autopilot": autopilot, "base_mode": 0, "system_status": mavlink.MAV_STATE_STANDBY}
+    wire.heard.update("HEARTBEAT", Target(system_id, component_id), fields, asyncio.get_running_loop().time())
+
+
+async def until_started(b: Bench, jobs: int = 1) -> None:
+    while len(b.service.started) < jobs:
+        await asyncio.sleep(0.05)
+
+
+def test_it_says_what_it_waits_for_and_how_it_ends() -> None:
+    async def main() -> None:
+        wire, notes = StationOnTheWire(), Notes()
+        wire.values = {"CMP_GYR_SIG": 2.5, "CMP_ACC_SIG": 0.0}
+        async with bench(ground=wire) as b:
+            station = station_on(wire, notes)
+            await station.find(None, 5.0)
+            asking = asyncio.create_task(station.calibrate(What.BOTH, None, reboot=False))
+            await until_started(b)
+            b.texts.say(Severity.INFO, "Hold still: gyro moves 0.31 deg/s, max 0.10")
+            await asyncio.sleep(1.0)
+            for percent in (75, 85):
+                b.service.jobs[0].progress_percent = percent
+                await asyncio.sleep(1.0)
+            b.texts.say(Severity.WARNING, "Before flight: reboot PX4: tilt 1.2 deg off", Weight.RESULT)
+            b.texts.say(Severity.NOTICE, "Calibration done: sigma 2.5 deg/h", Weight.RESULT)
+            b.service.jobs[0].finish("done")
+            outcome = await asking
+            assert (outcome.state, outcome.reason, outcome.good) == ("done", "sigma 2.5 deg/h", True)
+            assert outcome.lines[0].startswith("DONE after")
+            assert "warning: Before flight: reboot PX4: tilt 1.2 deg off" in outcome.lines
+            assert outcome.answer["gyro_sigma_deg_h"] == 2.5
+            assert outcome.answer["accel_sigma_mg"] is None, "0 is how the companion says that it has none"
+            assert "Hold still: gyro moves 0.31 deg/s, max 0.10" in notes.texts
+            assert notes.stages[-2:] == ["writing to the autopilot", "checking that the autopilot uses the new values"]
+
+    run_virtual(main())
+
+
+def test_without_words_the_result_still_counts() -> None:
+    async def main() -> None:
+        wire = StationOnTheWire()
+        async with bench(ground=wire) as b:
+            b.service.takes_s = 1.0
+            station = station_on(wire)
+            await station.find(1, 5.0)
+            outcome = await station.undo()
+            assert (outcome.state, outcome.reason) == ("done", "done (MAV_RESULT 0)")
+
+    run_virtual(main())
+
+
+def test_a_refusal_of_somebody_elses_request_is_not_taken_for_ours() -> None:
+    async def main() -> None:
+        wire = StationOnTheWire()
+        async with bench(ground=wire) as b:
+            station = station_on(wire)
+            await station.find(1, 5.0)
+            asking = asyncio.create_task(station.calibrate(What.GYROS, None, reboot=False))
+            await until_started(b)
+            b.texts.say(Severity.WARNING, "Calibration refused: a calibration is running", Weight.REFUSAL)
+            await asyncio.sleep(1.0)
+            b.texts.say(Severity.ERROR, "Calibration failed: the aircraft moved", Weight.RESULT)
+            b.service.jobs[0].finish("failed")
+            outcome = await asking
+            assert (outcome.state, outcome.reason, outcome.good) == (
+                "failed",
+                "Calibration failed: the aircraft moved",
+                False,
+            )
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [(3.0, "last calibration: cancelled"), (0.0, "has it restarted?"), (None, "has it restarted?")],
+)
+def test_an_end_that_was_not_heard_is_no_success(value: float | None, words: str) -> None:
+    async def main() -> None:
+        wire = StationOnTheWire()
+        wire.deaf_to = is_final
+        if value is not None:
+            wire.values["CMP_STATE"] = value
+        async with bench(ground=wire) as b:
+            b.service.takes_s = 2.0
+            b.service.mav_state = mavlink.MAV_STATE_STANDBY
+            station = station_on(wire)
+            await station.find(1, 5.0)
+            outcome = await station.calibrate(What.BOTH, None, reboot=False)
+            assert (outcome.state, outcome.good) == ("lost", False)
+            assert words in outcome.reason
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "words"), [(False, "companion ground status"), (True, "puts the old values back")]
+)
+def test_a_companion_that_is_gone_is_given_up_with_words(autopilot: bool, words: str) -> None:
+    async def main() -> None:
+        wire, notes = StationOnTheWire(), Notes()
+        async with bench(ground=wire) as b:
+            station = station_on(wire, notes)
+            await station.find(1, 5.0)
+            asking = asyncio.create_task(station.calibrate(What.BOTH, None, reboot=False))
+            await until_started(b)
+            b.wire.cut = True
+            while not asking.done():
+                if autopilot:
+                    beat(wire, 1, 1, mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4)
+                await asyncio.sleep(1.0)
+            outcome = await asking
+            assert (outcome.state, outcome.good) == ("lost", False)
+            assert words in outcome.reason
+            assert "nothing heard for 10 s" in notes.stages
+
+    run_virtual(main())
+
+
+def test_the_second_ctrl_c_does_not_wait() -> None:
+    async def main() -> None:
+        wire, notes = StationOnTheWire(), Notes()
+        async with bench(ground=wire) as b:
+            b.service.cancel = lambda requester: True  # type: ignore[method-assign] # a safe point that does not come
+            b.service.mav_state = mavlink.MAV_STATE_CALIBRATING
+            station = station_on(wire, notes)
+            await station.find(1, 5.0)
+            asking = asyncio.create_task(station.calibrate(What.BOTH, None, reboot=False))
+            await until_started(b)
+            station.interrupt()
+            await asyncio.sleep(3.0)
+            assert not asking.done()
+            assert notes.texts == ["Ctrl-C: cancelling (Ctrl-C: do not wait)"]
+            station.interrupt()
+            await asyncio.sleep(0.1)
+            outcome = await asking
+            assert (outcome.state, outcome.reason) == ("lost", "not waited for; the companion is still at work")
+
+    run_virtual(main())
+
+
+def test_a_cancel_that_came_too_late_says_so() -> None:
+    async def main() -> None:
+        wire = StationOnTheWire()
+        wire.values["CMP_STATE"] = 1.0
+        async with bench(ground=wire) as b:
+            b.service.cancel = lambda requester: True  # type: ignore[method-assign]
+            b.service.mav_state = mavlink.MAV_STATE_CALIBRATING
+            station = station_on(wire)
+            await station.find(1, 5.0)
+            asking = asyncio.create_task(station.cancel())
+            await asyncio.sleep(2.0)
+            assert not asking.done()
+            b.service.mav_state = mavlink.MAV_STATE_STANDBY
+            outcome = await asking
+            assert (outcome.state, outcome.reason) == ("cancelled", "the companion's last calibration: done")
+
+    run_virtual(main())
+
+
+def test_a_cancel_right_after_the_start_is_no_cancel_of_nothing() -> None:
+    """Heartbeats come once a second: none has shown yet that the companion is at work."""
+
+    async def main() -> None:
+        wire = StationOnTheWire()
+        async with bench(ground=wire) as b:
+            station = station_on(wire)
+            await station.find(1, 5.0)
+            b.service.cancel = lambda requester: True  # type: ignore[method-assign]
+            assert (await station.cancel()).state == "cancelled"
+
+    run_virtual(main())
+
+
+def test_a_cancel_of_nothing_says_so_while_the_last_heartbeat_still_shows_work() -> None:
+    async def main() -> None:
+        wire = StationOnTheWire()
+        async with bench(ground=wire) as b:
+            b.service.mav_state = mavlink.MAV_STATE_CALIBRATING
+            station = station_on(wire)
+            await station.find(1, 5.0)
+            outcome = await station.cancel()
+            assert (outcome.state, outcome.reason) == ("idle", "nothing was running")
+
+    run_virtual(main())
+
+
+def test_a_one_way_link_is_named() -> None:
+    async def main() -> None:
+        wire = StationOnTheWire()
+        async with bench(ground=wire) as b:
+            station = station_on(wire)
+            await station.find(1, 5.0)
+            b.wire.cut = True
+            with pytest.raises(NobodyHeardError, match="component 191 of system 1 beats, but does not answer"):
+                await station.undo()
+
+    run_virtual(main())
+
+
+def test_something_else_as_component_191_is_named() -> None:
+    async def main() -> None:
+        wire = StationOnTheWire()
+        async with bench(ground=wire) as b:
+            b.service.refusal = Refusal("other", "never")
+            station = station_on(wire)
+            await station.find(1, 5.0)
+
+            def answer(target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
+                b.link.send(
+                    mavlink.MAVLink_command_ack_message(command, mavlink.MAV_RESULT_UNSUPPORTED, 0, 0, 245, 190)
+                )
+
+            wire.send_command = answer  # type: ignore[method-assign]
+            outcome = await station.calibrate(What.BOTH, None, reboot=False)
+            assert outcome.state == "refused"
+            assert "is it a companion?" in outcome.reason
+
+    run_virtual(main())
+
+
+def test_with_two_vehicles_on_the_link_nobody_guesses() -> None:
+    async def main() -> None:
+        for chosen in (None, 2):
+            wire = StationOnTheWire()
+            for system_id in (1, 2):
+                beat(wire, system_id, 191, mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID)
+                beat(wire, system_id, 1, mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4)
+            station = station_on(wire)
+            if chosen is None:
+                with pytest.raises(ConfigError, match="systems 1, 2 are heard: say which with --system N"):
+                    await station.find(chosen, 5.0)
+            else:
+                await station.find(chosen, 5.0)
+                assert station.vehicle.system_id == chosen
+
+    run_virtual(main())
+
+
+def test_looking_for_it_has_an_end() -> None:
+    async def main() -> None:
+        wire = StationOnTheWire()
+        beat(wire, 1, 1, mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4)
+        begun_s = asyncio.get_running_loop().time()
+        with pytest.raises(NobodyHeardError, match="only system 1"):
+            await station_on(wire).find(None, 3.0)
+        assert 3.0 <= asyncio.get_running_loop().time() - begun_s <= 3.2
+
+    run_virtual(main())

@@ -1,0 +1,480 @@
+"""Saved noise profiles: files that survive, names that are taken, and one line for every mistake; and the command."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.telemetry.imu_messages import ARDUPILOT
+from companion.cli import main as companion
+from companion.config import parse
+from companion.config.sections import Config, Noise
+from companion.configured import models
+from companion.configured.profiles import Profiles
+from companion.errors import ConfigError, StorageError
+from companion.estimation.noise.allan import PROFILES, AllanModel, noise_profile
+from companion.lab.logs.log_files import read_logs
+from companion.recording.files import Beginning, RecordingFile
+from companion.recording.messages import IMU, MAVLINK, ImuState, Message, encode
+from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, check_name, saved_profile
+from companion.storage.state import MOST_BYTES, sealed, unsealed
+from sim.__main__ import main as simulator
+from tests.support.made_noise import DEG_H, adis16405, write_csv
+from tests.unit.daemon.test_plan import CALIBRATION
+
+GYRO = AllanModel(7e-5, 2e-5, 1e-6)
+ACCEL = AllanModel(5e-4, 2e-4, 1e-5)
+SMALLEST = '[mavlink]\nurl = "udpin:127.0.0.1:1"\n[[imu]]\nname = "fc"\nsource = "autopilot"\nprofile = "{}"\n'
+
+
+def saved(name: str = "mine", **changes: Any) -> SavedProfile:
+    source = Source(file="a.csv", began_at=None, still_s=5400.0, temperature_degc=(20.0, 21.5))
+    profile = SavedProfile(
+        format_version=FORMAT_VERSION, name=name, saved_at="2026-11-21T10:00:00+00:00", imu="fc", gyro=GYRO,
+        accel=ACCEL, kept_from="unknown", kept=("gyro K",), sources=(source,),
+    )  # fmt: skip
+    return msgspec.structs.replace(profile, **changes)
+
+
+# --- files
+
+
+def test_a_profile_comes_back_as_it_was(tmp_path: Path) -> None:
+    store = ProfileStore(tmp_path)
+    assert store.names() == []
+    path = store.write(saved())
+    assert path == tmp_path / "profiles" / "mine.json"
+    assert (store.names(), store.read("mine")) == (["mine"], saved())
+    store.write(saved(kept=()))
+    assert store.read("mine").kept == ()
+    assert [entry.name for entry in path.parent.iterdir()] == ["mine.json"]
+
+
+def changed(**changes: Any) -> Callable[[bytes], bytes]:
+    """As another version, or somebody by hand, would have it."""
+    return lambda data: sealed(json.dumps(json.loads(unsealed(data)) | changes).encode())
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda data: data[: len(data) // 2], "truncated"),
+        (lambda _: b"", "truncated"),
+        (lambda _: b"\x00\xff" * 40, "not a readable profile"),
+        (lambda _: b"[1, 2]", "not a readable profile"),
+        (lambda data: data.replace(b'"mine"', b'"nine"'), "its checksum does not fit: damaged, or changed by hand"),
+        (lambda data: data + b" " * MOST_BYTES, f"more than {MOST_BYTES} bytes"),
+        (changed(format_version=2), "found format 2; allowed: up to 1 (a newer companion has saved it)"),
+        (changed(name="other"), "it is of 'other'"),
+        (changed(gyro={"white": -1.0, "flicker": 0.0, "walk": 0.0}), "allowed: N above 0"),
+        (changed(gyro={"white": 0.0, "flicker": 0.0, "walk": 0.0}), "allowed: N above 0"),
+        (changed(accel={"white": 1.0}), "missing required field"),
+        (changed(gyro="loud"), "Expected `object`"),
+    ],
+)
+def test_a_damaged_or_newer_one_is_refused_in_one_line(
+    tmp_path: Path, damage: Callable[[bytes], bytes], words: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = ProfileStore(tmp_path)
+    path = store.write(saved())
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(StorageError) as caught:
+        store.read("mine")
+    assert words in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    # The configuration that names it is refused, in one line that says where.
+    with pytest.raises(ConfigError) as refused:
+        parse(SMALLEST.format("mine"), "x.toml", lambda _, name: saved_profile(tmp_path, name))
+    assert str(refused.value).startswith("x.toml: 'imu[0].profile': found 'mine', a saved profile: ")
+    assert words in str(refused.value)
+    # All but the daemon's own start, which no file may prevent: then with the figures of the worst parts, and a word.
+    config = parse(SMALLEST.format("mine"), "x.toml", lambda _, name: saved_profile(tmp_path, name, forgiving=True))
+    assert str(Profiles(config).status()[0]["summary"]).startswith("mine, which cannot be used")
+    instead, worst = noise_profile(config.imu[0].profile), noise_profile(None)
+    assert (instead.gyro, instead.accel) == (worst.gyro, worst.accel)
+    (said,) = caplog.messages
+    assert words in said
+
+
+@pytest.mark.parametrize("name", ["own", "my-imu_2.b", "a" * 40])
+def test_names_that_are_taken(name: str) -> None:
+    check_name(name)
+
+
+@pytest.mark.parametrize(
+    "name", ["", "A", "../x", ".hidden", "a b", "a/b", "a" * 41, "bmi088", "icm-42688-p", "ICM42688P", "unknown"]
+)
+def test_names_that_are_not(tmp_path: Path, name: str) -> None:
+    with pytest.raises(StorageError, match="allowed"):
+        ProfileStore(tmp_path).write(saved(name))
+    assert not (tmp_path / "profiles").exists()
+
+
+# --- in the configuration
+
+
+def test_a_saved_name_brings_its_figures_along(tmp_path: Path) -> None:
+    store = ProfileStore(tmp_path)
+    store.write(saved())
+    config = parse(SMALLEST.format("mine"), "x.toml", lambda _, name: saved_profile(tmp_path, name))
+    profile = config.imu[0].profile
+    assert isinstance(profile, Noise)
+    noise = noise_profile(profile)
+    assert (noise.name, noise.gyro, noise.accel) == ("mine", GYRO, ACCEL)
+    (shown,) = Profiles(config).status()
+    assert shown["summary"] == "mine, learned from 1.5 h at rest in 1 recording, saved 2026-11-21"
+    # As a recording takes it along: a replay elsewhere has the figures.
+    assert msgspec.json.decode(msgspec.json.encode(config), type=Config) == config
+
+
+def test_the_catalogue_wins_and_is_not_looked_up() -> None:
+    def never(_: Path, name: str) -> str:
+        raise AssertionError("looked for saved profiles")
+
+    for name in PROFILES:
+        assert parse(SMALLEST.format(name), "x.toml", never).imu[0].profile == name
+
+
+@pytest.mark.parametrize(("name", "near"), [("mime", "mine"), ("bmi08", "bmi088")])
+def test_an_unknown_name_is_refused_with_the_nearest_of_both(tmp_path: Path, name: str, near: str) -> None:
+    store = ProfileStore(tmp_path)
+    store.write(saved())
+    with pytest.raises(ConfigError) as caught:
+        parse(SMALLEST.format(name), "x.toml", lambda _, name: saved_profile(tmp_path, name))
+    text = str(caught.value)
+    assert text.startswith(f"x.toml: 'imu[0].profile': found {name!r}; allowed: \"icm42688p\", ")
+    assert text.endswith(f"did you mean {near!r}?")
+    assert '"mine"' in text
+
+
+def test_who_only_asks_the_daemon_does_not_look() -> None:
+    assert parse(SMALLEST.format("mine"), "x.toml", lambda _, name: name).imu[0].profile == "mine"
+
+
+def test_figures_are_not_written_into_the_file() -> None:
+    table = SMALLEST.format("x").replace('"x"', '{name = "x", gyro = [1.0, 1.0, 1.0], accel = [1.0, 1.0, 1.0]}')
+    with pytest.raises(ConfigError, match=r"'imu\[0\]\.profile': found a table; allowed: \"icm42688p\""):
+        parse(table, "x.toml")
+
+
+# --- the command
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, dict[str, Any], str]:
+    code = companion(["profile", "--json", *map(str, arguments)])
+    said = capsys.readouterr()
+    return code, json.loads(said.out) if said.out else {}, said.err
+
+
+@pytest.fixture(scope="module")
+def half_hour(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    t_s, readings = adis16405(1800, 8, seed=3)
+    return write_csv(tmp_path_factory.mktemp("logs") / "half_hour.csv", t_s, readings)
+
+
+def test_learned_saved_and_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[str], half_hour: Path) -> None:
+    code, answer, _ = run(capsys, half_hour, "--save", "mine", "--storage", tmp_path)
+    assert (code, answer["state"]) == (0, "done")
+    assert answer["file"] == str(tmp_path / "profiles" / "mine.json")
+    (imu,) = answer["imus"]
+    assert imu["still_s"] == pytest.approx(1798, abs=8)
+    assert {each["mean_s"] for each in imu["coverage"]} == {10, 30, 60}
+    (used,) = imu["used"]
+    assert used["seconds"] == pytest.approx(1800, abs=1)
+    assert sum(each["to_s"] - each["from_s"] for each in used["stretches"]) == pytest.approx(1798, abs=8)
+    profile = ProfileStore(tmp_path).read("mine")
+    assert profile.gyro.white / DEG_H == pytest.approx(150.0, rel=0.08)
+    assert (profile.sources[0].file, profile.imu) == ("half_hour.csv", "imu")
+    toml = tmp_path / "x.toml"
+    toml.write_text(SMALLEST.format("mine") + f'[storage]\ndirectory = "{tmp_path}"\n', encoding="utf-8")
+    config = parse(toml.read_text(encoding="utf-8"), "x.toml", saved_profile)
+    assert noise_profile(config.imu[0].profile).gyro == profile.gyro
+    # Whose figures they are, for `companion status`.
+    (shown,) = Profiles(config).status()
+    assert (shown["imu"], shown["name"], shown["fitted"]) == (config.imu[0].name, "mine", True)
+    assert shown["file"] == str(tmp_path / "profiles" / "mine.json")
+    assert str(shown["summary"]).startswith("mine, learned from 0.5 h at rest in 1 recording, saved ")
+    # A log is replayed with it, and compared with it, by its name or as a file, wherever that lies.
+    elsewhere = tmp_path / "from a laptop.json"
+    elsewhere.write_bytes((tmp_path / "profiles" / "mine.json").read_bytes())
+    short = tmp_path / "short.csv"
+    short.write_text("".join(half_hour.read_text().splitlines(keepends=True)[:600]), encoding="utf-8")
+    sigmas = {}
+    for wanted in ("mine", str(elsewhere), "adis16405", "ADIS-16405"):
+        assert companion(["-c", str(toml), "replay", str(short), "--json", "--profile", wanted]) == 0
+        sigmas[wanted] = json.loads(capsys.readouterr().out)["imus"][0]["gyro_sigma_use_rad_s"]
+    assert sigmas["mine"] == sigmas[str(elsewhere)] != sigmas["adis16405"] == sigmas["ADIS-16405"]
+    code, answer, _ = run(capsys, "-c", toml, half_hour, "--profile", "mine")
+    assert (code, answer["imus"][0]["compared"]["name"]) == (0, "mine")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "code", "words"),
+    [
+        (
+            "mein",
+            2,
+            "--profile: found mein; allowed: icm42688p, bmi088, adis16470, adis16405, unknown, damaged, mine, or",
+        ),
+        ("mein", 2, "did you mean 'mine'?"),
+        ("./mine.json", 1, "mine.json: cannot be read: No such file or directory"),
+        ("mine.json", 1, "mine.json: cannot be read: No such file or directory"),
+        ("damaged", 1, "damaged.json: not a readable profile: "),
+    ],
+)
+@pytest.mark.parametrize("command", ["replay", "profile"])
+def test_a_profile_that_is_not_there_is_one_line(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+    wanted: str,
+    code: int,
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ProfileStore(tmp_path).write(saved("mine"))
+    (tmp_path / "profiles" / "damaged.json").write_text("{", encoding="utf-8")
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    log = write_csv(tmp_path / "a.csv", *adis16405(30, 20, 1))
+    # Without a configuration: a laptop has none.
+    assert companion([command, str(log), "--profile", wanted]) == code
+    said = capsys.readouterr()
+    assert words in said.err
+    assert said.err.count("\n") == 1
+
+
+def test_the_table_says_what_it_found(capsys: pytest.CaptureFixture[str], half_hour: Path) -> None:
+    assert companion(["profile", str(half_hour), "--profile", "adis16405", "--skip", "60"]) == 0
+    said = capsys.readouterr().out
+    for words in (
+        "imu imu: 0.48 h at rest in 1 recording",
+        "gyro x, deg/h",
+        "gyro: adis16405                     152.0             29.0",
+        "used of half_hour.csv: ",
+        "note: too short to tell gyro K",
+    ):
+        assert words in said
+
+
+def test_a_log_of_the_simulator_can_be_learned_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "rest.csv"
+    assert simulator(["rest", str(path), "--part", "bmi088", "--hours", "0.1", "--rate-hz", "20"]) == 0
+    capsys.readouterr()
+    code, answer, _ = run(capsys, path, "--profile", "bmi088")
+    assert code == 0
+    # 20 Hz and steps of 1/16.4 deg/s: they add to N.
+    assert answer["imus"][0]["profile"]["gyro"]["white"] / DEG_H == pytest.approx(37.0, rel=0.15)
+
+
+def test_the_part_at_rest_is_named_and_lines_left_out_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two minutes at rest, half a minute in the hand, a line without a number; the clock began at 500 s."""
+    t_s, readings = adis16405(150, 20, seed=2)
+    readings[2400:, :3] += np.random.default_rng(1).normal(0.0, 0.5, (600, 3))
+    readings[7, 3] = np.nan
+    path = write_csv(tmp_path / "a.csv", t_s + 500.0, readings)
+    code, answer, _ = run(capsys, path)
+    assert code == 0
+    (used,) = answer["imus"][0]["used"]
+    (stretch,) = used["stretches"]
+    assert 0.0 <= stretch["from_s"] <= 2.0
+    assert 118.0 <= stretch["to_s"] <= 121.0
+    assert used["left_out"] == {"without a number in each of gx, gy, gz, ax, ay, az": 1}
+    assert any("were not at rest and are left out (gyro" in note for note in answer["imus"][0]["notes"])
+    assert companion(["profile", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert f"used of a.csv: {stretch['from_s']:.0f} to {stretch['to_s']:.0f} s, of 150 s" in said
+    assert "left out: 1 lines without a number in each of" in said
+
+
+def test_sessions_are_tested_on_one_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [write_csv(tmp_path / f"{seed}.csv", *adis16405(400, 8, seed)) for seed in (4, 5)]
+    code, answer, _ = run(capsys, *paths)
+    assert code == 0
+    (imu,) = answer["imus"]
+    assert imu["recordings"] == ["4.csv", "5.csv"]
+    # Of each the windows of one session of 398 s, not of its halves.
+    (last,) = [each for each in imu["coverage"] if (each["triad"], each["mean_s"]) == ("gyro", 60)]
+    assert last["minutes"] == 2 * (398 // 120)
+
+
+def test_a_profile_that_does_not_keep_its_word_is_not_saved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The first hour is quiet, in the second something comes and goes: its halves do not foretell one another."""
+    t_s, readings = adis16405(5400, 4, seed=6)
+    jumps = np.where(t_s > 2700.0, np.floor(t_s / 47.0) % 2.0, 0.0)
+    readings[:, 3] += 0.02 * jumps
+    readings[:, 4] += 0.02 * jumps
+    readings[:, 5] += 0.02 * jumps
+    path = write_csv(tmp_path / "jumps.csv", t_s, readings)
+    code, answer, err = run(capsys, path, "--save", "mine", "--storage", tmp_path)
+    assert (code, answer["state"], answer["file"]) == (1, "refused", None)
+    assert answer["reason"].startswith("not saved: accel: only ")
+    assert answer["reason"] in err
+    assert not (tmp_path / "profiles").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "code", "words"),
+    [
+        ("t_s,gx\n1,2\n", [], 1, "line 1: no column for gx, gy, gz, ax, ay, az in t_s, gx"),
+        ("", [], 1, "the file is empty"),
+        (None, [], 1, "No such file"),
+        (None, ["--save", "bmi088"], 1, "that name is the catalogue's"),
+        (None, ["--profile", "bmi08"], 2, "did you mean 'bmi088'?"),
+        ("short", [], 1, "imu imu: only 28 s at rest; a profile needs 60 s"),
+        ("short", ["--imu", "fc"], 1, "imu fc: only 28 s at rest"),
+    ],
+)
+def test_every_mistake_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str | None, more: list[str], code: int, words: str
+) -> None:
+    path = tmp_path / "a.csv"
+    if text == "short":
+        write_csv(path, *adis16405(30, 20, 1))
+    elif text is not None:
+        path.write_text(text, encoding="utf-8")
+    assert companion(["profile", str(path), *more]) == code
+    said = capsys.readouterr()
+    assert words in said.err
+    assert said.err.count("\n") == 1
+    assert said.out == ""
+
+
+def test_a_table_that_numpy_cannot_read_is_read_line_by_line(tmp_path: Path, half_hour: Path) -> None:
+    lines = half_hour.read_text(encoding="utf-8").splitlines()
+    plain = tmp_path / "plain.csv"
+    plain.write_text("\n".join(lines[:200]) + "\n", encoding="utf-8")
+    odd = tmp_path / "odd.csv"
+    rows = ['"' + '";"'.join(line.split(",")) + '"' for line in lines[:200]]
+    odd.write_text(
+        "# a remark\n\n" + "\r\n".join([*rows[:50], "", "# another", *rows[50:]]) + "\n9.9", encoding="utf-8"
+    )
+    (one,), (other,) = read_logs([plain]), read_logs([odd])
+    np.testing.assert_array_equal(one.t_s, other.t_s)
+    np.testing.assert_array_equal(one.readings, other.readings)
+    assert np.isnan(one.temperature_degc).all()
+
+
+def test_a_last_line_that_may_be_cut_does_not_count(tmp_path: Path, half_hour: Path) -> None:
+    lines = half_hour.read_text(encoding="utf-8").splitlines()[:200]
+    path = tmp_path / "cut.csv"
+    # Cut in its last number, which is one all the same.
+    path.write_text("\n".join(lines)[:-2], encoding="utf-8")
+    (log,) = read_logs([path])
+    assert len(log.t_s) == len(lines) - 2
+
+
+# --- recordings of our own
+
+
+def recording(
+    path: Path,
+    t_s: list[float],
+    imu: str,
+    message: str = "HIGHRES_IMU",
+    unix_s: float = 1.7e9,
+    written_s: float | None = None,
+) -> Path:
+    """A recording of noise; at `written_s` the daemon wrote offsets, which moved the gyros by 100 deg/h."""
+    config = parse(SMALLEST.format("bmi088"), "x.toml")
+    (instance, kind) = next(
+        (instance, each.kind) for instance, all_ in ARDUPILOT.items() for each in all_ if each.kind.message == message
+    )
+    state = ImuState(
+        sender=(1, 1),
+        firmware="ardupilot",
+        instance=instance,
+        message=message,
+        input=models.imu_input(config.imu[0], kind),
+        calibration=CALIBRATION,
+    )
+    rng, sender = np.random.default_rng(1), mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    entries: list[Message] = []
+    for t in t_s:
+        gyro, accel = rng.normal(0.0, 1e-3, 3).tolist(), (rng.normal(0.0, 0.02, 3) - [0.0, 0.0, 9.8]).tolist()
+        if written_s is not None and t >= written_s:
+            gyro[1] += 100.0 * DEG_H
+        if t in {t_s[0], written_s}:
+            entries.append((IMU + imu, t, encode(state)))
+        device_s = t - 90.0
+        degc = mavlink.MAVLink_scaled_imu_message(round(device_s * 1e3), 0, 0, -1000, 0, 0, 0, 0, 0, 0, 2500)
+        (ax, ay, az), (gx, gy, gz) = accel, gyro
+        floats = mavlink.MAVLink_highres_imu_message(
+            round(device_s * 1e6), ax, ay, az, gx, gy, gz, 0, 0, 0, 0, 0, 0, 0, fields_updated=63
+        )
+        second = mavlink.MAVLink_scaled_imu2_message(round(device_s * 1e3), 0, 0, -1000, 0, 0, 0, 0, 0, 0, 2500)
+        data = b"".join(bytes(each.pack(sender)) for each in (degc, floats, second))
+        entries.append((MAVLINK, t, data))
+    file = RecordingFile(path)
+    file.write(entries, Beginning(t_s[0] if t_s else 0.0, round(unix_s * 1e9), msgspec.json.encode(config), ()))
+    file.close()
+    return path
+
+
+def seconds(start: int, end: int) -> list[float]:
+    return [k / 8.0 for k in range(8 * start, 8 * end)]
+
+
+def test_recordings_that_follow_on_each_other_are_one_session(tmp_path: Path) -> None:
+    first = recording(tmp_path / "1.mcap", seconds(100, 150), "fc", "HIGHRES_IMU")
+    second = recording(tmp_path / "2.mcap", seconds(150, 200), "fc", "HIGHRES_IMU")
+    later = recording(tmp_path / "3.mcap", seconds(150, 200), "fc", "HIGHRES_IMU", unix_s=1.8e9)
+    one, two = read_logs([later, second, first])
+    assert (one.files, two.files) == (("1.mcap", "2.mcap"), ("3.mcap",))
+    assert (one.t_s[0], one.t_s[-1], len(one.t_s)) == (100.0, 199.875, 800)
+    assert one.profile == "bmi088"
+    assert one.began_at == "2023-11-14T22:15:00+00:00"
+    assert (one.temperature_degc == 25.0).all()
+
+
+def test_a_recording_is_learned_from_and_compared_with_its_own_profile(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = recording(tmp_path / "1.mcap", seconds(100, 180), "fc")
+    code, answer, _ = run(capsys, path)
+    assert code == 0
+    (imu,) = answer["imus"]
+    assert (imu["name"], imu["compared"]["name"], imu["temperature_degc"]) == ("fc", "bmi088", [25.0, 25.0])
+    assert imu["profile"]["gyro"]["white"] == pytest.approx(1e-3 / 8.0**0.5, rel=0.3)
+    code, _, err = run(capsys, path, "--imu", "own")
+    assert code == 1
+    assert "no IMU 'own' in these files; there are: fc" in err
+
+
+def test_written_offsets_are_no_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A step of 100 deg/h would be flicker of that size; where it was is in the recording."""
+    path = recording(tmp_path / "1.mcap", seconds(100, 1300), "fc", written_s=700.0)
+    (log,) = read_logs([path])
+    assert [(log.t_s[part][0], log.t_s[part][-1]) for part in log.pieces()] == [(100.0, 699.875), (700.0, 1299.875)]
+    assert [(log.t_s[part][0], log.t_s[part][-1]) for part in log.pieces(650.0)] == [(750.0, 1299.875)]
+    code, answer, _ = run(capsys, path)
+    assert code == 0
+    (imu,) = answer["imus"]
+    # White noise of 73 deg/h sqrt(s) in both parts, and nothing else by more than chance.
+    still = imu["axes"][1]["fit"]
+    assert not still["known"][1]
+    assert still["figures"][1] < 10.0 * DEG_H
+
+
+def test_whole_thousandths_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = recording(tmp_path / "1.mcap", seconds(100, 180), "fc", "SCALED_IMU2")
+    code, answer, err = run(capsys, path)
+    assert (code, answer["state"]) == (1, "failed")
+    assert "imu fc: it was recorded in whole mrad/s and mg" in err
+
+
+def test_a_recording_without_an_imu_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = recording(tmp_path / "none.mcap", [], "fc")
+    code, _, err = run(capsys, path)
+    assert code == 1
+    assert "no samples of an IMU in it" in err

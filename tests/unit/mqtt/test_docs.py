@@ -1,0 +1,62 @@
+"""docs/mqtt.md names every topic and every key, and its examples are understood."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from companion.config import parse
+from companion.mqtt.requests import KEYS, Request
+from companion.mqtt.requests import parse as parse_request
+from companion.mqtt.topics import Topics
+
+DOCS = (Path(__file__).parents[3] / "docs" / "mqtt.md").read_text(encoding="utf-8")
+ROWS = dict(re.findall(r"^\| `([a-z/]+)` \|(.*)\|$", DOCS, re.MULTILINE))
+
+
+def test_every_topic_has_its_row_and_no_other() -> None:
+    topics = Topics("x")
+    ours = {topics.status, topics.state, topics.record, topics.progress, topics.attitude}
+    ours |= {topics.request + command for command in KEYS} | {topics.response + command for command in KEYS}
+    assert {f"x/{row}" for row in ROWS} == ours
+
+
+@pytest.mark.parametrize("command", list(KEYS))
+def test_the_examples_of_requests_are_taken_and_show_every_key(command: str) -> None:
+    (example,) = re.findall(r"`(\{.*\})`", ROWS[f"request/{command}"])
+    request = parse_request(command, example.encode())
+    assert isinstance(request, Request)
+    assert set(request.content) == set(KEYS[command])
+    assert request.transaction is not None
+
+
+def test_the_examples_are_json() -> None:
+    examples = [example for row in ROWS.values() for example in re.findall(r"`(\{[^`]*\})`", row)]
+    assert len(examples) > 8
+    for example in examples:
+        json.loads(example.replace(", ...}", "}").replace("{...}", "{}").replace("[...]", "[]"))
+
+
+SAMPLE = (Path(__file__).parents[3] / "systemd" / "companion.toml").read_text(encoding="utf-8")
+
+
+def _shown_in_docs() -> str:
+    (shown,) = re.findall(r"```toml\n(.*?)```", DOCS, re.DOTALL)
+    return re.sub(r"^# ", "", shown, flags=re.MULTILINE)
+
+
+def _shown_in_sample() -> str:
+    (shown,) = re.findall(r"^#\[mqtt\]\n.*?\n$", SAMPLE, re.DOTALL | re.MULTILINE)
+    lines = [line[1:] for line in shown.splitlines() if re.match(r"#[\[\w]", line)]
+    return "\n".join(lines).replace("tls = false", "tls = true")
+
+
+@pytest.mark.parametrize("shown", [_shown_in_docs(), _shown_in_sample()], ids=["docs", "sample"])
+def test_the_configuration_shown_is_accepted_with_every_key(shown: str) -> None:
+    config = parse('[mavlink]\nurl="tcp:h:1"\n[[imu]]\nname="a"\nsource="autopilot"\n' + shown, "shown")
+    assert config.mqtt is not None
+    assert set(tomllib.loads(shown)["mqtt"]) == set(config.mqtt.__struct_fields__)

@@ -1,0 +1,230 @@
+"""What is handed out: the wheel, and what the Debian package and the BlueOS extension are made from.
+
+The Debian package itself is built and tried out in a clean root by `make deb-test`. An image is built nowhere here: its
+Dockerfile is read by a parser of others, and its labels are held against what BlueOS expects of them.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import json
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+from dockerfile_parse import DockerfileParser
+
+import companion
+from tests.support.installed import unit_environment
+
+PROJECT = Path(__file__).resolve().parents[3]
+DEB = PROJECT / "packaging/deb"
+BLUEOS = PROJECT / "packaging/blueos"
+PYPROJECT = tomllib.loads((PROJECT / "pyproject.toml").read_text())
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, as `pip install .` builds it, without the network."""
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    built = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+def test_the_wheel_has_every_file_of_the_companion_and_of_the_service(wheel: Path) -> None:
+    def below(folder: str) -> set[str]:
+        files = (path for path in (PROJECT / folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+        return {str(path.relative_to(PROJECT)) for path in files}
+
+    service = {f"companion/installation/{name}" for name in below("systemd")}
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    assert len(service) >= 4
+    assert "companion/lua/companion_arming.lua" in names
+    assert {name for name in names if ".dist-info/" not in name} == below("companion") | service
+
+
+def test_an_installed_wheel_needs_nothing_of_the_checkout(wheel: Path, tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(home)], check=True)
+    pip = [sys.executable, "-m", "pip", "--python", str(home / "bin/python"), "--disable-pip-version-check"]
+    subprocess.run([*pip, "install", "-q", "--no-deps", "--no-index", str(wheel)], check=True)
+    (packages,) = (home / "lib").glob("python*/site-packages")
+    # What it depends on is that of these tests. An editable companion among it has a .pth, not followed from here.
+    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+
+    def run(*words: str) -> str:
+        command = [str(home / "bin/companion"), *words]
+        done = subprocess.run(command, cwd=tmp_path, env={}, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    where = subprocess.run(
+        [home / "bin/python", "-c", "import companion; print(companion.__file__)"],
+        cwd=tmp_path, env={}, capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    assert where.startswith(str(packages))
+    assert run("--version") == f"companion {companion.__version__}\n"
+    assert run("lua") == (PROJECT / "companion/lua/companion_arming.lua").read_text()
+    root = tmp_path / "root"
+    run("install-service", "--root", str(root), "--prefix", "/usr")
+    unit = (root / "usr/lib/systemd/system/companion.service").read_text()
+    assert f"\nExecStart={home}/bin/companion -c " in unit
+
+
+def test_the_versions_agree() -> None:
+    assert PYPROJECT["project"]["version"] == companion.__version__
+    assert labels()["version"] == companion.__version__
+
+
+# --- the Debian package
+
+
+def test_the_package_takes_the_units_as_they_are() -> None:
+    home = re.search(r'^HOME: Final = "(.+)"$', (DEB / "build_deb.py").read_text(), re.MULTILINE)
+    assert home is not None
+    for name, words in (
+        ("companion.service", "-c /etc/companion/companion.toml run"),
+        ("companion-setup.service", "setup --page 0.0.0.0:8191"),
+    ):
+        assert f"\nExecStart=/{home[1]}/bin/companion {words}\n" in (PROJECT / "systemd" / name).read_text()
+
+
+@pytest.mark.parametrize("script", ["preinst", "postinst", "prerm", "postrm"])
+def test_the_maintainer_scripts_are_shell(script: str) -> None:
+    lines = (DEB / script).read_text().splitlines()
+    assert lines[0] == "#!/bin/sh"
+    assert "set -e" in lines
+    subprocess.run(["/bin/sh", "-n", str(DEB / script)], check=True)
+
+
+@pytest.mark.parametrize("script", ["preinst", "postinst"])
+def test_a_step_that_dpkg_may_invent_is_let_pass(script: str, tmp_path: Path) -> None:
+    command = ["/bin/sh", str(DEB / script), "unheard-of"]
+    done = subprocess.run(command, env={"PATH": str(tmp_path)}, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_nothing_of_its_owners_is_in_the_package() -> None:
+    # It would be overwritten by the next version; the configuration is written by `companion setup`.
+    assert re.findall(r'"(etc/[^"]+)"', (DEB / "build_deb.py").read_text()) == []
+
+
+# --- the extension for BlueOS
+
+
+def dockerfile(**arguments: str) -> DockerfileParser:
+    return DockerfileParser(path=str(BLUEOS / "Dockerfile"), env_replace=True, build_args=arguments)
+
+
+def labels(**arguments: str) -> dict[str, str]:
+    return dict(dockerfile(**arguments).labels)
+
+
+def test_the_container_has_the_units_settings_of_the_c_library() -> None:
+    ours = {name: value for name, value in dockerfile().envs.items() if name.startswith("MALLOC_")}
+    assert ours == {name: value for name, value in unit_environment().items() if name.startswith("MALLOC_")}
+    assert ours
+
+
+def test_the_labels_are_what_blueos_expects() -> None:
+    found = labels()
+    kinds = {"authors": list, "company": dict, "tags": list, "links": dict, "permissions": dict}
+    parsed = {name: json.loads(found[name]) for name in kinds}
+    assert {name: type(value) for name, value in parsed.items()} == kinds
+    assert found["type"] in {"device-integration", "example", "theme", "tool", "other"}
+    assert re.fullmatch(r"core >= \d+(\.\d+)*", found["requirements"])
+    assert len(parsed["tags"]) <= 10
+    assert all(re.fullmatch(r"[a-z0-9-]+", tag) for tag in parsed["tags"])
+    assert set(parsed["company"]) == {"name", "about", "email"}
+
+
+def test_whoever_publishes_the_extension_can_say_who_he_is() -> None:
+    authors = [{"name": "Somebody", "email": "somebody@example.invalid"}]
+    links = {"website": "https://example.invalid/companion"}
+    found = labels(AUTHORS=json.dumps(authors), LINKS=json.dumps(links), README="https://example.invalid/README.md")
+    assert json.loads(found["authors"]) == authors
+    assert json.loads(found["links"]) == links
+    assert found["readme"] == "https://example.invalid/README.md"
+
+
+def test_the_extension_may_open_serial_ports_and_nothing_more() -> None:
+    permissions = json.loads(labels()["permissions"])
+    assert set(permissions) == {"StopTimeout", "HostConfig"}
+    host = permissions["HostConfig"]
+    assert not host.get("Privileged")
+    # Documentation/admin-guide/devices.txt of the kernel: ttyS, ttyACM, ttyUSB, ttyAMA.
+    assert host["DeviceCgroupRules"] == [f"c {major}:* rw" for major in (4, 166, 188, 204)]
+    unit = (PROJECT / "systemd/companion.service").read_text()
+    assert f"TimeoutStopSec={permissions['StopTimeout']}\n" in unit
+    assert f"MemoryMax={host['Memory'] // 2**20}M\n" in unit
+    kept = {bind.split(":")[1] for bind in host["Binds"]} - {"/dev"}
+    environment = dockerfile().envs
+    assert kept == {"/etc/companion", environment["STATE_DIRECTORY"]}
+
+
+def test_the_paths_of_the_dockerfile_are_there_and_let_into_the_build() -> None:
+    ignored = (BLUEOS / "Dockerfile.dockerignore").read_text().split()
+    assert ignored[0] == "*"
+    let_in = [line.removeprefix("!") for line in ignored if line.startswith("!")]
+    sources = []
+    for instruction in dockerfile().structure:
+        if instruction["instruction"] == "COPY" and "--from=" not in instruction["value"]:
+            *names, _ = instruction["value"].split()
+            sources += names
+    assert len(sources) >= 6
+    for name in sources:
+        assert (PROJECT / name).exists()
+        assert any(fnmatch.fnmatch(name, pattern) for pattern in let_in), name
+    # What is installed is what is locked, for parts that there are.
+    locks = set(re.findall(r"-r /src/requirements/([a-z]+)\.txt", (BLUEOS / "Dockerfile").read_text()))
+    assert locks >= {"build", "runtime"}
+    assert locks - {"build", "runtime"} <= set(PYPROJECT["project"]["optional-dependencies"])
+    # All that the build of the wheel reads is copied.
+    needed = {"pyproject.toml", PYPROJECT["project"]["readme"], *PYPROJECT["project"]["license-files"]}
+    needed |= set(PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"])
+    needed |= set(PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"])
+    assert needed <= set(sources)
+
+
+def test_the_extension_starts_with_a_configuration_and_keeps_an_edited_one(tmp_path: Path) -> None:
+    script = (BLUEOS / "start").read_text()
+    for folder in ("etc/companion", "opt/companion", "bin"):
+        (tmp_path / folder).mkdir(parents=True)
+    for place in ("/etc/", "/opt/"):
+        script = script.replace(place, f"{tmp_path}{place}")
+    (tmp_path / "opt/companion/companion.toml").write_text("# sample\n")
+    fake = tmp_path / "bin/companion"
+    fake.write_text('#!/bin/sh\necho "$@"\n')
+    fake.chmod(0o755)
+    path = f"{tmp_path}/bin:{Path(shutil.which('cp') or '').parent}"
+    configuration = tmp_path / "etc/companion/companion.toml"
+
+    def start() -> tuple[str, str]:
+        done = subprocess.run(["/bin/sh", "-c", script], env={"PATH": path}, capture_output=True, text=True, check=True)
+        return done.stdout, done.stderr
+
+    out, words = start()
+    assert out == f"-c {configuration} run\n"
+    assert "this is the sample configuration" in words
+    assert configuration.read_text() == "# sample\n"
+    configuration.write_text("# mine\n")
+    assert start() == (out, "")
+    assert configuration.read_text() == "# mine\n"
+
+
+def test_the_router_of_blueos_takes_the_place_of_the_serial_line() -> None:
+    edit = re.search(r"RUN sed '([^']+)' (\S+) > \S+", (BLUEOS / "Dockerfile").read_text())
+    assert edit is not None
+    source = PROJECT / edit[2].removeprefix("/src/")
+    edited = subprocess.run(["sed", edit[1], str(source)], capture_output=True, text=True, check=True).stdout
+    assert tomllib.loads(edited)["mavlink"]["url"] == "tcp:127.0.0.1:5777"

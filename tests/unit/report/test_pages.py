@@ -1,0 +1,495 @@
+"""What stands on the pages, read by an independent parser."""
+
+from __future__ import annotations
+
+import datetime
+import html
+import itertools
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.cli import main
+from companion.estimation.records.record import Magnetic
+from companion.lab.report import calibration_page as calibration
+from companion.lab.report.calibration_page import calibration_page
+from companion.lab.report.source import material
+from companion.physics.units import DEG_H, MG
+from companion.report import page, svg
+from companion.samples import Vector
+from companion.storage.records import RecordStore
+from tests.support.histories import a_season, arming, imu_record, record, white_trace
+
+NOW = datetime.datetime(2026, 6, 1, 12, 0, tzinfo=datetime.UTC)
+LARGEST = 500_000
+VOID = {"meta", "br"}
+
+
+class Page(HTMLParser):
+    """Collects what a page holds; fails on tags that do not match."""
+
+    def __init__(self, content: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.shown: dict[str, str] = {}
+        self.exact: dict[str, list[float]] = {}
+        self._key: str | None = None
+        self.feed(content)
+        self.close()
+        assert self.open == []
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag in VOID:
+            return
+        self.open.append(tag)
+        held = dict(attrs)
+        if held.get("data-key"):
+            self._key = held["data-key"]
+        if tag == "data" and self._key is not None:
+            self.exact.setdefault(self._key, []).append(float(held["value"] or "nan"))
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+        if tag == "td":
+            self._key = None
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] == "style":
+            return
+        self.words.append(data)
+        if self._key is not None:
+            self.shown[self._key] = self.shown.get(self._key, "") + data
+
+
+def _store(folder: Path) -> RecordStore:
+    return RecordStore(folder)
+
+
+def _calibration(folder: Path, wanted: str | None = None) -> str:
+    return calibration_page(material(folder, wanted), NOW)
+
+
+def test_the_figures_are_those_of_the_record(tmp_path: Path) -> None:
+    one = record()
+    _store(tmp_path).save(one, white_trace(one))
+    found = Page(_calibration(tmp_path))
+    for imu in one.imus:
+        for triad, unit, columns in (
+            ("gyro", DEG_H, (imu.gyro_bias_rad_s, imu.gyro_sigma_use_rad_s, imu.gyro_sigma_stat_rad_s)),
+            ("accel", MG, (imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, imu.accel_sigma_stat_m_s2)),
+        ):
+            for column, values in zip(("bias", "sigma_use", "sigma_stat"), columns, strict=True):
+                assert values is not None
+                for axis, value in zip("xyz", values, strict=True):
+                    key = f"{imu.name}.{triad}.{column}.{axis}"
+                    assert found.exact[key] == [value]
+                    shown = float(found.shown[key].strip("±"))
+                    assert shown == pytest.approx(value / unit, rel=0.06 if "sigma" in column else 0.02)
+    for parameter, written in one.imus[0].written.items():
+        assert found.exact[f"{parameter}.after"] == [written.after]
+        assert found.exact.get(f"{parameter}.before", [None]) == [written.before]
+        assert float(found.shown[f"{parameter}.after"].removeprefix("after")) == pytest.approx(written.after, rel=1e-5)
+        assert f"{parameter}: {written.outcome}" in found.text.replace(" :", ":")
+    assert "before unknown" in found.text
+    assert one.pose is not None
+    assert found.exact["pose.theta"] == [one.pose.theta_deg, one.pose.sigma_deg.theta]
+    assert found.exact["pose.psi"] == [one.pose.psi_deg, one.pose.sigma_deg.psi]
+    assert one.site is not None
+    assert found.exact["site.gravity"] == [one.site.gravity_m_s2]
+    assert "DONE" in found.text
+    assert one.reason in found.text
+
+
+def test_how_good_the_compass_heading_can_be_is_one_line(tmp_path: Path) -> None:
+    found = Magnetic(
+        heading_bound_deg=6.24,
+        heading_from="field",
+        field_gauss=0.5731,
+        field_expected_gauss=0.5507,
+        inclination_deg=-59.04,
+        inclination_expected_deg=-59.5,
+        device_minus_field_deg=None,
+        wander_deg=0.12,
+    )
+    words = (
+        "heading good to 6.2 deg, worked out from its field and the gradienter, field 0.573 gauss (the Earth's 0.551),"
+        " inclination -59.0 deg (the Earth's -59.5), wandered 0.1 deg"
+    )
+    assert found.in_words() == words
+    _store(tmp_path).save(msgspec.structs.replace(record(), magnetic=found))
+    assert f"Compass: {words}." in Page(_calibration(tmp_path)).text
+    nothing = msgspec.structs.replace(found, heading_bound_deg=180.0, field_gauss=None, inclination_deg=None)
+    assert nothing.in_words().startswith("shows no heading here, worked out")
+    bare = msgspec.structs.replace(nothing, heading_bound_deg=None, heading_from="device", wander_deg=None)
+    assert bare.in_words() == "heading error bound unknown"
+
+
+def test_an_axis_of_a_small_plot_has_two_ticks_at_least() -> None:
+    for width in (1.0, 1.7, 2.9, 3.4, 3.8, 6.1, 9.9):
+        for middle in (0.0, 0.3, 1.7, -40.3):
+            assert len(svg.linear([middle - width / 2.0, middle + width / 2.0], ticks=3).ticks) >= 2
+
+
+def test_the_points_of_a_plot_lie_where_their_values_are() -> None:
+    across, up = svg.linear([0.0, 10.0]), svg.linear([1.0, 100.0])
+    plot = svg.Plot(across, up, name="test", height=100.0, x_label="x")
+    plot.points([(0.0, 1.0), (5.0, 50.5), (10.0, 100.0)], "sx", spans=[(1.0, 50.5)] * 3)
+    drawn = Page(plot.svg())
+    marks = next(held["d"] or "" for tag, held in drawn.tags if tag == "path" and held["class"] == "dot sx")
+    places = [(float(x), float(y)) for x, y in re.findall(r"M(-?[\d.]+) (-?[\d.]+)", marks)]
+    # Equal steps in value are equal steps on the page, to a tenth of a unit.
+    assert places[1][0] - places[0][0] == pytest.approx(places[2][0] - places[1][0], abs=0.21)
+    assert places[1][1] - places[0][1] == pytest.approx(places[2][1] - places[1][1], abs=0.21)
+    assert places[0][1] > places[2][1]
+    bars = next(held["d"] or "" for tag, held in drawn.tags if tag == "path" and held["class"] == "bar sx")
+    low, high = re.findall(r"M[-\d.]+ ([-\d.]+)V([-\d.]+)", bars)[0]
+    assert (float(low), float(high)) == pytest.approx((places[0][1], places[1][1]), abs=0.11)
+
+
+def test_a_page_needs_nothing_else_and_stays_small(tmp_path: Path) -> None:
+    names = [f"imu {k}" for k in range(9)]
+    store = RecordStore(tmp_path)
+    for k in range(230):
+        one = record(k, imus=tuple(imu_record(name, k) for name in names), warnings=tuple(["x" * 5000] * 100))
+        store.save(one, white_trace(one, 590) if k == 229 else None)
+    content = calibration_page(material(tmp_path, None), NOW)
+    assert len(content.encode()) < LARGEST
+    found = Page(content)
+    assert "5 more IMUs are not shown" in found.text
+    assert not re.search(r"https?:|//[a-z]|url\(|@import|javascript:", content.replace("http-equiv", ""), re.IGNORECASE)
+    tags = {tag for tag, _ in found.tags}
+    assert not tags & {"script", "link", "img", "iframe", "object", "embed", "form", "base", "a", "use", "image"}
+    for _, held in found.tags:
+        assert not {"src", "href", "xlink:href", "srcset", "action"} & held.keys()
+        assert not any(name.startswith("on") for name in held)
+    policies = [held["content"] for _, held in found.tags if held.get("http-equiv") == "Content-Security-Policy"]
+    assert len(policies) == 1
+    assert (policies[0] or "").startswith("default-src 'none';")
+
+
+def test_nothing_from_a_file_becomes_a_tag(tmp_path: Path) -> None:
+    evil = '</title></style><script>alert(1)</script><img src=x onerror=alert(1)>"\' onload="x" \u202egnp\x00\x1b[2J'
+    one = record(
+        imus=(msgspec.structs.replace(imu_record(evil), warnings=(evil,)),), reason=evil, warnings=(evil,), system_id=1
+    )
+    written = {evil: next(iter(one.imus[0].written.values()))}
+    imu = msgspec.structs.replace(one.imus[0], written=written)
+    assert one.site is not None
+    one = msgspec.structs.replace(one, imus=(imu,), site=msgspec.structs.replace(one.site, source=evil), undone_at=evil)
+    failed = record(1, state="failed", reason=evil)
+    trace = white_trace(one, moved=True)
+    verdicts = tuple(
+        msgspec.structs.replace(verdict, name=evil, words=(evil,) * len(trace.second)) for verdict in trace.verdicts
+    )
+    store = RecordStore(tmp_path)
+    store.save(one, msgspec.structs.replace(trace, verdicts=verdicts))
+    store.save(failed)
+    guilty = msgspec.structs.replace(arming(one), reason=evil)
+    (tmp_path / "armings.json").write_bytes(msgspec.json.encode([guilty]))
+    for content in (
+        calibration_page(material(tmp_path, "1"), NOW),
+        calibration_page(material(tmp_path, "2"), NOW),
+    ):
+        found = Page(content)
+        assert {tag for tag, _ in found.tags} <= {
+            "html", "head", "meta", "title", "style", "body", "h1", "h2", "h3", "p", "span", "div", "section", "strong",
+            "small", "ul", "li", "table", "tr", "th", "td", "br", "data", "figure", "figcaption", "details", "summary",
+            "svg", "path", "rect", "text", "circle",
+        }  # fmt: skip
+        assert not any(name.startswith("on") for _, held in found.tags for name in held)
+        assert "<script>alert(1)</script>" in found.text  # as words
+        assert not re.search("[\x00\x1b\u202e]", content)
+
+
+def test_a_failure_says_why(tmp_path: Path) -> None:
+    failed = record(
+        state="failed", reason="not finished in the time given: hold still: gyro fc moves 0.31 deg/s, max 0.10"
+    )
+    RecordStore(tmp_path).save(failed, white_trace(failed, moved=True))
+    found = Page(_calibration(tmp_path))
+    assert "FAILED" in found.text
+    assert failed.reason in found.text
+    assert "Nothing was written to the autopilot" in found.text
+    assert "16 s to 21 s:" in found.text
+    assert "no data from gradienter for 3 s" in found.text
+    assert "35 of 50 s were still for all sensors. No result came of them." in found.text
+
+
+def test_a_record_without_its_seconds_still_gives_a_page_that_says_so(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path)
+    store.save(record(0))
+    store.save(record(1), white_trace(record(1)))
+    (tmp_path / "records" / "000002.trace.json.gz").write_bytes(b"cut")
+    old, broken = Page(_calibration(tmp_path, "1")), Page(_calibration(tmp_path, "2"))
+    assert old.text.count("Not shown: this record has no trace of its seconds") == 1
+    assert "fc.gyro.bias.x" in old.exact
+    assert "000002.trace.json.gz: not a readable trace" in broken.text
+    assert "fc.gyro.bias.x" in broken.exact
+
+
+def test_drift_shows_the_calibrations_up_to_this_one_and_rings_it(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path)
+    for k in range(8):
+        store.save(record(k, temperature_degc=10.0 + 2 * k))
+    store.save(record(8, system_id=2))
+    found = Page(_calibration(tmp_path, "6"))
+    drawn = [held["d"] or "" for tag, held in found.tags if tag == "path" and held.get("class") == "dot sx"]
+    # 2 IMUs, 2 triads.
+    assert sorted(course.count("M") for course in drawn) == [6] * 4
+    assert sum(held.get("class") == "ring" for _, held in found.tags) == 3 * 4
+
+
+def test_a_clock_that_went_back_is_said_and_order_is_used(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path)
+    for k, year in enumerate((2026, 1970, 1970)):
+        store.save(record(k, started_at=f"{year}-01-01T00:0{k}:00.000+00:00"))
+    found = Page(_calibration(tmp_path))
+    assert "The companion's clock went back in between" in found.text
+    assert "number of the calibration" in found.text
+
+
+def test_three_calibrations_of_one_hour_after_a_month_are_three_dots(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path)
+    for k, when in enumerate(("04-20T09:00", "05-23T09:02", "05-23T09:31", "05-23T10:12")):
+        store.save(record(k, started_at=f"2026-{when}:00.000+00:00"))
+    found = Page(_calibration(tmp_path))
+    (course, *_) = (held["d"] or "" for tag, held in found.tags if tag == "path" and held.get("class") == "dot sx")
+    places = [float(x) for x in re.findall(r"M([\d.]+)", course)]
+    assert len(places) == 4
+    assert min(b - a for a, b in itertools.pairwise(places)) > 20.0
+    assert "stand in their order" in found.text
+    assert "23 May 09:31" in found.text
+
+
+# -------------------------------------------------------------------------------------------------------- the command
+
+
+def test_the_command_writes_a_file_and_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a_season(tmp_path / "kept", 5)
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "kept").rglob("*")}
+    target = tmp_path / "page.html"
+    arguments = ["report", "--storage", str(tmp_path / "kept"), "-o", str(target), "--json"]
+    assert main([*arguments, "-c", str(tmp_path / "none.toml")]) == 0
+    assert json.loads(capsys.readouterr().out) == {"state": "done", "reason": "", "file": str(target)}
+    assert "Calibration 5" in Page(target.read_text()).text
+    assert main(["report", "2026-05-01 11:3", *arguments[1:-1]]) == 0
+    assert capsys.readouterr().out == f"{target}\n"
+    assert "Calibration 2 " in Page(target.read_text()).text
+    # Read-only: nothing in the storage was touched.
+    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "kept").rglob("*")}
+
+
+@pytest.mark.parametrize(
+    ("more", "reason"),
+    [
+        (["7"], "no calibration '7'; there are number 1 to 3"),
+        (["2"], "000002.json: not a readable record"),
+        (["2026"], "no calibration '2026'"),
+        (["2026-05"], "2 calibrations begin with '2026-05'; the latest are number 1, 3"),
+        (["-o", "{folder}/none/x.html"], "there is no folder "),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], reason: str
+) -> None:
+    a_season(tmp_path, 3)
+    (tmp_path / "records" / "000002.json").write_bytes(b"{")
+    assert main(["report", *(word.format(folder=tmp_path) for word in more), "--storage", str(tmp_path), "--json"]) == 1
+    said = capsys.readouterr()
+    answer = json.loads(said.out)
+    assert answer["state"] == "failed"
+    assert reason in answer["reason"]
+    assert len(said.err.splitlines()) == 1
+
+
+def test_no_record_at_all_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", "--storage", str(tmp_path), "--json"]) == 1
+    reason = json.loads(capsys.readouterr().out)["reason"]
+    assert "no calibration yet" in reason
+    assert "--storage DIR" in reason
+    (tmp_path / "records").mkdir()
+    assert main(["report", "--storage", str(tmp_path)]) == 1
+    assert "no calibration yet" in capsys.readouterr().err
+    assert main(["report", "-c", str(tmp_path / "none.toml")]) == 2
+    assert "none.toml" in capsys.readouterr().err
+
+
+def test_a_damaged_latest_record_is_named_and_the_one_before_it_taken(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a_season(tmp_path / "kept", 3)
+    (tmp_path / "kept" / "records" / "000003.json").write_bytes(b"\xff\xfe")
+    assert main(["report", "--storage", str(tmp_path / "kept"), "-o", str(tmp_path), "--json"]) == 0
+    said = capsys.readouterr()
+    answer = json.loads(said.out)
+    assert answer["file"] == str(tmp_path / "companion-report-000002.html")
+    assert "000003.json: not a readable record" in answer["reason"]
+    assert "000003.json" in said.err
+    assert "000003.json: not a readable record" in Page(Path(answer["file"]).read_text()).text
+
+
+def test_a_page_on_stdout_is_all_that_is_there(tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
+    a_season(tmp_path, 2)
+    assert main(["report", "--storage", str(tmp_path), "-o", "-"]) == 0
+    assert "Calibration 2" in Page(capfdbinary.readouterr().out.decode()).text
+    assert main(["report", "--storage", str(tmp_path), "-o", "-", "--json"]) == 2
+
+
+def test_a_folder_that_only_root_may_enter_is_not_taken_for_an_empty_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(_: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    assert main(["report", "--storage", str(tmp_path)]) == 1
+    assert "cannot be read: Permission denied; run it with sudo" in capsys.readouterr().err
+
+
+def test_damaged_armings_are_named(tmp_path: Path) -> None:
+    a_season(tmp_path, 2)
+    (tmp_path / "armings.json").write_bytes(b"[{]")
+    assert "armings.json:" in Page(_calibration(tmp_path)).text
+
+
+def test_gyros_alone_are_shown_alone(tmp_path: Path) -> None:
+    imu = msgspec.structs.replace(
+        imu_record(), accel_bias_m_s2=None, accel_sigma_stat_m_s2=None, accel_sigma_use_m_s2=None
+    )
+    RecordStore(tmp_path).save(record(imus=(imu,)))
+    found = Page(_calibration(tmp_path))
+    assert "fc.gyro.bias.z" in found.exact
+    assert "fc.accel.bias.z" not in found.exact
+    assert "Not determined: not asked for" in found.text
+
+
+def test_what_was_held_back_is_not_shown_as_in_force(tmp_path: Path) -> None:
+    imu = msgspec.structs.replace(imu_record(), held_back=("accel",))
+    RecordStore(tmp_path).save(record(imus=(imu, imu_record("own", 1))))
+    assert Page(_calibration(tmp_path)).text.count("Held back: measured, not written.") == 1
+
+
+_floats = st.floats(allow_nan=False, allow_infinity=False)
+_axes = st.tuples(_floats, _floats, _floats)
+_times = st.one_of(st.datetimes().map(lambda t: t.isoformat()), st.text(max_size=30))
+
+
+_COLUMNS = (
+    "gyro_bias_rad_s", "gyro_sigma_stat_rad_s", "gyro_sigma_use_rad_s",
+    "accel_bias_m_s2", "accel_sigma_stat_m_s2", "accel_sigma_use_m_s2",
+)  # fmt: skip
+
+
+@settings(max_examples=25)
+@given(
+    axes=st.lists(_axes, min_size=6, max_size=6),
+    temperatures=st.lists(st.none() | _floats, min_size=3, max_size=3),
+    started=st.lists(_times, min_size=3, max_size=3),
+    words=st.text(),
+)
+def test_whatever_a_record_holds_gives_pages(
+    axes: list[Vector], temperatures: list[float | None], started: list[str], words: str
+) -> None:
+    records = []
+    for k, (temperature, at) in enumerate(zip(temperatures, started, strict=True)):
+        columns = dict(zip(_COLUMNS, axes[k:] + axes[:k], strict=True))
+        imu = msgspec.structs.replace(imu_record(), name=words, temperature_degc=temperature, **columns)
+        records.append((k, record(k, imus=(imu,), started_at=at, reason=words)))
+    last = records[-1][1]
+    one = calibration.Material(
+        number=2, record=last, trace=white_trace(last, 12), no_trace="", earlier=records, armings=[],
+        damaged=[words],
+    )  # fmt: skip
+    drawn = [held for tag, held in Page(calibration_page(one, NOW)).tags if tag in {"path", "rect", "circle", "text"}]
+    assert not any(re.search("nan|inf", str(value)) for held in drawn for key, value in held.items() if key != "class")
+
+
+# ---------------------------------------------------------------------------------------------------------- a browser
+
+CHROMIUM = shutil.which("chromium")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_browser_shows_it_on_a_phone_without_scrolling_sideways(tmp_path: Path, scheme: str) -> None:
+    a_season(tmp_path / "kept", 8)
+    content = calibration_page(material(tmp_path / "kept", None), NOW)
+    # Windows cannot be as narrow as a phone, and the page forbids scripts: it is looked at inside of another one.
+    probe = """<!DOCTYPE html><html style="color-scheme: light dark"><title>unseen</title>
+    <iframe width="390" height="3000" style="border: 0" sandbox="allow-same-origin" srcdoc="%s"></iframe><script>
+        window.onload = () => {
+            const inside = document.querySelector("iframe").contentDocument, cut = [];
+            for (const words of inside.querySelectorAll("svg text")) {
+                const inner = words.getBoundingClientRect(), outer = words.closest("svg").getBoundingClientRect();
+                if (inner.left < outer.left - 1 || inner.right > outer.right + 1) cut.push(words.textContent);
+            }
+            document.title = "WIDE=" + inside.documentElement.scrollWidth + " CUT=" + cut.length + " " + cut +
+                " BG=" + getComputedStyle(inside.body).backgroundColor;
+        };
+    </script>"""
+    path = tmp_path / "one.html"
+    path.write_text(probe % html.escape(content))
+    done = subprocess.run(
+        [
+            str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
+            "--disable-background-networking", "--disable-component-update", "--disable-sync",
+            f"--blink-settings=preferredColorScheme={0 if scheme == 'dark' else 1}",
+            f"--user-data-dir={tmp_path / 'profile'}", "--window-size=390,3000", "--dump-dom", path.as_uri(),
+        ],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    found = re.search(r"<title>WIDE=(\d+) CUT=(\d+) ([^<]*) BG=([^<]*)</title>", done.stdout)
+    assert found is not None, done.stderr[-2000:]
+    assert int(found[1]) <= 390
+    assert int(found[2]) == 0, f"cut off: {found[3]}"
+    assert found[4] == ("rgb(13, 13, 13)" if scheme == "dark" else "rgb(255, 255, 255)")
+
+
+def test_light_and_dark_text_have_contrast_for_sunlight() -> None:
+    """WCAG 2 contrast: 7:1 for text, 4.5:1 for what is drawn, on the page and on its cards."""
+    roots = [root for style in page._STYLES for root in re.findall(r":root\{([^}]*)\}", style.read_text())[:2]]
+    for scheme in (0, 1):
+        colours = dict(re.findall(r"--(\w+):#([0-9a-f]+)", "".join(roots[scheme::2])))
+        for ground in ("bg", "card"):
+            for ink, least in {"fg": 15.0, "soft": 7.0, "x": 4.5, "y": 4.0, "z": 4.5, "bad": 6.0, "good": 6.0}.items():
+                assert _contrast(colours[ink], colours[ground]) >= least, (ink, ground, colours)
+
+
+def _contrast(a: str, b: str) -> float:
+    def luminance(colour: str) -> float:
+        full = colour if len(colour) == 6 else "".join(2 * one for one in colour)
+        shares = [int(full[k : k + 2], 16) / 255 for k in (0, 2, 4)]
+        linear = [share / 12.92 if share <= 0.04045 else ((share + 0.055) / 1.055) ** 2.4 for share in shares]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    bright, dim = sorted((luminance(a), luminance(b)), reverse=True)
+    return (bright + 0.05) / (dim + 0.05)
+
+
+@pytest.mark.parametrize("every_s", [600.0, 86400.0 * 3.0, 86400.0 / 3.0], ids=["minutes", "days", "some a day"])
+def test_dates_below_a_plot_do_not_stand_in_one_another(every_s: float) -> None:
+    """A letter takes 7 of the 310 that are there."""
+    axis = svg.in_order([1.7e9 + every_s * k for k in range(26)])
+    assert len(axis.ticks) >= 3
+    letters = [len(label) for _, label in axis.ticks]
+    apart = 310.0 * (axis.ticks[1][0] - axis.ticks[0][0]) / (axis.high - axis.low)
+    assert max(letters) * 7.0 <= apart
+    assert len({label for _, label in axis.ticks}) == len(letters)

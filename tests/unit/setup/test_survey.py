@@ -1,0 +1,129 @@
+"""What was heard where, and what that says of a configuration that is there already."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from companion import cli, config
+from companion.links.mavlink.listening import HeardUdp
+from companion.links.serial.listening import Heard
+from companion.protocols.guess import Candidate, Line
+from companion.protocols.heartbeat import Heartbeat
+from companion.setup import keeping
+from companion.setup.draft import Draft
+from companion.setup.survey import FoundDevice, Survey, same_url
+from tests.unit.setup.test_document import OWN
+
+PX4, STATION = Heartbeat(1, 1, 2, 12), Heartbeat(255, 190, 6, 8)
+SILENT = Heard(None, None, None, 0)
+
+
+def test_autopilots_on_wires_come_first_and_stations_are_none() -> None:
+    found = Survey(
+        {"/dev/a": Heard(Line(921600, "none"), None, "MAVLink", 900, PX4), "/dev/b": SILENT, "/dev/c": "in use"},
+        {
+            14540: HeardUdp(14540, (PX4,), 3, from_here=True),
+            14550: HeardUdp(14550, (STATION,), 9, from_here=False),
+            14551: HeardUdp(14551, (PX4, STATION), 9, from_here=False),
+        },
+    )
+    urls = [one.url for one in found.autopilots]
+    assert urls == ["serial:/dev/a:921600", "udpin:127.0.0.1:14540", "udpin:0.0.0.0:14551"]
+
+
+def test_what_somebody_holds_is_not_silent(tmp_path: Path) -> None:
+    held, quiet, alias, other = (tmp_path / name for name in ("held", "quiet", "alias", "other"))
+    for path in (held, quiet, other):
+        path.touch()
+    alias.symlink_to(quiet)
+    found = Survey({str(held): "in use by another program", str(quiet): SILENT}, {14540: "in use", 14550: _nobody()})
+    assert [found.silent(str(path)) for path in (held, quiet, alias, other)] == [False, True, True, False]
+    assert found.silent(str(tmp_path / "gone"))
+    assert not found.silent("tcp://box:4000")
+    urls = (
+        "udpin:0.0.0.0:14540",
+        "udpin:0.0.0.0:14550",
+        "udpin:0.0.0.0:14551",
+        "tcp:box:5760",
+        f"serial:{alias}:57600",
+    )
+    assert [found.silent_url(url) for url in urls] == [False, True, False, False, True]
+
+
+def _nobody() -> HeardUdp:
+    return HeardUdp(14550, (), 0, from_here=True)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("udpin:127.0.0.1:14550", "udpin:0.0.0.0:14550", True),
+        ("udpin:127.0.0.1:14550", "udpin:127.0.0.1:14551", False),
+        ("udpin:127.0.0.1:14550", "udpout:127.0.0.1:14550", False),
+        ("tcp:a:5760", "tcp:b:5760", False),
+        ("serial:/dev/x:57600", "serial:/dev/x:57600", True),
+        ("serial:/dev/x:57600", "serial:/dev/x:921600", False),
+    ],
+)
+def test_urls_are_compared_by_where_they_lead(one: str, other: str, same: bool) -> None:
+    assert same_url(one, other) is same
+
+
+def test_a_device_that_works_as_it_is_gets_no_further_keys() -> None:
+    """A configuration that leaves the speed to the protocol stays as its owner wrote it."""
+    draft = Draft(OWN, is_new=False)
+    assert draft.lines == {"/dev/tilt": Line(9600, "none")}
+    draft.take(FoundDevice("/dev/tilt", "inclinometer_xy", Line(9600, "none"), "gradienter"))
+    assert draft.result() == OWN
+    draft.take(FoundDevice("/dev/tilt", "inclinometer_xy", Line(2400, "none"), "gradienter"))
+    assert "baud = 2400\n" in draft.result()
+    assert "parity" not in draft.result()
+
+
+def test_of_two_devices_of_a_kind_both_are_told() -> None:
+    def heard(protocol: str) -> Heard:
+        return Heard(Line(9600, "none"), Candidate(protocol, ("gradienter",), 9, 0), None, 500)
+
+    found = Survey({"/dev/a": heard("inclinometer_xy"), "/dev/b": heard("jewell"), "/dev/c": SILENT}, {})
+    assert [str(one) for one in found.devices("gradienter")] == [
+        "inclinometer_xy: /dev/a, 9600 8N1",
+        "jewell: /dev/b, 9600 8N1",
+    ]
+    assert found.devices("imu") == []
+
+
+def test_the_old_file_is_kept_and_a_link_is_followed(tmp_path: Path) -> None:
+    real, link = tmp_path / "real" / "c.toml", tmp_path / "c.toml"
+    link.symlink_to(real)
+    assert keeping.put(link, keeping.sample()) is None
+    assert keeping.put(link, "first") is None, "the sample is nobody's work"
+    real.chmod(0o640)
+    assert keeping.put(link, "second") == real.with_name("c.toml.old1")
+    assert keeping.put(link, "third") == real.with_name("c.toml.old2")
+    assert link.is_symlink()
+    assert {path.name: path.read_text() for path in real.parent.iterdir()} == {
+        "c.toml": "third",
+        "c.toml.old1": "first",
+        "c.toml.old2": "second",
+    }
+    assert {path.stat().st_mode & 0o777 for path in real.parent.iterdir()} == {0o640}
+    assert keeping.holds(link, "third")
+    assert not keeping.holds(tmp_path / "none", "third")
+
+
+def test_where_nothing_can_be_written_that_is_said_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert keeping.is_writable(tmp_path / "not" / "yet" / "there.toml")
+    monkeypatch.setattr("os.access", lambda *_: False)
+    missing = tmp_path / "c.toml"
+    assert cli.main(["-c", str(missing), "setup", "--yes"]) == 1
+    assert "is not yours to write: sudo companion setup" in capsys.readouterr().err
+    # The daemon's own start says the same with its own code: nobody is asked what cannot be kept.
+    monkeypatch.setattr(config, "DEFAULT_PATH", missing)
+    assert cli.main(["run"]) == 2
+    assert (
+        capsys.readouterr().err == f"{missing}: no such file: companion setup makes it (or give another with -c FILE)\n"
+    )

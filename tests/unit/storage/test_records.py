@@ -1,0 +1,314 @@
+"""What must survive a power cut: whole or not at all, whatever step fails."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from companion.errors import StorageError
+from companion.estimation.collector.trace import Trace
+from companion.estimation.records.record import GyroPrior, ImuRecord, Prior, Record, WrittenParameter, to_json
+from companion.storage import records as records_module
+from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
+from companion.storage.lock import only_daemon
+from companion.storage.records import RecordStore
+from companion.storage.state import remove_durably, write_atomically
+
+
+def _record(reason: str) -> Record:
+    imu = ImuRecord(
+        name="fc",
+        samples=6000,
+        temperature_degc=None,
+        gyro_bias_rad_s=(1e-4, -2e-4, 0.1 + 0.2),
+        gyro_sigma_stat_rad_s=(1e-6, 1e-6, 1e-6),
+        gyro_sigma_use_rad_s=(1e-5, 1e-5, 1e-5),
+        accel_bias_m_s2=None,
+        accel_sigma_stat_m_s2=None,
+        accel_sigma_use_m_s2=None,
+        covariance=None,
+        residual_gyro_rad_s=None,
+        residual_accel_m_s2=None,
+        written={"INS_GYROFFS_X": WrittenParameter(before=0.0, after=1e-4, read_back=1e-4, outcome="verified")},
+    )
+    return Record(
+        state="done",
+        reason=reason,
+        warnings=(),
+        started_at="2026-05-01T10:00:00+00:00",
+        duration_s=12.0,
+        pose=None,
+        site=None,
+        imus=(imu,),
+    )
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace", "fdopen"])
+def test_a_failure_at_any_step_leaves_the_old_content(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    path = tmp_path / "state.json"
+    write_atomically(path, b"old")
+
+    def fail(*args: object) -> Any:
+        if step == "fdopen":
+            os.close(int(str(args[0])))
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(StorageError, match=r"state\.json: cannot be written: No space left on device"):
+        write_atomically(path, b"new")
+    monkeypatch.undo()
+    assert path.read_bytes() == b"old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["state.json"]
+
+
+def test_order_is_content_then_name_then_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[str] = []
+    real_fsync, real_replace = os.fsync, os.replace
+
+    def fsync(descriptor: int) -> None:
+        steps.append("folder" if os.path.isdir(f"/proc/self/fd/{descriptor}") else "content")
+        real_fsync(descriptor)
+
+    def replace(old: str, new: str) -> None:
+        steps.append("name")
+        real_replace(old, new)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", replace)
+    write_atomically(tmp_path / "x", b"1")
+    assert steps == ["content", "name", "folder"]
+
+
+_WRITER = """
+import sys, pathlib
+from companion.storage.state import write_atomically
+path, n = pathlib.Path(sys.argv[1]), 0
+while True:
+    n += 1
+    write_atomically(path, b"%d\\n" % n * 20000)
+    print(n, flush=True)
+"""
+
+
+def test_kill_9_at_any_moment_leaves_a_whole_file(tmp_path: Path) -> None:
+    path = tmp_path / "state"
+    for rounds in (1, 3, 7, 12):
+        with subprocess.Popen([sys.executable, "-c", _WRITER, str(path)], stdout=subprocess.PIPE) as writer:
+            assert writer.stdout is not None
+            for _ in range(rounds):
+                said = int(writer.stdout.readline())
+            writer.send_signal(signal.SIGKILL)
+        lines = path.read_bytes().split()
+        assert len(lines) == 20000
+        assert len(set(lines)) == 1
+        assert int(lines[0]) >= said
+
+
+def test_records_come_back_newest_first_and_whole(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path)
+    assert store.history() == []
+    saved = [_record(f"number {n}") for n in range(12)]
+    for record in saved:
+        store.save(record)
+    assert RecordStore(tmp_path).history() == saved[::-1]
+    assert RecordStore(tmp_path).history(limit=3) == saved[:8:-1]
+
+
+def test_a_damaged_record_is_passed_over_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store = RecordStore(tmp_path)
+    store.save(_record("good"))
+    store.save(_record("cut")).write_bytes(b'{"format_version": 1, "st')
+    assert [record.reason for record in store.history()] == ["good"]
+    assert "000002.json: not a readable record" in caplog.text
+
+
+def test_a_record_of_a_newer_companion_is_refused_in_one_line(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path)
+    store.save(_record("newer")).write_bytes(b'{"format_version": 2, "reason": ["of", "another", "type"]}')
+    found = next(store.entries())
+    assert found.record is None
+    assert found.problem.endswith("found format 2; allowed: up to 1 (a newer companion has saved it)")
+
+
+def test_a_record_with_keys_that_were_removed_since_is_read(tmp_path: Path) -> None:
+    """`by_model` stood in `prior` where a fleet's statistics had taken part."""
+    gyro = GyroPrior(
+        used=True,
+        power_ups=5,
+        temperature_model=False,
+        expected_rad_s=(1e-4, 0.0, 0.0),
+        sigma_rad_s=(1e-5, 1e-5, 1e-5),
+        measured_rad_s=(1e-4, 0.0, 0.0),
+        shift_sigma=(0.0, 0.0, 0.0),
+    )
+    record = _record("of before")
+    imu = msgspec.structs.replace(record.imus[0], prior=Prior(gyro=gyro, accel=None))
+    record = msgspec.structs.replace(record, imus=(imu,))
+    store = RecordStore(tmp_path)
+    before = to_json(record).replace(b'"shift_sigma"', b'"by_model":true,"shift_sigma"')
+    assert b'"by_model"' in before
+    store.save(record).write_bytes(before)
+    assert store.history() == [record]
+
+
+def test_a_record_that_was_changed_is_passed_over_and_one_from_before_there_were_checksums_is_not(
+    tmp_path: Path,
+) -> None:
+    store = RecordStore(tmp_path)
+    store.save(_record("of before")).write_bytes(to_json(_record("of before")) + b"\n")
+    path = store.save(_record("changed"))
+    path.write_bytes(path.read_bytes().replace(b'"duration_s":12.0', b'"duration_s":19.0'))
+    assert [record.reason for record in store.history()] == ["of before"]
+    assert next(store.entries()).problem.endswith("damaged, or changed by hand")
+
+
+def test_numbers_of_records_go_on_beyond_six_digits(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path)
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "999999.json").write_bytes(b"")
+    for reason in ("first", "second"):
+        store.save(_record(reason))
+    assert [record.reason for record in store.history()] == ["second", "first"]
+
+
+def test_a_folder_in_the_place_of_an_old_record_costs_no_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(records_module, "KEEP", 1)
+    (tmp_path / "records" / "000001.json").mkdir(parents=True)
+    store = RecordStore(tmp_path)
+    store.save(_record("new"))
+    assert [record.reason for record in store.history()] == ["new"]
+    assert "000001.json: cannot be removed: " in caplog.text
+
+
+def test_old_records_make_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(records_module, "KEEP", 3)
+    store = RecordStore(tmp_path)
+    for n in range(5):
+        store.save(_record(str(n)))
+    assert [record.reason for record in store.history()] == ["4", "3", "2"]
+    assert len(list((tmp_path / "records").iterdir())) == 3
+
+
+def _trace(record: Record) -> Trace:
+    return Trace(
+        started_at=record.started_at, second=(-1, 0), good=(True, False), measured=None, cut=False, verdicts=()
+    )
+
+
+def test_what_was_seen_lies_beside_its_record_and_goes_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(records_module, "KEEP", 4)
+    monkeypatch.setattr(records_module, "KEEP_TRACES", 2)
+    store = RecordStore(tmp_path)
+    for n in range(6):
+        record = _record(str(n))
+        store.save(record, _trace(record) if n != 4 else None)
+    entries = list(store.entries())
+    assert [entry.number for entry in entries] == [6, 5, 4, 3]
+    assert [store.trace(entry) for entry in entries] == [_trace(_record("5")), None, None, None]
+    assert len(list((tmp_path / "records").iterdir())) == 4 + 1
+    assert [record.reason for record in store.history()] == ["5", "4", "3", "2"]
+
+
+def test_a_trace_without_its_record_is_never_taken_for_the_next_ones(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path)
+    first = _record("first")
+    # The power went between the two files.
+    store.save(first, _trace(first)).unlink()
+    store.save(_record("second"))
+    (entry,) = store.entries()
+    assert store.trace(entry) is None
+
+    other = tmp_path / "records" / "000001.trace.json.gz"
+    assert not other.exists()
+    (tmp_path / "elsewhere").mkdir()
+    RecordStore(tmp_path / "elsewhere").save(first, msgspec.structs.replace(_trace(first), started_at="2020"))
+    other.write_bytes((tmp_path / "elsewhere/records/000001.trace.json.gz").read_bytes())
+    with pytest.raises(StorageError, match="belongs to the calibration of 2020"):
+        store.trace(entry)
+
+
+@pytest.mark.parametrize("damage", ["cut", "garbage", "empty", "bomb"])
+def test_a_damaged_trace_is_named(tmp_path: Path, damage: str) -> None:
+    store = RecordStore(tmp_path)
+    record = _record("good")
+    store.save(record, _trace(record))
+    path = tmp_path / "records" / "000001.trace.json.gz"
+    whole = path.read_bytes()
+    bomb = gzip.compress(b" " * (records_module.MAX_TRACE_BYTES + 1))
+    path.write_bytes({"cut": whole[:-20], "garbage": b"\x00\xff" * 40, "empty": b"", "bomb": bomb}[damage])
+    (entry,) = store.entries()
+    assert entry.record == record
+    with pytest.raises(StorageError, match=r"000001\.trace\.json\.gz: not a readable trace"):
+        store.trace(entry)
+
+
+def test_the_record_is_kept_where_its_trace_cannot_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(path: Path, data: bytes) -> None:
+        if "trace" in path.name:
+            raise StorageError(f"{path}: cannot be written: No space left on device")
+        write_atomically(path, data)
+
+    monkeypatch.setattr(records_module, "write_atomically", refuse)
+    store, record = RecordStore(tmp_path), _record("good")
+    store.save(record, _trace(record))
+    assert store.history() == [record]
+    assert "No space left on device; the record is kept without it" in caplog.text
+
+
+def test_a_storage_directory_below_a_missing_folder_is_refused(tmp_path: Path) -> None:
+    """A typing error, or a stick that is not mounted: a tree made silently would hide it."""
+    directory = tmp_path / "stick" / "state"
+    with only_daemon(directory), pytest.raises(StorageError, match=r"cannot be written: No such file or directory$"):
+        ChangeLog(directory).check_writable()
+    assert list(tmp_path.iterdir()) == []
+    directory.parent.mkdir()
+    with only_daemon(directory):
+        ChangeLog(directory).check_writable()
+    assert list(tmp_path.rglob("*")) == [directory.parent, directory]
+
+
+def test_journal_and_undo_outlive_the_process(tmp_path: Path) -> None:
+    changes = ChangeSet(1, (Changed("INS_GYROFFS_X", before=0.1, after=-0.25),))
+    log = ChangeLog(tmp_path)
+    assert log.journal.read() is None
+    log.journal.write(changes)
+    log.undo_of(1).write(Undoable(1, (changes,)))
+    assert ChangeLog(tmp_path).journal.read() == changes
+    log.journal.clear()
+    log.journal.clear()
+    assert ChangeLog(tmp_path).journal.read() is None
+    assert ChangeLog(tmp_path).undo_of(1).read() == Undoable(1, (changes,))
+
+
+def test_a_journal_that_cannot_be_understood_is_an_error_not_an_empty_one(tmp_path: Path) -> None:
+    (tmp_path / "journal.json").write_text("{")
+    with pytest.raises(StorageError, match=r"journal\.json: cannot be used"):
+        ChangeLog(tmp_path).journal.read()
+
+
+def test_removing_what_cannot_be_removed_is_said(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(StorageError, match="cannot be removed"):
+        remove_durably(tmp_path / "folder")
+
+
+def test_a_folder_that_cannot_be_written_is_found_out_before_it_matters(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="cannot be written"):
+        ChangeLog(tmp_path / "file").check_writable()
+    ChangeLog(tmp_path / "new").check_writable()
+    assert list((tmp_path / "new").iterdir()) == []
