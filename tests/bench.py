@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import binascii
-import contextlib
 import json
 import struct
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -33,8 +32,7 @@ from companion.links.mavlink.link import MavlinkLink
 from companion.protocols.registry import Kind
 from companion.samples import ImuSample
 from companion.storage.learned import BiasStore, KnownImu
-from tests import bench_attitude, bench_daemon, bench_learning, bench_reading, bench_replay, bench_start
-from tests.bench_text import against_pynmeagps
+from tests import bench_attitude, bench_daemon, bench_replay, bench_start
 from tests.support.component import ScriptedGate
 from tests.support.decoders import make_decoder
 from tests.support.frames import (
@@ -129,57 +127,6 @@ def _replay_speed(path: Path) -> float:
     return best
 
 
-class Stalls:
-    """The longest that each of the daemon's tasks has held the loop, in processor time, while calibrating.
-
-    What the daemon gives to a thread is not counted, though on virtual time it runs on the spot.
-    """
-
-    def __init__(self) -> None:
-        self.longest_s: dict[str, float] = {}
-        self._elsewhere_s = 0.0
-
-    async def offload(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        start_s = time.process_time()
-        try:
-            return function(*arguments)
-        finally:
-            self._elsewhere_s += time.process_time() - start_s
-
-    @contextlib.contextmanager
-    def watching(self) -> Iterator[None]:
-        inner = asyncio.Handle._run
-
-        def run(handle: asyncio.Handle) -> None:
-            task = getattr(getattr(handle, "_callback", None), "__self__", None)
-            start_s, elsewhere_s = time.process_time(), self._elsewhere_s
-            inner(handle)
-            spent_s = time.process_time() - start_s - (self._elsewhere_s - elsewhere_s)
-            if isinstance(task, asyncio.Task) and not task.get_name().startswith("Task-"):
-                name = task.get_name()
-                self.longest_s[name] = max(self.longest_s.get(name, 0.0), spent_s)
-
-        asyncio.Handle._run = run  # type: ignore[assignment, method-assign]
-        try:
-            yield
-        finally:
-            asyncio.Handle._run = inner  # type: ignore[method-assign]
-
-
-async def _longest_stalls(folder: Path) -> dict[str, float]:
-    """Over a calibration by itself, its record, an arming, and half a minute of keeping the verdict fresh."""
-    stalls, rig = Stalls(), Rig(folder, own_imu=True, at_arm="gate")
-    rig.offload = stalls.offload
-    with stalls.watching():
-        async with rig.running():
-            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 100.0)
-            rig.double.arm()
-            await asyncio.sleep(2.0)
-            rig.double.disarm()
-            await asyncio.sleep(30.0)
-    return stalls.longest_s
-
-
 def arm_request() -> Callable[[], object]:
     """MAV_CMD_ARM_AUTHORIZATION_REQUEST received, judged from the cache, and the COMMAND_ACK packed."""
     sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -227,16 +174,11 @@ def main() -> None:
     ):
         print(f"{words:44} {seconds_a_call(work) / base_s:12.1f}")
     print(f"{'arm authorisation, from request to answer':44} {asyncio.run(_answering()) / base_s:12.1f}")
-    against_pynmeagps()
     with tempfile.TemporaryDirectory() as folder:
         share = run_virtual(_one_calibration(Path(folder)))
         recording = run_virtual(_one_calibration(Path(folder) / "recorded", recordings_mb=64))
         speed = _replay_speed(Path(folder) / "recorded" / "recordings" / "000001.mcap")
         size, read_s, loads_s = _store(Path(folder) / "store")
-        longest_s = run_virtual(_longest_stalls(Path(folder) / "stalls"))
-    print("\nlongest hold of the loop by one task, calibrating by itself (ms; x reference):")
-    for name, held_s in sorted(longest_s.items(), key=lambda item: -item[1])[:6]:
-        print(f"  {name:42} {1e3 * held_s:6.2f} {held_s / base_s:8.0f}")
     print(f"\na calibration with simulator and daemon in one process: {share:.1%} of a core (100 Hz FC, 200 Hz serial)")
     print(f"the same while it is recorded: {recording:.1%}")
     print(f"a recording of it is replayed {speed:.0f} times as fast as it was made")
@@ -244,8 +186,6 @@ def main() -> None:
         f"biases of two years of three IMUs ({size} bytes) are read in {1e3 * read_s:.2f} ms,"
         f" {read_s / loads_s:.2f} x json.loads"
     )
-    bench_reading.main()
-    bench_learning.table()
     bench_attitude.table()
     bench_start.main()
     bench_replay.main()

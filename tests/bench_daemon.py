@@ -16,7 +16,6 @@ the rounds. The machine may be busy: what somebody else does on it moves both si
 
     python -m tests.bench_daemon                    three rounds of 20 s: some eight minutes
     python -m tests.bench_daemon --imu imu_line     with the project's own line at 200 Hz instead
-    python -m tests.bench_daemon --profile          where the daemon's time goes, by room and by function
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ from typing import Any, Final
 from companion.links.serial.port import SerialOpener
 from sim.scenario import Scenario
 from sim.serve import configuration
-from tests import bench_profile, obvious_script
+from tests import obvious_script
 from tests.bench_arming import companion_status, free_port, running
 from tests.bench_daemon_load import MESSAGES_HZ, feed_imu, feed_rest, imu_device, scenario
 
@@ -264,10 +263,10 @@ def daemon_config(load: Load, *, recording: bool) -> Path:
 
 
 @contextlib.contextmanager
-def daemon(load: Load, *, recording: bool, words: tuple[str, ...] = ("-m", "companion")) -> Iterator[int]:
+def daemon(load: Load, *, recording: bool) -> Iterator[int]:
     """The daemon's process, once it pushes attitudes: started, calibrated, aligned."""
     config, log = daemon_config(load, recording=recording), load.folder / "daemon.log"
-    command = [sys.executable, *words, "-c", str(config)]
+    command = [sys.executable, "-m", "companion", "-c", str(config)]
     with contextlib.ExitStack() as stack:
         running_daemon = stack.enter_context(running([*command, "run"], stderr=log.open("w")))
         until_s = time.monotonic() + READY_S
@@ -326,32 +325,14 @@ def _ratio(found: list[float], peer: list[float]) -> str:
     return f"{middle:.2f} ({min(by_round):.2f} to {max(by_round):.2f})"
 
 
-def profile(imu: str, seconds: float, *, recording: bool) -> None:
-    """Where the daemon's processor time goes."""
-    with loaded(imu) as load:
-        out = load.folder / "profile.json"
-        words = ("-m", "tests.bench_profile", str(out))
-        with daemon(load, recording=recording, words=words) as pid:
-            bench_profile.start(pid)
-            share, _, pushed_hz = measure(pid, load, seconds)
-            bench_profile.stop(pid, out)
-        print(f"\n{share:.2f} % of a core, {pushed_hz:.1f} attitudes/s; sampled every so often, which costs some of it")
-        bench_profile.tell(out, share)
-
-
 def main() -> None:
     options = argparse.ArgumentParser(prog="python -m tests.bench_daemon", description=__doc__)
     options.formatter_class = argparse.RawDescriptionHelpFormatter
     options.add_argument("--rounds", type=int, default=3)
     options.add_argument("--seconds", type=float, default=20.0, help="of each measurement")
     options.add_argument("--imu", choices=("vectornav", "imu_line"), default="vectornav")
-    options.add_argument("--profile", action="store_true", help="where the daemon's time goes")
-    options.add_argument("--recording", action="store_true", help="the profile, with the ring of recordings")
     given = options.parse_args()
-    if given.profile:
-        profile(given.imu, given.seconds, recording=given.recording)
-    else:
-        table(given.rounds, given.seconds, given.imu)
+    table(given.rounds, given.seconds, given.imu)
 
 
 if __name__ == "__main__":
