@@ -40,6 +40,7 @@ at_arm = "gate"
 [web]
 bind = "127.0.0.1:0"
 """
+CHILDREN: Final = {"page": "companion.web", "MQTT": "companion.mqtt"}
 PEERS: Final = {
     "floor: asyncio, msgspec, numpy and dialect": """
 import asyncio, msgspec, numpy
@@ -176,17 +177,17 @@ async def of_companion(folder: Path, calibrations: int) -> dict[str, Memory]:
             )
             async with visited(int(heard["page"]["url"].rstrip("/").rpartition(":")[2])):
                 await asyncio.sleep(SETTLED_S)
-                page_id = child_of(process_id, "companion.web")
-                found["companion, everything on, started"] = memory(process_id)
-                found["page's process, started"] = memory(page_id)
+                of = {"companion": process_id} | {
+                    f"{name}'s process": child_of(process_id, module) for name, module in CHILDREN.items()
+                }
+                found |= {f"{name}, everything on, started": memory(one) for name, one in of.items()}
                 await status_when(control, lambda now: bool(now["arming"]["verdict"] == "accept"))
                 for number in range(1, calibrations + 1):
                     next_s = asyncio.get_running_loop().time() + PERIOD_S
                     record = (await last_reply(control, {"command": "calibrate", "wait": True}))["record"]
                     assert record["state"] == "done", record["reason"]
                     await asyncio.sleep(SETTLED_S)
-                    found[f"companion, everything on, calibrations: {number}"] = memory(process_id)
-                    found[f"page's process, calibrations: {number}"] = memory(page_id)
+                    found |= {f"{name}, calibrations: {number}": memory(one) for name, one in of.items()}
                     if number < calibrations:
                         await asyncio.sleep(max(0.0, next_s - asyncio.get_running_loop().time()))
                 after = await status_when(control, lambda now: bool(now["mqtt"]["connected"]))
@@ -216,7 +217,7 @@ def table(calibrations: int = 1) -> None:
     print(f"\n{'memory (MiB)':52} {'RSS':>6} {'PSS':>6} {'USS':>6} {'most':>6}")
     for words, found in rows.items():
         print(f"{words:52} {found}")
-    resident = max(found.resident for found in ours.values())
+    resident = max(found.resident for name, found in ours.items() if name.startswith("companion"))
     print(f"limit {LIMIT_MIB:g} MiB: RSS {resident:.1f} MiB, {'held' if resident <= LIMIT_MIB else 'NOT HELD'}")
 
 
