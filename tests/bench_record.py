@@ -32,7 +32,8 @@ from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
 LIMIT_MS: Final = 50.0
-_SOLVE: Final = "Solving.solve.<locals>.<lambda>"
+_SOLVE: Final = "Estimator.solve.<locals>.<lambda>"
+_KEEP: Final = "CalibrationManager._keep.<locals>.save"
 SETTINGS: Final = """
 [push]
 parameters = false
@@ -144,7 +145,7 @@ async def _processor_s(folder: Path) -> dict[str, float]:
             assert not isinstance(job, Refusal)
             await rig.until(lambda job=job: job.words == "working out the biases" or job.finished.done(), 100.0)  # type: ignore[misc]
             await job.finished
-            for name in (_SOLVE, "Conductor._keep"):
+            for name in (_SOLVE, _KEEP):
                 least[name] = min(least.get(name, float("inf")), spent.pop(name))
     return least
 
@@ -167,7 +168,7 @@ def table(calibrations: int) -> None:
         print(f"{words:60} {took_ms[0]:6.1f} {statistics.median(took_ms):7.1f} {took_ms[-1]:6.1f}")
     print(f"{'floor: the disk alone, for a record and its trace':60} {'':6} {disk_ms:7.1f}")
     print(f"{'processor time of it: biases':60} {1e3 * processor[_SOLVE]:6.1f}")
-    print(f"{'processor time of it: record, trace and files':60} {1e3 * processor['Conductor._keep']:6.1f}")
+    print(f"{'processor time of it: record, trace and files':60} {1e3 * processor[_KEEP]:6.1f}")
     median_ms = statistics.median(own_ms)
     print(f"limit {LIMIT_MS:g} ms: median {median_ms:.1f} ms, {'held' if median_ms <= LIMIT_MS else 'NOT HELD'}; "
           f"load average {os.getloadavg()[0]:.1f}")  # fmt: skip

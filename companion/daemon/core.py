@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import datetime
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 from typing import Any, Final
 
@@ -19,8 +18,6 @@ from companion.configured.profiles import Profiles
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.machine import Machine
 from companion.estimation.means.windows import Window
-from companion.estimation.records.record import Record
-from companion.estimation.solution.draft import Draft
 from companion.estimation.solution.site import LocalEarth, local_earth
 from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
@@ -94,10 +91,6 @@ class Core:
         """Gravity and the Earth's rate where it stands, as known now."""
         found: LocalEarth = await self.offload(local_earth, models.whereabouts(self.config, self.vehicle))
         return found
-
-    def draft(self, before: Record | None = None) -> Draft:
-        """Of what is measured from now on; `before`: the calibration that is in force."""
-        return Draft(datetime.datetime.now(tz=datetime.UTC), self.vehicle.system_id, before=before)
 
     async def keep_ticking(self) -> None:
         """Tell the collector the time until cancelled: the only one in the daemon who does."""

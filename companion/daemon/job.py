@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Final
 
 import msgspec
@@ -13,9 +13,7 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.records.align_record import AlignmentRecord, FacesRecord, TurnRecord
 from companion.estimation.records.record import Record, WrittenParameter
 from companion.estimation.request import What
-from companion.estimation.solution.doubt import Doubt
 from companion.links.system.waiting import comes
-from companion.samples import Triad
 from companion.storage.changes import BY_TEMPERATURE, ChangeSet
 
 ALIGNMENT: Final = "gradienter alignment"
@@ -77,8 +75,6 @@ class Job:
         self.finished: asyncio.Future[JobResult] = asyncio.get_running_loop().create_future()
         self.product: Product | None = None
         """The record of a calibration or an alignment, or what an undo has put back."""
-        self.held_back: Mapping[tuple[str, Triad], Doubt] = {}
-        """By IMU and triad, what is measured but not written, and why: only of what nobody asked for."""
         self.words = ""
         """What is going on now, for people."""
         self.hold_still_s: int | None = None
@@ -112,14 +108,6 @@ class Job:
         """This is what came of it."""
         self.product = product
 
-    def note_armed(self) -> None:
-        """The aircraft is armed."""
-        self.was_armed = True
-
-    def hold_back(self, doubts: Mapping[tuple[str, Triad], Doubt]) -> None:
-        """This is measured and not written."""
-        self.held_back = doubts
-
     @property
     def is_running(self) -> bool:
         """Whether its end is still to come."""
@@ -148,11 +136,6 @@ class Job:
     def cancelled(self) -> bool:
         """Whether somebody has asked it to stop."""
         return self._cancelled_by is not None
-
-    def adopt(self, requester: str, deadline_s: float | None, *, reboot: bool) -> None:
-        """Somebody asks for what already runs by itself: from now on it is theirs."""
-        self.reboot |= reboot
-        self.kind, self.requester, self.deadline_s, self.automatic = "calibration", requester, deadline_s, False
 
     def cancel(self, by: str) -> None:
         """Ask it to stop at the next safe point."""

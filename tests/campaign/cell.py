@@ -276,7 +276,7 @@ class _Course:
     def _judge_rest(self, records: dict[str, bytes]) -> None:
         stage, fault = self._stage, self._fault
         now = judge.vectors(stage)
-        last = stage.service.calibrating.conductor.results.last
+        last = stage.service.calibrating.conductor.last
         done = [self._written(record) for record in stage.service.calibrating.store.history() if record.state == "done"]
         done += judge.undoable(stage)
         for words in judge.half_written(now, *self._known, *[{**now, **each} for each in done if each]):
@@ -327,12 +327,12 @@ class _Course:
                 break
             await asyncio.sleep(4.0)
         if result != ACCEPTED:
-            last = stage.service.calibrating.conductor.results.last
+            last = stage.service.calibrating.conductor.last
             self._wrong(
                 f"no calibration afterwards: {result}, {last.reason if last else None}; {stage.ground.texts()[-3:]}"
             )
             return
-        last = stage.service.calibrating.conductor.results.last
+        last = stage.service.calibrating.conductor.last
         assert last is not None
         for words in judge.off_truth(stage, last):
             self._wrong(f"afterwards: {words}")

@@ -137,13 +137,12 @@ async def _operate(stage: Stage, hour: Hour, minutes: float) -> None:
     await _to_rest(stage)
     hour.calibrations = sum(record.state == "done" for record in stage.service.calibrating.store.history())
     if await operator.ask(CALIBRATE) != ACCEPTED:
-        last = stage.service.calibrating.conductor.results.last
+        last = stage.service.calibrating.conductor.last
         hour.problems.append(f"no calibration after the hour: {last.reason if last else None}")
     else:
-        assert stage.service.calibrating.conductor.results.last is not None
+        assert stage.service.calibrating.conductor.last is not None
         hour.problems += [
-            f"after the hour: {words}"
-            for words in judge.off_truth(stage, stage.service.calibrating.conductor.results.last)
+            f"after the hour: {words}" for words in judge.off_truth(stage, stage.service.calibrating.conductor.last)
         ]
 
 

@@ -173,16 +173,14 @@ def test_what_was_calibrated_with_the_old_zero_is_calibrated_anew_by_itself(tmp_
         async with made.running():
             await made.ready()
             conductor, in_force = made.service.calibrating.conductor, made.service.arming.in_force
-            await made.until(lambda: conductor.results.last is not None and not in_force.findings(made.now_s), 200.0)
-            assert conductor.results.last is not None
-            assert conductor.results.last.alignment is None
+            await made.until(lambda: conductor.last is not None and not in_force.findings(made.now_s), 200.0)
+            assert conductor.last is not None
+            assert conductor.last.alignment is None
             assert (await aligned(made, hands, Plan("zero"))).outcome == "done"
             assert [finding.words for finding in in_force.findings(made.now_s)] == ["gradienter aligned since then"]
-            await made.until(
-                lambda: conductor.results.last is not None and conductor.results.last.alignment is not None, 150.0
-            )
+            await made.until(lambda: conductor.last is not None and conductor.last.alignment is not None, 150.0)
             await made.until(lambda: not in_force.findings(made.now_s), 60.0)
-            off_mg, sigma_mg = worst_horizontal(conductor.results.last, made)
+            off_mg, sigma_mg = worst_horizontal(conductor.last, made)
             assert sigma_mg <= TARGET_MG
             assert off_mg < 2.5 * sigma_mg
 

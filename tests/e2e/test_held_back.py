@@ -12,6 +12,7 @@ import pytest
 from companion.cli.show import monitor_lines, record_lines
 from companion.component.service import Refusal
 from companion.daemon.arming import automatic
+from companion.daemon.calibrating.run import CalibrationRun
 from companion.daemon.job import Job
 from companion.estimation.machine import State
 from companion.estimation.request import What
@@ -180,7 +181,7 @@ def test_who_asks_in_the_middle_is_not_answered_with_half_of_it(tmp_path: Path) 
             await rig.until(
                 lambda: len(rig.service.calibrating.store.history()) == 1 and conductor.state is State.VERIFYING, 150.0
             )
-            assert conductor.job is not None
+            assert isinstance(conductor.job, CalibrationRun)
             assert conductor.job.held_back
             refused = conductor.start_calibration(What.BOTH, "test")
             assert isinstance(refused, Refusal)

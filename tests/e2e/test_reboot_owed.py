@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from companion.autopilot.parameters.change import Change
-from companion.daemon.offsets.reboot_owed import RebootOwed, owed_in
+from companion.daemon.offsets.reboot import RebootOwed, owed_in
 from tests.e2e.test_calibration import calibrated, started
 from tests.support.rig import Rig, inline
 from tests.support.virtual_time import run_virtual

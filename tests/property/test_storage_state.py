@@ -11,7 +11,7 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.daemon.offsets.reboot_owed import owed_in
+from companion.daemon.offsets.reboot import owed_in
 from companion.estimation.records.record import Arming
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from companion.storage.learned import SIGNING_FILE, BiasStore, Done, alignment_in, faces_in, signing_time_in

@@ -24,7 +24,7 @@ from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.in_force import InForce
-from companion.daemon.calibrating.conductor import Conductor
+from companion.daemon.calibrating.manager import CalibrationManager
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -61,7 +61,9 @@ class AutomaticWrite(msgspec.Struct, frozen=True):
 class Automatic:
     """Starts calibrations by itself; `run` decides when."""
 
-    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, in_force: InForce) -> None:
+    def __init__(
+        self, core: Core, imus: Mapping[str, AutopilotImu], conductor: CalibrationManager, in_force: InForce
+    ) -> None:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
         self._wanted, self._only_listening = core.wanted, core.only_listening is not None
         self._imus, self._in_force = imus, in_force
@@ -77,7 +79,6 @@ class Automatic:
         """Of `run`, so that it is seen to go on."""
         self.stopped: str | None = None
         """Why it waits for a request, for people; None while it works."""
-        conductor.on_ended.add(self._on_ended)
 
     # --- may it
 
@@ -163,7 +164,8 @@ class Automatic:
 
     # --- what comes of it
 
-    def _on_ended(self, job: Job, result: JobResult) -> None:
+    def on_ended(self, job: Job, result: JobResult) -> None:
+        """Count an automatic calibration, and decide when the next one may start."""
         if job.kind in NO_CALIBRATION:
             return
         now_s = asyncio.get_running_loop().time()

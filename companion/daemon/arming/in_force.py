@@ -19,11 +19,12 @@ from companion.autopilot.firmware.firmwares import outcomes_of
 from companion.component.service import JobResult
 from companion.config.sections import Config, Imu
 from companion.configured import models
+from companion.daemon.arming.held_back import HeldBack
 from companion.daemon.arming.offset_watch import OffsetWatch
 from companion.daemon.biases.memory import BiasMemory
-from companion.daemon.calibrating.conductor import Conductor
-from companion.daemon.calibrating.held_back import HeldBack, Key
-from companion.daemon.calibrating.solver import Solver
+from companion.daemon.calibrating.estimator import Estimator
+from companion.daemon.calibrating.manager import CalibrationManager
+from companion.daemon.calibrating.run import CalibrationRun, Key
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
@@ -62,11 +63,16 @@ class InForce:
     """The calibration in force; `poll` often, `measure` whenever there may be a new window."""
 
     def __init__(
-        self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, solver: Solver, memory: BiasMemory
+        self,
+        core: Core,
+        imus: Mapping[str, AutopilotImu],
+        conductor: CalibrationManager,
+        estimator: Estimator,
+        memory: BiasMemory,
     ) -> None:
         self._core, self._config, self._conductor = core, core.config, conductor
         config = core.config
-        self._imus, self._solver, self._memory = imus, solver, memory
+        self._imus, self._estimator, self._memory = imus, estimator, memory
         wanted = config.calibration
         self._limits = Limits(
             max_age_s=60.0 * wanted.max_age_min, max_temperature_change_k=wanted.max_temperature_change_degc
@@ -93,8 +99,7 @@ class InForce:
         self.calibration: Record | None = None
         """The last finished calibration of this run, while at least one of its values is in force."""
         self.undone = False
-        conductor.on_ended.add(self._on_ended)
-        solver.alignment.on_change.add(self._realigned)
+        estimator.alignment.on_change.add(self._realigned)
 
     # --- what is known
 
@@ -134,7 +139,7 @@ class InForce:
     @property
     def earlier(self) -> Record | None:
         """The last calibration, be it of before this start, if it was good and has not been undone."""
-        return None if self.undone else self._conductor.results.good
+        return None if self.undone else self._conductor.last_good
 
     @property
     def worth_writing_s(self) -> float:
@@ -184,7 +189,7 @@ class InForce:
 
     # --- what happens
 
-    def _on_ended(self, job: Job, result: JobResult) -> None:
+    def on_ended(self, job: Job, result: JobResult) -> None:
         """A calibration or an undo has come to its end: what the autopilot has now is of our doing."""
         self._forget()
         self.offsets.on_ended(job, result)
@@ -195,7 +200,7 @@ class InForce:
                 self._held_back.let_go()
                 self._held = dict.fromkeys(self._held, Why.UNDONE)
             return
-        if done and job.record is not None:
+        if done and isinstance(job, CalibrationRun) and job.record is not None:
             self.undone = False
             self.calibration = job.record
             for imu in job.record.imus:
@@ -287,7 +292,7 @@ class InForce:
         self._measured_s = window.end_s
         known = self.offsets.known()
         try:
-            solution, _ = await self._solver.solve(window, self.what)
+            solution, _ = await self._estimator.solve(window, self.what)
         except CalibrationRefusedError:
             self._forget()
             return True

@@ -17,11 +17,11 @@ from companion.component.service import ArmAnswer
 from companion.config.sections import AtArm
 from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.in_force import InForce
-from companion.daemon.calibrating.conductor import Conductor
+from companion.daemon.calibrating.manager import CalibrationManager
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core
 from companion.daemon.offsets.effect import LOOK_S
-from companion.daemon.offsets.reboot_owed import RebootOwed
+from companion.daemon.offsets.reboot import RebootOwed
 from companion.estimation.machine import State
 from companion.estimation.records.validity import Why
 from companion.physics.units import DEG_H, MG
@@ -71,7 +71,7 @@ MOVED_S: Final = 4.0
 class Forecast:
     """Of the write that the conductor does."""
 
-    def __init__(self, core: Core, conductor: Conductor) -> None:
+    def __init__(self, core: Core, conductor: CalibrationManager) -> None:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
         self._min_still_s = core.config.calibration.min_still_s
         self._promised: tuple[object, float] | None = None
@@ -126,7 +126,7 @@ class Readiness:
     """The arm gate's answer, and what goes with it: `run` keeps it fresh."""
 
     def __init__(
-        self, core: Core, owed: RebootOwed, conductor: Conductor, in_force: InForce, automatic: Automatic
+        self, core: Core, owed: RebootOwed, conductor: CalibrationManager, in_force: InForce, automatic: Automatic
     ) -> None:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
         self._wanted, self._on_deck = core.wanted, core.config.vehicle.platform == "deck"

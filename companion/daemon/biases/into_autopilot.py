@@ -18,8 +18,7 @@ from companion.daemon.biases.memory import LOOK_K, BiasMemory
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import CurvesWritten, Job
-from companion.daemon.offsets.conclusion import Conclusion
-from companion.daemon.offsets.plan import Plan, Target, left_in
+from companion.daemon.offsets.plan import Plan, Target, WriteLog, left_in
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.measuring import Measuring
 from companion.errors import CalibrationRefusedError
@@ -40,10 +39,9 @@ class IntoAutopilot:
         measuring: Measuring,
         memory: BiasMemory,
         offsets: Offsets,
-        conclusion: Conclusion,
     ) -> None:
         self._core, self._imus, self._measuring, self._memory = core, imus, measuring, memory
-        self._pusher, self._ledger, self._conclusion = offsets.pusher, offsets.ledger, conclusion
+        self._path, self._ledger = offsets.write_path, offsets.ledger
 
     def why_not(self) -> str | None:
         """Why nothing could be written; None where all is well."""
@@ -73,24 +71,24 @@ class IntoAutopilot:
             CompanionError: it failed, and why; the old values are back, or it is said which are not.
             JobCancelledError: cancelled; likewise.
         """
-        draft = self._core.draft()
+        log = WriteLog()
         await self._core.offload(self._memory.follow)
         self._measuring.begin()
         window = await self._measuring.measure(job)
-        if not await self._pusher.offsets_still_hold():
+        if not await self._path.offsets_still_hold():
             raise CalibrationRefusedError("the autopilot's values were changed in between: try again")
         job.progress(MEASURED_PERCENT, "reading the autopilot's temperature calibration")
         targets, words, left = await self._find(window, overwrite=overwrite)
         if not targets:
             raise CalibrationRefusedError("; ".join(left or ["no IMU of the autopilot was measured"]))
-        draft.warnings += left
+        log.warnings += left
         if not any(target.all for target in targets):
             self._core.machine.on(Event.NOTHING_TO_WRITE)
             return "already in force"
-        plan = await self._pusher.push(job, Plan(tuple(targets), self._core.vehicle.boots), window, draft)
-        await self._conclusion.conclude(job, plan, window, draft)
-        warnings = (*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each))
-        job.deliver(CurvesWritten(draft.written, warnings))
+        plan = await self._path.write(job, Plan(tuple(targets), self._core.vehicle.boots), window, log)
+        await self._path.settle(job, plan, window, log)
+        warnings = (*log.warnings, *(words for each in log.imu_warnings.values() for words in each))
+        job.deliver(CurvesWritten(log.written, warnings))
         return f"written: {'; '.join(words)}"
 
     async def _find(self, window: Window, *, overwrite: bool) -> tuple[list[Target], list[str], list[str]]:

@@ -13,15 +13,13 @@ from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.component.service import Refusal
 from companion.daemon.biases.into_autopilot import IntoAutopilot
 from companion.daemon.biases.memory import BiasMemory
-from companion.daemon.calibrating.conductor import Conductor
-from companion.daemon.calibrating.course import Course, Solving
-from companion.daemon.calibrating.results import Results
-from companion.daemon.calibrating.solver import Solver
+from companion.daemon.calibrating.estimator import Estimator, Given
+from companion.daemon.calibrating.manager import CalibrationManager
+from companion.daemon.calibrating.run import Parts
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job
-from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.accel_writes import AccelWrites
@@ -36,9 +34,12 @@ from companion.daemon.stands.measuring import Measuring
 from companion.daemon.stands.stands import Stands
 from companion.daemon.stands.turning import TurnAsked, Turning
 from companion.errors import CalibrationRefusedError, RequestRefusedError
+from companion.estimation.means.windows import Window
 from companion.estimation.records.record import Record
 from companion.estimation.request import What, is_time_limit
+from companion.estimation.solution.prior import Expectation
 from companion.formats import Object
+from companion.links.system.listeners import Listeners
 from companion.links.system.waiting import comes
 from companion.storage.records import RecordStore
 
@@ -61,28 +62,26 @@ class Calibrating(Subsystem):
         self.measuring = measuring = Measuring(core, imus)
         self.faces = FacesInForce(core, imus)
         own = OwnAttitude(core.vehicle, wanted=config.compass is None)
-        self.solver = Solver(core, self.alignment, self.faces, own)
-        self.solving = Solving(core, self.solver, self.memory)
+        self.estimator = Estimator(core, self.alignment, self.faces, own)
+        self.on_solved: Listeners[Window, Window, Given, What, Expectation] = Listeners()
         ditherer = Ditherer(core, imus, offsets.writer, offsets.ledger)
-        conclusion = Conclusion(core, offsets.effect, offsets.firmware, offsets.owed)
-        course = Course(core, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, conclusion)
         self.stands = stands = Stands(core, imus, measuring)
-        self._writes = writes = AccelWrites(core, imus, offsets, conclusion)
+        self._writes = writes = AccelWrites(core, imus, offsets)
         self._aligner = Aligner(core, stands, self.alignment)
         self._facing = Facing(core, imus, stands, writes, self.faces)
         levels = LevelWrites(core, imus, offsets, own)
         self._turning = Turning(core, imus, stands, writes, levels, self.faces)
-        self._results = Results(core, self.store, self.memory)
         self.by_hand = ByHand(core, imus)
-        self._into_autopilot = IntoAutopilot(core, imus, measuring, self.memory, offsets, conclusion)
-        self.conductor = Conductor(core, course, offsets.recovery, self._results, self.by_hand)
+        self._into_autopilot = IntoAutopilot(core, imus, measuring, self.memory, offsets)
+        parts = Parts(core, imus, measuring, ditherer, self.estimator, self.memory, offsets, self.on_solved)
+        self.conductor = CalibrationManager(parts, self.store, self.by_hand)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.alignment.load()
         self.faces.load()
         self.by_hand.load()
         self.memory.load()
-        self._results.load()
+        self.conductor.load()
 
     def commands(self) -> Mapping[str, Handler]:
         """As in the base class; each raises `RequestRefusedError`, or another `CompanionError` once it was taken."""
@@ -106,7 +105,7 @@ class Calibrating(Subsystem):
             "alignment": self.alignment.status(),
             "by_hand": self.by_hand.latest(),
             "stands": msgspec.to_builtins(self.stands.shown),
-            "last": _summary(conductor.results.last),
+            "last": _summary(conductor.last),
             "job": self._job(),
         }
 

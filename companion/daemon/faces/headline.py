@@ -13,7 +13,7 @@ import msgspec
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.daemon.arming.readiness import BY_ITSELF
 from companion.daemon.arming.subsystem import Arming
-from companion.daemon.calibrating.conductor import Conductor
+from companion.daemon.calibrating.manager import CalibrationManager
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
@@ -41,7 +41,12 @@ class Headlines:
     """Works out the headline from those who know; computes little."""
 
     def __init__(
-        self, core: Core, devices: Devices, conductor: Conductor, arming: Arming, attitude: AttitudeService | None
+        self,
+        core: Core,
+        devices: Devices,
+        conductor: CalibrationManager,
+        arming: Arming,
+        attitude: AttitudeService | None,
     ) -> None:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
         self._readiness, self._automatic, self._armings = arming.readiness, arming.automatic, arming.armings

@@ -116,8 +116,8 @@ class Faces(Subsystem):
         shown, due_s, loop, record = "", 0.0, asyncio.get_running_loop(), None
         while True:
             reply: Object = {"kind": "progress", "pose": await self._pose.refresh()}
-            if self._conductor.results.last is not record:
-                record = self._conductor.results.last
+            if self._conductor.last is not record:
+                record = self._conductor.last
                 reply["record"] = msgspec.to_builtins(record)
             state = self._conductor.state.shown
             if state != shown or loop.time() >= due_s:

@@ -23,6 +23,7 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job, JobCancelledError
 from companion.daemon.offsets.ledger import Ledger
+from companion.daemon.offsets.plan import WriteLog
 from companion.errors import AutopilotError, CalibrationRefusedError, CompanionError
 from companion.estimation.collector.intake import LIMITS_IMU
 from companion.estimation.machine import Event
@@ -30,7 +31,6 @@ from companion.estimation.means.dither import SECONDS, STEPS, Dithered, Step, co
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
-from companion.estimation.solution.draft import Draft
 from companion.physics.frames import Array
 from companion.samples import ImuSample
 from companion.storage.changes import Changed, ChangeSet
@@ -81,7 +81,7 @@ class Ditherer:
         self._machine, self._imus, self._writer, self._ledger = core.machine, imus, writer, ledger
         self._profiles = core.profiles
 
-    async def refine(self, window: Window, job: Job, draft: Draft) -> Window:
+    async def refine(self, window: Window, job: Job, log: WriteLog) -> Window:
         """Dither every IMU of the window that needs it; returns the window with their means in place.
 
         Raises:
@@ -101,14 +101,14 @@ class Ditherer:
             # PX4's own calibration would take a far offset for a bias in the middle of it.
             rivals = [rival.words for rival in imu.in_force.rivals if rival.parameter == "IMU_GYRO_CAL_EN"]
             if rivals:
-                draft.warn(each.name, f"imu {each.name}: offsets not dithered: {rivals[0]}")
+                log.warn(each.name, f"imu {each.name}: offsets not dithered: {rivals[0]}")
                 found.append(each)
                 continue
             writes = self._parameters.writes
             self._machine.on(Event.DITHER)
             result = await self._dither(each, imu, job)
             writes = self._parameters.writes - writes
-            draft.warn(each.name, f"imu {each.name}: offsets dithered and put back, {writes} parameter writes")
+            log.warn(each.name, f"imu {each.name}: offsets dithered and put back, {writes} parameter writes")
             found.append(_with(each, result))
         return msgspec.structs.replace(window, imus=tuple(found))
 

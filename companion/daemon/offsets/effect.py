@@ -56,85 +56,85 @@ TOLERANCE_SIGMAS: Final = 2.0
 """What may remain besides noise: nobody claims the bias better than by its sigma_use."""
 
 
-class EffectWatch:
-    """Waits for a still stretch of telemetry after a write, and judges it."""
+async def watch_effect(
+    core: Core, px4: Px4Writes, plan: Plan, before: Window, go_on: Callable[[str], None], boots: int
+) -> tuple[Verdicts | None, str]:
+    """Wait for still telemetry after a write and judge it; a step that is nearly visible is watched longer.
 
-    def __init__(self, core: Core, px4: Px4Writes) -> None:
-        self._core, self._vehicle, self._collector, self._px4 = core, core.vehicle, core.collector, px4
-        self._profiles = core.profiles
-        self._most_s = VERIFY_MAX_S if core.config.vehicle.platform == "ground" else VERIFY_ON_DECK_S
-        self._look_s = min(LOOK_S, core.config.calibration.min_still_s)
+    Args:
+        core: the aircraft.
+        px4: knows the output while far values were in force.
+        plan: the written changes.
+        before: window before the write.
+        go_on: called with words now and then; what it raises ends the watch.
+        boots: restarts of the autopilot seen before.
 
-    async def judge(
-        self, plan: Plan, before: Window, go_on: Callable[[str], None], boots: int
-    ) -> tuple[Verdicts | None, str]:
-        """Verdicts by IMU, or why there were none to be had; a step that only just cannot be seen is looked at longer.
+    Returns:
+        Verdicts by IMU, or the reason why there are none.
+    """
+    watched = [target for target in plan.targets if target.watched]
+    if not watched:
+        return None, "no autopilot IMU is in the telemetry"
+    loop, vehicle = asyncio.get_running_loop(), core.vehicle
+    most_s = VERIFY_MAX_S if core.config.vehicle.platform == "ground" else VERIFY_ON_DECK_S
+    written = Moment(vehicle)
+    words = TELEMETRY
+    while not written.has_passed(settle_s(vehicle.firmware)):
+        go_on(words)
+        await asyncio.sleep(POLL_S)
+    since_s = loop.time()
+    verdicts: Verdicts | None = None
+    while (looked_s := loop.time() - since_s) < most_s:
+        go_on(words)
+        if vehicle.arm_state is ArmState.ARMED:
+            return verdicts, "armed right after the write"
+        if vehicle.boots != boots:
+            return None, "the autopilot rebooted right after the write"
+        words = _in_the_way(core, looked_s)
+        if not words:
+            try:
+                after = await core.window(since_s=since_s)
+            except CalibrationRefusedError as error:
+                words = str(error)
+            else:
+                verdicts = {target.name: _judge(core, px4, target, before, after) for target in watched}
+                words = _inconclusive(verdicts, loop.time() - since_s)
+                if not words:
+                    return verdicts, ""
+        await asyncio.sleep(POLL_S)
+    return verdicts, f"not still within {most_s:.0f} s after the write ({words})"
 
-        Args:
-            plan: what was written.
-            before: the telemetry until then.
-            go_on: told now and then what is going on; what it raises ends the look.
-            boots: of the autopilot, as many as before.
-        """
-        watched = [target for target in plan.targets if target.watched]
-        if not watched:
-            return None, "no autopilot IMU is in the telemetry"
-        loop = asyncio.get_running_loop()
-        written = Moment(self._vehicle)
-        words = TELEMETRY
-        while not written.has_passed(settle_s(self._vehicle.firmware)):
-            go_on(words)
-            await asyncio.sleep(POLL_S)
-        since_s = loop.time()
-        verdicts: Verdicts | None = None
-        while (looked_s := loop.time() - since_s) < self._most_s:
-            go_on(words)
-            if self._vehicle.arm_state is ArmState.ARMED:
-                return verdicts, "armed right after the write"
-            if self._vehicle.boots != boots:
-                return None, "the autopilot rebooted right after the write"
-            words = self._in_the_way(looked_s)
-            if not words:
-                try:
-                    after = await self._core.window(since_s=since_s)
-                except CalibrationRefusedError as error:
-                    words = str(error)
-                else:
-                    verdicts = {target.name: self._judge(target, before, after) for target in watched}
-                    words = _inconclusive(verdicts, loop.time() - since_s)
-                    if not words:
-                        return verdicts, ""
-            await asyncio.sleep(POLL_S)
-        return verdicts, f"not still within {self._most_s:.0f} s after the write ({words})"
 
-    def _in_the_way(self, looked_s: float) -> str:
-        """What is waited for before there is something to judge; empty when there is."""
-        now_s = asyncio.get_running_loop().time()
-        status = self._collector.status(now_s)
-        words = status.waiting_for or ""
-        if words and status.still_s > 0.0:
-            # How long a calibration must be still says nothing about how long a step takes to show.
-            moves = self._collector.glance(now_s).obstacle
-            words = "" if moves is None else moves.words
-            if not words and status.still_s < self._look_s:
-                words = f"hold still {self._look_s - status.still_s:.0f} s more"
-        if words and looked_s < TELEMETRY_S:
-            return TELEMETRY  # which was not taken during the write
-        return words
+def _in_the_way(core: Core, looked_s: float) -> str:
+    """Say what has to be waited for before the telemetry can be judged; empty: nothing."""
+    now_s = asyncio.get_running_loop().time()
+    status = core.collector.status(now_s)
+    words = status.waiting_for or ""
+    if words and status.still_s > 0.0:
+        # The time for which a calibration must be still says nothing about the time that a step takes to show.
+        moves = core.collector.glance(now_s).obstacle
+        words = "" if moves is None else moves.words
+        look_s = min(LOOK_S, core.config.calibration.min_still_s)
+        if not words and status.still_s < look_s:
+            words = f"hold still {look_s - status.still_s:.0f} s more"
+    if words and looked_s < TELEMETRY_S:
+        return TELEMETRY  # telemetry during the write was left out
+    return words
 
-    def _judge(self, target: Target, before: Window, after: Window) -> list[Verdict]:
-        sides = Sides(
-            before=next(imu for imu in before.imus if imu.name == target.name),
-            after=next(imu for imu in after.imus if imu.name == target.name),
-            gyro_residual=target.solution.gyro_rad_s,
-            accel_residual=target.solution.accel_m_s2,
-            apart_s=(after.start_s + after.end_s - before.start_s - before.end_s) / 2.0,
-        )
-        steps = step_from_far(target.calibration, target.all, sides.before.accel_m_s2)
-        seen = self._px4.seen_far(target.calibration)
-        on_the_way = {triad: (seen[triad], vector(step)) for triad, step in steps.items() if triad in seen}
-        profile = self._profiles.of(target.name)
-        return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile, on_the_way)
+
+def _judge(core: Core, px4: Px4Writes, target: Target, before: Window, after: Window) -> list[Verdict]:
+    sides = Sides(
+        before=next(imu for imu in before.imus if imu.name == target.name),
+        after=next(imu for imu in after.imus if imu.name == target.name),
+        gyro_residual=target.solution.gyro_rad_s,
+        accel_residual=target.solution.accel_m_s2,
+        apart_s=(after.start_s + after.end_s - before.start_s - before.end_s) / 2.0,
+    )
+    steps = step_from_far(target.calibration, target.all, sides.before.accel_m_s2)
+    seen = px4.seen_far(target.calibration)
+    on_the_way = {triad: (seen[triad], vector(step)) for triad, step in steps.items() if triad in seen}
+    profile = core.profiles.of(target.name)
+    return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile, on_the_way)
 
 
 def _inconclusive(verdicts: Verdicts, looked_s: float) -> str:

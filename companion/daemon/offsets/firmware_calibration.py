@@ -36,10 +36,9 @@ from companion.autopilot.vehicle.ekf import SETTLED_RAD_S, EkfWatch
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.config.sections import Platform
 from companion.daemon.offsets.ledger import Ledger
-from companion.daemon.offsets.plan import Plan
+from companion.daemon.offsets.plan import Plan, WriteLog
 from companion.errors import AutopilotError, CompanionError
 from companion.estimation.records.record import WrittenParameter
-from companion.estimation.solution.draft import Draft
 from companion.physics.units import DEG_H
 from companion.storage.changes import ChangeSet
 
@@ -93,7 +92,7 @@ class FirmwareCalibration:
             return None
         return before
 
-    async def write(self, plan: Plan, before: GyroParameters, draft: Draft, go_on: Callable[[str], None]) -> Plan:
+    async def write(self, plan: Plan, before: GyroParameters, draft: WriteLog, go_on: Callable[[str], None]) -> Plan:
         """All offsets, the firmware's calibration, the gyro offsets again: all, or all the old values are back.
 
         In a transaction of these changes, which grows with what the firmware may change besides. The plan with that,

@@ -23,11 +23,10 @@ from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core, Offload
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
-from companion.daemon.offsets.reboot_owed import RebootOwed
+from companion.daemon.offsets.reboot import RebootOwed
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
 from companion.estimation.records.record import WrittenParameter
 from companion.formats import Object, utc_now
-from companion.links.system.listeners import Listeners
 from companion.storage.changes import ChangeLog, ChangeSet, Interruptions, Undoable
 
 logger = logging.getLogger(__name__)
@@ -199,10 +198,8 @@ class Recovery:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
         self._writer, self.ledger, self._imus, self._owed = writer, ledger, imus, owed
         self._offload, self._interruptions = core.offload, Interruptions(core.config.storage.path)
-        self.on_recovered: Listeners[str] = Listeners()
-        """Told, in words, of what was put in order."""
-        self.note_undone: Callable[[ChangeSet, str], Awaitable[object]] = _nobody_notes
-        """Notes, with the words for people, that a step which could be undone is no longer in force."""
+        self.on_recovered: Callable[..., Awaitable[object]] = _nobody_notes
+        """Told of a restored interrupted write, in words, and whether that undid a step (keyword `undone`)."""
 
     def interruptions(self) -> list[Object]:
         """Interrupted writes for the history, the latest first; blocking."""
@@ -252,12 +249,10 @@ class Recovery:
         if foreign:
             found += f"; changed by others, left alone: {', '.join(foreign)}"
         words = f"Interrupted write: {found}"
-        if self.ledger.is_undoable(open_set):
-            await self.note_undone(open_set, words)
+        await self.on_recovered(open_set, words, undone=self.ledger.is_undoable(open_set))
         await self._keep(open_set, found)
         await self.ledger.undone()
         logger.warning("%s", words)
-        self.on_recovered.tell(words)
         self._say(Severity.WARNING, words, Weight.RESULT)
 
     async def _keep(self, open_set: ChangeSet, reason: str) -> None:
@@ -331,8 +326,8 @@ class Recovery:
         return found
 
 
-async def _nobody_notes(_step: ChangeSet, _words: str) -> None:
-    """Stand in until somebody keeps a history."""
+async def _nobody_notes(_step: ChangeSet, _words: str, *, undone: bool) -> None:
+    """Stand in until the manager keeps a history."""
 
 
 def _why_not_undone(error: WriteFailedError | NothingWrittenError, step: ChangeSet) -> str:

@@ -10,14 +10,12 @@ from companion.autopilot.vehicle.ekf import EkfWatch
 from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.offsets.companions import OtherCompanions
-from companion.daemon.offsets.effect import EffectWatch
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration
 from companion.daemon.offsets.ledger import Ledger, Recovery
-from companion.daemon.offsets.plan import Planner
-from companion.daemon.offsets.push import Pusher
 from companion.daemon.offsets.px4_writes import Px4Writes
-from companion.daemon.offsets.reboot_owed import RebootOwed
+from companion.daemon.offsets.reboot import RebootOwed
 from companion.daemon.offsets.rivalry import Rivalry
+from companion.daemon.offsets.write import WritePath
 from companion.formats import Object
 from companion.storage.changes import ChangeLog
 
@@ -29,17 +27,15 @@ class Offsets(Subsystem):
 
     def __init__(self, core: Core, devices: Devices) -> None:
         config, vehicle, parameters, imus = core.config, core.vehicle, core.parameters, devices.imus
-        self._vehicle = vehicle
+        self._vehicle, self.slots = vehicle, devices.slots
         self.companions = OtherCompanions(core.link, core.texts.say, lambda: core.wanted.push)
         self.ledger = Ledger(ChangeLog(config.storage.path), core.offload, self.companions.why_not)
         self.writer = ParameterWriter(parameters, vehicle)
         self.rivalry, self.owed = Rivalry(core, imus), RebootOwed(core)
         px4 = Px4Writes(core.link, vehicle, self.writer, self.ledger, devices.slots, core.say)
         ekf, platform = EkfWatch(vehicle), config.vehicle.platform
-        self.firmware = FirmwareCalibration(vehicle, parameters, self.writer, self.ledger, ekf, platform)
-        self.effect = EffectWatch(core, px4)
-        self.planner = Planner(core, imus, devices.slots, self.rivalry)
-        self.pusher = Pusher(core, imus, self.writer, self.ledger, px4, self.firmware, self.effect, self.owed)
+        firmware = FirmwareCalibration(vehicle, parameters, self.writer, self.ledger, ekf, platform)
+        self.write_path = WritePath(core, imus, self.writer, self.ledger, px4, firmware, self.owed)
         self.recovery = Recovery(core, self.writer, self.ledger, imus, self.owed)
 
     def load(self) -> None:  # noqa: D102 - as in the base class

@@ -21,7 +21,7 @@ import msgspec
 from companion.autopilot.telemetry.imu_samples import EkfBiasReading
 from companion.component.service import JobResult
 from companion.configured import models
-from companion.daemon.calibrating.solver import Given
+from companion.daemon.calibrating.estimator import Given
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -122,7 +122,7 @@ class Recorder(Subsystem):
             imu.on_change.add(partial(self._on_imu, imu))
         devices.ekf_bias.on_read.add(self._on_ekf_bias)
         calibrating.measuring.on_measured.add(self._on_measured)
-        calibrating.solving.on_solved.add(self._on_solved)
+        calibrating.on_solved.add(self._on_solved)
         calibrating.conductor.on_ended.add(self._on_ended)
 
     # --- inputs

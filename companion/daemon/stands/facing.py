@@ -17,6 +17,7 @@ from companion.component.statustext import Severity
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
+from companion.daemon.offsets.plan import WriteLog
 from companion.daemon.stands.accel_writes import AccelWrites
 from companion.daemon.stands.align_steps import LEVEL, Hold
 from companion.daemon.stands.faces_in_force import FacesInForce
@@ -27,7 +28,6 @@ from companion.estimation.alignment.missing import Missing, missing, seen_before
 from companion.estimation.machine import Event
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.records.align_record import FaceRecord, FacesImuRecord, FacesRecord, faces_imu_record
-from companion.estimation.solution.draft import Draft
 from companion.estimation.solution.site import LocalEarth
 from companion.physics.frames import Array, vector
 from companion.physics.units import MG
@@ -84,7 +84,7 @@ class Facing:
             self._name_left_out(before, known)
         assert local is not None
         await self._stands.check_offsets()
-        draft = self._core.draft()
+        draft = WriteLog()
         draft.warnings += local.warnings
         if known.wish is not None:
             draft.warnings.append(f"after {MOST} stands {known.wish.partition(': ')[2]}")
@@ -202,7 +202,7 @@ class Facing:
         windows: list[Window],
         by_imu: dict[str, Faces],
         local: LocalEarth,
-        draft: Draft,
+        draft: WriteLog,
         measured: list[FacesImuRecord],
     ) -> FacesRecord:
         first = next(iter(by_imu))

@@ -17,12 +17,12 @@ import numpy as np
 
 from companion.autopilot.firmware.ardupilot import TRIM
 from companion.autopilot.firmware.px4 import LEVEL, read_level
-from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
+from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.daemon.core import Core
-from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
-from companion.daemon.job import Job, JobCancelledError
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import Job
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import AutopilotError, CalibrationRefusedError
 from companion.estimation.alignment.spot import Mounting
@@ -30,7 +30,7 @@ from companion.estimation.machine import Event
 from companion.estimation.means.windows import Window
 from companion.estimation.records.record import Outcome, WrittenParameter
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix
-from companion.storage.changes import ChangeSet, Origin
+from companion.storage.changes import Origin
 
 MOST_DEG: Final = 10.0
 SEEN_DEG: Final = 0.1
@@ -57,7 +57,7 @@ class LevelWrites:
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], offsets: Offsets, own: OwnAttitude) -> None:
         self._core, self._machine, self._imus, self._own = core, core.machine, imus, own
-        self._ledger, self._writer, self._owed = offsets.ledger, offsets.writer, offsets.owed
+        self._path, self._writer, self._owed = offsets.write_path, offsets.writer, offsets.owed
 
     async def write(
         self, job: Job, board: Mounting, last: Window, origin: Origin
@@ -74,25 +74,26 @@ class LevelWrites:
         with self._own.asked():
             job.progress(MEASURED_PERCENT, "reading the autopilot's attitude")
             before = await self._own.up_since(asyncio.get_running_loop().time())
-            job.check_cancelled()
-            self._machine.on(Event.WRITE)
-            job.progress(MEASURED_PERCENT, f"writing {len(plan.changes)} parameters")
-            kept = ChangeSet.of(self._core.vehicle.system_id, plan.changes, origin=origin)
-            async with self._ledger.transaction(kept):
-                with changing(self._imus.values() if self._turns_imus else ()):
-                    written = await self._writer.apply(plan.changes)
-                self._machine.on(Event.WRITTEN)
-                try:
-                    outcome, warning = await self._look(job, plan, before, last)
-                except JobCancelledError as cancelled:
-                    raise JobCancelledError(await self._put_back(plan, str(cancelled))) from None
+            await self._path.begin(job, len(plan.changes))
+            written: dict[str, WrittenParameter] = {}
+            outcome: Outcome | None = None
+            warning: str | None = None
+
+            async def apply() -> list[Change]:
+                written.update(await self._writer.apply(plan.changes))
+                return plan.changes
+
+            async def verify() -> None:
+                nonlocal outcome, warning
+                outcome, warning = await self._look(job, plan, before, last)
                 if outcome is None:
-                    raise AutopilotError(
-                        await self._put_back(plan, "the attitude did not follow the new level, or it moved")
-                    )
+                    raise AutopilotError("the attitude did not follow the new level, or it moved")
                 if warning == REBOOT:
                     await self._owed.after(plan.changes)
-                await self._ledger.done(kept)
+
+            imus = list(self._imus.values()) if self._turns_imus else []
+            await self._path.commit(plan.changes, origin, imus, apply, verify)
+        assert outcome is not None
         for event in (Event.VERIFIED, Event.CONCLUDED):
             self._machine.on(event)
         return {name: msgspec.structs.replace(one, outcome=outcome) for name, one in written.items()}, warning
@@ -153,16 +154,6 @@ class LevelWrites:
                 if imu.name in self._imus and imu.name in were
             )
         return False
-
-    async def _put_back(self, plan: _Plan, reason: str) -> str:
-        with changing(self._imus.values() if self._turns_imus else ()):
-            try:
-                await self._writer.restore(plan.changes)
-            except (NothingWrittenError, WriteFailedError) as error:
-                left = error.left_changed or [change.parameter for change in plan.changes]
-                return f"{reason}; old values NOT back in {', '.join(left)}: will be once disarmed"
-        await self._ledger.undone()
-        return f"{reason}; old values back"
 
 
 def _angle_deg(one: Array, other: Array) -> float:

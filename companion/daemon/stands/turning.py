@@ -13,6 +13,7 @@ from companion.component.statustext import Severity
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
+from companion.daemon.offsets.plan import WriteLog
 from companion.daemon.stands.accel_writes import AccelWrites
 from companion.daemon.stands.align_steps import Plan
 from companion.daemon.stands.faces_in_force import FacesInForce
@@ -27,7 +28,6 @@ from companion.estimation.machine import Event
 from companion.estimation.means.windows import Window
 from companion.estimation.records.align_record import BoardRecord, TurnRecord, stand_record, turn_imu_record
 from companion.estimation.records.record import WrittenParameter
-from companion.estimation.solution.draft import Draft
 from companion.estimation.solution.site import LocalEarth
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG, MG
@@ -95,7 +95,7 @@ class Turning:
         found: Alignment = await self._core.offload(turned, stands, ground(local, None))
         if found.complaint is not None:
             raise CalibrationRefusedError(in_words(found.complaint, gradienter=False))
-        draft = self._core.draft()
+        draft = WriteLog()
         draft.warnings += local.warnings
         if plan.headings == 2 and _sigma_m_s2(found) > LOOSE_M_S2:
             draft.warnings.append(
@@ -173,7 +173,7 @@ def _sigma_m_s2(found: Alignment) -> float:
 
 
 def _record(
-    taken: list[Taken], stands: list[Stand], found: Alignment, draft: Draft, whole_m_s2: Mapping[str, Array]
+    taken: list[Taken], stands: list[Stand], found: Alignment, draft: WriteLog, whole_m_s2: Mapping[str, Array]
 ) -> TurnRecord:
     degrees = {imu.name: imu.temperature_degc for imu in taken[-1].window.imus}
     return TurnRecord(

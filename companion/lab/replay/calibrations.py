@@ -18,9 +18,9 @@ from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.means.windows import Window
 from companion.estimation.records.record import AlignmentUsed, Record
 from companion.estimation.request import What
-from companion.estimation.solution.draft import Draft, in_words
 from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.otherwise import NOTHING, Otherwise
+from companion.estimation.solution.results import record_of
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Solution, solve
 from companion.physics.frames import Array
@@ -166,22 +166,34 @@ class Calibrations:
 
     def _record(self, recorded: Record, solution: Solution) -> Record:
         """Make the record of a solution; what only the autopilot can tell is taken from the recorded one."""
-        draft = Draft(datetime.datetime.fromisoformat(recorded.started_at), recorded.system_id, solution)
         corrected = {imu.name for imu in recorded.imus if imu.residual_gyro_rad_s or imu.residual_accel_m_s2}
-        draft.whole = {found.name: self._whole(found) for found in solution.imus if found.name in corrected}
-        draft.written = {imu.name: dict(imu.written) for imu in recorded.imus}
-        draft.device_ids = {imu.name: (imu.gyro_id, imu.accel_id) for imu in recorded.imus}
-        draft.alignment = recorded.alignment
-        return draft.record(recorded.state, recorded.reason, recorded.duration_s)
+        again = record_of(
+            solution,
+            datetime.datetime.fromisoformat(recorded.started_at),
+            recorded.duration_s,
+            state=recorded.state,
+            reason=recorded.reason,
+            whole={found.name: self._whole(found) for found in solution.imus if found.name in corrected},
+        )
+        were = {imu.name: imu for imu in recorded.imus}
+        imus = tuple(
+            msgspec.structs.replace(imu, written=was.written, gyro_id=was.gyro_id, accel_id=was.accel_id)
+            if (was := were.get(imu.name)) is not None
+            else imu
+            for imu in again.imus
+        )
+        return msgspec.structs.replace(again, imus=imus, system_id=recorded.system_id, alignment=recorded.alignment)
 
-    def estimate(self, collector: RollingCollector, now_s: float, draft: Draft, seconds: float) -> Record:
+    def estimate(
+        self, collector: RollingCollector, now_s: float, began_at: datetime.datetime, seconds: float
+    ) -> Record:
         """Return what a calibration would have found now."""
         try:
-            draft.solution = self._solved(collector.window(now_s), What.BOTH)
+            solution = self._solved(collector.window(now_s), What.BOTH)
         except CalibrationRefusedError as error:
-            return draft.record("failed", str(error), seconds)
-        draft.whole = {found.name: self._whole(found) for found in draft.solution.imus if self._offsets.get(found.name)}
-        return draft.record("done", in_words(draft), seconds)
+            return record_of(None, began_at, seconds, state="failed", reason=str(error))
+        whole = {found.name: self._whole(found) for found in solution.imus if self._offsets.get(found.name)}
+        return record_of(solution, began_at, seconds, whole=whole)
 
     def set_offsets(self, offsets: Offsets) -> None:
         """Take the offsets in force, for `estimate`."""

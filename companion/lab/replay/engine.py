@@ -20,7 +20,6 @@ from companion.configured.models import collect
 from companion.errors import StorageError
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.records.record import Record, from_json
-from companion.estimation.solution.draft import Draft
 from companion.lab.logs.playback import UNUSABLE, Playback, config_of
 from companion.lab.logs.recording import Head, Message, Recording
 from companion.lab.replay.calibrations import Calibrations, Offsets, Replayed
@@ -127,9 +126,9 @@ class Replay:
         estimate = None
         if not self._calibrations.again and self._collector is not None:
             began_s = self._first_s + self._head.offset_ns / 1e9
-            draft = Draft(datetime.datetime.fromtimestamp(began_s, tz=datetime.UTC))
+            began_at = datetime.datetime.fromtimestamp(began_s, tz=datetime.UTC)
             self._calibrations.set_offsets(self._offsets())
-            estimate = self._calibrations.estimate(self._collector, self._now_s, draft, seconds)
+            estimate = self._calibrations.estimate(self._collector, self._now_s, began_at, seconds)
         ours, theirs = versions(), self._head.versions
         notes = []
         if ours["companion"] != theirs.get("companion"):

@@ -23,7 +23,7 @@ from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.record import Record
 from companion.estimation.request import What
-from companion.estimation.solution.draft import Draft, in_words
+from companion.estimation.solution.results import record_of
 from companion.estimation.solution.site import Remedies, Whereabouts, local_earth
 from companion.estimation.solution.solve import solve
 from companion.lab.logs.log import Poses, StillLog
@@ -187,7 +187,7 @@ class _Pass:
     def run(self) -> Estimated:
         """From its first sample to its last."""
         log, collector = self._log, self._collector
-        draft = Draft(datetime.datetime.now(tz=datetime.UTC))
+        began_at = datetime.datetime.now(tz=datetime.UTC)
         offset_s = _FIRST_S - float(log.t_s[0])
         end_s = float(log.t_s[-1]) + offset_s
         looked_s = _FIRST_S
@@ -208,9 +208,9 @@ class _Pass:
         if best is None:
             why = self._obstacle or self._unusable(seconds)
             least = f"no {self._least_s:.0f} s {_AT_REST[self._given.platform]} in it"
-            record = draft.record("failed", refused or f"{least}: {why}", seconds)
+            record = record_of(None, began_at, seconds, state="failed", reason=refused or f"{least}: {why}")
             return Estimated(record, self._used(None, seconds))
-        record = self._solved(draft, best[1], seconds)
+        record = self._solved(began_at, best[1], seconds)
         return Estimated(record, self._used(best[0], seconds))
 
     def _look(self, now_s: float, *, last: bool = False) -> None:
@@ -257,22 +257,23 @@ class _Pass:
             return measurement
         return msgspec.structs.replace(measurement, begun_s={self._log.imu: begun_s - powered_s})
 
-    def _solved(self, draft: Draft, window: Window, seconds: float) -> Record:
+    def _solved(self, began_at: datetime.datetime, window: Window, seconds: float) -> Record:
         given, streams = self._given, self._streams
+        warnings: list[str] = []
         if streams.gradienter is None:
             tilt = "a tilt in the log" if given.platform == "deck" else "--pitch-deg and --roll-deg"
-            draft.warnings.append(f"no accelerometer biases without {tilt}")
+            warnings.append(f"no accelerometer biases without {tilt}")
         source = None if given.latitude_deg is None and given.height_m is None else "command line"
-        date = draft.started_at.date()
+        date = began_at.date()
         where = Whereabouts(given.latitude_deg, given.longitude_deg, given.height_m, source, date)
         what = What.GYROS if streams.gradienter is None else What.BOTH
         try:
             earth = local_earth(where, _REMEDIES)
             posed, poses = _posed(window, given), (streams.gradienter, streams.compass)
-            draft.solution = solve(posed, earth, *poses, what, given.platform, any_bias=given.any_bias)
+            solution = solve(posed, earth, *poses, what, given.platform, any_bias=given.any_bias)
         except CalibrationRefusedError as error:
-            return draft.record("failed", str(error), seconds)
-        return draft.record("done", in_words(draft), seconds)
+            return record_of(None, began_at, seconds, state="failed", reason=str(error), warnings=warnings)
+        return record_of(solution, began_at, seconds, warnings=warnings)
 
     # --- what of it was used
 

@@ -17,9 +17,9 @@ from scipy import linalg
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.records.history import PowerUp
 from companion.estimation.request import What
-from companion.estimation.solution.draft import Draft
 from companion.estimation.solution.joint import Weighed, Whole, points, weigh
 from companion.estimation.solution.prior import Expectation, Expected, ExpectedImu
+from companion.estimation.solution.results import record_of
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution, solve
 from companion.estimation.turning.watch import Turn
@@ -148,7 +148,7 @@ def test_a_record_has_no_covariance_of_what_is_not_known() -> None:
     gyros = dataclasses.replace(gyros, accel_m_s2=None)
     none = dataclasses.replace(none, gyro_rad_s=None, accel_m_s2=None)
     began = datetime.datetime(2026, 5, 1, tzinfo=datetime.UTC)
-    record = Draft(began, solution=solution([whole, gyros, none], shared)).record("done", "", 1.0)
+    record = record_of(solution([whole, gyros, none], shared), began, 1.0)
     first, second, third = (imu.covariance for imu in record.imus)
     assert first is not None
     assert second is not None

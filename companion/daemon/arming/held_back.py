@@ -6,19 +6,14 @@ until somebody asks for a calibration or the output shows something else.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Final
 
 import msgspec
 
+from companion.daemon.calibrating.run import Key, in_short
 from companion.estimation.records.validity import Finding, Held, Present, Why, worst_axis
 from companion.estimation.solution.doubt import Doubt
-from companion.samples import Triad
 
-Key = tuple[str, Triad]
-"""Name of an IMU, and which half of it."""
-
-_TRIADS: Final[dict[Triad, str]] = {"gyro": "gyros of", "accel": "accelerometers of"}
 _CHOSEN: Final = frozenset({Why.UNDONE, Why.CHANGED})
 """What a person has chosen; all else gives way to a doubt of what is measured."""
 
@@ -27,16 +22,6 @@ class _OnHold(msgspec.Struct, frozen=True):
     words: str
     seen: Held
     """What was measured: so long as the output stays there, measuring again would tell the same."""
-
-
-def in_words(held_back: Iterable[Key]) -> str:
-    """Which triads, in few words."""
-    keys = list(held_back)
-    return " and ".join(
-        f"{_TRIADS[triad]} {', '.join(name for name, of in keys if of == triad)}"
-        for triad in _TRIADS
-        if any(of == triad for _, of in keys)
-    )
 
 
 class HeldBack:
@@ -55,7 +40,7 @@ class HeldBack:
         if not self._kept:
             return None
         why = ", ".join(dict.fromkeys(each.words for each in self._kept.values()))
-        return f"held back: {in_words(self._kept)} ({why})"
+        return f"held back: {in_short(self._kept)} ({why})"
 
     def hold(self, key: Key, doubt: Doubt, seen: Held) -> None:
         """Put a triad on hold."""

@@ -1,7 +1,4 @@
-"""What the science needs besides a window's means, in one place.
-
-That is the site, gradienter and compass as they are in force, and what fills in where one of them is missing.
-"""
+"""Biases from a window: the window's means, the site, gradienter and compass, and the stand-ins for missing sensors."""
 
 from __future__ import annotations
 
@@ -22,20 +19,20 @@ from companion.estimation.solution.solve import Solution, solve
 
 
 class Given(NamedTuple):
-    """What a solution was made of, besides the readings."""
+    """Inputs of an estimate besides the window."""
 
     where: Whereabouts
     otherwise: Otherwise
 
 
-class Solver:
-    """Works out biases from a window."""
+class Estimator:
+    """Estimates biases with the alignment and the site in force."""
 
     def __init__(self, core: Core, alignment: AlignmentInForce, faces: FacesInForce, own: OwnAttitude) -> None:
         self._core, self.alignment, self._faces, self._own = core, alignment, faces, own
 
     async def solve(self, window: Window, what: What) -> tuple[Solution, Given]:
-        """The biases, and what else they were made of.
+        """Estimate the biases; returns the other inputs too.
 
         Raises:
             CalibrationRefusedError: as `solve`.
@@ -61,7 +58,7 @@ class Solver:
         )
 
     async def _own_heading(self) -> OwnHeading | None:
-        """The autopilot's; an EKF3 that waits for one from outside holds 0 deg, and calls that as good as any."""
+        """Return the autopilot's heading; an EKF3 that waits for an external one holds 0 deg and calls it good."""
         found, core = self._own.heading(), self._core
         if found is None or core.vehicle.firmware != "ardupilot":
             return found

@@ -1,0 +1,333 @@
+"""Starts, adopts, cancels and undoes calibrations, one at a time, and keeps their records.
+
+`run` is a calibration itself. Nothing is ever cut off in the middle of a write: a cancel waits for the next safe point.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Collection, Coroutine
+from typing import Literal
+
+import msgspec
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
+from companion.component.service import JobResult, Refusal
+from companion.component.statustext import Severity, Weight
+from companion.component.tunes import Tune
+from companion.daemon.calibrating.run import CalibrationRun, Parts
+from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
+from companion.daemon.job import Job, JobCancelledError, Undone
+from companion.daemon.stands.by_hand import ByHand
+from companion.errors import CompanionError, StorageError
+from companion.estimation.machine import Event, State
+from companion.estimation.records.record import Record
+from companion.estimation.request import What
+from companion.formats import utc_now
+from companion.links.system.listeners import Listeners
+from companion.storage.changes import BY_HAND, ChangeSet
+from companion.storage.records import RecordStore
+
+logger = logging.getLogger(__name__)
+
+_SEVERITIES = {"done": Severity.NOTICE, "failed": Severity.ERROR, "cancelled": Severity.NOTICE}
+
+
+class CalibrationManager:
+    """The calibration service behind MAVLink, the control socket, MQTT and the page."""
+
+    def __init__(self, parts: Parts, store: RecordStore, by_hand: ByHand) -> None:
+        core = parts.core
+        self._parts, self._core, self._machine, self._vehicle = parts, core, core.machine, core.vehicle
+        self._recovery, self._store, self._by_hand = parts.offsets.recovery, store, by_hand
+        self._starts = StartLimit()
+        self._task: asyncio.Task[None] | None = None
+        self.job: Job | None = None
+        """The running or the latest job."""
+        self.reason = ""
+        """Reason for the present state, in words."""
+        self.last: Record | None = None
+        """Record of the latest calibration, loaded from disk at start."""
+        self.on_ended: Listeners[Job, JobResult] = Listeners()
+        """Told of every end, before the requester is."""
+        core.vehicle.on_event.add(self._on_event)
+        core.wanted.on_retarget.add(lambda _settings: self._retarget())
+        self._recovery.on_recovered = self._recovered
+
+    def load(self) -> None:
+        """Load the latest record; blocking."""
+        try:
+            self.last = next(iter(self._store.history(limit=1)), None)
+        except StorageError as error:
+            logger.warning("%s; the daemon goes on without earlier records", error)
+
+    # --- state, and requests (component.service.CalibrationService)
+
+    @property
+    def progress_percent(self) -> int:
+        """Progress of the latest job; 100 from `done` on, though its record may still be on its way to the disk."""
+        if self.job is None or self._machine.state is State.DONE:
+            return 100
+        return self.job.progress_percent
+
+    @property
+    def state(self) -> State:
+        """State of the calibration."""
+        return self._machine.state
+
+    @property
+    def running(self) -> Job | None:
+        """The job under way."""
+        return self.job if self.job is not None and self.job.is_running else None
+
+    @property
+    def last_good(self) -> Record | None:
+        """The latest record, if it was good and has not been undone."""
+        return self.last if self.last is not None and self.last.state == "done" and not self.last.undone_at else None
+
+    def why_not(self, rungs: Collection[Rung] = tuple(Rung)) -> Obstacle | None:
+        """Return the first of these obstacles to starting something."""
+        return obstacle(self._vehicle, self._recovery.ledger, self.running, rungs)
+
+    @property
+    def mav_state(self) -> int:
+        """MAV_STATE_* for the heartbeat."""
+        if self._machine.state.busy:
+            return mavlink.MAV_STATE_CALIBRATING
+        if self._recovery.ledger.fault is not None:
+            return mavlink.MAV_STATE_CRITICAL
+        return mavlink.MAV_STATE_ACTIVE if self._vehicle.arm_state is ArmState.ARMED else mavlink.MAV_STATE_STANDBY
+
+    def start_calibration(
+        self,
+        what: What,
+        requester: str,
+        timeout_s: float | None = None,
+        *,
+        automatic: bool = False,
+        reboot: bool = False,
+    ) -> Job | Refusal:
+        """Start a calibration, adopt a running automatic one that includes this request, or refuse."""
+        deadline_s = _deadline_s(timeout_s)
+        own = self._automatic_run()
+        if isinstance(own, CalibrationRun) and own.is_adoptable and own.what in (what, What.BOTH):
+            own.adopt(requester, deadline_s, reboot=reboot)
+            return own
+        untold = what is What.ACCELEROMETERS and self._core.config.gradienter is None
+        missing = "accelerometers need a gradienter: none is configured" if untold else None
+        if (refusal := self._refusal(requester, missing)) is not None:
+            return refusal
+        run = CalibrationRun(
+            self._parts, what, requester, deadline_s, self.last_good, reboot=reboot, automatic=automatic
+        )
+        return self._start(run, Event.REQUEST, self._calibrate(run))
+
+    def start_job(
+        self,
+        kind: str,
+        what: What,
+        requester: str,
+        timeout_s: float | None,
+        missing: str | None,
+        run: Callable[[Job], Awaitable[str]],
+    ) -> Job | Refusal:
+        """Start an alignment or the writing of temperature curves, or refuse.
+
+        Args:
+            kind: one of `NO_CALIBRATION`.
+            what: the biases concerned.
+            requester: for the log.
+            timeout_s: time limit for waiting until it is still.
+            missing: why it cannot be done on this aircraft, if so.
+            run: carries it out; returns the result in words.
+        """
+        if (refusal := self._refusal(requester, missing)) is not None:
+            return refusal
+        job = Job(kind, what, requester, _deadline_s(timeout_s))
+        return self._start(job, Event.REQUEST, self._align(job, run))
+
+    def start_undo(self, requester: str, *, force: bool = False) -> Job | Refusal:
+        """Start restoring the values from before the last write (see `Recovery.undo`), or refuse."""
+        running, task = self._automatic_run(), self._task
+        if running is not None and task is not None:
+            # Whoever wants old values back must not wait for new ones that nobody asked for.
+            if (refusal := self._starts.refuses(requester)) is not None:
+                return refusal
+            running.cancel(requester)
+            self.job = job = Job("undo", What.BOTH, requester, None)
+            work = self._undo_instead(task, running, job, force=force)
+            self._task = asyncio.get_running_loop().create_task(work, name="undo")
+            return job
+        if (refusal := self._refusal(requester, self._recovery.why_no_undo(), "nothing_to_undo")) is not None:
+            return refusal
+        job = Job("undo", What.BOTH, requester, None)
+        return self._start(job, Event.UNDO, self._undo(job, force=force))
+
+    def cancel(self, requester: str) -> bool:
+        """Cancel the running job; returns whether there was one."""
+        if self.running is None:
+            return False
+        self.running.cancel(requester)
+        return True
+
+    async def close(self) -> None:
+        """Cancel the running job and wait until it has left the autopilot in order."""
+        self.cancel("the daemon's end")
+        if self._task is not None:
+            await asyncio.wait([self._task])
+
+    def _refusal(
+        self, requester: str, missing: str | None, kind: Literal["other", "nothing_to_undo"] = "other"
+    ) -> Refusal | None:
+        if self._core.only_listening is not None:
+            return Refusal("other", self._core.only_listening)
+        if (found := self.why_not()) is not None:
+            return found.refusal
+        return self._starts.refuses(requester) if missing is None else Refusal(kind, missing)
+
+    def _automatic_run(self) -> Job | None:
+        """Return the automatic calibration under way, while disarmed."""
+        job = self.running
+        return job if job is not None and job.automatic and self._vehicle.arm_state is ArmState.DISARMED else None
+
+    def _start(self, job: Job, event: Event, work: Coroutine[None, None, None]) -> Job:
+        self._machine.on(event)
+        self.job = job
+        logger.info("%s asked for by %s", job.kind, job.requester)
+        self._task = asyncio.get_running_loop().create_task(work, name=job.kind)
+        return job
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event == "armed":
+            if self.job is not None:
+                self.job.was_armed = True
+            self._core.collector.reset("armed")
+        elif event == "disarmed":
+            self._core.collector.reset("just disarmed")
+
+    def _retarget(self) -> None:
+        if self.running is None:
+            self._core.collector.retarget(self._core.wanted.settings)
+
+    # --- one job to its end
+
+    async def _calibrate(self, run: CalibrationRun) -> None:
+        result = await _result(run, run.calibrate())
+        record = run.make_record(result)
+        run.deliver(record)
+        await self._keep(record, run)
+        self._core.collector.retarget(self._core.wanted.settings)
+        self._end(run, result)
+
+    async def _align(self, job: Job, run: Callable[[Job], Awaitable[str]]) -> None:
+        result = await _result(job, run(job))
+        await self._by_hand.keep(job, result)
+        self._core.collector.retarget(self._core.wanted.settings)
+        self._end(job, result)
+
+    async def _undo_instead(self, task: asyncio.Task[None], before: Job, job: Job, *, force: bool) -> None:
+        """Undo while an automatic calibration ran: what that has written goes first."""
+        await asyncio.wait([task])
+        record = before.record
+        self._machine.on(Event.UNDO)
+        if record is not None and record.state == "cancelled" and record.written:
+            self._machine.on(Event.CONCLUDED)
+            self._end(job, JobResult("done", "auto calibration taken back"))
+        else:
+            await self._undo(job, force=force)
+
+    async def _undo(self, job: Job, *, force: bool) -> None:
+        async def run() -> str:
+            step, written = await self._recovery.undo(force=force)
+            job.deliver(Undone(step, written, await self._note_undone(step)))
+            self._machine.on(Event.CONCLUDED)
+            return f"{len(written)} old values back{step.origin.what and f': {step.origin.what}'}"
+
+        self._end(job, await _result(job, run()))
+
+    def _end(self, job: Job, result: JobResult) -> None:
+        """End a job; the state table has its `done` already."""
+        if result.outcome != "done":
+            self._machine.on(Event.FAULT if result.outcome == "failed" else Event.CANCEL)
+        self.reason = result.reason
+        severity = _SEVERITIES[result.outcome]
+        outcome = "" if result.outcome == "cancelled" else f"{result.outcome}: "  # a cancel's reason says so itself
+        words = f"{job.kind.capitalize()} {outcome}{result.reason}"
+        logger.log(logging.ERROR if result.outcome == "failed" else logging.INFO, "%s", words)
+        if not (job.automatic and result.outcome == "failed" and self._vehicle.arm_state is ArmState.ARMED):
+            # A pilot who has just armed has no use for the end of what nobody asked for.
+            self._core.say(max(severity, Severity.WARNING) if job.automatic else severity, words, Weight.RESULT)
+            if self.why_not((Rung.PENDING,)) is not None:
+                self._core.say(Severity.WARNING, "Old values NOT back: disarm, keep it connected", Weight.RESULT)
+        if not job.automatic and result.outcome != "cancelled":
+            self._core.tunes.play(Tune.DONE if result.outcome == "done" else Tune.FAILED)
+        self.on_ended.tell(job, result)
+        job.finish(result)
+
+    async def _recovered(self, step: ChangeSet, words: str, *, undone: bool) -> None:
+        """The recovery has ended an interrupted write, or an undo."""
+        if undone:
+            job = Job("undo", What.BOTH, "recovery", None)
+            job.deliver(Undone(step, {}, await self._note_undone(step)))
+            result = JobResult("done", words)
+            self.on_ended.tell(job, result)
+            job.finish(result)
+        self.reason = words
+
+    # --- records
+
+    async def _keep(self, record: Record, run: CalibrationRun) -> None:
+        """Keep a record and the readings behind it on disk, and say so where that fails."""
+        self.last = record
+        seen = self._core.collector.snapshot(run.begun_s, run.measured_s)
+
+        def save() -> None:
+            try:
+                trace = seen.trace(record.started_at)
+            except Exception:
+                # Readings for a later look must not cost the record.
+                logger.exception("the readings of this calibration cannot be kept")
+                trace = None
+            self._store.save(record, trace)
+
+        try:
+            if record.is_worth_keeping:
+                await self._core.offload(save)
+        except StorageError as error:
+            logger.error("%s", error)  # noqa: TRY400 - the traceback tells nothing more
+            self._core.say(Severity.WARNING, f"Record not kept: {error}")
+
+    async def _note_undone(self, step: ChangeSet) -> bool:
+        """Note in the history that a step was undone; returns whether it was no calibration's."""
+        if step.origin.what in BY_HAND:
+            await self._by_hand.undone(step)
+            return True
+        now = utc_now()
+        try:
+            marked: list[str] = await self._core.offload(self._store.mark_undone, step, now)
+        except StorageError as error:
+            logger.error("the history does not show the undo: %s", error)  # noqa: TRY400 - one line
+            marked = [step.origin.at] if step.origin.at else []
+        if self.last is not None and self.last.started_at in marked:
+            self.last = msgspec.structs.replace(self.last, undone_at=now)
+        await self._parts.memory.forget(marked)
+        return not (marked or step.origin.what)
+
+
+def _deadline_s(timeout_s: float | None) -> float | None:
+    return None if timeout_s is None else asyncio.get_running_loop().time() + timeout_s
+
+
+async def _result(job: Job, work: Awaitable[str]) -> JobResult:
+    """Await work and turn whatever it raises into a result."""
+    try:
+        return JobResult("done", await work)
+    except JobCancelledError as cancelled:
+        return JobResult("cancelled", str(cancelled))
+    except CompanionError as error:
+        return JobResult("failed", str(error))
+    except Exception as error:
+        logger.exception("the %s met a fault of the program", job.kind)
+        return JobResult("failed", f"internal error: {error!r}; the log has the details")

@@ -1,0 +1,375 @@
+"""One calibration from request to record: all of its state, and its phases in their order.
+
+`CalibrationRun.calibrate` is the whole of it. `estimation.machine` says which phase may follow which; a phase reports
+an event there, and raises where the calibration cannot go on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+from collections.abc import Collection, Mapping
+from typing import Final, NamedTuple
+
+import msgspec
+
+from companion.autopilot.firmware.firmwares import read_calibration
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
+from companion.autopilot.parameters.change import WriteFailedError
+from companion.component.service import WRITTEN_PERCENT, JobResult
+from companion.component.statustext import Severity
+from companion.component.tunes import Tune
+from companion.config.sections import Platform
+from companion.daemon.biases.memory import BiasMemory
+from companion.daemon.calibrating.estimator import Estimator, Given
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import Job
+from companion.daemon.offsets.dither import Ditherer
+from companion.daemon.offsets.effect import TELEMETRY
+from companion.daemon.offsets.plan import (
+    Plan,
+    Target,
+    WriteLog,
+    as_good,
+    refuse_shared,
+    residual_of_consumer,
+    target_of,
+    warnings_of,
+    without,
+)
+from companion.daemon.offsets.subsystem import Offsets
+from companion.daemon.offsets.write import WATCHING
+from companion.daemon.stands.measuring import Measuring
+from companion.estimation.machine import Event
+from companion.estimation.means.windows import Window
+from companion.estimation.records.history import Point
+from companion.estimation.records.record import AlignmentUsed, ImuRecord, Record
+from companion.estimation.request import What
+from companion.estimation.solution.doubt import Doubt
+from companion.estimation.solution.joint import Weighed, weigh
+from companion.estimation.solution.prior import Expectation
+from companion.estimation.solution.results import Bias, in_words, record_of, unseen_turn, when_warm
+from companion.estimation.solution.solve import ImuSolution, Solution
+from companion.links.system.listeners import Listeners
+from companion.samples import Triad
+from companion.storage.changes import AUTOMATIC
+
+logger = logging.getLogger(__name__)
+
+Key = tuple[str, Triad]
+"""Name of an IMU, and its gyros or its accelerometers."""
+
+WRONG_IMU_ATTEMPTS: Final = 3
+"""Of three IMUs two may have been mistaken for the right one."""
+_STARTED: Final[dict[Platform, str]] = {
+    "ground": "Calibration started: keep the aircraft still",
+    "deck": "Calibration started: the deck may sway",
+}
+_TRIADS: Final[dict[Triad, str]] = {"gyro": "gyros of", "accel": "accelerometers of"}
+
+
+class Parts(NamedTuple):
+    """Parts of the daemon that every calibration uses; none of them holds the state of one."""
+
+    core: Core
+    imus: Mapping[str, AutopilotImu]
+    measuring: Measuring
+    ditherer: Ditherer
+    estimator: Estimator
+    memory: BiasMemory
+    offsets: Offsets
+    on_solved: Listeners[Window, Window, Given, What, Expectation]
+    """Told of every estimate: the window measured and the window used, other inputs, the request, earlier biases."""
+
+
+class CalibrationRun(Job):
+    """One calibration; as a `Job` it holds request, progress, cancel and outcome too."""
+
+    def __init__(
+        self,
+        parts: Parts,
+        what: What,
+        requester: str,
+        deadline_s: float | None,
+        before: Record | None,
+        *,
+        reboot: bool = False,
+        automatic: bool = False,
+    ) -> None:
+        """`before`: the last calibration, if it was good and has not been undone."""
+        kind = AUTOMATIC if automatic else "calibration"
+        super().__init__(kind, what, requester, deadline_s, reboot=reboot, automatic=automatic)
+        self._parts, self._core, self._machine = parts, parts.core, parts.core.machine
+        self._imus, self._measuring, self._path = parts.imus, parts.measuring, parts.offsets.write_path
+        self.before, self.system_id = before, parts.core.vehicle.system_id
+        self.begun_s = asyncio.get_running_loop().time()
+        self.log = WriteLog()
+        """Written parameters, and warnings."""
+        self.alignment: AlignmentUsed | None = None
+        """Alignment of the gradienter in force; None: its zero and sigma are those of the configuration."""
+        self.device_ids: dict[str, tuple[int | None, int | None]] = {}
+        """Gyro and accelerometer ids by IMU of the autopilot."""
+        self.held_back: dict[Key, Doubt] = {}
+        """Measured triads that are not written, and why: they contradict earlier calibrations and nobody asked."""
+        self._forget()
+
+    def _forget(self) -> None:
+        """Clear the results of all phases."""
+        self.measured: Window | None = None
+        """Window of telemetry under the offsets in force."""
+        self.window: Window | None = None
+        """The measured window, or a dithered one."""
+        self.solution: Solution | None = None
+        """The estimate: residuals in the output of the autopilot's IMUs, whole biases of others."""
+        self.whole: dict[str, Bias] = {}
+        """Whole biases by IMU, where the autopilot subtracts offsets."""
+        self.points: dict[str, Point] = {}
+        """By IMU, what later calibrations learn from this one once it has ended well."""
+        self.unchanged: set[Key] = set()
+        """Triads whose offsets are as good as new ones, and stay."""
+        self.plan: Plan | None = None
+        self.held_back.clear()
+        self.log.written.clear()
+        self.log.imu_warnings.clear()
+
+    async def calibrate(self) -> str:
+        """Run all phases; returns the result in one line.
+
+        Raises:
+            CompanionError: cause of the failure; the autopilot is as before, or the message says what is not.
+            JobCancelledError: cancelled; likewise.
+        """
+        self._announce()
+        self._measuring.begin()
+        for attempts_left in reversed(range(WRONG_IMU_ATTEMPTS)):
+            try:
+                await self._measure()
+                await self._estimate()
+                await self._make_plan()
+                await self._write_and_settle()
+            except WriteFailedError as error:
+                if not attempts_left or error.kind not in ("not as believed", "without effect") or error.left_changed:
+                    raise
+                self._begin_again(error)
+            else:
+                break
+        await self._remember()
+        return "; ".join([in_words(self.solution, self._imu_records()), *self.log.notes])
+
+    @property
+    def is_adoptable(self) -> bool:
+        """Whether a request may still take over this automatic run as a whole."""
+        return self.automatic and not self.cancelled and not self.held_back
+
+    def adopt(self, requester: str, deadline_s: float | None, *, reboot: bool) -> None:
+        """Hand an automatic calibration to somebody who asks for one."""
+        self.reboot |= reboot
+        self.kind, self.requester, self.deadline_s, self.automatic = "calibration", requester, deadline_s, False
+
+    def _announce(self) -> None:
+        if self.automatic:
+            return
+        platform = self._core.config.vehicle.platform
+        self._core.say(Severity.NOTICE, _STARTED[platform])
+        if platform == "ground":
+            self._core.tunes.play(Tune.HOLD_STILL)
+
+    def _begin_again(self, error: WriteFailedError) -> None:
+        """Measure anew after a write that acted on another IMU, or on none; the old values are restored."""
+        self._machine.on(Event.MOVED)
+        logger.warning("%s; put back, measuring again", error.reason)
+        self._forget()
+        if error.kind == "not as believed":
+            self.log.warnings.append(f"{error.reason}; put back, and written where it belongs")
+        else:
+            self.log.warnings.append(f"{error.reason}; put back, and tried again")
+        self.check_cancelled()
+
+    # --- the phases
+
+    async def _measure(self) -> None:
+        """Wait until it is still and average; a dither betters integer means where that is allowed."""
+        while True:
+            self.measured = window = await self._measuring.measure(self)
+            if await self._path.offsets_still_hold():
+                self.window = await self._parts.ditherer.refine(window, self, self.log)
+                if self.window is window or await self._path.offsets_still_hold():
+                    return
+            # The window holds telemetry under other offsets than those now in force.
+            self._machine.on(Event.MOVED)
+
+    async def _estimate(self) -> None:
+        """Estimate biases, weigh them with earlier ones, and hold back contradictions that nobody asked for.
+
+        A contradiction is written where somebody has asked for the calibration. In an automatic one it is held back:
+        the offsets in force were right once, and a gradienter that has moved would spoil them without anybody looking.
+        """
+        assert self.measured is not None
+        assert self.window is not None
+        core, memory, unix_s = self._core, self._parts.memory, self.log.started_at.timestamp()
+        estimator = self._parts.estimator
+        solution, given = await estimator.solve(self.window, self.what)
+        self.alignment, self.solution = estimator.alignment.used, solution
+        for name, words in memory.forgotten().items():
+            self.log.warn(name, words)
+        expectation: Expectation = await core.offload(memory.expectation, solution, unix_s)
+        self._parts.on_solved.tell(self.measured, self.window, given, self.what, expectation)
+        self.device_ids = memory.device_ids()
+        whole = memory.whole(solution)
+        weighed: Weighed = await core.offload(weigh, solution, whole, expectation)
+        # From here on nobody can adopt this run, so that a request is never answered with half of it.
+        if self.automatic and core.wanted.push:
+            written = {i.name for i in core.config.imu if i.source == "autopilot" or i.autopilot_instance}
+            self.held_back = {key: doubt for key, doubt in weighed.doubted.items() if key[0] in written}
+        self.solution = weighed.solution
+        points = memory.measured(solution, whole, weighed.doubts, self.log.started, unix_s)
+        self.points = _less(points, self.held_back)
+        for doubt in weighed.doubts:
+            core.say(Severity.WARNING, doubt.words)
+        if not self.automatic:
+            for words in (*unseen_turn(self.solution), *when_warm(self.solution)):
+                core.say(Severity.NOTICE, words)
+        if self.held_back:
+            kept = in_short(self.held_back)
+            core.say(Severity.WARNING, f"Held back: {kept}; calibrate on request to write it all the same")
+
+    async def _make_plan(self) -> None:
+        """Work out new offsets of every IMU that the autopilot uses, and the rivals to switch off.
+
+        Raises:
+            AutopilotError: a parameter cannot be read, or the autopilot cannot be calibrated as it is.
+        """
+        assert self.solution is not None
+        core, rivalry, slots = self._core, self._parts.offsets.rivalry, self._parts.offsets.slots
+        sources = {imu.name: imu for imu in core.config.imu}
+        push = core.wanted.push  # may be switched while parameters are read: for all IMUs or for none
+        targets: list[Target] = []
+        for estimate in self.solution.imus:
+            imu, instance = self._imus.get(estimate.name), sources[estimate.name].autopilot_instance
+            found = without(estimate, [triad for name, triad in self.held_back if name == estimate.name])
+            if imu is not None:
+                calibration = imu.in_force
+                self.whole[estimate.name] = whole_of(calibration, estimate)
+                found = without(found, self._keep_as_good(calibration, found)) if push and not self.reboot else found
+                residual = found.gyro_rad_s, found.accel_m_s2
+            elif instance is not None:
+                calibration = await read_calibration(core.parameters, instance, slots)
+                residual = residual_of_consumer(calibration, found)
+            else:
+                continue
+            self.log.warn(estimate.name, *rivalry.left_of(calibration))
+            if push:
+                target = target_of(calibration, found, residual, imu)
+                self.log.warn(target.name, *warnings_of(target))
+                targets.append(target)
+        refuse_shared(targets, slots)
+        if targets:
+            stops = rivalry.changes([target.calibration for target in targets])
+            # First of all, so that no rival acts between this and the biases; undone last.
+            targets[0] = dataclasses.replace(targets[0], changes=(*stops, *targets[0].changes))
+            for change in stops:
+                words = f"{change.parameter} is switched off; companion undo switches it on again"
+                self.log.warn(targets[0].name, words)
+        self.plan = Plan(tuple(targets), core.vehicle.boots)
+
+    def _keep_as_good(self, calibration: ImuCalibration, found: ImuSolution) -> frozenset[Triad]:
+        assert self.solution is not None
+        earlier = () if self.before is None else self.before.imus
+        before = next((imu for imu in earlier if imu.name == found.name), None)
+        kept = as_good(calibration, found, self.solution.shared, before)
+        self.unchanged |= {(found.name, triad) for triad in kept}
+        return kept
+
+    async def _write_and_settle(self) -> None:
+        """Write the plan, watch its effect in the telemetry, and wait until the autopilot uses it."""
+        assert self.plan is not None
+        assert self.window is not None
+        if not self.plan.changes:
+            self.check_cancelled()
+            self._machine.on(Event.NOTHING_TO_WRITE)
+            return
+        self.plan = await self._path.write(self, self.plan, self.window, self.log, self._watching)
+        await self._path.settle(self, self.plan, self.window, self.log)
+
+    def _watching(self, words: str) -> None:
+        """Show progress while the telemetry is watched, and tell who asked that it moves."""
+        self.check_cancelled()
+        now_s, collector = asyncio.get_running_loop().time(), self._core.collector
+        moves = collector.glance(now_s).moves
+        if moves is not None and words != TELEMETRY:
+            self._measuring.tell(self, moves)
+        share = min(collector.status(now_s).still_s / self._core.wanted.settings.min_still_s, 1.0)
+        self.progress(WRITTEN_PERCENT + (100.0 - WRITTEN_PERCENT) * share, words or WATCHING)
+
+    async def _remember(self) -> None:
+        """Let later calibrations learn from this one."""
+        points = self.points
+        if self._core.wanted.push and not self.automatic:
+            # Who asked was told of every contradiction, and the measured biases are in force: they are right now. But
+            # gyros that may have turned are no new ones.
+            told = self.solution is not None and self.solution.turn.by != "earlier calibrations"
+            points = {name: point.as_chosen(gyro=told) for name, point in points.items()}
+        await self._parts.memory.keep(points)
+        if self.held_back:
+            self.log.notes.append(f"{in_short(self.held_back)} held back")
+
+    # --- the record
+
+    @property
+    def measured_s(self) -> tuple[float, float] | None:
+        """Start and end of the window behind the estimate, loop time."""
+        return (self.measured.start_s, self.measured.end_s) if self.solution and self.measured else None
+
+    def make_record(self, result: JobResult) -> Record:
+        """Build the record; after a failure it holds what was known until then."""
+        record = record_of(
+            self.solution,
+            self.log.started_at,
+            asyncio.get_running_loop().time() - self.begun_s,
+            state=result.outcome,
+            reason=result.reason,
+            warnings=self.log.warnings,
+            whole=self.whole,
+        )
+        return msgspec.structs.replace(
+            record, imus=self._imu_records(), system_id=self.system_id, alignment=self.alignment
+        )
+
+    def _imu_records(self) -> tuple[ImuRecord, ...]:
+        found = record_of(self.solution, self.log.started_at, 0.0, whole=self.whole).imus
+        return tuple(
+            msgspec.structs.replace(
+                imu,
+                warnings=(*imu.warnings, *self.log.imu_warnings.get(imu.name, ())),
+                written=self.log.written.get(imu.name, {}),
+                held_back=tuple(triad for name, triad in self.held_back if name == imu.name),
+                unchanged=tuple(sorted(triad for name, triad in self.unchanged if name == imu.name)),
+                gyro_id=self.device_ids.get(imu.name, (None, None))[0],
+                accel_id=self.device_ids.get(imu.name, (None, None))[1],
+            )
+            for imu in found
+        )
+
+
+def in_short(triads: Collection[Key]) -> str:
+    """Name triads in few words."""
+    return " and ".join(
+        f"{words} {', '.join(name for name, of in triads if of == triad)}"
+        for triad, words in _TRIADS.items()
+        if any(of == triad for _, of in triads)
+    )
+
+
+def _less(points: Mapping[str, Point], held_back: Collection[Key]) -> dict[str, Point]:
+    """Leave out what was held back: it must not become a habit by being measured again and again."""
+    left = {
+        name: msgspec.structs.replace(
+            point,
+            gyro=None if (name, "gyro") in held_back else point.gyro,
+            accel=None if (name, "accel") in held_back else point.accel,
+        )
+        for name, point in points.items()
+    }
+    return {name: point for name, point in left.items() if point.gyro is not None or point.accel is not None}

@@ -1,0 +1,179 @@
+"""Restarts of the autopilot after a write: done on request, and owed to PX4 while its EKF2 keeps an old tilt.
+
+The tilt is remembered over the companion's own restarts. A restart of PX4 while the companion was off shows in its time
+since boot: it is less than at the write, or began after the write, where the board has run on. A restart that shows in
+neither counts as none: one restart too many costs a minute.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.firmware.px4 import LEVEL, stale_tilt_deg
+from companion.autopilot.parameters.change import Change
+from companion.autopilot.vehicle.commands import result_name
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.component.statustext import Severity, Weight
+from companion.daemon.core import Core
+from companion.daemon.job import GoOn
+from companion.errors import AutopilotError, NotDisarmedError, StorageError
+from companion.storage.learned import this_boot
+from companion.storage.state import StateFile
+
+logger = logging.getLogger(__name__)
+
+GATED_TILT_DEG: Final = 0.3
+"""Tilt kept by PX4 from before a write, above which it has to be restarted before it flies. A smaller one is what its
+EKF2 shows of the biases of an uncalibrated sensor (autopilots 9.3)."""
+CLOCK_STEP_S: Final = 0.5
+"""Apparent step back of the autopilot's clock by late packets."""
+OWED_POLL_S: Final = 1.0
+POLL_S: Final = 0.2
+STORED_AFTER_S: Final = 3.0
+"""PX4 saves its parameters up to 2 s after a change, ArduPilot from a queue (autopilots 8)."""
+ANSWER_S: Final = 3.0
+BACK_WITHIN_S: Final = 60.0
+
+
+class NotRebootedError(AutopilotError):
+    """The autopilot was not restarted; the written values are in force all the same."""
+
+
+def harm_of_reboot(calibrations: Sequence[ImuCalibration], changes: Sequence[Change]) -> str | None:
+    """Say why a restart would replace the new offsets; None: it would not."""
+    after = {change.parameter: change.after for change in changes}
+    gyros = {name for calibration in calibrations for name in calibration.parameters.gyro_offset}
+    for rival in (rival for calibration in calibrations for rival in calibration.rivals):
+        if rival.acts == "at a start" and after.get(rival.parameter) != 0.0 and gyros & set(after):
+            return (
+                f"not rebooted: {rival.parameter} = {rival.value} would measure the gyros anew at the start and"
+                f" throw these gyro offsets away; set {rival.parameter} to 0 first (push.stop_rivals = true does)"
+            )
+    return None
+
+
+async def reboot(vehicle: Vehicle, go_on: GoOn) -> None:
+    """Restart the autopilot, disarmed, once all is stored, and wait until it is back.
+
+    Raises:
+        NotRebootedError: it was not restarted.
+        AutopilotError: it was restarted and is not back.
+    """
+    loop = asyncio.get_running_loop()
+    stored_s = loop.time() + STORED_AFTER_S
+    while loop.time() < stored_s:
+        go_on("waiting until the autopilot has stored the new offsets")
+        await asyncio.sleep(POLL_S)
+    boots = vehicle.boots
+    try:
+        await vehicle.disarmed.ensure()
+    except NotDisarmedError as error:
+        raise NotRebootedError(f"not rebooted: {error}") from error
+    logger.info("rebooting %s", vehicle.name)
+    command = mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+    result = await vehicle.commands.send(command, 1.0, timeout_s=ANSWER_S)
+    if result not in (mavlink.MAV_RESULT_ACCEPTED, None):
+        raise NotRebootedError(f"not rebooted: {vehicle.name} refused ({result_name(result or 0)})")
+    # No answer proves nothing: it may have gone down with it.
+    back_s = loop.time() + BACK_WITHIN_S
+    while vehicle.boots == boots or vehicle.arm_state is not ArmState.DISARMED:
+        if loop.time() > back_s:
+            if vehicle.boots == boots and vehicle.alive:
+                raise NotRebootedError(f"not rebooted: {vehicle.name} did not answer and has not restarted")
+            raise AutopilotError(f"{vehicle.name} was rebooted and is not back, disarmed, within {BACK_WITHIN_S:.0f} s")
+        await asyncio.sleep(POLL_S)
+
+
+class _Owed(msgspec.Struct, frozen=True):
+    """Tilt kept by PX4, and when in the life of the autopilot and of the board that began."""
+
+    system_id: int
+    tilt_deg: float
+    boot_s: float
+    """Time since the boot of the autopilot."""
+    host: str
+    """Identity of the board's boot; empty: unknown."""
+    host_s: float
+    """Time on the clock of that boot."""
+
+
+def owed_in(directory: Path) -> StateFile[_Owed]:
+    """Return the file in a storage directory."""
+    return StateFile(directory / "reboot-owed.json", _Owed)
+
+
+class RebootOwed:
+    """Remembers that PX4 must be restarted; `run` forgets it when the restart was seen."""
+
+    def __init__(self, core: Core) -> None:
+        self._vehicle, self._offload, self._core = core.vehicle, core.offload, core
+        self._file, self._host = owed_in(core.config.storage.path), this_boot()
+        self._owed: _Owed | None = None
+        self._boots = 0
+        """Restarts seen when the restart became owed, or was loaded."""
+        self._earlier = False
+        """Whether it was loaded from an earlier run of the companion."""
+
+    def load(self) -> None:
+        """Load the file; blocking."""
+        self._owed = self._file.load()
+        self._earlier = True
+
+    @property
+    def words(self) -> str | None:
+        """Reason to restart PX4 before it may arm, in few words; None without one."""
+        owed = self._owed
+        if owed is None or self._vehicle.system_id not in (None, owed.system_id) or self._restarted(owed):
+            return None
+        return f"reboot PX4: tilt {owed.tilt_deg:.1f} deg off"
+
+    def say(self) -> None:
+        """Tell the pilot of an owed restart."""
+        if (words := self.words) is not None:
+            self._core.say(Severity.WARNING, f"Before flight: {words}", Weight.RESULT)
+
+    async def after(self, changes: Sequence[Change]) -> None:
+        """Judge changes that come into force.
+
+        Raises:
+            StorageError: that a restart is owed cannot be kept.
+        """
+        level = {change.parameter: change.after - change.before for change in changes if change.parameter in LEVEL}
+        turned_deg, stale_deg = math.hypot(*level.values()), stale_tilt_deg(changes)
+        if turned_deg == 0.0 and stale_deg < GATED_TILT_DEG:
+            return
+        # A small step after a large one leaves what the large one has left.
+        left_deg = self._owed.tilt_deg if self._owed is not None and self.words is not None else 0.0
+        tilt_deg = max(left_deg, turned_deg, stale_deg)
+        now_s, boot_s = asyncio.get_running_loop().time(), self._vehicle.boot.clock.latest_s
+        owed = _Owed(self._vehicle.system_id or 0, round(tilt_deg, 2), boot_s or 0.0, self._host, now_s)
+        await self._offload(self._file.write, owed)
+        self._owed, self._boots, self._earlier = owed, self._vehicle.boots, False
+
+    def _restarted(self, owed: _Owed) -> bool:
+        latest = self._vehicle.boot.clock.latest
+        if not self._earlier or latest is None:
+            return self._vehicle.boots != self._boots
+        boot_s, heard_s = latest
+        began_later = owed.host == self._host != "" and heard_s - boot_s > owed.host_s
+        return began_later or boot_s < owed.boot_s - CLOCK_STEP_S or self._vehicle.boots != self._boots
+
+    async def run(self) -> None:
+        """Forget the owed restart once it was seen; runs until cancelled."""
+        while True:
+            await asyncio.sleep(OWED_POLL_S)
+            if self._owed is not None and self._vehicle.system_id == self._owed.system_id and self.words is None:
+                logger.info("PX4 has restarted: nothing is owed to it any more")
+                with contextlib.suppress(StorageError):
+                    await self._offload(self._file.clear)
+                    self._owed = None

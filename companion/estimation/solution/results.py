@@ -1,0 +1,155 @@
+"""A solution as a calibration's record, and in words."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from companion.estimation.records.record import CrossCovariance, ImuRecord, Record, Standing
+from companion.estimation.solution.solve import ImuSolution, Solution
+from companion.physics.frames import Array, Matrix, vector
+from companion.physics.units import DEG, DEG_H, MG
+from companion.samples import Vector
+
+Bias = tuple[Array | None, Array | None]
+"""Gyro bias, rad/s, and accelerometer bias, m/s^2, each (3,); None: not estimated."""
+
+
+def record_of(
+    solution: Solution | None,
+    started_at: datetime.datetime,
+    duration_s: float,
+    *,
+    state: Literal["done", "failed", "cancelled"] = "done",
+    reason: str | None = None,
+    warnings: Sequence[str] = (),
+    whole: Mapping[str, Bias] | None = None,
+) -> Record:
+    """Build the record of a solution; without a solution it has no IMUs.
+
+    Args:
+        solution: the estimate, if there is one.
+        started_at: start of the calibration, UTC.
+        duration_s: duration of the calibration.
+        state: outcome of the calibration.
+        reason: cause of the outcome; None: the figures in words.
+        warnings: warnings beyond those of the estimate.
+        whole: whole biases, estimated residual and offsets, by IMU whose owner subtracts offsets from its output.
+    """
+    owned = whole or {}
+    imus = () if solution is None else tuple(_imu(imu, owned.get(imu.name)) for imu in solution.imus)
+    seen = () if solution is None else (*solution.warnings, *unseen_turn(solution))
+    return Record(
+        state=state,
+        reason=in_words(solution, imus) if reason is None else reason,
+        warnings=(*seen, *warnings),
+        started_at=started_at.isoformat(timespec="milliseconds"),
+        duration_s=round(duration_s, 3),
+        pose=solution.pose if solution else None,
+        site=solution.site if solution else None,
+        magnetic=solution.magnetic if solution else None,
+        standing=_standing(solution) if solution else None,
+        imus=imus,
+        cross_covariance=_cross(solution) if solution else (),
+    )
+
+
+def _imu(estimate: ImuSolution, whole: Bias | None) -> ImuRecord:
+    gyro, accel = whole or (estimate.gyro_rad_s, estimate.accel_m_s2)
+    has_gyro, has_accel = estimate.gyro_rad_s is not None, estimate.accel_m_s2 is not None
+    return ImuRecord(
+        name=estimate.name,
+        samples=estimate.samples,
+        temperature_degc=estimate.temperature_degc,
+        gyro_bias_rad_s=_axes(gyro),
+        gyro_sigma_stat_rad_s=_axes(estimate.sigma_stat[:3] if has_gyro else None),
+        gyro_sigma_use_rad_s=_axes(estimate.gyro_sigma_use_rad_s if has_gyro else None),
+        accel_bias_m_s2=_axes(accel),
+        accel_sigma_stat_m_s2=_axes(estimate.sigma_stat[3:] if has_accel else None),
+        accel_sigma_use_m_s2=_axes(estimate.accel_sigma_use_m_s2 if has_accel else None),
+        covariance=_where_known(estimate.use_covariance, _known(estimate), _known(estimate)),
+        gyro_sigma_warm_up_rad_s=_axes(np.sqrt(estimate.warm_up_variance[:3]) if has_gyro else None),
+        accel_sigma_warm_up_m_s2=_axes(np.sqrt(estimate.warm_up_variance[3:]) if has_accel else None),
+        residual_gyro_rad_s=_axes(estimate.gyro_rad_s if whole else None),
+        residual_accel_m_s2=_axes(estimate.accel_m_s2 if whole else None),
+        warnings=(*estimate.warnings, *estimate.drifting),
+        prior=estimate.prior,
+        effective=estimate.effective,
+        when_warm=estimate.when_warm,
+    )
+
+
+def _axes(values: Array | None) -> Vector | None:
+    return None if values is None else vector(values)
+
+
+def _standing(solution: Solution) -> Standing:
+    turn, told = solution.turn, solution.turn.is_told
+    return Standing(
+        platform=solution.platform,
+        turn_deg_s=round(turn.rate_rad_s / DEG, 6) if told else None,
+        turn_sigma_deg_s=round(turn.sigma_rad_s / DEG, 6) if told else None,
+        told_by=turn.by if told else None,
+    )
+
+
+def unseen_turn(solution: Solution) -> tuple[str, ...]:
+    """Warn that a platform which turned from the start looks still without a compass."""
+    if solution.platform == "deck" or all(imu.gyro_rad_s is None for imu in solution.imus):
+        return ()
+    turn = solution.turn
+    if not turn.is_told:
+        return ("no compass: nothing saw whether the ground turns",)
+    if turn.by == "earlier calibrations" and not turn.is_chance:
+        return (f"the aircraft {turn.in_words}, or its gyros are unlike in earlier power-ups: sigma widened",)
+    return ()
+
+
+def when_warm(solution: Solution) -> list[str]:
+    """Predict the biases of the warm IMUs, where a temperature curve is known."""
+    return [words for imu in solution.imus if imu.when_warm is not None for words in imu.when_warm.words]
+
+
+def _known(imu: ImuSolution) -> list[bool]:
+    return [imu.gyro_rad_s is not None] * 3 + [imu.accel_m_s2 is not None] * 3
+
+
+def _cross(solution: Solution) -> tuple[CrossCovariance, ...]:
+    known = {imu.name: _known(imu) for imu in solution.imus}
+    found = {pair: _where_known(matrix, *(known[name] for name in pair)) for pair, matrix in solution.cross.items()}
+    return tuple(CrossCovariance(imus=pair, covariance=matrix) for pair, matrix in found.items() if matrix is not None)
+
+
+def _where_known(matrix: Matrix, rows: list[bool], columns: list[bool]) -> tuple[tuple[float | None, ...], ...] | None:
+    if not any(rows) or not any(columns):
+        return None
+    return tuple(tuple(float(matrix[i, j]) if rows[i] and columns[j] else None for j in range(6)) for i in range(6))
+
+
+def in_words(solution: Solution | None, imus: Sequence[ImuRecord]) -> str:
+    """Summarise a result: the largest sigma over axes and IMUs, short enough for one STATUSTEXT."""
+    if solution is None:
+        return "nothing measured"
+    parts: list[str] = []
+    gyros = [sigma for imu in imus if (sigma := imu.sigma_in_force("gyro")) is not None]
+    accels = [sigma for imu in imus if (sigma := imu.sigma_in_force("accel")) is not None]
+    if gyros:
+        # Without decimals, so that it stays one STATUSTEXT.
+        sigma_deg_h = np.max(gyros) / DEG_H
+        parts.append(f"{sigma_deg_h:.0f} deg/h warming" if _warms(solution) else f"{sigma_deg_h:.1f} deg/h")
+    if accels:
+        parts.append(f"{np.max(accels) / MG:.2f} mg")
+    unknown = ", ".join(f"{triad} {name}" for name, triad in solution.unknown)
+    kept = any(imu.unchanged for imu in imus) and not any(imu.written for imu in imus)
+    begin = "unchanged," if kept else "sigma"
+    return f"{begin} {', '.join(parts)}{f'; not known: {unknown}' if unknown else ''}"
+
+
+def _warms(solution: Solution) -> bool:
+    """Whether the gyros' sigma is mainly that of a warm-up."""
+    gyros = [imu for imu in solution.imus if imu.gyro_rad_s is not None]
+    worst = max(gyros, key=lambda imu: float(imu.gyro_sigma_use_rad_s.max()))
+    return bool(worst.warm_up_variance[:3].max() > np.diag(worst.covariance)[:3].max())
