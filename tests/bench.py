@@ -111,7 +111,7 @@ async def _one_calibration(folder: Path, recordings_mb: int = 0) -> float:
     async with Rig(folder, own_imu=True, recordings_mb=recordings_mb).running() as rig:
         await rig.ready()
         start_s, virtual_s = time.process_time(), rig.now_s
-        job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "bench")
+        job = rig.service.calibrating.manager.start_calibration(What.BOTH, "bench")
         assert isinstance(job, Job), job
         await job.finished
         return (time.process_time() - start_s) / (rig.now_s - virtual_s)

@@ -141,7 +141,7 @@ async def _processor_s(folder: Path) -> dict[str, float]:
     async with rig.running():
         await rig.ready()
         for _ in range(5):
-            job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "bench")
+            job = rig.service.calibrating.manager.start_calibration(What.BOTH, "bench")
             assert not isinstance(job, Refusal)
             await rig.until(lambda job=job: job.words == "working out the biases" or job.finished.done(), 100.0)  # type: ignore[misc]
             await job.finished

@@ -209,7 +209,7 @@ class _Course:
             async with asyncio.timeout(60.0):
                 await entered.wait()
             await asyncio.sleep(stage.chance.uniform(0.0, SHORTEST_S[stage.variant.name][phase]))
-            found = stage.service.calibrating.conductor.state
+            found = stage.service.calibrating.manager.state
             if found is not state:
                 raise MissedError(found.value)
         self._tell(f"{phase}: strikes")
@@ -252,7 +252,7 @@ class _Course:
         deadline_s = stage.now_s + RECOVERED_WITHIN_S
 
         def restless() -> str:
-            job = stage.service.calibrating.conductor.job
+            job = stage.service.calibrating.manager.job
             if job is not None and not job.finished.done():
                 return f"the {job.kind} still runs: {job.words}"
             if stage.service.offsets.ledger.pending:
@@ -276,7 +276,7 @@ class _Course:
     def _judge_rest(self, records: dict[str, bytes]) -> None:
         stage, fault = self._stage, self._fault
         now = judge.vectors(stage)
-        last = stage.service.calibrating.conductor.last
+        last = stage.service.calibrating.manager.last
         done = [self._written(record) for record in stage.service.calibrating.store.history() if record.state == "done"]
         done += judge.undoable(stage)
         for words in judge.half_written(now, *self._known, *[{**now, **each} for each in done if each]):
@@ -327,12 +327,12 @@ class _Course:
                 break
             await asyncio.sleep(4.0)
         if result != ACCEPTED:
-            last = stage.service.calibrating.conductor.last
+            last = stage.service.calibrating.manager.last
             self._wrong(
                 f"no calibration afterwards: {result}, {last.reason if last else None}; {stage.ground.texts()[-3:]}"
             )
             return
-        last = stage.service.calibrating.conductor.last
+        last = stage.service.calibrating.manager.last
         assert last is not None
         for words in judge.off_truth(stage, last):
             self._wrong(f"afterwards: {words}")

@@ -137,12 +137,12 @@ async def _operate(stage: Stage, hour: Hour, minutes: float) -> None:
     await _to_rest(stage)
     hour.calibrations = sum(record.state == "done" for record in stage.service.calibrating.store.history())
     if await operator.ask(CALIBRATE) != ACCEPTED:
-        last = stage.service.calibrating.conductor.last
+        last = stage.service.calibrating.manager.last
         hour.problems.append(f"no calibration after the hour: {last.reason if last else None}")
     else:
-        assert stage.service.calibrating.conductor.last is not None
+        assert stage.service.calibrating.manager.last is not None
         hour.problems += [
-            f"after the hour: {words}" for words in judge.off_truth(stage, stage.service.calibrating.conductor.last)
+            f"after the hour: {words}" for words in judge.off_truth(stage, stage.service.calibrating.manager.last)
         ]
 
 
@@ -155,10 +155,10 @@ async def _people(operator: Operator, hour: Hour, chance: random.Random) -> None
 
 
 async def _to_rest(stage: Stage) -> None:
-    conductor = stage.service.calibrating.conductor
+    manager = stage.service.calibrating.manager
     await asyncio.sleep(5.0)
     await stage.until(
-        lambda: (conductor.job is None or conductor.job.finished.done()) and not stage.service.offsets.ledger.pending,
+        lambda: (manager.job is None or manager.job.finished.done()) and not stage.service.offsets.ledger.pending,
         240.0,
     )
 

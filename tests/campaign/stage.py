@@ -223,7 +223,7 @@ class Stage(Rig):
 
     async def _live(self) -> None:
         self.service = Service(self.config, link=self.link, offload=self.offload, imu_rate_hz=IMU_RATE_HZ, child=Idle)
-        machine = self.service.calibrating.conductor._machine
+        machine = self.service.calibrating.manager._machine
         on = machine.on
 
         def watched(event: Event) -> State:

@@ -172,15 +172,15 @@ def test_what_was_calibrated_with_the_old_zero_is_calibrated_anew_by_itself(tmp_
     async def main() -> None:
         async with made.running():
             await made.ready()
-            conductor, in_force = made.service.calibrating.conductor, made.service.arming.in_force
-            await made.until(lambda: conductor.last is not None and not in_force.findings(made.now_s), 200.0)
-            assert conductor.last is not None
-            assert conductor.last.alignment is None
+            manager, in_force = made.service.calibrating.manager, made.service.arming.in_force
+            await made.until(lambda: manager.last is not None and not in_force.findings(made.now_s), 200.0)
+            assert manager.last is not None
+            assert manager.last.alignment is None
             assert (await aligned(made, hands, Plan("zero"))).outcome == "done"
             assert [finding.words for finding in in_force.findings(made.now_s)] == ["gradienter aligned since then"]
-            await made.until(lambda: conductor.last is not None and conductor.last.alignment is not None, 150.0)
+            await made.until(lambda: manager.last is not None and manager.last.alignment is not None, 150.0)
             await made.until(lambda: not in_force.findings(made.now_s), 60.0)
-            off_mg, sigma_mg = worst_horizontal(conductor.last, made)
+            off_mg, sigma_mg = worst_horizontal(manager.last, made)
             assert sigma_mg <= TARGET_MG
             assert off_mg < 2.5 * sigma_mg
 
@@ -192,21 +192,21 @@ def test_who_may_start_one_and_how_it_ends(tmp_path: Path) -> None:
 
     async def main() -> None:
         async with made.running():
-            conductor = made.service.calibrating.conductor
+            manager = made.service.calibrating.manager
             await made.ready()
             # A calibration and an alignment exclude each other.
             job = started(made.service.calibrating.start_alignment({"action": "zero"}, "test"))
-            refused = conductor.start_calibration(What.BOTH, "test")
+            refused = manager.start_calibration(What.BOTH, "test")
             assert isinstance(refused, Refusal)
             assert "a gradienter alignment is running (" in refused.reason
             await made.until(lambda: "waiting for it to move" in job.words, 60.0)
-            assert conductor.cancel("the test")
+            assert manager.cancel("the test")
             assert (await job.finished).outcome == "cancelled"
-            running = started(conductor.start_calibration(What.BOTH, "test"))
+            running = started(manager.start_calibration(What.BOTH, "test"))
             refused = made.service.calibrating.start_alignment({"action": "zero"}, "test")
             assert isinstance(refused, Refusal)
             assert "a calibration is running" in refused.reason
-            conductor.cancel("the test")
+            manager.cancel("the test")
             await running.finished
             # Nobody turns it: it ends by itself, and says where it was.
             job = started(made.service.calibrating.start_alignment({"action": "zero", "timeout_s": 40.0}, "test"))

@@ -30,7 +30,7 @@ async def run(rig: Rig, hands: Hands, meddle: Meddle, **asked: object) -> tuple[
     """As the page asks for it."""
     status, reason = await press(rig, "align", **asked)
     assert status == 200, reason
-    job = rig.service.calibrating.conductor.running
+    job = rig.service.calibrating.manager.running
     assert job is not None
     return await follow(rig, hands, job, meddle), job
 

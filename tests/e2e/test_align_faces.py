@@ -85,7 +85,7 @@ def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tmp_path
             gyros = {name: made.double.parameter(name) for name in offset_names(1, "gyro")}
             assert (await calibrated(made, What.GYROS))[0].outcome == "done"
             for what in ("calibration", "faces"):
-                undone = made.service.calibrating.conductor.start_undo("test")
+                undone = made.service.calibrating.manager.start_undo("test")
                 assert not isinstance(undone, Refusal)
                 result = await undone.finished
                 assert result.reason.endswith(f"old values back: {what}")
@@ -181,7 +181,7 @@ def test_px4s_offsets_are_written_and_such_scales_as_it_starts_with(
             await asyncio.sleep(10.0)
             left_mg = np.array(made.autopilot.residual(1, made.now_s).accel_m_s2) / MG
             np.testing.assert_allclose(left_mg, 0.0, atol=0.2)
-            undone = made.service.calibrating.conductor.start_undo("test")
+            undone = made.service.calibrating.manager.start_undo("test")
             assert not isinstance(undone, Refusal)
             assert (await undone.finished).outcome == "done"
             assert {name: made.autopilot.parameter(name) for name in names} == old

@@ -72,7 +72,7 @@ def test_the_level_is_found_on_a_slope_and_written(tmp_path: Path) -> None:
             names = offset_names(1, "accel")
             old = [made.double.parameter(name) for name in names]
             record = await turned(made, hands, 2, write=True)
-            assert made.service.calibrating.conductor.reason.endswith("written")
+            assert made.service.calibrating.manager.reason.endswith("written")
             assert record.checked
             assert record.slope_deg == pytest.approx(float(np.hypot(STEEP.pitch_deg, STEEP.roll_deg)), abs=0.06)
             (imu,) = record.imus
@@ -85,7 +85,7 @@ def test_the_level_is_found_on_a_slope_and_written(tmp_path: Path) -> None:
             assert {one.outcome for one in imu.written.values()} == {"verified"}
             written = np.array([made.double.parameter(name) for name in names]) / MG
             assert (np.abs(written - true_mg(made))[:2] < 2.5 * sigma).all()
-            undone = made.service.calibrating.conductor.start_undo("test")
+            undone = made.service.calibrating.manager.start_undo("test")
             assert not isinstance(undone, Refusal)
             assert (await undone.finished).outcome == "done"
             assert [made.double.parameter(name) for name in names] == old
@@ -150,7 +150,7 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
             assert set(record.board.written) == {"AHRS_TRIM_X", "AHRS_TRIM_Y"}
             assert {one.outcome for one in record.board.written.values()} == {"verified"}
             assert offsets == {name: made.double.parameter(name) for name in offsets}, "offsets stay as they are"
-            undone = made.service.calibrating.conductor.start_undo("test")
+            undone = made.service.calibrating.manager.start_undo("test")
             assert not isinstance(undone, Refusal)
             assert (await undone.finished).outcome == "done"
             assert made.double.parameter("AHRS_TRIM_X") == made.double.parameter("AHRS_TRIM_Y") == 0.0
@@ -200,11 +200,11 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
             assert {one.outcome for one in record.board.written.values()} == {"verified"}
             assert made.service.offsets.owed.words == "reboot PX4: tilt 1.2 deg off"
             assert made.service.status()["headline"]["word"] != "READY"
-            undone = made.service.calibrating.conductor.start_undo("test")
+            undone = made.service.calibrating.manager.start_undo("test")
             assert not isinstance(undone, Refusal)
             assert (await undone.finished).outcome == "done"
             assert [made.autopilot.parameter(name) for name in names] == pytest.approx([0.3, 0.0])
-            undone = made.service.calibrating.conductor.start_undo("test")
+            undone = made.service.calibrating.manager.start_undo("test")
             assert not isinstance(undone, Refusal)
             assert (await undone.finished).reason.endswith("old values back: faces")
             assert {name: made.autopilot.parameter(name) for name in old} == old

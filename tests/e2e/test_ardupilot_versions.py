@@ -85,7 +85,7 @@ def test_preflight_storage_is_never_sent_and_the_firmwares_gyro_calibration_at_m
         async with rig.running():
             await rig.ready()
             await calibrated(rig, timeout_s=200.0)
-            await started(rig.service.calibrating.conductor.start_undo("test")).finished
+            await started(rig.service.calibrating.manager.start_undo("test")).finished
         assert mavlink.MAV_CMD_PREFLIGHT_STORAGE not in traffic.commands
         assert traffic.commands.count(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION) == (firmware == "ardupilot")
         harmless = {
@@ -102,7 +102,7 @@ def test_streams_at_a_quarter_of_their_rate_during_a_parameter_transfer_do_no_ha
     async def main() -> None:
         async with Rig(tmp_path, max_s=20.0, imu_rate_hz=100.0).running() as rig:
             await rig.ready()
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
             await asyncio.sleep(4.0)
             seen = rig.service.devices.imus["fc"].stream.samples
             rig.double.channels[0].listing = True  # on our own link somebody reads all parameters, by a slow radio

@@ -282,7 +282,7 @@ def test_a_change_that_is_not_seen_to_work_leaves_the_gate_shut(tmp_path: Path) 
     async def main() -> None:
         async with Rig(tmp_path, at_arm="gate", max_s=12.0).running() as rig:
             rig.double.faults.echo_without_effect = True
-            await rig.until(lambda: rig.service.calibrating.conductor.state is State.VERIFYING, 100.0)
+            await rig.until(lambda: rig.service.calibrating.manager.state is State.VERIFYING, 100.0)
             for _ in range(200):
                 await asyncio.sleep(0.25)
                 assert rig.service.arming.readiness.answer().verdict != "accept"

@@ -64,7 +64,7 @@ class Flight:
         await self.rig.until(lambda: self.rig.now_s >= end_s, seconds + 1.0)
 
     async def calibrate(self) -> None:
-        job = self.rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
+        job = self.rig.service.calibrating.manager.start_calibration(What.BOTH, "test")
         assert isinstance(job, Job)
         assert (await job.finished).outcome == "done"
 

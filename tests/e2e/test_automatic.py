@@ -39,8 +39,8 @@ async def calibrated_by_itself(rig: Rig, more: int = 1) -> None:
 
 async def started_by_itself(rig: Rig) -> Job:
     """Wait until an automatic calibration verifies what it wrote."""
-    await rig.until(lambda: rig.service.calibrating.conductor.state is State.VERIFYING, START_WITHIN_S)
-    job = rig.service.calibrating.conductor.job
+    await rig.until(lambda: rig.service.calibrating.manager.state is State.VERIFYING, START_WITHIN_S)
+    job = rig.service.calibrating.manager.job
     assert job is not None
     assert job.automatic
     return job
@@ -163,7 +163,7 @@ def test_values_changed_by_another_station_are_shown_and_not_overwritten(tmp_pat
             assert answer.verdict == "refuse"
             assert "changed by someone else" in answer.words
             # A request is a request: it calibrates, and from then on it goes on by itself.
-            job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
+            job = rig.service.calibrating.manager.start_calibration(What.BOTH, "test")
             assert isinstance(job, Job)
             await job.finished
             assert rig.service.arming.automatic.stopped is None
@@ -332,8 +332,8 @@ def test_a_check_starts_nothing(tmp_path: Path) -> None:
             rig.service.core.only_listening = "only a check is running"
             await asyncio.sleep(60.0)
             assert rig.double.writes == []
-            conductor = rig.service.calibrating.conductor
-            for answer in (conductor.start_calibration(What.BOTH, "test"), conductor.start_undo("test")):
+            manager = rig.service.calibrating.manager
+            for answer in (manager.start_calibration(What.BOTH, "test"), manager.start_undo("test")):
                 assert isinstance(answer, Refusal)
                 assert "only a check is running" in answer.reason
 

@@ -219,7 +219,7 @@ def test_a_damaged_file_costs_one_line_and_what_is_undone_is_forgotten(
             result, _ = await calibrated(rig)
             assert result.outcome == "done"
             assert len(BiasStore(tmp_path).read()["fc"].points) == 1
-            job = rig.service.calibrating.conductor.start_undo("test")
+            job = rig.service.calibrating.manager.start_undo("test")
             assert isinstance(job, Job)
             assert (await job.finished).outcome == "done"
             assert BiasStore(tmp_path).read()["fc"].points == ()

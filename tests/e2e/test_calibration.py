@@ -36,7 +36,7 @@ async def calibrated(
     rig: Rig, what: What = What.BOTH, timeout_s: float | None = None, *, reboot: bool = False
 ) -> tuple[JobResult, Record]:
     """Calibrate to the end, as a person who asks for it."""
-    job = started(rig.service.calibrating.conductor.start_calibration(what, "test", timeout_s, reboot=reboot))
+    job = started(rig.service.calibrating.manager.start_calibration(what, "test", timeout_s, reboot=reboot))
     result = await job.finished
     assert job.record is not None
     return result, job.record

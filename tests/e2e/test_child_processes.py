@@ -79,15 +79,15 @@ async def beside(rig: Rig) -> AsyncIterator[Child]:
 
 async def calibrated(rig: Rig, during: State | None = None, fault: Callable[[], None] = lambda: None) -> str:
     """Calibrate, with a fault when the calibration is in a state; return how it ended."""
-    conductor = rig.service.calibrating.conductor
+    manager = rig.service.calibrating.manager
     if during is not None:
         # However long it has stood still before, on a busy machine: from here on it has to wait, and to measure.
         rig.aircraft.add(Handling(start_s=rig.aircraft.time_at(rig.now_s), duration_s=1.0, seed=1))
         await asyncio.sleep(0.5)
-    job = conductor.start_calibration(What.BOTH, "test")
+    job = manager.start_calibration(What.BOTH, "test")
     assert isinstance(job, Job)
     async with asyncio.timeout(120.0):
-        while during is not None and conductor.state is not during:
+        while during is not None and manager.state is not during:
             assert not job.finished.done(), f"never {during}"
             await asyncio.sleep(0.002)
         fault()

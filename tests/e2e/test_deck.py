@@ -40,7 +40,7 @@ def test_a_boat_is_calibrated_while_it_sways_and_turns(tmp_path: Path) -> None:
         async with boat(tmp_path).running() as rig:
             await rig.ready()
             rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=20 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", 900.0))
+            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test", 900.0))
             result = await job.finished
             record = job.record
             assert record is not None
@@ -117,7 +117,7 @@ def test_a_replay_on_a_deck_gives_the_same_records(tmp_path: Path) -> None:
             await rig.ready()
             rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=20 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
             for _ in range(2):
-                job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", 300.0))
+                job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test", 300.0))
                 result = await job.finished
                 assert result.outcome == "done", result
                 await asyncio.sleep(40.0)
@@ -132,7 +132,7 @@ def test_where_the_ground_is_meant_the_words_name_the_deck(tmp_path: Path) -> No
     async def main() -> None:
         async with boat(tmp_path, BOAT, more="").running() as rig:
             await rig.ready()
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", 60.0))
+            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test", 60.0))
             result = await job.finished
             assert result.outcome == "failed"
             assert "deck" in result.reason

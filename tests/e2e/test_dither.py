@@ -103,7 +103,7 @@ def test_with_push_dither_the_undithered_imu_comes_within_a_few_deg_h(tmp_path: 
     async def main() -> None:
         async with second_imu_only(tmp_path, UNDITHERED, dither=True).running() as rig:
             await ready(rig)
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
             seen: set[str] = set()
             while not job.finished.done():
                 seen.add(job.words)
@@ -130,7 +130,7 @@ def test_with_push_dither_the_undithered_imu_comes_within_a_few_deg_h(tmp_path: 
             off = np.abs(np.subtract(imu.gyro_bias_rad_s, true.gyro_rad_s))
             assert np.all(off < 3.5 * np.array(imu.gyro_sigma_use_rad_s))
             # What an undo would bring back is the old offsets, not a step of the dither.
-            undone = started(rig.service.calibrating.conductor.start_undo("test"))
+            undone = started(rig.service.calibrating.manager.start_undo("test"))
             assert (await undone.finished).outcome == "done"
             assert ChangeLog(tmp_path).journal.read() is None
 
@@ -203,7 +203,7 @@ def test_a_dither_that_is_interrupted_leaves_the_offsets_as_they_were(tmp_path: 
         async with second_imu_only(tmp_path, UNDITHERED, dither=True, max_s=3.0, coarse=True).running() as rig:
             await ready(rig)
             before = offsets(rig)
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
             await _until_step(rig, job, step)
             assert ChangeLog(tmp_path).journal.read() is not None
             assert step == 1 or offsets(rig) != before

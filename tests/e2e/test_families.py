@@ -209,7 +209,7 @@ def now_s() -> float:
 async def _calibrated(service: Service, tasks: list[asyncio.Task[None]]) -> Record:
     async with asyncio.timeout(WITHIN_S):
         # Armed or not is known, and every device is heard: then there is nothing left to wait for but stillness.
-        while not isinstance(job := service.calibrating.conductor.start_calibration(What.BOTH, "test"), Job):
+        while not isinstance(job := service.calibrating.manager.start_calibration(What.BOTH, "test"), Job):
             assert not any(task.done() for task in tasks)
             await asyncio.sleep(0.1)
         result = await job.finished

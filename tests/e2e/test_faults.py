@@ -129,10 +129,10 @@ def test_a_storage_that_cannot_be_written_refuses_with_the_reason_before_anythin
     async def main() -> None:
         async with Rig(tmp_path / "file").running() as rig:
             await rig.until(lambda: rig.service.core.vehicle.alive, 10.0)
-            refusal = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
+            refusal = rig.service.calibrating.manager.start_calibration(What.BOTH, "test")
             assert isinstance(refusal, Refusal)
             assert "cannot be written" in refusal.reason
-            assert rig.service.calibrating.conductor.mav_state == 5  # MAV_STATE_CRITICAL
+            assert rig.service.calibrating.manager.mav_state == 5  # MAV_STATE_CRITICAL
 
     run_virtual(main())
 
@@ -142,8 +142,8 @@ def test_a_foreign_write_during_the_verification_is_never_called_verified(tmp_pa
         async with Rig(tmp_path, max_s=12.0).running() as rig:
             await rig.ready()
             before = values(rig.double)
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.calibrating.conductor.state is State.VERIFYING, 60.0)
+            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.manager.state is State.VERIFYING, 60.0)
             await asyncio.sleep(1.5)
             foreign = rig.double.parameter("INS_GYROFFS_X") + 6e-5
             rig.double.write_as_another_station("INS_GYROFFS_X", foreign)

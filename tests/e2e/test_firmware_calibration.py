@@ -90,7 +90,7 @@ def test_accelerometers_then_the_firmwares_calibration_once_then_the_fine_gyro_o
             assert {"INS_GYR2OFFS_X", "INS4_GYROFFS_Z", "INS_GYR1_CALTEMP"} <= others
             words = " ".join(record.warnings)
             assert all(name in words for name in others)
-            started(rig.service.calibrating.conductor.start_undo("test"))
+            started(rig.service.calibrating.manager.start_undo("test"))
             await rig.until(lambda: imu_parameters(rig) == before, 20.0)
 
     run_virtual(main())
@@ -126,7 +126,7 @@ def test_with_a_temperature_calibration_on_any_imu_it_is_left_out_and_the_ekf_wa
             await rig.ready()
             sent = Sent(rig)
             words: set[str] = set()
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
             while not job.finished.done():
                 words.add(job.words)
                 await asyncio.sleep(0.5)
@@ -146,7 +146,7 @@ def test_arming_or_a_cancel_while_the_ekf_settles_ends_the_waiting_and_not_the_r
         async with make(folder, parameters={"INS_TCAL1_ENABLE": 1.0}).running() as rig:
             await rig.ready()
             before = imu_parameters(rig)
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
             await rig.until(lambda: job.words.startswith("EKF adjusting"), 90.0)
             act(rig)
             await rig.until(job.finished.done, 3.0)
@@ -156,7 +156,7 @@ def test_arming_or_a_cancel_while_the_ekf_settles_ends_the_waiting_and_not_the_r
     result, words, changed = run_virtual(settling(tmp_path / "armed", lambda rig: rig.double.arm()))
     assert (result.outcome, changed) == ("done", True)
     assert "armed before the EKF had settled" in words
-    cancel = settling(tmp_path / "cancelled", lambda rig: rig.service.calibrating.conductor.cancel("test"))
+    cancel = settling(tmp_path / "cancelled", lambda rig: rig.service.calibrating.manager.cancel("test"))
     result, words, changed = run_virtual(cancel)
     assert (result.outcome, changed) == ("done", True)
     assert "wait 2 min before take-off: cancelled by test" in words
@@ -224,7 +224,7 @@ PHASES: dict[str, Callable[[Rig, Sent], bool]] = {
     "in the middle of the first write": lambda rig, sent: len(sent.log) == 3,
     "during the firmware's calibration": lambda rig, sent: rig.double.calibrating,
     "in the middle of the fine offsets": lambda rig, sent: sent.log[-2:-1] == [GYRO_CALIBRATION],
-    "while the effect is looked at": lambda rig, sent: rig.service.calibrating.conductor.state is State.VERIFYING,
+    "while the effect is looked at": lambda rig, sent: rig.service.calibrating.manager.state is State.VERIFYING,
 }
 
 
@@ -243,7 +243,7 @@ def test_a_reboot_in_any_phase_leaves_the_old_values_or_says_what_the_boot_has_m
             await asyncio.sleep(1.0)
             sent = Sent(rig)
             before = imu_parameters(rig)
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
             while not PHASES[phase](rig, sent):
                 await asyncio.sleep(0.005)
                 assert not job.finished.done(), job.finished.result()
@@ -275,7 +275,7 @@ def test_a_daemon_that_died_during_the_firmwares_calibration_puts_everything_bac
         async with make(tmp_path / "first", auxiliary=True).running() as rig:
             await rig.ready()
             before = imu_parameters(rig)
-            started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
             await rig.until(lambda: rig.double.calibrating, 90.0)
             return before, imu_parameters(rig), (tmp_path / "first" / "journal.json").read_bytes()
 
@@ -301,8 +301,8 @@ def test_a_daemon_that_died_after_it_leaves_alone_what_others_have_changed_since
         async with make(first, auxiliary=True).running() as rig:
             await rig.ready()
             before = imu_parameters(rig)
-            started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.calibrating.conductor.state is State.VERIFYING, 90.0)
+            started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.manager.state is State.VERIFYING, 90.0)
             second.mkdir()
             (second / "journal.json").write_bytes((first / "journal.json").read_bytes())
             return before, imu_parameters(rig)
@@ -376,7 +376,7 @@ def test_the_undo_of_one_vehicle_is_never_written_to_another_and_waits_for_its_o
     async def undo(system_id: int, after: dict[str, float]) -> None:
         async with make(tmp_path, system_id=system_id, parameters=after).running() as rig:
             await rig.ready()
-            answer = rig.service.calibrating.conductor.start_undo("test")
+            answer = rig.service.calibrating.manager.start_undo("test")
             if system_id == 3:
                 assert isinstance(answer, Refusal)
                 assert "only on system 1, 2" in answer.reason

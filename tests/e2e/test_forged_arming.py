@@ -155,7 +155,7 @@ async def _one(folder: Path, seed: int) -> tuple[int, int]:
         rig.autopilot.faults.arm_after_writes = None
         rig.autopilot.disarm()
         await asyncio.sleep(15.0)
-        job = rig.service.calibrating.conductor.job
+        job = rig.service.calibrating.manager.job
         await rig.until(lambda: (job is None or job.finished.done()) and not rig.service.offsets.ledger.pending, 240.0)
     assert judge.faults == [], f"seed {seed}"
     return judge.writes, conflicts

@@ -53,9 +53,9 @@ def test_what_ten_seconds_show_is_final(tmp_path: Path, monkeypatch: pytest.Monk
 
         def ever() -> bool:
             looks.append(rig.now_s)
-            job = rig.service.calibrating.conductor.job
+            job = rig.service.calibrating.manager.job
             words.add(job.words if job else "")
-            assert rig.service.calibrating.conductor.state is State.VERIFYING
+            assert rig.service.calibrating.manager.state is State.VERIFYING
             return True
 
         rig = Rig(tmp_path, min_still_s=2.0, max_s=4.0, imu_rate_hz=100.0, feed_s=0.05)

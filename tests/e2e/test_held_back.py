@@ -86,7 +86,7 @@ def test_accelerometers_are_held_back_when_the_gradienter_has_moved_until_somebo
             for _ in range(60):
                 await asyncio.sleep(1.0)
                 assert not any("accel" in found.words for found in rig.service.arming.in_force.findings(rig.now_s))
-            await rig.until(lambda: rig.service.calibrating.conductor.state is State.DONE, 60.0)
+            await rig.until(lambda: rig.service.calibrating.manager.state is State.DONE, 60.0)
             assert accelerometers(rig) == before
             assert rig.service.arming.in_force.held_back is not None
             assert (await calibrated(rig))[0].outcome == "done"
@@ -107,13 +107,13 @@ def test_what_somebody_asked_for_is_true_from_then_on_also_for_calibrations_by_i
     async def main() -> None:
         async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
             before = await held_back(rig)
-            conductor, store = rig.service.calibrating.conductor, rig.service.calibrating.store
+            manager, store = rig.service.calibrating.manager, rig.service.calibrating.store
             assert (await calibrated(rig))[0].outcome == "done"
             asked = accelerometers(rig)
             assert all(asked[name] != value for name, value in before.items())
             for _ in range(2):
                 await asyncio.sleep(10.0)
-                job = conductor.start_calibration(What.BOTH, "the companion", automatic=True)
+                job = manager.start_calibration(What.BOTH, "the companion", automatic=True)
                 assert isinstance(job, Job)
                 assert (await job.finished).outcome == "done"
                 record = store.history(1)[0]
@@ -132,9 +132,9 @@ def test_an_undo_of_what_was_asked_for_makes_the_earlier_ones_count_again(tmp_pa
     async def main() -> None:
         async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
             before = await held_back(rig)
-            conductor, known = rig.service.calibrating.conductor, rig.service.calibrating.store
+            manager, known = rig.service.calibrating.manager, rig.service.calibrating.store
             assert (await calibrated(rig))[0].outcome == "done"
-            undo = conductor.start_undo("test")
+            undo = manager.start_undo("test")
             assert isinstance(undo, Job)
             assert (await undo.finished).outcome == "done"
             assert accelerometers(rig) == before
@@ -177,16 +177,16 @@ def test_who_asks_in_the_middle_is_not_answered_with_half_of_it(tmp_path: Path) 
         async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
             await calibrated_by_itself(rig)
             knocked(rig)
-            conductor = rig.service.calibrating.conductor
+            manager = rig.service.calibrating.manager
             await rig.until(
-                lambda: len(rig.service.calibrating.store.history()) == 1 and conductor.state is State.VERIFYING, 150.0
+                lambda: len(rig.service.calibrating.store.history()) == 1 and manager.state is State.VERIFYING, 150.0
             )
-            assert isinstance(conductor.job, CalibrationRun)
-            assert conductor.job.held_back
-            refused = conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(manager.job, CalibrationRun)
+            assert manager.job.held_back
+            refused = manager.start_calibration(What.BOTH, "test")
             assert isinstance(refused, Refusal)
             assert refused.kind == "busy"
-            await conductor.job.finished
+            await manager.job.finished
             assert (await calibrated(rig))[0].outcome == "done"
             assert any("ACC" in name for name in rig.service.calibrating.store.history(1)[0].imus[0].written)
 

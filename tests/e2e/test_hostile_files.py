@@ -49,7 +49,7 @@ def test_a_damaged_file_is_named_and_nothing_of_it_is_written(
             assert rig.service.offsets.ledger.fault is None
             assert not rig.service.offsets.ledger.pending
             if name == "undo-1.json":
-                answer = rig.service.calibrating.conductor.start_undo("test")
+                answer = rig.service.calibrating.manager.start_undo("test")
                 assert isinstance(answer, Refusal)
                 assert answer.reason == "nothing to undo; what was kept could not be used"
             else:

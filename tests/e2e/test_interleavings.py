@@ -173,7 +173,7 @@ async def _one(folder: Path, seed: int) -> tuple[int, int, int]:
         await rig.ready()
         await asyncio.gather(people(rig, chance), _fate(rig, chance), _fate(rig, chance))
         # Now let everything come to rest.
-        double, conductor = rig.double, rig.service.calibrating.conductor
+        double, manager = rig.double, rig.service.calibrating.manager
         faults = double.faults
         faults.silent = faults.heartbeat_off = False
         faults.arm_after_writes = faults.reboot_after_writes = None
@@ -181,7 +181,7 @@ async def _one(folder: Path, seed: int) -> tuple[int, int, int]:
         double.disarm()
         await asyncio.sleep(2.0)  # what is still on the wire, and the autopilot's reboot, if it is in one
         await rig.until(
-            lambda: (conductor.job is None or conductor.job.finished.done()) and not rig.service.offsets.ledger.pending,
+            lambda: (manager.job is None or manager.job.finished.done()) and not rig.service.offsets.ledger.pending,
             240.0,
         )
         records = rig.service.calibrating.store.history()[::-1]

@@ -32,7 +32,7 @@ GYRO_Y = offset_names(1, "gyro")[1]
 
 
 async def settling(rig: Rig) -> None:
-    await rig.until(lambda: rig.service.calibrating.conductor.state is State.SETTLING, 90.0)
+    await rig.until(lambda: rig.service.calibrating.manager.state is State.SETTLING, 90.0)
 
 
 def whys(rig: Rig) -> set[Why]:
@@ -121,7 +121,7 @@ def test_a_second_autopilot_with_our_system_id_stops_everything_and_is_named(tmp
             assert rig.service.core.vehicle.firmware == "ardupilot"
             answer = rig.service.arming.readiness.answer()
             assert (answer.verdict, answer.words) == ("refuse", "two autopilots have system id 1")
-            refusal = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
+            refusal = rig.service.calibrating.manager.start_calibration(What.BOTH, "test")
             assert isinstance(refusal, Refusal)
             assert refusal.reason == "two autopilots have system id 1"
             # It goes away, and all goes on.

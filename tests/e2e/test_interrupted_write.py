@@ -35,8 +35,8 @@ def test_a_write_that_was_killed_stands_in_the_history_before_and_after_the_rest
         async with Rig(tmp_path, **QUICK).running() as rig:
             await rig.ready()
             before = values(rig.double)
-            started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.calibrating.conductor.state is State.WRITING, 60.0)
+            started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.manager.state is State.WRITING, 60.0)
             await rig.until(lambda: values(rig.double) != before, 10.0)
             await rig.restart()
             rig.wire.cut = True
@@ -65,7 +65,7 @@ def test_an_undo_that_armed_in_its_middle_is_brought_to_its_end_and_told_as_one(
             before = values(rig.double)
             assert (await calibrated(rig))[0].outcome == "done"
             rig.double.faults.arm_after_writes = 2
-            failed = await started(rig.service.calibrating.conductor.start_undo("test")).finished
+            failed = await started(rig.service.calibrating.manager.start_undo("test")).finished
             assert failed.outcome == "failed"
             assert "undone in part (" in failed.reason
             assert failed.reason.endswith("the rest follows once disarmed")

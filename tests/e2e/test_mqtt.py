@@ -193,8 +193,8 @@ def test_a_flood_of_requests_is_answered_and_disturbs_nothing(tmp_path: Path) ->
                 answers = watcher.responses("companion/1", "calibrate")
                 assert [one["state"] for one in answers].count("accepted") == 1
                 assert {one["refusal"] for one in answers if one["state"] == "refused"} == {"busy"}
-                assert rig.service.calibrating.conductor.cancel("test")
-                await rig.until(lambda: rig.service.calibrating.conductor.state is State.CANCELLED, 10.0)
+                assert rig.service.calibrating.manager.cancel("test")
+                await rig.until(lambda: rig.service.calibrating.manager.state is State.CANCELLED, 10.0)
                 assert rig.service.calibrating.store.history() == []  # nothing had been measured
                 link = mqtt_of(rig.service).link
                 assert link is not None

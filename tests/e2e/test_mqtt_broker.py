@@ -157,8 +157,8 @@ def test_what_ended_while_the_broker_was_away_is_not_lost(tmp_path: Path) -> Non
                     await watcher.response("companion/1", "calibrate", "lost", "accepted")
                 one.kill()
                 await until_connected(rig.service, connected=False)
-                assert rig.service.calibrating.conductor.cancel("somebody")
-                await rig.until(lambda: rig.service.calibrating.conductor.state is State.CANCELLED, 10.0)
+                assert rig.service.calibrating.manager.cancel("somebody")
+                await rig.until(lambda: rig.service.calibrating.manager.state is State.CANCELLED, 10.0)
                 await one.start()
                 async with peer(one) as watcher:
                     record = (await watcher.until("companion/1/calibration/state")).json

@@ -27,14 +27,14 @@ class Faces:
         self._task = asyncio.create_task(self._look())
 
     async def _look(self) -> None:
-        conductor = self._rig.service.calibrating.conductor
+        manager = self._rig.service.calibrating.manager
         while True:
             headline = self._rig.service.status()["headline"]
             seen = headline["word"].rstrip("0123456789 s%"), headline["tone"]
             if self.headlines[-1:] != [seen]:
                 self.headlines.append(seen)
-            if conductor.running is not None:
-                self.progress.append(conductor.state.word)
+            if manager.running is not None:
+                self.progress.append(manager.state.word)
             await asyncio.sleep(0.1)
 
     def stop(self) -> list[tuple[str, str]]:
@@ -154,9 +154,9 @@ def test_whoever_moves_it_while_the_new_offsets_are_looked_at_is_told(tmp_path: 
         async with Rig(tmp_path, max_s=12.0).running() as rig:
             await rig.ready()
             faces = Faces(rig)
-            conductor = rig.service.calibrating.conductor
+            manager = rig.service.calibrating.manager
             calibration = asyncio.create_task(calibrated(rig))
-            await rig.until(lambda: conductor.state is State.VERIFYING, 60.0)
+            await rig.until(lambda: manager.state is State.VERIFYING, 60.0)
             rig.aircraft.add(Handling(start_s=rig.aircraft.time_at(rig.now_s) + 4.0, duration_s=6.0, seed=3))
             result, _ = await calibration
             assert result.outcome == "done"

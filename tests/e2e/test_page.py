@@ -85,7 +85,7 @@ def test_buttons_do_what_the_command_line_does_and_are_refused_in_the_same_words
 
             assert await press(rig, "calibrate", what="nothing") == (409, "calibrate: 'NOTHING' is not understood")
             assert await press(rig, "calibrate") == (200, "calibration started")
-            job = rig.service.calibrating.conductor.job
+            job = rig.service.calibrating.manager.job
             assert job is not None
             assert job.what is What.BOTH
             busy = await press(rig, "calibrate")
@@ -96,7 +96,7 @@ def test_buttons_do_what_the_command_line_does_and_are_refused_in_the_same_words
 
             before = rig.double.parameter("INS_GYROFFS_X")
             assert await press(rig, "calibrate", what="gyros") == (200, "calibration started")
-            job = rig.service.calibrating.conductor.job
+            job = rig.service.calibrating.manager.job
             assert job is not None
             assert job.what is What.GYROS
             assert (await job.finished).outcome == "done"
@@ -135,7 +135,7 @@ def test_the_big_word_through_a_calibration_with_nervous_hands(tmp_path: Path) -
             rig.double.disarm()
             await rig.until(lambda: headline(rig)[1] == "READY", 3.0)
 
-            job = started(rig.service.calibrating.conductor.start_undo("test"))
+            job = started(rig.service.calibrating.manager.start_undo("test"))
             await rig.until(lambda: headline(rig)[1] == "PUTTING BACK", 3.0)
             assert (await job.finished).outcome == "done"
             await rig.until(lambda: headline(rig)[1] == "NOT CALIBRATED", 3.0)

@@ -71,7 +71,7 @@ def test_offsets_that_px4_would_ignore_are_in_use_after_a_calibration_and_out_af
             assert fc.accel_sigma_use_m_s2 is not None
             assert np.abs(left.gyro_rad_s / fc.gyro_sigma_use_rad_s).max() < 3.5
             assert np.abs(left.accel_m_s2 / fc.accel_sigma_use_m_s2).max() < 3.5
-            undo = started(rig.service.calibrating.conductor.start_undo("test"))
+            undo = started(rig.service.calibrating.manager.start_undo("test"))
             assert (await undo.finished).outcome == "done"
             await asyncio.sleep(1.5)
             assert set(values(rig).values()) == {0.0}
@@ -124,7 +124,7 @@ def test_a_small_accelerometer_vector_is_brought_into_use_before_anything_is_mea
             left = rig.px4.residual(1, rig.now_s)
             assert fc.accel_sigma_use_m_s2 is not None
             assert np.abs(left.accel_m_s2 / fc.accel_sigma_use_m_s2).max() < 3.5
-            undo = started(rig.service.calibrating.conductor.start_undo("test"))
+            undo = started(rig.service.calibrating.manager.start_undo("test"))
             assert (await undo.finished).outcome == "done"
             assert values(rig)["CAL_ACC0_XOFF"] == np.float32(0.006)
 
@@ -143,7 +143,7 @@ def test_power_cut_of_the_companion_between_the_steps_is_mended(tmp_path: Path, 
         async with rig.running():
             await rig.ready()
             before |= values(rig)
-            started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
             await rig.until(lambda: len(rig.px4.writes) >= after, 60.0)
             rig.wire.cut = True  # the companion is gone for good
             journal = (tmp_path / "journal.json").read_bytes()
@@ -167,7 +167,7 @@ def test_armed_between_the_steps_nothing_is_written_until_disarmed_and_then_the_
     async def main() -> None:
         async with px4_rig(tmp_path).running() as rig:
             await rig.ready()
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
             await rig.until(lambda: len(rig.px4.writes) == 5, 60.0)
             rig.px4.arm()
             result = await job.finished
@@ -193,8 +193,8 @@ def test_a_reboot_at_any_phase_leaves_the_old_values_or_the_new_ones_in_use(tmp_
         async with px4_rig(tmp_path, parameters={"CAL_ACC0_ZOFF": 0.25}).running() as rig:
             await rig.ready()
             before = values(rig)
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.calibrating.conductor.state.value == "collecting", 30.0)
+            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.manager.state.value == "collecting", 30.0)
             await rig.until(lambda: len(rig.px4.writes) >= writes, 60.0)
             rig.px4.reboot()
             result = await job.finished
@@ -244,7 +244,7 @@ def test_rivals_are_stopped_with_the_biases_and_the_undo_starts_them_again(tmp_p
             await rig.until(lambda: any("gyro calibration still runs" in text for text in rig.ground.texts()), 10.0)
             (warning,) = rig.service.status()["warnings"]
             assert "IMU_GYRO_CAL_EN is off from the next boot on" in warning
-            undo = started(rig.service.calibrating.conductor.start_undo("test"))
+            undo = started(rig.service.calibrating.manager.start_undo("test"))
             assert (await undo.finished).outcome == "done"
             assert [rig.px4.parameter(name) for name in rivals] == [1, 1]
             assert set(values(rig).values()) == {0.0}

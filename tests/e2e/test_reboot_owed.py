@@ -63,7 +63,7 @@ def test_an_undo_leaves_the_same_tilt(tmp_path: Path) -> None:
             await rig.until(lambda: rig.service.offsets.owed.words is None, 20.0)
             await rig.until(lambda: rig.service.arming.in_force.reading() is None, 20.0)
             await asyncio.sleep(4.0)
-            assert (await started(rig.service.calibrating.conductor.start_undo("test")).finished).outcome == "done"
+            assert (await started(rig.service.calibrating.manager.start_undo("test")).finished).outcome == "done"
             assert rig.service.offsets.owed.words == "reboot PX4: tilt 1.6 deg off"
             await rig.until(lambda: "Before flight: reboot PX4: tilt 1.6 deg off" in rig.ground.texts(), 5.0)
 

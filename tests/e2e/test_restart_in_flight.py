@@ -82,7 +82,7 @@ def test_it_goes_on_within_three_seconds_in_a_turn(tmp_path: Path, firmware: Fir
             assert headline["word"] == "ARMED"
             assert headline["reason"].startswith("companion started in flight: ")
             assert begun(flying, killed_s) == []
-            assert flying.rig.service.calibrating.conductor.job is None
+            assert flying.rig.service.calibrating.manager.job is None
             texts = flying.rig.ground.texts()[said:]
             assert "Attitude: heading pushed to the autopilot" in texts
             assert not [text for text in texts if "rmed" in text or "alibrat" in text or "not pushed" in text]

@@ -51,7 +51,7 @@ def test_with_the_rival_stopped_it_is_rebooted_and_the_offsets_are_confirmed(tmp
             assert rig.double.parameter("INS_GYR_CAL") == 0
             written = record.imus[0].written
             assert [written[name].after for name in offset_names(1, "gyro")] == pytest.approx(gyro(rig))
-            undo = rig.service.calibrating.conductor.start_undo("test")
+            undo = rig.service.calibrating.manager.start_undo("test")
             assert isinstance(undo, Job)
             assert (await undo.finished).outcome == "done"
             assert rig.double.parameter("INS_GYR_CAL") == 1
@@ -111,7 +111,7 @@ def test_a_reboot_is_not_sent_to_an_aircraft_that_armed_meanwhile(tmp_path: Path
     async def main() -> None:
         async with quick(tmp_path).running() as rig:
             await rig.ready()
-            job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", reboot=True)
+            job = rig.service.calibrating.manager.start_calibration(What.BOTH, "test", reboot=True)
             assert isinstance(job, Job), job
             await rig.until(lambda: "stored the new offsets" in job.words, 90.0)
             rig.double.arm()

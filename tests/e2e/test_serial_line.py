@@ -79,7 +79,7 @@ def test_on_a_busy_57600_baud_line_a_calibration_is_right(tmp_path: Path) -> Non
         )
         async with rig.running(), other_traffic(rig):
             await rig.ready()
-            job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
+            job = rig.service.calibrating.manager.start_calibration(What.BOTH, "test")
             assert isinstance(job, Job)
             result = await job.finished
             assert result.outcome == "done", result

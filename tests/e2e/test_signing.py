@@ -136,7 +136,7 @@ def test_who_has_no_key_starts_nothing_and_changes_nothing(tmp_path: Path, attac
                 await asyncio.sleep(0.1)
                 rig.wire.carry_from_other(data)
                 await asyncio.sleep(1.5)
-            assert rig.service.calibrating.conductor.job is None
+            assert rig.service.calibrating.manager.job is None
             assert parameters.get("CMP_PUSH") == push
             assert rig.ground.acks() == []
             assert sum(rig.service.status()["vehicle"]["signing"]["doubted"].values()) == 3

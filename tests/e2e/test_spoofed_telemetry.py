@@ -43,7 +43,7 @@ async def spoofed(rig: Rig, every_s: float, *messages: Callable[[], Message]) ->
 
 
 def calibrate(rig: Rig) -> Job:
-    answer = rig.service.calibrating.conductor.start_calibration(What.BOTH, "a pilot")
+    answer = rig.service.calibrating.manager.start_calibration(What.BOTH, "a pilot")
     assert not isinstance(answer, Refusal), answer.reason
     return answer
 

@@ -42,9 +42,9 @@ def test_headline_and_arming_say_the_same_at_every_moment(tmp_path: Path) -> Non
                     await asyncio.sleep(0.01)
 
             looking = asyncio.create_task(look())
-            conductor = rig.service.calibrating.conductor
+            manager = rig.service.calibrating.manager
             await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 120.0)
-            await rig.until(lambda: conductor.running is None, 120.0)
+            await rig.until(lambda: manager.running is None, 120.0)
             rig.double.faults.echo_without_effect = True
             rig.model.turn_on([2000.0 * SIM_DEG_H, 0.0, 0.0], [0.0, 0.0, 0.0])
             await calibrated(rig)
@@ -56,7 +56,7 @@ def test_headline_and_arming_say_the_same_at_every_moment(tmp_path: Path) -> Non
             rig.double.reboot()
             await asyncio.sleep(6.0)
             looking.cancel()
-            assert conductor.state is not State.IDLE
+            assert manager.state is not State.IDLE
             assert found == set()
 
     run_virtual(main())

@@ -93,7 +93,7 @@ def test_one_writes_and_the_other_refuses_by_name_and_an_undo_brings_all_back(tm
             refusing = [rig for rig in both if rig.service.offsets.companions.why_not() is not None]
             (second,) = refusing
             (writer,) = [rig for rig in both if rig is not second]
-            refusal = second.service.calibrating.conductor.start_calibration(What.BOTH, "test")
+            refusal = second.service.calibrating.manager.start_calibration(What.BOTH, "test")
             assert isinstance(refusal, Refusal)
             assert refusal.reason == WORDS
             status = second.service.status()
@@ -106,7 +106,7 @@ def test_one_writes_and_the_other_refuses_by_name_and_an_undo_brings_all_back(tm
             assert said <= set(both[0].ground.texts())
             assert (await calibrated(writer))[0].outcome == "done"
             assert values(writer.double) != before
-            undo = second.service.calibrating.conductor.start_undo("test")
+            undo = second.service.calibrating.manager.start_undo("test")
             assert isinstance(undo, Refusal)
             assert undo.reason == WORDS
             assert (await undone(writer)).outcome == "done"
@@ -123,7 +123,7 @@ def test_a_write_that_the_second_has_begun_to_measure_for_is_not_done(tmp_path: 
             for rig in both:
                 await rig.ready()
             before = values(both[0].double)
-            jobs = [rig.service.calibrating.conductor.start_calibration(What.BOTH, "test") for rig in both]
+            jobs = [rig.service.calibrating.manager.start_calibration(What.BOTH, "test") for rig in both]
             results = [await job.finished for job in jobs if not isinstance(job, Refusal)]
             reasons = [job.reason for job in jobs if isinstance(job, Refusal)]
             reasons += [result.reason for result in results if result.outcome != "done"]

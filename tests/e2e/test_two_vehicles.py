@@ -139,7 +139,7 @@ def test_a_calibration_and_its_undo_leave_the_other_aircraft_alone(
             before = values(rig.autopilot)
             rig.ground.command(CALIBRATE, target=(own_id, 191))
             await rig.until(lambda: rig.ground.acks(CALIBRATE)[-1:] == [0], 90.0)
-            record = rig.service.calibrating.conductor.last
+            record = rig.service.calibrating.manager.last
             assert record is not None
             assert record.state == "done"
             residual = rig.autopilot.residual(1, rig.now_s)

@@ -62,7 +62,7 @@ def steps(rig: Rig) -> list[str]:
 
 
 async def undone(rig: Rig, *, force: bool = False) -> JobResult:
-    return await started(rig.service.calibrating.conductor.start_undo("test", force=force)).finished
+    return await started(rig.service.calibrating.manager.start_undo("test", force=force)).finished
 
 
 def test_each_undo_takes_one_step_back_to_the_bit_says_which_and_then_there_is_nothing(tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_a_power_cut_at_any_moment_of_an_undo_costs_no_step_and_takes_back_no_se
             await made.ready()
             assert (await undone(made)).outcome == "done"
             cutting = True
-            job = started(made.service.calibrating.conductor.start_undo("test"))
+            job = started(made.service.calibrating.manager.start_undo("test"))
             while job.is_running:
                 cut()
                 await asyncio.sleep(0.01)
@@ -181,7 +181,7 @@ def test_an_undo_that_fails_before_its_first_write_can_be_asked_for_again(
         async with Rig(tmp_path, parameters=wanted[0]).running() as rig:
             await rig.ready()
             kept = step_file.read_bytes()
-            job = started(rig.service.calibrating.conductor.start_undo("test"))
+            job = started(rig.service.calibrating.manager.start_undo("test"))
             await rig.until((tmp_path / "journal.json").exists, 5.0)
             assert read(rig) == wanted[0]
             fault(rig)

@@ -17,7 +17,7 @@ from tests.support.virtual_time import run_virtual
 
 
 def ask(rig: Rig, requester: str) -> Job | Refusal:
-    return rig.service.calibrating.conductor.start_calibration(What.BOTH, requester)
+    return rig.service.calibrating.manager.start_calibration(What.BOTH, requester)
 
 
 async def done(rig: Rig) -> None:
@@ -41,7 +41,7 @@ def test_requests_and_cancels_in_a_loop_leave_the_history_as_it_was(tmp_path: Pa
                 await asyncio.sleep(0.005)
             # The last cancel is still on its way, and would cancel what comes next.
             await rig.until(lambda: len(rig.ground.finals(CANCEL)) == 1000, 30.0)
-            await rig.until(lambda: not rig.service.calibrating.conductor.state.busy, 30.0)
+            await rig.until(lambda: not rig.service.calibrating.manager.state.busy, 30.0)
             assert [entry.path.read_bytes() for entry in rig.service.calibrating.store.entries()] == before
             assert len(before) == 1
             assert TEMPORARILY_REJECTED in rig.ground.finals(CALIBRATE)
@@ -58,8 +58,8 @@ def test_what_was_measured_before_the_cancel_is_a_record(tmp_path: Path) -> None
             await rig.ready()
             job = ask(rig, "a pilot")
             assert isinstance(job, Job)
-            await rig.until(lambda: rig.service.calibrating.conductor.state.is_writing, 60.0)
-            rig.service.calibrating.conductor.cancel("a pilot")
+            await rig.until(lambda: rig.service.calibrating.manager.state.is_writing, 60.0)
+            rig.service.calibrating.manager.cancel("a pilot")
             assert (await job.finished).outcome == "cancelled"
             assert [record.state for record in rig.service.calibrating.store.history()] == ["cancelled"]
 
@@ -122,7 +122,7 @@ def test_alignments_have_the_same_limit(tmp_path: Path) -> None:
             answers = []
             for _ in range(30):
                 answers.append(rig.service.calibrating.start_alignment({"action": "zero"}, "a script"))
-                rig.service.calibrating.conductor.cancel("a script")
+                rig.service.calibrating.manager.cancel("a script")
                 if isinstance(job := answers[-1], Job):
                     await job.finished
             reasons = [answer.reason for answer in answers if isinstance(answer, Refusal)]

@@ -29,7 +29,7 @@ def test_nobody_is_accused_who_works(tmp_path: Path) -> None:
             looking = asyncio.create_task(look())
             await asyncio.sleep(20.0)
             for _ in range(2):
-                job = running.service.calibrating.conductor.start_calibration(What.BOTH, "test")
+                job = running.service.calibrating.manager.start_calibration(What.BOTH, "test")
                 assert not isinstance(job, Refusal)
                 await job.finished
                 rig.wire.cut = True

@@ -83,7 +83,7 @@ async def _survives(folder: Path, firmware: Literal["ardupilot", "px4"], seed: i
         await rig.ready()
         kinds = [kind for kind in mavlink.mavlink_map.values() if rig.link._handlers.get(kind.msgname)]
         assert len(kinds) > 20
-        start = rig.service.calibrating.conductor.start_calibration
+        start = rig.service.calibrating.manager.start_calibration
         asked = start(What.BOTH, "a pilot")
         for turn in range(1500):
             for kind in kinds if turn < 2 else hostile._chance.choices(kinds, k=3):
@@ -94,11 +94,11 @@ async def _survives(folder: Path, firmware: Literal["ardupilot", "px4"], seed: i
         assert rig.link.received["handler error"] == 0
         assert rig.service.recorder.fault is None
         # Once it is over, all is as before: at the latest when the words of a spoofed restart have been looked into.
-        await rig.until(lambda: not rig.service.calibrating.conductor.state.busy, 240.0)
+        await rig.until(lambda: not rig.service.calibrating.manager.state.busy, 240.0)
         if isinstance(asked, Job):
             assert asked.finished.done()
         await asyncio.sleep(60.0)
-        await rig.until(lambda: not rig.service.calibrating.conductor.state.busy, 240.0)
+        await rig.until(lambda: not rig.service.calibrating.manager.state.busy, 240.0)
         again = start(What.BOTH, "a pilot")
         assert not isinstance(again, Refusal), again.reason
         async with asyncio.timeout(240.0):

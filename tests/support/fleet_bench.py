@@ -46,7 +46,7 @@ async def _record(folder: Path) -> dict[str, Any]:
     rig = Rig(folder, own_imu=True)
     async with rig.running():
         await rig.ready()
-        job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "bench")
+        job = rig.service.calibrating.manager.start_calibration(What.BOTH, "bench")
         assert isinstance(job, Job), job
         await job.finished
     found: dict[str, Any] = msgspec.json.decode((folder / "records" / "000001.json").read_bytes())

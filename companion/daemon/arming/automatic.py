@@ -62,9 +62,9 @@ class Automatic:
     """Starts calibrations by itself; `run` decides when."""
 
     def __init__(
-        self, core: Core, imus: Mapping[str, AutopilotImu], conductor: CalibrationManager, in_force: InForce
+        self, core: Core, imus: Mapping[str, AutopilotImu], manager: CalibrationManager, in_force: InForce
     ) -> None:
-        self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
+        self._vehicle, self._collector, self._manager = core.vehicle, core.collector, manager
         self._wanted, self._only_listening = core.wanted, core.only_listening is not None
         self._imus, self._in_force = imus, in_force
         self._say, self._offload = core.say, core.offload
@@ -134,7 +134,7 @@ class Automatic:
         if self.why_not() is not None or not (in_force.findings(now_s) or in_force.worth_writing_s >= WORTH_FOR_S):
             return
         if self._is_possible() and await self._still_ours() and self._is_possible():
-            answer = self._conductor.start_calibration(self._in_force.what, REQUESTER, TIMEOUT_S, automatic=True)
+            answer = self._manager.start_calibration(self._in_force.what, REQUESTER, TIMEOUT_S, automatic=True)
             if isinstance(answer, Refusal):
                 logger.info("nothing is written by itself: %s", answer.reason)
 
@@ -150,7 +150,7 @@ class Automatic:
 
     def _is_possible(self) -> bool:
         """Disarmed, nothing else runs, and the window would not get better by waiting."""
-        if self._conductor.why_not((Rung.BUSY, Rung.ARMED, Rung.UNKNOWN)) is not None:
+        if self._manager.why_not((Rung.BUSY, Rung.ARMED, Rung.UNKNOWN)) is not None:
             return False
         status = self._collector.status(asyncio.get_running_loop().time())
         return status.waiting_for is None and status.enough and self._in_force.measured

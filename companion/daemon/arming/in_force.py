@@ -66,11 +66,11 @@ class InForce:
         self,
         core: Core,
         imus: Mapping[str, AutopilotImu],
-        conductor: CalibrationManager,
+        manager: CalibrationManager,
         estimator: Estimator,
         memory: BiasMemory,
     ) -> None:
-        self._core, self._config, self._conductor = core, core.config, conductor
+        self._core, self._config, self._manager = core, core.config, manager
         config = core.config
         self._imus, self._estimator, self._memory = imus, estimator, memory
         wanted = config.calibration
@@ -139,7 +139,7 @@ class InForce:
     @property
     def earlier(self) -> Record | None:
         """The last calibration, be it of before this start, if it was good and has not been undone."""
-        return None if self.undone else self._conductor.last_good
+        return None if self.undone else self._manager.last_good
 
     @property
     def worth_writing_s(self) -> float:

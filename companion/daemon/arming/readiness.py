@@ -69,10 +69,10 @@ MOVED_S: Final = 4.0
 
 
 class Forecast:
-    """Of the write that the conductor does."""
+    """Of the write that the manager does."""
 
-    def __init__(self, core: Core, conductor: CalibrationManager) -> None:
-        self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
+    def __init__(self, core: Core, manager: CalibrationManager) -> None:
+        self._vehicle, self._collector, self._manager = core.vehicle, core.collector, manager
         self._min_still_s = core.config.calibration.min_still_s
         self._promised: tuple[object, float] | None = None
         """The state, and the time at which its end was promised."""
@@ -89,12 +89,12 @@ class Forecast:
 
     @property
     def _job_s(self) -> float:
-        job = self._conductor.running
+        job = self._manager.running
         return 0.0 if job is None else job.left_s
 
     def answer(self, now_s: float) -> ArmAnswer:
         """What is going on and for how long yet, for somebody who may not arm because of it."""
-        state = self._conductor.state
+        state = self._manager.state
         words = _IN_THE_MIDDLE[state]
         if state is State.SETTLING:
             left_s = self._left_s(state, self._job_s, now_s)
@@ -126,12 +126,12 @@ class Readiness:
     """The arm gate's answer, and what goes with it: `run` keeps it fresh."""
 
     def __init__(
-        self, core: Core, owed: RebootOwed, conductor: CalibrationManager, in_force: InForce, automatic: Automatic
+        self, core: Core, owed: RebootOwed, manager: CalibrationManager, in_force: InForce, automatic: Automatic
     ) -> None:
-        self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
+        self._vehicle, self._collector, self._manager = core.vehicle, core.collector, manager
         self._wanted, self._on_deck = core.wanted, core.config.vehicle.platform == "deck"
         self.in_force, self._automatic, self._owed = in_force, automatic, owed
-        self._forecast = Forecast(core, conductor)
+        self._forecast = Forecast(core, manager)
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
         self._said = -math.inf, math.inf
@@ -155,8 +155,8 @@ class Readiness:
         """The answer as of the last fraction of a second; what can change at once is looked at again."""
         if asyncio.get_running_loop().time() - self._answered_s > OLDEST_ANSWER_S:
             return ArmAnswer("wait", "companion is busy: try again")
-        if self._conductor.state.is_writing and self._answer.verdict == "accept":
-            return ArmAnswer("wait", f"{_IN_THE_MIDDLE[self._conductor.state]}: wait")
+        if self._manager.state.is_writing and self._answer.verdict == "accept":
+            return ArmAnswer("wait", f"{_IN_THE_MIDDLE[self._manager.state]}: wait")
         return self._answer
 
     async def run(self) -> None:
@@ -201,16 +201,16 @@ class Readiness:
     @property
     def _writing(self) -> bool:
         """Whether a job that may write runs, or one that was interrupted is being put in order."""
-        return self._conductor.why_not((Rung.BUSY, Rung.PENDING)) is not None
+        return self._manager.why_not((Rung.BUSY, Rung.PENDING)) is not None
 
     def _judge(self, now_s: float) -> ArmAnswer:
-        if (obstacle := self._conductor.why_not(_CLOSED)) is not None:
+        if (obstacle := self._manager.why_not(_CLOSED)) is not None:
             wait = _WAITS.get(obstacle.rung)
             return ArmAnswer("refuse", obstacle.words) if wait is None else ArmAnswer("wait", wait)
         if not self._wanted.push:
             return ArmAnswer("refuse", "writing is off (CMP_PUSH): no gate")
         glance = self._collector.glance(now_s)
-        if self._conductor.state.is_writing:
+        if self._manager.state.is_writing:
             return self._forecast.answer(now_s)
         if glance.obstacle is not None and not glance.moving:
             return ArmAnswer("refuse", glance.obstacle.words)
@@ -271,12 +271,12 @@ class Readiness:
         """In which state it would arm now, in a word and in one short line."""
         state, words = self._state(now_s)
         held_back = self.in_force.held_back
-        if held_back is None or self._conductor.state.is_writing:
+        if held_back is None or self._manager.state.is_writing:
             return state, words
         return state, f"{words}; {held_back}; calibrate to write it" if words else f"{held_back}; calibrate to write it"
 
     def _state(self, now_s: float) -> tuple[Literal["calibrated", "checked", "uncalibrated"], str]:
-        if (middle := _IN_THE_MIDDLE.get(self._conductor.state)) is not None:
+        if (middle := _IN_THE_MIDDLE.get(self._manager.state)) is not None:
             return "uncalibrated", middle
         if (reading := self.in_force.reading()) is not None:
             return "uncalibrated", reading

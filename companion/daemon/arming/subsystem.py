@@ -32,12 +32,12 @@ class Arming(Subsystem):
     def __init__(self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating) -> None:
         self._core, self._store, self._by_hand = core, calibrating.store, calibrating.by_hand
         self._recovery = offsets.recovery
-        self.in_force = InForce(core, devices.imus, calibrating.conductor, calibrating.estimator, calibrating.memory)
-        self.automatic = Automatic(core, devices.imus, calibrating.conductor, self.in_force)
+        self.in_force = InForce(core, devices.imus, calibrating.manager, calibrating.estimator, calibrating.memory)
+        self.automatic = Automatic(core, devices.imus, calibrating.manager, self.in_force)
         # In this order: the next automatic calibration asks for what is in force.
         for on_ended in (self.in_force.on_ended, self.automatic.on_ended):
-            calibrating.conductor.on_ended.add(on_ended)
-        self.readiness = Readiness(core, offsets.owed, calibrating.conductor, self.in_force, self.automatic)
+            calibrating.manager.on_ended.add(on_ended)
+        self.readiness = Readiness(core, offsets.owed, calibrating.manager, self.in_force, self.automatic)
         self.armings = Armings(core, self.readiness)
         self.gate_setup = GateSetup(core, self.readiness)
 

@@ -74,14 +74,14 @@ class Calibrating(Subsystem):
         self.by_hand = ByHand(core, imus)
         self._into_autopilot = IntoAutopilot(core, imus, measuring, self.memory, offsets)
         parts = Parts(core, imus, measuring, ditherer, self.estimator, self.memory, offsets, self.on_solved)
-        self.conductor = CalibrationManager(parts, self.store, self.by_hand)
+        self.manager = CalibrationManager(parts, self.store, self.by_hand)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.alignment.load()
         self.faces.load()
         self.by_hand.load()
         self.memory.load()
-        self.conductor.load()
+        self.manager.load()
 
     def commands(self) -> Mapping[str, Handler]:
         """As in the base class; each raises `RequestRefusedError`, or another `CompanionError` once it was taken."""
@@ -94,33 +94,33 @@ class Calibrating(Subsystem):
         }
 
     def status(self) -> Object:  # noqa: D102
-        conductor, job = self.conductor, self.conductor.running
+        manager, job = self.manager, self.manager.running
         still = self._core.collector.status(asyncio.get_running_loop().time())
         return {
-            "state": conductor.state.shown,
-            "reason": job.words if job is not None else conductor.reason,
-            "progress": conductor.progress_percent if job is not None else None,
+            "state": manager.state.shown,
+            "reason": job.words if job is not None else manager.reason,
+            "progress": manager.progress_percent if job is not None else None,
             "still_s": round(still.still_s, 1),
             "waiting_for": still.waiting_for,
             "alignment": self.alignment.status(),
             "by_hand": self.by_hand.latest(),
             "stands": msgspec.to_builtins(self.stands.shown),
-            "last": _summary(conductor.last),
+            "last": _summary(manager.last),
             "job": self._job(),
         }
 
     def _job(self) -> Object | None:
         """Progress of the latest job; None before the first."""
-        conductor, job = self.conductor, self.conductor.job
+        manager, job = self.manager, self.manager.job
         if job is None:
             return None
         return {
             "kind": job.kind,
             "what": job.what.name.lower(),
             "requester": job.requester,
-            "state": conductor.state.shown,
-            "percent": conductor.progress_percent,
-            "text": job.words if conductor.running is not None else conductor.reason,
+            "state": manager.state.shown,
+            "percent": manager.progress_percent,
+            "text": job.words if manager.running is not None else manager.reason,
         }
 
     async def _calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
@@ -134,9 +134,9 @@ class Calibrating(Subsystem):
                 f"calibrate: 'timeout_s': found {timeout_s!r}; allowed: a number of seconds above 0"
             )
         reboot = request.get("reboot") is True
-        job = _accepted(self.conductor.start_calibration(what, f"{face} calibrate", timeout_s, reboot=reboot))
+        job = _accepted(self.manager.start_calibration(what, f"{face} calibrate", timeout_s, reboot=reboot))
         if not request.get("wait"):
-            yield {"kind": "result", "state": self.conductor.state.shown, "reason": "calibration started"}
+            yield {"kind": "result", "state": self.manager.state.shown, "reason": "calibration started"}
             return
         async for reply in self._progress(job):
             yield reply
@@ -153,7 +153,7 @@ class Calibrating(Subsystem):
                 yield reply
         elif action == "write":
             job = _accepted(
-                self.conductor.start_job(
+                self.manager.start_job(
                     TEMPERATURE,
                     What.GYROS,
                     f"{face} temperature",
@@ -168,15 +168,15 @@ class Calibrating(Subsystem):
             yield {"kind": "result", "imus": await self._core.offload(self.memory.temperature)}
 
     async def _cancel(self, _request: Object, face: str) -> AsyncIterator[Object]:
-        running = self.conductor.cancel(f"{face} cancel")
-        if running and self.conductor.job is not None:
-            await asyncio.shield(self.conductor.job.finished)
-        reason = self.conductor.reason if running else "nothing was running"
-        yield {"kind": "result", "state": self.conductor.state.shown, "reason": reason}
+        running = self.manager.cancel(f"{face} cancel")
+        if running and self.manager.job is not None:
+            await asyncio.shield(self.manager.job.finished)
+        reason = self.manager.reason if running else "nothing was running"
+        yield {"kind": "result", "state": self.manager.state.shown, "reason": reason}
 
     async def _undo(self, request: Object, face: str) -> AsyncIterator[Object]:
         await self._hear()
-        job = _accepted(self.conductor.start_undo(f"{face} undo", force=request.get("force") is True))
+        job = _accepted(self.manager.start_undo(f"{face} undo", force=request.get("force") is True))
         result = await asyncio.shield(job.finished)
         yield {
             "kind": "result",
@@ -198,7 +198,7 @@ class Calibrating(Subsystem):
         if action == "show":
             yield {"kind": "result", **self._shown()}
         elif action == "forget":
-            if (busy := self.conductor.why_not((Rung.BUSY,))) is not None:
+            if (busy := self.manager.why_not((Rung.BUSY,))) is not None:
                 raise CalibrationRefusedError(busy.words)
             was = await self.alignment.forget()
             words = "the configuration's zero and sigma are in force" if was else "there was no alignment to forget"
@@ -206,7 +206,7 @@ class Calibrating(Subsystem):
         else:
             job = _accepted(self.start_alignment(request, f"{face} align"))
             if request.get("wait") is False:
-                yield {"kind": "result", "state": self.conductor.state.shown, "reason": f"{job.kind} started"}
+                yield {"kind": "result", "state": self.manager.state.shown, "reason": f"{job.kind} started"}
                 return
             async for reply in self._to_end(job, "alignment"):
                 yield reply
@@ -248,7 +248,7 @@ class Calibrating(Subsystem):
             if kind == ALIGNMENT:
                 return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
             return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
-        return self.conductor.start_job(kind, what, by, timeout_s, missing, run)
+        return self.manager.start_job(kind, what, by, timeout_s, missing, run)
 
     async def _to_end(self, job: Job, product: str) -> AsyncIterator[Object]:
         """How it goes, and at its end the result, with what came of it under this key."""
@@ -266,9 +266,9 @@ class Calibrating(Subsystem):
         while job.is_running:
             yield {
                 "kind": "progress",
-                "state": self.conductor.state.shown,
-                "word": self.conductor.state.word,
-                "percent": self.conductor.progress_percent,
+                "state": self.manager.state.shown,
+                "word": self.manager.state.word,
+                "percent": self.manager.progress_percent,
                 "text": job.words,
             }
             await asyncio.wait([job.finished], timeout=PROGRESS_EVERY_S)

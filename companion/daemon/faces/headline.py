@@ -44,11 +44,11 @@ class Headlines:
         self,
         core: Core,
         devices: Devices,
-        conductor: CalibrationManager,
+        manager: CalibrationManager,
         arming: Arming,
         attitude: AttitudeService | None,
     ) -> None:
-        self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
+        self._vehicle, self._collector, self._manager = core.vehicle, core.collector, manager
         self._readiness, self._automatic, self._armings = arming.readiness, arming.automatic, arming.armings
         self._devices, self._attitude = devices, attitude
         self._on_deck = core.config.vehicle.platform == "deck"
@@ -69,7 +69,7 @@ class Headlines:
 
     def _now(self) -> Headline:
         now_s = asyncio.get_running_loop().time()
-        job, obstacle = self._conductor.running, self._conductor.why_not()
+        job, obstacle = self._manager.running, self._manager.why_not()
         rung = obstacle.rung if obstacle is not None else None
         if obstacle is not None and rung is Rung.FAULT:
             return Headline("FAULT", obstacle.words, "bad")
@@ -79,7 +79,7 @@ class Headlines:
             return self._working(job, now_s)
         if rung is Rung.UNKNOWN:
             return self._no_autopilot()
-        if self._conductor.why_not((Rung.PENDING,)) is not None:
+        if self._manager.why_not((Rung.PENDING,)) is not None:
             return Headline("PUTTING BACK", "an interrupted write is being put back", "busy")
         state, words = self._readiness.state(now_s)
         if rung is Rung.ARMED:
@@ -88,7 +88,7 @@ class Headlines:
                     return Headline(ARMED, f"companion started in flight: {words}", "wait")
                 return Headline(ARMED, f"not calibrated: {words}", "bad")
             return Headline(ARMED, words, "good")
-        if (second := self._conductor.why_not((Rung.SECOND,))) is not None:
+        if (second := self._manager.why_not((Rung.SECOND,))) is not None:
             return Headline("TWO COMPANIONS", second.words, "bad")
         if self._readiness.at_arm == "gate":
             return self._gate()
@@ -104,7 +104,7 @@ class Headlines:
         return Headline("NO AUTOPILOT", f"no heartbeat for {age_s:.0f} s: {why}", "bad")
 
     def _working(self, job: Job, now_s: float) -> Headline:
-        state = self._conductor.state
+        state = self._manager.state
         words = job.words or state.word
         if job.cancelled:
             return Headline("CANCELLING", words, "busy")
@@ -162,9 +162,9 @@ class Headlines:
         return Headline(f"HOLD STILL {left_s:.0f} s", f"{words}: {BY_ITSELF}", "wait")
 
     def _failed(self) -> Headline | None:
-        if self._conductor.state is not State.FAILED:
+        if self._manager.state is not State.FAILED:
             return None
-        return Headline("FAILED", self._conductor.reason, "bad")
+        return Headline("FAILED", self._manager.reason, "bad")
 
 
 def _hold_still(seconds: int, meanwhile: str = "") -> Headline:

@@ -61,17 +61,17 @@ class Faces(Subsystem):
         self._core, self._devices = core, devices
         self.component = Component(
             core.link,
-            calibrating.conductor,
+            calibrating.manager,
             arming.readiness,
             core.texts,
             core.tunes,
             own_parameters(core.wanted),
             Senders(core.config.mavlink.allow),
         )
-        calibrating.conductor.on_ended.add(self._show_result)
-        self._headlines = Headlines(core, devices, calibrating.conductor, arming, heading.attitude)
+        calibrating.manager.on_ended.add(self._show_result)
+        self._headlines = Headlines(core, devices, calibrating.manager, arming, heading.attitude)
         self._pose, self._readiness = heading.pose, arming.readiness
-        self._conductor = calibrating.conductor
+        self._manager = calibrating.manager
         self._subsystems = (self, devices, offsets, calibrating, arming, heading, recorder)
         self._handlers: dict[str, Handler] = {"status": self._status, "monitor": self._monitor}
         for subsystem in self._subsystems:
@@ -116,10 +116,10 @@ class Faces(Subsystem):
         shown, due_s, loop, record = "", 0.0, asyncio.get_running_loop(), None
         while True:
             reply: Object = {"kind": "progress", "pose": await self._pose.refresh()}
-            if self._conductor.last is not record:
-                record = self._conductor.last
+            if self._manager.last is not record:
+                record = self._manager.last
                 reply["record"] = msgspec.to_builtins(record)
-            state = self._conductor.state.shown
+            state = self._manager.state.shown
             if state != shown or loop.time() >= due_s:
                 reply["status"] = self.all_status()
                 shown, due_s = state, loop.time() + MONITOR_EVERY_S

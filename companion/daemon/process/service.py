@@ -104,7 +104,7 @@ class Service:
                 finally:
                     # Before the links go: the heading needs another source, a write under way its end.
                     self.heading.close()
-                    await self.calibrating.conductor.close()
+                    await self.calibrating.manager.close()
         finally:
             self.core.vehicle.close()
 

@@ -98,7 +98,7 @@ class Recorder(Subsystem):
         self.fault: str | None = None
         """Why the ring is not written, in one line; None while all is well."""
         self.tape = Tape()
-        self._core, self._offload, self._conductor = core, core.offload, calibrating.conductor
+        self._core, self._offload, self._manager = core, core.offload, calibrating.manager
         self._alignment = calibrating.alignment
         self._folder = config.storage.path / "recordings"
         megabytes = config.storage.recordings_mb
@@ -123,7 +123,7 @@ class Recorder(Subsystem):
         devices.ekf_bias.on_read.add(self._on_ekf_bias)
         calibrating.measuring.on_measured.add(self._on_measured)
         calibrating.on_solved.add(self._on_solved)
-        calibrating.conductor.on_ended.add(self._on_ended)
+        calibrating.manager.on_ended.add(self._on_ended)
 
     # --- inputs
 
@@ -254,7 +254,7 @@ class Recorder(Subsystem):
             return
         try:
             await self._in_thread(ring.write, batch, beginning)
-            if ring.is_full and not self._conductor.state.busy:
+            if ring.is_full and not self._manager.state.busy:
                 await self._in_thread(ring.close)
         except StorageError as error:
             self._stop_ring(str(error))

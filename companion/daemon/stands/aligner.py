@@ -33,7 +33,7 @@ OFFSET_WARNING_SIGMAS: Final = 4.0
 
 
 class Aligner:
-    """Measures alignments; who may start one is the conductor's."""
+    """Measures alignments; who may start one is the manager's."""
 
     def __init__(self, core: Core, stands: Stands, alignment: AlignmentInForce) -> None:
         self._core, self._config, self._stands, self._alignment = core, core.config, stands, alignment

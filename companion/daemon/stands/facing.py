@@ -51,7 +51,7 @@ class _Known(NamedTuple):
 
 
 class Facing:
-    """Measures accelerometers so; who may start it is the conductor's."""
+    """Measures accelerometers so; who may start it is the manager's."""
 
     def __init__(
         self, core: Core, imus: Mapping[str, AutopilotImu], stands: Stands, writes: AccelWrites, kept: FacesInForce

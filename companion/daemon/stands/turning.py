@@ -49,7 +49,7 @@ class TurnAsked(NamedTuple):
 
 
 class Turning:
-    """Measures so; who may start it is the conductor's."""
+    """Measures so; who may start it is the manager's."""
 
     def __init__(
         self,

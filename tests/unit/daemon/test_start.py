@@ -101,7 +101,7 @@ def test_the_record_waits_for_nothing_after_its_last_second(tmp_path: Path) -> N
             for pause_s in (5.0, 0.0, 0.37):
                 await asyncio.sleep(pause_s)
                 asked_s = rig.now_s
-                job = rig.service.calibrating.conductor.start_calibration(What.GYROS, "test")
+                job = rig.service.calibrating.manager.start_calibration(What.GYROS, "test")
                 assert isinstance(job, Job)
                 result = await job.finished
                 assert result.outcome == "done", result.reason
