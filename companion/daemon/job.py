@@ -1,4 +1,4 @@
-"""One request under way, as its requesters see it."""
+"""One request under way: a calibration, an alignment, the writing of temperature curves, or an undo."""
 
 from __future__ import annotations
 
@@ -23,23 +23,24 @@ TEMPERATURE: Final = "temperature curve"
 NO_CALIBRATION: Final = (ALIGNMENT, FACES, TURN, TEMPERATURE)
 
 GoOn = Callable[[str], None]
+"""Called now and then with words for progress; raises `JobCancelledError`."""
 
 
 class Undone(msgspec.Struct, frozen=True):
-    """One step back."""
+    """One undone step."""
 
     step: ChangeSet
     written: dict[str, WrittenParameter]
-    """What was put back; less than the step where others have changed something."""
+    """Restored parameters; fewer than in the step where others have changed some."""
     by_hand: bool
-    """Whether it was of what stands or curves had told, so that the last calibration is as it was."""
+    """Whether an alignment or a temperature curve was undone, so that the last calibration stays."""
 
 
 class CurvesWritten(msgspec.Struct, frozen=True):
-    """Curves over temperature that are in the autopilot now."""
+    """Curves over temperature that were written to the autopilot."""
 
     imus: dict[str, dict[str, WrittenParameter]]
-    """By IMU and parameter."""
+    """Parameters by IMU."""
     warnings: tuple[str, ...]
 
 
@@ -51,7 +52,7 @@ class JobCancelledError(Exception):
 
 
 class Job:
-    """A calibration or an undo; `finished` is done exactly once."""
+    """One request, as its requesters see it; `finished` is done exactly once."""
 
     def __init__(
         self,
@@ -65,98 +66,76 @@ class Job:
     ) -> None:
         self.kind, self.what, self.requester = kind, what, requester
         self.reboot = reboot
-        """Whether the autopilot is to be restarted once the result is stored."""
+        """Whether to restart the autopilot once the result is stored."""
         self.automatic = automatic
         """Whether nobody asked for it."""
         self.was_armed = False
-        """Whether the aircraft was armed since, be it for a moment."""
+        """Whether the aircraft was armed since the start, be it for a moment."""
         self.deadline_s = deadline_s
-        """Loop time until which measuring may take; None: no limit."""
+        """Loop time by which measuring must end; None: no limit."""
         self.finished: asyncio.Future[JobResult] = asyncio.get_running_loop().create_future()
         self.product: Product | None = None
-        """The record of a calibration or an alignment, or what an undo has put back."""
+        """Record of a calibration or an alignment, or the restored parameters of an undo."""
         self.words = ""
-        """What is going on now, for people."""
+        """Present activity, for people."""
         self.hold_still_s: int | None = None
-        """How long the aircraft has to stand still before anything else goes on."""
-        self._percent = 0
+        """Time to hold still before anything else goes on."""
+        self.progress_percent = 0
+        """0 to 100, never falling."""
         self._until_s = 0.0
         self._cancelled_by: str | None = None
         self._nudge = asyncio.Event()
 
     @property
+    def is_running(self) -> bool:
+        """Whether it has not finished."""
+        return not self.finished.done()
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether somebody has cancelled it."""
+        return self._cancelled_by is not None
+
+    @property
+    def record(self) -> Record | None:
+        """Record of a calibration."""
+        return self.product if isinstance(self.product, Record) else None
+
+    @property
     def undone(self) -> Undone | None:
-        """What came of an undo."""
+        """Result of an undo."""
         return self.product if isinstance(self.product, Undone) else None
 
     @property
     def undid_calibration(self) -> bool:
-        """Whether what a calibration has written was taken back; also one that nobody had asked for."""
+        """Whether the write of a calibration was undone, also of an automatic one."""
         return self.kind == "undo" and (self.undone is None or not self.undone.by_hand)
 
     @property
     def short(self) -> str:
-        """What it is, as the command line calls it."""
+        """The job as the command line calls it."""
         return {FACES: "faces", TURN: "turn", TEMPERATURE: BY_TEMPERATURE}.get(self.kind, self.kind)
 
     @property
-    def record(self) -> Record | None:
-        """What came of a calibration."""
-        return self.product if isinstance(self.product, Record) else None
+    def left_s(self) -> float:
+        """Estimated remaining time."""
+        return max(0.0, self._until_s - asyncio.get_running_loop().time())
 
     def deliver(self, product: Product) -> None:
-        """This is what came of it."""
+        """Set the product."""
         self.product = product
 
-    @property
-    def is_running(self) -> bool:
-        """Whether its end is still to come."""
-        return not self.finished.done()
-
-    @property
-    def progress_percent(self) -> int:
-        """0 to 100, never falling."""
-        return self._percent
-
     def progress(self, percent: float, words: str, hold_still_s: int | None = None) -> None:
-        """Say how far it is and what is going on; and how long to hold still, where that is all."""
-        self._percent = max(self._percent, min(99, int(percent)))
+        """Set percentage and present activity; and the time to hold still, where that is all."""
+        self.progress_percent = max(self.progress_percent, min(99, int(percent)))
         self.words, self.hold_still_s = words, hold_still_s
 
     def lasts(self, seconds: float) -> None:
-        """Say how long what is going on now will take."""
+        """Set the expected duration of the present activity."""
         self._until_s = asyncio.get_running_loop().time() + seconds
 
-    @property
-    def left_s(self) -> float:
-        """How long it will take yet, about."""
-        return max(0.0, self._until_s - asyncio.get_running_loop().time())
-
-    @property
-    def cancelled(self) -> bool:
-        """Whether somebody has asked it to stop."""
-        return self._cancelled_by is not None
-
-    def cancel(self, by: str) -> None:
-        """Ask it to stop at the next safe point."""
-        self._cancelled_by = self._cancelled_by or by
-        self._nudge.set()
-
-    def look_again(self) -> None:
-        """What it pauses for may have come: a `pause` under way ends."""
-        self._nudge.set()
-
-    def check_cancelled(self) -> None:
-        """The safe point.
-
-        Raises:
-            JobCancelledError: somebody cancelled it; says who.
-        """
-        if self._cancelled_by is not None:
-            raise JobCancelledError(f"cancelled by {self._cancelled_by}")
-
     def going_on(self, percent: float, otherwise: str = "") -> GoOn:
-        """What to call now and then with words, or none, for what goes on; raises JobCancelledError."""
+        """Make a `GoOn` that shows its words, or `otherwise`, at this percentage."""
 
         def go_on(words: str) -> None:
             self.check_cancelled()
@@ -164,11 +143,25 @@ class Job:
 
         return go_on
 
-    def check_time(self) -> None:
-        """The end of its patience.
+    def cancel(self, by: str) -> None:
+        """Ask it to stop at the next safe point."""
+        self._cancelled_by = self._cancelled_by or by
+        self._nudge.set()
+
+    def check_cancelled(self) -> None:
+        """Stop here if it was cancelled: a safe point.
 
         Raises:
-            CalibrationRefusedError: it has taken as long as it may.
+            JobCancelledError: somebody cancelled it; says who.
+        """
+        if self._cancelled_by is not None:
+            raise JobCancelledError(f"cancelled by {self._cancelled_by}")
+
+    def check_time(self) -> None:
+        """Check the deadline.
+
+        Raises:
+            CalibrationRefusedError: it is over.
         """
         if self.deadline_s is not None and asyncio.get_running_loop().time() >= self.deadline_s:
             raise CalibrationRefusedError(f"not finished in the time given: {self.words}")
@@ -184,8 +177,12 @@ class Job:
         if await comes(self._nudge, seconds):
             self.check_cancelled()
 
+    def look_again(self) -> None:
+        """End a `pause` under way: its cause may be over."""
+        self._nudge.set()
+
     def finish(self, result: JobResult) -> None:
         """Tell everybody who waits."""
-        self._percent = 100
+        self.progress_percent = 100
         if not self.finished.done():
             self.finished.set_result(result)

@@ -1,6 +1,6 @@
-"""Why nothing can be started at this moment: one ladder for all who ask, each of whom minds some of its rungs.
+"""Obstacles to starting a calibration, in the order in which they are told; and the limit on repeated requests.
 
-A person who asks is never held up by how often; a script that starts and cancels is.
+A person who asks is never held up by the limit; a script that starts and cancels is.
 """
 
 from __future__ import annotations
@@ -25,47 +25,45 @@ MOST_REQUESTERS: Final = 16
 
 
 class Rung(enum.Enum):
-    """What may stand in the way, in the order in which it is told."""
+    """Kinds of obstacles."""
 
     FAULT = "fault"
-    """Nothing can be kept, so that nothing is written."""
+    """Old values cannot be kept, so nothing is written."""
     CONFLICT = "conflict"
     """Two autopilots."""
     BUSY = "busy"
     ARMED = "armed"
     UNKNOWN = "unknown"
-    """Whether it is armed."""
+    """Arm state unknown."""
     SECOND = "second"
     """Another companion writes to this autopilot."""
     PENDING = "pending"
-    """An interrupted write is being put back."""
+    """The restore of an interrupted write is pending."""
 
 
 _KINDS: Final[dict[Rung, Literal["armed", "unknown", "busy", "other"]]] = {
-    Rung.FAULT: "other",
     Rung.CONFLICT: "unknown",
     Rung.BUSY: "busy",
     Rung.ARMED: "armed",
     Rung.UNKNOWN: "unknown",
-    Rung.SECOND: "other",
     Rung.PENDING: "busy",
 }
 
 
 class Obstacle(NamedTuple):
-    """What stands in the way, for people."""
+    """One obstacle, in words for people."""
 
     rung: Rung
     words: str
 
     @property
     def refusal(self) -> Refusal:
-        """The answer to a request."""
-        return Refusal(_KINDS[self.rung], self.words)
+        """Answer to a request."""
+        return Refusal(_KINDS.get(self.rung, "other"), self.words)
 
 
 def obstacle(vehicle: Vehicle, ledger: Ledger, job: Job | None, rungs: Collection[Rung]) -> Obstacle | None:
-    """The first of these that stands in the way; None where nothing does."""
+    """Return the first obstacle of these kinds."""
     return next((found for found in _obstacles(vehicle, ledger, job) if found.rung in rungs), None)
 
 
@@ -89,14 +87,14 @@ def _obstacles(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[Ob
 
 
 class StartLimit:
-    """A budget of starts for each requester."""
+    """Budget of starts for each requester."""
 
     def __init__(self) -> None:
         self._budgets: dict[str, Budget] = {}
         self._newcomers = Budget(STARTS_PER_S, BURST)
 
     def refuses(self, requester: str) -> Refusal | None:
-        """Take one start; or, when the requester has none left, why not."""
+        """Count one start; returns a refusal where the budget is spent."""
         now_s = asyncio.get_running_loop().time()
         budget = self._budget(requester, now_s)
         left = budget.left(now_s)
@@ -108,7 +106,7 @@ class StartLimit:
 
     def _budget(self, requester: str, now_s: float) -> Budget:
         if requester not in self._budgets:
-            # Of who has asked for nothing lately there is nothing to be remembered.
+            # A full budget need not be remembered.
             self._budgets = {name: each for name, each in self._budgets.items() if each.left(now_s) < BURST}
             if len(self._budgets) >= MOST_REQUESTERS:
                 return self._newcomers

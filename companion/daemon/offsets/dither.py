@@ -1,7 +1,7 @@
-"""Offset dither: steps the autopilot's offsets below the last digit of an integer stream, and puts them back.
+"""Offset dither: steps the autopilot's offsets below the last digit of an integer stream, and restores them.
 
-The old values and all that may stand in their place are kept on disk before the first write, and the recovery puts them
-back after whatever ends the dither too early: a cancel, arming, a reboot, a lost link, the daemon's death.
+The old values and all values of the steps are on disk before the first write; the recovery restores the old ones after
+whatever ends the dither too early: a cancel, arming, a reboot, a lost link, the daemon's death.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ from companion.storage.changes import Changed, ChangeSet
 logger = logging.getLogger(__name__)
 
 SETTLE_S: Final = {"ardupilot": 1.0, "px4": 2.5}
-"""Until the telemetry shows a written offset: ArduPilot's filter 60 ms, PX4's parameter updates a second (autopilots
+"""Delay of a written offset in the telemetry: ArduPilot's filter 60 ms, PX4's parameter updates a second (autopilots
 9.1, 9.2)."""
 WRITE_S: Final = 0.5
 POLL_S: Final = 0.2
 SLACK_S: Final = 6.0
-"""Beyond its seconds a step may take so much longer when readings are lost."""
+"""Extra time of a step when readings are lost."""
 MOST_VOID: Final = 6
-"""The most void steps in one dither before it is given up."""
+"""Void steps after which a dither fails."""
 BACK_WITHIN_S: Final = 20.0
-"""How long the recovery is waited for before the job ends without it."""
+"""Longest wait for the recovery before the job ends without it."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -63,17 +63,17 @@ class _Work:
 
     @property
     def before(self) -> dict[str, float]:
-        """The parameters as they were and must be again."""
+        """Old parameter values."""
         return self.calibration.offsets
 
     def step(self, values: Mapping[str, float], batches: Sequence[Batch]) -> Step:
-        """What was seen under these parameters."""
+        """Make a step from the batches collected under these parameters."""
         changes = [Change(name, before, values[name]) for name, before in self.before.items()]
         return Step(np.concatenate(output_step(self.calibration, changes)) / self.steps_si, batches)
 
 
 class Ditherer:
-    """Replaces the means of IMUs whose integers do not tell, where the user has allowed it."""
+    """Replaces means that the last digit of integers hides, where the configuration allows it."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], writer: ParameterWriter, ledger: Ledger) -> None:
         self._allowed, self._wanted = core.config.push.dither, core.wanted
@@ -133,7 +133,7 @@ class Ditherer:
         )
 
     async def _steps(self, work: _Work, job: Job) -> list[Step]:
-        """All steps, and the old values again."""
+        """Carry out all steps, then restore the old values."""
         in_force = work.before
         done: list[Step] = []
         voids = 0
@@ -158,7 +158,7 @@ class Ditherer:
         return done
 
     def _step_s(self) -> float:
-        """What a step takes: writing it, the telemetry showing it, whole seconds of it, the last of them complete."""
+        """Duration of a step: write, delay of the telemetry, whole seconds."""
         return WRITE_S + SETTLE_S.get(self._vehicle.firmware or "", 2.5) + SECONDS + 1.0
 
     def _prepare(self, window: ImuWindow, imu: AutopilotImu) -> _Work:
@@ -194,7 +194,7 @@ class Ditherer:
         job.check_time()
 
     async def _collect(self, work: _Work, values: Mapping[str, float], job: Job) -> tuple[Step, str | None]:
-        """The seconds of one step, after the telemetry has had time to show it, and who says that it moved."""
+        """Collect the seconds of one step once the telemetry shows it; returns words on a movement too."""
         loop = asyncio.get_running_loop()
         written = Moment(self._vehicle)
         while not written.has_passed(SETTLE_S.get(self._vehicle.firmware or "", 2.5)):
@@ -222,14 +222,14 @@ class Ditherer:
         return work.step(values, batches), moved
 
     def _moving(self, own: str) -> str | None:
-        """What another device says of the aircraft; the dithered IMU itself takes no part at present."""
+        """Return words of another device on a movement; the dithered IMU takes no part."""
         for source in self._collector.status(asyncio.get_running_loop().time()).sources:
             if source.name != own and not source.still and source.words:
                 return source.words
         return None
 
     async def _put_back(self) -> str:
-        """Let the recovery put the old offsets back, and say what became of it."""
+        """Let the recovery restore the old offsets; returns the result in words."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + BACK_WITHIN_S
         while loop.time() < deadline_s and self._vehicle.arm_state is not ArmState.ARMED:
@@ -240,7 +240,7 @@ class Ditherer:
 
 
 def _offsets(calibration: ImuCalibration, shift: Array) -> dict[str, float]:
-    """The parameters that shift the output (6, vehicle FRD) by so much: off - R^-1 shift, accelerometer over scale."""
+    """Compute parameters that shift the output (6, vehicle FRD): off - R^-1 shift, accelerometer over scale."""
     names, rotation = calibration.parameters, calibration.orientation
     gyro = np.asarray(calibration.gyro_offset_rad_s) - rotation.T @ shift[:3]
     accel = np.asarray(calibration.accel_offset_m_s2) - (rotation.T @ shift[3:]) / np.asarray(calibration.accel_scale)
@@ -250,7 +250,7 @@ def _offsets(calibration: ImuCalibration, shift: Array) -> dict[str, float]:
 
 
 def _with(window: ImuWindow, found: Dithered) -> ImuWindow:
-    """The window with the dithered means in place of those that do not tell."""
+    """Replace the hidden means of a window by dithered ones."""
     result = window
     for part, triad in (("gyro", slice(0, 3)), ("accel", slice(3, 6))):
         if part not in window.hidden:

@@ -1,7 +1,6 @@
-"""Did the autopilot take the new offsets? Its telemetry before and after the write, against what must have changed.
+"""Effect of a write: the telemetry before and after it, compared with the step that the new offsets must make.
 
-What the last digit of integer telemetry hides is in the windows' sigmas; only the short look at far values on the way
-is of plain means.
+The windows' sigmas cover the last digit of integer telemetry; only the short look at far values uses plain means.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ import asyncio
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -27,33 +26,33 @@ from companion.daemon.offsets.px4_writes import FarMean, Px4Writes, step_from_fa
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.rolling import MIN_BATCHES
 from companion.estimation.means.windows import ImuWindow, Window
-from companion.estimation.noise.allan import AllanModel, floor_variance, noise_profile
+from companion.estimation.noise.allan import floor_variance, noise_profile
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad, Vector
 
 VERIFY_MAX_S: Final = 60.0
-"""How long the aircraft may move after the write before its effect counts as not seen."""
+"""Longest wait for stillness after the write before its effect counts as not seen."""
 VERIFY_ON_DECK_S: Final = 180.0
-"""The same where the deck may sway: there it takes the better part of a minute to see a step."""
+"""Longest wait on a deck, where it takes the better part of a minute to see a step."""
 LOOK_S: Final = 10.0
 """Seconds that show a step, where a calibration must be still for longer."""
 LOOK_LONGER_S: Final = 30.0
 """The longest look at a change that a few seconds do not show; beyond it flicker hides more than averaging shows."""
 TELEMETRY_S: Final = 2.0
-"""How long after a write the telemetry may seem to be missing."""
+"""Time after a write in which the telemetry may seem to be missing."""
 TELEMETRY: Final = "waiting for the telemetry"
-"""What is said until then: the step of the new offsets themselves looks like a movement."""
+"""Progress shown until then: the step of the new offsets itself looks like a movement."""
 POLL_S: Final = 0.2
 
 Verdicts = Mapping[str, list[Verdict]]
-"""By IMU."""
+"""Verdicts by IMU."""
 
 # Between two neighbouring windows of some ten seconds an unnamed part is taken for an ordinary one (floors of 8 deg/h
 # and 50 micro-g), not for the worst there is as over the minutes of sigma_use: else no step could ever be seen.
-ORDINARY_FLICKER: Final = (8.0 / 0.664 * DEG_H, 0.05 / 0.664 * MG)
+ORDINARY_FLICKER: Final[Mapping[Triad, float]] = {"gyro": 8.0 / 0.664 * DEG_H, "accel": 0.05 / 0.664 * MG}
 TOLERANCE_SIGMAS: Final = 2.0
-"""What may remain besides noise: nobody claims the bias better than by its sigma_use."""
+"""Residual allowed besides noise, in sigma_use of the bias."""
 
 
 async def watch_effect(
@@ -138,47 +137,34 @@ def _judge(core: Core, px4: Px4Writes, target: Target, before: Window, after: Wi
 
 
 def _inconclusive(verdicts: Verdicts, looked_s: float) -> str:
-    """Why the look goes on; empty when what was seen is the last word."""
+    """Say why the watch goes on; empty when the verdicts are final."""
     found = [verdict for each in verdicts.values() for verdict in each]
     # The scatter of two seconds says little of their mean: nothing is called wrong on so little.
     hasty = looked_s < LOOK_S and not all(verdict.ok for verdict in found)
-    if looked_s > LOOK_LONGER_S or not (hasty or any(nearly_visible(verdict) for verdict in found)):
+    # A longer look can show a hidden step that has at least 3 of the 8 sigmas it needs.
+    nearly = any(
+        verdict.ok and verdict.hidden and verdict.fraction_sigma is not None and verdict.fraction_sigma < 1 / 3
+        for verdict in found
+    )
+    if looked_s > LOOK_LONGER_S or not (hasty or nearly):
         return ""
     return f"the change {'does not show' if hasty else 'is small'}: looking longer"
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Sides:
-    """One IMU's telemetry before and after the write, and what it had to read before (vehicle FRD)."""
+    """One IMU's telemetry before and after a write, and the residuals that the write takes out (vehicle FRD)."""
 
     before: ImuWindow
     after: ImuWindow
     gyro_residual: Array | None
     accel_residual: Array | None
     apart_s: float = 0.0
-    """Of their middles."""
+    """Time between the middles of both windows."""
 
 
 OnTheWay = Mapping[Triad, tuple[FarMean, Vector]]
-"""What was seen between: the output while far values were in force, and the step from there to the new ones."""
-
-
-class _Half(NamedTuple):
-    """The gyros or the accelerometers of one IMU, as they were written."""
-
-    sensor: Triad
-    parameters: tuple[str, str, str]
-    unit: str
-    residual: Array
-    step: Vector
-    resolution: float
-    drift: float
-
-    def of(self, window: ImuWindow) -> tuple[Vector, Vector, Vector]:
-        """Mean, sigma_stat and sigma_use."""
-        if self.sensor == "gyro":
-            return window.gyro_rad_s, window.gyro_sigma_stat_rad_s, window.gyro_sigma_use_rad_s
-        return window.accel_m_s2, window.accel_sigma_stat_m_s2, window.accel_sigma_use_m_s2
+"""Output while far values were in force, and the step from there to the new ones."""
 
 
 def judge_vectors(
@@ -189,96 +175,87 @@ def judge_vectors(
     profile: str | Noise | None,
     on_the_way: OnTheWay,
 ) -> list[Verdict]:
-    """Judge the vectors that were written: accelerometers, gyros, or both.
+    """Judge the written vectors: accelerometers, gyros, or both.
 
-    Where the output was seen to follow a far value and then to leave it as it had to, the new one is in use, however
-    small the change as a whole.
+    Where the output followed a far value and then left it as it had to, the new value is in use, however small the
+    change as a whole.
     """
     gyro_step, accel_step = output_step(calibration, changes, sides.before.accel_m_s2)
     names, noise = calibration.parameters, noise_profile(profile)
     spans_s = (sides.before.duration_s, sides.after.duration_s)
-    gyro_flicker, accel_flicker = (math.inf, math.inf) if profile is not None else ORDINARY_FLICKER
-    gyro_lsb, accel_lsb = (kind.gyro_step_rad_s, kind.accel_step_m_s2) if kind else (0.0, 0.0)
-    halves = []
-    if (residual := sides.accel_residual) is not None:
-        drift = _drift_sigma(noise.accel, accel_flicker, spans_s)
-        halves.append(_Half("accel", names.accel_offset, "m/s^2", residual, accel_step, accel_lsb, drift))
-    if (residual := sides.gyro_residual) is not None:
-        drift = _drift_sigma(noise.gyro, gyro_flicker, spans_s)
-        halves.append(_Half("gyro", names.gyro_offset, "rad/s", residual, gyro_step, gyro_lsb, drift))
-    return [_judge_half(half, sides, calibration, on_the_way) for half in halves]
-
-
-def _judge_half(half: _Half, sides: Sides, calibration: ImuCalibration, on_the_way: OnTheWay) -> Verdict:
-    (before, before_sigma, use), (after, after_sigma, _) = half.of(sides.before), half.of(sides.after)
-    spans_s = (sides.before.duration_s, sides.after.duration_s)
-    before, after, warmed = _as_at_end(half.sensor, sides, before, after)
-    observation = Observation(
-        parameters=half.parameters,
-        unit=half.unit,
-        before=before,
-        before_sigma=before_sigma,
-        after=after,
-        after_sigma=vector(np.hypot(np.hypot(_no_calmer(after_sigma, before_sigma, spans_s), half.drift), warmed)),
-        expected_step=half.step,
-        truth=vector(np.subtract(before, half.residual)),
-        tolerance=TOLERANCE_SIGMAS * max(use),
-        orientation=calibration.orientation,
+    flicker: Mapping[Triad, float] = {} if profile is not None else ORDINARY_FLICKER
+    verdicts: list[Verdict] = []
+    halves: tuple[tuple[Triad, Array | None, Vector, tuple[str, str, str], str], ...] = (
+        ("accel", sides.accel_residual, accel_step, names.accel_offset, "m/s^2"),
+        ("gyro", sides.gyro_residual, gyro_step, names.gyro_offset, "rad/s"),
     )
-    verdict = judge(observation)
-    if not verdict.ok or half.sensor not in on_the_way:
-        return verdict
-    far, step = on_the_way[half.sensor]
-    return judge(
-        dataclasses.replace(
-            observation,
-            before=vector(far.mean),
-            before_sigma=vector(far.sigma),
+    for triad, residual, step, parameters, unit in halves:
+        if residual is None:
+            continue
+        mean, sigma, use = _read(sides.before, triad)
+        mean_after, sigma_after, _ = _read(sides.after, triad)
+        before, after, warmed = _as_at_end(triad, sides, mean, mean_after)
+        model = noise.of(triad)
+        # The bias wanders between the windows (method 2.2, V less its white part).
+        drift = np.sqrt(floor_variance(min(model.flicker, flicker.get(triad, math.inf)), model.walk, *spans_s))
+        observation = Observation(
+            parameters=parameters,
+            unit=unit,
+            before=before,
+            before_sigma=sigma,
+            after=after,
+            after_sigma=vector(np.hypot(np.hypot(_no_calmer(sigma_after, sigma, spans_s), drift), warmed)),
             expected_step=step,
-            resolution=half.resolution,
+            truth=vector(np.subtract(before, residual)),
+            tolerance=TOLERANCE_SIGMAS * max(use),
+            orientation=calibration.orientation,
         )
-    )
+        verdict = judge(observation)
+        if verdict.ok and triad in on_the_way:
+            far, step_from_there = on_the_way[triad]
+            verdict = judge(
+                dataclasses.replace(
+                    observation,
+                    before=vector(far.mean),
+                    before_sigma=vector(far.sigma),
+                    expected_step=step_from_there,
+                    resolution=_resolution(kind, triad),
+                )
+            )
+        verdicts.append(verdict)
+    return verdicts
 
 
-def _as_at_end(sensor: Triad, sides: Sides, before: Vector, after: Vector) -> tuple[Vector, Vector, Array]:
-    """Both means as if the temperature had stayed as it was at the end of the first, and one sigma of that, (3,)."""
+def _read(window: ImuWindow, triad: Triad) -> tuple[Vector, Vector, Vector]:
+    """Return mean, sigma_stat and sigma_use of one triad."""
+    if triad == "gyro":
+        return window.gyro_rad_s, window.gyro_sigma_stat_rad_s, window.gyro_sigma_use_rad_s
+    return window.accel_m_s2, window.accel_sigma_stat_m_s2, window.accel_sigma_use_m_s2
+
+
+def _resolution(kind: StreamKind | None, triad: Triad) -> float:
+    if kind is None:
+        return 0.0
+    return kind.gyro_step_rad_s if triad == "gyro" else kind.accel_step_m_s2
+
+
+def _as_at_end(triad: Triad, sides: Sides, before: Vector, after: Vector) -> tuple[Vector, Vector, Array]:
+    """Convert both means to the temperature at the end of the first window; returns one sigma of that too, (3,)."""
     first, second = sides.before.warming, sides.after.warming
     if first is None or sides.before.dithered:
         return before, after, np.zeros(3)
-    slope, sigma = first.goes_on(sensor)
-    later = np.zeros(3) if second is None else second.ahead(sensor)
+    slope, sigma = first.goes_on(triad)
+    later = np.zeros(3) if second is None else second.ahead(triad)
     since_end_s = sides.apart_s - first.half_s
     return (
-        vector(before - first.ahead(sensor) + slope * first.half_s),
+        vector(before - first.ahead(triad) + slope * first.half_s),
         vector(after - later - slope * since_end_s),
         sigma * sides.apart_s,
     )
 
 
-def in_short(verdict: Verdict) -> str:
-    """What is wrong in one short line for people; `verdict.problems` has the figures."""
-    unused = [axis.parameter for axis in verdict.axes if axis.word == "not seen"]
-    if unused:
-        return f"the autopilot stored {', '.join(unused)} but does not use {'it' if len(unused) == 1 else 'them'}"
-    wrong = [axis.parameter for axis in verdict.axes if axis.word == "wrong"]
-    if wrong:
-        return f"the output did not follow {', '.join(wrong)} (orientation, sign or scale not as believed, or it moved)"
-    return "; ".join(verdict.problems)
-
-
-def nearly_visible(verdict: Verdict) -> bool:
-    """Whether a step that could not be seen might be with a longer look: at least 3 of the 8 sigmas it needs."""
-    sigma = verdict.fraction_sigma
-    return verdict.ok and bool(verdict.hidden) and sigma is not None and sigma < 1 / 3
-
-
-def _drift_sigma(model: AllanModel, most_flicker: float, spans_s: tuple[float, float]) -> float:
-    """How far the bias itself wanders between two neighbouring windows (method 2.2, V less its white part)."""
-    return float(np.sqrt(floor_variance(min(model.flicker, most_flicker), model.walk, *spans_s)))
-
-
 def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> Vector:
-    """The sigmas of the later mean, but none below what the noise before the write makes of so many seconds.
+    """Limit the sigmas of the later mean from below by the noise before the write.
 
     A write changes no noise; but the scatter of a few seconds is, by chance, now and then a tenth of what it should be.
     Where the seconds before are few as well, the three axes together count: simulated, 2 s against 2 s, each axis by
@@ -288,3 +265,14 @@ def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> V
     triad = float(np.sqrt(np.mean(np.square(before)))) if spans_s[0] < MIN_BATCHES else 0.0
     x, y, z = (max(sigma, longer * usual, longer * triad) for sigma, usual in zip(after, before, strict=True))
     return x, y, z
+
+
+def in_short(verdict: Verdict) -> str:
+    """Summarise a verdict in one short line for people; `verdict.problems` has the figures."""
+    unused = [axis.parameter for axis in verdict.axes if axis.word == "not seen"]
+    if unused:
+        return f"the autopilot stored {', '.join(unused)} but does not use {'it' if len(unused) == 1 else 'them'}"
+    wrong = [axis.parameter for axis in verdict.axes if axis.word == "wrong"]
+    if wrong:
+        return f"the output did not follow {', '.join(wrong)} (orientation, sign or scale not as believed, or it moved)"
+    return "; ".join(verdict.problems)

@@ -1,7 +1,7 @@
-"""What was changed in the autopilot, in memory and on disk at once.
+"""Journal of writes to the autopilot, in memory and on disk at once; recovery of interrupted ones, and undo.
 
-Open: a write is under way. Orphaned: a write was interrupted (the daemon died, or the old values could not all be
-put back), and the recovery has to bring it to an end. Undoable: the last finished writes on each vehicle.
+Open: a write is under way. Orphaned: a write was interrupted (the daemon died, or not all old values could be
+restored), and the recovery has to end it. Undoable: the last finished writes on each vehicle.
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ POLL_S: Final = 0.2
 
 
 class Ledger:
-    """The change files of one storage folder and what they say."""
+    """Journal and undo steps of one storage folder."""
 
     def __init__(self, log: ChangeLog, offload: Offload, why_yield: Callable[[], str | None] = lambda: None) -> None:
         self._log, self._offload, self.why_yield = log, offload, why_yield
-        """`why_yield`: why another companion writes here, and this one does not."""
+        """`why_yield`: reason not to write because another companion does; None without one."""
         self.fault: str | None = None
-        """Why nothing may be written at all, for people; None while all is well."""
+        """Reason why nothing can be kept, so that nothing may be written; None while all is well."""
         self._open: ChangeSet | None = None
         self._orphaned = asyncio.Event()
         self._undoable: dict[int, Undoable] = {}
         self.unusable: tuple[str, ...] = ()
-        """Files that were there and were set aside, each in a line; none of it was written anywhere."""
+        """Damaged files that were set aside, each in a line."""
         self.lost_write = False
-        """One of them was the journal: an interrupted write stays as it is."""
+        """Whether the journal was damaged, so that an interrupted write stays as it is."""
 
     @property
     def pending(self) -> bool:
-        """Whether an interrupted write waits for the recovery."""
+        """Whether the restore of an interrupted write is pending."""
         return self._orphaned.is_set()
 
     def load(self) -> None:
-        """Read the files at start, and find out whether they can be written; what cannot be used is set aside."""
+        """Load the files, and check that they can be written; damaged ones are set aside. Blocking."""
         try:
             self._log.check_writable()
         except StorageError as error:
@@ -73,21 +73,21 @@ class Ledger:
 
     @property
     def undoable(self) -> list[int]:
-        """The vehicles, by system id, on which there is something to undo."""
+        """System ids of the vehicles with something to undo."""
         return sorted(system_id for system_id, each in self._undoable.items() if each.all)
 
     def steps(self, system_id: int | None) -> tuple[ChangeSet, ...]:
-        """What can be undone on one vehicle, the latest first."""
+        """Return the undo steps of one vehicle, the latest first."""
         found = self._undoable.get(system_id or 0)
         return () if found is None else found.all
 
     @property
     def orphaned(self) -> ChangeSet | None:
-        """The interrupted write that waits for the recovery."""
+        """Interrupted write whose restore is pending."""
         return self._open if self.pending else None
 
     def is_undoable(self, changes: ChangeSet) -> bool:
-        """Whether a step that can be undone holds these changes."""
+        """Check whether these changes are in an undo step."""
         kept = self._undoable.get(changes.system_id)
         return kept is not None and kept.without(changes) is not kept
 
@@ -99,21 +99,20 @@ class Ledger:
 
     @contextlib.asynccontextmanager
     async def transaction(self, changes: ChangeSet, *, stepwise: bool = False) -> AsyncIterator[None]:
-        """Around a write: what happens to one that is not finished is decided here and nowhere else.
+        """Enclose a write; an unfinished write is handled here and nowhere else.
 
-        The old values are on disk before the block begins. It says itself how it ended, by `done` or `undone`; and a
-        writer's error that has left nothing changed says that the autopilot is as it was before the block: after a
-        failed undo that means the values that were to be undone. After anything else (a value left
-        changed, a cancellation, a fault of the program, no word at all) nobody knows what is, and the recovery looks.
+        The old values are on disk before the block begins. The block reports its end by `done` or `undone`. A writer's
+        error with nothing left changed means that the autopilot is as before the block. After anything else (a value
+        left changed, a cancellation, a fault of the program, no report) the state is unknown: the recovery looks.
 
         Args:
-            changes: what the block will change, as far as it is known beforehand.
-            stepwise: the block writes these values more than once, so that a write which has put back what it found
-                has not put back what is kept here.
+            changes: changes of the block, as far as they are known beforehand.
+            stepwise: the block writes these values more than once, so that a write which has restored what it found
+                has not restored the values kept here.
 
         Raises:
             AutopilotError: an earlier write is open still, or another companion writes here; do not write.
-            StorageError: they could not be kept, or a name or a value is none that the companion writes; do not write.
+            StorageError: the changes could not be kept, or hold a name or a value that is never written; do not write.
         """
         if self._open is not None:
             raise AutopilotError("putting old values back first")
@@ -135,10 +134,10 @@ class Ledger:
             self._orphaned.set()
 
     async def widen(self, changes: ChangeSet) -> None:
-        """In a transaction: keep this in the place of what was kept, before anything of it is overwritten.
+        """Replace the kept changes of a transaction, before any of the new ones is made.
 
         Raises:
-            StorageError: as `transaction`; what was kept still is.
+            StorageError: as `transaction`; the earlier changes are still kept.
         """
         if self._open is not None:
             changes = msgspec.structs.replace(changes, origin=self._open.origin)
@@ -146,7 +145,7 @@ class Ledger:
         self._open = changes
 
     async def done(self, changes: ChangeSet) -> None:
-        """The end of a transaction: the write stays, and from now on it can be undone.
+        """End a transaction whose write stays; from now on it can be undone.
 
         Raises:
             StorageError: the disk refuses; the write stays open.
@@ -156,13 +155,13 @@ class Ledger:
         await self.unchanged()
 
     async def undone(self) -> None:
-        """The end of a transaction, or of an interrupted one, or of an undo: the old values are in force.
+        """End a transaction, an interrupted write or an undo: the old values are in force.
 
         Raises:
             StorageError: the disk refuses; the write stays open.
         """
         if self._open is not None and (kept := self._undoable.get(self._open.system_id)) is not None:
-            # It was an undo, or a write that had come to its end but for the journal.
+            # It was an undo, or a write that ended before the journal was cleared.
             left = kept.without(self._open)
             if left is not kept:
                 await self._keep(left)
@@ -174,7 +173,7 @@ class Ledger:
         self._undoable[undoable.system_id] = undoable
 
     async def unchanged(self) -> None:
-        """End a transaction that left the autopilot as it found it: every step that could be undone still can.
+        """End a transaction that left the autopilot as it was; all undo steps stay.
 
         Raises:
             StorageError: the disk refuses; the write stays open.
@@ -185,7 +184,7 @@ class Ledger:
 
 
 class Recovery:
-    """Puts values back, guarded like every write."""
+    """Restores interrupted writes, and undoes finished ones."""
 
     def __init__(
         self,
@@ -202,11 +201,11 @@ class Recovery:
         """Told of a restored interrupted write, in words, and whether that undid a step (keyword `undone`)."""
 
     def interruptions(self) -> list[Object]:
-        """Interrupted writes for the history, the latest first; blocking."""
+        """List interrupted writes, the latest first; blocking."""
         return self._interruptions.history(self.ledger.orphaned)
 
     def why_no_undo(self) -> str | None:
-        """Why there is nothing to undo, or None when there is."""
+        """Say why there is nothing to undo; None when there is."""
         if self.ledger.steps(self._vehicle.system_id):
             return None
         if elsewhere := self.ledger.undoable:
@@ -214,7 +213,7 @@ class Recovery:
         return "nothing to undo" + ("; what was kept could not be used" if self.ledger.unusable else "")
 
     async def run(self) -> None:
-        """Bring interrupted writes to an end, whenever there is one, until cancelled."""
+        """End interrupted writes; runs until cancelled."""
         if self.ledger.lost_write:
             self._say(Severity.WARNING, "Interrupted write, file damaged: calibrate", Weight.RESULT)
         while True:
@@ -239,7 +238,7 @@ class Recovery:
         while self._vehicle.arm_state is not ArmState.DISARMED:
             await asyncio.sleep(POLL_S)
         if unknown := {changed.parameter: changed.before for changed in open_set.changes if changed.after is None}:
-            # What the firmware finds it stores at its end, over whatever was put back before.
+            # The firmware stores its result at its end, over whatever was restored before.
             await wait_until_over(self._parameters, unknown)
         ours, foreign = await self._sort(open_set)
         if ours:
@@ -259,16 +258,16 @@ class Recovery:
         await self._offload(self._interruptions.keep, open_set, reason, utc_now())
 
     async def undo(self, *, force: bool = False) -> tuple[ChangeSet, dict[str, WrittenParameter]]:
-        """Put back the values from before the last step, all or none; returns the step and what was done.
+        """Restore the values from before the last step, all or none; returns the step and the restored parameters.
 
         Args:
-            force: leave what somebody else has changed since as it is, and put the rest back; without it, nothing is
+            force: leave values that somebody else has changed since, and restore the rest; otherwise nothing is
                 written then.
 
         Raises:
-            AutopilotError: somebody else has changed some of them since (each named, with their value, ours and the
-                one before), or the writing failed: then the step is as it was, or, where some values could not be
-                written again, the recovery brings the undo to its end as soon as the aircraft is disarmed.
+            AutopilotError: somebody else has changed some values since (each named, with the present value, ours and
+                the old one), or the write failed: then the step stays in force, or, where some values could not be
+                written again, the recovery ends the undo as soon as the aircraft is disarmed.
             StorageError: the disk refuses.
         """
         if (why := self.why_no_undo()) is not None:
@@ -295,7 +294,7 @@ class Recovery:
         return step, written
 
     async def _sort(self, changes: ChangeSet) -> tuple[Sequence[Change], Sequence[str]]:
-        """Which changes are still as we made them, and what others have put in their place."""
+        """Sort into changes that are still ours, and words on values that others have replaced."""
         ours: list[Change] = []
         foreign: list[str] = []
         found = await self._read(changes.names)
@@ -316,7 +315,7 @@ class Recovery:
         return ours, foreign
 
     async def _read(self, names: Sequence[str]) -> dict[str, float]:
-        """Those that the autopilot does not refuse; silence is no refusal, and is waited for."""
+        """Read parameters, without those that the autopilot refuses; silence is no refusal."""
         with contextlib.suppress(ParameterRefusedError):
             return await self._parameters.read_many(names)
         found: dict[str, float] = {}
@@ -331,7 +330,7 @@ async def _nobody_notes(_step: ChangeSet, _words: str, *, undone: bool) -> None:
 
 
 def _why_not_undone(error: WriteFailedError | NothingWrittenError, step: ChangeSet) -> str:
-    """The writer's "old values" are those from before the undo: say what is in force, as the pilot sees it."""
+    """Say what is in force after a failed undo; the writer's "old values" are those from before the undo."""
     cause = f"{error.kind}: {error.reason}" if isinstance(error, WriteFailedError) else str(error)
     if error.left_changed:
         return f"{cause}; undone in part ({', '.join(error.left_changed)}): the rest follows once disarmed"

@@ -9,12 +9,11 @@ from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.ekf import EkfWatch
 from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.offsets.companions import OtherCompanions
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration
 from companion.daemon.offsets.ledger import Ledger, Recovery
+from companion.daemon.offsets.other_writers import OtherCompanions, Rivalry
 from companion.daemon.offsets.px4_writes import Px4Writes
 from companion.daemon.offsets.reboot import RebootOwed
-from companion.daemon.offsets.rivalry import Rivalry
 from companion.daemon.offsets.write import WritePath
 from companion.formats import Object
 from companion.storage.changes import ChangeLog

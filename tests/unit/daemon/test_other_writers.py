@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.daemon.offsets.companions import EXPIRE_S, FIRST_BEATS, IDLE_BEATS, OtherCompanions
+from companion.daemon.offsets.other_writers import EXPIRE_S, FIRST_BEATS, IDLE_BEATS, OtherCompanions
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.virtual_time import run_virtual
 

@@ -1,0 +1,233 @@
+"""Other writers of our parameters: companions on the same link, and the autopilot's own calibrations (rivals).
+
+Two companions write the same parameters and keep each other's values as "old" ones, so that no order of undos brings
+back the values from before both. So each announces itself, and all but one refuse to write. They usually share system
+and component id, and routers do not pass on a heartbeat to where its ids have been heard: each announces an instance
+number of its own in NAMED_VALUE_INT, which ArduPilot and PX4 do pass on. Rank by announced constants alone: a companion
+that has found itself alone goes before a new one, then the lower number. No clocks are compared, so both agree.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+import msgspec
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, Rival, stop
+from companion.autopilot.parameters.change import Change
+from companion.autopilot.vehicle.vehicle import VehicleEvent
+from companion.component.statustext import Say, Severity, Weight
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.links.mavlink.link import MavlinkLink
+
+logger = logging.getLogger(__name__)
+
+NAME: Final = "CMP_INST"
+BEAT_S: Final = 1.0
+IDLE_BEATS: Final = 5
+"""Beats from one announcement to the next while no other companion is heard."""
+FIRST_BEATS: Final = 10
+"""Beats after the start that all carry an announcement."""
+SETTLE_S: Final = 6.0
+"""Time after the start in which a running companion makes itself heard."""
+CONFIRM_S: Final = 0.5
+"""Least time between two announcements that make a companion count: leftovers of one that has ended come at once."""
+EXPIRE_S: Final = 12.0
+"""Silence after which a companion is gone: its announcements come every second while two hear each other."""
+MOST: Final = 8
+"""Companions remembered; instance numbers can be made up."""
+INSTANCE_BITS: Final = 30
+JUST_NOW_S: Final = 20.0
+"""Time after a landing or a start in which a rewritten offset counts as the work of a rival that acts then."""
+
+
+class _Other(msgspec.Struct):
+    """One other companion."""
+
+    system_id: int
+    component_id: int
+    is_new: bool
+    instance: int
+    boot_ms: int
+    first_s: float
+    latest_s: float
+
+    @property
+    def rank(self) -> tuple[bool, int]:
+        """Lower goes first."""
+        return self.is_new, self.instance
+
+    def counts(self, now_s: float) -> bool:
+        """Whether it has been heard twice, and of late."""
+        return self.latest_s - self.first_s >= CONFIRM_S and now_s - self.latest_s < EXPIRE_S
+
+
+class OtherCompanions:
+    """Announces this companion and listens for others; `run` until cancelled."""
+
+    def __init__(self, link: MavlinkLink, say: Say, writes: Callable[[], bool]) -> None:
+        """`writes`: whether this companion writes to the autopilot at all."""
+        self._link, self._say, self._writes = link, say, writes
+        self._instance, self._is_new = int.from_bytes(os.urandom(4)) >> 32 - INSTANCE_BITS, True
+        self._others: dict[int, _Other] = {}
+        self._told: str | None = None
+        link.subscribe(mavlink.MAVLink_named_value_int_message, self._on_value)
+
+    def why_not(self) -> str | None:
+        """Reason not to write, naming the companion that does; None without one."""
+        other = self._other()
+        if other is None or not self._writes() or other.rank > (self._is_new, self._instance):
+            return None
+        return f"second companion ({other.system_id}/{other.component_id}) on this link writes: stop one of them"
+
+    @property
+    def warning(self) -> str | None:
+        """Presence of another companion, for people; None without one."""
+        other = self._other()
+        if other is None or not self._writes():
+            return None
+        refuses = f"second companion ({other.system_id}/{other.component_id}) on this link waits: stop one of them"
+        return self.why_not() or refuses
+
+    async def run(self) -> None:
+        """Announce this companion, and tell the pilot of others."""
+        loop = asyncio.get_running_loop()
+        started_s, beats = loop.time(), 0
+        while True:
+            await asyncio.sleep(BEAT_S)  # nothing may leave before the component's first heartbeat
+            now_s = loop.time()
+            if self._is_new and now_s - started_s >= SETTLE_S and self.why_not() is None:
+                self._is_new = False
+            due = beats < FIRST_BEATS or self._hears(now_s) or beats % IDLE_BEATS == 0
+            if due and self._writes() and self._link.connected:
+                value = self._instance << 1 | self._is_new
+                name = NAME.encode("ascii")
+                self._link.send(mavlink.MAVLink_named_value_int_message(int(now_s * 1e3) % 2**32, name, value))
+            self._tell()
+            beats += 1
+
+    def _tell(self) -> None:
+        words = self.warning
+        if words is not None and words != self._told:
+            logger.warning("%s", words)
+            self._say(Severity.WARNING, words[:1].upper() + words[1:], Weight.NEWS)
+        self._told = words
+
+    def _hears(self, now_s: float) -> bool:
+        return any(now_s - other.latest_s < EXPIRE_S for other in self._others.values())
+
+    def _other(self) -> _Other | None:
+        """The first by rank of those that count."""
+        now_s = asyncio.get_running_loop().time()
+        present = (other for other in self._others.values() if other.counts(now_s))
+        return min(present, key=lambda other: other.rank, default=None)
+
+    def _on_value(self, message: mavlink.MAVLink_named_value_int_message, t_s: float) -> None:
+        if message.name != NAME or message.get_srcSystem() != self._link.system_id:
+            return
+        instance, is_new, boot_ms = message.value >> 1, bool(message.value & 1), message.time_boot_ms
+        if instance == self._instance:
+            return  # an echo of our own
+        known = self._others.get(instance)
+        if known is None or t_s - known.latest_s >= EXPIRE_S:
+            self._others = {number: each for number, each in self._others.items() if t_s - each.latest_s < EXPIRE_S}
+            if len(self._others) < MOST:
+                ids = message.get_srcSystem(), message.get_srcComponent()
+                self._others[instance] = _Other(*ids, is_new, instance, boot_ms, t_s, t_s)
+        elif boot_ms != known.boot_ms:  # a copy proves nothing: routers in a loop repeat one for ever
+            known.is_new, known.boot_ms, known.latest_s = is_new, boot_ms, t_s
+
+
+class Rivalry:
+    """Warns of rivals that will overwrite our offsets or did, and switches them off where that is configured."""
+
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
+        self._imus, self._say = imus, core.say
+        self.stop_rivals = core.config.push.stop_rivals
+        """Whether the next write switches rivals off."""
+        self._told: set[str] = set()
+        """Rivals that the ground stations were told of since they were switched on; status shows them always."""
+        self._disarmed_s = self._rebooted_s = -math.inf
+        self._was_armed = False
+        core.vehicle.on_event.add(self._on_event)
+        for name, imu in imus.items():
+            imu.on_read.add(functools.partial(self._on_read, name))
+
+    @property
+    def warnings(self) -> list[str]:
+        """Warnings about rivals that are switched on."""
+        known = [imu.calibration for imu in self._imus.values() if imu.calibration is not None]
+        return list(dict.fromkeys(rival.words for calibration in known for rival in calibration.rivals))
+
+    def changes(self, calibrations: Sequence[ImuCalibration]) -> list[Change]:
+        """Return changes that switch rivals off, to be written before the biases."""
+        if not self.stop_rivals:
+            return []
+        rivals = {rival.parameter: rival for calibration in calibrations for rival in calibration.rivals}
+        return stop(tuple(rivals.values()))
+
+    def left_of(self, calibration: ImuCalibration) -> list[str]:
+        """Return the warnings about a calibration, without those of rivals that the next write switches off."""
+        stopped = {r.words for r in calibration.rivals if not r.until_boot} if self.stop_rivals else set()
+        return [warning for warning in calibration.warnings if warning not in stopped]
+
+    def switch(self, *, stop_rivals: bool) -> None:
+        """Change whether rivals are switched off with the next write."""
+        self.stop_rivals = stop_rivals
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        now_s = asyncio.get_running_loop().time()
+        if event == "armed":
+            self._was_armed = True
+        elif event == "disarmed":
+            self._disarmed_s = now_s if self._was_armed else self._disarmed_s
+            self._was_armed = False
+        elif event == "rebooted":
+            self._rebooted_s, self._was_armed = now_s, False
+
+    def _on_read(self, name: str, before: ImuCalibration | None, after: ImuCalibration) -> None:
+        self._told &= {rival.name for rival in after.rivals}
+        for rival in after.rivals:
+            if rival.name not in self._told and (rival.until_boot or not self.stop_rivals):
+                self._told.add(rival.name)
+                what = "all" if rival.accelerometers else "gyro"
+                words = f"The autopilot may rewrite {what} offsets: set {rival.parameter} to 0"
+                if rival.until_boot:
+                    words = "Reboot PX4: its gyro calibration still runs"
+                self._say(Severity.WARNING, words, Weight.NEWS)
+        if before is not None and before.parameters == after.parameters:
+            self._compare(name, before, after)
+
+    def _compare(self, name: str, before: ImuCalibration, after: ImuCalibration) -> None:
+        gyros = before.gyro_offset_rad_s != after.gyro_offset_rad_s
+        accelerometers = before.accel_offset_m_s2 != after.accel_offset_m_s2
+        if not (gyros or accelerometers):
+            return
+        what = "all" if gyros and accelerometers else "gyro" if gyros else "accelerometer"
+        rival = self._culprit(after.rivals, accelerometers=accelerometers)
+        if rival is not None:
+            logger.warning("imu %s: %s offsets rewritten by the autopilot itself (%s)", name, what, rival.words)
+            words = f"The autopilot rewrote {what} offsets of {name}: {rival.name}"
+        else:
+            logger.warning("imu %s: %s offsets rewritten by somebody else", name, what)
+            words = f"Somebody rewrote {what} offsets of {name}"
+        self._say(Severity.WARNING, words, Weight.NEWS)
+
+    def _culprit(self, rivals: Sequence[Rival], *, accelerometers: bool) -> Rival | None:
+        """Return the rival that rewrote offsets, by the time at which each acts."""
+        now_s = asyncio.get_running_loop().time()
+        acting = {
+            "at a start": now_s - self._rebooted_s < JUST_NOW_S,
+            "after a flight": now_s - self._disarmed_s < JUST_NOW_S,
+            "while still": not accelerometers,
+        }
+        able = [rival for rival in rivals if acting[rival.acts] and (rival.accelerometers or not accelerometers)]
+        return min(able, key=lambda rival: rival.acts == "while still", default=None)
