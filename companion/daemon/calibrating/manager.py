@@ -133,15 +133,9 @@ class CalibrationManager:
         missing: str | None,
         run: Callable[[Job], Awaitable[str]],
     ) -> Job | Refusal:
-        """Start an alignment or the writing of temperature curves, or refuse.
+        """Start a job of a kind in `NO_CALIBRATION`, or refuse.
 
-        Args:
-            kind: one of `NO_CALIBRATION`.
-            what: the biases concerned.
-            requester: for the log.
-            timeout_s: time limit for waiting until it is still.
-            missing: why it cannot be done on this aircraft, if so.
-            run: carries it out; returns the result in words.
+        `missing`: why it cannot be done on this aircraft, if so. `run` carries it out; returns the result in words.
         """
         if (refusal := self._refusal(requester, missing)) is not None:
             return refusal

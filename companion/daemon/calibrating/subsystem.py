@@ -1,4 +1,4 @@
-"""Calibrations and alignments: who may start one, how it goes, and what is kept of it."""
+"""Calibrations and alignments as the daemon's interfaces see them: commands and status."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ from companion.storage.records import RecordStore
 
 PROGRESS_EVERY_S: Final = 0.2
 HEARD_WITHIN_S: Final = 5.0
-"""How long an undo waits for an autopilot that was not heard since the start."""
+"""Longest wait of an undo for an autopilot not heard since the start."""
 ALIGN_TIMEOUT_S: Final = 900.0
 """An alignment that nobody ends must not keep calibrations from starting for ever."""
 
 
 class Calibrating(Subsystem):
-    """From request to record."""
+    """Wires calibrations and alignments, and answers their commands."""
 
     def __init__(self, core: Core, devices: Devices, offsets: Offsets) -> None:
         config, imus = core.config, devices.imus
@@ -84,7 +84,7 @@ class Calibrating(Subsystem):
         self.manager.load()
 
     def commands(self) -> Mapping[str, Handler]:
-        """As in the base class; each raises `RequestRefusedError`, or another `CompanionError` once it was taken."""
+        """Return the handlers; each raises `RequestRefusedError`, or another `CompanionError` once it has started."""
         return {
             "calibrate": self._calibrate,
             "align": self._align,
@@ -143,7 +143,7 @@ class Calibrating(Subsystem):
         yield {"kind": "result", "record": msgspec.to_builtins(job.record)}
 
     async def _temperature(self, request: Object, face: str) -> AsyncIterator[Object]:
-        """Show the curves, write them, or put back what was there before them."""
+        """Show the curves, write them, or undo their write."""
         action, into = request.get("action"), self._into_autopilot
         if action == "undo":
             await self._hear()
@@ -223,7 +223,7 @@ class Calibrating(Subsystem):
         return {"state": state, "reason": reason, **found}
 
     def start_alignment(self, request: Object, by: str) -> Job | Refusal:
-        """Start measuring in stands, or say why not.
+        """Start an alignment, or refuse.
 
         Raises:
             CalibrationRefusedError: the request is not understood.
@@ -251,7 +251,7 @@ class Calibrating(Subsystem):
         return self.manager.start_job(kind, what, by, timeout_s, missing, run)
 
     async def _to_end(self, job: Job, product: str) -> AsyncIterator[Object]:
-        """How it goes, and at its end the result, with what came of it under this key."""
+        """Yield progress, then the result with the job's product under this key."""
         async for reply in self._progress(job):
             yield reply
         result = job.finished.result()

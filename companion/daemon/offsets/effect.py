@@ -60,16 +60,8 @@ async def watch_effect(
 ) -> tuple[Verdicts | None, str]:
     """Wait for still telemetry after a write and judge it; a step that is nearly visible is watched longer.
 
-    Args:
-        core: the aircraft.
-        px4: knows the output while far values were in force.
-        plan: the written changes.
-        before: window before the write.
-        go_on: called with words now and then; what it raises ends the watch.
-        boots: restarts of the autopilot seen before.
-
-    Returns:
-        Verdicts by IMU, or the reason why there are none.
+    `go_on` is called with words now and then, and ends the watch by raising; `boots` counts the restarts seen before.
+    Returns verdicts by IMU, or the reason why there are none.
     """
     watched = [target for target in plan.targets if target.watched]
     if not watched:

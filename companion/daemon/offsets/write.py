@@ -90,7 +90,6 @@ class WritePath:
 
         Raises:
             NotDisarmedError: it is armed, or no heartbeat comes.
-            JobCancelledError: cancelled.
         """
         job.check_cancelled()
         self._machine.on(Event.WRITE)
@@ -172,21 +171,10 @@ class WritePath:
     # --- a write of offsets
 
     async def write(self, job: Job, plan: Plan, before: Window, log: WriteLog, go_on: GoOn | None = None) -> Plan:
-        """Write offsets, read them back, and watch the telemetry make the step that it must.
+        """Write offsets, read them back, and watch the telemetry make the step that it must; errors as `commit`.
 
-        Args:
-            job: its progress and cancel; a cancel restores the old values.
-            plan: changes.
-            before: window measured under the old offsets.
-            log: filled with outcomes and warnings.
-            go_on: called now and then with words while the telemetry is watched; None: reports to the job.
-
-        Returns:
-            The plan with the firmware's own changes.
-
-        Raises:
-            CompanionError: as `commit`.
-            JobCancelledError: as `commit`.
+        `before` is the window measured under the old offsets. `log` is filled; `go_on` replaces the job's progress
+        while the telemetry is watched. Returns the plan with the firmware's own changes.
         """
         await self.begin(job, len(plan.changes))
         gyros = await self._firmware.prepare(plan.gyros, log.warnings.append)

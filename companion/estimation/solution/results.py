@@ -30,14 +30,7 @@ def record_of(
 ) -> Record:
     """Build the record of a solution; without a solution it has no IMUs.
 
-    Args:
-        solution: the estimate, if there is one.
-        started_at: start of the calibration, UTC.
-        duration_s: duration of the calibration.
-        state: outcome of the calibration.
-        reason: cause of the outcome; None: the figures in words.
-        warnings: warnings beyond those of the estimate.
-        whole: whole biases, estimated residual and offsets, by IMU whose owner subtracts offsets from its output.
+    `reason` None: the figures in words. `whole`: sums of residual and offsets, by IMU whose owner subtracts offsets.
     """
     owned = whole or {}
     imus = () if solution is None else tuple(_imu(imu, owned.get(imu.name)) for imu in solution.imus)

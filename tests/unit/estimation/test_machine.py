@@ -9,25 +9,6 @@ import pytest
 from companion.estimation.machine import RESTING, TRANSITIONS, Event, IllegalEventError, Machine, State
 
 
-def test_the_main_road() -> None:
-    machine = Machine()
-    road = [
-        (Event.REQUEST, "waiting"),
-        (Event.STILL, "collecting"),
-        (Event.MOVED, "waiting"),
-        (Event.STILL, "collecting"),
-        (Event.ENOUGH, "solving"),
-        (Event.WRITE, "writing"),
-        (Event.WRITTEN, "verifying"),
-        (Event.VERIFIED, "settling"),
-        (Event.CONCLUDED, "done"),
-        (Event.UNDO, "undoing"),
-        (Event.CONCLUDED, "done"),
-    ]
-    for event, state in road:
-        assert machine.on(event).value == state
-
-
 @pytest.mark.parametrize("state", [state for state in State if state not in RESTING])
 def test_every_busy_state_can_fail_and_be_cancelled(state: State) -> None:
     assert TRANSITIONS[state, Event.FAULT] is State.FAILED
