@@ -31,8 +31,8 @@ from companion.estimation.means.dither import SECONDS, STEPS, Dithered, Step, co
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
-from companion.physics.frames import Array
-from companion.samples import ImuSample
+from companion.physics.frames import Array, vector
+from companion.samples import ImuSample, Vector
 from companion.storage.changes import Changed, ChangeSet
 
 logger = logging.getLogger(__name__)
@@ -251,18 +251,10 @@ def _offsets(calibration: ImuCalibration, shift: Array) -> dict[str, float]:
 
 def _with(window: ImuWindow, found: Dithered) -> ImuWindow:
     """Replace the hidden means of a window by dithered ones."""
-    result = window
-    for part, triad in (("gyro", slice(0, 3)), ("accel", slice(3, 6))):
-        if part not in window.hidden:
-            continue
-        mean, stat, use = (
-            tuple(float(value) for value in each[triad]) for each in (found.mean, found.sigma_stat, found.sigma_use)
-        )
-        unit = "rad_s" if part == "gyro" else "m_s2"
-        changes = {
-            f"{part}_{unit}": mean,
-            f"{part}_sigma_stat_{unit}": stat,
-            f"{part}_sigma_use_{unit}": use,
-        }
-        result = msgspec.structs.replace(result, **changes)
-    return msgspec.structs.replace(result, hidden={}, dithered=True)
+    changes: dict[str, Vector] = {}
+    for part, unit, rows in (("gyro", "rad_s", slice(0, 3)), ("accel", "m_s2", slice(3, 6))):
+        if part in window.hidden:
+            changes[f"{part}_{unit}"] = vector(found.mean[rows])
+            changes[f"{part}_sigma_stat_{unit}"] = vector(found.sigma_stat[rows])
+            changes[f"{part}_sigma_use_{unit}"] = vector(found.sigma_use[rows])
+    return msgspec.structs.replace(window, hidden={}, dithered=True, **changes)

@@ -89,7 +89,7 @@ async def watch_effect(
                 words = str(error)
             else:
                 verdicts = {target.name: _judge(core, px4, target, before, after) for target in watched}
-                words = _inconclusive(verdicts, loop.time() - since_s)
+                words = why_look_longer(verdicts, loop.time() - since_s)
                 if not words:
                     return verdicts, ""
         await asyncio.sleep(POLL_S)
@@ -128,7 +128,7 @@ def _judge(core: Core, px4: Px4Writes, target: Target, before: Window, after: Wi
     return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile, on_the_way)
 
 
-def _inconclusive(verdicts: Verdicts, looked_s: float) -> str:
+def why_look_longer(verdicts: Verdicts, looked_s: float) -> str:
     """Say why the watch goes on; empty when the verdicts are final."""
     found = [verdict for each in verdicts.values() for verdict in each]
     # The scatter of two seconds says little of their mean: nothing is called wrong on so little.

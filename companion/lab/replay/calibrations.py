@@ -167,33 +167,24 @@ class Calibrations:
     def _record(self, recorded: Record, solution: Solution) -> Record:
         """Make the record of a solution; what only the autopilot can tell is taken from the recorded one."""
         corrected = {imu.name for imu in recorded.imus if imu.residual_gyro_rad_s or imu.residual_accel_m_s2}
-        again = record_of(
-            solution,
-            datetime.datetime.fromisoformat(recorded.started_at),
-            recorded.duration_s,
-            state=recorded.state,
-            reason=recorded.reason,
-            whole={found.name: self._whole(found) for found in solution.imus if found.name in corrected},
-        )
+        began, seconds = datetime.datetime.fromisoformat(recorded.started_at), recorded.duration_s
+        whole = {found.name: self._whole(found) for found in solution.imus if found.name in corrected}
+        again = record_of(solution, began, seconds, state=recorded.state, reason=recorded.reason, whole=whole)
         were = {imu.name: imu for imu in recorded.imus}
         imus = tuple(
             msgspec.structs.replace(imu, written=was.written, gyro_id=was.gyro_id, accel_id=was.accel_id)
-            if (was := were.get(imu.name)) is not None
-            else imu
-            for imu in again.imus
+            for imu, was in ((imu, were[imu.name]) for imu in again.imus if imu.name in were)
         )
         return msgspec.structs.replace(again, imus=imus, system_id=recorded.system_id, alignment=recorded.alignment)
 
-    def estimate(
-        self, collector: RollingCollector, now_s: float, began_at: datetime.datetime, seconds: float
-    ) -> Record:
+    def estimate(self, collector: RollingCollector, now_s: float, began: datetime.datetime, seconds: float) -> Record:
         """Return what a calibration would have found now."""
         try:
             solution = self._solved(collector.window(now_s), What.BOTH)
         except CalibrationRefusedError as error:
-            return record_of(None, began_at, seconds, state="failed", reason=str(error))
+            return record_of(None, began, seconds, state="failed", reason=str(error))
         whole = {found.name: self._whole(found) for found in solution.imus if self._offsets.get(found.name)}
-        return record_of(solution, began_at, seconds, whole=whole)
+        return record_of(solution, began, seconds, whole=whole)
 
     def set_offsets(self, offsets: Offsets) -> None:
         """Take the offsets in force, for `estimate`."""

@@ -12,7 +12,7 @@ from companion.autopilot.firmware.ardupilot import parameters_of
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import Verdict
-from companion.daemon.offsets.effect import Sides, judge_vectors
+from companion.daemon.offsets.effect import LOOK_LONGER_S, LOOK_S, Sides, judge_vectors, why_look_longer
 from companion.estimation.means.windows import ImuWindow
 
 NOISE_RAD_S = 1e-4
@@ -104,3 +104,22 @@ def test_what_is_known_of_the_noise_after_the_write_still_counts() -> None:
     sides = Sides(before, after, np.array(before.gyro_rad_s) + 1e-9, None)
     (verdict,) = judge_vectors(sides, calibration(), changes, None, "icm42688p", {})
     assert verdict.ok
+
+
+@pytest.mark.parametrize(
+    ("problems", "sigma", "looked_s", "words"),
+    [
+        (("by chance",), 0.1, 2.0, "the change does not show: looking longer"),
+        (("by chance",), 0.1, LOOK_S, ""),
+        ((), 0.3, LOOK_S, "the change is small: looking longer"),
+        ((), 0.5, 2.0, ""),
+        ((), 0.3, LOOK_LONGER_S + 0.1, ""),
+    ],
+    ids=["two seconds call nothing wrong", "ten do", "nearly visible", "hidden for good", "looked for long enough"],
+)
+def test_a_longer_look_is_worth_it_where_it_can_change_the_verdict(
+    problems: tuple[str, ...], sigma: float, looked_s: float, words: str
+) -> None:
+    axes: Any = ()
+    verdict = Verdict(axes=axes, fraction_sigma=sigma, problems=problems, hidden=("INS_GYROFFS_X",))
+    assert why_look_longer({"fc": [verdict]}, looked_s) == words
