@@ -18,7 +18,7 @@ from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import Solution, solve
 
 
-class Given(NamedTuple):
+class EstimatorInputs(NamedTuple):
     """Inputs of an estimate besides the window."""
 
     where: Whereabouts
@@ -31,14 +31,14 @@ class Estimator:
     def __init__(self, core: Core, alignment: AlignmentInForce, faces: FacesInForce, own: OwnAttitude) -> None:
         self._core, self.alignment, self._faces, self._own = core, alignment, faces, own
 
-    async def solve(self, window: Window, what: What) -> tuple[Solution, Given]:
+    async def solve(self, window: Window, what: What) -> tuple[Solution, EstimatorInputs]:
         """Estimate the biases; returns the other inputs too.
 
         Raises:
             CalibrationRefusedError: as `solve`.
         """
         config = self._core.config
-        given = Given(models.whereabouts(config, self._core.vehicle), await self._otherwise(window))
+        given = EstimatorInputs(models.whereabouts(config, self._core.vehicle), await self._otherwise(window))
         poses = self.alignment.model(), models.compass_model(config.compass)
         platform, any_bias = config.vehicle.platform, config.calibration.any_bias
         found: Solution = await self._core.offload(

@@ -51,7 +51,7 @@ class CalibrationManager:
         self.last: Record | None = None
         """Record of the latest calibration, loaded from disk at start."""
         self.on_ended: Listeners[Job, JobResult] = Listeners()
-        """Told of every end, before the requester is."""
+        """Listeners to the end of a job; they come before the requester."""
         core.vehicle.on_event.add(self._on_event)
         core.wanted.on_retarget.add(lambda _settings: self._retarget())
         self._recovery.on_recovered = self._recovered

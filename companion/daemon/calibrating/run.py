@@ -22,7 +22,7 @@ from companion.component.statustext import Severity
 from companion.component.tunes import Tune
 from companion.config.sections import Platform
 from companion.daemon.biases.memory import BiasMemory
-from companion.daemon.calibrating.estimator import Estimator, Given
+from companion.daemon.calibrating.estimator import Estimator, EstimatorInputs
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
@@ -62,7 +62,7 @@ Key = tuple[str, Triad]
 """Name of an IMU, and its gyros or its accelerometers."""
 
 WRONG_IMU_ATTEMPTS: Final = 3
-"""Of three IMUs two may have been mistaken for the right one."""
+"""Writes that may act on another IMU than believed: two of three IMUs may be mistaken for the right one."""
 _STARTED: Final[dict[Platform, str]] = {
     "ground": "Calibration started: keep the aircraft still",
     "deck": "Calibration started: the deck may sway",
@@ -80,8 +80,8 @@ class Parts(NamedTuple):
     estimator: Estimator
     memory: BiasMemory
     offsets: Offsets
-    on_solved: Listeners[Window, Window, Given, What, Expectation]
-    """Told of every estimate: the window measured and the window used, other inputs, the request, earlier biases."""
+    on_solved: Listeners[Window, Window, EstimatorInputs, What, Expectation]
+    """Listeners to estimates: measured window, used window, other inputs, request, earlier biases."""
 
 
 class CalibrationRun(Job):
@@ -126,7 +126,7 @@ class CalibrationRun(Job):
         self.whole: dict[str, Bias] = {}
         """Whole biases by IMU, where the autopilot subtracts offsets."""
         self.points: dict[str, Point] = {}
-        """By IMU, what later calibrations learn from this one once it has ended well."""
+        """Biases by IMU that later calibrations learn from, once this one has ended well."""
         self.unchanged: set[Key] = set()
         """Triads whose offsets are as good as new ones, and stay."""
         self.plan: Plan | None = None

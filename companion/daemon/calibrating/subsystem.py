@@ -13,7 +13,7 @@ from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.component.service import Refusal
 from companion.daemon.biases.into_autopilot import IntoAutopilot
 from companion.daemon.biases.memory import BiasMemory
-from companion.daemon.calibrating.estimator import Estimator, Given
+from companion.daemon.calibrating.estimator import Estimator, EstimatorInputs
 from companion.daemon.calibrating.manager import CalibrationManager
 from companion.daemon.calibrating.run import Parts
 from companion.daemon.calibrating.why_not import Rung
@@ -63,7 +63,7 @@ class Calibrating(Subsystem):
         self.faces = FacesInForce(core, imus)
         own = OwnAttitude(core.vehicle, wanted=config.compass is None)
         self.estimator = Estimator(core, self.alignment, self.faces, own)
-        self.on_solved: Listeners[Window, Window, Given, What, Expectation] = Listeners()
+        self.on_solved: Listeners[Window, Window, EstimatorInputs, What, Expectation] = Listeners()
         ditherer = Ditherer(core, imus, offsets.writer, offsets.ledger)
         self.stands = stands = Stands(core, imus, measuring)
         self._writes = writes = AccelWrites(core, imus, offsets)

@@ -21,7 +21,7 @@ import msgspec
 from companion.autopilot.telemetry.imu_samples import EkfBiasReading
 from companion.component.service import JobResult
 from companion.configured import models
-from companion.daemon.calibrating.estimator import Given
+from companion.daemon.calibrating.estimator import EstimatorInputs
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -169,7 +169,9 @@ class Recorder(Subsystem):
         )
         self.tape.put(messages.MEASURED, _now_s(), messages.encode(measured))
 
-    def _on_solved(self, measured: Window, refined: Window, given: Given, what: What, expectation: Expectation) -> None:
+    def _on_solved(
+        self, measured: Window, refined: Window, given: EstimatorInputs, what: What, expectation: Expectation
+    ) -> None:
         used = self._alignment.used
         solved = Solved(
             where=given.where,
