@@ -17,7 +17,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.component.tunes import Tune
-from companion.daemon.calibrating.run import CalibrationRun, Parts
+from companion.daemon.calibrating.run import CalibrationParts, CalibrationRun
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.job import Job, JobCancelledError, Undone
 from companion.daemon.stands.by_hand import ByHand
@@ -38,7 +38,7 @@ _SEVERITIES = {"done": Severity.NOTICE, "failed": Severity.ERROR, "cancelled": S
 class CalibrationManager:
     """The calibration service behind MAVLink, the control socket, MQTT and the page."""
 
-    def __init__(self, parts: Parts, store: RecordStore, by_hand: ByHand) -> None:
+    def __init__(self, parts: CalibrationParts, store: RecordStore, by_hand: ByHand) -> None:
         core = parts.core
         self._parts, self._core, self._machine, self._vehicle = parts, core, core.machine, core.vehicle
         self._recovery, self._store, self._by_hand = parts.offsets.recovery, store, by_hand

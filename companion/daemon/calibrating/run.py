@@ -70,7 +70,7 @@ _STARTED: Final[dict[Platform, str]] = {
 _TRIADS: Final[dict[Triad, str]] = {"gyro": "gyros of", "accel": "accelerometers of"}
 
 
-class Parts(NamedTuple):
+class CalibrationParts(NamedTuple):
     """Parts of the daemon that every calibration uses; none of them holds the state of one."""
 
     core: Core
@@ -89,7 +89,7 @@ class CalibrationRun(Job):
 
     def __init__(
         self,
-        parts: Parts,
+        parts: CalibrationParts,
         what: What,
         requester: str,
         deadline_s: float | None,

@@ -15,7 +15,7 @@ from companion.daemon.biases.into_autopilot import IntoAutopilot
 from companion.daemon.biases.memory import BiasMemory
 from companion.daemon.calibrating.estimator import Estimator, EstimatorInputs
 from companion.daemon.calibrating.manager import CalibrationManager
-from companion.daemon.calibrating.run import Parts
+from companion.daemon.calibrating.run import CalibrationParts
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
@@ -73,7 +73,7 @@ class Calibrating(Subsystem):
         self._turning = Turning(core, imus, stands, writes, levels, self.faces)
         self.by_hand = ByHand(core, imus)
         self._into_autopilot = IntoAutopilot(core, imus, measuring, self.memory, offsets)
-        parts = Parts(core, imus, measuring, ditherer, self.estimator, self.memory, offsets, self.on_solved)
+        parts = CalibrationParts(core, imus, measuring, ditherer, self.estimator, self.memory, offsets, self.on_solved)
         self.manager = CalibrationManager(parts, self.store, self.by_hand)
 
     def load(self) -> None:  # noqa: D102 - as in the base class

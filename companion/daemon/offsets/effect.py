@@ -114,7 +114,7 @@ def _in_the_way(core: Core, looked_s: float) -> str:
 
 
 def _judge(core: Core, px4: Px4Writes, target: Target, before: Window, after: Window) -> list[Verdict]:
-    sides = Sides(
+    sides = BeforeAfter(
         before=next(imu for imu in before.imus if imu.name == target.name),
         after=next(imu for imu in after.imus if imu.name == target.name),
         gyro_residual=target.solution.gyro_rad_s,
@@ -144,7 +144,7 @@ def why_look_longer(verdicts: Verdicts, looked_s: float) -> str:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Sides:
+class BeforeAfter:
     """One IMU's telemetry before and after a write, and the residuals that the write takes out (vehicle FRD)."""
 
     before: ImuWindow
@@ -160,7 +160,7 @@ OnTheWay = Mapping[Triad, tuple[FarMean, Vector]]
 
 
 def judge_vectors(
-    sides: Sides,
+    sides: BeforeAfter,
     calibration: ImuCalibration,
     changes: list[Change],
     kind: StreamKind | None,
@@ -231,7 +231,7 @@ def _resolution(kind: StreamKind | None, triad: Triad) -> float:
     return kind.gyro_step_rad_s if triad == "gyro" else kind.accel_step_m_s2
 
 
-def _as_at_end(triad: Triad, sides: Sides, before: Vector, after: Vector) -> tuple[Vector, Vector, Array]:
+def _as_at_end(triad: Triad, sides: BeforeAfter, before: Vector, after: Vector) -> tuple[Vector, Vector, Array]:
     """Convert both means to the temperature at the end of the first window; returns one sigma of that too, (3,)."""
     first, second = sides.before.warming, sides.after.warming
     if first is None or sides.before.dithered:

@@ -12,7 +12,7 @@ from companion.autopilot.firmware.ardupilot import parameters_of
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import Verdict
-from companion.daemon.offsets.effect import LOOK_LONGER_S, LOOK_S, Sides, judge_vectors, why_look_longer
+from companion.daemon.offsets.effect import LOOK_LONGER_S, LOOK_S, BeforeAfter, judge_vectors, why_look_longer
 from companion.estimation.means.windows import ImuWindow
 
 NOISE_RAD_S = 1e-4
@@ -59,7 +59,7 @@ def verdict_of(rng: np.random.Generator, spans: tuple[int, int], noise: Any, ste
     after = window(rng.normal(0.0, noise, (spans[1], 3)), step if made is None else made)
     changes = [Change(name, 0.0, float(each)) for name, each in zip(parameters_of(1).gyro_offset, step, strict=True)]
     (verdict,) = judge_vectors(
-        Sides(before, after, np.asarray(step), None), calibration(), changes, None, "icm42688p", {}
+        BeforeAfter(before, after, np.asarray(step), None), calibration(), changes, None, "icm42688p", {}
     )
     return verdict
 
@@ -101,7 +101,7 @@ def test_what_is_known_of_the_noise_after_the_write_still_counts() -> None:
         window(rng.normal(0.0, 1e-9, (10, 3)), STEP_RAD_S + 3e-5), gyro_sigma_stat_rad_s=(1e-4, 1e-4, 1e-4)
     )
     changes = [Change(name, 0.0, STEP_RAD_S) for name in parameters_of(1).gyro_offset]
-    sides = Sides(before, after, np.array(before.gyro_rad_s) + 1e-9, None)
+    sides = BeforeAfter(before, after, np.array(before.gyro_rad_s) + 1e-9, None)
     (verdict,) = judge_vectors(sides, calibration(), changes, None, "icm42688p", {})
     assert verdict.ok
 
