@@ -1,4 +1,4 @@
-"""`companion profile`: what noise an IMU has, out of recordings of it at rest."""
+"""`companion profile`: the noise of an IMU, from recordings of it at rest."""
 
 from __future__ import annotations
 
@@ -12,53 +12,30 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import msgspec
 
 from companion.cli.replay_log import add_table_options
-from companion.cli.terminal import (
-    AddCommand,
-    conclude,
-    load_config,
-    print_lines,
-    seconds,
-    storage_path,
-)
+from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds, storage_path
 from companion.errors import CalibrationRefusedError, ConfigError, StorageError
 from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
-    from companion.estimation.noise.allan import AllanModel, NoiseProfile
+    from companion.estimation.noise.allan import NoiseProfile
     from companion.lab.logs.log import StillLog
-    from companion.lab.profiling.coverage import Kept
-    from companion.lab.profiling.profile_fit import AxisFinding, Finding, Rests
+    from companion.lab.profile import AxisFinding, Finding, Rests
 
-LEAST_SHARE: Final = 0.90
-"""The least share of minutes within 2 sigma for a profile to be saved."""
-LEAST_MINUTES: Final = 20.0
-"""The least number of windows side by side: fewer say nothing about a share of 90 %."""
 SHORT_S: Final = 1200
 MOST_STRETCHES: Final = 6
-"""Shown of each recording; --json has them all."""
+"""Most stretches of a recording that are shown; --json has them all."""
 _UNITS: Final = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
-_AXES: Final = "xyz"
 
 
 class Result(NamedTuple):
-    """What was found of one IMU."""
+    """Noise of one IMU, and the recordings that it comes from."""
 
     imu: str
     logs: list[StillLog]
     rests: list[Rests]
     finding: Finding
     compared: NoiseProfile
-    kept: list[Kept]
     notes: list[str]
-
-    @property
-    def broken(self) -> list[str]:
-        """Where the profile did not keep its word, in words."""
-        return [
-            f"{each.triad}: only {each.share:.0%} of the minutes after {each.mean_s} s were within 2 sigma"
-            for each in self.kept
-            if each.share < LEAST_SHARE and each.minutes >= LEAST_MINUTES
-        ]
 
 
 def add_command(add: AddCommand) -> None:
@@ -67,17 +44,10 @@ def add_command(add: AddCommand) -> None:
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recordings (.mcap) or CSV logs")
     sub.add_argument("--imu", metavar="NAME", help="only this one; of CSV files: what theirs is called (default imu)")
     add_table_options(sub)
-    sub.add_argument(
-        "--profile", metavar="PART", help="to compare with, and for what the recordings do not tell (default: as used)"
-    )
-    sub.add_argument(
-        "--warm-up",
-        nargs="+",
-        type=Path,
-        default=(),
-        metavar="FILE",
-        help="recordings that begin when it was switched on, cold: by how much its biases move",
-    )
+    words = "to compare with, and for what the recordings do not tell (default: as used)"
+    sub.add_argument("--profile", metavar="PART", help=words)
+    words = "recordings that begin when it was switched on, cold: by how much its biases move"
+    sub.add_argument("--warm-up", nargs="+", type=Path, default=(), metavar="FILE", help=words)
     sub.add_argument("--skip", type=seconds, default=0.0, metavar="S", help="leave out so much at each beginning")
     sub.add_argument("--save", metavar="NAME", help='keep it: profile = "NAME" in [[imu]] then takes it')
     sub.add_argument("--storage", type=Path, metavar="DIR", help="where to (default: as in the configuration)")
@@ -85,15 +55,18 @@ def add_command(add: AddCommand) -> None:
 
 async def profile(options: argparse.Namespace) -> int:
     """`companion profile`."""
+    from companion.estimation.noise.allan import noise_profile
     from companion.lab.logs.log import NAME
     from companion.lab.logs.log_files import read_logs
-    from companion.storage.profiles import ProfileStore, check_name
+    from companion.storage.profiles import ProfileStore, check_name, given_profile
 
-    store = None
+    store = compared = None
     if options.save is not None:
         check_name(options.save)
         store = ProfileStore(options.storage or load_config(options).storage.path)
-    compared = _compared(options)
+    if options.profile is not None:
+        given = given_profile(options.profile, lambda: options.storage or storage_path(options))
+        compared = noise_profile(given)
     logs, cold = (
         read_logs(files, options.columns, options.rate, options.imu or NAME) if files else []
         for files in (options.files, options.warm_up)
@@ -106,33 +79,23 @@ async def profile(options: argparse.Namespace) -> int:
             refused.append(f"imu {imu}: {error}")
     for words in refused:
         print_lines(f"companion: {words}", error=True)
+    good = bool(results) and not refused
+    lines = [line for result in results for line in _lines(result)]
     saved = None
-    reason = "; ".join(refused)
-    state = "done" if results and not refused else "failed"
-    if store is not None and state == "done":
+    if store is not None and good:
         if len(results) > 1:
             names = ", ".join(result.imu for result in results)
             raise ConfigError(f"--save: found IMUs {names}; allowed: one; say which with --imu")
-        if results[0].broken:
-            state, reason = "refused", f"not saved: {'; '.join(results[0].broken)}"
-        else:
-            saved = store.write(_to_save(results[0], options.save))
-    lines = [line for result in results for line in _lines(result)]
-    if saved is not None:
+        saved = store.write(_to_save(results[0], options.save))
         lines.append(f'saved: {saved}; profile = "{options.save}" in [[imu]] takes it, after a restart')
-    if state == "refused":
-        print_lines(f"companion: {reason}", error=True)
-    answer = {"state": state, "reason": reason, "file": None if saved is None else str(saved)}
-    return conclude(options, {**answer, "imus": [_object(result) for result in results]}, lines, good=state == "done")
-
-
-def _compared(options: argparse.Namespace) -> NoiseProfile | None:
-    from companion.estimation.noise.allan import noise_profile
-    from companion.storage.profiles import given_profile
-
-    if options.profile is None:
-        return None
-    return noise_profile(given_profile(options.profile, lambda: options.storage or storage_path(options)))
+        lines.append(f"check it: companion replay LOG --windows 60 --profile {saved}")
+    answer = {
+        "state": "done" if good else "failed",
+        "reason": "; ".join(refused),
+        "file": None if saved is None else str(saved),
+        "imus": [_object(result) for result in results],
+    }
+    return conclude(options, answer, lines, good=good)
 
 
 def _by_imu(logs: Sequence[StillLog], wanted: str | None) -> dict[str, list[StillLog]]:
@@ -147,16 +110,15 @@ def _by_imu(logs: Sequence[StillLog], wanted: str | None) -> dict[str, list[Stil
 
 
 def _learn(
-    imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float, cold: Sequence[StillLog] = ()
+    imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float, cold: Sequence[StillLog]
 ) -> Result:
-    """All of one IMU.
+    """Estimate the noise of one IMU.
 
     Raises:
-        CalibrationRefusedError: the recordings tell nothing of it.
+        CalibrationRefusedError: the recordings do not show it.
     """
     from companion.estimation.noise.allan import noise_profile
-    from companion.lab.profiling.coverage import coverage
-    from companion.lab.profiling.profile_fit import fit_profile, joined, learn_warm_up, rests
+    from companion.lab.profile import Rests, fit_profile, learn_warm_up, rests
 
     whole = [log for log in logs if not log.truncated]
     if not whole:
@@ -168,50 +130,31 @@ def _learn(
     for log in whole:
         pieces = log.pieces(skip_s)
         parts = [rests(log.t_s[at], log.readings[at], log.temperature_degc[at], imu, against) for at in pieces]
-        found.append(joined(parts))
+        stretches = tuple(rest for part in parts for rest in part.stretches)
+        obstacle = next((part.obstacle for part in parts if part.obstacle), "")
+        found.append(Rests(stretches, sum(part.seconds for part in parts), obstacle))
     obstacle = next((each.obstacle for each in found if each.obstacle), "")
-    stretches = [stretch for each in found for stretch in each.stretches]
+    in_the_way = f" (in the way: {obstacle})" if obstacle else ""
     try:
-        finding = fit_profile(imu, stretches, against)
+        finding = fit_profile(imu, [stretch for each in found for stretch in each.stretches], against)
     except CalibrationRefusedError as error:
-        raise CalibrationRefusedError(f"{error}{f' (in the way: {obstacle})' if obstacle else ''}") from None
+        raise CalibrationRefusedError(f"{error}{in_the_way}") from None
+    warm_up = None
     if cold:
-        seen = [rests(log.t_s, log.readings, log.temperature_degc, imu, against).stretches for log in cold]
-        finding = msgspec.structs.replace(
-            finding, profile=msgspec.structs.replace(finding.profile, warm_up=learn_warm_up(seen))
-        )
-    kept = coverage([each.stretches for each in found], against)
-    notes = _notes(finding, against, found, kept, obstacle)
-    if cold:
-        gyro, accel = finding.profile.warm_up[0] / DEG_H, finding.profile.warm_up[1] / MG
+        stretches_of = [rests(log.t_s, log.readings, log.temperature_degc, imu, against).stretches for log in cold]
+        warm_up = learn_warm_up(stretches_of)
+        own = msgspec.structs.replace(finding.profile, warm_up=warm_up)
+        finding = msgspec.structs.replace(finding, profile=own)
+    notes = _notes(finding, against, found, obstacle)
+    if warm_up is not None:
+        gyro, accel = warm_up[0] / DEG_H, warm_up[1] / MG
         notes.append(
             f"warming up moves gyros by {gyro:.3g} deg/h, accelerometers by {accel:.3g} mg: sigma allows for it"
         )
-    return Result(imu, whole, found, finding, against, kept, notes)
+    return Result(imu, whole, found, finding, against, notes)
 
 
-def _used(result: Result) -> Iterator[tuple[StillLog, list[tuple[float, float]], float]]:
-    """Of each recording the stretches that were learned from, in seconds from its beginning on, and how long it is."""
-    for log, found in zip(result.logs, result.rests, strict=True):
-        begin_s = float(log.t_s[0])
-        spans = [(float(rest.slots[0]) - begin_s, float(rest.slots[-1]) + 1.0 - begin_s) for rest in found.stretches]
-        yield log, spans, float(log.t_s[-1]) - begin_s
-
-
-def _used_lines(result: Result) -> list[str]:
-    lines = []
-    for log, spans, seconds_s in _used(result):
-        shown = ", ".join(f"{from_s:.0f} to {to_s:.0f} s" for from_s, to_s in spans[:MOST_STRETCHES])
-        more = f" and {len(spans) - MOST_STRETCHES} more" if len(spans) > MOST_STRETCHES else ""
-        lines.append(f"used of {', '.join(log.files)}: {shown}{more}, of {seconds_s:.0f} s")
-        lines += [f"left out: {count} lines {why}" for why, count in log.left_out.items()]
-        lines += [f"note: {note}" for note in log.notes]
-    return lines
-
-
-def _notes(
-    finding: Finding, against: NoiseProfile, found: Sequence[Rests], kept: Sequence[Kept], obstacle: str
-) -> list[str]:
+def _notes(finding: Finding, against: NoiseProfile, found: Sequence[Rests], obstacle: str) -> list[str]:
     import numpy as np
 
     notes = []
@@ -241,67 +184,50 @@ def _notes(
                 f"{name}: {ratio:.1f} times the noise that N, B and K make of {span} s: something periodic, or steps;"
                 " B allows for it"
             )
-    if not kept:
-        notes.append("too short to test: no room for a window and the minute after it in both halves")
-    elif all(each.minutes < LEAST_MINUTES for each in kept):
-        notes.append("too short a test: the shares say little")
     return notes
 
 
 def _named(finding: Finding) -> Iterator[tuple[str, AxisFinding, float, str, int]]:
     for column, axis in enumerate(finding.axes):
         triad = "gyro" if column < 3 else "accel"
-        yield (f"{triad} {_AXES[column % 3]}", axis, *_UNITS[triad])
+        yield (f"{triad} {'xyz'[column % 3]}", axis, *_UNITS[triad])
+
+
+def _used(result: Result) -> Iterator[tuple[StillLog, list[tuple[float, float]], float]]:
+    """Give each recording with its stretches, in seconds from its beginning, and its length in seconds."""
+    for log, found in zip(result.logs, result.rests, strict=True):
+        begin_s = float(log.t_s[0])
+        spans = [(float(rest.slots[0]) - begin_s, float(rest.slots[-1]) + 1.0 - begin_s) for rest in found.stretches]
+        yield log, spans, float(log.t_s[-1]) - begin_s
 
 
 def _lines(result: Result) -> list[str]:
-    """For people."""
+    """Make the lines for people."""
     finding = result.finding
     recordings = f"{len(result.logs)} recording{'s' if len(result.logs) > 1 else ''}"
     span = _temperatures(result.logs)
     degc = "" if span is None else f", {span[0]:.1f} to {span[1]:.1f} degC"
     lines = [f"imu {result.imu}: {finding.still_s / 3600.0:.2f} h at rest in {recordings}{degc}"]
-    lines.append(f"{'':24} {'N, x sqrt(s)':>16} {'floor A':>16} {'K, / sqrt(s)':>16}")
+    table = [("", ["N, x sqrt(s)", "floor A", "K, / sqrt(s)"])]
     for name, axis, unit, unit_name, digits in _named(finding):
-        cells = [_cell(axis, which, unit, digits) for which in range(3)]
-        lines.append(f"{name + ', ' + unit_name:24} {cells[0]:>16} {cells[1]:>16} {cells[2]:>16}")
-    for triad, ours, theirs in (
-        ("gyro", finding.profile.gyro, result.compared.gyro),
-        ("accel", finding.profile.accel, result.compared.accel),
-    ):
-        unit, _, digits = _UNITS[triad]
-        for name, model in (("this profile", ours), (result.compared.name, theirs)):
-            cells = [
-                f"{value / unit:.{digits + more}f}" for value, more in zip(_figures(model), (0, 0, 2), strict=True)
-            ]
-            lines.append(f"{f'{triad}: {name}':24} {cells[0]:>16} {cells[1]:>16} {cells[2]:>16}")
-    if result.kept:
-        heads = ("T, s", "sigma_use", "rms error", "over sigma", "2 sigma")
-        widths = (5, 11, 11, 10, 8)
-        lines.append(
-            "the minute after windows of T s, learned from other recordings or the other half; within 2 sigma:"
-        )
-        lines.append(_row("", heads, widths))
-        for each in result.kept:
-            unit, unit_name, digits = _UNITS[each.triad]
-            sizes = [f"{value / unit:.{digits}f} {unit_name}" for value in (each.sigma_use, each.rms)]
-            line = (f"{each.mean_s}", *sizes, f"{each.ratio:.2f}", f"{each.share:.1%}")
-            lines.append(_row(each.triad, line, widths))
-    lines += _used_lines(result)
-    lines += [f"note: {note}" for note in result.notes]
-    return lines + [f"DO NOT USE: {words}" for words in result.broken]
-
-
-def _row(first: str, cells: Sequence[str], widths: Sequence[int]) -> str:
-    return f"{first:6}" + " ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
-
-
-def _figures(model: AllanModel) -> tuple[float, float, float]:
-    return model.white, model.floor, model.walk
+        table.append((f"{name}, {unit_name}", [_cell(axis, which, unit, digits) for which in range(3)]))
+    for triad, (unit, _, digits) in _UNITS.items():
+        for name, noise in (("this profile", finding.profile), (result.compared.name, result.compared)):
+            model = noise.gyro if triad == "gyro" else noise.accel
+            figures = ((model.white, digits), (model.floor, digits), (model.walk, digits + 2))
+            table.append((f"{triad}: {name}", [f"{value / unit:.{places}f}" for value, places in figures]))
+    lines += [f"{first:24} " + " ".join(f"{cell:>16}" for cell in cells) for first, cells in table]
+    for log, spans, seconds_s in _used(result):
+        shown = ", ".join(f"{from_s:.0f} to {to_s:.0f} s" for from_s, to_s in spans[:MOST_STRETCHES])
+        more = f" and {len(spans) - MOST_STRETCHES} more" if len(spans) > MOST_STRETCHES else ""
+        lines.append(f"used of {', '.join(log.files)}: {shown}{more}, of {seconds_s:.0f} s")
+        lines += [f"left out: {count} lines {why}" for why, count in log.left_out.items()]
+        lines += [f"note: {note}" for note in log.notes]
+    return lines + [f"note: {note}" for note in result.notes]
 
 
 def _cell(axis: AxisFinding, which: int, unit: float, digits: int) -> str:
-    """A figure with its standard error, or its upper limit where it is not told."""
+    """Write a figure with its standard error, or its upper limit where the recordings do not show it."""
     from companion.estimation.noise.allan import FLOOR_OF_FLICKER
 
     factor = (1.0, FLOOR_OF_FLICKER, 1.0)[which] / unit
@@ -316,9 +242,9 @@ def _cell(axis: AxisFinding, which: int, unit: float, digits: int) -> str:
 def _temperatures(logs: Sequence[StillLog]) -> tuple[float, float] | None:
     import numpy as np
 
-    known = [log.temperature_degc[np.isfinite(log.temperature_degc)] for log in logs]
-    known = [each for each in known if len(each)]
-    return (min(float(each.min()) for each in known), max(float(each.max()) for each in known)) if known else None
+    degc = np.concatenate([log.temperature_degc for log in logs])
+    known = degc[np.isfinite(degc)]
+    return (float(known.min()), float(known.max())) if len(known) else None
 
 
 def _to_save(result: Result, name: str) -> Any:
@@ -326,31 +252,32 @@ def _to_save(result: Result, name: str) -> Any:
     from companion.storage.profiles import FORMAT_VERSION, SavedProfile, Source
 
     finding = result.finding
-    now = datetime.datetime.now(tz=datetime.UTC)
+    sources = [
+        Source(
+            file=", ".join(log.files),
+            began_at=log.began_at,
+            still_s=float(rests.still_s),
+            temperature_degc=_temperatures([log]),
+        )
+        for log, rests in zip(result.logs, result.rests, strict=True)
+    ]
     return SavedProfile(
         format_version=FORMAT_VERSION,
         name=name,
-        saved_at=now.isoformat(timespec="seconds"),
+        saved_at=datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="seconds"),
         imu=result.imu,
         gyro=finding.profile.gyro,
         accel=finding.profile.accel,
         kept_from=result.compared.name,
         kept=finding.kept,
-        sources=tuple(
-            Source(
-                file=", ".join(log.files),
-                began_at=log.began_at,
-                still_s=float(rests.still_s),
-                temperature_degc=_temperatures([log]),
-            )
-            for log, rests in zip(result.logs, result.rests, strict=True)
-        ),
+        sources=tuple(sources),
         notes=tuple(result.notes),
         warm_up=finding.profile.warm_up if finding.profile.warm_up != WARM_UP else None,
     )
 
 
 def _object(result: Result) -> dict[str, Any]:
+    """Make the object for --json."""
     finding = result.finding
     return {
         "name": result.imu,
@@ -370,17 +297,7 @@ def _object(result: Result) -> dict[str, Any]:
         "profile": msgspec.to_builtins(finding.profile),
         "compared": msgspec.to_builtins(result.compared),
         "kept": list(finding.kept),
-        "axes": [_finite(msgspec.to_builtins(axis)) for axis in finding.axes],
-        "coverage": [msgspec.to_builtins(each) for each in result.kept],
+        # An upper limit that nobody knows is infinite; msgspec writes null for it.
+        "axes": msgspec.json.decode(msgspec.json.encode(finding.axes)),
         "notes": result.notes,
-        "broken": result.broken,
     }
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no infinity: an upper limit that nobody knows is null."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

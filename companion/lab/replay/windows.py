@@ -19,7 +19,6 @@ import numpy as np
 from companion.errors import StorageError
 from companion.estimation.records.record import ImuRecord
 from companion.lab.logs.log import StillLog
-from companion.lab.profiling.coverage import Held
 from companion.lab.replay.estimate import Given, estimate
 from companion.physics.frames import Floats, roll_pitch_from_up, rotation_matrix
 from companion.physics.units import DEG
@@ -45,13 +44,21 @@ class Refused(msgspec.Struct, frozen=True):
     """Of the first."""
 
 
-class AxisKept(Held, frozen=True, kw_only=True):
-    """How often one axis came out as was said, rad/s or m/s^2."""
+class AxisKept(msgspec.Struct, frozen=True, kw_only=True):
+    """Predictions of one axis against the windows after them, rad/s or m/s^2."""
 
     axis: str
     next_s: float
-    """So long after the window."""
+    """Time after the window that is predicted."""
     pairs: int
+    sigma_use: float
+    """Median of what was promised."""
+    rms: float
+    """Root mean square of the misses."""
+    ratio: float
+    """Root mean square of a miss over its sigma; 1 where sigma is right."""
+    share: float
+    """Share within 2 sigma, the white noise of what comes after allowed for."""
 
 
 class Windows(msgspec.Struct, frozen=True, kw_only=True):
@@ -161,8 +168,16 @@ def _kept(found: Sequence[_Found | None], span: int, next_s: float) -> list[Axis
         seen.append(np.mean([np.square(each.stat) for each in after], axis=0) / span)
     if not misses:
         return []
-    columns = zip(*(np.array(each).T for each in (misses, uses, seen)), _AXES, strict=True)
+    columns = zip(_AXES, *(np.array(each).T for each in (misses, uses, seen)), strict=True)
     return [
-        AxisKept.against(miss, use, own, axis=axis, next_s=next_s, pairs=len(misses))
-        for miss, use, own, axis in columns
+        AxisKept(
+            axis=axis,
+            next_s=next_s,
+            pairs=len(misses),
+            sigma_use=float(np.sqrt(np.median(use))),
+            rms=float(np.sqrt(np.square(miss).mean())),
+            ratio=float(np.sqrt((np.square(miss) / (use + own)).mean())),
+            share=float((np.square(miss) <= 4.0 * (use + own)).mean()),
+        )
+        for axis, miss, use, own in columns
     ]

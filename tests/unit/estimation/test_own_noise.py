@@ -18,7 +18,7 @@ from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import solve
 from companion.estimation.stillness.gates import ImuGate
 from companion.estimation.stillness.own_noise import OwnNoise
-from companion.lab.profiling.profile_fit import fit_profile, rests, seconds_of
+from companion.lab.profile import fit_profile, rests, seconds_of
 from tests.support.extent import extent
 from tests.support.made_noise import DEG, DEG_H, MG, filtered
 from tests.support.recordings import shared

@@ -1,1 +1,0 @@
-"""An IMU's noise profile from a long recording at rest."""
