@@ -16,8 +16,7 @@ from typing import Final
 import numpy as np
 
 from companion.fleet.judgement import Columns, History, columns_of, compass_column, counts
-from companion.fleet.models import Scatter, scatter_of_model, scatter_of_part
-from companion.fleet.sequential import Alarm, watch
+from companion.fleet.sequential import Alarm, Scatter, scatter_of_model, scatter_of_part, watch
 from companion.physics.frames import Floats
 from companion.physics.units import DEG_H, MG
 

@@ -83,8 +83,7 @@ async def _acl(options: argparse.Namespace) -> int:
 
 
 def _server(options: argparse.Namespace) -> Server:
-    from companion.fleet.certificate import Certificate
-    from companion.fleet.server import Server, read_password
+    from companion.fleet.server import Certificate, Server, read_password
 
     password = None if options.password_file is None else read_password(options.password_file)
     if (options.cert is None) != (options.key is None):

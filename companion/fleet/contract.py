@@ -130,32 +130,6 @@ class _Calibration(msgspec.Struct, frozen=True):
     alignment: _Zero | None = None
 
 
-class _Arming(msgspec.Struct, frozen=True):
-    armed_at: str
-    state: _Word
-    reason: str
-    calibration: str | None
-    gyro_sigma_use_rad_s: _Number | None = None
-    accel_sigma_use_m_s2: _Number | None = None
-
-
-class _Undo(msgspec.Struct, frozen=True):
-    what: str
-    of: str
-    undone_at: str
-
-
-class _Alignment(msgspec.Struct, frozen=True):
-    what: str
-    state: _Word
-    measured_at: str
-    reason: str
-
-
-class _Event(msgspec.Struct, frozen=True):
-    what: str
-
-
 _FIRMWARES: Final = {"INS": "ardupilot", "CAL": "px4", "TC": "px4"}
 """Firmwares by the prefix of their parameters."""
 _ABOUT: Final = ("gyro_id", "accel_id", "temperature_degc", "samples")
@@ -167,11 +141,16 @@ def _calibration(body: bytes) -> Rows:
     biases: list[Row] = []
     for imu in {imu.name: imu for imu in told.imus}.values():
         about = {"imu": imu.name} | {name: getattr(imu, name) for name in _ABOUT}
-        triads = {name: getattr(imu, name) for name in _TRIADS} | _by_readings(imu)
+        # Biases before earlier power-ups were weighed in; None: none were.
+        prior = imu.prior or _Prior()
+        gyro, accel = prior.gyro or _Found(), prior.accel or _Found()
+        triads = {name: getattr(imu, name) for name in _TRIADS}
+        triads |= {"gyro_read_rad_s": gyro.measured_rad_s, "accel_read_m_s2": accel.measured_m_s2}
         for number, axis in enumerate("xyz"):
             figures = {name: value and value[number] for name, value in triads.items()}
             biases.append({**about, "axis": axis, **figures})
     held = [f"{imu.name} {triad}" for imu in told.imus for triad in imu.held_back]
+    prefixes = {name.partition("_")[0] for imu in told.imus for name in imu.written}
     zero = told.alignment
     row = {
         "started_at": moment(told.started_at),
@@ -180,7 +159,7 @@ def _calibration(body: bytes) -> Rows:
         "reason": told.reason,
         "held_back": ", ".join(held),
         "undone_at": _at(told.undone_at),
-        "firmware": _firmware(told.imus),
+        "firmware": next((firmware for prefix, firmware in _FIRMWARES.items() if prefix in prefixes), None),
         "heading_bound_deg": told.magnetic and told.magnetic.heading_bound_deg,
         "zero_at": zero and moment(zero.measured_at),
         "zero_x_deg": zero and zero.offset_deg[0],
@@ -190,17 +169,13 @@ def _calibration(body: bytes) -> Rows:
     return {"calibrations": [row], "biases": biases}
 
 
-def _by_readings(imu: _Imu) -> dict[str, _Axes]:
-    """Give the biases before earlier power-ups were weighed in; None: none were."""
-    prior = imu.prior or _Prior()
-    gyro, accel = prior.gyro or _Found(), prior.accel or _Found()
-    return {"gyro_read_rad_s": gyro.measured_rad_s, "accel_read_m_s2": accel.measured_m_s2}
-
-
-def _firmware(imus: Iterable[_Imu]) -> str | None:
-    """Tell the firmware by the written parameters; None: none were written."""
-    prefixes = {name.partition("_")[0] for imu in imus for name in imu.written}
-    return next((firmware for prefix, firmware in _FIRMWARES.items() if prefix in prefixes), None)
+class _Arming(msgspec.Struct, frozen=True):
+    armed_at: str
+    state: _Word
+    reason: str
+    calibration: str | None
+    gyro_sigma_use_rad_s: _Number | None = None
+    accel_sigma_use_m_s2: _Number | None = None
 
 
 def _arming(body: bytes) -> Rows:
@@ -209,14 +184,31 @@ def _arming(body: bytes) -> Rows:
     return {"armings": [{**row, "armed_at": moment(row["armed_at"]), "calibration_at": _at(of)}]}
 
 
+class _Undo(msgspec.Struct, frozen=True):
+    what: str
+    of: str
+    undone_at: str
+
+
 def _undo(body: bytes) -> Rows:
     told = msgspec.json.decode(body, type=_Undo)
     return {"undos": [{"what": told.what, "of_at": moment(told.of), "undone_at": moment(told.undone_at)}]}
 
 
+class _Alignment(msgspec.Struct, frozen=True):
+    what: str
+    state: _Word
+    measured_at: str
+    reason: str
+
+
 def _alignment(body: bytes) -> Rows:
     row = msgspec.structs.asdict(msgspec.json.decode(body, type=_Alignment))
     return {"alignments": [{**row, "measured_at": moment(row["measured_at"])}]}
+
+
+class _Event(msgspec.Struct, frozen=True):
+    what: str
 
 
 def _event(body: bytes) -> Rows:

@@ -14,15 +14,16 @@ import numpy as np
 import sqlalchemy as sa
 
 from companion.estimation.solution.by_temperature import ByTemperature, Expected, ExpectedForces, Seen
-from companion.fleet.judging import Part, parts_of
-from companion.fleet.models import Scatter, Typical, typical_part
+from companion.fleet.judgement import Part, parts_of
 from companion.fleet.schema import Moment, aircraft, parts
+from companion.fleet.sequential import Typical, typical_part
+from companion.physics.frames import Floats
 from companion.physics.units import UNITS
 from companion.report import svg
 from companion.report.by_temperature import biases_by_temperature
 from companion.report.markup import Child, Markup, join, row, tag
 from companion.report.page import AXES, CLASSES, NAMES, page
-from companion.samples import TRIADS, Triad
+from companion.samples import TRIADS, Triad, rows_of
 
 OUTSIDE: Final = 3.0
 """Least distance from the typical part, in sigmas of the spread, for the list of outliers."""
@@ -58,6 +59,7 @@ def model_page(connection: sa.Connection, model: str, now: datetime.datetime, so
     query = sa.select(aircraft.c.aircraft, aircraft.c.name).where(of_parts)
     names = {row.aircraft: row.name for row in connection.execute(query)}
     typical = typical_part(list(of_model.values()))
+    turn_on = np.array([part.turn_on for part in of_model.values()])
     all_parts = models(connection).get(model, 0)
     power_ups = sum(part.power_ups for part in of_model.values())
     shown: list[Child] = [
@@ -68,26 +70,38 @@ def model_page(connection: sa.Connection, model: str, now: datetime.datetime, so
         tag("p", "How far the biases of each part scatter from one power-up to the next, at one temperature."),
     ]
     for triad in TRIADS:
-        shown += _distribution(of_model, triad, typical)
-        shown += _outside(of_model, triad, typical, names)
+        shown += _distribution(turn_on, triad, typical)
+        if typical is not None:
+            shown.append(_outside(list(of_model), turn_on, triad, typical, names))
     if typical is None:
         shown.append(tag("p", "Too few parts with a known scatter to say which one is typical."))
     return page(f"IMU model {model}", now, *shown, source=source)
 
 
-def _distribution(of_model: Mapping[Part, Scatter], triad: Triad, typical: Typical | None) -> list[Child]:
+def _distribution(turn_on: Floats, triad: Triad, typical: Typical | None) -> list[Child]:
     """Draw a dot for each part, above the others that scatter as much, and the typical part."""
     unit, unit_name, _ = UNITS[triad]
-    columns = {axis: _scatters(of_model, triad, axis) for axis in range(3)}
-    every = [value / unit for of_axis in columns.values() for value in of_axis.values()]
-    if not every:
+    columns = [np.sort(column[np.isfinite(column)]) / unit for column in turn_on[:, rows_of(triad)].T]
+    if not any(map(len, columns)):
         return []
-    across = svg.linear([0.0, *every])
+    across = svg.linear([0.0, *np.concatenate(columns).tolist()])
     across = msgspec.structs.replace(across, low=0.0, ticks=tuple(tick for tick in across.ticks if tick[0] >= 0.0))
     plots = []
-    for axis, of_axis in columns.items():
-        points = _stacked([value / unit for value in of_axis.values()], across)
-        most = max((place for _, place in points), default=1.0)
+    for axis, values in enumerate(columns):
+        there: Counter[int] = Counter()
+        points: list[svg.Pair] = []
+        for value in values.tolist():
+            place = round(across.share(value) * _BINS)
+            there[place] += 1
+            points.append((value, float(there[place])))
+        most = float(max(there.values(), default=1))
+        label = f"{AXES[axis]}, {unit_name}"
+        usual = None
+        if typical is not None and np.isfinite(typical.turn_on[rows_of(triad)][axis]):
+            usual, spread = (
+                float(each[rows_of(triad)][axis]) / unit for each in (typical.turn_on, typical.turn_on_spread)
+            )
+            label += f": typically {usual:.3g}, parts differ by {spread:.2g}"
         plot = svg.Plot(
             across,
             svg.Axis(0.0, most + 1.0, ()),
@@ -95,86 +109,44 @@ def _distribution(of_model: Mapping[Part, Scatter], triad: Triad, typical: Typic
             told=f"{len(points)} parts",
             height=min(max(_DOT * (most + 1.0), _LEAST_HEIGHT), _MOST_HEIGHT),
             x_label=f"turn-on scatter, {unit_name}" if axis == 2 else "",
-            y_label=f"{AXES[axis]}, {unit_name}{_in_words(typical, triad, axis)}",
+            y_label=label,
             left=16.0,
         )
         plot.points(points, CLASSES[axis], [(place, place) for _, place in points])
-        if typical is not None and np.isfinite(usual := typical.turn_on[_column(triad, axis)]):
-            plot.upright(float(usual) / unit, "now")
+        if usual is not None:
+            plot.upright(usual, "now")
         plots.append(plot.svg())
     words = "A dot is a part. " + ("Dashes: the typical one." if typical is not None else "")
-    return [tag("h2", NAMES[triad]), tag("figure", *plots, tag("figcaption", words)), _slopes(typical, triad)]
-
-
-def _column(triad: Triad, axis: int) -> int:
-    """Give the column of an axis in the figures of a part."""
-    return 3 * TRIADS.index(triad) + axis
-
-
-def _scatters(of_model: Mapping[Part, Scatter], triad: Triad, axis: int) -> dict[Part, float]:
-    found = {key: float(part.turn_on[_column(triad, axis)]) for key, part in of_model.items()}
-    return {key: value for key, value in found.items() if np.isfinite(value)}
-
-
-def _stacked(values: Sequence[float], across: svg.Axis) -> list[svg.Pair]:
-    """Place each value on its abscissa, one step above the values already there."""
-    there: Counter[int] = Counter()
-    points = []
-    for value in sorted(values):
-        place = round(across.share(value) * _BINS)
-        there[place] += 1
-        points.append((value, float(there[place])))
-    return points
-
-
-def _in_words(typical: Typical | None, triad: Triad, axis: int) -> str:
-    if typical is None:
-        return ""
-    scatter, spread = (
-        each[_column(triad, axis)] / UNITS[triad][0] for each in (typical.turn_on, typical.turn_on_spread)
-    )
-    return f": typically {scatter:.3g}, parts differ by {spread:.2g}" if np.isfinite(scatter) else ""
-
-
-def _slopes(typical: Typical | None, triad: Triad) -> Markup | None:
-    unit, unit_name, _ = UNITS[triad]
-    at = slice(_column(triad, 0), _column(triad, 0) + 3)
-    if typical is None or not np.isfinite(typical.per_k[at]).all():
-        return None
-    each = ", ".join(
-        f"{axis} {mean / unit:+.2g} ± {spread / unit:.2g}"
-        for axis, mean, spread in zip(AXES, typical.per_k[at], typical.per_k_spread[at], strict=True)
-    )
-    return tag("p", f"By temperature, {unit_name} a kelvin, mean and how parts differ: {each}.")
+    slopes = None
+    if typical is not None and np.isfinite(per_k := typical.per_k[rows_of(triad)]).all():
+        spreads = typical.per_k_spread[rows_of(triad)]
+        each = ", ".join(
+            f"{axis} {mean / unit:+.2g} ± {spread / unit:.2g}"
+            for axis, mean, spread in zip(AXES, per_k, spreads, strict=True)
+        )
+        slopes = tag("p", f"By temperature, {unit_name} a kelvin, mean and how parts differ: {each}.")
+    return [tag("h2", NAMES[triad]), tag("figure", *plots, tag("figcaption", words)), slopes]
 
 
 def _outside(
-    of_model: Mapping[Part, Scatter], triad: Triad, typical: Typical | None, names: Mapping[str, str | None]
-) -> list[Child]:
+    keys: Sequence[Part], turn_on: Floats, triad: Triad, typical: Typical, names: Mapping[str, str | None]
+) -> Markup:
     """List the parts that scatter far more, or less, than the others."""
-    if typical is None:
-        return []
     unit, unit_name, _ = UNITS[triad]
-    found = [
-        (float(value / usual), value, axis, key)
-        for axis in range(3)
-        for usual, spread in [(each[_column(triad, axis)] for each in (typical.turn_on, typical.turn_on_spread))]
-        for key, value in _scatters(of_model, triad, axis).items()
-        if abs(value - usual) > OUTSIDE * spread
-    ]
-    if not found:
-        return [tag("p", "No part is far off the others (three times what they differ).", class_="soft")]
-    rows = [
-        row(
-            tag("td", tag("a", names.get(key[0]) or key[0], href=f"/aircraft/{key[0]}"), tag("small", f"IMU {key[1]}")),
-            AXES[axis],
-            f"{value / unit:.3g}",
-            tag("td", f"{ratio:.1f}", class_="warn"),
-        )
-        for ratio, value, axis, key in sorted(found, reverse=True)[:MOST_OUTSIDE]
-    ]
+    at = rows_of(triad)
+    values, usual, spread = turn_on[:, at], typical.turn_on[at], typical.turn_on_spread[at]
+    far = np.argwhere(np.abs(values - usual) > OUTSIDE * spread).tolist()
+    if not far:
+        return tag("p", "No part is far off the others (three times what they differ).", class_="soft")
+    rows = []
+    for part, axis in sorted(far, key=lambda one: -values[one[0], one[1]] / usual[one[1]])[:MOST_OUTSIDE]:
+        which, imu = keys[part]
+        link = tag("a", names.get(which) or which, href=f"/aircraft/{which}")
+        value = values[part, axis]
+        ratio = tag("td", f"{value / usual[axis]:.1f}", class_="warn")
+        rows.append(row(tag("td", link, tag("small", f"IMU {imu}")), AXES[axis], f"{value / unit:.3g}", ratio))
     head = row(*(tag("th", words) for words in ("Far off the others", "axis", unit_name, "times the typical")))
-    return [tag("table", head, *rows, class_="fleet")]
+    return tag("table", head, *rows, class_="fleet")
 
 
 # --- one aircraft

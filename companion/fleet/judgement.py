@@ -1,16 +1,24 @@
-"""Judgement of one sensor: from its calibrations, in order, to findings. It needs no database and no clock."""
+"""Judgement of an aircraft's sensors: from the rows of its calibrations to rows of `parts` and `findings`.
+
+Each IMU becomes a `History` over its power-ups, that becomes columns for the tests of sequential.py, and their alarms
+become findings. All calibrations are the input, never an earlier judgement: every collector gets the same result.
+"""
 
 from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from itertools import pairwise
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+import sqlalchemy as sa
 from numpy.typing import NDArray
 
-from companion.fleet.models import Scatter, middle_of, scatter_of_part
-from companion.fleet.sequential import Alarm, watch
+from companion.fleet import schema
+from companion.fleet.contract import Row
+from companion.fleet.schema import Moment
+from companion.fleet.sequential import Alarm, Scatter, middle_of, scatter_of_model, scatter_of_part, watch
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG, G
 
@@ -37,6 +45,26 @@ _DRIFT_AFTER: Final = 8
 SHOWN: Final = 30
 """Power-ups for which a level that has moved is shown."""
 _AXES: Final = [f"{triad} {axis}" for triad in ("gyro", "accel") for axis in "xyz"]
+ZERO_SIGMAS: Final = 8.0
+"""Least move of a zero in a finding, in sigmas."""
+ZERO_USUAL_DEG: Final = 0.05
+"""One sigma between two alignments of a good gradienter, from the air's temperature."""
+MOST_CALIBRATIONS: Final = 2000
+"""Most calibrations of an aircraft, the latest ones: five years of one a day."""
+SAME_POWER_UP: Final = datetime.timedelta(minutes=30)
+"""Most time between two calibrations that agree and count as one power-up."""
+MOST_DEGC: Final = 150.0
+"""Limit of a believable temperature, to catch kelvins that were not turned into degrees."""
+_AGREE_SIGMAS: Final = 5.0
+MOST_PARTS: Final = 300
+"""Parts of one model that are compared."""
+_TOGETHER: Final = 10
+"""Most power-ups between moves of accelerometers that count as one move of the gradienter."""
+REPLACE: Final = {"scatter": 3.0, "noise": 2.0, "drift": 8.0, "bias": 8.0}
+"""Least sizes of findings, by kind, for the word "replace"."""
+
+Part = tuple[str, str]
+"""Aircraft and name of the IMU there."""
 
 
 class History(NamedTuple):
@@ -79,7 +107,7 @@ class Finding(NamedTuple):
     since: int
     """Index of the power-up."""
     size: float
-    """Severity, as a multiple of what is usual."""
+    """Multiple of what is usual."""
     words: str
     moved: float = 0.0
     """Move of a level, rad/s or m/s^2."""
@@ -136,7 +164,13 @@ def judge(history: History, model: Scatter | None) -> list[Finding]:
     for alarm in filter(counts, watch(*columns[:-1])):
         axis, unit = alarm.column % 6, columns.unit[alarm.column]
         if alarm.column >= 6:
-            _noise(found, alarm, columns, n)
+            before = found.pop((axis, "noise"), None)
+            since = before.since if before else alarm.since
+            values = columns.values[:, alarm.column] * unit
+            times = float(np.exp(middle_of(values[-LEARNS:]) - middle_of(values[max(since - LEARNS, 0) : since])))
+            if times >= LEAST_TIMES:
+                words = f"{_AXES[axis]} noise {times:.1f} times what it was"
+                found[axis, "noise"] = Finding("noise", axis, since, times, words)
         elif alarm.kind == "scatter" and alarm.until == n:
             its = "times its model's" if model is not None else "times what it was"
             words = f"{_AXES[axis]} turn-on scatter {alarm.size:.1f} {its}"
@@ -156,18 +190,6 @@ def judge(history: History, model: Scatter | None) -> list[Finding]:
     # A grown scatter also raises alarms of the level.
     left = [each for (axis, what), each in found.items() if what != "level" or (axis, "scatter") not in found]
     return sorted((each._replace(size=abs(each.size)) for each in left), key=lambda each: -each.size)
-
-
-def _noise(found: dict[tuple[int, str], Finding], alarm: Alarm, columns: Columns, n: int) -> None:
-    axis, unit = alarm.column % 6, columns.unit[alarm.column]
-    before = found.get((axis, "noise"))
-    since = before.since if before else alarm.since
-    values = columns.values[:, alarm.column] * unit
-    times = float(np.exp(middle_of(values[-LEARNS:]) - middle_of(values[max(since - LEARNS, 0) : since])))
-    found.pop((axis, "noise"), None)
-    if times >= LEAST_TIMES:
-        words = f"{_AXES[axis]} noise {times:.1f} times what it was"
-        found[axis, "noise"] = Finding("noise", axis, since, times, words)
 
 
 def judge_compass(heading_bound_deg: Floats) -> list[Finding]:
@@ -191,15 +213,17 @@ def compass_column(heading_bound_deg: Floats) -> Columns:
     n, nowhere = len(bound), np.full((len(bound), 1), np.nan)
     six = np.repeat(bound[:LEARNS], 6, axis=1)
     unit = np.fmax(scatter_of_part(six, nowhere[:LEARNS, 0]).turn_on[:1], _LEAST_NOISE)
-    zeros, one = np.zeros((n, 1)), np.ones(1)
-    first, least = np.full(1, LEARNS), np.log(LEAST_TIMES) / unit
-    return Columns(bound / unit, zeros, nowhere, WANDER[0] * one, zeros > 0.0, first, _OF_OWN * one, least, unit)
-
-
-ZERO_SIGMAS: Final = 8.0
-"""Least move of a zero in a finding, in sigmas."""
-ZERO_USUAL_DEG: Final = 0.05
-"""One sigma between two alignments of a good gradienter, from the air's temperature."""
+    return Columns(
+        values=bound / unit,
+        variance=np.zeros((n, 1)),
+        temperature_degc=nowhere,
+        wander=np.full(1, WANDER[0]),
+        relevel=np.zeros((n, 1), dtype=bool),
+        first=np.full(1, LEARNS),
+        most_own=np.full(1, _OF_OWN),
+        least=np.log(LEAST_TIMES) / unit,
+        unit=unit,
+    )
 
 
 def judge_zero(offset_deg: Floats, sigma_deg: Floats) -> list[Finding]:
@@ -212,3 +236,183 @@ def judge_zero(offset_deg: Floats, sigma_deg: Floats) -> list[Finding]:
         return []
     words = f"gradienter: its zero has moved by {moved:.2f} deg between two alignments ({moved * G * DEG / MG:.1f} mg)"
     return [Finding("zero", -1, len(offset_deg) - 1, sigmas / 2.0, words)]
+
+
+# --- one aircraft
+
+
+class _Calibration(NamedTuple):
+    about: Any
+    """Row of `calibrations`."""
+    axes: list[Any]
+    """Rows of `biases` of one IMU: x, y, z."""
+
+    def figures(self, name: str) -> list[float]:
+        """Give a figure of gyro x y z, accelerometer x y z."""
+        names = (f"gyro_{name}_rad_s", f"accel_{name}_m_s2")
+        return [np.nan if (value := getattr(row, each)) is None else value for each in names for row in self.axes]
+
+
+def judged(connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Row]]:
+    """Judge an aircraft by all calibrations in the database; return its rows of `parts` and of `findings`."""
+    done = _done(connection, aircraft)
+    imus: dict[str, list[_Calibration]] = {}
+    biases = _biases(connection, aircraft)
+    for key, about in done.items():
+        for imu, rows in biases.get(key, {}).items():
+            if len(rows) == 3:
+                imus.setdefault(imu, []).append(_Calibration(about, rows))
+    # The import is heavy, and most of the collector does without.
+    from companion.autopilot.firmware.firmwares import model_of
+
+    firmware = next((row.firmware for row in reversed(done.values()) if row.firmware), None)
+    parts: list[Row] = []
+    found: _Found = []
+    for imu, calibrations in sorted(imus.items()):
+        history = _history(_power_ups(calibrations))
+        ids = calibrations[-1].axes[0]
+        model = model_of(firmware, ids.gyro_id, ids.accel_id)
+        parts += _part(aircraft, imu, model, scatter_of_part(history.biases, history.temperature_degc))
+        others = None if model is None else scatter_of_model([*parts_of(connection, model, but=aircraft).values()])
+        found += [(imu, history.at, each) for each in judge(history, others)]
+    found = _of_the_gradienter(found, len(imus))
+    rows = list(done.values())
+    bounds = [row for row in rows if row.heading_bound_deg is not None]
+    figures = np.array([row.heading_bound_deg for row in bounds])
+    found += [(None, [row.started_at for row in bounds], each) for each in judge_compass(figures)]
+    zeros = list({row.zero_at: row for row in rows if row.zero_at is not None}.values())
+    offsets, sigmas = ([(row.zero_x_deg, row.zero_y_deg) for row in zeros], [row.zero_sigma_deg for row in zeros])
+    found += [(None, [row.zero_at for row in zeros], each) for each in judge_zero(np.array(offsets), np.array(sigmas))]
+    worst = sorted(found, key=lambda one: -one[2].size)
+    return parts, [_row(aircraft, place, *each) for place, each in enumerate(worst)]
+
+
+def parts_of(connection: sa.Connection, model: str, *, but: str = "") -> dict[Part, Scatter]:
+    """Read the scatter of each part of a model that is in an aircraft now, except in the aircraft `but`."""
+    query = sa.select(schema.parts).where(schema.parts.c.model == model, schema.parts.c.aircraft != but)
+    found: dict[Part, Scatter] = {}
+    for row in connection.execute(query.order_by("aircraft", "imu").limit(6 * MOST_PARTS)):
+        one = found.setdefault((row.aircraft, row.imu), Scatter(row.power_ups, *np.full((3, 6), np.nan)))
+        place = _AXES.index(f"{row.triad} {row.axis}")
+        for name in ("turn_on", "wander", "per_k"):
+            getattr(one, name)[place] = np.nan if (value := getattr(row, name)) is None else value
+    return found
+
+
+def _done(connection: sa.Connection, aircraft: str) -> dict[tuple[str, int], Any]:
+    """Read the calibrations that were not undone, by key, in the order of epochs and sequences."""
+    query = """
+        SELECT s.epoch, s.sequence, s.started_at, s.duration_s, s.firmware, s.heading_bound_deg,
+               s.zero_at, s.zero_x_deg, s.zero_y_deg, s.zero_sigma_deg, i.received_at
+        FROM standing s
+        JOIN tellings t ON t.aircraft = s.aircraft AND t.epoch = s.epoch AND t.sequence = s.sequence
+        JOIN items i ON i.aircraft = s.aircraft AND i.epoch = s.epoch AND i.sequence = s.sequence
+        WHERE s.aircraft = :aircraft"""
+    moments = {name: Moment() for name in ("started_at", "zero_at", "received_at")}
+    rows = connection.execute(sa.text(query).columns(**moments), {"aircraft": aircraft}).all()
+    began: dict[str, datetime.datetime] = {}
+    for row in rows:
+        began[row.epoch] = min(row.received_at, began.get(row.epoch, row.received_at))
+    ordered = sorted(rows, key=lambda row: (began[row.epoch], row.epoch, row.sequence))[-MOST_CALIBRATIONS:]
+    return {(row.epoch, row.sequence): row for row in ordered}
+
+
+def _biases(connection: sa.Connection, aircraft: str) -> dict[tuple[str, int], dict[str, list[Any]]]:
+    b = schema.biases.c
+    query = sa.select(
+        b.epoch, b.sequence, b.imu, b.gyro_id, b.accel_id, b.temperature_degc, b.samples,
+        sa.func.coalesce(b.gyro_read_rad_s, b.gyro_bias_rad_s).label("gyro_read_rad_s"),
+        sa.func.coalesce(b.accel_read_m_s2, b.accel_bias_m_s2).label("accel_read_m_s2"),
+        b.gyro_sigma_stat_rad_s, b.gyro_sigma_use_rad_s, b.accel_sigma_stat_m_s2, b.accel_sigma_use_m_s2,
+    )  # fmt: skip
+    found: dict[tuple[str, int], dict[str, list[Any]]] = {}
+    for row in connection.execute(query.where(b.aircraft == aircraft).order_by(b.axis)):
+        found.setdefault((row.epoch, row.sequence), {}).setdefault(row.imu, []).append(row)
+    return found
+
+
+def _power_ups(calibrations: list[_Calibration]) -> list[_Calibration]:
+    """Select the last calibration of each power-up, of the part that is in the aircraft now.
+
+    Calibrations of one power-up must also agree, as a wrong clock could join many.
+    """
+    ids = [(one.axes[0].gyro_id, one.axes[0].accel_id) for one in calibrations]
+    others = [place for place, each in enumerate(ids) if each != ids[-1]]
+    calibrations = calibrations[others[-1] + 1 if others else 0 :]
+    found = calibrations[:1]
+    for before, one in pairwise(calibrations):
+        read, use = (np.array([each.figures(name) for each in (before, one)]) for name in ("read", "sigma_use"))
+        off = np.nan_to_num(np.abs(read[1] - read[0]) / np.sqrt(np.square(use).sum(axis=0)))
+        if abs(one.about.started_at - before.about.started_at) < SAME_POWER_UP and (off < _AGREE_SIGMAS).all():
+            found.pop()
+        found.append(one)
+    return found
+
+
+def _history(calibrations: Sequence[_Calibration]) -> History:
+    biases, sigma_stat, sigma_use = (
+        np.array([one.figures(name) for one in calibrations]) for name in ("read", "sigma_stat", "sigma_use")
+    )
+    samples = np.array([one.axes[0].samples or np.nan for one in calibrations], dtype=np.float64)
+    took_s = np.array([one.about.duration_s for one in calibrations])
+    # Sample rate by the quickest of the calibrations before: the duration of others includes waiting.
+    rate = samples / np.maximum(took_s, 1.0)
+    rate = np.array([np.fmax.reduce(rate[max(k - 7, 0) : k + 1]) for k in range(len(rate))])
+    degc = np.array([one.axes[0].temperature_degc for one in calibrations], dtype=np.float64)
+    zeros = [one.about.zero_at for one in calibrations]
+    return History(
+        at=[one.about.started_at for one in calibrations],
+        temperature_degc=np.where(np.abs(degc) < MOST_DEGC, degc, np.nan),
+        biases=biases,
+        sigma_use=sigma_use,
+        white=sigma_stat * np.sqrt(samples / rate)[:, None],
+        new_zero=np.array([False, *(a != b for a, b in pairwise(zeros))]),
+    )
+
+
+def _part(aircraft: str, imu: str, model: str | None, scatter: Scatter) -> list[Row]:
+    figures = {name: getattr(scatter, name).tolist() for name in ("turn_on", "wander", "per_k")}
+    about = {"aircraft": aircraft, "imu": imu, "model": model, "power_ups": scatter.power_ups}
+    return [
+        {**about, "triad": triad, "axis": axis}
+        | {name: values[place] if np.isfinite(values[place]) else None for name, values in figures.items()}
+        for place, (triad, axis) in enumerate(each.split() for each in _AXES)
+    ]
+
+
+_Found = list[tuple[str | None, Sequence[datetime.datetime], Finding]]
+
+
+def _of_the_gradienter(found: _Found, imus: int) -> _Found:
+    """Replace findings of level accelerometers that moved together by one against the gradienter."""
+    left = list(found)
+    for axis, name in ((3, "forward"), (4, "right")):
+        of_it = [one for one in found if one[2].axis == axis and one[2].kind in ("bias", "drift")]
+        moved, sinces = [one[2].moved for one in of_it], [one[2].since for one in of_it]
+        if imus < 2 or len(of_it) < imus or max(sinces) - min(sinces) > _TOGETHER:
+            continue
+        if min(moved) * max(moved) > 0.0 and max(map(abs, moved)) < 2.0 * min(map(abs, moved)):
+            mean = float(np.mean(np.abs(moved)))
+            words = (
+                f"all accelerometers have moved {name} by {mean / MG:.1f} mg at once: the gradienter's zero, by"
+                f" {mean / G / DEG:.2f} deg, or its mounting"
+            )
+            _, at, worst = max(of_it, key=lambda one: one[2].size)
+            left = [one for one in left if one not in of_it]
+            left.append((None, at, worst._replace(kind="zero", words=words)))
+    return left
+
+
+def _row(aircraft: str, place: int, imu: str | None, at: Sequence[datetime.datetime], found: Finding) -> Row:
+    since = at[min(found.since, len(at) - 1)]
+    what = "" if imu is None else f"{'replace' if found.size >= REPLACE[found.kind] else 'watch'} IMU {imu}: "
+    return {
+        "aircraft": aircraft,
+        "place": place,
+        "kind": found.kind,
+        "imu": imu,
+        "since": since,
+        "power_ups": len(at) - found.since,
+        "size": found.size,
+        "words": f"{what}{found.words}, since {since.day} {since:%B %Y}",
+    }

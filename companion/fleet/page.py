@@ -6,15 +6,13 @@ import datetime
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
-import numpy as np
 import sqlalchemy as sa
 
 from companion.estimation.solution.by_temperature import Seen
 from companion.fleet.imu_pages import by_temperature, curves, model_links
 from companion.fleet.schema import Moment, findings, rejected
 from companion.fleet.schema import aircraft as known
-from companion.physics.frames import vector
-from companion.physics.units import DEG_H, MG, UNITS
+from companion.physics.units import UNITS
 from companion.report.markup import Child, Markup, join, row, tag
 from companion.report.page import NAMES, Point, arming_items, card, drift, page, seconds_of, with_sigma
 from companion.samples import TRIADS, Triad, Vector
@@ -188,74 +186,63 @@ def _findings(connection: sa.Connection, which: str | None = None) -> Markup | N
 
 def _imus(connection: sa.Connection, which: str) -> list[Child]:
     query = "SELECT * FROM bias_history WHERE aircraft = :which ORDER BY started_at DESC, imu, axis LIMIT :most"
-    rows = _rows(connection, query, which=which, most=MOST_CALIBRATIONS * 3 * 4)
+    by_imu: dict[str, dict[tuple[str, int], dict[str, Any]]] = {}
+    for each in _rows(connection, query, which=which, most=MOST_CALIBRATIONS * 3 * 4):
+        by_imu.setdefault(each.imu, {}).setdefault((each.epoch, each.sequence), {})[each.axis] = each
     parts: list[Child] = []
     told = curves(connection, which)
-    for imu in sorted({each.imu for each in rows}):
-        of_it = [each for each in rows if each.imu == imu]
-        ids = [
-            f"{what} {value}"
-            for what, value in (("gyro", of_it[0].gyro_id), ("accelerometer", of_it[0].accel_id))
-            if value
-        ]
+    for imu, found in sorted(by_imu.items()):
+        latest = [axes for axes in found.values() if len(axes) == 3][:MOST_CALIBRATIONS][::-1]
+        newest = next(iter(next(iter(found.values())).values()))
+        named = (("gyro", newest.gyro_id), ("accelerometer", newest.accel_id))
+        ids = [f"{what} {value}" for what, value in named if value]
         parts.append(tag("h2", f"IMU {imu}"))
         parts.append(tag("p", f"Device ids: {', '.join(ids)}", class_="soft") if ids else None)
         for triad in TRIADS:
-            points = _points(of_it, triad)
+            unit, unit_name, _ = UNITS[triad]
+            points = [
+                Point(axes["x"].sequence, seconds_of(axes["x"].started_at), _scaled(bias, unit), _scaled(sigma, unit))
+                for axes in latest
+                if (bias := _triad(axes, triad, "bias")) and (sigma := _triad(axes, triad, "sigma_use"))
+            ]
             if not points:
                 continue
-            unit, unit_name, _ = UNITS[triad]
-            last = points[-1]
-            pairs = (with_sigma(last.bias[k], last.sigma_use[k], unit) for k in range(3))
+            pairs = (with_sigma(points[-1].bias[k], points[-1].sigma_use[k], unit) for k in range(3))
             cells = [tag("td", value, " ± ", sigma) for value, sigma in pairs]
             parts += [
                 tag("h3", f"{NAMES[triad]}, {unit_name}"),
                 tag("table", row(*(tag("th", axis) for axis in "xyz")), row(*cells)),
                 drift(points, triad, name=f"{imu} {triad}"),
             ]
-        parts.append(by_temperature(told.get(imu), _seen(of_it)))
+        seen = [
+            Seen(
+                at_unix_s=seconds_of(axes["x"].started_at) or 0.0,
+                started_at="",
+                power_up=number,
+                degc=axes["x"].temperature_degc,
+                gyro_deg_h=gyro,
+                sigma_deg_h=sigma,
+                accel_mg=_triad(axes, "accel", "bias"),
+                accel_sigma_mg=_triad(axes, "accel", "sigma_use"),
+            )
+            for number, axes in enumerate(latest)
+            if axes["x"].temperature_degc is not None
+            and (gyro := _triad(axes, "gyro", "bias"))
+            and (sigma := _triad(axes, "gyro", "sigma_use"))
+        ]
+        parts.append(by_temperature(told.get(imu), seen))
     return parts
 
 
-def _seen(rows: Sequence[Any]) -> list[Seen]:
-    """Select the biases with a temperature."""
-    degc = {(each.sequence, seconds_of(each.started_at)): each.temperature_degc for each in rows}
-    gyro, accel = ({(one.number, one.unix_s): one for one in _points(rows, triad)} for triad in TRIADS)
-    return [
-        Seen(
-            at_unix_s=key[1] or 0.0,
-            started_at="",
-            power_up=number,
-            degc=degc[key],
-            gyro_deg_h=vector(np.array(one.bias) / DEG_H),
-            sigma_deg_h=vector(np.array(one.sigma_use) / DEG_H),
-            accel_mg=vector(np.array(accel[key].bias) / MG) if key in accel else None,
-            accel_sigma_mg=vector(np.array(accel[key].sigma_use) / MG) if key in accel else None,
-        )
-        for number, (key, one) in enumerate(gyro.items())
-        if degc.get(key) is not None
-    ]
+def _triad(axes: dict[str, Any], triad: Triad, what: str) -> Vector | None:
+    """Give a figure of three axes in deg/h or mg; None: it is not known of all."""
+    column = f"{triad}_{what}_{UNITS[triad].name.replace('/', '_')}"
+    x, y, z = (getattr(axes[axis], column) for axis in "xyz")
+    return None if None in (x, y, z) else (x, y, z)
 
 
-def _points(rows: Sequence[Any], triad: Triad) -> list[Point]:
-    """Select the latest biases, in the order of time, SI units."""
-    unit, name, _ = UNITS[triad]
-    suffix = name.replace("/", "_")
-    found: dict[tuple[str, int], dict[str, Any]] = {}
-    for each in rows:
-        found.setdefault((each.epoch, each.sequence), {})[each.axis] = each
-    points = []
-    for (_, sequence), axes in list(found.items())[:MOST_CALIBRATIONS]:
-        bias = _vector(axes, f"{triad}_bias_{suffix}", unit)
-        sigma = _vector(axes, f"{triad}_sigma_use_{suffix}", unit)
-        if bias is not None and sigma is not None:
-            points.append(Point(sequence, seconds_of(axes["x"].started_at), bias, sigma))
-    return points[::-1]
-
-
-def _vector(axes: dict[str, Any], column: str, unit: float) -> Vector | None:
-    found = [value * unit for axis in "xyz" if (value := getattr(axes.get(axis), column, None)) is not None]
-    return (found[0], found[1], found[2]) if len(found) == 3 else None
+def _scaled(figures: Vector, unit: float) -> Vector:
+    return figures[0] * unit, figures[1] * unit, figures[2] * unit
 
 
 def _armings(connection: sa.Connection, which: str) -> list[Child]:

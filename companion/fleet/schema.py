@@ -1,4 +1,4 @@
-"""Schema of the database, for PostgreSQL and SQLite, and the steps that bring an older one up to date.
+"""Schema of the database, for PostgreSQL and SQLite.
 
 The table `items` has the payloads as they came. All else is made from them and can be made again. Axes are the
 vehicle's FRD. Times are UTC by the aircraft's clock, which may be wrong; `heard_at`, `received_at` and `last_at` are by
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import datetime
 import re
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,6 +16,7 @@ import sqlalchemy as sa
 
 from companion.errors import StorageError
 
+VERSION: Final = 4
 _LOCK: Final = 0x636F6D70616E696F
 """Key of PostgreSQL's advisory lock that the collector holds while it reads and changes the version."""
 
@@ -259,72 +259,31 @@ _VIEW: Final = re.compile(r"-- (\w+): (.*)\n([^;]+);")
 _VIEWS: Final = Path(__file__).with_name("views.sql")
 
 
-def _indices_by_time(connection: sa.Connection) -> None:
-    for table in (calibrations, armings):
-        for index in table.indexes:
-            index.create(connection, checkfirst=True)
-
-
-def curves_and_flights(connection: sa.Connection) -> None:
-    """Make the tables of curves and flights; parse the curves that were kept as they came."""
-    for table in (curves, flights):
-        table.create(connection, checkfirst=True)
-    connection.execute(sa.update(items).where(items.c.kind == "curve").values(state="unknown"))
-
-
-def _to_be_judged(connection: sa.Connection) -> None:
-    """Add the columns that sensors are judged by, and parse the calibrations again to fill them."""
-    for table in (calibrations, biases):
-        there = {column["name"] for column in sa.inspect(connection).get_columns(table.name)}
-        for column in table.columns:
-            if column.name not in there:
-                words = sa.schema.CreateColumn(column).compile(dialect=connection.dialect)
-                connection.exec_driver_sql(f"ALTER TABLE {table.name} ADD COLUMN {words}")
-                if column.comment and connection.dialect.supports_comments:
-                    connection.execute(sa.schema.SetColumnComment(column))
-    for table in (parts, findings, judgements):
-        table.create(connection, checkfirst=True)
-    for table in (biases, calibrations):
-        connection.execute(sa.delete(table))
-    connection.execute(sa.update(items).where(items.c.kind == "calibration", _TAKEN).values(state="unknown"))
-
-
-_TAKEN: Final = items.c.state == "taken"
-Step = Callable[[sa.Connection], object]
-STEPS: Sequence[Step] = (_indices_by_time, curves_and_flights, _to_be_judged)
-"""Updates of the tables, from version n to n + 1; views are made again after an update, and where one is missing."""
-
-
 def bring_up_to_date(connection: sa.Connection) -> bool:
-    """Make the tables, or bring those of an older version up to date; return whether anything was to do.
+    """Make the tables, and views that are missing; return whether anything was to do.
 
     All of it happens within the connection's transaction, by one collector at a time.
 
     Raises:
-        StorageError: a newer companion has made them.
+        StorageError: another version has made the tables.
     """
-    newest = len(STEPS) + 1
     if connection.dialect.name == "postgresql":
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
         connection.exec_driver_sql("SET LOCAL statement_timeout = 0")  # tables of years take their time
-    found, inspector = 0, sa.inspect(connection)
-    if inspector.has_table(_version.name):
-        found = connection.execute(sa.select(_version.c.version)).scalar_one()
-    if found > newest:
-        raise StorageError(
-            f"the database has tables of version {found}; allowed: up to {newest} (a newer companion has made them)"
-        )
-    if found == newest and {view for view, _, _ in views()} <= {*inspector.get_view_names()}:
+    inspector = sa.inspect(connection)
+    found = connection.execute(sa.select(_version)).scalar_one() if inspector.has_table(_version.name) else None
+    if found not in (None, VERSION):
+        remedy = "a newer companion has made them: update this one"
+        if found < VERSION:
+            remedy = "name a new database with --database: aircraft send again what they still keep"
+        raise StorageError(f"the database has tables of version {found}; allowed: {VERSION}; {remedy}")
+    if found is not None and {view for view, _, _ in views()} <= {*inspector.get_view_names()}:
         return False
     for view, _, _ in reversed(views()):
         connection.exec_driver_sql(f"DROP VIEW IF EXISTS {view}")
-    if found == 0:
+    if found is None:
         tables.create_all(connection)
-        connection.execute(sa.insert(_version).values(version=newest))
-    elif found < newest:
-        for step in STEPS[found - 1 :]:
-            step(connection)
-        connection.execute(sa.update(_version).values(version=newest))
+        connection.execute(sa.insert(_version).values(version=VERSION))
     for view, purpose, query in views():
         connection.exec_driver_sql(f"CREATE VIEW {view} AS /* {purpose} */ {query}")
         if connection.dialect.name == "postgresql":  # which forgets what stands in a query's text

@@ -1,12 +1,16 @@
-"""Serves the pages over HTTP: read only, on this computer alone or to clients with the password."""
+"""The pages over HTTP or HTTPS: read only, for this computer alone or for clients with the password."""
 
 from __future__ import annotations
 
 import asyncio
 import base64
+import datetime
 import logging
+import re
 import secrets
+import ssl
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, NoReturn
 
@@ -21,10 +25,10 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from companion.config.rules import bind_problem
 from companion.errors import ConfigError
-from companion.fleet.certificate import Certificate
+from companion.fleet import imu_pages, page
 from companion.fleet.database import engine_of, why
-from companion.fleet.rendering import Renderer
 from companion.links.system.connection import Backoff, Reconnection
+from companion.mqtt.broker import load_pair, unusable
 from companion.storage.state import read_regular
 from companion.web.access import Access, is_loopback, page_url, split_address
 from companion.web.listener import listening
@@ -39,6 +43,11 @@ SOON_S: Final = 2
 """Period after which a browser tries again when the database could not be read."""
 CERTIFICATE_S: Final = 60.0
 """Period at which the certificate's files are checked for a change."""
+FRESH_S: Final = 2.0
+"""Time for which a rendered page is given to further clients."""
+_GLANCE: Final = re.compile(r"/(?:page/([1-9][0-9]{0,6}))?")
+_AIRCRAFT: Final = re.compile(r"/aircraft/([0-9a-f]{16,36})")
+_MODEL: Final = re.compile(r"/model/([0-9a-z-]{1,40})")
 _HEADERS: Final = (
     ("X-Content-Type-Options", "nosniff"),
     ("X-Frame-Options", "DENY"),
@@ -62,6 +71,115 @@ def read_password(path: Path) -> str:
     if len(found) < LEAST_PASSWORD:
         raise ConfigError(f"{path}: found a password of {len(found)} characters; allowed: at least {LEAST_PASSWORD}")
     return found
+
+
+class Certificate:
+    """A certificate with its chain, and its key, PEM; `context` is for a server.
+
+    Raises:
+        ConfigError: they cannot be used; one line that names the file.
+    """
+
+    def __init__(self, cert: Path, key: Path) -> None:
+        self._cert, self._key = cert, key
+        self.context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        self._stamps: object = None
+        self._load()
+
+    def reload(self) -> None:
+        """Load files that have changed, for new connections; files that cannot be used change nothing."""
+        if self._read_stamps() == self._stamps:
+            return
+        try:
+            self._load()
+        except ConfigError as error:
+            logger.warning("page: the former certificate is used: %s", error)
+        else:
+            logger.info("page: %s was taken anew", self._cert)
+
+    def _read_stamps(self) -> object:
+        try:
+            return [(found.st_mtime_ns, found.st_ino) for found in (self._cert.stat(), self._key.stat())]
+        except OSError:
+            return None
+
+    def _load(self) -> None:
+        client, trial = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        self._stamps = self._read_stamps()
+        where = self._cert
+        try:
+            client.load_verify_locations(where)
+            where = self._key
+            for context in (trial, self.context):
+                load_pair(context, self._cert, self._key)
+        except OSError as error:
+            raise ConfigError(str(unusable(error, where))) from None
+        if (refused := _refused_by(client, trial)) is not None:
+            logger.warning("page: %s: browsers will refuse it: %s", self._cert, refused)
+
+
+def _refused_by(client: ssl.SSLContext, server: ssl.SSLContext) -> str | None:
+    """Return why a client that trusts this very certificate refuses it (dates, purpose), by a handshake in memory."""
+    client.check_hostname = False
+    client.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
+    sides = client.wrap_bio(back, there), server.wrap_bio(there, back, server_side=True)
+    for side in sides * 2:
+        try:
+            side.do_handshake()
+        except ssl.SSLWantReadError:
+            continue
+        except ssl.SSLCertVerificationError as error:
+            return error.verify_message
+    return None
+
+
+class Renderer:
+    """Pages of one database.
+
+    Rendering is work for the processor: at once, 20 of them would take 20 times as long each, and as much memory.
+    """
+
+    def __init__(self, engine: sa.Engine) -> None:
+        self._engine = engine
+        self._thread = ThreadPoolExecutor(1, "fleet-pages")
+        self._pages: dict[str, asyncio.Task[bytes | None]] = {}
+
+    async def get(self, path: str) -> bytes | None:
+        """Return a page that is at most `FRESH_S` old, or render it; None: there is none.
+
+        Raises:
+            SQLAlchemyError: the database cannot be read.
+        """
+        if (task := self._pages.get(path)) is None:
+            task = self._pages[path] = asyncio.create_task(self._render(path), name=f"fleet page {path}")
+        # A client that disconnects does not cancel the rendering for the others.
+        return await asyncio.shield(task)
+
+    async def _render(self, path: str) -> bytes | None:
+        loop = asyncio.get_running_loop()
+        keep_s = 0.0
+        try:
+            found = await loop.run_in_executor(self._thread, self._rendered, path)
+            keep_s = 0.0 if found is None else FRESH_S
+            return found
+        finally:
+            loop.call_later(keep_s, self._pages.pop, path, None)
+
+    def _rendered(self, path: str) -> bytes | None:
+        with self._engine.begin() as connection:
+            found = _page_at(connection, path, datetime.datetime.now(tz=datetime.UTC))
+        return None if found is None else found.encode()
+
+
+def _page_at(connection: sa.Connection, path: str, now: datetime.datetime) -> str | None:
+    if (match := _GLANCE.fullmatch(path)) is not None:
+        return page.glance(connection, now, int(match[1] or 1))
+    if (match := _AIRCRAFT.fullmatch(path)) is not None:
+        return page.aircraft(connection, match[1], now)
+    if (match := _MODEL.fullmatch(path)) is not None:
+        return imu_pages.model_page(connection, match[1], now, page.SOURCE)
+    return None
 
 
 class Server:
@@ -112,7 +230,7 @@ class Server:
                 while True:
                     await asyncio.sleep(CERTIFICATE_S)
                     if self._certificate is not None:
-                        await asyncio.to_thread(self._certificate.look_again)
+                        await asyncio.to_thread(self._certificate.reload)
         except OSError as error:
             return f"{self._host}:{self._port}: {error.strerror or error}"
         finally:

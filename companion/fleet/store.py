@@ -32,7 +32,7 @@ from companion.fleet.contract import (
     read_key,
 )
 from companion.fleet.database import OF_THE_DATABASE, OF_THE_ITEM, engine_of, why
-from companion.fleet.judging import Judged, judged
+from companion.fleet.judgement import judged
 
 logger = logging.getLogger(__name__)
 
@@ -115,12 +115,12 @@ class Store:
                 # Write nothing if new items have come meanwhile.
                 update = sa.update(table).where(is_it, table.c.news == due.news).values(judged=due.news)
                 if connection.execute(update).rowcount and found is not None:
-                    for of, rows in ((schema.parts, found.parts), (schema.findings, found.findings)):
+                    for of, rows in zip((schema.parts, schema.findings), found, strict=True):
                         connection.execute(sa.delete(of).where(of.c.aircraft == due.aircraft))
                         self._put(connection, of, rows)
         return True
 
-    def _judged(self, connection: sa.Connection, aircraft: str) -> Judged | None:
+    def _judged(self, connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Row]] | None:
         try:
             with np.errstate(all="ignore"):
                 return judged(connection, aircraft)

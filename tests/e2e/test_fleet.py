@@ -9,12 +9,16 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
-import aiomqtt
 import pytest
+import sqlalchemy as sa
 
+from companion.config.sections import Mqtt
 from companion.daemon.process.check import run_check
+from companion.fleet.collector import Collector, stop
+from companion.fleet.store import Store
 from tests.support.broker import BEST, Broker, broker, hurry
-from tests.support.fleet import Collector
+from tests.support.collecting import items_in, rows_of
+from tests.support.fleet import check
 from tests.support.mqtt_daemon import alone, until_connected
 from tests.support.rig import Rig
 
@@ -27,33 +31,22 @@ def _hurried(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextlib.asynccontextmanager
-async def collecting(one: Broker, database: dict[Any, Any]) -> AsyncIterator[Collector]:
+async def collecting(one: Broker, database: str) -> AsyncIterator[None]:
     """A collector at a real broker, as long as that lives."""
-    async with aiomqtt.Client("127.0.0.1", one.port) as client:
-        said: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue()
-        collector = Collector(lambda topic, payload: said.put_nowait((topic, payload)))
-        collector.database = database
+    task = asyncio.create_task(Collector(Mqtt(host="127.0.0.1", port=one.port), Store(database)).run())
+    try:
+        yield
+    finally:
+        await stop([task])
 
-        async def speak() -> None:
-            while True:
-                topic, payload = await said.get()
-                await client.publish(topic, payload, qos=1)
 
-        async def listen() -> None:
-            async for message in client.messages:
-                assert isinstance(message.payload, bytes)
-                collector.take(message.topic.value, message.payload)
+def told(database: str) -> list[Any]:
+    """The items in the database, in order; each as the contract says."""
+    return [check("item", item[3].encode()) for item in items_in(database)] if Path(database).exists() else []
 
-        await client.subscribe([("fleet/+/hello", 1), ("fleet/+/item", 1)])
-        tasks = [asyncio.create_task(speak()), asyncio.create_task(listen())]
-        try:
-            yield collector
-        finally:
-            for task in tasks:
-                task.cancel()
-            for ended in await asyncio.gather(*tasks, return_exceptions=True):
-                if isinstance(ended, AssertionError):
-                    raise ended
+
+def kinds(database: str) -> list[str]:
+    return [item["kind"] for item in told(database)]
 
 
 async def until(what: Callable[[], bool], within_s: float = 90.0) -> None:
@@ -62,9 +55,13 @@ async def until(what: Callable[[], bool], within_s: float = 90.0) -> None:
             await asyncio.sleep(0.05)
 
 
-def test_a_calibration_an_undo_and_an_arming_arrive_and_nothing_is_lost_with_the_broker(tmp_path: Path) -> None:
+def test_a_calibration_an_undo_and_an_arming_are_in_the_database_whatever_is_killed(tmp_path: Path) -> None:
+    database, named = str(tmp_path / "collected.sqlite"), sa.text("SELECT aircraft, name FROM fleet")
+
     async def main() -> None:
-        database: dict[Any, Any] = {}
+        store = Store(database)
+        store.prepare()
+        store.close()
         async with broker(tmp_path) as one:
             more = f'{one.section()}[fleet]\nname = "Heron 7"\nlocation = "full"\n'
             rig = Rig(tmp_path, min_still_s=3.0, max_s=4.0, more=more)
@@ -77,14 +74,12 @@ def test_a_calibration_an_undo_and_an_arming_arrive_and_nothing_is_lost_with_the
                 async def ask(**request: Any) -> Any:
                     return [reply async for reply in service.faces.answer(request)][-1]
 
-                async with collecting(one, database) as collector:
+                async with collecting(one, database):
                     done = await ask(command="calibrate", wait=True)
                     assert done["record"]["state"] == "done"
-                    await until(lambda: "calibration" in collector.kinds(UID))
-                    (told,) = collector.of(UID)
-                    assert told["body"] == json.loads(json.dumps(done["record"]))
-                    assert told["body"]["imus"][0]["gyro_id"] == rig.autopilot.parameter("INS_GYR_ID")
-                    await until(lambda: service.status()["fleet"]["waiting"] == 0)
+                    await until(
+                        lambda: service.status()["fleet"]["waiting"] == 0 and kinds(database) == ["calibration"]
+                    )
                 # Nobody collects any more, and the broker forgets everything.
                 one.kill()
                 assert (await ask(command="undo"))["state"] == "done"
@@ -96,10 +91,21 @@ def test_a_calibration_an_undo_and_an_arming_arrive_and_nothing_is_lost_with_the
                 rig.autopilot.armed = True
                 await until(lambda: service.status()["fleet"]["waiting"] == 2)
                 await one.start()
-                async with collecting(one, database) as collector:
-                    await until(lambda: collector.kinds(UID)[1:] == ["undo", "arming"])
+                async with collecting(one, database):
+                    await until(lambda: kinds(database)[1:] == ["undo", "arming"])
                     await until(lambda: service.status()["fleet"]["waiting"] == 0)
-                    assert collector.hellos[-1]["aircraft"] == UID
+                    # Its name comes with a hello, which waits for the items that were sent with it.
+                    await until(lambda: [*map(tuple, rows_of(database, named))] == [(UID, "Heron 7")])
+        calibration, undo, _ = told(database)
+        assert calibration["body"] == json.loads(json.dumps(done["record"]))
+        assert undo["body"]["of"] == done["record"]["started_at"]
+        (imu, *_) = calibration["body"]["imus"]
+        assert imu["gyro_id"] == rig.autopilot.parameter("INS_GYR_ID")
+        query = sa.text("SELECT gyro_bias_rad_s FROM biases WHERE imu = :imu ORDER BY axis").bindparams(imu=imu["name"])
+        assert [row[0] for row in rows_of(database, query)] == imu["gyro_bias_rad_s"]
+        assert [tuple(row) for row in rows_of(database, sa.text("SELECT aircraft, name FROM fleet"))] == [
+            (UID, "Heron 7")
+        ]
 
     asyncio.run(main())
 

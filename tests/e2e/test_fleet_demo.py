@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import datetime
-import json
 import os
 import re
 import signal
@@ -115,31 +113,6 @@ def test_pages_fit_a_phone_and_a_desktop(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-def test_an_aircraft_has_all_its_history(tmp_path: Path) -> None:
-    one = Aircraft(1)
-    one.live(NOW, 12)
-    flight = one.fly(NOW - datetime.timedelta(days=1))
-    one.learn(NOW)
-
-    async def main() -> None:
-        async with served(tmp_path, one) as port:
-            status, page = await get(port, f"/aircraft/{one.id}")
-            assert status == 200
-            assert page.count("<svg") == 2 * (2 * 2 * 3)  # over time, and over temperature
-            # A dot or a mark for each calibration that was done.
-            drawn = re.findall(r'd="([^"]*)" class="(?:dot|mark) s[xyz]"', page)
-            assert [path.count("M") for path in drawn] == [len(one.biases)] * 12
-            assert page.count("<li>") >= 12
-            flown = json.loads(one.told[flight])["body"]["flight"]["imus"]
-            off_m = max(imu["drift"]["flown"][0]["median_m"] for imu in flown)
-            assert f"2026-11-19 12:00 UTC: </strong>flight, 30 s without GNSS: off by {off_m} m" in page
-            assert page.count("IMU fc2 by temperature, gyro ") == 3
-            assert (await get(port, f"/aircraft/{'f' * 36}"))[0] == 404
-            assert (await get(port, "/../etc/passwd"))[0] == 404
-
-    asyncio.run(main())
-
-
 def test_names_and_reasons_of_aircraft_are_no_markup(tmp_path: Path) -> None:
     one = Aircraft(1)
     one.name = "<script>alert(1)</script>"
@@ -157,7 +130,7 @@ def test_names_and_reasons_of_aircraft_are_no_markup(tmp_path: Path) -> None:
 
 
 def test_who_lies_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.fleet.rendering.FRESH_S", 0.0)
+    monkeypatch.setattr("companion.fleet.server.FRESH_S", 0.0)
     liar, other = Aircraft(1), Aircraft(2)
     other.calibrate(NOW)
 

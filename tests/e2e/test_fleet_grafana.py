@@ -97,14 +97,3 @@ def test_panels_ask_the_views_of_the_database_that_is_chosen(panel: dict[str, An
     asked = set(re.findall(r"(?:FROM|JOIN) (\w+)", target["rawSql"]))
     assert asked <= {view for view, _, _ in schema.views()}
     assert asked
-
-
-def test_panels_do_not_overlap() -> None:
-    taken: set[tuple[int, int]] = set()
-    for panel in PANELS:
-        at = panel["gridPos"]
-        cells = {(at["x"] + k, at["y"] + j) for k in range(at["w"]) for j in range(at["h"])}
-        assert not cells & taken, panel["title"]
-        assert at["x"] + at["w"] <= 24
-        taken |= cells
-    assert len({panel["id"] for panel in PANELS}) == len(PANELS)

@@ -14,8 +14,7 @@ import trustme
 
 from companion.cli import main as companion
 from companion.errors import ConfigError
-from companion.fleet.certificate import Certificate
-from companion.fleet.server import Server
+from companion.fleet.server import Certificate, Server
 from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW, get, served
 

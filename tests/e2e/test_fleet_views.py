@@ -129,21 +129,6 @@ def test_calibrations_and_armings_each_once(told: str) -> None:
     assert len(asked(told, "SELECT * FROM calibration_history")) == 4
 
 
-def test_biases_in_the_units_of_people(told: str) -> None:
-    query = "SELECT sequence, imu, axis, gyro_bias_deg_h, accel_bias_mg FROM bias_history WHERE aircraft = "
-    found = {
-        (row["sequence"], row["imu"], row["axis"]): (row["gyro_bias_deg_h"], row["accel_bias_mg"])
-        for row in asked(told, f"{query}'{ONE.id}'")
-    }
-    wanted = {}
-    for sequence in ONE.biases:
-        for imu in json.loads(ONE.told[sequence])["body"]["imus"]:
-            for k, axis in enumerate("xyz"):
-                gyro, accel = imu["gyro_bias_rad_s"][k] / RAD_S, imu["accel_bias_m_s2"][k] / MG
-                wanted[sequence, imu["name"], axis] = pytest.approx(gyro), pytest.approx(accel)
-    assert found == wanted
-
-
 def test_the_latest_curve_of_each_imu(told: str) -> None:
     found = asked(told, "SELECT * FROM temperature_curves ORDER BY imu, triad, degc, axis")
     assert {row["aircraft"] for row in found} == {ONE.id}
@@ -227,26 +212,3 @@ def test_scatter_and_findings_in_the_units_of_people(told: str) -> None:
     assert [accel[name] for name in names] == [None, None, pytest.approx(3.0), pytest.approx(0.5)]
     (found,) = asked(told, "SELECT * FROM sensor_findings")
     assert (found["name"], found["words"], found["place"]) == (ONE.name, "replace it", 0)
-
-
-def test_an_older_database_has_them_after_an_update(told: str) -> None:
-    """Curves and flights were kept as they came."""
-    queries = [f"SELECT * FROM {table} ORDER BY 1, 2, 3, 4, 5, 6" for table in ("curves", "flights")]  # noqa: S608
-    now = [rows_of(told, sa.text(query)) for query in queries]
-    engine = engine_of(told)
-    with engine.begin() as connection:
-        for view, _, _ in reversed(schema.views()):
-            connection.exec_driver_sql(f"DROP VIEW {view}")
-        for table in (schema.curves, schema.flights):
-            table.drop(connection)
-        flights = schema.items.c.kind == "flight"
-        connection.execute(sa.update(schema.items).where(flights).values(state="unknown"))
-        version = schema.STEPS.index(schema.curves_and_flights) + 1
-        connection.exec_driver_sql(f"UPDATE schema_version SET version = {version}")  # noqa: S608
-    engine.dispose()
-    store = Store(told)
-    store.prepare()
-    store.close()
-    assert [rows_of(told, sa.text(query)) for query in queries] == now
-    assert rows_of(told, sa.text("SELECT COUNT(*) FROM items WHERE state <> 'taken'")) == [(0,)]
-    assert len(asked(told, "SELECT * FROM flight_history")) == 4

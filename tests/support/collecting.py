@@ -17,10 +17,9 @@ from typing import Any
 import sqlalchemy as sa
 
 from companion.fleet import schema
-from companion.fleet.certificate import Certificate
 from companion.fleet.collector import stop
 from companion.fleet.database import engine_of
-from companion.fleet.server import Server
+from companion.fleet.server import Certificate, Server
 from companion.fleet.store import Message, Store
 from sim.fleet.aircraft import Aircraft
 from tests.support.broker import Broker, free_port

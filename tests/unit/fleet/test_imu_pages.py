@@ -14,8 +14,8 @@ import sqlalchemy as sa
 
 from companion.fleet import page, schema
 from companion.fleet.imu_pages import model_page
-from companion.fleet.judging import parts_of
-from companion.fleet.models import LEAST_PARTS, Typical, typical_part
+from companion.fleet.judgement import parts_of
+from companion.fleet.sequential import LEAST_PARTS, Typical, typical_part
 from companion.fleet.store import Message, Store
 from companion.physics.units import DEG_H, MG
 from sim.fleet.aircraft import Aircraft

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from companion.autopilot.firmware.firmwares import model_of
-from companion.fleet.models import LEAST_PARTS, Scatter, scatter_of_model, scatter_of_part
+from companion.fleet.sequential import LEAST_PARTS, Scatter, scatter_of_model, scatter_of_part
 from companion.physics.frames import Floats
 
 TRUE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 5.0])

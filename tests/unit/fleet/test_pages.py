@@ -12,7 +12,7 @@ import sqlalchemy as sa
 
 from companion.fleet import page, schema
 from companion.fleet.database import engine_of
-from companion.fleet.rendering import Renderer
+from companion.fleet.server import Renderer
 from companion.fleet.store import Message, Store
 from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW
@@ -164,7 +164,7 @@ def test_clients_of_one_page_share_one_rendering(counting: Counting) -> None:
 
 
 def test_a_page_is_made_anew_once_it_is_old(counting: Counting, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.fleet.rendering.FRESH_S", 0.0)
+    monkeypatch.setattr("companion.fleet.server.FRESH_S", 0.0)
 
     async def main() -> None:
         for times in (1, 2):
