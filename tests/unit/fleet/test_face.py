@@ -18,7 +18,6 @@ import msgspec
 import pytest
 
 from companion.config.sections import Location
-from companion.errors import StorageError
 from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
 from companion.estimation.records.record import Arming, Magnetic
@@ -36,8 +35,6 @@ from companion.storage.state import BoundedList, sealed, write_atomically
 from tests.support.extent import extent
 from tests.support.fleet import CRANE, HERON, Aircraft, check
 from tests.support.histories import arming, record, windows_of_days
-from tests.support.namespaces import run_again_with_mounts
-from tests.support.small_disk import small_disk
 from tests.support.virtual_time import run_virtual
 from tests.unit.lab.test_profiles import saved
 
@@ -645,40 +642,6 @@ def test_a_full_disk_is_said_and_nothing_is_missing_afterwards(tmp_path: Path) -
         assert begun(aircraft.collector.of(HERON)) == starts(*range(9))
 
     virtually(main())
-
-
-def test_a_real_file_system_of_two_megabytes_that_others_fill(request: pytest.FixtureRequest) -> None:
-    with small_disk(2) as folder:
-        if folder is None:
-            run_again_with_mounts(request.node)
-            return
-        filler = folder / "filler"
-
-        async def main() -> None:
-            aircraft = Aircraft(folder)
-            async with aircraft.running() as face:
-                aircraft.connection.connect()
-                keep(folder, 0)
-                await until_told(face)
-                with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
-                    for _ in range(1 << 12):
-                        file.write(b"x" * 1024)
-                with filler.open("r+b") as file:
-                    file.truncate(filler.stat().st_size - 40_000)
-                kept = [0]
-                with contextlib.suppress(StorageError):
-                    for number in range(1, 200):
-                        keep(folder, number)
-                        kept.append(number)
-                await until(lambda: "full" in face.status()["summary"], 600.0)
-                assert 2 <= len(kept) < 100, "some were kept, until the disk was full"
-                filler.unlink()
-                await until_told(face)
-                assert face.status()["good"] is True
-            # What the aircraft could keep of itself has arrived, each once and in order.
-            assert begun(aircraft.collector.of(HERON)) == starts(*kept)
-
-        virtually(main())
 
 
 @pytest.mark.parametrize("damage", [b"nonsense", b"SQLite format 3\0" + b"\xff" * 4096])

@@ -23,9 +23,8 @@ from companion.estimation.noise.allan import PROFILES, AllanModel, noise_profile
 from companion.lab.logs.log_files import read_logs
 from companion.recording.files import Beginning, RecordingFile
 from companion.recording.messages import IMU, MAVLINK, ImuState, Message, encode
-from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, check_name, saved_profile
+from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, saved_profile
 from companion.storage.state import MOST_BYTES, sealed, unsealed
-from sim.__main__ import main as simulator
 from tests.support.made_noise import DEG_H, adis16405, write_csv
 from tests.unit.daemon.test_plan import CALIBRATION
 
@@ -102,11 +101,6 @@ def test_a_damaged_or_newer_one_is_refused_in_one_line(
     assert (instead.gyro, instead.accel) == (worst.gyro, worst.accel)
     (said,) = caplog.messages
     assert words in said
-
-
-@pytest.mark.parametrize("name", ["own", "my-imu_2.b", "a" * 40])
-def test_names_that_are_taken(name: str) -> None:
-    check_name(name)
 
 
 @pytest.mark.parametrize(
@@ -264,16 +258,6 @@ def test_the_table_says_what_it_found(capsys: pytest.CaptureFixture[str], half_h
         assert words in said
 
 
-def test_a_log_of_the_simulator_can_be_learned_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "rest.csv"
-    assert simulator(["rest", str(path), "--part", "bmi088", "--hours", "0.1", "--rate-hz", "20"]) == 0
-    capsys.readouterr()
-    code, answer, _ = run(capsys, path, "--profile", "bmi088")
-    assert code == 0
-    # 20 Hz and steps of 1/16.4 deg/s: they add to N.
-    assert answer["imus"][0]["profile"]["gyro"]["white"] / DEG_H == pytest.approx(37.0, rel=0.15)
-
-
 def test_the_part_at_rest_is_named_and_lines_left_out_are_counted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -321,21 +305,6 @@ def test_every_mistake_is_one_line(
     assert words in said.err
     assert said.err.count("\n") == 1
     assert said.out == ""
-
-
-def test_a_table_that_numpy_cannot_read_is_read_line_by_line(tmp_path: Path, half_hour: Path) -> None:
-    lines = half_hour.read_text(encoding="utf-8").splitlines()
-    plain = tmp_path / "plain.csv"
-    plain.write_text("\n".join(lines[:200]) + "\n", encoding="utf-8")
-    odd = tmp_path / "odd.csv"
-    rows = ['"' + '";"'.join(line.split(",")) + '"' for line in lines[:200]]
-    odd.write_text(
-        "# a remark\n\n" + "\r\n".join([*rows[:50], "", "# another", *rows[50:]]) + "\n9.9", encoding="utf-8"
-    )
-    (one,), (other,) = read_logs([plain]), read_logs([odd])
-    np.testing.assert_array_equal(one.t_s, other.t_s)
-    np.testing.assert_array_equal(one.readings, other.readings)
-    assert np.isnan(one.temperature_degc).all()
 
 
 def test_a_last_line_that_may_be_cut_does_not_count(tmp_path: Path, half_hour: Path) -> None:

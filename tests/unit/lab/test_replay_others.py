@@ -138,16 +138,6 @@ def test_the_biases_are_found_whoever_wrote_the_log(
     assert used["seconds"] == pytest.approx(SECONDS, abs=0.1)
 
 
-def test_a_column_of_another_name_is_passed_over_and_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
-) -> None:
-    rows = [[*row, 1, 20.0] for row in still[0].tolist()]
-    code, record = replay(capsys, written(tmp_path, f"{HEADER},lamp,mx_ut\n" + joined(rows)), *WHERE)
-    assert code == 0
-    assert record["log"]["notes"] == ["columns passed over: lamp, mx_ut"]
-    assert_near(record["imus"][0], still[1])
-
-
 def test_lines_without_a_number_are_counted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
 ) -> None:
@@ -351,14 +341,6 @@ def test_a_tilt_that_moves_is_no_rest(
     code, record = replay(capsys, path, *PLACE)
     assert code == 1
     assert "gradienter" in record["reason"]
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1"])
-def test_a_remark_may_hold_any_letter(tmp_path: Path, still: tuple[Floats, ImuModel], encoding: str) -> None:
-    path = tmp_path / "log.csv"
-    path.write_bytes(f"# 21 °C, Größe 1\n{HEADER},Größe\n{joined([[*row, 1] for row in still[0]])}".encode(encoding))
-    log = read(path)
-    np.testing.assert_array_equal(log.readings, still[0][:, 1:])
 
 
 def test_a_file_of_office_programs_in_utf_16_is_refused_in_one_line(

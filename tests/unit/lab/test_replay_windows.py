@@ -100,18 +100,6 @@ def test_windows_that_are_refused_are_counted_by_reason(
     assert by_axis(answer, 60.0)["gyro x"]["pairs"] == 4 + 4 + 3
 
 
-def test_how_it_lay_and_was_mounted_does_not_matter(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], hour: tuple[Floats, Floats]
-) -> None:
-    t_s, readings = hour[0][:9000], hour[1][:9000]
-    over = readings * [1, -1, -1, 1, -1, -1]
-    _, straight = run(capsys, write_csv(tmp_path / "a.csv", t_s, readings), "--profile", "adis16405")
-    _, turned = run(capsys, write_csv(tmp_path / "b.csv", t_s, over), "--profile", "adis16405")
-    for one, other in zip(straight["windows"]["axes"], turned["windows"]["axes"], strict=True):
-        assert other["rms"] == pytest.approx(one["rms"], rel=1e-3)
-        assert other["sigma_use"] == pytest.approx(one["sigma_use"], rel=1e-3)
-
-
 def test_windows_in_another_pose_are_not_held_against_each_other(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], hour: tuple[Floats, Floats]
 ) -> None:
