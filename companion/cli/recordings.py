@@ -52,7 +52,7 @@ async def record(options: argparse.Namespace) -> int:
 
 async def replay(options: argparse.Namespace) -> int:
     """`companion replay`."""
-    from companion.lab.logs.autopilot_logs import reader_of
+    from companion.lab.logs.log_files import reader_of
     from companion.lab.logs.recording import is_text
 
     logs = []
@@ -91,7 +91,7 @@ def _replay_recording(options: argparse.Namespace) -> int:
 
 def _lines(result: Result) -> list[str]:
     """For people; the last line is the verdict."""
-    from companion.lab.replay.calibrations import TOLERANCE_SIGMAS
+    from companion.lab.replay.engine import TOLERANCE_SIGMAS
 
     lines: list[str] = []
     different = 0

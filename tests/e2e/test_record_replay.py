@@ -27,8 +27,7 @@ from companion.errors import StorageError
 from companion.estimation.records.record import Record, to_json
 from companion.formats import Object
 from companion.lab.logs.recording import MAGIC
-from companion.lab.replay.calibrations import TOLERANCE_SIGMAS
-from companion.lab.replay.engine import Result, replay
+from companion.lab.replay.engine import TOLERANCE_SIGMAS, Result, replay
 from companion.recording import messages
 from companion.recording import tape as tape_module
 from companion.recording.files import Ring

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from companion.lab.flight.inertial import joined
 from companion.lab.flight.log import Boot, Estimated, FlownImu, Place, Start, changes, starts
-from companion.lab.logs.blocks import Progress
 from companion.lab.logs.dataflash import dataflash
+from companion.lab.logs.log import Progress
 from companion.physics.frames import Floats
 from companion.physics.units import DEG
 

@@ -23,8 +23,8 @@ from companion.lab.flight.in_force import calibration_in, moment, with_others, w
 from companion.lab.flight.inertial import Increments, Navigation, Window, World
 from companion.lab.flight.log import Boot, FlownImu
 from companion.lab.flight.split import LENGTH_S, SHORT_S, split
-from companion.lab.logs.autopilot_logs import read_ulog, reader_of
-from companion.lab.logs.blocks import Progress
+from companion.lab.logs.log import Progress
+from companion.lab.logs.log_files import read_ulog, reader_of
 from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
 from companion.physics.frames import Floats
 from companion.physics.statistics import MAD_TO_SIGMA

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.lab.flight.inertial import Navigation
-from companion.lab.logs.blocks import DROPOUTS, PARAMETERS, Block
+from companion.lab.logs.log import DROPOUTS, PARAMETERS, Block
 from companion.physics.frames import Floats
 
 MOST_ROWS: Final = 1 << 19

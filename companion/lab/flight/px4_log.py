@@ -10,7 +10,7 @@ import numpy as np
 
 from companion.lab.flight.inertial import Navigation, joined
 from companion.lab.flight.log import Boot, Estimated, FlownImu, Place, Start, ascending, changes, starts
-from companion.lab.logs.blocks import US, Progress
+from companion.lab.logs.log import US, Progress
 from companion.lab.logs.ulog import ulog
 from companion.physics.frames import Floats
 

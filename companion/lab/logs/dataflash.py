@@ -1,4 +1,7 @@
-"""ArduPilot's dataflash log (.bin): AP_Logger/LogStructure.h; the letters of its formats are pymavlink's."""
+"""ArduPilot's dataflash log (.bin): AP_Logger/LogStructure.h; the letters of its formats are pymavlink's.
+
+Messages come out in blocks, piece by piece, so that memory does not grow with the file.
+"""
 
 from __future__ import annotations
 
@@ -8,39 +11,66 @@ from typing import Final
 
 import numpy as np
 
-from companion.lab.logs.blocks import PARAMETERS, Block, Kept, Progress, columns, nobody, pieces
+from companion.errors import StorageError
+from companion.lab.logs.log import PARAMETERS, US, Block, Progress, nobody
 
 MAGIC: Final = b"\xa3\x95\x80"
-"""It begins with what says how such beginnings are made."""
+"""Beginning of a file: the head of a format message that describes format messages."""
 _HEAD: Final = MAGIC[:2]
 _FMT: Final = np.dtype([("Type", "u1"), ("Length", "u1"), ("Name", "S4"), ("Format", "S16"), ("Columns", "S64")])
 _CLOCK: Final = "TimeUS"
 _PARAMETER: Final = "PARM"
+_PIECE: Final = 1 << 22
 
 Fields = Mapping[str, tuple[str, tuple[str, ...]]]
-"""By message: the field with its instance, or nothing, and those to read."""
+"""By message: the field with its instance, or nothing, and the fields to read."""
 
 
 class _Kind:
-    """What a format message says of others."""
+    """Layout of one kind of message, and the messages of it that wait for the end of a piece."""
 
-    def __init__(self, length: int, kept: Kept | None, factors: Mapping[str, float]) -> None:
+    def __init__(self, length: int, name: str = "", layout: np.dtype[np.void] | None = None) -> None:
         self.length = length
-        """With its head."""
-        self.kept = kept
-        """None: nobody wants them."""
-        self.factors = factors
+        """Length with the head."""
+        self.name = name
+        self.layout = layout
+        """None: not to be read."""
+        self.factors: dict[str, float] = {}
+        self.data = bytearray()
+
+    def blocks(self, fields: Fields) -> Iterator[Block]:
+        """Give the waiting messages, by instance."""
+        if self.layout is None or not self.data:
+            return
+        messages = np.frombuffer(bytes(self.data), self.layout)
+        self.data.clear()
+        key, wanted = fields.get(self.name, ("Name", ("Value",)))
+        there = messages.dtype.names or ()
+        rows = np.full((len(messages), 1 + len(wanted)), np.nan)
+        rows[:, 0] = messages[_CLOCK] * US
+        with np.errstate(invalid="ignore"):  # damaged
+            for k, name in enumerate(wanted, 1):
+                if name in there:
+                    rows[:, k] = messages[name] * self.factors.get(name, 1.0)
+        if self.name == _PARAMETER:
+            texts = tuple(text.decode("latin-1") for text in messages["Name"].tolist())
+            yield Block(PARAMETERS, 0, rows, texts)
+        elif key not in there:
+            yield Block(self.name, 0, rows)
+        else:
+            for instance in np.unique(messages[key]).tolist():
+                yield Block(self.name, int(instance), rows[messages[key] == instance])
 
 
 def dataflash(path: Path, fields: Fields, progress: Progress = nobody) -> Iterator[Block | None]:
-    """These messages and the parameters; None where another log begins in the same file.
+    """Give these messages and the parameters; None where another log begins in the same file.
 
     Raises:
         StorageError: one line: it cannot be read.
     """
-    kinds: dict[bytes, _Kind] = {MAGIC: _Kind(_FMT.itemsize + 3, None, {})}
+    kinds: dict[bytes, _Kind] = {MAGIC: _Kind(_FMT.itemsize + 3)}
     left = b""
-    for piece in pieces(path, progress):
+    for piece in _pieces(path, progress):
         # So the last message is followed by a head, as any other.
         data = left + (piece or _HEAD)
         at, end = 0, len(data)
@@ -50,27 +80,42 @@ def dataflash(path: Path, fields: Fields, progress: Progress = nobody) -> Iterat
             if kind is not None and after + 2 > end and piece:
                 break
             if kind is None or data[after : after + 2] != _HEAD:
-                # Damage: whatever is not followed by another message is none.
+                # Damage: bytes that no other message follows are no message.
                 at = data.find(_HEAD, at + 1)
                 at = end - 1 if at < 0 else at
                 continue
-            if kind.kept is not None:
-                kind.kept.data += data[at + 3 : after]
+            if kind.layout is not None:
+                kind.data += data[at + 3 : after]
             elif data[at + 2] == MAGIC[2]:
-                head, learnt = _learn(data[at + 3 : after], fields)
+                head, described = _described(data[at + 3 : after], fields)
                 if head == MAGIC or head in kinds:
-                    yield from _flush(kinds, fields)
+                    for each in kinds.values():
+                        yield from each.blocks(fields)
                 if head == MAGIC:
                     yield None
-                elif learnt is not None:
-                    kinds[head] = learnt
+                elif described is not None:
+                    kinds[head] = described
             at = after
         left = data[at:]
-        yield from _flush(kinds, fields)
+        for each in kinds.values():
+            yield from each.blocks(fields)
 
 
-def _learn(data: bytes, fields: Fields) -> tuple[bytes, _Kind | None]:
-    """The head of the messages that a format message is about; None: it cannot be."""
+def _pieces(path: Path, progress: Progress) -> Iterator[bytes]:
+    """Give the bytes of a file; an empty piece is the last one."""
+    try:
+        with path.open("rb") as file:
+            size = max(path.stat().st_size, 1)
+            while piece := file.read(min(_PIECE, size - file.tell())):
+                yield piece
+                progress(min(file.tell() / size, 1.0))
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
+    yield b""
+
+
+def _described(data: bytes, fields: Fields) -> tuple[bytes, _Kind | None]:
+    """Give the head and the kind of the messages that a format message describes; None: it cannot be one."""
     from pymavlink.DFReader import FORMAT_TO_STRUCT
 
     number, length, *said = np.frombuffer(data, _FMT)[0].tolist()
@@ -78,39 +123,22 @@ def _learn(data: bytes, fields: Fields) -> tuple[bytes, _Kind | None]:
     head = _HEAD + bytes((number,))
     if length <= len(head):
         return head, None
+    kind = _Kind(length, name)
     if name not in fields and name != _PARAMETER:
-        return head, _Kind(length, None, {})
-    parts, factors = [], {}
+        return head, kind
+    parts = []
     for letter, label in zip(letters, labels.split(","), strict=False):
         code, factor, _ = FORMAT_TO_STRUCT.get(letter, ("", None, None))
         parts.append((label, f"S{code[:-1]}" if code.endswith("s") else f"<{code}"))
-        factors[label] = 1.0 if factor is None else factor
+        kind.factors[label] = 1.0 if factor is None else factor
     try:
         layout = np.dtype(parts)
     except (TypeError, ValueError):
-        return head, _Kind(length, None, {})
+        return head, kind
     key, wanted = fields.get(name, ("Name", ("Value",)))
-    kinds = {label: layout[label].kind for label in layout.names or ()}
-    texts = {label for label in (_CLOCK, *wanted) if kinds.get(label) == "S"}
-    good = layout.itemsize + len(head) == length and _CLOCK in kinds and not texts
-    good = good and kinds.get(key, "u") in ("S" if name == _PARAMETER else "iu")
-    return head, _Kind(length, Kept(name, 0, layout) if good else None, factors)
-
-
-def _flush(kinds: Mapping[bytes, _Kind], fields: Fields) -> Iterator[Block]:
-    for kind in kinds.values():
-        if kind.kept is None or not kind.kept.data:
-            continue
-        name, messages = kind.kept.name, kind.kept.taken()
-        if name == _PARAMETER:
-            texts = tuple(text.decode("latin-1") for text in messages["Name"].tolist())
-            yield Block(PARAMETERS, 0, columns(messages, _CLOCK, ("Value",)), texts)
-            continue
-        key, wanted = fields[name]
-        rows = columns(messages, _CLOCK, wanted) * [1.0, *(kind.factors.get(each, 1.0) for each in wanted)]
-        if key not in (messages.dtype.names or ()):
-            yield Block(name, 0, rows)
-            continue
-        instances = messages[key]
-        for instance in np.unique(instances).tolist():
-            yield Block(name, int(instance), rows[instances == instance])
+    types = {label: layout[label].kind for label in layout.names or ()}
+    good = layout.itemsize + len(head) == length and _CLOCK in types
+    good = good and "S" not in {types.get(label) for label in (_CLOCK, *wanted)}
+    if good and types.get(key, "u") in ("S" if name == _PARAMETER else "iu"):
+        kind.layout = layout
+    return head, kind

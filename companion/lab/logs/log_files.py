@@ -1,10 +1,15 @@
-"""Logs of IMUs in files of any kind as columns of numbers: our own recordings, and logs of others."""
+"""IMUs at rest in files of any kind: our own recordings, logs of autopilots (ULog, dataflash), CSV.
+
+The readings in an autopilot's log are those that it flies by, its offsets taken off: biases found in them are what the
+offsets leave, in the vehicle's axes.
+"""
 
 from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -13,15 +18,34 @@ import numpy as np
 
 from companion.config.sections import Config
 from companion.errors import StorageError
-from companion.lab.logs import autopilot_logs, csv_log
-from companion.lab.logs.log import NAME, StillLog
+from companion.lab.logs import csv_log, dataflash, ulog
+from companion.lab.logs.log import DROPOUTS, LAST_S, NAME, Block, StillLog
 from companion.lab.logs.playback import UNUSABLE, Playback, config_of
 from companion.lab.logs.recording import Head, Message, Recording, is_text
+from companion.physics.frames import Floats
 from companion.recording import messages
 from companion.samples import ImuSample
 
 CONTINUED_S: Final = 60.0
 """A recording that begins within so much of another's end, on the same clock, goes on with it."""
+_LARGEST: Final = 1e6
+"""Largest reading, in SI units."""
+_CORRECTED: Final = (
+    "the autopilot's offsets are taken off in it: what is found is what they leave, in the vehicle's axes"
+)
+_RAW: Final = "readings without the autopilot's offsets"
+_IMUS: Final = 5
+"""Most IMUs of a board: a larger number is damage."""
+
+_FIELDS: Final = ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ", "T")
+_KINDS: Final = {"IMU": ("I", _FIELDS), "IMU2": ("", _FIELDS), "IMU3": ("", _FIELDS)}
+_INSTANCES: Final = {"IMU2": 1, "IMU3": 2}
+"""Messages and their instances; newer firmware has one kind, with the instance in it."""
+_TOPICS: Final = {
+    "sensor_combined": tuple(f"{name}[{k}]" for name in ("gyro_rad", "accelerometer_m_s2") for k in range(3)),
+    "sensor_gyro": ("x", "y", "z", "temperature"),
+    "sensor_accel": ("x", "y", "z"),
+}
 
 
 def read_logs(
@@ -35,7 +59,7 @@ def read_logs(
     found: list[StillLog] = []
     for path in paths:
         try:
-            text, autopilots = is_text(path), autopilot_logs.reader_of(path)
+            text, autopilots = is_text(path), reader_of(path)
         except OSError as error:
             raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
         if autopilots is not None:
@@ -149,3 +173,97 @@ def _goes_on(before: StillLog, log: StillLog) -> bool:
     if not len(before.t_s) or not len(log.t_s) or abs(before.clock_offset_s - log.clock_offset_s) > 1.0:
         return False
     return 0.0 < float(log.t_s[0] - before.t_s[-1]) < CONTINUED_S
+
+
+# --- logs of autopilots
+
+
+def reader_of(path: Path) -> Callable[[Path], list[StillLog]] | None:
+    """Return the reader of an autopilot's log; None: the file is none.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        head = file.read(len(ulog.MAGIC))
+    if head.startswith(ulog.MAGIC):
+        return read_ulog
+    return read_dataflash if head.startswith(dataflash.MAGIC) else None
+
+
+def read_ulog(path: Path) -> list[StillLog]:
+    """Read the IMUs of a PX4 log: sensor_combined, by which PX4 flies, and each pair of sensor_gyro and sensor_accel.
+
+    Raises:
+        StorageError: one line: it cannot be read.
+    """
+    data = _joined_blocks(ulog.ulog(path, _TOPICS))
+    dropouts = len(data.get((DROPOUTS, 0), ()))
+    notes = (f"gaps in it, in which PX4 could not write: {dropouts}",) if dropouts else ()
+    logs: list[StillLog] = []
+    for (topic, instance), rows in sorted(data.items()):
+        times = rows[:, 0]
+        if topic == "sensor_combined":
+            logs += _log(path, topic, times, rows[:, 1:7], np.full(len(times), np.nan), (_CORRECTED, *notes))
+        elif topic == "sensor_gyro" and (topic_of_force := ("sensor_accel", instance)) in data:
+            # Each has messages of its own: join the force that is nearest in time to every rate.
+            beside = data[topic_of_force]
+            at = np.searchsorted(0.5 * (beside[1:, 0] + beside[:-1, 0]), times)
+            readings = np.hstack([rows[:, 1:4], beside[at, 1:4]])
+            logs += _log(path, f"sensor{instance}", times, readings, rows[:, 4], (_RAW, *notes))
+    return _some(path, logs)
+
+
+def read_dataflash(path: Path) -> list[StillLog]:
+    """Read the IMUs of an ArduPilot log, from its IMU messages.
+
+    Raises:
+        StorageError: one line: it cannot be read.
+    """
+    data = {
+        (_INSTANCES.get(name, k), name): rows
+        for (name, k), rows in _joined_blocks(dataflash.dataflash(path, _KINDS)).items()
+        if name in _KINDS
+    }
+    logs: list[StillLog] = []
+    for (instance, _), rows in sorted(data.items()):
+        logs += _log(path, f"imu{instance}", rows[:, 0], rows[:, 1:7], rows[:, 7], (_CORRECTED,))
+    return _some(path, logs)
+
+
+def _joined_blocks(blocks: Iterable[Block | None]) -> dict[tuple[str, int], Floats]:
+    """Join the rows of each message and instance."""
+    found: dict[tuple[str, int], list[Floats]] = defaultdict(list)
+    for block in blocks:
+        if block is not None and block.instance < _IMUS:
+            found[block.name, block.instance].append(block.rows)
+    return {key: np.concatenate(rows) for key, rows in found.items()}
+
+
+def _some(path: Path, logs: list[StillLog]) -> list[StillLog]:
+    if not logs:
+        raise StorageError(f"{path}: no samples of an IMU in it")
+    return logs
+
+
+def _log(
+    path: Path, imu: str, t_s: Floats, readings: Floats, degc: Floats, notes: tuple[str, ...]
+) -> Iterator[StillLog]:
+    """Make the log of an IMU from the samples that are whole and in order of time, if there are any."""
+    whole = (np.abs(t_s) < LAST_S) & (np.abs(readings) < _LARGEST).all(axis=1)
+    ahead = whole.copy()
+    newest = np.maximum.accumulate(np.where(whole, t_s, -np.inf)) if len(t_s) else t_s
+    ahead[1:] &= t_s[1:] > newest[:-1]
+    left_out = {"without a number": int((~whole).sum()), "late or repeated": int((whole & ~ahead).sum())}
+    if ahead.any():
+        yield StillLog(
+            imu=imu,
+            files=(path.name,),
+            began_unix_s=None,
+            t_s=t_s[ahead],
+            readings=readings[ahead],
+            temperature_degc=degc[ahead],
+            notes=notes,
+            left_out={why: count for why, count in left_out.items() if count},
+            clock_from_start=True,
+        )

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from companion.errors import StorageError
-from companion.lab.logs.blocks import DROPOUTS, PARAMETERS, US, Block, Progress, nobody
+from companion.lab.logs.log import DROPOUTS, PARAMETERS, US, Block, Progress, nobody
 
 MAGIC: Final = b"ULog\x01\x12\x35"
 _MOST_TIMES: Final = 4

@@ -14,33 +14,80 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
+import numpy as np
 
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
 from companion.configured import models
-from companion.configured.models import collect
-from companion.errors import StorageError
+from companion.configured.models import aligned, collect
+from companion.errors import CalibrationRefusedError, StorageError
+from companion.estimation.collector.measurement import Measurement
 from companion.estimation.collector.rolling import RollingCollector
-from companion.estimation.records.record import Record, from_json
+from companion.estimation.means.windows import Window
+from companion.estimation.records.record import AlignmentUsed, Record, from_json
+from companion.estimation.request import What
+from companion.estimation.solution.joint import weigh
+from companion.estimation.solution.otherwise import NOTHING, Otherwise
+from companion.estimation.solution.results import record_of
+from companion.estimation.solution.site import Whereabouts, local_earth
+from companion.estimation.solution.solve import ImuSolution, Solution, solve
 from companion.lab.logs.playback import UNUSABLE, Playback, config_of
 from companion.lab.logs.recording import Head, Message, Recording
-from companion.lab.replay.calibrations import Calibrations, Offsets, Replayed
+from companion.physics.frames import Array
 from companion.recording import messages
 from companion.recording.files import versions
-from companion.recording.messages import ImuState, Start, decode
+from companion.recording.messages import ImuState, Measured, Solved, Start, decode
 
 FOLLOWS_S: Final = 3.0
-"""The longest gap between two files that follow on one another: more means that one between them is missing."""
+"""Longest gap between two files that follow on one another; a longer one means that a file between them is missing."""
+TOLERANCE_SIGMAS: Final = 0.01
+"""Largest accepted difference of a replayed bias from the recorded one, in its sigma_use."""
+_SIGMAS: Final = {
+    "gyro_bias_rad_s": "gyro_sigma_use_rad_s",
+    "residual_gyro_rad_s": "gyro_sigma_use_rad_s",
+    "accel_bias_m_s2": "accel_sigma_use_m_s2",
+    "residual_accel_m_s2": "accel_sigma_use_m_s2",
+}
+"""Compared fields, and the sigma of each."""
+_BEFORE: Final = "it was measured before the recording began"
+
+
+class Difference(msgspec.Struct, frozen=True):
+    """One bias that came out different."""
+
+    field: str
+    """Such as imus[fc].gyro_bias_rad_s[0]."""
+    recorded: float | None
+    replayed: float | None
+    sigmas: float | None
+    """Difference in sigma_use; None where one of them is missing."""
+
+    def __str__(self) -> str:
+        size = "" if self.sigmas is None else f" ({self.sigmas:.2g} sigma)"
+        return f"{self.field}: recorded {self.recorded!r}, replayed {self.replayed!r}{size}"
+
+
+class Replayed(msgspec.Struct, frozen=True):
+    """One calibration again."""
+
+    record: Record
+    differences: list[Difference]
+    """Biases that differ by more than the tolerance."""
+    worst_sigmas: float | None
+    """Largest difference of all biases, in sigma_use; None where nothing was recomputed."""
+    not_recomputed: str | None
+    """Reason why its estimates were taken from the recording, if so."""
 
 
 class Result(msgspec.Struct, frozen=True):
-    """What a recording gave."""
+    """Result of a replay."""
 
     calibrations: list[Replayed]
     estimate: Record | None
-    """Of the last still stretch, where no calibration is in the recording."""
+    """Estimate of the last still stretch, where no calibration is in the recording."""
     seconds: float
     cut_short: str | None
     notes: list[str]
-    """What a reader should know: other versions, gaps."""
+    """Other versions, gaps."""
 
 
 class Replay:
@@ -49,17 +96,24 @@ class Replay:
     def __init__(self, head: Head, path: Path) -> None:
         config = config_of(head, path)
         self._path, self._config, self._head = path, config, head
-        self._playback, self._calibrations = Playback(config), Calibrations(config)
+        self._playback = Playback(config)
         self._collector: RollingCollector | None = None
+        self._calibrations: list[Replayed] = []
         self._notes: list[str] = []
         self._is_cut = False
-        self._first_s = self._now_s = math.nan
+        self._first_s = self._now_s = self._begun_s = math.nan
+        self._where = Whereabouts()
+        self._measured: Measurement | CalibrationRefusedError | None = None
+        self._offsets: dict[str, ImuCalibration | None] = {}
+        """Offsets in force at the latest window, by IMU."""
+        self._solution: Solution | None = None
+        self._not_recomputed = _BEFORE
 
     def take(self, message: Message) -> None:
-        """Take the next message.
+        """Replay the next message.
 
         Raises:
-            StorageError: it is nothing that this version could have written.
+            StorageError: this version cannot have written it.
         """
         try:
             self._take(message.topic, message.data, message.t_s)
@@ -76,21 +130,23 @@ class Replay:
             return
         self._now_s = t_s
         if self._playback.wants(topic):
-            before = self._imu_state(topic)
+            imu = topic.removeprefix(messages.IMU) if topic.startswith(messages.IMU) else ""
+            before = self._playback.state(imu)
             for role, part in self._playback.take(topic, data, t_s):
                 collect(collector, role, part)
-            if (state := self._imu_state(topic)) is not None:
+            if (state := self._playback.state(imu)) is not None:
                 _change(collector, before, state)
         elif topic == messages.TICK:
             collector.tick(t_s)
         elif topic == messages.PLACE:
-            self._calibrations.where = decode(topic, data)
+            self._where = decode(topic, data)
         elif topic == messages.MEASURED:
-            self._calibrations.measured(collector, decode(topic, data), t_s, self._offsets())
+            self._offsets = self._offsets_now()
+            self._measured = self._measure(collector, decode(topic, data), t_s)
         elif topic == messages.SOLVED:
-            self._calibrations.solve(decode(topic, data))
+            self._solve(decode(topic, data))
         elif topic == messages.RECORD:
-            self._calibrations.recorded(from_json(data))
+            self._calibrations.append(self._compare(from_json(data)))
 
     def _start(self, start: Start, t_s: float) -> None:
         follows = start.continues and self._collector is not None and not self._is_cut
@@ -100,17 +156,84 @@ class Replay:
             self._notes.append(f"{start.lost} messages were lost in recording; replayed from behind the gap")
         if math.isnan(self._first_s):
             self._first_s = t_s
-        self._is_cut = False
+        self._is_cut, self._begun_s = False, t_s
         self._collector = models.collector(self._config)
         self._playback.begin()
-        self._calibrations.begin(t_s)
+        self._measured = self._solution = None
+        self._not_recomputed = _BEFORE
 
-    def _imu_state(self, topic: str) -> ImuState | None:
-        return self._playback.state(topic.removeprefix(messages.IMU)) if topic.startswith(messages.IMU) else None
-
-    def _offsets(self) -> Offsets:
+    def _offsets_now(self) -> dict[str, ImuCalibration | None]:
         states = {imu.name: self._playback.state(imu.name) for imu in self._config.imu}
         return {name: state.calibration for name, state in states.items() if state is not None}
+
+    def _measure(
+        self, collector: RollingCollector, measured: Measured, now_s: float
+    ) -> Measurement | CalibrationRefusedError | None:
+        """Take the window of the recorded seconds; None: the recording does not have them all."""
+        if measured.start_s < self._begun_s:
+            return None
+        try:
+            found = collector.measurement(now_s)
+            if self._config.vehicle.platform == "ground" and found.slots[0] != measured.start_s:
+                # The cause of a new stretch, such as arming, is not in the bytes.
+                found = collector.measurement(now_s, since_s=measured.start_s)
+        except CalibrationRefusedError as error:
+            return error
+        return msgspec.structs.replace(
+            found, wander_deg=measured.wander_deg, begun_s=measured.begun_s, turn=measured.turn
+        )
+
+    def _solve(self, detail: Solved) -> None:
+        """Estimate from the latest window what the daemon estimated from it."""
+        self._solution, self._where = None, detail.where
+        if detail.dithered:
+            self._not_recomputed = "its means came from an offset dither"
+            return
+        if self._measured is None:
+            self._not_recomputed = _BEFORE
+            return
+        used = detail.alignment
+        alignment = AlignmentUsed(measured_at="", offset_deg=used[:2], sigma_deg=used[2]) if used else None
+        try:
+            if isinstance(self._measured, CalibrationRefusedError):
+                raise self._measured
+            solution = self._solved(self._measured.window(), What[detail.what], alignment, detail.otherwise)
+            whole = {found.name: self._whole(found) for found in solution.imus}
+            self._solution = weigh(solution, whole, detail.expectation).solution
+        except CalibrationRefusedError as error:
+            self._not_recomputed = f"refused here: {error}"
+
+    def _solved(
+        self, window: Window, what: What, alignment: AlignmentUsed | None = None, otherwise: Otherwise = NOTHING
+    ) -> Solution:
+        config = self._config
+        gradienter = aligned(models.gradienter_model(config.gradienter), alignment)
+        compass = models.compass_model(config.compass)
+        local, platform, any_bias = local_earth(self._where), config.vehicle.platform, config.calibration.any_bias
+        return solve(window, local, gradienter, compass, what, platform, any_bias=any_bias, otherwise=otherwise)
+
+    def _whole(self, found: ImuSolution) -> tuple[Array | None, Array | None]:
+        calibration = self._offsets.get(found.name)
+        return (found.gyro_rad_s, found.accel_m_s2) if calibration is None else whole_of(calibration, found)
+
+    def _compare(self, recorded: Record) -> Replayed:
+        """Compare a recorded calibration with its replay; the record takes from it what only the autopilot can tell."""
+        solution, self._solution = self._solution, None
+        if recorded.pose is None:
+            return Replayed(recorded, [], None, "it ended before anything was worked out")
+        if solution is None:
+            return Replayed(recorded, [], None, self._not_recomputed)
+        corrected = {imu.name for imu in recorded.imus if imu.residual_gyro_rad_s or imu.residual_accel_m_s2}
+        began, seconds = datetime.datetime.fromisoformat(recorded.started_at), recorded.duration_s
+        whole = {found.name: self._whole(found) for found in solution.imus if found.name in corrected}
+        again = record_of(solution, began, seconds, state=recorded.state, reason=recorded.reason, whole=whole)
+        earlier = {imu.name: imu for imu in recorded.imus}
+        imus = tuple(
+            msgspec.structs.replace(imu, written=was.written, gyro_id=was.gyro_id, accel_id=was.accel_id)
+            for imu, was in ((imu, earlier[imu.name]) for imu in again.imus if imu.name in earlier)
+        )
+        again = msgspec.structs.replace(again, imus=imus, system_id=recorded.system_id, alignment=recorded.alignment)
+        return compared(recorded, again)
 
     def cut(self) -> None:
         """Note that the end of a file is missing: the next one begins anew."""
@@ -121,31 +244,57 @@ class Replay:
         return (head.offset_ns, head.config) == (self._head.offset_ns, self._head.config)
 
     def result(self, cut_short: str | None) -> Result:
-        """Return what it gave."""
+        """Return the calibrations; without one, the estimate that a calibration would have made at the end."""
         seconds = 0.0 if math.isnan(self._first_s) else self._now_s - self._first_s
         estimate = None
-        if not self._calibrations.again and self._collector is not None:
-            began_s = self._first_s + self._head.offset_ns / 1e9
-            began_at = datetime.datetime.fromtimestamp(began_s, tz=datetime.UTC)
-            self._calibrations.set_offsets(self._offsets())
-            estimate = self._calibrations.estimate(self._collector, self._now_s, began_at, seconds)
+        if not self._calibrations and self._collector is not None:
+            estimate = self._estimate(self._collector, seconds)
         ours, theirs = versions(), self._head.versions
         notes = []
         if ours["companion"] != theirs.get("companion"):
             notes.append(f"recorded with companion {theirs.get('companion')}, here {ours['companion']}")
-        return Result(self._calibrations.again, estimate, seconds, cut_short, [*notes, *self._notes])
+        return Result(self._calibrations, estimate, seconds, cut_short, [*notes, *self._notes])
+
+    def _estimate(self, collector: RollingCollector, seconds: float) -> Record:
+        began_s = self._first_s + self._head.offset_ns / 1e9
+        began = datetime.datetime.fromtimestamp(began_s, tz=datetime.UTC)
+        self._offsets = self._offsets_now()
+        try:
+            solution = self._solved(collector.window(self._now_s), What.BOTH)
+        except CalibrationRefusedError as error:
+            return record_of(None, began, seconds, state="failed", reason=str(error))
+        whole = {found.name: self._whole(found) for found in solution.imus if self._offsets.get(found.name)}
+        return record_of(solution, began, seconds, whole=whole)
+
+
+def compared(recorded: Record, again: Record) -> Replayed:
+    """Compare the biases of a record with those of a replay."""
+    differences: list[Difference] = []
+    worst = 0.0
+    ours = {imu.name: imu for imu in again.imus}
+    for imu in recorded.imus:
+        for field, sigma in _SIGMAS.items():
+            before, sigmas = getattr(imu, field), getattr(imu, sigma)
+            now = getattr(ours.get(imu.name), field, None)
+            if before is None and now is None:
+                continue
+            for axis in range(3):
+                one, other = (None if values is None else values[axis] for values in (before, now))
+                off = None if one is None or other is None else float(np.abs(other - one) / sigmas[axis])
+                worst = worst if off is None else max(worst, off)
+                if off is None or not off <= TOLERANCE_SIGMAS:
+                    differences.append(Difference(f"imus[{imu.name}].{field}[{axis}]", one, other, off))
+    return Replayed(again, differences, worst, None)
 
 
 def _change(collector: RollingCollector, before: ImuState | None, state: ImuState) -> None:
-    """Tell the collector of another stream or other offsets, as the daemon does."""
+    """Give the collector another stream or other offsets, as the daemon does."""
     name = state.input.name
     if before is None or messages.encode(before.input) != messages.encode(state.input):
         collector.set_imu(state.input)
     one, other = None if before is None else before.calibration, state.calibration
-    if one is None or other is None:
-        if one is not other:
-            collector.reset("offsets written", name)
-    elif not one.corrects_like(other):
+    is_like = one is other if one is None or other is None else one.corrects_like(other)
+    if not is_like:
         collector.reset("offsets written", name)
 
 

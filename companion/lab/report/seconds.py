@@ -1,4 +1,4 @@
-"""Was it still? The verdicts of a calibration second by second."""
+"""Section "Was it still?" of a report: the verdicts of a calibration second by second."""
 
 from __future__ import annotations
 
