@@ -89,24 +89,16 @@ async def profile(options: argparse.Namespace) -> int:
         saved = store.write(_to_save(results[0], options.save))
         lines.append(f'saved: {saved}; profile = "{options.save}" in [[imu]] takes it, after a restart')
         lines.append(f"check it: companion replay LOG --windows 60 --profile {saved}")
-    answer = {
-        "state": "done" if good else "failed",
-        "reason": "; ".join(refused),
-        "file": None if saved is None else str(saved),
-        "imus": [_object(result) for result in results],
-    }
-    return conclude(options, answer, lines, good=good)
+    state, file = "done" if good else "failed", None if saved is None else str(saved)
+    answer = {"state": state, "reason": "; ".join(refused), "file": file}
+    return conclude(options, {**answer, "imus": [_object(result) for result in results]}, lines, good=good)
 
 
 def _by_imu(logs: Sequence[StillLog], wanted: str | None) -> dict[str, list[StillLog]]:
-    found: dict[str, list[StillLog]] = {}
-    for log in logs:
-        found.setdefault(log.imu, []).append(log)
-    if wanted is None:
-        return found
-    if wanted not in found:
-        raise StorageError(f"no IMU {wanted!r} in these files; there are: {', '.join(found)}")
-    return {wanted: found[wanted]}
+    names = dict.fromkeys(log.imu for log in logs)
+    if wanted is not None and wanted not in names:
+        raise StorageError(f"no IMU {wanted!r} in these files; there are: {', '.join(names)}")
+    return {name: [log for log in logs if log.imu == name] for name in names if wanted in (None, name)}
 
 
 def _learn(

@@ -182,10 +182,12 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Fin
         if not any(each.variance[0, column] > 0.0 for each in curves):
             raise CalibrationRefusedError(f"{axis} never changes: its noise is below its last digit")
         without, drift = fit_axis(level_curves, column), 0.0
+        white, flicker, walk = without.figures
         for rest, (_, slopes) in zip(rests, level, strict=True):
-            slope = float(slopes[column])
-            if len(rest.slots) >= DRIFT_LEAST_S and abs(slope) > abs(drift):
-                drift = slope if abs(slope) > DRIFT_T * _slope_sigma(rest, without.figures) else drift
+            slope, span_s = float(slopes[column]), float(rest.slots[-1] - rest.slots[0] + 1)
+            sigma = math.sqrt(12.0 * white**2 / span_s**3 + float(slope_variance(flicker, walk, span_s)))
+            if len(rest.slots) >= DRIFT_LEAST_S and abs(slope) > max(DRIFT_T * sigma, abs(drift)):
+                drift = slope
         axes.append(AxisFinding(fit=without if drift else fit_axis(curves, column), drift_per_s=drift))
     models, kept = [], []
     for triad in TRIADS:
@@ -235,13 +237,6 @@ def _without_line(rest: Rest) -> tuple[Floats, Floats]:
     times = rest.slots - rest.slots.mean()
     slopes = (times[:, None] * rest.means).sum(axis=0) / max(float(np.square(times).sum()), 1.0)
     return rest.means - slopes * times[:, None], slopes
-
-
-def _slope_sigma(rest: Rest, figures: tuple[float, float, float]) -> float:
-    """Return the standard error of a least squares slope over the stretch under such noise."""
-    white, flicker, walk = figures
-    span_s = float(rest.slots[-1] - rest.slots[0] + 1)
-    return math.sqrt(12.0 * white**2 / span_s**3 + float(slope_variance(flicker, walk, span_s)))
 
 
 def within_horizon(model: AllanModel, stretches: Sequence[tuple[NDArray[np.int64], Floats]]) -> AllanModel:
@@ -297,7 +292,12 @@ def learn_warm_up(recordings: Sequence[Sequence[Rest]]) -> tuple[float, float]:
     """
     found = np.zeros(2)
     for rests in recordings:
-        minutes = np.array([row for rest in rests for row in _minutes(rest)])
+        rows = []
+        for rest in rests:
+            minute, table = (rest.slots - rest.slots[0]) // 60, np.column_stack([rest.means, rest.temperature_degc])
+            many = [minute == k for k in np.unique(minute) if (minute == k).sum() >= _LEAST_IN_MINUTE]
+            rows += [table[these].mean(axis=0) for these in many]
+        minutes = np.array(rows)
         seconds = sum(len(rest.slots) for rest in rests)
         if seconds < WARM_UP_LEAST_S or len(minutes) < 2:
             raise CalibrationRefusedError(
@@ -308,10 +308,3 @@ def learn_warm_up(recordings: Sequence[Sequence[Rest]]) -> tuple[float, float]:
         share = max(WARM_UP_K / kelvin, 1.0) if kelvin >= _LEAST_K else 1.0
         found = np.maximum(found, np.array([moved[:3].max(), moved[3:6].max()]) * share)
     return float(found[0]), float(found[1])
-
-
-def _minutes(rest: Rest) -> list[Floats]:
-    """Average six axes and the thermometer (NaN: none) over each minute that is mostly there."""
-    minute = (rest.slots - rest.slots[0]) // 60
-    table = np.column_stack([rest.means, rest.temperature_degc])
-    return [table[minute == k].mean(axis=0) for k in np.unique(minute) if (minute == k).sum() >= _LEAST_IN_MINUTE]

@@ -50,7 +50,7 @@ _AT_ONCE: Final = 4096
 _NUMBERS: Final = 1e20
 """Limit of a number in any unit: nanoseconds since 1970 are 2e18."""
 _WRAPS: Final = 2.0**32
-"""A counter of 32 bits begins anew: an Arduino's micros() every 71.6 min."""
+"""Range of a counter of 32 bits: an Arduino's micros() begins anew every 71.6 min."""
 _MOST_NAMED: Final = 12
 
 
@@ -73,7 +73,7 @@ def read(path: Path, columns: str | None = None, rate_hz: float | None = None, n
     """
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
-            return _Table(path, file, columns, rate_hz).log(name)
+            return _Table(path, file, columns, timed=rate_hz is None).log(name, rate_hz)
     except OSError as error:
         raise StorageError(f"{path}: cannot be read as text: {error.strerror or error}") from None
 
@@ -120,44 +120,60 @@ def _lines(file: TextIO, path: Path) -> Iterator[tuple[int, str]]:
             yield number, text
 
 
+def _fields(text: str, separator: str) -> list[str]:
+    try:
+        return next(csv.reader((text,), delimiter=separator, skipinitialspace=separator == " "), [])
+    except csv.Error:
+        return [text]
+
+
+def _separator(text: str) -> str:
+    return next((each for each in _SEPARATORS if each in text), ",")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
 class _Table:
     """One file while it is read."""
 
-    def __init__(self, path: Path, file: TextIO, names: str | None, rate_hz: float | None) -> None:
-        self._path, self._rate_hz = path, rate_hz
-        self._left_out: Counter[str] = Counter()
+    def __init__(self, path: Path, file: TextIO, columns: str | None, *, timed: bool) -> None:
+        self._path = path
         lines = _lines(file, path)
         number, first = next(lines, (0, ""))
         if not number:
             raise StorageError(f"{path}: the file is empty")
         self._separator = _separator(first)
-        if names is None:
-            self._names = [name.strip() for name in _fields(first, self._separator)]
-            where = f"{path}, line {number}"
+        if columns is None:
+            names, where = [name.strip() for name in _fields(first, self._separator)], f"{path}, line {number}"
         else:
-            self._names, where = names.split(","), "--columns"
-            lines = itertools.chain(((number, first),), lines)
-            lines = itertools.dropwhile(lambda line: self._is_text(line[1]), lines)
-            first_of_numbers = next(lines, (0, ""))
-            self._separator = _separator(first_of_numbers[1])
-            lines = itertools.chain((first_of_numbers,) if first_of_numbers[0] else (), lines)
-        while self._names and not self._names[-1]:
-            self._names.pop()  # a separator at the end of the line
-        self._columns = columns_of(self._names, where, timed=rate_hz is None)
-        passed = [name for name in self._names if name not in COLUMNS and name != "-"]
+            names, where = columns.split(","), "--columns"
+            # Text before the numbers is another header, or a logger's preamble.
+            lines = itertools.dropwhile(
+                lambda line: _is_text(line[1], len(names)), itertools.chain([(number, first)], lines)
+            )
+            if (first_of_numbers := next(lines, None)) is not None:
+                self._separator = _separator(first_of_numbers[1])
+                lines = itertools.chain([first_of_numbers], lines)
+        while names and not names[-1]:
+            names.pop()  # a separator at the end of the line
+        self._names, self._data = names, lines
+        self._columns = columns_of(names, where, timed=timed)
+        passed = [name for name in names if name not in COLUMNS and name != "-"]
         self._notes = [f"columns passed over: {_some(passed)}"] if passed else []
-        self._data = lines
+        self._left_out: Counter[str] = Counter()
 
-    def _is_text(self, line: str) -> bool:
-        """Return whether a line is text before the numbers: another header, a logger's preamble."""
-        fields = _fields(line, _separator(line))
-        return len(fields) < len(self._names) or not any(map(_is_number, fields))
-
-    def log(self, name: str) -> StillLog:
+    def log(self, name: str, rate_hz: float | None) -> StillLog:
         """Read it to its end."""
         order = [what for quantities, _ in _UNITS for what in quantities if what in self._columns]
+        places = [self._columns[what].place for what in order]
         flat, numbers = array("d"), array("I")
-        for lines, block in self._blocks([self._columns[what].place for what in order]):
+        while some := list(itertools.islice(self._data, _AT_ONCE)):
+            lines, block = self._block([text for _, text in some], [number for number, _ in some], places)
             block[~(np.abs(block) < _NUMBERS)] = math.nan
             flat.frombytes(np.ascontiguousarray(block).tobytes())
             numbers.extend(lines)
@@ -167,13 +183,19 @@ class _Table:
         values = {what: table[:, column] for column, what in enumerate(order)}
         first = order.index("gx")
         readings = table[:, first : first + 6]
-        t_s, kept = self._times(values.get("t"), readings, numbers)
+        whole = np.asarray(np.isfinite(readings).all(axis=1))
+        self._count("without a number in each of " + ", ".join(IMU), whole)
+        if rate_hz is None:
+            t_s, kept = self._times(values["t"], readings, whole, numbers)
+        else:
+            kept = np.flatnonzero(whole)
+            t_s = kept / rate_hz
         if not len(kept):
             raise StorageError(f"{self._path}: no line in it has a number for all of {', '.join(IMU)}")
         if len(kept) < len(readings):
             readings = readings[kept]
             values = {what: column[kept] for what, column in values.items()}
-        # In place: of a night it is the largest thing there is.
+        # In place: of a night it is the largest array.
         readings *= [self._columns[what].factor for what in IMU]
         self._check_gravity(readings[:, 3:])
         return StillLog(
@@ -200,66 +222,51 @@ class _Table:
                 " their right unit, or log the accelerometer itself"
             )
 
-    def _blocks(self, places: Sequence[int]) -> Iterator[tuple[list[int], Floats]]:
-        """Give some thousand lines at a time: their numbers, and the values of the columns."""
-        while some := list(itertools.islice(self._data, _AT_ONCE)):
-            numbers, texts = [number for number, _ in some], [text for _, text in some]
-            yield self._block(texts, numbers, places)
-
     def _block(self, texts: list[str], numbers: list[int], places: Sequence[int]) -> tuple[list[int], Floats]:
-        separator, between = self._separator, len(self._names) - 1
-        if separator != " " and all(text.count(separator) == between for text in texts):
+        """Read some thousand lines; return their numbers, and the values of the columns."""
+        separator, width = self._separator, len(self._names)
+        if separator != " " and all(text.count(separator) == width - 1 for text in texts):
             try:
                 found = np.loadtxt(texts, delimiter=separator, usecols=places, comments=None, quotechar='"', ndmin=2)
             except ValueError:
                 pass  # not all of it is numbers
             else:
                 return numbers, found
-        return self._field_by_field(texts, numbers, places)
-
-    def _field_by_field(self, texts: list[str], numbers: list[int], places: Sequence[int]) -> tuple[list[int], Floats]:
         values, lines = [], []
-        rows = csv.reader(texts, delimiter=self._separator, skipinitialspace=self._separator == " ")
+        rows = csv.reader(texts, delimiter=separator, skipinitialspace=separator == " ")
         try:
             for row in rows:
                 number = numbers[rows.line_num - 1]
-                self._check_width(number, row)
+                if len(row) < width or any(field.strip() for field in row[width:]):
+                    raise StorageError(
+                        f"{self._path}, line {number}: found {len(row)} fields; allowed: {width}, as many as columns"
+                    )
                 values.append([self._number(row[place], number, place) for place in places])
                 lines.append(number)
         except csv.Error as error:
             raise StorageError(f"{self._path}, line {numbers[rows.line_num - 1]}: {error}") from None
         return lines, np.array(values).reshape(-1, len(places))
 
-    def _check_width(self, number: int, row: Sequence[str]) -> None:
-        width = len(self._names)
-        if len(row) < width or any(field.strip() for field in row[width:]):
-            raise StorageError(
-                f"{self._path}, line {number}: found {len(row)} fields; allowed: {width}, as many as columns"
-            )
-
     def _number(self, field: str, line: int, place: int) -> float:
-        text = field.strip(' "\t\r\n')
         try:
-            return float(text or "nan")
+            return float(field.strip(' "\t\r\n') or "nan")
         except ValueError:
             raise StorageError(
                 f"{self._path}, line {line}: found {field!r} in column {self._names[place]}; allowed: a number"
             ) from None
 
-    # --- times
-
-    def _times(self, stamps: Floats | None, readings: Floats, numbers: array[int]) -> tuple[Floats, NDArray[np.intp]]:
+    def _times(
+        self, stamps: Floats, readings: Floats, whole: NDArray[np.bool_], numbers: array[int]
+    ) -> tuple[Floats, NDArray[np.intp]]:
         """Give the times of the lines that count, and which those are."""
-        whole = np.asarray(np.isfinite(readings).all(axis=1))
-        self._count("without a number in each of " + ", ".join(IMU), whole)
-        if stamps is None:
-            assert self._rate_hz is not None
-            kept = np.flatnonzero(whole)
-            return kept / self._rate_hz, kept
         timed = np.isfinite(stamps)
         self._count("without a time", timed)
         kept = np.flatnonzero(whole & timed)
-        t_s = _unwrapped(stamps[kept]) * self._columns["t"].factor
+        stamps = stamps[kept]
+        falls = np.diff(stamps) < -_WRAPS / 2.0
+        if falls.any() and (np.abs(stamps) < _WRAPS).all():  # a counter of 32 bits
+            stamps = stamps + _WRAPS * np.concatenate(([0], np.cumsum(falls)))
+        t_s = stamps * self._columns["t"].factor
         if len(t_s) and np.abs(t_s).max() > LAST_S:
             line = numbers[int(kept[np.abs(t_s).argmax()])]
             raise StorageError(
@@ -275,9 +282,8 @@ class _Table:
         again = np.zeros(len(kept), dtype=bool)
         equal = np.flatnonzero(np.diff(t_s) == 0.0) + 1
         again[equal] = (readings[kept[equal]] == readings[kept[equal - 1]]).all(axis=1)
-        if again.any():
-            self._count("repeated: time and readings of the line before", ~again)
-            kept, t_s = kept[~again], t_s[~again]
+        self._count("repeated: time and readings of the line before", ~again)
+        kept, t_s = kept[~again], t_s[~again]
         return self._spread(t_s), kept
 
     def _count(self, why: str, good: NDArray[np.bool_]) -> None:
@@ -298,6 +304,11 @@ class _Table:
         return np.asarray(t_s + within * np.repeat(steps / runs, runs))
 
 
+def _is_text(line: str, width: int) -> bool:
+    fields = _fields(line, _separator(line))
+    return len(fields) < width or not any(map(_is_number, fields))
+
+
 def _poses(values: dict[str, Floats]) -> Poses | None:
     tilt = np.column_stack([values[what] for what in TILT]) if TILT[0] in values else None
     true, magnetic = values.get("heading"), values.get("heading_magnetic")
@@ -305,29 +316,3 @@ def _poses(values: dict[str, Floats]) -> Poses | None:
     if tilt is None and heading is None:
         return None
     return Poses(tilt_deg=tilt, heading_deg=heading, magnetic=true is None and magnetic is not None)
-
-
-def _fields(text: str, separator: str) -> list[str]:
-    try:
-        return next(csv.reader((text,), delimiter=separator, skipinitialspace=separator == " "), [])
-    except csv.Error:
-        return [text]
-
-
-def _separator(text: str) -> str:
-    return next((each for each in _SEPARATORS if each in text), ",")
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
-
-
-def _unwrapped(stamps: Floats) -> Floats:
-    """Carry the stamps of a counter of 32 bits on over its end."""
-    falls = np.diff(stamps) < -_WRAPS / 2.0
-    if not falls.any() or not (np.abs(stamps) < _WRAPS).all():
-        return stamps
-    return stamps + _WRAPS * np.concatenate(([0], np.cumsum(falls)))
