@@ -17,10 +17,9 @@ import jsonschema
 import msgspec
 import pytest
 
-from companion.config.sections import Location
 from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
-from companion.estimation.records.record import Arming, Magnetic
+from companion.estimation.records.record import Arming
 from companion.estimation.solution.prior import curve_of
 from companion.estimation.solution.temperature_summary import by_temperature
 from companion.mqtt import fleet as face_module
@@ -90,28 +89,6 @@ def test_a_history_from_before_goes_once_and_in_order(tmp_path: Path) -> None:
         assert {item["clock"] for item in collector.of(HERON)} == {"unknown"}
         assert (collector.hellos[-1]["first"], collector.hellos[-1]["last"]) == (1, 50)
         assert collector.hellos[-1]["name"] == "Heron 7"
-
-    virtually(main())
-
-
-def test_half_a_year_offline_with_a_restart_every_week(tmp_path: Path) -> None:
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path)
-        days = extent(whole=180, a_slice=60)
-        for day in range(0, days, 6):
-            async with aircraft.running():
-                await asyncio.sleep(11.0)
-                keep(tmp_path, *range(day, day + 6))
-                await asyncio.sleep(random.Random(day).choice([0.0, 1.0, 10.0]))  # switched off, perhaps at once
-        async with aircraft.running() as face:
-            await asyncio.sleep(20.0)
-            assert face.status()["waiting"] == days
-            assert f"{days} items waiting for the fleet, never confirmed so far" in face.status()["summary"]
-            aircraft.connection.connect()
-            await until_told(face)
-            assert face.status()["summary"].startswith("no items waiting for the fleet, last confirmed 20")
-        assert begun(aircraft.collector.of(HERON)) == starts(*range(days))
-        assert [key[2] for key in aircraft.collector.deliveries] == list(range(1, days + 1))
 
     virtually(main())
 
@@ -188,30 +165,6 @@ def test_lost_doubled_reordered_and_cut_off(tmp_path: Path, seed: int) -> None:
             await until_told(face)
         assert begun(collector.of(HERON)) == starts(*range(number))
         assert [item["sequence"] for item in collector.of(HERON)] == list(range(1, number + 1))
-
-    virtually(main())
-
-
-def test_a_collector_restored_from_last_weeks_backup_gets_what_it_lacks(tmp_path: Path) -> None:
-    keep(tmp_path, *range(30))
-
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path)
-        collector = aircraft.collector
-        async with aircraft.running() as face:
-            aircraft.connection.connect()
-            await until_told(face)
-            lost = [key for key in collector.database if 12 <= key[2] <= 20 or key[2] == 25]
-            for key in lost:
-                del collector.database[key]
-            collector.deliveries.clear()
-            epoch = collector.hellos[-1]["epoch"]
-            collector.say(HERON, "wanted", epoch, [[12, 20], [25, 25], [900, 1000]])
-            await until(lambda: len(collector.database) == 30)
-            await asyncio.sleep(100.0)
-            assert [key[2] for key in collector.deliveries] == [*range(12, 21), 25]
-            assert face.status()["waiting"] == 0
-        assert begun(collector.of(HERON)) == starts(*range(30))
 
     virtually(main())
 
@@ -560,47 +513,6 @@ def test_a_curve_is_told_when_it_is_another_one(tmp_path: Path, monkeypatch: pyt
         assert [body["power_ups"] for body in told] == [4, 5, real.power_ups]
         assert "points" not in told[0]
         assert len(told[2]["curve"]) == len(real.curve) > 3
-
-    virtually(main())
-
-
-MAGNETIC = Magnetic(
-    heading_bound_deg=2.0, heading_from="device", field_gauss=0.51234, field_expected_gauss=0.51111,
-    inclination_deg=61.23, inclination_expected_deg=61.27, device_minus_field_deg=None, wander_deg=None,
-)  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("location", "site", "field"),
-    [
-        ("off", (None, None, None, None), (None, None, None, None)),
-        ("1km", (40.12, 100.0, 9.802, -7.1), (0.512, 0.511, 61.2, 61.3)),
-        ("full", (40.12345, 51.0, 9.80154, -7.11), (0.51234, 0.51111, 61.23, 61.27)),
-    ],
-)
-def test_how_much_of_the_place_is_told(
-    tmp_path: Path, location: Location, site: tuple[float | None, ...], field: tuple[float | None, ...]
-) -> None:
-    one = record(0)
-    assert one.site is not None
-    place = msgspec.structs.replace(one.site, latitude_deg=40.12345, height_m=51.0)
-    field_is = "compass field is 0.7 gauss, the Earth's {}: wrong counts_per_gauss, or a magnet"
-    warnings = (field_is.format("0.511"),)
-    RecordStore(tmp_path).save(msgspec.structs.replace(one, site=place, magnetic=MAGNETIC, warnings=warnings))
-
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path, location=location)
-        async with aircraft.running() as face:
-            aircraft.connection.connect()
-            await until_told(face)
-        (item,) = aircraft.collector.of(HERON)
-        told, magnetic = item["body"]["site"], item["body"]["magnetic"]
-        names = ("latitude_deg", "height_m", "gravity_m_s2", "declination_deg")
-        assert tuple(told[name] for name in names) == site
-        names = ("field_gauss", "field_expected_gauss", "inclination_deg", "inclination_expected_deg")
-        assert tuple(magnetic[name] for name in names) == field
-        assert magnetic["heading_bound_deg"] == 2.0
-        assert item["body"]["warnings"] == [field_is.format("0.511" if location == "full" else "?")]
 
     virtually(main())
 

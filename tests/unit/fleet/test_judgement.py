@@ -182,17 +182,6 @@ def test_what_was_undone_does_not_count(store: Store, database: str) -> None:
     assert judged(store, database, messages_of(one)) == []
 
 
-def test_what_was_held_back_counts(store: Store, database: str) -> None:
-    """It contradicts earlier ones: that is what is looked for."""
-    one = faulty()
-    for sequence in [sequence for sequence in one.told if sequence > 30]:
-        imus = json.loads(one.told[sequence])["body"]["imus"]
-        imus[1]["held_back"] = ["gyro"]
-        changed(one, sequence, imus=imus)
-    (found,) = judged(store, database, messages_of(one))
-    assert found.kind == "bias"
-
-
 def test_the_reading_counts_and_not_what_earlier_ones_made_of_it(store: Store, database: str) -> None:
     one = faulty()
     for sequence in [sequence for sequence in one.told if sequence > 30]:

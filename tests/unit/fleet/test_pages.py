@@ -80,18 +80,6 @@ def test_invented_aircraft_push_no_real_one_from_the_first_page(
     ]  # fmt: skip
 
 
-def test_a_finding_comes_before_all_others(store: Store, database: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page, "MOST_AIRCRAFT", 1)
-    fleet = [Aircraft(number) for number in range(3)]
-    for one in fleet:
-        one.calibrate(NOW, "" if one is fleet[2] else "the aircraft moved")
-    tell(store, *fleet)
-    finding = {"aircraft": fleet[2].id, "place": 0, "kind": "bias", "power_ups": 4, "size": 9.0, "words": "replace it"}
-    with store._engine.begin() as connection:
-        connection.execute(sa.insert(schema.findings).values(finding))
-    assert listed(shown(database)) == [fleet[2].id]
-
-
 def test_a_fleet_of_one_page_has_no_others(store: Store, database: str) -> None:
     assert "No aircraft was heard yet." in (shown(database) or "")
     tell(store, Aircraft(1))

@@ -358,19 +358,6 @@ def test_what_the_database_refuses_in_any_form_is_confirmed_all_the_same(
     assert query(database, "SELECT times FROM rejected") == [(1,)]
 
 
-def test_a_database_that_fails_while_it_refuses_confirms_nothing(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = aircraft(1)
-    reject = store._reject(items_of(one)[0], "no such number", NOW)
-    assert reject.confirmed == {(one.id, one.epoch): [1]}
-
-    def fails(*_: object) -> None:
-        raise sa.exc.OperationalError("INSERT", {}, ValueError("disk full"))
-
-    monkeypatch.setattr(Store, "_put", fails)
-    with pytest.raises(LinkError, match="disk full"):
-        store._reject(items_of(one)[0], "no such number", NOW)
-
-
 @pytest.mark.parametrize(("version", "remedy"), [(3, "name a new database with --database"), (5, "update this one")])
 def test_a_database_of_another_version_is_refused_in_one_line_and_left_as_it_is(
     store: Store, database: str, version: int, remedy: str

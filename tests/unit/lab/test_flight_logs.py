@@ -407,21 +407,6 @@ def test_gps_time_that_comes_late_or_leaps_dates_the_flight(
     assert answer["flights"][0]["began_at"] == "2026-10-11T00:00:46+00:00"
 
 
-def test_a_time_that_is_damaged_costs_no_more_than_its_message(
-    log: Path, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    told = messages(flown, parameters())
-    for k in range(1000, len(told), 501):
-        name, (_, *rest) = told[k]
-        told[k] = name, (2**40 if k % 2 else 0, *rest)
-    _, answer = said(capsys, dataflash(tmp_path / "x.bin", told), *storage(tmp_path))
-    _, whole = said(capsys, log, *storage(tmp_path))
-    (flight,), (expected,) = answer["flights"], whole["flights"]
-    assert flight["imus"][0]["rate_hz"] == pytest.approx(100.0, rel=0.01)
-    for axis, other in zip(flight["imus"][0]["axes"], expected["imus"][0]["axes"], strict=True):
-        assert axis["in_flight"]["value"] == pytest.approx(other["in_flight"]["value"], abs=other["in_flight"]["sigma"])
-
-
 def test_readings_at_the_sensors_own_rate_tell_the_same(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -509,20 +494,6 @@ def test_what_a_failed_imu_reads_is_left_aside(
         assert abs(axis["in_flight"]["value"] / unit - bias) < 2.0 * axis["in_flight"]["sigma"] / unit
     # From 70 s to 164 s.
     assert imu["drift"]["flown"][0]["starts"] == pytest.approx(164 - 70 - 10, abs=2)
-
-
-def test_an_imu_that_has_failed_from_the_start_is_named(
-    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    told: list[tuple[str, tuple[Any, ...]]] = []
-    for name, values in messages(flown, parameters()):
-        told.append((name, values))
-        if name == "IMU":
-            told.append((name, (values[0], 1, *[0.0] * 6, 0, 0, 40.0, 0, 0, 0, 0)))
-    _, answer = said(capsys, dataflash(tmp_path / "failed.bin", told), *storage(tmp_path))
-    (flight,) = answer["flights"]
-    assert flight["notes"] == ["IMU 2 has nothing to go by in it"]
-    assert [imu["imu"] for imu in flight["imus"]] == [1]
 
 
 def test_a_truncated_and_damaged_log_is_read_as_far_as_it_goes(

@@ -153,20 +153,6 @@ def test_windows_of_one_power_up_are_joined_and_this_one_stands_out() -> None:
         assert len(drawn.paths("run past")) == 5
 
 
-def test_each_plot_says_in_words_what_it_shows() -> None:
-    imu = learned(windows_of_days(10), now_degc=30.0)
-    root = ElementTree.fromstring(biases_by_temperature([imu]))  # noqa: S314 - our own
-    assert imu.now is not None
-    for axis, svg in enumerate(list(root.iter("svg"))[:3]):
-        assert svg.get("role") == "img"
-        assert svg[0].tag == "title"
-        assert svg[0].text == f"IMU fc, gyro {'xyz'[axis]}: bias by temperature"
-        assert svg[1].tag == "desc"
-        assert f"Now {imu.now.gyro_deg_h[axis]:+.0f} ± {imu.now.sigma_deg_h[axis]:.0f} deg/h at 30.0 degC." in (
-            svg[1].text or ""
-        )
-
-
 @pytest.mark.parametrize(
     ("points", "words"),
     [
