@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def add_commands(add: AddCommand) -> None:
-    """Add it to the parser of the command line."""
+    """Add `flight` to the parser of the command line."""
     command = add("flight", flight, "what a log of the autopilot says of a flight")
     command.add_argument("file", type=Path, metavar="LOG", help="ArduPilot's .bin or PX4's .ulg")
     command.add_argument(
@@ -74,7 +74,7 @@ async def flight(options: argparse.Namespace) -> int:
 
 
 class _Progress:
-    """Once a second, where reading takes so long, how far it is."""
+    """Prints the progress of reading once a second."""
 
     def __init__(self) -> None:
         self._next_s = time.monotonic() + 1.0
@@ -86,7 +86,7 @@ class _Progress:
 
 
 def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | None]:
-    """What the companion has on disk, and where it keeps flights; None: this user may not look."""
+    """Read what the companion has on disk, and give its store of flights; None: this user may not."""
     from companion.lab.flight.flight import Knowledge
     from companion.lab.flight.in_force import parameter_file
     from companion.storage.flights import FlightStore
@@ -105,7 +105,7 @@ def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | No
 
 
 def _keep(store: FlightStore, log: str, found: Sequence[Flight]) -> list[int]:
-    """Those that flew, for report and history; their numbers there."""
+    """Keep the flights that flew, for report and history; return their numbers."""
     read_at = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="seconds")
     flown = [each for each in found if any(imu.drift for imu in each.imus)]
     if flown and not store.folder.parent.is_dir():
@@ -158,7 +158,7 @@ def _imu_lines(imu: ImuFlight) -> list[str]:
 
 
 def _table(imu: ImuFlight) -> list[str]:
-    """What is known of every axis; what is known of none is named once."""
+    """Make the table of axes; name once what is known of none."""
     shown = [term for term in HEADS if any(getattr(axis, term) for axis in imu.axes)]
     lines = [f"{'left over':13}" + "".join(f"{HEADS[term]:>13}" for term in shown)]
     for axis in imu.axes:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from companion.lab.replay.engine import Result
 
 MOST_LINES = 20
-"""Of differences, for people; --json has them all."""
+"""Most differences that are shown; --json has them all."""
 
 
 def add_commands(add: AddCommand) -> None:

@@ -1,4 +1,4 @@
-"""`companion replay` of a log that is not one of ours: what to say of it, and what it gives."""
+"""`companion replay` of a log of another program: its options, and its biases."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from companion.lab.replay.windows import Windows
 
 MOST_LINES = 12
-"""Of pieces that were not used, for people; --json has them all."""
+"""Most unused pieces that are shown; --json has them all."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What only a log needs."""
+    """Add the options of a log."""
     log = parser.add_argument_group("for a log (docs/recording.md)")
     add_table_options(log)
     log.add_argument("--imu", metavar="NAME", help="which one, where there are several")
@@ -77,7 +77,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_table_options(parser: argparse._ActionsContainer) -> None:
-    """How a CSV file is to be read."""
+    """Add the options of a CSV file."""
     parser.add_argument(
         "--columns",
         metavar="NAMES",
@@ -89,7 +89,7 @@ def add_table_options(parser: argparse._ActionsContainer) -> None:
 
 
 def replay(options: argparse.Namespace, file: Path) -> int:
-    """The biases that the estimator finds in it."""
+    """Print the biases in a log."""
     from companion.lab.replay.estimate import estimate
 
     given = _given(options)
@@ -155,7 +155,7 @@ def _windows(options: argparse.Namespace, log: StillLog, given: Given) -> int:
 
 
 def window_lines(found: Windows) -> list[str]:
-    """How often sigma kept its word, axis by axis."""
+    """Make the lines of the check of sigma, axis by axis."""
     lines = [f"windows of {found.length_s:g} s: {found.count}, calibrated: {found.done}"]
     lines += [f"not calibrated: {each.count}: {each.why}" for each in found.refused[:MOST_LINES]]
     for next_s, axes in itertools.groupby(found.axes, key=lambda each: each.next_s):
@@ -171,7 +171,7 @@ def window_lines(found: Windows) -> list[str]:
 
 
 def used_lines(used: Used, *, at_rest: bool = True) -> list[str]:
-    """Which stretch it was, and why not the rest."""
+    """Make the lines of the used stretch, and of the reasons against the rest."""
     lines = []
     if used.from_s is not None and used.to_s is not None:
         still = f"; {used.still_s} s of it at rest" if at_rest else ""

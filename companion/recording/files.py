@@ -36,7 +36,7 @@ _NAME = re.compile(r"(\d{6,})\.mcap")
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Beginning:
-    """What a file holds before its messages, should it begin now."""
+    """Content of a file before its messages, if it begins now."""
 
     t_s: float
     offset_ns: int
@@ -76,7 +76,7 @@ def open_new(path: Path) -> IO[bytes]:
 
 
 def is_available() -> bool:
-    """Whether what recording needs is installed; without loading it."""
+    """Return whether the libraries of recording are installed, without loading them."""
     from importlib.util import find_spec
 
     return find_spec("mcap") is not None and find_spec("zstandard") is not None
@@ -116,7 +116,7 @@ class RecordingFile:
 
     @property
     def bytes_written(self) -> int:
-        """Its size so far."""
+        """Size of the file so far."""
         return 0 if self._file is None else int(self._file.tell())
 
     def write(self, batch: Sequence[Message], beginning: Beginning, *, continues: bool = False) -> None:
@@ -235,7 +235,7 @@ class Ring:
         self._opener, self._free_bytes = opener, free_bytes
         self._current: RecordingFile | None = None
         self._continues = False
-        """Whether the next file begins where the one before ended."""
+        """True: the next file begins where the one before ended."""
 
     @property
     def path(self) -> Path | None:
@@ -244,7 +244,7 @@ class Ring:
 
     @property
     def is_full(self) -> bool:
-        """Whether the present file has had its share."""
+        """True: the present file has its share of the ring."""
         return self._current is not None and self._current.bytes_written >= self.most_bytes // PARTS
 
     def write(self, batch: Sequence[Message], beginning: Beginning) -> None:

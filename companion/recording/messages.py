@@ -47,7 +47,7 @@ class Start(msgspec.Struct, frozen=True):
     lost: int = 0
     """Messages dropped right before, because the disk did not keep up."""
     continues: bool = False
-    """Whether the file before this one in the ring ends where this one begins."""
+    """True: the file before this one in the ring ends where this one begins."""
 
 
 class ImuState(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,7 +87,7 @@ class Solved(msgspec.Struct, frozen=True, kw_only=True):
     otherwise: Otherwise
     expectation: Expectation
     dithered: bool
-    """Whether means were replaced by those of an offset dither, which no recording holds."""
+    """True: means came from an offset dither, which no recording holds."""
 
 
 _TYPES: Final[dict[str, Any]] = {

@@ -25,7 +25,7 @@ class Tape:
 
     def __init__(self) -> None:
         self.is_on = False
-        """Whether messages are kept; states always are."""
+        """True: messages are kept; states always are."""
         self.lost = 0
         """Messages dropped since `begin`; while there are any, nothing is taken."""
         self.lost_in_all = 0

@@ -15,7 +15,7 @@ from companion.report.page import AXES, CLASSES, NAMES
 from companion.samples import TRIADS, Triad, Vector
 
 _LEAST_K: Final = 4.0
-"""How wide an axis is at least, so that a tenth of a kelvin does not fill it."""
+"""Least width of an axis, so that a tenth of a kelvin does not fill it."""
 _WHEN: Final = {"now": "now", "then": "this calibration"}
 
 
@@ -91,7 +91,7 @@ def _power_up(plot: svg.Plot, dots: Sequence[_Dot], axis: int, class_: str) -> N
 
 
 def _mark(plot: svg.Plot, degc: float, bias: float) -> None:
-    """The temperature now, and the bias."""
+    """Mark the temperature now, and the bias."""
     plot.upright(degc, "now")
     x, y = plot.at(degc, bias)
     plot.draw(tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=8, class_="ring"))
@@ -111,7 +111,7 @@ def _value(found: Expected, axis: int) -> str:
 
 
 def _told(imu: ByTemperature, triad: Triad, axis: int, dots: Sequence[tuple[float, float, float]], when: str) -> str:
-    """For who cannot see it."""
+    """Describe the plot for a screen reader."""
     unit, digits = UNITS[triad].name, 0 if triad == "gyro" else 2
     low, high = (f"{pick(value for _, value, _ in dots):+.{digits}f}" for pick in (min, max))
     words = [f"{len(dots)} points, {low} to {high} {unit}."]

@@ -24,7 +24,7 @@ CLASSES: Final = ("sx", "sy", "sz")
 _MOST: Final = 1e4
 """The largest value in a plot (SI units): what is beyond comes from a damaged file and must not squash the rest."""
 _DOT_SHARE: Final = 0.015
-"""How wide a dot is, of a plot's width."""
+"""Width of a dot, as a share of the plot's."""
 _LATEST_S: Final = 230 * 365.25 * 86400
 MAX_WARNINGS: Final = 40
 MAX_IMUS: Final = 4
@@ -72,7 +72,7 @@ def moment(iso: str) -> str:
 
 
 def damaged(problems: Sequence[str]) -> Markup | None:
-    """What could not be read."""
+    """List files that could not be read."""
     if not problems:
         return None
     more = f" and {len(problems) - 10} more" if len(problems) > 10 else ""
@@ -133,13 +133,13 @@ def seconds_of(moment: datetime.datetime) -> float | None:
 
 
 def clock_is_sound(points: Sequence[Point]) -> bool:
-    """Whether the times ascend: a field computer without a clock battery begins in the past at every boot."""
+    """Return whether times ascend: a computer without a clock battery begins in the past at every boot."""
     known = [point.unix_s for point in points]
     return None not in known and all(a <= b for a, b in itertools.pairwise(known) if a is not None and b is not None)
 
 
 def _too_close(places: Sequence[float]) -> bool:
-    """Whether by time two would be one dot: ascending places, of which some are nearer than a dot is wide."""
+    """Return whether two of these ascending places are nearer than a dot is wide."""
     apart = [b - a for a, b in itertools.pairwise(places)]
     return len(apart) > 1 and min(apart) < _DOT_SHARE * (places[-1] - places[0])
 

@@ -111,7 +111,7 @@ class Plot:
         self._parts: list[Markup] = []
 
     def at(self, x: float, y: float) -> Pair:
-        """Where a point lies."""
+        """Return the place of a point in the picture."""
         across = self._left + self._x.share(x) * (WIDTH - self._left - _RIGHT)
         return across, self._top + (1.0 - self._y.share(y)) * self._height
 

@@ -1,4 +1,4 @@
-"""What the fleet is to know of each aircraft: numbered items, kept until confirmed, and for as long as there is room.
+"""Items for the fleet of each aircraft: numbered, kept until confirmed, and for as long as there is room.
 
 One SQLite file (`fleet.sqlite` in the storage directory): items and the marks of what they were made of come and go
 together, so that nothing is lost or taken twice, whatever a power cut leaves. Every call blocks.
@@ -22,62 +22,62 @@ from companion.storage.state import set_aside
 FILE: Final = "fleet.sqlite"
 FORMAT_VERSION: Final = 1
 MOST_BYTES: Final = 16 * 1024 * 1024
-"""Of all items; some 2500 calibrations."""
+"""Most bytes of all items; some 2500 calibrations."""
 MAKE_ROOM: Final = 1 / 16
-"""What goes at once when it is full: so one word in a while says what was lost."""
+"""Share that is dropped at once when it is full, so that a loss is reported rarely."""
 CACHE_KIB: Final = 128
 LOG_PAGES: Final = 64
 
 Clock = Literal["good", "unknown"]
 Range = tuple[int, int]
-"""From one sequence to another, both included."""
+"""First and last sequence, both included."""
 
 
 class Item(NamedTuple):
-    """Something to be told."""
+    """Item for the fleet."""
 
     kind: str
     at: str
-    """When it happened: UTC, ISO 8601."""
+    """Time of the event: UTC, ISO 8601."""
     clock: Clock
     body: bytes
     """A JSON object."""
 
 
 class Mark(NamedTuple):
-    """How far something has been told."""
+    """State up to which a source has been read."""
 
     stamp: str
-    """Its file's, to see at a glance whether there is news."""
+    """Stamp of the source's file, to notice a change quickly."""
     value: str
 
 
 class Entry(NamedTuple):
-    """Items, and the marks that say they were taken."""
+    """Items, and the marks of their sources."""
 
     marks: dict[str, Mark]
     items: Sequence[Item] = ()
 
 
 class Kept(NamedTuple):
-    """How it stands with one aircraft."""
+    """Items of one aircraft."""
 
     aircraft: str
     epoch: str
     first: int
-    """The first sequence that is kept; `last` + 1 where none is."""
+    """First sequence that is kept; `last` + 1: none is."""
     last: int
-    """The last one given; 0: none yet."""
+    """Last sequence that was given; 0: none yet."""
     waiting: int
-    """Not confirmed."""
+    """Number of items that are not confirmed."""
     confirmed_at: str | None
 
 
 class Waiting(NamedTuple):
-    """One item on its way."""
+    """Item that is not confirmed yet."""
 
     number: int
-    """Over all aircraft, in order."""
+    """Number over all aircraft, in order."""
     aircraft: str
     epoch: str
     sequence: int
@@ -85,7 +85,7 @@ class Waiting(NamedTuple):
 
 
 class FleetItems:
-    """The file. Every method may raise StorageError; then nothing of what it was to do is done."""
+    """The file. A method that raises StorageError has changed nothing."""
 
     def __init__(self, directory: Path, *, most_bytes: int = MOST_BYTES) -> None:
         self.path = directory / FILE
@@ -94,7 +94,7 @@ class FleetItems:
         self._lock = threading.Lock()
 
     def close(self) -> None:
-        """Until the next call; waits for the end of one under way."""
+        """Close the file until the next call; wait for the end of a call under way."""
         with self._lock:
             self._drop()
 
@@ -105,7 +105,7 @@ class FleetItems:
                 connection.close()
 
     def add(self, aircraft: str, entries: Iterable[Entry], now: str) -> None:
-        """Number the items, keep them and the marks; where that takes room from others, a word of it is an item too."""
+        """Number and keep the items, and keep the marks; where older items are dropped for room, an event says so."""
         with self._transaction() as db:
             for entry in entries:
                 for item in entry.items:
@@ -115,18 +115,18 @@ class FleetItems:
             self._make_room(db, now)
 
     def marks(self, prefix: str) -> dict[str, Mark]:
-        """Those whose key begins so."""
+        """Return the marks whose key begins with a prefix."""
         with self._transaction() as db:
             found = db.execute("SELECT key, stamp, value FROM mark WHERE substr(key, 1, ?) = ?", (len(prefix), prefix))
             return {key: Mark(stamp, value) for key, stamp, value in found}
 
     def forget(self, keys: Iterable[str]) -> None:
-        """Drop marks of what is there no more."""
+        """Drop the marks of sources that are gone."""
         with self._transaction() as db:
             db.executemany("DELETE FROM mark WHERE key = ?", [(key,) for key in keys])
 
     def aircraft(self) -> list[Kept]:
-        """All of which there was ever something to tell."""
+        """List all aircraft with an item ever."""
         with self._transaction() as db:
             found = db.execute(
                 "SELECT id, epoch, ifnull(min(sequence), last + 1), last, ifnull(sum(NOT confirmed), 0), confirmed_at"
@@ -135,7 +135,7 @@ class FleetItems:
             return [Kept(*row) for row in found]
 
     def waiting(self, after: int, limit: int) -> list[Waiting]:
-        """The first that are not confirmed, of all aircraft, behind a number."""
+        """Return the first unconfirmed items of all aircraft behind a number."""
         with self._transaction() as db:
             found = db.execute(
                 "SELECT number, aircraft, epoch, sequence, kind, at, clock, body FROM item"
@@ -145,11 +145,11 @@ class FleetItems:
             return [Waiting(number, of, epoch, sequence, Item(*told)) for number, of, epoch, sequence, *told in found]
 
     def confirm(self, aircraft: str, epoch: str, ranges: Iterable[Range], now: str) -> bool:
-        """The fleet has these; False where that is another epoch."""
+        """Mark items as confirmed by the fleet; False: it means another epoch."""
         return self._set(aircraft, epoch, ranges, confirmed=True, now=now)
 
     def want(self, aircraft: str, epoch: str, ranges: Iterable[Range]) -> bool:
-        """The fleet lacks these: they wait again, as far as they are kept."""
+        """Mark items that the fleet lacks as unconfirmed, as far as they are kept."""
         return self._set(aircraft, epoch, ranges, confirmed=False)
 
     def _set(

@@ -36,7 +36,7 @@ _ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "EV": ("", ("Id",)),
     "RCOU": ("", tuple(f"C{k}" for k in range(1, 15))),
 }
-"""By message, the field with its instance, and what is read of it."""
+"""Field with the instance, and fields to read, by message."""
 _IMUS: Final = 5
 _GPS_UNIX_S: Final = 315964800.0
 _LEAP_S: Final = 18.0
@@ -86,14 +86,14 @@ def _boot(start: Start) -> Boot:
 
 
 def _lanes(start: Start) -> Floats:
-    """(n, 2) time and the core that it flies by: each core tells it."""
+    """Give the EKF core in use over time, (n, 2); each core logs it."""
     told = next((start.rows("XKF4", core) for core in start.instances("XKF4")), np.zeros((0, 2)))
     told = told[(told[:, 1] >= 0) & (told[:, 1] < _IMUS)]
     return told if len(told) else np.zeros((1, 2))
 
 
 def _in_use(start: Start, name: str, lanes: Floats) -> Floats:
-    """Of a message of each core, those of the core that it flew by."""
+    """Select the rows of a message of the EKF core in use."""
     parts = [start.rows(name)[:0]]
     for core in start.instances(name):
         rows = start.rows(name, core)
@@ -126,7 +126,7 @@ def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[
 
 
 def _raw(gyro: Floats, accel: Floats) -> Floats:
-    """GYR and ACC at the sensor's own rate, corrected too; forces at the gyro's times."""
+    """Join GYR and ACC, corrected, at the sensor's own rate; forces at the gyro's times."""
     if len(gyro) < 2 or len(accel) < 2:
         return np.zeros((0, 7))
     forces = [np.interp(gyro[:, 0], accel[:, 0], column) for column in accel[:, 1:4].T]
@@ -162,7 +162,7 @@ def _estimated(start: Start, core: int) -> Estimated | None:
 
 
 def _whole(cut: Floats, step: float) -> Floats:
-    """The middle of what was cut off to this."""
+    """Give the middle of the range that was cut off to a value."""
     return np.asarray(cut + 0.5 * step * np.sign(cut))
 
 
@@ -180,7 +180,7 @@ def _events(start: Start, what: str) -> tuple[tuple[float, bool], ...]:
 
 
 def _motors(outputs: Floats, parameters: dict[str, float]) -> tuple[tuple[float, bool], ...]:
-    """Whether any turns, by what is sent to them."""
+    """Read whether any motor turns from the outputs to them."""
     used = [k for k in range(1, 15) if round(parameters.get(f"SERVO{k}_FUNCTION", 0.0)) in _MOTOR_FUNCTIONS]
     if not len(outputs) or not used:
         return ()

@@ -1,4 +1,4 @@
-"""One flight of a log: what was in force, what the biases did, how far free inertial navigation would have come."""
+"""One flight of a log: offsets in force, biases in the air, and the drift of free inertial navigation."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _STOOD_S: Final = 30.0
 _STILL_RAD_S: Final = 0.005
 _OUTLIER: Final = 6.0
 _USUAL: Final = np.array([30.0 * DEG_H] * 3 + [1.0 * MG])
-"""Of so much windows may differ at any time."""
+"""Least scatter of windows that counts as usual."""
 _LIFTED_M: Final = 1.5
 _LEAST_AIR_S: Final = 15.0
 _SLOW_HZ: Final = 80.0
@@ -49,11 +49,11 @@ _SYSTEM_ID: Final = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
 """ArduPilot's up to 4.6, from 4.7 on; PX4's."""
 _GROUND: Final = round(LENGTH_S / SHORT_S)
 _MOST_MOMENTS: Final = 120
-"""Of a flight of more than 20 minutes each two, three ... windows are one."""
+"""Most windows in a record; of a longer flight two, three ... are averaged."""
 
 
 class Knowledge(msgspec.Struct, frozen=True, kw_only=True):
-    """What the companion has on disk."""
+    """Records, biases and sets of offsets on the companion's disk."""
 
     records: Sequence[Record] = ()
     """The newest first."""
@@ -63,7 +63,7 @@ class Knowledge(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def read(path: Path, progress: Progress) -> Iterator[Boot]:
-    """Each start of the autopilot in it.
+    """Read each start of the autopilot in a log.
 
     Raises:
         StorageError: one line: it cannot be read, or is another file.
@@ -81,7 +81,7 @@ def read(path: Path, progress: Progress) -> Iterator[Boot]:
 
 
 async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
-    """All flights of one start of the autopilot, in order."""
+    """Analyse all flights of one start of the autopilot, in order."""
     reference = boot.truth or boot.solution
     if reference is None:
         return []
@@ -117,7 +117,7 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
 
 
 def _key(boot: Boot, stages: Stages) -> str:
-    """Parameters tell autopilots and starts apart: both firmwares count in them how often and how long they ran."""
+    """Hash what tells flights apart: both firmwares count in parameters how often and how long they ran."""
     sensors = [(imu.number, imu.gyro_id, imu.accel_id) for imu in boot.imus]
     told = [boot.firmware, stages.armed_s, sensors, sorted(boot.parameters_at(stages.armed_s).items())]
     return hashlib.sha256(msgspec.json.encode(told)).hexdigest()[:16]
@@ -128,7 +128,7 @@ def _system_id(values: Mapping[str, float]) -> int | None:
 
 
 def _during(found: Increments, stages: Stages) -> Increments:
-    """What of a log is of this flight."""
+    """Select the increments of one flight."""
     start_s, end_s = stages.armed_s - _STOOD_S, stages.disarmed_s or math.inf
     inside = (found.t_s > start_s) & (found.t_s < end_s)
     return Increments(*(each[inside] for each in found))
@@ -143,7 +143,7 @@ def _world(boot: Boot) -> World:
 
 
 def _stages(boot: Boot, reference: Navigation) -> list[Stages]:
-    """One of each arming; where none is logged, the whole log is one."""
+    """List the stages of each arming; where none is logged, the whole log is one."""
     armed = [at_s for at_s, state in boot.armed if state] or [float(reference.t_s[0])]
     found = []
     for k, armed_s in enumerate(armed):
@@ -161,7 +161,7 @@ def _stages(boot: Boot, reference: Navigation) -> list[Stages]:
 
 
 def _lifted(reference: Navigation, armed_s: float, end_s: float) -> tuple[float | None, float | None]:
-    """By height: of aircraft that log no take-off."""
+    """Find take-off and landing by height, for aircraft that log none."""
     inside = (reference.t_s >= armed_s) & (reference.t_s <= end_s)
     t_s, down = reference.t_s[inside], reference.position[inside, 2]
     high = np.flatnonzero(down < down[0] - _LIFTED_M) if len(down) else np.zeros(0, dtype=np.int64)
@@ -227,7 +227,7 @@ async def _imu(
 
 
 def _stood(found: Increments, stages: Stages, reference: Navigation, world: World) -> list[Window]:
-    """Before the motors it stood still, if it did: better than any solution knows."""
+    """List windows before the motors, if it stood still: that is known better than any solution."""
     end_s = (stages.motors_s or stages.armed_s) - 0.5
     start_s = max(end_s - _STOOD_S, float(reference.t_s[0]))
     if end_s - start_s < 3 * SHORT_S:
@@ -241,7 +241,7 @@ def _stood(found: Increments, stages: Stages, reference: Navigation, world: Worl
 
 
 def _kept(rows: Sequence[Window]) -> list[Window]:
-    """Without those in which the solution has jumped: a heading was found anew, say."""
+    """Leave out windows in which the solution has jumped, as when it found its heading anew."""
     if len(rows) < 4:
         return list(rows)
     values = np.array([[*one.gyro_rad_s, one.down_m_s2] for one in rows])
@@ -251,7 +251,7 @@ def _kept(rows: Sequence[Window]) -> list[Window]:
 
 
 def _means(table: Floats, times_s: Sequence[float]) -> Floats | None:
-    """Of rows of time and value, the value about each of these times."""
+    """Average a value, from rows of time and value, about each of these times."""
     if len(table) < 2:
         return None
     edges = [table[:-1, 0].searchsorted([at_s - LENGTH_S / 2, at_s + LENGTH_S / 2]) for at_s in times_s]
@@ -259,7 +259,7 @@ def _means(table: Floats, times_s: Sequence[float]) -> Floats | None:
 
 
 def _moments(imu: FlownImu, armed_s: float, ground: Sequence[Window], flown: Sequence[Window]) -> tuple[Moment, ...]:
-    """For plots: the windows, before the motors as long as in the air."""
+    """Give the windows for plots, joined before the motors to the length of those in the air."""
     rows = [[one.t_s, *one.gyro_rad_s, one.down_m_s2] for one in (*ground, *flown)]
     per = max(1, math.ceil(len(flown) / _MOST_MOMENTS))
     joined = [rows[k : k + _GROUND] for k in range(0, len(ground), _GROUND)]
@@ -280,7 +280,7 @@ def _moments(imu: FlownImu, armed_s: float, ground: Sequence[Window], flown: Seq
 
 
 def _ekf(imu: FlownImu, in_air: tuple[float, float] | None) -> list[Term | None]:
-    """The latter half of the flight, when it has had time to find them; sigma is its own, and what the log cuts off."""
+    """Average the EKF's biases over the latter half; sigma is its own, and the rounding in the log."""
     found, nothing = imu.estimated, [None] * 4
     if found is None or in_air is None:
         return [*nothing]
@@ -312,7 +312,7 @@ def _others(
 def _warmth(
     imu: FlownImu, calibration: ImuCalibration, known: Knowledge, stages: Stages, in_air: tuple[float, float]
 ) -> list[Term | None]:
-    """Of the gyros, what the learnt curve says of the step from before the motors to the air."""
+    """Predict by the learnt curve the step of the gyros from before the motors to the air."""
     nothing: list[Term | None] = [None] * 4
     own = next((one for one in known.biases.values() if _is_same(one.identity, imu, calibration)), None)
     start_s = stages.motors_s or stages.armed_s

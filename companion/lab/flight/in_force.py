@@ -1,4 +1,4 @@
-"""Whose offsets an aircraft has flown with: the log's parameters against the history of calibrations."""
+"""Offsets that an aircraft has flown with, and their calibration: the log's parameters against the history."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from companion.samples import Triad
 
 
 class _Logged:
-    """The parameters of a log, asked for as those of an autopilot."""
+    """Parameters of a log behind the interface of an autopilot's parameters."""
 
     def __init__(self, firmware: Firmware, values: Mapping[str, float]) -> None:
         self._values = values
@@ -49,10 +49,10 @@ class _Logged:
 
 
 async def calibration_in(firmware: Firmware, values: Mapping[str, float], imu: FlownImu) -> ImuCalibration:
-    """What the autopilot corrected an IMU with, by the parameters in the log.
+    """Read what the autopilot corrected an IMU with from the parameters in the log.
 
     Raises:
-        AutopilotError: they do not say.
+        AutopilotError: a parameter is missing.
     """
     memory = SlotMemory()
     ids: dict[Triad, int | None] = {"gyro": imu.gyro_id, "accel": imu.accel_id}
@@ -63,9 +63,9 @@ async def calibration_in(firmware: Firmware, values: Mapping[str, float], imu: F
 
 
 def written_in(calibration: ImuCalibration, records: Sequence[Record]) -> tuple[Record, dict[str, float]] | None:
-    """The latest calibration that wrote the offsets in force, and what was there before it; records newest first.
+    """Find the latest calibration that wrote the offsets in force, and the values before; records newest first.
 
-    By the offsets and not by the time: clocks of a companion and of an autopilot may be years apart.
+    The offsets decide and not the time: clocks of a companion and of an autopilot may be years apart.
     """
     in_force = calibration.offsets
     for record in records:
@@ -78,7 +78,7 @@ def written_in(calibration: ImuCalibration, records: Sequence[Record]) -> tuple[
 
 
 def with_others(calibration: ImuCalibration, others: Mapping[str, float], accel: Floats) -> tuple[Floats, Floats]:
-    """What the output has more with other offsets, rad/s and m/s^2; `accel` (3,) is the mean output."""
+    """Return the change of the output by other offsets, rad/s and m/s^2; `accel` (3,) is the mean output."""
     own = calibration.corrections
     changes = [Change(name, own[name], value) for name, value in others.items() if name in own]
     x, y, z = accel.tolist()
@@ -87,7 +87,7 @@ def with_others(calibration: ImuCalibration, others: Mapping[str, float], accel:
 
 
 def parameter_file(path: Path) -> dict[str, float]:
-    """Of a ground station: NAME,VALUE or NAME VALUE a line, or QGroundControl's five columns.
+    """Read a ground station's parameter file: NAME,VALUE or NAME VALUE a line, or QGroundControl's five columns.
 
     Raises:
         StorageError: it cannot be read, or is none.
@@ -110,7 +110,7 @@ def parameter_file(path: Path) -> dict[str, float]:
 
 
 def moment(unix_s: float | None) -> str | None:
-    """UTC, ISO 8601."""
+    """Format a time in UTC, ISO 8601; None: it is not believable."""
     if unix_s is None or not 0.0 < unix_s < 1e11:
         return None
     return datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC).isoformat(timespec="seconds")

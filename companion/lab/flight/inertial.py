@@ -1,4 +1,4 @@
-"""Free inertial navigation over pieces of a flight: what the firmware's corrected readings alone make of it.
+"""Free inertial navigation over pieces of a flight, by the firmware's corrected readings alone.
 
 Between any two times the readings are integrated once, from the log's beginning; a start somewhere in the flight is
 then one turn and one shift of that, so that many starts cost no more than one (method 3.7).
@@ -37,18 +37,18 @@ class Navigation(NamedTuple):
     """(n, 3) m, NED."""
 
     def at(self, t_s: Floats) -> tuple[Floats, Floats, Floats]:
-        """Rotation matrices (m, 3, 3) body to NED, velocities and positions (m, 3) in between."""
+        """Interpolate rotation matrices (m, 3, 3) body to NED, velocities and positions (m, 3)."""
         q = _between(t_s, self.t_s, _one_sign(self.attitude))
         return matrices(q), _between(t_s, self.t_s, self.velocity), _between(t_s, self.t_s, self.position)
 
 
 def whole(rows: Floats) -> Floats:
-    """Without those that hold what no aircraft can mean."""
+    """Leave out rows with values beyond any aircraft."""
     return np.asarray(rows[(np.abs(rows) < _LARGEST).all(axis=1)])
 
 
 def joined(attitude: Floats, moving: Floats) -> Navigation | None:
-    """Of quaternions (n, 1 + 4) and velocities and positions (m, 1 + 6) by time; None of too few."""
+    """Join quaternions (n, 1 + 4) with velocities and positions (m, 1 + 6) by time; None: too few."""
     attitude, moving = whole(attitude), whole(moving)
     if len(attitude) < 2 or len(moving) < 2:
         return None
@@ -59,14 +59,14 @@ def joined(attitude: Floats, moving: Floats) -> Navigation | None:
 
 
 class World(NamedTuple):
-    """Where it flies: a simulator may leave out that the Earth turns."""
+    """Gravity and rotation of the Earth; a simulator may have none."""
 
     gravity_m_s2: float
     earth_rate_ned_rad_s: Floats
 
 
 class Increments(NamedTuple):
-    """What the sensors have added up, sample by sample."""
+    """Angles and velocities that the sensors have integrated, sample by sample."""
 
     t_s: Floats
     """(n,) the ends."""
@@ -86,7 +86,7 @@ class Increments(NamedTuple):
 
 
 def increments(t_s: Floats, readings: Floats, *, means: bool) -> Increments:
-    """Of readings (n, 6), rad/s and m/s^2: means since the one before, or instants between which they go straight."""
+    """Integrate readings (n, 6), rad/s and m/s^2: means since the one before, or instants joined by lines."""
     dt = np.diff(t_s)
     rates = readings[1:] if means else 0.5 * (readings[1:] + readings[:-1])
     grown = rates * dt[:, None]
@@ -95,7 +95,7 @@ def increments(t_s: Floats, readings: Floats, *, means: bool) -> Increments:
     counts = np.diff(np.append(starts, len(bins)))
 
     def before(values: Floats) -> Floats:
-        """What of a bin has come before each of its samples."""
+        """Sum what a bin has before each of its samples."""
         sums = np.cumsum(values, axis=0) - values
         return np.asarray(sums - np.repeat(sums[starts], counts, axis=0))
 
@@ -123,7 +123,7 @@ def without_earth(found: Increments, solution: Navigation, world: World) -> Incr
 
 
 def lag_s(found: Increments, solution: Navigation) -> float:
-    """By how much the readings come behind the solution's attitude: filters delay them.
+    """Estimate by how much filters delay the readings against the solution's attitude.
 
     Over a short while readings that are late have turned by less than the solution has, by the rate at its end less
     that at its beginning, times the delay.
@@ -151,7 +151,7 @@ def lag_s(found: Increments, solution: Navigation) -> float:
 
 
 class _Carried(NamedTuple):
-    """Integrated from the log's beginning, in the axes in which the body lay then."""
+    """Readings integrated from the log's beginning, in the axes of the body then."""
 
     turn: Floats
     velocity: Floats
@@ -175,7 +175,7 @@ def drift(
     spans_s: Sequence[float],
     offsets: Mapping[str, tuple[Floats, Floats]],
 ) -> dict[str, list[Drift]]:
-    """Free inertial navigation from a start each second within a time, by offsets.
+    """Navigate freely from a start each second within a time, by each set of offsets.
 
     Args:
         found: readings, corrected by the firmware, on the solution's clock.
@@ -219,10 +219,10 @@ def drift(
 
 
 class Window(NamedTuple):
-    """What the readings of some seconds have too much, by the solution; axes of the body."""
+    """Excess of the readings over the solution in some seconds; axes of the body."""
 
     t_s: float
-    """Its middle."""
+    """Middle of the window."""
     gyro_rad_s: Floats
     down_m_s2: float
     """Along the vertical, counted along body z."""
@@ -233,7 +233,7 @@ class Window(NamedTuple):
 def windows(
     found: Increments, solution: Navigation, world: World, within_s: tuple[float, float], length_s: float
 ) -> list[Window]:
-    """Side by side, without those that the readings or the solution have holes in."""
+    """List windows side by side, without those in which readings or solution have holes."""
     clean = without_earth(found, solution, world)
     nodes = np.concatenate([found.t_s - found.dt_s, found.t_s[-1:]])
     turn, velocity, _ = solution.at(nodes)
@@ -287,7 +287,7 @@ def _transposed(turns: Floats) -> Floats:
 
 
 def _one_sign(q: Floats) -> Floats:
-    """Of q and -q, which are the same, the one next to the one before."""
+    """Choose of q and -q, which are the same, the one next to the one before."""
     if not len(q):
         return q
     flips = np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0.0, -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""A log of an autopilot as what a flight is judged by, whichever firmware wrote it."""
+"""The parts of an autopilot's log that a flight is judged by, whichever firmware wrote it."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from companion.lab.logs.log import DROPOUTS, PARAMETERS, Block
 from companion.physics.frames import Floats
 
 MOST_ROWS: Final = 1 << 19
-"""Of a message and instance: 20 minutes at 400 Hz; of a longer log each two, four ... are one mean."""
+"""Most rows of a message and instance, 20 minutes at 400 Hz; in a longer log two, four ... are averaged."""
 _MOST_PARAMETERS: Final = 1 << 16
 _INSTANCES: Final = 16
-"""More nobody has: another number is damage."""
+"""Most instances: a larger number is damage."""
 
 
 class Table:
@@ -31,10 +31,10 @@ class Table:
         self._left: list[Floats] = []
         self._count = 0
         self.each = 1
-        """So many messages are one row."""
+        """Number of messages in a row."""
 
     def add(self, rows: Floats) -> None:
-        """(n, ...) more."""
+        """Add rows (n, ...)."""
         rows = np.concatenate([*self._left, rows])
         whole = len(rows) - len(rows) % self.each
         self._left = [rows[whole:].copy()]
@@ -49,22 +49,22 @@ class Table:
             self._take(_means(rows[: len(rows) // 2 * 2], 2))
 
     def rows(self) -> Floats:
-        """(n, ...) whole numbers only, ascending in time."""
+        """Return the rows (n, ...), ascending in time."""
         return ascending(np.concatenate(self._chunks))
 
 
 class Start:
-    """What one start of the autopilot has logged, message by message."""
+    """Messages of one start of the autopilot."""
 
     def __init__(self, fields: Mapping[str, int]) -> None:
         self._fields = fields
         self._tables: dict[tuple[str, int], Table] = defaultdict(Table)
         self.parameters: list[tuple[float, str, float]] = []
         self.gaps = 0
-        """In which the autopilot could not write."""
+        """Gaps in which the autopilot could not write."""
 
     def take(self, block: Block) -> None:
-        """Some more of it."""
+        """Add a block of messages."""
         if block.name == PARAMETERS:
             found = zip(block.rows[:, 0].tolist(), block.texts, block.rows[:, 1].tolist(), strict=True)
             self.parameters += itertools.islice(found, _MOST_PARAMETERS - len(self.parameters))
@@ -74,22 +74,22 @@ class Start:
             self._tables[block.name, block.instance].add(block.rows)
 
     def rows(self, name: str, instance: int = 0) -> Floats:
-        """(n, 1 + fields), the time in s first."""
+        """Return the rows of a message, (n, 1 + fields), the time in s first."""
         if (name, instance) not in self._tables:
             return np.zeros((0, 1 + self._fields[name]))
         return self._tables[name, instance].rows()
 
     def means(self, name: str, instance: int) -> bool:
-        """Whether each row is of several messages."""
+        """Return whether each row is the mean of several messages."""
         return self._tables[name, instance].each > 1
 
     def instances(self, name: str) -> list[int]:
-        """That have logged it."""
+        """List the instances that have logged a message."""
         return sorted(instance for each, instance in self._tables if each == name)
 
 
 def starts(blocks: Iterable[Block | None], fields: Mapping[str, int]) -> Iterator[Start]:
-    """Of a file, one after another: memory is that of one. `fields`: how many a message has."""
+    """Give the starts in a file one after another: memory is that of one. `fields`: number of fields by message."""
     start = None
     for block in blocks:
         if block is not None:
@@ -103,7 +103,7 @@ def starts(blocks: Iterable[Block | None], fields: Mapping[str, int]) -> Iterato
 
 
 def ascending(rows: Floats) -> Floats:
-    """Of rows that begin with a time, those in order; one alone that is ahead of all is damage."""
+    """Select rows in order of their time, the first column; a single one that is ahead of all others is damage."""
     rows = rows[np.isfinite(rows[:, 0])]
     if not len(rows):
         return rows
@@ -131,7 +131,7 @@ class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU in one log."""
 
     number: int
-    """From 1, as in the configuration."""
+    """Number from 1, as in the configuration."""
     t_s: Floats
     readings: Floats
     """(n, 6) rad/s and m/s^2, corrected by the firmware, vehicle FRD."""
@@ -145,29 +145,29 @@ class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
     """Time and level, m/s^2."""
     estimated: Estimated | None = None
     failed_s: Floats = np.zeros(0)
-    """When the autopilot took it for failed: what it reads then is not among its readings."""
+    """Times at which the autopilot took it for failed; its readings then are left out."""
 
     @property
     def rate_hz(self) -> float:
-        """Of its readings."""
+        """Mean rate of the readings."""
         return (len(self.t_s) - 1) / float(self.t_s[-1] - self.t_s[0]) if len(self.t_s) > 1 else 0.0
 
 
 class Place(msgspec.Struct, frozen=True):
-    """Where it flew."""
+    """Place of the flight."""
 
     latitude_deg: float
     height_m: float
 
 
 class Boot(msgspec.Struct, frozen=True, kw_only=True):
-    """What one start of the autopilot has logged; times in s on its clock."""
+    """Log of one start of the autopilot, whichever firmware wrote it; times in s on its clock."""
 
     firmware: Firmware
     imus: tuple[FlownImu, ...]
     solution: Navigation | None
     truth: Navigation | None = None
-    """Of a simulator."""
+    """Truth of a simulator."""
     armed: tuple[tuple[float, bool], ...] = ()
     motors: tuple[tuple[float, bool], ...] = ()
     airborne: tuple[tuple[float, bool], ...] = ()
@@ -180,7 +180,7 @@ class Boot(msgspec.Struct, frozen=True, kw_only=True):
     notes: tuple[str, ...] = ()
 
     def parameters_at(self, t_s: float) -> dict[str, float]:
-        """As they were then; of one that was told only later, its first value."""
+        """Return the parameters at a time; one that was logged only later has its first value."""
         found: dict[str, float] = {}
         for told_s, name, value in self.parameters:
             if told_s <= t_s or name not in found:
@@ -189,7 +189,7 @@ class Boot(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def changes(t_s: Sequence[float] | Floats, states: Sequence[bool] | NDArray[Any]) -> tuple[tuple[float, bool], ...]:
-    """The first state and every other one after it."""
+    """List the first state and each change after it."""
     found: list[tuple[float, bool]] = []
     for at_s, state in zip(t_s, states, strict=True):
         if not found or found[-1][1] != bool(state):

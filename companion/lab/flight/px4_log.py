@@ -81,7 +81,7 @@ def _whole(rows: Floats) -> Floats:
 
 
 def _sampled(rows: Floats) -> Floats:
-    """By the time of the sample, the field after that of the message; older versions have only the latter."""
+    """Order rows by the sample's time, the field after the message's; older versions have only the latter."""
     at_s = rows[:, 1] * US
     return ascending(_whole(np.column_stack([np.where(np.isfinite(at_s), at_s, rows[:, 0]), rows[:, 2:]])))
 
@@ -92,7 +92,7 @@ def _navigation(start: Start, suffix: str) -> Navigation | None:
 
 
 def _imus(start: Start) -> tuple[FlownImu, ...]:
-    """Those whose readings are logged fast enough: the one that PX4 flies by, and others if somebody has asked."""
+    """List the IMUs logged fast enough: the one that PX4 flies by, and others if the logger was set so."""
     found: dict[int, FlownImu] = {}
     status = {k: start.rows("vehicle_imu_status", k) for k in start.instances("vehicle_imu_status")}
     ids = {rows[-1, 1]: k for k, rows in status.items() if len(rows)}
@@ -112,7 +112,7 @@ def _imus(start: Start) -> tuple[FlownImu, ...]:
 
 
 def _selection(start: Start) -> Floats:
-    """(n, 2) since when it has flown by which gyro, by its device id."""
+    """Give the device id of the gyro in use over time, (n, 2)."""
     told = _whole(start.rows("sensor_selection"))
     return told if len(told) else np.zeros((1, 2))
 

@@ -1,4 +1,4 @@
-"""What the biases did in flight, split into what was there before the motors, and what they and time have added.
+"""Biases in flight, split into turn-on bias, step at the motors' start, vibration and trend.
 
 By least squares over windows side by side. What a window is off by comes from the solution's own errors at its two
 ends, which the next window has with the other sign: taken as independent they make sigma rather too large. What the
@@ -24,14 +24,14 @@ SHORT_S: Final = 2.0
 """Before the motors, where there is little time and little noise."""
 _LEAST: Final = 3
 _ATTITUDE_RAD: Final = (0.3 * DEG, 0.3 * DEG, 2.0 * DEG)
-"""Of a solution with GNSS and a compass: tilt and heading may be off by this at one end of a stretch."""
+"""Error of tilt and heading at one end of a stretch, for a solution with GNSS and a compass."""
 _VELOCITY_M_S: Final = 0.1
 _GRAVITY_M_S2: Final = 0.003
 """Gravity where it flies against the normal one, and the accelerometer's scale at one g."""
 _AT_REST: Final = 0.02
-"""Of both, while it stands."""
+"""Share of both errors while it stands."""
 _LEVEL_M_S2: Final = 5.0 * MG
-"""What the other two accelerometers may be off by; where it tilts, that is in the vertical."""
+"""Error of the other two accelerometers, which a tilt turns into the vertical."""
 _LEAST_SPREAD: Final = 0.15
 """Share of its mean by which vibration has to vary for a slope."""
 _LEAST_TREND_S: Final = 60.0
@@ -44,7 +44,7 @@ def split(
     warmth: Sequence[Term | None],
     ekf: Sequence[Term | None],
 ) -> list[Split]:
-    """The gyro's three axes and the accelerometer's vertical one.
+    """Split the gyro's three axes and the accelerometer's vertical one.
 
     Args:
         before: windows before the motors.
@@ -84,7 +84,7 @@ def _tilt(windows: Sequence[Window]) -> float:
 
 
 def _mean(values: Floats, span_s: float, end: float, constant: float) -> Term | None:
-    """Of windows; `end` is what the solution may be off by at either end of them all, `constant` what it always is."""
+    """Average windows; `end`: error of the solution at either end of them all; `constant`: its constant error."""
     if len(values) < _LEAST:
         return None
     freedom = len(values) - 1
@@ -96,7 +96,7 @@ def _mean(values: Floats, span_s: float, end: float, constant: float) -> Term | 
 def _slopes(
     values: Floats, windows: Sequence[Window], levels: Floats | None, end: float, aside: float
 ) -> tuple[Term | None, Term | None]:
-    """Against vibration, and a minute; each only where the flight has enough of it."""
+    """Fit slopes against vibration and time; each only where the flight has enough of it."""
     times = np.array([one.t_s for one in windows])
     columns = {}
     if len(times) > _LEAST and np.ptp(times) >= _LEAST_TREND_S:

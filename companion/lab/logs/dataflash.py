@@ -23,7 +23,7 @@ _PARAMETER: Final = "PARM"
 _PIECE: Final = 1 << 22
 
 Fields = Mapping[str, tuple[str, tuple[str, ...]]]
-"""By message: the field with its instance, or nothing, and the fields to read."""
+"""Field with the instance, or nothing, and fields to read, by message."""
 
 
 class _Kind:

@@ -42,7 +42,7 @@ class Block(NamedTuple):
 
 
 class Poses(msgspec.Struct, frozen=True, kw_only=True):
-    """What else was logged beside an IMU, line by line; NaN where a line says nothing."""
+    """Tilt and heading logged beside an IMU, line by line; NaN: not in that line."""
 
     tilt_deg: Floats | None = None
     """(n, 2): a gradienter's readings, in the vehicle's axes and by its own law."""
@@ -64,7 +64,7 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
     temperature_degc: Floats
     """(n,); NaN where unknown."""
     profile: str | Noise | None = None
-    """That of the configuration in force then."""
+    """Noise profile in the configuration in force then."""
     truncated: bool = False
     """It came as integers only, which are left out."""
     clock_offset_s: float | None = None
@@ -73,12 +73,12 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
     """When the readings became others by no noise: offsets were written, the device restarted."""
 
     notes: tuple[str, ...] = ()
-    """What was taken for granted, or is strange."""
+    """Assumptions and oddities, in words."""
     left_out: dict[str, int] = {}
     """Lines that do not count, by reason."""
     poses: Poses | None = None
     clock_from_start: bool = False
-    """Whether its times count from when the autopilot was switched on."""
+    """True: times count from the switch-on of the autopilot."""
 
     @property
     def began_at(self) -> str | None:

@@ -15,13 +15,13 @@ from companion.lab.logs.log import DROPOUTS, PARAMETERS, US, Block, Progress, no
 
 MAGIC: Final = b"ULog\x01\x12\x35"
 _MOST_TIMES: Final = 4
-"""How often a file may be read: damage can lead pyulog back to where it was, again and again."""
+"""Most times that a file is read: damage can lead pyulog back to where it was, again and again."""
 _NEEDS_MORE: Final = (
     "a log of PX4 needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
 )
 
 Topics = Mapping[str, tuple[str, ...]]
-"""By topic the fields to read, of arrays element by element: `gyro_rad[0]`."""
+"""Fields to read by topic; arrays element by element: `gyro_rad[0]`."""
 
 
 class _Counted(io.BufferedReader):

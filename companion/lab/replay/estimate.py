@@ -1,4 +1,4 @@
-"""The biases that the estimator finds in a log, from its longest still stretch; and which stretch that was."""
+"""Biases in a log, estimated from its longest still stretch; and which stretch that was."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _LOOK_S: Final = 300
 
 
 class Given(msgspec.Struct, frozen=True, kw_only=True):
-    """What the log does not say itself: how the IMU stood, and where; None: not known, which widens the sigmas."""
+    """Pose and place of the IMU, which the log does not contain; None: not known, which widens the sigmas."""
 
     pitch_deg: float | None = None
     """Before a tilt in the log, as the heading likewise."""
@@ -67,16 +67,16 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
     powered_s: float = 0.0
     """For so long the IMU had been switched on when the log began, at least."""
     law: Law = "axis"
-    """Of a tilt in the log."""
+    """Law of a tilt in the log."""
     tilt_lag_s: float = 0.0
-    """By which it follows the truth."""
+    """Delay of the tilt in the log."""
     platform: Platform = "ground"
     mounting: Mounting = "ROTATION_NONE"
     """IMU to vehicle FRD."""
     profile: str | Noise | None = None
     """The IMU's model, or figures learned, for its Allan figures."""
     any_bias: bool = False
-    """Whether biases beyond what any part has are taken."""
+    """True: accept biases beyond those of any part."""
 
 
 class Unused(msgspec.Struct, frozen=True):
@@ -88,7 +88,7 @@ class Unused(msgspec.Struct, frozen=True):
 
 
 class Used(msgspec.Struct, frozen=True, kw_only=True):
-    """What of a log went into the means; times from its first sample on."""
+    """Part of a log that went into the means; times from its first sample on."""
 
     files: tuple[str, ...]
     seconds: float
@@ -101,25 +101,25 @@ class Used(msgspec.Struct, frozen=True, kw_only=True):
     left_out: dict[str, int]
     """Lines, by reason."""
     notes: tuple[str, ...]
-    """What was taken for granted."""
+    """Assumptions, in words."""
 
 
-class Estimated(msgspec.Struct, frozen=True):
-    """What the estimator makes of a log."""
+class LogEstimate(msgspec.Struct, frozen=True):
+    """Record and used part of a log."""
 
     record: Record
     used: Used
 
 
-def estimate(log: StillLog, given: Given, *, max_still_s: float = MAX_STILL_S) -> Estimated:
-    """The biases from the longest still stretch of a log."""
+def estimate(log: StillLog, given: Given, *, max_still_s: float = MAX_STILL_S) -> LogEstimate:
+    """Estimate the biases from the longest still stretch of a log."""
     return _Pass(log, given, max_still_s).run()
 
 
 class _Streams:
-    """What goes into the collector beside the IMU, and how it is to be understood.
+    """Tilt and heading for the collector, and their models.
 
-    What is given on the command line stands for the whole log; a column of the same is then left out.
+    A value of the command line holds for the whole log; a column of the same quantity is then left out.
     """
 
     def __init__(self, log: StillLog, given: Given) -> None:
@@ -148,7 +148,7 @@ class _Streams:
         return values
 
     def feed(self, collector: RollingCollector, at: int, now_s: float) -> None:
-        """What stands in line `at` of the log."""
+        """Add the tilt and the heading in line `at` of the log."""
         if self.tilt is not None:
             x_deg, y_deg = self.tilt[at].tolist()
             if x_deg == x_deg and y_deg == y_deg:
@@ -181,11 +181,11 @@ class _Pass:
         self._obstacle = ""
         self._longest_s = 0.0
         self._verdicts: dict[int, tuple[str, str]] = {}
-        """By second, why it was not still, and without the figures of a movement; empty where it was."""
+        """Reason why a second was not still, and its kind without figures, by second; empty: it was still."""
         self._verdicts_from_s = 0.0
 
-    def run(self) -> Estimated:
-        """From its first sample to its last."""
+    def run(self) -> LogEstimate:
+        """Run from the first sample to the last."""
         log, collector = self._log, self._collector
         began_at = datetime.datetime.now(tz=datetime.UTC)
         offset_s = _FIRST_S - float(log.t_s[0])
@@ -209,12 +209,12 @@ class _Pass:
             why = self._obstacle or self._unusable(seconds)
             least = f"no {self._least_s:.0f} s {_AT_REST[self._given.platform]} in it"
             record = record_of(None, began_at, seconds, state="failed", reason=refused or f"{least}: {why}")
-            return Estimated(record, self._used(None, seconds))
+            return LogEstimate(record, self._used(None, seconds))
         record = self._solved(began_at, best[1], seconds)
-        return Estimated(record, self._used(best[0], seconds))
+        return LogEstimate(record, self._used(best[0], seconds))
 
     def _look(self, now_s: float, *, last: bool = False) -> None:
-        """At the end of a second: is it worth while to measure?"""
+        """Measure at the end of a second if the stretch has grown enough."""
         collector = self._collector
         glance = collector.glance(now_s)
         self._longest_s = max(self._longest_s, glance.still_s)
@@ -238,7 +238,7 @@ class _Pass:
             self._verdicts_from_s = now_s - 5.0
 
     def _unusable(self, seconds: float) -> str:
-        """What is in the way where no second of it could be judged."""
+        """Give the reason where no second could be judged."""
         (imu, *_) = self._collector.status(seconds + _FIRST_S).sources
         worst = max(imu.dropped, key=lambda why: imu.dropped[why], default="")
         if worst:
@@ -248,7 +248,7 @@ class _Pass:
         return f"it is {seconds:.1f} s long"
 
     def _aged(self, measurement: Measurement) -> Measurement:
-        """With what is known of the time before the log, where nothing was silent since."""
+        """Add the time for which the IMU had been on before the log, unless it was silent since."""
         begun_s = measurement.begun_s.get(self._log.imu, math.inf)
         powered_s = self._given.powered_s
         if self._log.clock_from_start:
@@ -310,7 +310,7 @@ class _Pass:
 
 
 def _in_rows(whys: Iterable[tuple[int, int, str, str]]) -> Iterator[Unused]:
-    """Seconds in a row that are out for reasons alike, in the words of the first."""
+    """Join seconds in a row with reasons of one kind, in the words of the first."""
     for kind, group in itertools.groupby(whys, key=lambda each: each[3]):
         some = list(group)
         if kind:
@@ -318,7 +318,7 @@ def _in_rows(whys: Iterable[tuple[int, int, str, str]]) -> Iterator[Unused]:
 
 
 def _rows(log: StillLog, offset_s: float) -> Iterator[tuple[float, Vector, Vector, float | None]]:
-    """Time, rates, forces and temperature, a sample at a time."""
+    """Give time, rates, forces and temperature of each sample."""
     for at in range(0, len(log.t_s), _AT_ONCE):
         part = slice(at, at + _AT_ONCE)
         times = (log.t_s[part] + offset_s).tolist()
@@ -328,7 +328,7 @@ def _rows(log: StillLog, offset_s: float) -> Iterator[tuple[float, Vector, Vecto
 
 
 def _latest(found: list[Measurement]) -> tuple[tuple[Measurement, Window] | None, str]:
-    """The latest that gives a window, and that; where none does, why the very latest gives none."""
+    """Find the latest measurement that gives a window; without one, the reason of the very latest."""
     refused = ""
     for each in reversed(found):
         try:
@@ -339,7 +339,7 @@ def _latest(found: list[Measurement]) -> tuple[tuple[Measurement, Window] | None
 
 
 def _posed(window: Window, given: Given) -> Window:
-    """The window with what was given in the place of gradienter and compass."""
+    """Replace gradienter and compass of a window by the given pose."""
     tilt, heading = window.tilt, window.heading
     if given.pitch_deg is not None and given.roll_deg is not None:
         tilt = TiltWindow(

@@ -1,4 +1,4 @@
-"""Does sigma keep its word on this sensor? Every window of a long still log is calibrated by itself, as after a start.
+"""Check of sigma on a sensor: every window of a long still log is calibrated by itself, as after a start.
 
 What it finds is held against what the windows after it find: the biases' difference has to come out within 2 sigma in
 95 of 100 cases. How the sensor lay is the same in both, so that it cancels: the pose counts as known, and sigma is the
@@ -41,7 +41,7 @@ class Refused(msgspec.Struct, frozen=True):
 
     count: int
     why: str
-    """Of the first."""
+    """Reason of the first."""
 
 
 class AxisKept(msgspec.Struct, frozen=True, kw_only=True):
@@ -81,7 +81,7 @@ class _Found(msgspec.Struct, frozen=True):
 
 
 def windows(log: StillLog, given: Given, length_s: float) -> Windows:
-    """Calibrate in every window of so many seconds."""
+    """Calibrate in every window of a length in seconds."""
     posed, force = given, np.zeros(3)
     found: list[_Found | None] = []
     whys: list[str] = []
@@ -124,7 +124,7 @@ def windows(log: StillLog, given: Given, length_s: float) -> Windows:
 
 
 def _posed(force: Floats, given: Given) -> Given:
-    """With a pose by that specific force (3,), and a place, for whatever was not said, all of it without doubt."""
+    """Fill in what was not given: a pose by that specific force (3,), and a place, both exact."""
     mean = rotation_matrix(given.mounting) @ force
     roll_rad, pitch_rad = roll_pitch_from_up(mean / np.linalg.norm(mean))
     return msgspec.structs.replace(
@@ -149,7 +149,7 @@ def _found(imu: ImuRecord) -> _Found | None:
 
 
 def _counted(whys: Sequence[str]) -> tuple[Refused, ...]:
-    """Reasons without their figures, the commonest first."""
+    """Count reasons without their figures, the commonest first."""
     kinds: dict[str, list[str]] = {}
     for why in whys:
         kinds.setdefault(re.sub(r"\d+(\.\d+)?", "", why), []).append(why)
@@ -157,7 +157,7 @@ def _counted(whys: Sequence[str]) -> tuple[Refused, ...]:
 
 
 def _kept(found: Sequence[_Found | None], span: int, next_s: float) -> list[AxisKept]:
-    """Every window against the mean of the `span` ones after it."""
+    """Compare every window with the mean of the `span` windows after it."""
     misses, uses, seen = [], [], []
     for at, one in enumerate(found):
         after = [each for each in found[at + 1 : at + 1 + span] if each is not None]

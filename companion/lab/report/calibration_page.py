@@ -42,7 +42,7 @@ _OUTCOMES: Final[dict[Outcome, tuple[str, str]]] = {
 
 
 class Material(msgspec.Struct, frozen=True, kw_only=True):
-    """Everything that the page of one calibration is made of."""
+    """Content of the page of one calibration."""
 
     number: int
     record: Record
@@ -50,18 +50,18 @@ class Material(msgspec.Struct, frozen=True, kw_only=True):
     no_trace: str
     """Why there is no trace; empty where there is one."""
     earlier: Sequence[tuple[int, Record]]
-    """Of the same aircraft, oldest first, this one last."""
+    """Calibrations of the same aircraft, oldest first, this one last."""
     armings: Sequence[Arming]
     """While it was in force, oldest first."""
     damaged: Sequence[str]
     by_temperature: Sequence[ByTemperature] = ()
-    """Of its IMUs, as known when the page is made."""
+    """Curves of its IMUs, as known when the page is made."""
     flown: Mapping[str, Sequence[str]] = {}
-    """By IMU, what flights have found that its sigma has not; likewise."""
+    """Changes by motors beyond sigma, in words, by IMU."""
 
 
 def calibration_page(material: Material, now: datetime.datetime) -> str:
-    """The file's content."""
+    """Make the page."""
     record = material.record
     imus, warmth = record.imus[:MAX_IMUS], material.by_temperature[:MAX_IMUS]
     return page(

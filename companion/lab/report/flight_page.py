@@ -27,7 +27,7 @@ from companion.report.markup import Child, Markup, cell, row, tag
 from companion.report.page import CLASSES, MAX_IMUS, card, moment, page, with_sigma
 
 _MARKS: Final = ("●", "■", "▲")
-"""As the plot draws `CLASSES`."""
+"""Marks that the plot draws for `CLASSES`."""
 _MOST_SETS: Final = 8
 _SHORTEST_M: Final = 0.01
 

@@ -21,11 +21,11 @@ class Run(msgspec.Struct, frozen=True):
     last: int
     state: State
     words: str
-    """Of its first second."""
+    """Words of the first second."""
 
 
 def runs(trace: Trace, verdict: VerdictTrace) -> list[Run]:
-    """The verdicts of one source, joined where neighbours are of one kind."""
+    """Join the verdicts of one source where neighbours are of one kind."""
     states: list[State] = []
     for words, fault in zip(verdict.words, verdict.fault, strict=True):
         states.append("still" if words is None else "unknown" if not words else "fault" if fault else "moving")
@@ -46,7 +46,7 @@ _ROW: Final = 26.0
 
 
 def stillness(trace: Trace | None, no_trace: str) -> Markup:
-    """Every second's verdict of every source."""
+    """Show every second's verdict of every source."""
     parts: list[Child] = [tag("h2", "Was it still?")]
     if trace is None:
         parts.append(card("", f"Not shown: {no_trace}"))
@@ -97,7 +97,7 @@ def _block(plot: svg.Plot, first: float, end: float, row: float, height: float, 
 
 
 def _used(trace: Trace) -> list[tuple[int, int]]:
-    """Seconds that the result is the mean of, joined; the second of each pair is not included."""
+    """Join the seconds in the mean; the second of each pair is not included."""
     first, last = trace.measured or (0, 0)
     found: list[tuple[int, int]] = []
     for second, good in zip(trace.second, trace.good, strict=True):
@@ -132,7 +132,7 @@ def _events(found: list[Run]) -> Markup | None:
 
 
 def _said(run: Run) -> str:
-    """What its first second said, without the length of a second where there were more."""
+    """Give the words of the first second, without its length if there were more."""
     return run.words if run.first == run.last else run.words.replace(" was silent for a second", " was silent")
 
 

@@ -1,4 +1,4 @@
-"""What a page is made of, read from the storage folder; nothing is changed there, and no daemon is needed."""
+"""Content of pages, read from the storage folder without a daemon; nothing is changed there."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NO_SIGMA: Final = (math.inf,) * 3
 
 
 def material(directory: Path, wanted: str | None) -> Material:
-    """What the page of one calibration is made of, by its number or the beginning of its time; None: the latest.
+    """Read the content of a page by a calibration's number or the beginning of its time; None: the latest.
 
     Raises:
         StorageError: there is nothing to make a page of, none of that number or time, or it cannot be read.
@@ -86,7 +86,7 @@ def material(directory: Path, wanted: str | None) -> Material:
 
 
 def flight(directory: Path, wanted: int) -> tuple[int, KeptFlight, list[Flight]]:
-    """A flight by its number; 0: the latest; and all that are known.
+    """Read a flight by its number, or the latest by 0; and all flights.
 
     Raises:
         StorageError: there is none, none of that number, or it cannot be read.
@@ -103,7 +103,7 @@ def flight(directory: Path, wanted: int) -> tuple[int, KeptFlight, list[Flight]]
 
 
 def _moved_in_flight(flights: Sequence[Flight], record: Record, known: Mapping[str, KnownImu]) -> dict[str, list[str]]:
-    """By IMU, what motors surely add to its biases, where that is more than the calibration's sigma."""
+    """List by IMU what motors surely add to its biases, where that exceeds the calibration's sigma."""
     found: dict[str, list[str]] = {}
     for imu in record.imus:
         identity = known[imu.name].identity if imu.name in known else {}
@@ -120,7 +120,7 @@ def _moved_in_flight(flights: Sequence[Flight], record: Record, known: Mapping[s
 
 
 def _by_temperature(directory: Path, record: Record, every: Mapping[str, KnownImu]) -> list[ByTemperature]:
-    """What is known today of this calibration's IMUs, as far as it is the same vehicle's."""
+    """List the curves known today of this calibration's IMUs on the same vehicle."""
     found = []
     for name, known in every.items():
         identity, points = known.identity, known.points
