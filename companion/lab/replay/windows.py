@@ -72,18 +72,11 @@ class Windows(msgspec.Struct, frozen=True, kw_only=True):
     """None where fewer than two windows in a row gave a result."""
 
 
-class _Found(msgspec.Struct, frozen=True):
-    """(6,) each: gyro in rad/s, accelerometer in m/s^2."""
-
-    bias: Floats
-    stat: Floats
-    use: Floats
-
-
 def windows(log: StillLog, given: Given, length_s: float) -> Windows:
     """Calibrate in every window of a length in seconds."""
     posed, force = given, np.zeros(3)
-    found: list[_Found | None] = []
+    found: list[Floats | None] = []
+    """Bias, sigma_stat and sigma_use of each window, (3, 6); None: it gave none."""
     whys: list[str] = []
     begin_s = float(log.t_s[0])
     starts_s = np.concatenate(([begin_s], log.t_s[1:][np.diff(log.t_s) > PAUSE_S]))
@@ -109,7 +102,7 @@ def windows(log: StillLog, given: Given, length_s: float) -> Windows:
         powered_s = float(log.t_s[start] - starts_s[at]) + (posed.powered_s if at == 0 else 0.0)
         record = estimate(part, msgspec.structs.replace(posed, powered_s=powered_s), max_still_s=length_s).record
         imu = record.imus[0] if record.imus else None
-        one = None if imu is None else _found(imu)
+        one = None if imu is None else _figures(imu)
         found.append(one)
         if one is None:
             whys.append(record.reason if imu is None else "; ".join(imu.warnings))
@@ -139,13 +132,10 @@ def _posed(force: Floats, given: Given) -> Given:
     )
 
 
-def _found(imu: ImuRecord) -> _Found | None:
+def _figures(imu: ImuRecord) -> Floats | None:
     gyro = (imu.gyro_bias_rad_s, imu.gyro_sigma_stat_rad_s, imu.gyro_sigma_use_rad_s)
     accel = (imu.accel_bias_m_s2, imu.accel_sigma_stat_m_s2, imu.accel_sigma_use_m_s2)
-    if None in gyro or None in accel:
-        return None
-    bias, stat, use = (np.array([*(one or ()), *(other or ())]) for one, other in zip(gyro, accel, strict=True))
-    return _Found(bias, stat, use)
+    return None if None in gyro or None in accel else np.hstack([np.array(gyro), np.array(accel)])
 
 
 def _counted(whys: Sequence[str]) -> tuple[Refused, ...]:
@@ -156,16 +146,17 @@ def _counted(whys: Sequence[str]) -> tuple[Refused, ...]:
     return tuple(sorted((Refused(len(each), each[0]) for each in kinds.values()), key=lambda each: -each.count))
 
 
-def _kept(found: Sequence[_Found | None], span: int, next_s: float) -> list[AxisKept]:
+def _kept(found: Sequence[Floats | None], span: int, next_s: float) -> list[AxisKept]:
     """Compare every window with the mean of the `span` windows after it."""
     misses, uses, seen = [], [], []
     for at, one in enumerate(found):
         after = [each for each in found[at + 1 : at + 1 + span] if each is not None]
         if one is None or len(after) < span:
             continue
-        misses.append(one.bias - np.mean([each.bias for each in after], axis=0))
-        uses.append(np.square(one.use))
-        seen.append(np.mean([np.square(each.stat) for each in after], axis=0) / span)
+        bias, stat, _ = np.moveaxis(np.array(after), 1, 0)
+        misses.append(one[0] - bias.mean(axis=0))
+        uses.append(np.square(one[2]))
+        seen.append(np.square(stat).mean(axis=0) / span)
     if not misses:
         return []
     columns = zip(_AXES, *(np.array(each).T for each in (misses, uses, seen)), strict=True)

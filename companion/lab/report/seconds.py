@@ -26,16 +26,13 @@ class Run(msgspec.Struct, frozen=True):
 
 def runs(trace: Trace, verdict: VerdictTrace) -> list[Run]:
     """Join the verdicts of one source where neighbours are of one kind."""
-    states: list[State] = []
-    for words, fault in zip(verdict.words, verdict.fault, strict=True):
-        states.append("still" if words is None else "unknown" if not words else "fault" if fault else "moving")
     found: list[Run] = []
-    for k, (second, state) in enumerate(zip(trace.second, states, strict=True)):
-        before = found[-1] if found else None
-        if before is not None and before.state == state and before.last == second - 1:
-            found[-1] = msgspec.structs.replace(before, last=second)
+    for second, words, fault in zip(trace.second, verdict.words, verdict.fault, strict=True):
+        state: State = "still" if words is None else "unknown" if not words else "fault" if fault else "moving"
+        if found and found[-1].state == state and found[-1].last == second - 1:
+            found[-1] = msgspec.structs.replace(found[-1], last=second)
         else:
-            found.append(Run(second, second, state, verdict.words[k] or ""))
+            found.append(Run(second, second, state, words or ""))
     return found
 
 
@@ -123,18 +120,12 @@ def _events(found: list[Run]) -> Markup | None:
     events = sorted((run for run in found if run.state in {"moving", "fault"}), key=lambda run: run.first)
     if not events:
         return None
+    items = []
+    for run in events[:MAX_EVENTS]:
+        when, words = f"{run.first} s: ", run.words
+        if run.first != run.last:
+            # The words of the first second, without its length.
+            when, words = f"{run.first} s to {run.last + 1} s: ", words.replace(" silent for a second", " silent")
+        items.append(tag("li", tag("strong", when), words))
     more = len(events) - MAX_EVENTS
-    return tag(
-        "ul",
-        *(tag("li", tag("strong", _when(run)), _said(run)) for run in events[:MAX_EVENTS]),
-        tag("li", f"and {more} more") if more > 0 else None,
-    )
-
-
-def _said(run: Run) -> str:
-    """Give the words of the first second, without its length if there were more."""
-    return run.words if run.first == run.last else run.words.replace(" was silent for a second", " was silent")
-
-
-def _when(run: Run) -> str:
-    return f"{run.first} s: " if run.first == run.last else f"{run.first} s to {run.last + 1} s: "
+    return tag("ul", *items, tag("li", f"and {more} more") if more > 0 else None)
