@@ -15,8 +15,8 @@ from typing import Final
 
 import numpy as np
 
-from companion.fleet.judgement import Columns, History, columns_of, compass_column, counts
-from companion.fleet.sequential import Alarm, Scatter, scatter_of_model, scatter_of_part, watch
+from companion.fleet.judgement import History, columns_of, compass_column, counts
+from companion.fleet.sequential import Alarm, Columns, Scatter, scatter_of_model, scatter_of_part, watch
 from companion.physics.frames import Floats
 from companion.physics.units import DEG_H, MG
 
@@ -92,7 +92,7 @@ def alarms_of(parts: Sequence[Columns]) -> Iterator[tuple[int, Alarm]]:
     wide = parts[0].values.shape[1]
     joined = (np.concatenate([part[k] for part in parts], axis=-1) for k in range(len(Columns._fields)))
     columns = Columns(*joined)
-    for alarm in watch(*columns[:-1]):
+    for alarm in watch(columns):
         part, column = divmod(alarm.column, wide)
         one = alarm._replace(column=column if wide > 1 else 6)
         if counts(one):

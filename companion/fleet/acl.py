@@ -49,14 +49,12 @@ def access_list(broker: Broker, aircraft: Sequence[str]) -> list[str]:
         ConfigError: one is no such pair, or an id has two users.
     """
     name, words = _BROKERS[broker]
-    found = [_aircraft(user, which) for user, which in _pairs(aircraft)] or [_aircraft(None, name)]
-    collector = Right(COLLECTOR, ("fleet/+/confirmed", "fleet/+/wanted"), ("fleet/+/hello", "fleet/+/item"))
-    return words([collector, *found])
-
-
-def _aircraft(user: str | None, which: str) -> Right:
-    writes, reads = ([topic.format(id=which, user=user or which) for topic in topics] for topics in (_WRITES, _READS))
-    return Right(user, tuple(writes), tuple(reads))
+    rights = [Right(COLLECTOR, ("fleet/+/confirmed", "fleet/+/wanted"), ("fleet/+/hello", "fleet/+/item"))]
+    pairs: list[tuple[str | None, str]] = [*_pairs(aircraft)]
+    for user, which in pairs or [(None, name)]:
+        writes, reads = ([each.format(id=which, user=user or which) for each in topics] for topics in (_WRITES, _READS))
+        rights.append(Right(user, tuple(writes), tuple(reads)))
+    return words(rights)
 
 
 def _pairs(aircraft: Iterable[str]) -> list[tuple[str, str]]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from companion.fleet import schema
 from companion.fleet.contract import Row
 from companion.fleet.schema import Moment
-from companion.fleet.sequential import Alarm, Scatter, middle_of, scatter_of_model, scatter_of_part, watch
+from companion.fleet.sequential import Alarm, Columns, Scatter, middle_of, scatter_of_model, scatter_of_part, watch
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG, G
 
@@ -81,20 +81,6 @@ class History(NamedTuple):
     """(n, 6) white noise, same units times sqrt(s)."""
     new_zero: NDArray[np.bool_]
     """(n,) whether the gradienter's zero differs from the power-up before."""
-
-
-class Columns(NamedTuple):
-    """Arguments of `watch`, and the unit of each column."""
-
-    values: Floats
-    variance: Floats
-    temperature_degc: Floats
-    wander: Floats
-    relevel: NDArray[np.bool_]
-    first: NDArray[np.int_]
-    most_own: Floats
-    least: Floats
-    unit: Floats
 
 
 class Finding(NamedTuple):
@@ -161,7 +147,7 @@ def judge(history: History, model: Scatter | None) -> list[Finding]:
     columns = columns_of(history, model)
     n = len(history.biases)
     found: dict[tuple[int, str], Finding] = {}
-    for alarm in filter(counts, watch(*columns[:-1])):
+    for alarm in filter(counts, watch(columns)):
         axis, unit = alarm.column % 6, columns.unit[alarm.column]
         if alarm.column >= 6:
             before = found.pop((axis, "noise"), None)
@@ -198,7 +184,7 @@ def judge_compass(heading_bound_deg: Floats) -> list[Finding]:
         return []
     columns = compass_column(heading_bound_deg)
     found = []
-    for alarm in watch(*columns[:-1]):
+    for alarm in watch(columns):
         now = middle_of(heading_bound_deg[-LEARNS // 2 :])
         before = middle_of(heading_bound_deg[max(alarm.since - LEARNS, 0) : alarm.since])
         if alarm.kind == "level" and now > max(_BOUND_DEG, LEAST_TIMES * before):
@@ -236,9 +222,6 @@ def judge_zero(offset_deg: Floats, sigma_deg: Floats) -> list[Finding]:
         return []
     words = f"gradienter: its zero has moved by {moved:.2f} deg between two alignments ({moved * G * DEG / MG:.1f} mg)"
     return [Finding("zero", -1, len(offset_deg) - 1, sigmas / 2.0, words)]
-
-
-# --- one aircraft
 
 
 class _Calibration(NamedTuple):

@@ -168,38 +168,42 @@ class Alarm(NamedTuple):
     """Move of the level, or the scatter since then, in usual scatters."""
 
 
-def watch(  # noqa: PLR0915
-    values: Floats,
-    variance: Floats,
-    temperature_degc: Floats,
-    wander: Floats,
-    relevel: NDArray[np.bool_],
-    first: NDArray[np.int_],
-    most_own: Floats,
-    least: Floats,
-) -> list[Alarm]:
-    """Find the alarms of all columns, in the order in which they were raised.
+class Columns(NamedTuple):
+    """Figures of n power-ups in order, in c columns that are tested side by side."""
 
-    Args:
-        values: (n, c) of n power-ups in order, in usual scatters; NaN: not measured.
-        variance: (n, c) variance of a value beyond the usual one, in squares of the usual scatter.
-        temperature_degc: (n, c); NaN: not known.
-        wander: (c,) one sigma of the step of the level from one power-up to the next, in usual scatters.
-        relevel: (n, c) whether the reference of the measurement has changed, so that the level may differ.
-        first: (c,) number of power-ups at the beginning that define what is usual, at least 3.
-        most_own: (c,) largest accepted scatter of the column itself, in usual scatters.
-        least: (c,) least move or scatter that raises an alarm.
-    """
+    values: Floats
+    """(n, c) in usual scatters; NaN: not measured."""
+    variance: Floats
+    """(n, c) variance of a value beyond the usual one, in squares of the usual scatter."""
+    temperature_degc: Floats
+    """(n, c); NaN: not known."""
+    wander: Floats
+    """(c,) one sigma of the step of the level from one power-up to the next, in usual scatters."""
+    relevel: NDArray[np.bool_]
+    """(n, c) whether the reference of the measurement has changed, so that the level may differ."""
+    first: NDArray[np.int_]
+    """(c,) number of power-ups at the beginning that define what is usual, at least 3."""
+    most_own: Floats
+    """(c,) largest accepted scatter of the column itself, in usual scatters."""
+    least: Floats
+    """(c,) least move or scatter that raises an alarm."""
+    unit: Floats
+    """(c,) usual scatter."""
+
+
+def watch(columns: Columns) -> list[Alarm]:  # noqa: PLR0915
+    """Find the alarms of all columns, in the order in which they were raised."""
+    values, variance, temperature_degc, wander, relevel, first, most_own, least, _ = columns
     n, c = values.shape
     there = np.isfinite(values)
     unknown = ~np.isfinite(temperature_degc)
     warmer = (np.where(unknown, _AT_DEGC, temperature_degc) - _AT_DEGC) / _STEP_K
     unknown &= ~unknown.all(axis=0)
     laws = warmer[:, :, None] ** np.arange(4)
-    columns = np.arange(c)
+    every = np.arange(c)
     # A value that was not measured repeats the one before; the filter does not count it.
     held = np.maximum.accumulate(np.where(there, np.arange(n)[:, None], there.argmax(axis=0)), axis=0)
-    y, laws = np.nan_to_num(values[held, columns] - values[held[0], columns]), laws[held, columns]
+    y, laws = np.nan_to_num(values[held, every] - values[held[0], every]), laws[held, every]
     x, p = np.zeros((c, 4)), np.tile(np.diag(_BEFORE), (c, 1, 1))
     own, count = np.full(c, OWN_WEIGHT), np.full(c, OWN_WEIGHT)
     up, down, wide = np.zeros((3, c))
@@ -237,9 +241,9 @@ def watch(  # noqa: PLR0915
         p -= gain[:, :, None] * ph[:, None, :]
 
         # Scatter about the median of the three values before: a moved level makes two large residuals only.
-        before = y[latest, columns] - (laws[latest, columns, 1:] * x[:, 1:]).sum(axis=2)
+        before = y[latest, every] - (laws[latest, every, 1:] * x[:, 1:]).sum(axis=2)
         middle = before.sum(axis=0) - before.max(axis=0) - before.min(axis=0)
-        apart = h[:, 1:] - laws[latest, columns, 1:].mean(axis=0)
+        apart = h[:, 1:] - laws[latest, every, 1:].mean(axis=0)
         of_law = ((p[:, 1:, 1:] * apart[:, None, :]).sum(axis=2) * apart).sum(axis=1)
         about = usual * (1.0 + _MEDIAN_OF_3) + more + of_law
         d2 = np.square(y[k] - (h[:, 1:] * x[:, 1:]).sum(axis=1) - middle) / about

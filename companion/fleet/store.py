@@ -173,8 +173,12 @@ class Store:
                 continue
             outcome.confirmed.setdefault((item.aircraft, item.epoch), []).append(item.sequence)
             heard.add(item.aircraft)
-            columns, made = _read(item, message, outcome)
-            told.append({**item.key, **columns, "received_at": now})
+            try:
+                columns, made = read_item(item, message.payload)
+            except NotTakenError as error:
+                outcome.rejected.append((message, str(error)))
+                columns, made = _REJECTED, {}
+            told.append({**item.key, **_raw(item, message), **columns, "received_at": now})
             for table, of in made.items():
                 rows.setdefault(table, []).extend(of)
         with self._engine.begin() as connection:
@@ -254,7 +258,10 @@ class Store:
         self, connection: sa.Connection, refused: Sequence[tuple[Message, str]], now: datetime.datetime
     ) -> None:
         table = schema.rejected
-        rows = {_digest(message): (message, reason) for message, reason in refused}
+        rows: dict[str, tuple[Message, str]] = {}
+        for message, reason in refused:
+            digest = hashlib.sha256(message.topic.encode() + b"\0" + message.payload).hexdigest()[:32]
+            rows[digest] = message, reason
         for digest, (message, reason) in sorted(rows.items()):
             insert = self._insert(table).values(
                 digest=digest,
@@ -310,16 +317,6 @@ class Store:
         return len(found) == _AGAIN
 
 
-def _read(item: Item, message: Message, outcome: Outcome) -> tuple[Row, Rows]:
-    """Parse an item into its columns and rows; add one that cannot be parsed to the rejected messages."""
-    try:
-        columns, rows = read_item(item, message.payload)
-    except NotTakenError as error:
-        outcome.rejected.append((message, str(error)))
-        columns, rows = _REJECTED, {}
-    return {**_raw(item, message), **columns}, rows
-
-
 def _refusal(error: sa.exc.SQLAlchemyError) -> str:
     return f"the database refuses it: {why(error)}"
 
@@ -350,7 +347,3 @@ def _lacking(connection: sa.Connection, which: Iterable[str]) -> dict[tuple[str,
 def _without_zero(value: object) -> object:
     """Replace zero bytes, which PostgreSQL refuses in a text."""
     return value.replace("\0", "\ufffd") if isinstance(value, str) else value
-
-
-def _digest(message: Message) -> str:
-    return hashlib.sha256(message.topic.encode() + b"\0" + message.payload).hexdigest()[:32]

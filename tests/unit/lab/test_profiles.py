@@ -245,8 +245,9 @@ def test_a_profile_that_is_not_there_is_one_line(
     assert said.err.count("\n") == 1
 
 
-def test_the_table_says_what_it_found(capsys: pytest.CaptureFixture[str], half_hour: Path) -> None:
-    assert companion(["profile", str(half_hour), "--profile", "adis16405", "--skip", "60"]) == 0
+def test_the_table_says_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str], half_hour: Path) -> None:
+    save = ["--save", "mine", "--storage", str(tmp_path)]
+    assert companion(["profile", str(half_hour), "--profile", "adis16405", "--skip", "60", *save]) == 0
     said = capsys.readouterr().out
     for words in (
         "imu imu: 0.48 h at rest in 1 recording",
@@ -254,6 +255,7 @@ def test_the_table_says_what_it_found(capsys: pytest.CaptureFixture[str], half_h
         "gyro: adis16405                     152.0             29.0",
         "used of half_hour.csv: ",
         "note: too short to tell gyro K",
+        f"check it: companion replay LOG --windows 60 --profile {tmp_path / 'profiles' / 'mine.json'}",
     ):
         assert words in said
 
