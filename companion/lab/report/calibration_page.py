@@ -126,9 +126,6 @@ def _warnings(record: Record) -> Markup | None:
     )
 
 
-# ------------------------------------------------------------------------------------------------------- an IMU
-
-
 def _imu(imu: ImuRecord, flown: Sequence[str]) -> Markup:
     temperature = "temperature unknown" if imu.temperature_degc is None else f"{imu.temperature_degc:.1f} degC"
     return join(
@@ -184,9 +181,6 @@ def _triad(imu: ImuRecord, triad: Triad) -> Markup:
     )
 
 
-# ------------------------------------------------------------------------------------------------- what was written
-
-
 def _written(record: Record) -> Markup | None:
     if not any(imu.written for imu in record.imus):
         return None
@@ -218,9 +212,6 @@ def _written(record: Record) -> Markup | None:
 
 def _setting(value: float | None) -> Markup:
     return tag("span", "unknown") if value is None else number(value, ".6g")
-
-
-# ----------------------------------------------------------------------------------------------------------- pose
 
 
 def _pose(record: Record) -> Markup:
@@ -263,9 +254,6 @@ def _angle(value: float | None, sigma: float | None, sign: str) -> Markup:
         return join(number(value, f"{sign}.2f"), " deg")
     shown, width = with_sigma(value, sigma, 1.0, sign)
     return join(shown, " ± ", width, " deg")
-
-
-# ---------------------------------------------------------------------------------------------------------- drift
 
 
 def _drift(material: Material) -> Markup:

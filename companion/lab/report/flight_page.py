@@ -78,9 +78,6 @@ def _imu(flight: Flight, imu: ImuFlight) -> list[Child]:
     ]
 
 
-# ---------------------------------------------------------------------------------------------------------- drift
-
-
 def _drift(flight: Flight, imu: ImuFlight) -> list[Child]:
     sets = {name: rows for name, rows in list(imu.drift.items())[:_MOST_SETS] if rows}
     if not sets:
@@ -137,9 +134,6 @@ def _drift_plot(imu: ImuFlight, sets: dict[str, list[Drift]], shape: dict[str, t
         plot.line(points, f"run {shape[name][0]}")
         plot.points(points, shape[name][0], [(up(one.median_m), up(one.worst_m)) for one in rows])
     return plot.svg()
-
-
-# --------------------------------------------------------------------------------------------------------- biases
 
 
 def _biases(flight: Flight, imu: ImuFlight) -> list[Child]:
