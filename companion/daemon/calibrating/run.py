@@ -339,6 +339,7 @@ class CalibrationRun(Job):
 
     def _imu_records(self) -> tuple[ImuRecord, ...]:
         found = record_of(self.solution, self.log.started_at, 0.0, whole=self.whole).imus
+        before = {} if self.before is None else {imu.name: imu for imu in self.before.imus}
         return tuple(
             msgspec.structs.replace(
                 imu,
@@ -348,7 +349,7 @@ class CalibrationRun(Job):
                 unchanged=tuple(sorted(triad for name, triad in self.unchanged if name == imu.name)),
                 gyro_id=self.device_ids.get(imu.name, (None, None))[0],
                 accel_id=self.device_ids.get(imu.name, (None, None))[1],
-            )
+            ).confirming(before.get(imu.name))
             for imu in found
         )
 

@@ -7,12 +7,14 @@ and never zero. All axes are the vehicle's FRD.
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Callable
 from typing import Literal
 
 import msgspec
 
 from companion import formats
-from companion.samples import Triad, Vector
+from companion.samples import TRIADS, Triad, Vector
 
 FORMAT_VERSION = 1
 
@@ -237,27 +239,63 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """The gyro's device id in the autopilot; None where it has none, or by an older version. Likewise the next."""
     accel_id: int | None = None
 
-    def _of(self, triad: Triad) -> tuple[Vector | None, Vector | None, Vector | None]:
-        """sigma_use, the residual and the part of sigma_use for a warm-up."""
-        if triad == "gyro":
-            return self.gyro_sigma_use_rad_s, self.residual_gyro_rad_s, self.gyro_sigma_warm_up_rad_s
-        return self.accel_sigma_use_m_s2, self.residual_accel_m_s2, self.accel_sigma_warm_up_m_s2
+    gyro_sigma_in_force_rad_s: Vector | None = None
+    """One sigma of the gyro offsets that this calibration left unchanged; None where it wrote them."""
+    accel_sigma_in_force_m_s2: Vector | None = None
+    """One sigma of the accelerometer offsets that this calibration left unchanged; None where it wrote them."""
 
     def sigma_in_force(self, triad: Triad) -> Vector | None:
-        """sigma_use of what the offsets leave; those not written again are off by what was found, too."""
-        sigma, residual, _ = self._of(triad)
+        """Return one sigma of what the offsets in force leave in the output, for the next minutes."""
+        known = self.gyro_sigma_in_force_rad_s if triad == "gyro" else self.accel_sigma_in_force_m_s2
+        if known is not None:
+            return known
+        sigma, _, residual, _ = self._figures(triad)
         if sigma is None or residual is None or triad not in self.unchanged:
             return sigma
-        x, y, z = map(math.hypot, sigma, residual)
-        return x, y, z
+        return _each(math.hypot, sigma, residual)
 
     def settled_sigma(self, triad: Triad) -> Vector | None:
-        """sigma_use without that part, which moves old and new offsets alike."""
-        whole, _, part = self._of(triad)
-        if whole is None or part is None:
+        """Return sigma_use without the warm-up, which moves the output alike under old and new offsets."""
+        whole, _, _, warm_up = self._figures(triad)
+        if whole is None or warm_up is None:
             return whole
-        x, y, z = (math.sqrt(max(use**2 - of**2, 0.0)) for use, of in zip(whole, part, strict=True))
-        return x, y, z
+        return _each(lambda use, part: math.sqrt(max(use**2 - part**2, 0.0)), whole, warm_up)
+
+    def confirming(self, before: ImuRecord | None) -> ImuRecord:
+        """Return this record with the sigma of the offsets that it left unchanged; `before` describes their origin."""
+        gyro, accel = (self._confirmed(triad, before) for triad in TRIADS)
+        return msgspec.structs.replace(self, gyro_sigma_in_force_rad_s=gyro, accel_sigma_in_force_m_s2=accel)
+
+    def _confirmed(self, triad: Triad, before: ImuRecord | None) -> Vector | None:
+        sigma, averaged, residual, _ = self._figures(triad)
+        earlier = None if before is None or triad in before.held_back else before.sigma_in_force(triad)
+        if earlier is None or sigma is None or averaged is None or residual is None or triad not in self.unchanged:
+            return None
+        return _each(_confirmed_sigma, earlier, sigma, averaged, residual)
+
+    def _figures(self, triad: Triad) -> tuple[Vector | None, Vector | None, Vector | None, Vector | None]:
+        """Return sigma_use, sigma_stat, the residual, and the part of sigma_use for a warm-up."""
+        if triad == "gyro":
+            sigmas = self.gyro_sigma_use_rad_s, self.gyro_sigma_stat_rad_s
+            return *sigmas, self.residual_gyro_rad_s, self.gyro_sigma_warm_up_rad_s
+        sigmas = self.accel_sigma_use_m_s2, self.accel_sigma_stat_m_s2
+        return *sigmas, self.residual_accel_m_s2, self.accel_sigma_warm_up_m_s2
+
+
+def _confirmed_sigma(earlier: float, sigma: float, averaged: float, residual: float) -> float:
+    """Return one sigma of an offset of known sigma after a second measurement has found this residual.
+
+    The residual counts by the share that its own noise does not explain. The second measurement alone would leave
+    hypot(sigma, residual). No average of the two sigmas is claimed: part of their errors is common.
+    """
+    gain = earlier**2 / max(earlier**2 + averaged**2, sys.float_info.min)
+    return min(math.hypot(earlier, gain * residual), math.hypot(sigma, residual))
+
+
+def _each(function: Callable[..., float], *vectors: Vector) -> Vector:
+    """Apply a function axis by axis."""
+    x, y, z = map(function, *vectors)
+    return x, y, z
 
 
 class Arming(msgspec.Struct, frozen=True, kw_only=True):

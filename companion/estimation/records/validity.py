@@ -133,7 +133,7 @@ class Finding(msgspec.Struct, frozen=True):
 def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
     """The horizon H at which the expected wandering, V(T, H) without its white part, reaches DRIFT_SIGMAS sigma_use.
 
-    At most a day (method 2.2); of `sigma`, as in `Held`, the smallest axis counts, `averaged_s` is T.
+    At most a day, far beyond the configured limit. The smallest axis of `sigma` counts; `averaged_s` is T.
     """
     allowed = (DRIFT_SIGMAS * min(sigma)) ** 2
 

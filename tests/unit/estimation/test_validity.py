@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -24,6 +25,7 @@ from companion.estimation.records.validity import (
 from companion.physics.units import DEG_H
 from companion.samples import Vector
 from tests.support.allan import use_variance
+from tests.support.histories import imu_record
 
 GYRO = PROFILES["icm42688p"].gyro
 LIMITS = Limits(max_age_s=1800.0, max_temperature_change_k=3.0)
@@ -153,3 +155,25 @@ def test_a_warm_up_to_come_is_in_the_promise_and_in_no_comparison() -> None:
     assert worth_writing(off, young, 0.0)
     assert worth_writing(off, None, 0.0)
     assert age_limit_s(GYRO, young.sigma, 30.0) == age_limit_s(GYRO, HELD.sigma, 30.0)
+
+
+@pytest.mark.parametrize("coarse_deg_h", [5.0, 12.0, 30.0])
+def test_offsets_left_unchanged_keep_the_sigma_of_the_better_measurement(coarse_deg_h: float) -> None:
+    """Offsets known to 12 deg/h are measured again: drawn errors stay within the sigma that is stated."""
+    fine, random = 12.0, np.random.default_rng(11)
+    before = msgspec.structs.replace(imu_record(), gyro_sigma_use_rad_s=(fine * DEG_H,) * 3)
+    error = random.normal(0.0, fine, (3000, 3))
+    residual = error + random.normal(0.0, coarse_deg_h, error.shape)
+    said = []
+    for row in residual * DEG_H:
+        again = msgspec.structs.replace(
+            before,
+            gyro_sigma_stat_rad_s=(coarse_deg_h * DEG_H,) * 3,
+            gyro_sigma_use_rad_s=(coarse_deg_h * DEG_H,) * 3,
+            residual_gyro_rad_s=(row[0], row[1], row[2]),
+            unchanged=("gyro",),
+        )
+        said.append(again.confirming(before).sigma_in_force("gyro") or ())
+    sigma = np.array(said) / DEG_H
+    assert 0.95 < np.mean(np.abs(error) < 2.0 * sigma) < 0.995
+    assert np.sqrt(np.mean(np.square(sigma))) < 1.3 * fine
