@@ -11,9 +11,9 @@ import numpy as np
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import by_power_up, kept
-from companion.estimation.solution.at_end import Pair, at_end, foretold
+from companion.estimation.solution.joint import at_end, with_warm
 from companion.estimation.solution.prior import ExpectedImu, curve_of, follow
-from companion.estimation.temperature.along import settling
+from companion.estimation.temperature.curve import settling
 from sim.accuracy.figures import Claim, Section, covered, rms
 from sim.accuracy.stand import POSTURES, References, collected, samples, sites, solved, stand
 from sim.accuracy.temperature import AMBIENT_DEGC, COVERS, DAYS, TRIED, Aircraft
@@ -71,22 +71,21 @@ def mid_warm_up(part: str, rate_k_min: float, seed: int, number: int) -> MidRun:
         solution = solved(standing, window, References.drawn(0.05, 0.5, random))
         plain = solution.imus[0]
         assert plain.gyro_rad_s is not None
-        plain_end: Pair = (plain.gyro_rad_s, None)
-        end = plain_end
+        end = plain.gyro_rad_s
         path = None if plain.warming is None else plain.warming.path
         said, known = plain, ExpectedImu(name="imu")
         if curve is not None and path is not None:
             known = ExpectedImu(name="imu", along={"gyro": follow(curve, path, settles, profile.gyro)})
-            said, end, followed = at_end(plain, plain_end, known, solution.shared)
-            said = foretold(said, end, known, followed)
+            said, shift, followed = at_end(plain, known, solution.shared)
+            end = end + shift[:3]
+            said = with_warm(said, (end, None), known, followed)
         truth = standing.bias(window.end_s - 0.5, window.end_s + 0.5)[:3]
         late_s = window.end_s + _FLAT * board.time_constant_s
         warm = standing.bias(late_s - 0.5, late_s + 0.5)[:3]
         told = said.when_warm
         unknown = np.full(3, np.nan)
-        assert end[0] is not None
         found.append([
-            end[0] - truth,
+            end - truth,
             np.sqrt(np.diag(said.covariance)[:3]),
             unknown if told is None else np.array(told.gyro_bias_rad_s) - warm,
             unknown if told is None else np.array(told.gyro_sigma_rad_s),

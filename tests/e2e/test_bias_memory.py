@@ -54,7 +54,7 @@ def power_up(
             before(rig)
         records = []
         async with rig.running():
-            rig.service.calibrating.memory.whose.power_up = lambda name, unix_s: since(run)  # type: ignore[method-assign]
+            rig.service.calibrating.memory.identities.power_up = lambda name, unix_s: since(run)  # type: ignore[method-assign]
             await rig.ready()
             for _ in range(times):
                 result, record = await calibrated(rig)

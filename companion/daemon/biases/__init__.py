@@ -1,1 +1,1 @@
-"""What is known of each IMU's biases from earlier power-ups, and whose it is."""
+"""Memory of each IMU's biases from earlier power-ups, and the IMU's identity."""

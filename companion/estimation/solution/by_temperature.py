@@ -1,13 +1,29 @@
 """Biases of one IMU over temperature, as the terminal, the page and reports show them.
 
-Built by `temperature_summary`. Without numpy: the page's process reads them.
+Imports no numpy: the page's process reads these types.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Final
+
 import msgspec
 
+from companion.estimation.records.history import WEIGHS_FROM, Point, PowerUp, by_power_up
+from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
+
+if TYPE_CHECKING:
+    from companion.estimation.temperature.curve import Curve
+
+STEP_K: Final = 1.0
+"""Distance between the rows of a curve."""
+MOST_ROWS: Final = 60
+_ENOUGH_K: Final = 5.0
+"""Least span of temperatures for a curve (method 3.3)."""
+_DAY_S: Final = 86400.0
 
 
 class Seen(msgspec.Struct, frozen=True, kw_only=True):
@@ -22,7 +38,7 @@ class Seen(msgspec.Struct, frozen=True, kw_only=True):
     gyro_deg_h: Vector
     sigma_deg_h: Vector
     accel_mg: Vector | None
-    """Known where the tilt was known."""
+    """None: the tilt was unknown."""
     accel_sigma_mg: Vector | None
 
 
@@ -43,7 +59,7 @@ class ExpectedForces(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU."""
+    """Biases of one IMU over temperature."""
 
     imu: str
     summary: str = ""
@@ -63,3 +79,114 @@ class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
     """Bias now: as last measured in this power-up, moved along the curve since."""
     at_power_up: Expected | None = None
     """Bias that the curve expects of a power-up at the temperature now."""
+
+
+def by_temperature(
+    name: str,
+    points: Sequence[Point],
+    curve: Curve | None,
+    accel: Curve | None = None,
+    *,
+    power_up: PowerUp | None,
+    now_degc: float | None = None,
+    started_at: str = "",
+) -> ByTemperature:
+    """Build the summary of one IMU.
+
+    Args:
+        name: of the IMU.
+        points: all points kept of the IMU.
+        curve: the gyros' curve through them.
+        accel: the accelerometers' curve through them.
+        power_up: the present one; None: unknown.
+        now_degc: the temperature; None: that of the last window of this power-up.
+        started_at: the calibration that counts as now, in a look back; empty: the last window of this power-up.
+    """
+    groups = by_power_up([point for point in points if point.temperature_degc is not None and point.gyro is not None])
+    seen = [found for k, group in enumerate(groups) for point in group if (found := _seen(point, k)) is not None]
+    same = (k for k, group in enumerate(groups) for p in group if power_up is not None and p.power_up.is_same(power_up))
+    today = next(same, None)
+    of_today = [one for one in seen if one.power_up == today and started_at in ("", one.started_at)]
+    last = max(of_today, key=lambda one: one.at_unix_s, default=None)
+    degc = now_degc if now_degc is not None or last is None else last.degc
+    degcs = [one.degc for one in seen]
+    days = len({math.floor(one.at_unix_s / _DAY_S) for one in seen})
+    windows = f"{_many(len(seen), 'still window')}, {_many(len(groups), 'power-up')} on {_many(days, 'day')}"
+    return ByTemperature(
+        imu=name,
+        summary=f"{windows}, {min(degcs):.0f} to {max(degcs):.0f} degC" if degcs else "nothing seen yet",
+        power_ups=len(groups),
+        days=days,
+        points=tuple(sorted(seen, key=lambda one: one.at_unix_s)),
+        curve=() if curve is None else tuple(_expected(curve, step) for step in _steps(*curve.span_degc)),
+        accel_curve=() if accel is None else tuple(_forces(accel, step) for step in _steps(*accel.span_degc)),
+        needs=None if curve is not None else _needs(len(points), len(groups), degcs),
+        today=today,
+        now=None if last is None or degc is None else _moved(last, curve, degc),
+        at_power_up=None if curve is None or degc is None else _expected(curve, degc),
+    )
+
+
+def _seen(point: Point, power_up: int) -> Seen | None:
+    if point.temperature_degc is None or point.gyro is None:
+        return None
+    return Seen(
+        at_unix_s=round(point.unix_s),
+        started_at=point.started_at,
+        power_up=power_up,
+        degc=point.temperature_degc,
+        gyro_deg_h=_in(DEG_H, point.gyro.bias),
+        sigma_deg_h=_in(DEG_H, point.gyro.sigma_use),
+        accel_mg=None if point.accel is None else _in(MG, point.accel.bias),
+        accel_sigma_mg=None if point.accel is None else _in(MG, point.accel.sigma_use),
+    )
+
+
+def _expected(curve: Curve, degc: float) -> Expected:
+    bias, variance = curve.at(degc)
+    return Expected(degc=round(degc, 2), gyro_deg_h=_in(DEG_H, bias), sigma_deg_h=_in(DEG_H, map(math.sqrt, variance)))
+
+
+def _forces(curve: Curve, degc: float) -> ExpectedForces:
+    bias, variance = curve.at(degc)
+    return ExpectedForces(degc=round(degc, 2), accel_mg=_in(MG, bias), sigma_mg=_in(MG, map(math.sqrt, variance)))
+
+
+def _moved(last: Seen, curve: Curve | None, degc: float) -> Expected:
+    """Move the last measured bias to another temperature; without a curve it stays at its own."""
+    if curve is None:
+        return Expected(degc=last.degc, gyro_deg_h=last.gyro_deg_h, sigma_deg_h=last.sigma_deg_h)
+    change, variance = curve.change((last.degc, 0.0), (degc, 0.0))
+    return Expected(
+        degc=round(degc, 2),
+        gyro_deg_h=_in(1.0, last.gyro_deg_h + change / DEG_H),
+        sigma_deg_h=_in(1.0, map(math.hypot, last.sigma_deg_h, map(math.sqrt, variance / DEG_H**2))),
+    )
+
+
+def _steps(low: float, high: float) -> Iterable[float]:
+    step = max(STEP_K, (high - low) / MOST_ROWS)
+    inner = (step * k for k in range(math.floor(low / step) + 1, math.ceil(high / step)))
+    return (low, *inner, high)
+
+
+def _many(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _needs(known: int, power_ups: int, degc: Sequence[float]) -> str:
+    if not degc:
+        if known:
+            return "its temperature is not known: no curve without a thermometer"
+        return "ten still seconds at a known temperature are the first point"
+    if power_ups < WEIGHS_FROM:
+        return f"{power_ups} of {WEIGHS_FROM} power-ups seen; still seconds at other temperatures will draw a curve"
+    span_k = max(degc) - min(degc)
+    if span_k >= _ENOUGH_K:
+        return "no curve: its bias does not follow the temperature that it tells; another sensor's?"
+    return f"only {span_k:.0f} K seen; still seconds where it is warmer or colder will draw a curve"
+
+
+def _in(unit: float, axes: Iterable[float]) -> Vector:
+    x, y, z = (round(float(value) / unit, 3) for value in axes)
+    return x, y, z

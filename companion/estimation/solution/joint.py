@@ -1,6 +1,10 @@
-"""What is known from before, and today's readings of all IMUs, as one estimate (method 3.3).
+"""Combines the predictions of earlier calibrations with today's readings of all IMUs (method 3.3).
 
-With d the biases by today's readings and p those expected, all IMUs together,
+A window that warmed is moved to its end first: the mean over it is that of its mean temperature. The curve predicts how
+the bias went from there to the end, the readings' own slope measures it, and each has a share by its variance. Where
+they contradict each other the window alone counts: its mean, or the end of its ramp.
+
+Then, with d the biases by today's readings and p the predictions, all IMUs together,
 
     d = b + e_d     p = b + e_p     b_MAP = d + K (p - d)     K = cov(e_d, e_d - e_p) cov(e_d - e_p)^-1
 
@@ -10,8 +14,8 @@ well, so that nothing averages it away. Where they were made with other zeros, s
 
 A sigma_use that is too cautious would hand the estimate to the prior. So K counts as e_d only what is *known* to be
 noise: what averaging has left (sigma_stat), the gradienter's scatter, what is not known of the platform's turn, and
-the sigma of the zero if somebody vouches for it. K is then smaller than the best one, and with any K between zero and
-twice that the estimate is no worse than without a prior. The covariance is that of the K used, with the whole S_d.
+the sigma of the zero if it was measured or configured. K is then smaller than the best one, and with any K between zero
+and twice that the estimate is no worse than without a prior. The covariance is that of the K used, with the whole S_d.
 """
 
 from __future__ import annotations
@@ -19,21 +23,20 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
-from companion.estimation.records.history import Measured, Point, PowerUp
-from companion.estimation.records.record import AccelPrior, GyroPrior, Prior
-from companion.estimation.solution.at_end import Pair, at_end, foretold
-from companion.estimation.solution.doubt import Doubt, Witness, doubts
+from companion.estimation.means.warming import NEXT_S
+from companion.estimation.records.record import AccelPrior, GyroPrior, Prior, WhenWarm
+from companion.estimation.solution.doubt import Doubt, Witness, contradictions
 from companion.estimation.solution.prior import Expectation, Expected, ExpectedImu
-from companion.estimation.solution.solve import ImuSolution, Shared, Solution
+from companion.estimation.solution.solve import ImuSolution, Pair, Shared, Solution, moved
 from companion.estimation.turning.watch import CHANCE_SIGMAS, Turn
-from companion.physics.frames import Array, Matrix, vector
-from companion.physics.units import DEG
-from companion.samples import TRIADS, Triad, Vector, rows_of
+from companion.physics.frames import Array, vector
+from companion.physics.units import DEG, UNITS
+from companion.samples import TRIADS, Triad, rows_of
 
 Whole = Mapping[str, Pair]
 """By IMU: whole gyro and accelerometer bias by the readings alone, (3,) each, vehicle FRD."""
@@ -42,19 +45,25 @@ AGREES: Final = 11.34
 """Chi square of three axes that is passed by chance once in a hundred: beyond it nobody is warned yet, but what may
 well be of another sensor takes no part."""
 BOUNDS_RAD_S: Final = 0.1 * DEG
-"""One sigma; what is known worse than that (no thermometer, say) says nothing of a turn."""
+"""Largest sigma of a gyro's prediction that says something of a turn."""
+_CONTRADICTS: Final = 4.0
+"""Sigmas between the slope of the readings and that of the curve."""
+_WORTH_SAYING: Final = 2.0
+"""Least change until warm that is reported, in sigma_use."""
+_END_OF_RAMP: Final = 0.25
+"""Variance of a mean over that of the end of a line through the same values (`robust.Line.end_leverage`)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Weighed:
-    """A solution with what was known before."""
+    """A solution that earlier calibrations have taken part in, and what contradicts them."""
 
     solution: Solution
     doubts: tuple[Doubt, ...]
 
     @property
     def doubted(self) -> dict[tuple[str, Triad], Doubt]:
-        """By IMU and triad, what speaks against it; a tilt or a turn is in all, whether each shows it or not."""
+        """Contradictions by IMU and triad; a tilt or a turn is in all IMUs, whether each shows it or not."""
         return {
             (name, doubt.triad): doubt
             for doubt in reversed(self.doubts)
@@ -64,7 +73,7 @@ class Weighed:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Known:
-    """One triad that something is expected of."""
+    """One triad with a prediction."""
 
     imu: int
     triad: Triad
@@ -77,210 +86,154 @@ class _Known:
         start = 6 * self.imu + rows_of(self.triad).start
         return slice(start, start + 3)
 
+    @property
+    def agrees(self) -> bool:
+        """Whether the measurement is near enough for the prediction to take part."""
+        covariance = np.diag(self.witness.own_variance) + self.witness.common
+        difference = self.witness.difference
+        return float(difference @ np.linalg.solve(covariance, difference)) < AGREES
+
 
 def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed:
-    """Take in what was known from before: guard against it, and let it take part where it may."""
+    """Check a solution against earlier calibrations, and let them take part where they may."""
     expected = {each.name: each for each in expectation.imus}
-    solution, whole, followed = _at_end(solution, whole, expected)
-    solution = dataclasses.replace(
-        solution, imus=tuple(_with_effect(imu, expected.get(imu.name), solution.shared) for imu in solution.imus)
+    ends = [at_end(imu, expected.get(imu.name), solution.shared) for imu in solution.imus]
+    whole = {imu.name: moved(whole[imu.name], shift) for imu, shift, _ in ends if imu.name in whole}
+    imus = tuple(_with_effect(imu, expected.get(imu.name), solution.shared) for imu, _, _ in ends)
+    solution = dataclasses.replace(solution, imus=imus)
+    earlier, today = (_known(solution, whole, expected, today=today) for today in (False, True))
+    doubts = contradictions(
+        [(one.triad, one.witness) for one in earlier],
+        [(one.triad, one.witness) for one in today],
+        len(imus),
+        solution.shared.up,
+        solution.shared.by_reading,
     )
-    known, of_today = (_known(solution, whole, expected, today=today) for today in (False, True))
-    found = Weighed(solution, tuple(_doubts(solution, known, of_today)))
+    found = Weighed(solution, tuple(doubts))
     used = [
         one
-        for one in known
-        if one.expected.weighs and (one.witness.name, one.triad) not in found.doubted and _agrees(one.witness)
+        for one in earlier
+        if one.expected.weighs and (imus[one.imu].name, one.triad) not in found.doubted and one.agrees
     ]
-    weighed = _estimate(solution, used, zero_is_known=expectation.zero_is_known) if used else solution
-    weighed = _grounded(weighed, known, of_today)
-    imus = []
-    for k, imu in enumerate(weighed.imus):
-        own = [doubt.words for doubt in found.doubts if not doubt.of_all and imu.name in doubt.names]
-        prior = _prior([one for one in known if one.imu == k], used)
+    weighed, shift = _combined(solution, used, zero_is_known=expectation.zero_is_known)
+    weighed = _grounded(weighed, earlier, today)
+    final = []
+    for k, (imu, (_, _, followed)) in enumerate(zip(weighed.imus, ends, strict=True)):
+        own = [doubt.words for doubt in doubts if not doubt.of_all and imu.name in doubt.names]
+        prior = _prior([one for one in earlier if one.imu == k], used)
         if imu.name in whole:
-            imu = foretold(
-                imu, _shifted_by(whole[imu.name], solution.imus[k], imu), expected.get(imu.name), followed[k]
-            )
-        imus.append(dataclasses.replace(imu, prior=prior, warnings=(*imu.warnings, *own)))
-    common = [doubt.words for doubt in found.doubts if doubt.of_all]
-    weighed = dataclasses.replace(weighed, imus=tuple(imus), warnings=(*solution.warnings, *common))
+            now = moved(whole[imu.name], shift[6 * k : 6 * k + 6])
+            imu = with_warm(imu, now, expected.get(imu.name), followed)
+        final.append(dataclasses.replace(imu, prior=prior, warnings=(*imu.warnings, *own)))
+    common = [doubt.words for doubt in doubts if doubt.of_all]
+    weighed = dataclasses.replace(weighed, imus=tuple(final), warnings=(*solution.warnings, *common))
     return Weighed(weighed, found.doubts)
 
 
-def _at_end(
-    solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu]
-) -> tuple[Solution, Whole, list[tuple[Triad, ...]]]:
-    """Where the temperature changed: the same at the end of the window; and of which triads of each."""
-    imus, moved, followed = [], dict(whole), []
-    for imu in solution.imus:
-        of: tuple[Triad, ...] = ()
-        if imu.name in whole and imu.name in expected:
-            imu, moved[imu.name], of = at_end(imu, whole[imu.name], expected[imu.name], solution.shared)
-        imus.append(imu)
-        followed.append(of)
-    return dataclasses.replace(solution, imus=tuple(imus)), moved, followed
+# --- a window that warmed
 
 
-def _shifted_by(whole: Pair, before: ImuSolution, after: ImuSolution) -> Pair:
-    """Whole biases with what an estimate has become."""
-    pairs = (before.gyro_rad_s, after.gyro_rad_s), (before.accel_m_s2, after.accel_m_s2)
-    gyro, accel = (
-        None if bias is None or one is None or other is None else bias + other - one
-        for bias, (one, other) in zip(whole, pairs, strict=True)
+def at_end(
+    imu: ImuSolution, expected: ExpectedImu | None, shared: Shared
+) -> tuple[ImuSolution, Array, tuple[Triad, ...]]:
+    """Move an estimate to the end of its window; also give the shift, (6,), and the triads that followed a curve."""
+    shift, stat, warm_up = np.zeros(6), imu.sigma_stat.copy(), imu.warm_up_variance.copy()
+    covariance, followed = imu.covariance.copy(), list[Triad]()
+    for triad, bias in zip(TRIADS, imu.biases, strict=True):
+        along = None if expected is None else expected.along.get(triad)
+        if along is None or bias is None or imu.warming is None:
+            continue
+        lines, half_s, slope = imu.warming.of(triad), imu.warming.half_s, np.array(along.slope)
+        of_slope = np.array(along.slope_variance)
+        more = lines.slope - slope
+        if (np.abs(more) > _CONTRADICTS * np.sqrt(lines.variance + of_slope)).any():
+            continue
+        followed.append(triad)
+        share = of_slope / (lines.variance + of_slope)
+        bend = np.maximum(np.array(along.shift_variance) - half_s**2 * of_slope, 0.0)
+        variance = half_s**2 * share * lines.variance + bend
+        rows, at = rows_of(triad), np.arange(6)[rows_of(triad)]
+        shift[rows] = np.array(along.shift) + half_s * (share * more - lines.ramp)
+        covariance[at, at] = shared.covariance[at, at] + lines.level_variance + variance
+        stat[rows] = np.sqrt(np.square(stat[rows]) * np.where(lines.ramp != 0.0, _END_OF_RAMP, 1.0) + variance)
+        # The slope may go on, or end now.
+        warm_up[rows] = (np.square(slope + share * more) / 3.0 + share * lines.variance) * (NEXT_S / 2.0) ** 2
+    gyro, accel = moved(imu.biases, shift)
+    at_its_end = dataclasses.replace(
+        imu, gyro_rad_s=gyro, accel_m_s2=accel, covariance=covariance, sigma_stat=stat, warm_up_variance=warm_up
     )
-    return gyro, accel
+    return at_its_end, shift, tuple(followed)
 
 
-def _doubts(solution: Solution, earlier: Sequence[_Known], of_today: Sequence[_Known]) -> list[Doubt]:
-    """What contradicts what was known."""
-    found: list[Doubt] = []
-    for triad in TRIADS:
-        # What was measured in this power-up says most; where it is content, nothing older has to be asked.
-        for known, today in ((of_today, True), (earlier, False)):
-            witnesses = [one.witness for one in known if one.triad == triad]
-            said = doubts(triad, witnesses, solution.shared.up, solution.shared.by_reading, today=today)
-            if said or (today and len(witnesses) == len(solution.imus)):
-                found += said
-                break
-    return found
-
-
-def _grounded(solution: Solution, earlier: Sequence[_Known], today: Sequence[_Known]) -> Solution:
-    """Where neither a compass nor a rest has told how fast the platform turns, what is known of the gyros bounds it.
-
-    What they read more about the vertical is taken for chance up to `CHANCE_SIGMAS`, and else belongs to sigma. Only
-    earlier power-ups tell that nothing turns: what was measured today may have turned already.
-    """
-    if solution.turn.is_told or solution.platform == "deck":
-        return solution
-    up, more_rad_s = solution.shared.up, 0.0
-    for known in (earlier, today):
-        found = [_about(up, one.witness) for one in known if one.triad == "gyro"]
-        rate, sigma = min(found, key=lambda each: each[1], default=(0.0, math.inf))
-        if abs(rate) > CHANCE_SIGMAS * sigma:
-            more_rad_s = max(more_rad_s, abs(rate))
-        if known is earlier and sigma < BOUNDS_RAD_S:
-            turn = Turn(rate_rad_s=-rate, sigma_rad_s=sigma, by="earlier calibrations")
-            solution = dataclasses.replace(solution, turn=turn)
-    by_turn = np.zeros((6, 6))
-    by_turn[:3, :3] = np.outer(up, up) * more_rad_s**2
-    return dataclasses.replace(
-        solution,
-        shared=dataclasses.replace(solution.shared, covariance=solution.shared.covariance + by_turn),
-        imus=tuple(dataclasses.replace(imu, covariance=imu.covariance + by_turn) for imu in solution.imus),
-        cross={pair: matrix + by_turn for pair, matrix in solution.cross.items()},
+def with_warm(imu: ImuSolution, whole: Pair, expected: ExpectedImu | None, followed: Collection[Triad]) -> ImuSolution:
+    """Add the biases that are predicted for when the IMU is warm, from the `whole` biases now."""
+    figures: dict[Triad, tuple[Array, Array]] = {}
+    words, degc = [], 0.0
+    for triad, now in zip(TRIADS, whole, strict=True):
+        along = None if expected is None or triad not in followed else expected.along.get(triad)
+        warm = None if along is None else along.warm
+        if warm is None or now is None:
+            continue
+        change, degc = np.array(warm.change), warm.degc
+        present = np.diag(imu.covariance)[rows_of(triad)]
+        sigma = np.sqrt(present + np.array(warm.variance))
+        figures[triad] = now + change, sigma
+        worst = int(np.abs(change).argmax())
+        if abs(change[worst]) > _WORTH_SAYING * np.sqrt(present[worst]):
+            unit, name, digits = UNITS[triad]
+            then, of_then = (now + change)[worst] / unit, sigma[worst] / unit
+            words.append(
+                f"{triad} {imu.name} {'xyz'[worst]} now {now[worst] / unit:.{digits}f} {name},"
+                f" at {degc:.0f} degC {then:.{digits}f} +- {of_then:.{digits}f}"
+            )
+    if "gyro" not in figures:
+        return imu
+    when = WhenWarm(
+        degc=round(degc, 1),
+        gyro_bias_rad_s=vector(figures["gyro"][0]),
+        gyro_sigma_rad_s=vector(figures["gyro"][1]),
+        accel_bias_m_s2=vector(figures["accel"][0]) if "accel" in figures else None,
+        accel_sigma_m_s2=vector(figures["accel"][1]) if "accel" in figures else None,
+        words=tuple(words),
     )
+    return dataclasses.replace(imu, when_warm=when, drifting=tuple(words))
 
 
-def _about(up: Array, witness: Witness) -> tuple[float, float]:
-    """By how much it reads more about the vertical than expected, and one sigma of that."""
-    variance = np.square(up) @ witness.own_variance + up @ witness.common @ up
-    return float(up @ witness.difference), math.sqrt(variance)
-
-
-def points(
-    solution: Solution,
-    whole: Whole,
-    found: Iterable[Doubt],
-    *,
-    started_at: str,
-    unix_s: float,
-    power_ups: Mapping[str, PowerUp],
-    zero: str | None,
-) -> dict[str, Point]:
-    """By IMU, what later calibrations may know of this one."""
-    shared = solution.shared
-    doubted = {(doubt.triad, name) for doubt in found for name in doubt.names}
-    by_zero = _by_reading(shared) * shared.zero_sigma_rad
-    common = np.diag(shared.covariance).copy()
-    common[3:] = np.maximum(common[3:] - np.diag(by_zero @ by_zero.T), 0.0)
-
-    def measured(imu: ImuSolution, triad: Triad) -> Measured | None:
-        bias = whole[imu.name][TRIADS.index(triad)]
-        if bias is None:
-            return None
-        part = rows_of(triad)
-        return Measured(
-            bias=_short(bias if imu.warming is None else bias - imu.warming.ahead(triad)),
-            sigma_stat=_short(imu.sigma_stat[part]),
-            sigma_use=_short(np.sqrt(_own_variance(imu, shared)[part])),
-            sigma_shared=_short(np.sqrt(common[part])),
-            suspect=(triad, imu.name) in doubted,
-        )
-
-    return {
-        imu.name: Point(
-            started_at=started_at,
-            unix_s=unix_s,
-            power_up=power_ups[imu.name],
-            temperature_degc=imu.mean_degc,
-            k_s=imu.k_s,
-            up=_short(shared.up),
-            zero=zero if whole[imu.name][1] is not None else None,
-            zero_sigma_rad=shared.zero_sigma_rad,
-            gyro=measured(imu, "gyro"),
-            accel=measured(imu, "accel"),
-        )
-        for imu in solution.imus
-        if imu.name in whole
-    }
-
-
-def _short(values: Array) -> Vector:
-    """In as many digits as are worth keeping: 9 decimals are 2e-4 deg/h."""
-    return vector(np.round(values, 9))
+# --- predictions and measurements
 
 
 def _with_effect(imu: ImuSolution, expected: ExpectedImu | None, shared: Shared) -> ImuSolution:
-    """What the accelerometers' bias is worth at another attitude."""
-    effect = expected.effect if expected is not None else None
+    """Add what the accelerometers' bias is worth at another attitude."""
+    effect = None if expected is None else expected.effect
     if imu.accel_m_s2 is None or effect is None:
         return imu
-    warning = effect.warning(imu.name, shared.gravity_m_s2, shared.up, imu.accel_sigma_use_m_s2)
-    return dataclasses.replace(
-        imu,
-        effective=effect.effective(shared.gravity_m_s2, shared.up, imu.accel_sigma_use_m_s2),
-        warnings=imu.warnings if warning is None else (*imu.warnings, warning),
-    )
+    figures = shared.gravity_m_s2, shared.up, imu.accel_sigma_use_m_s2
+    warning = effect.warning(imu.name, *figures)
+    warnings = imu.warnings if warning is None else (*imu.warnings, warning)
+    return dataclasses.replace(imu, effective=effect.effective(*figures), warnings=warnings)
 
 
 def _known(solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu], *, today: bool) -> list[_Known]:
+    """Pair each prediction with its measurement."""
     found: list[_Known] = []
     for triad, (k, imu) in itertools.product(TRIADS, enumerate(solution.imus)):
         said, measured = expected.get(imu.name), whole[imu.name][TRIADS.index(triad)] if imu.name in whole else None
         known = None if said is None else (said.today if today else said.earlier).get(triad)
         if measured is not None and known is not None:
-            witness = _witness(imu, solution.shared, triad, known, measured)
-            found.append(_Known(k, triad, known, measured, witness))
+            found.append(_Known(k, triad, known, measured, _witness(imu, solution.shared, triad, known, measured)))
     return found
-
-
-def _agrees(witness: Witness) -> bool:
-    covariance = np.diag(witness.own_variance) + witness.common
-    return float(witness.difference @ np.linalg.solve(covariance, witness.difference)) < AGREES
-
-
-def _own_variance(imu: ImuSolution, shared: Shared) -> Array:
-    """Of the sensor alone, (6,)."""
-    return np.maximum(np.diag(imu.covariance) - np.diag(shared.covariance), 0.0)
-
-
-def _by_reading(shared: Shared) -> Matrix:
-    return np.zeros((3, 2)) if shared.by_reading is None else shared.by_reading
 
 
 def _witness(imu: ImuSolution, shared: Shared, triad: Triad, expected: Expected, measured: Array) -> Witness:
     part = rows_of(triad)
     common = shared.covariance[part, part]
     if triad == "accel":
-        by_reading = _by_reading(shared)
-        zero, other = by_reading * shared.zero_sigma_rad, by_reading * expected.other_zero_rad
+        zero, other = shared.by_zero, shared.tilted(expected.other_zero_rad)
         common = common + (np.square(1.0 - expected.same_zero) - 1.0) * (zero @ zero.T) + other @ other.T
     return Witness(
         name=imu.name,
         difference=measured - np.array(expected.value),
-        own_variance=_own_variance(imu, shared)[part] + np.array(expected.variance),
+        own_variance=imu.own_variance(shared)[part] + np.array(expected.variance),
         common=common,
         limit=expected.limit,
         power_ups=expected.power_ups,
@@ -288,26 +241,23 @@ def _witness(imu: ImuSolution, shared: Shared, triad: Triad, expected: Expected,
     )
 
 
-def _whole_covariance(solution: Solution) -> Matrix:
-    """Of all biases of all IMUs, (6 n, 6 n)."""
-    blocks = {(imu.name, imu.name): imu.covariance for imu in solution.imus} | dict(solution.cross)
-    blocks |= {(other, one): matrix.T for (one, other), matrix in solution.cross.items()}
-    return np.block([[blocks[one.name, other.name] for other in solution.imus] for one in solution.imus])
-
-
-def _estimate(solution: Solution, used: Sequence[_Known], *, zero_is_known: bool) -> Solution:
-    """The solution with what may take part; see the equations at the top."""
+def _combined(solution: Solution, used: Sequence[_Known], *, zero_is_known: bool) -> tuple[Solution, Array]:
+    """Combine measurements and predictions by the equations at the top; also give the shift of all biases, (6 n,)."""
     shared, count = solution.shared, len(solution.imus)
+    if not used:
+        return solution, np.zeros(6 * count)
     index = np.concatenate([np.arange(one.rows.start, one.rows.stop) for one in used])
     innovation = -np.concatenate([one.witness.difference for one in used])
-    s_d = _whole_covariance(solution)
-    by_reading, none = _by_reading(shared), np.zeros((3, 2))
-    zero = by_reading * shared.zero_sigma_rad
+    blocks = {(imu.name, imu.name): imu.covariance for imu in solution.imus} | dict(solution.cross)
+    blocks |= {(other, one): matrix.T for (one, other), matrix in solution.cross.items()}
+    s_d = np.block([[blocks[one.name, other.name] for other in solution.imus] for one in solution.imus])
+    zero, none = shared.by_zero, np.zeros((3, 2))
     # Every accelerometer's share of the zero's error: in d it is whole, in p as far as that was measured with it.
     zero_in_d = np.tile(np.vstack([none, zero]), (count, 1))
-    noise_in_d = np.tile(np.vstack([none, by_reading * np.array(shared.reading_sigma_rad)]), (count, 1))
-    zero_in_p = np.vstack([zero * one.expected.same_zero if one.triad == "accel" else none for one in used])
-    other_in_p = np.vstack([by_reading * one.expected.other_zero_rad if one.triad == "accel" else none for one in used])
+    noise_in_d = np.tile(np.vstack([none, shared.tilted(np.array(shared.reading_sigma_rad))]), (count, 1))
+    accels = [(one.triad == "accel", one.expected) for one in used]
+    zero_in_p = np.vstack([zero * expected.same_zero if accel else none for accel, expected in accels])
+    other_in_p = np.vstack([shared.tilted(expected.other_zero_rad) if accel else none for accel, expected in accels])
     s_p = np.diag(np.concatenate([one.expected.variance for one in used]))
     s_p = s_p + zero_in_p @ zero_in_p.T + other_in_p @ other_in_p.T
     both = zero_in_d @ zero_in_p.T
@@ -324,30 +274,51 @@ def _estimate(solution: Solution, used: Sequence[_Known], *, zero_is_known: bool
     rest[:, index] -= gain
     mixed = rest @ both @ gain.T
     covariance = rest @ s_d @ rest.T + gain @ s_p @ gain.T + mixed + mixed.T
-    stat_covariance = rest @ np.diag(np.square(stat)) @ rest.T + gain @ s_p @ gain.T
+    stat = np.sqrt(np.diag(rest @ np.diag(np.square(stat)) @ rest.T + gain @ s_p @ gain.T))
+    stat = np.minimum(stat, np.sqrt(np.diag(covariance)))
     shift = gain @ innovation
     part = {imu.name: slice(6 * k, 6 * k + 6) for k, imu in enumerate(solution.imus)}
-    stat = np.sqrt(np.diag(stat_covariance))
-    imus = tuple(
-        _shifted(imu, shift[at], covariance[at, at], stat[at])
-        for imu, at in zip(solution.imus, part.values(), strict=True)
-    )
+    imus = []
+    for imu, at in zip(solution.imus, part.values(), strict=True):
+        gyro, accel = moved(imu.biases, shift[at])
+        imus.append(
+            dataclasses.replace(
+                imu, gyro_rad_s=gyro, accel_m_s2=accel, covariance=covariance[at, at], sigma_stat=stat[at]
+            )
+        )
     cross = {(one, other): covariance[part[one], part[other]] for one, other in itertools.combinations(part, 2)}
-    return dataclasses.replace(solution, imus=imus, cross=cross)
+    return dataclasses.replace(solution, imus=tuple(imus), cross=cross), shift
 
 
-def _shifted(imu: ImuSolution, shift: Array, covariance: Matrix, stat: Array) -> ImuSolution:
+def _grounded(solution: Solution, earlier: Sequence[_Known], today: Sequence[_Known]) -> Solution:
+    """Bound the platform's turn by the gyros' predictions, where neither a compass nor a rest has measured it.
+
+    What they read more about the vertical is taken for chance up to `CHANCE_SIGMAS`, and else belongs to sigma. Only
+    earlier power-ups tell that nothing turns: what was measured today may have turned already.
+    """
+    if solution.turn.is_told or solution.platform == "deck":
+        return solution
+    up, more_rad_s = solution.shared.up, 0.0
+    for known in (earlier, today):
+        found = [one.witness.along(up) for one in known if one.triad == "gyro"]
+        rate, sigma = min(found, key=lambda each: each[1], default=(0.0, math.inf))
+        if abs(rate) > CHANCE_SIGMAS * sigma:
+            more_rad_s = max(more_rad_s, abs(rate))
+        if known is earlier and sigma < BOUNDS_RAD_S:
+            turn = Turn(rate_rad_s=-rate, sigma_rad_s=sigma, by="earlier calibrations")
+            solution = dataclasses.replace(solution, turn=turn)
+    by_turn = np.zeros((6, 6))
+    by_turn[:3, :3] = np.outer(up, up) * more_rad_s**2
     return dataclasses.replace(
-        imu,
-        gyro_rad_s=None if imu.gyro_rad_s is None else imu.gyro_rad_s + shift[:3],
-        accel_m_s2=None if imu.accel_m_s2 is None else imu.accel_m_s2 + shift[3:],
-        covariance=covariance,
-        sigma_stat=np.minimum(stat, np.sqrt(np.diag(covariance))),
+        solution,
+        shared=dataclasses.replace(solution.shared, covariance=solution.shared.covariance + by_turn),
+        imus=tuple(dataclasses.replace(imu, covariance=imu.covariance + by_turn) for imu in solution.imus),
+        cross={pair: matrix + by_turn for pair, matrix in solution.cross.items()},
     )
 
 
 def _prior(known: Sequence[_Known], used: Sequence[_Known]) -> Prior | None:
-    """What the record says of what was known of one IMU."""
+    """Make the record's entry of one IMU's predictions."""
     found: dict[Triad, GyroPrior | AccelPrior] = {}
     for one in known:
         witness, expected = one.witness, one.expected
@@ -358,8 +329,7 @@ def _prior(known: Sequence[_Known], used: Sequence[_Known]) -> Prior | None:
             f"measured_{unit}": vector(one.measured),
             "shift_sigma": vector(witness.difference / witness.sigma),
         }
-        by_temperature = expected.by_temperature
         found[one.triad] = kind(
-            used=one in used, power_ups=expected.power_ups, temperature_model=by_temperature, **figures
+            used=one in used, power_ups=expected.power_ups, temperature_model=expected.by_temperature, **figures
         )
     return Prior(**{triad: found.get(triad) for triad in TRIADS}) if found else None  # type: ignore[arg-type]

@@ -18,8 +18,8 @@ from companion.estimation.alignment.align_model import response
 from companion.estimation.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Sides
 from companion.estimation.means.windows import ImuWindow
 from companion.estimation.noise.allan import AllanModel, floor_variance
-from companion.estimation.solution.prior import CATALOGUE_PER_K, CATALOGUE_SCATTER
 from companion.estimation.solution.site import LocalEarth
+from companion.estimation.temperature.curve import CATALOGUE_PER_K, CATALOGUE_SCATTER
 from companion.physics.frames import Array, Matrix, symmetric_by
 from companion.physics.units import DEG, MG
 

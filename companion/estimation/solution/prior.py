@@ -1,7 +1,7 @@
-"""Prediction of today's bias from earlier calibrations (method 3.3).
+"""Prediction of today's bias from earlier calibrations (method 3.3), with a sigma.
 
 Run to run a MEMS bias scatters (an ADIS16405 by 70 deg/h and 2 mg, method 1.3). The prediction for today is the
-mean of the earlier power-ups, or their curve over temperature (`temperature.curve`). Its sigma is that of *one more*
+mean of the earlier power-ups, or their cubic over temperature (`temperature.curve`). Its sigma is that of *one more*
 power-up: the scatter, widened as Student's for few points, and the error of the mean.
 
 From three power-ups on the prediction guards (`joint`), from five on it may take part in the estimate. Within one
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Literal
 
 import msgspec
@@ -27,14 +27,24 @@ from companion.estimation.alignment.align_model import Priors
 from companion.estimation.means.warming import Path
 from companion.estimation.noise.allan import AllanModel, floor_variance
 from companion.estimation.records.align_record import Determined, ImuAlignmentRecord
-from companion.estimation.records.history import Measured, Point, PowerUp, believed
+from companion.estimation.records.history import GUARDS_FROM, WEIGHS_FROM, Measured, Point, PowerUp, believed
 from companion.estimation.records.record import Effective
-from companion.estimation.temperature.along import WARM_AFTER, Along, Settling, along
-from companion.estimation.temperature.curve import Curve, Node, PowerUpNodes, fit
+from companion.estimation.solution.doubt import Doubt
+from companion.estimation.solution.solve import ImuSolution, Pair, Solution
+from companion.estimation.temperature.curve import (
+    CATALOGUE_PER_K,
+    WARM_AFTER,
+    Along,
+    Curve,
+    Node,
+    PowerUpNodes,
+    Settling,
+    fit,
+)
 from companion.physics.frames import Array, Floats, Matrix, skew, symmetric, vector
 from companion.physics.statistics import student_quantile
-from companion.physics.units import DEG, DEG_H, MG, G
-from companion.samples import Triad, Vector
+from companion.physics.units import DEG, MG, G
+from companion.samples import TRIADS, Triad, Vector, rows_of
 
 LEVEL: Final = np.array([0.0, 0.0, -1.0])
 WORTH_SAYING_M_S2: Final = 1.0 * MG
@@ -113,17 +123,9 @@ def _known(found: Determined | None, unit: float, assumed: float) -> tuple[Array
     return np.where(known, found.value, 0.0) * unit, np.where(known, np.array(found.sigma) * unit, assumed)
 
 
-GUARDS_FROM: Final = 3
-"""Least earlier power-ups of a guard."""
-WEIGHS_FROM: Final = 5
-"""Least earlier power-ups that take part in the estimate."""
 GATE_SIGMAS: Final = 4.0
 TEMPERATURE_SIGMA_K: Final = 10.0
 """Temperature change between two calibrations of one power-up, where no temperature is known."""
-CATALOGUE_SCATTER: Final[dict[Triad, float]] = {"gyro": 70.0 * DEG_H, "accel": 2.0 * MG}
-"""Run-to-run scatter of method 1.3; it only weighs the points against one another."""
-CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2 * MG}
-"""Slope over temperature of a BMI088, the worse one of method 2.1."""
 _KNOWN: Final = 0.5
 """Largest sigma of a usable curve's slope, as a share of the catalogue's slope."""
 _UNEXPLAINED: Final = 0.1
@@ -193,79 +195,37 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
     if len(groups) < GUARDS_FROM:
         return None
     # Where a temperature is missing, all count as measured at the same one.
-    told = now.temperature_degc is not None and _told(groups)
-    seen = [[_of(point, triad) for point in group] for group in groups]
-    here = [_here(group, found, triad, now, effect) for group, found in zip(groups, seen, strict=True)]
-    zeros = [group[-1].zero_sigma_rad * now.gravity_m_s2 if triad == "accel" else 0.0 for group in groups]
-    nodes = [
-        PowerUpNodes(
-            [_node(point, bias, _white(one), told=told) for point, one, bias in zip(group, found, biases, strict=True)],
-            common_variance=float(np.square(pose).mean()) + zero**2,
+    by_degc = now.temperature_degc is not None and _have_temperatures(groups)
+    nodes, poses, shared = [], [], []
+    for group in groups:
+        found = [_of(point, triad) for point in group]
+        biases, pose = _here(group, found, triad, now, effect)
+        zero = group[-1].zero_sigma_rad * now.gravity_m_s2 if triad == "accel" else 0.0
+        nodes.append(
+            PowerUpNodes(
+                [_node(*each, by_degc=by_degc) for each in zip(group, biases, map(_white, found), strict=True)],
+                common_variance=float(np.square(pose).mean()) + zero**2,
+            )
         )
-        for group, found, (biases, pose), zero in zip(groups, seen, here, zeros, strict=True)
-    ]
+        poses.append(pose.mean(axis=0))
+        shared += [one.sigma_shared for one in found]
     curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad])
     assert curve is not None
     degc = now.temperature_degc or 0.0
-    value, variance = curve.at(degc, now.k_s) if told else curve.at(0.0)
+    value, variance = curve.at(degc, now.k_s) if by_degc else curve.at(0.0)
     # An error that all power-ups share, of one attitude or one place, does not average out.
-    pose = np.array([each.mean(axis=0) for _, each in here])
-    shared = [one.sigma_shared for found in seen for one in found]
-    together = np.square(curve.shares @ pose) + np.max(np.square(shared), axis=0)
+    together = np.square(curve.shares @ np.array(poses)) + np.max(np.square(shared), axis=0)
     same, other = _zeros([group[-1] for group in groups], curve.shares, now.zero) if triad == "accel" else (0.0, 0.0)
     return Expected(
         value=vector(value),
         variance=vector(variance + together),
         limit=student_quantile(GATE_SIGMAS, curve.freedom),
         power_ups=len(groups),
-        weighs=len(groups) >= WEIGHS_FROM and (not told or curve.beyond_k(degc) == 0.0),
+        weighs=len(groups) >= WEIGHS_FROM and (not by_degc or curve.beyond_k(degc) == 0.0),
         by_temperature=curve.order > 0,
         same_zero=same,
         other_zero_rad=other,
     )
-
-
-def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve | None:
-    """Fit how a bias follows the temperature within a power-up; None: too little is known."""
-    groups = believed(points, triad)
-    if len(groups) < WEIGHS_FROM or not _told(groups):
-        return None
-    nodes = [PowerUpNodes([_along(group[0], point, triad) for point in group]) for group in groups]
-    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad], may_be_mean=False)
-    assert curve is not None
-    low, high = curve.span_degc
-    _, variance = curve.change((low, 0.0), (low + 1.0, 0.0))
-    known = high > low and variance.max() < (_KNOWN * CATALOGUE_PER_K[triad]) ** 2
-    return curve if known and curve.unexplained < _UNEXPLAINED else None
-
-
-def _along(first: Point, point: Point, triad: Triad) -> Node:
-    """Make a node of a power-up; an accelerometer's variance grows with the change of attitude from the first."""
-    found = _of(point, triad)
-    variance = _white(found)
-    if triad == "accel":
-        _, sigma = pose_effect(None).change(G, np.array(point.up), np.array(first.up))
-        variance += float(np.square(sigma).mean())
-    return _node(point, np.array(found.bias), variance, told=True)
-
-
-def follow(curve: Curve, path: Path, settles: Settling | None, model: AllanModel) -> Along:
-    """Predict by a curve the bias over a window, and when the IMU is warm."""
-    wander = 0.0 if settles is None else _in_run(model, max(WARM_AFTER * settles.tau_s, _SHORTEST_GAP_S))
-    return along(curve, path.states, path.span_s, path.variance, settles, wander)
-
-
-def _white(found: Measured) -> float:
-    return float(np.square(found.sigma_stat).mean())
-
-
-def _told(groups: Sequence[Sequence[Point]]) -> bool:
-    return all(point.temperature_degc is not None for group in groups for point in group)
-
-
-def _in_run(model: AllanModel, gap_s: float = _SHORTEST_GAP_S) -> float:
-    """Give the variance by which a bias wanders within a power-up."""
-    return float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * gap_s))
 
 
 def expect_today(
@@ -279,12 +239,11 @@ def expect_today(
     if found is None:
         return None
     bias, pose = _here([last], [found], triad, now, effect)
-    kelvin = TEMPERATURE_SIGMA_K
-    if last.temperature_degc is not None and now.temperature_degc is not None:
-        kelvin = now.temperature_degc - last.temperature_degc
+    then_degc, now_degc = last.temperature_degc, now.temperature_degc
+    kelvin = now_degc - then_degc if then_degc is not None and now_degc is not None else TEMPERATURE_SIGMA_K
     change, of_change = np.zeros(3), np.full(3, (CATALOGUE_PER_K[triad] * kelvin) ** 2)
-    if curve is not None and last.temperature_degc is not None and now.temperature_degc is not None:
-        change, of_change = curve.change((last.temperature_degc, last.k_s), (now.temperature_degc, now.k_s))
+    if curve is not None and then_degc is not None and now_degc is not None:
+        change, of_change = curve.change((then_degc, last.k_s), (now_degc, now.k_s))
     drift = _in_run(model, max(abs(now.unix_s - last.unix_s), _SHORTEST_GAP_S))
     variance = np.square(found.sigma_use) + np.square(found.sigma_shared) + np.square(pose[0]) + of_change + drift
     same = triad == "accel" and last.zero == now.zero
@@ -299,15 +258,110 @@ def expect_today(
     )
 
 
+def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve | None:
+    """Fit how a bias follows the temperature within a power-up; None: too little is known."""
+    groups = believed(points, triad)
+    if len(groups) < WEIGHS_FROM or not _have_temperatures(groups):
+        return None
+    nodes = [PowerUpNodes([_along(group[0], point, triad) for point in group]) for group in groups]
+    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad], may_be_mean=False)
+    assert curve is not None
+    low, high = curve.span_degc
+    _, variance = curve.change((low, 0.0), (low + 1.0, 0.0))
+    known = high > low and variance.max() < (_KNOWN * CATALOGUE_PER_K[triad]) ** 2
+    return curve if known and curve.unexplained < _UNEXPLAINED else None
+
+
+def follow(curve: Curve, path: Path, settles: Settling | None, model: AllanModel) -> Along:
+    """Predict by a curve the bias over a window, and when the IMU is warm."""
+    wander = 0.0 if settles is None else _in_run(model, max(WARM_AFTER * settles.tau_s, _SHORTEST_GAP_S))
+    return curve.along(path.states, path.span_s, path.variance, settles, wander)
+
+
+def points(
+    solution: Solution,
+    whole: Mapping[str, Pair],
+    doubts: Iterable[Doubt],
+    *,
+    started_at: str,
+    unix_s: float,
+    power_ups: Mapping[str, PowerUp],
+    zero: str | None,
+) -> dict[str, Point]:
+    """Make each IMU's point of the history from the readings alone; what is doubted is marked as suspect."""
+    shared = solution.shared
+    doubted = {(doubt.triad, name) for doubt in doubts for name in doubt.names}
+    common = np.diag(shared.covariance).copy()
+    common[3:] = np.maximum(common[3:] - np.diag(shared.by_zero @ shared.by_zero.T), 0.0)
+
+    def measured(imu: ImuSolution, triad: Triad) -> Measured | None:
+        bias = whole[imu.name][TRIADS.index(triad)]
+        if bias is None:
+            return None
+        part = rows_of(triad)
+        return Measured(
+            bias=_short(bias if imu.warming is None else bias - imu.warming.ahead(triad)),
+            sigma_stat=_short(imu.sigma_stat[part]),
+            sigma_use=_short(np.sqrt(imu.own_variance(shared)[part])),
+            sigma_shared=_short(np.sqrt(common[part])),
+            suspect=(triad, imu.name) in doubted,
+        )
+
+    return {
+        imu.name: Point(
+            started_at=started_at,
+            unix_s=unix_s,
+            power_up=power_ups[imu.name],
+            temperature_degc=imu.mean_degc,
+            k_s=imu.k_s,
+            up=_short(shared.up),
+            zero=zero if whole[imu.name][1] is not None else None,
+            zero_sigma_rad=shared.zero_sigma_rad,
+            gyro=measured(imu, "gyro"),
+            accel=measured(imu, "accel"),
+        )
+        for imu in solution.imus
+        if imu.name in whole
+    }
+
+
+def _short(values: Array) -> Vector:
+    """Round to 9 decimals, 2e-4 deg/h."""
+    return vector(np.round(values, 9))
+
+
 def _of(point: Point, triad: Triad) -> Measured:
     found = point.of(triad)
     assert found is not None  # `believed` returns only these
     return found
 
 
-def _node(point: Point, bias: Array, variance: float, *, told: bool) -> Node:
-    degc, k_s = (point.temperature_degc or 0.0, point.k_s) if told else (0.0, 0.0)
+def _white(found: Measured) -> float:
+    return float(np.square(found.sigma_stat).mean())
+
+
+def _have_temperatures(groups: Sequence[Sequence[Point]]) -> bool:
+    return all(point.temperature_degc is not None for group in groups for point in group)
+
+
+def _in_run(model: AllanModel, gap_s: float = _SHORTEST_GAP_S) -> float:
+    """Give the variance by which a bias wanders within a power-up."""
+    return float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * gap_s))
+
+
+def _node(point: Point, bias: Array, variance: float, *, by_degc: bool) -> Node:
+    degc, k_s = (point.temperature_degc or 0.0, point.k_s) if by_degc else (0.0, 0.0)
     return Node(degc, vector(bias), variance, k_s)
+
+
+def _along(first: Point, point: Point, triad: Triad) -> Node:
+    """Make a node of a power-up; an accelerometer's variance grows with the change of attitude from the first."""
+    found = _of(point, triad)
+    variance = _white(found)
+    if triad == "accel":
+        _, sigma = pose_effect(None).change(G, np.array(point.up), np.array(first.up))
+        variance += float(np.square(sigma).mean())
+    return _node(point, np.array(found.bias), variance, by_degc=True)
 
 
 def _here(

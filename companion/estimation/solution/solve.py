@@ -46,6 +46,9 @@ from companion.physics.frames import Array, Matrix, roll_pitch_from_up, skew
 from companion.physics.units import DEG
 from companion.samples import Triad
 
+Pair = tuple[Array | None, Array | None]
+"""Biases of gyro and accelerometer, (3,) each, rad/s and m/s^2; None: unknown."""
+
 _ON_DECK: Final = "on a deck gyros need a compass: without one a slow turn looks like a bias"
 
 
@@ -83,6 +86,15 @@ class ImuSolution:
     """What the accelerometers' bias is worth at another attitude."""
 
     @property
+    def biases(self) -> Pair:
+        """Both biases."""
+        return self.gyro_rad_s, self.accel_m_s2
+
+    def own_variance(self, shared: Shared) -> Array:
+        """Give the variance of the sensor alone, (6,)."""
+        return np.maximum(np.diag(self.covariance) - np.diag(shared.covariance), 0.0)
+
+    @property
     def gyro_sigma_use_rad_s(self) -> Array:
         """One sigma per axis, shape (3,)."""
         return np.sqrt(np.diag(self.use_covariance)[:3])
@@ -118,6 +130,15 @@ class Shared:
     zero_sigma_rad: float
     """Of the gradienter's zero, the same in every calibration."""
 
+    @property
+    def by_zero(self) -> Matrix:
+        """One sigma of the accelerometer biases by each axis of the gradienter's zero, (3, 2)."""
+        return self.tilted(self.zero_sigma_rad)
+
+    def tilted(self, sigma_rad: float | Array) -> Matrix:
+        """Give the change of the accelerometer biases by each reading of the gradienter, (3, 2)."""
+        return np.zeros((3, 2)) if self.by_reading is None else self.by_reading * sigma_rad
+
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Solution:
@@ -137,6 +158,14 @@ class Solution:
     platform: Platform = "ground"
     cross: Mapping[tuple[str, str], Matrix] = dataclasses.field(default_factory=dict)
     """Cross-covariance (6x6) of every two IMUs, in their order."""
+
+
+def moved(biases: Pair, shift: Array) -> Pair:
+    """Add a shift, (6,), to the biases that are known."""
+    gyro, accel = (
+        None if bias is None else bias + part for bias, part in zip(biases, (shift[:3], shift[3:]), strict=True)
+    )
+    return gyro, accel
 
 
 def accelerometer_bias(mean_m_s2: Array, up: Array, gravity_m_s2: float) -> Array:

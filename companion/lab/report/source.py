@@ -12,9 +12,8 @@ from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.flight_evidence import moved
 from companion.estimation.records.flight_record import AXES, Flight, KeptFlight
 from companion.estimation.records.record import Arming, Record
-from companion.estimation.solution.by_temperature import ByTemperature
+from companion.estimation.solution.by_temperature import ByTemperature, by_temperature
 from companion.estimation.solution.prior import curve_of
-from companion.estimation.solution.temperature_summary import by_temperature
 from companion.lab.report.calibration_page import Material
 from companion.storage.flights import FlightStore
 from companion.storage.learned import BiasStore, KnownImu

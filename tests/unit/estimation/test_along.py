@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from companion.estimation.means.warming import temperature_path
-from companion.estimation.temperature.along import Along, Settling, Warm, along, settling
-from companion.estimation.temperature.curve import Curve, fit
+from companion.estimation.temperature.curve import Along, Curve, Settling, Warm, fit, settling
 from sim.accuracy.mid_warm_up import RATES_K_MIN, SPANS_S, mid_warm_up
 from sim.imu_model import DEG_H
 from tests.unit.estimation.test_temperature import PER_K, power_up
@@ -58,7 +57,7 @@ def test_the_end_of_a_window_and_when_it_is_warm(curve: Curve) -> None:
     seconds_of = np.arange(60.0) + 0.5
     path = temperature_path(seconds(exponential(seconds_of).tolist()))
     assert path is not None
-    found = along(curve, path.states, path.span_s, path.variance, Settling(240.0, 12.0))
+    found = curve.along(path.states, path.span_s, path.variance, Settling(240.0, 12.0))
     bias = bent(exponential(seconds_of))
     end = float(bent(exponential(np.array([60.0])))[0])
     assert found.shift == pytest.approx((end - bias.mean(),) * 3, abs=3.0 * math.sqrt(max(found.shift_variance)) + 0.5)
@@ -70,8 +69,8 @@ def test_the_end_of_a_window_and_when_it_is_warm(curve: Curve) -> None:
     assert np.abs(np.subtract(warm.change, change)).max() < 3.0 * math.sqrt(max(warm.variance))
     assert math.sqrt(max(warm.variance)) < 0.25 * change
     # Where no power-up has been, and where nobody knows how it settles, nothing is foretold.
-    assert along(curve, path.states, path.span_s, path.variance, Settling(1200.0, 60.0)).warm is None
-    assert along(curve, path.states, path.span_s, path.variance, None).warm is None
+    assert curve.along(path.states, path.span_s, path.variance, Settling(1200.0, 60.0)).warm is None
+    assert curve.along(path.states, path.span_s, path.variance, None).warm is None
     # What somebody takes off by temperature the readings do not show.
     none = found.less(np.array(found.shift), np.array(found.slope))
     assert (none.shift, none.slope, none.warm) == ((0.0,) * 3, (0.0,) * 3, None)

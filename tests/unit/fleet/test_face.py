@@ -20,8 +20,8 @@ import pytest
 from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
 from companion.estimation.records.record import Arming
+from companion.estimation.solution.by_temperature import by_temperature
 from companion.estimation.solution.prior import curve_of
-from companion.estimation.solution.temperature_summary import by_temperature
 from companion.mqtt import fleet as face_module
 from companion.mqtt.fleet import AircraftFleet
 from companion.mqtt.fleet_sources import Sources

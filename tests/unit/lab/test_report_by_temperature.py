@@ -15,9 +15,8 @@ import pytest
 from companion.cli.show import temperature_lines
 from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.history import Point
-from companion.estimation.solution.by_temperature import ByTemperature
+from companion.estimation.solution.by_temperature import ByTemperature, by_temperature
 from companion.estimation.solution.prior import curve_of
-from companion.estimation.solution.temperature_summary import by_temperature
 from companion.lab.report.calibration_page import calibration_page
 from companion.lab.report.source import material
 from companion.physics.units import DEG_H, MG

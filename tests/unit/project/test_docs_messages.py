@@ -19,7 +19,7 @@ ALSO = ROOT / "docs/service.md"
 
 AT_A_DESK = (
     "companion/cli", "companion/setup", "companion/lab", "companion/recording", "companion/fleet",
-    "companion/estimation/solution/temperature_summary.py", "companion/estimation/records/flight_record.py",
+    "companion/estimation/solution/by_temperature.py", "companion/estimation/records/flight_record.py",
     "companion/estimation/records/flight_evidence.py", "companion/estimation/solution/by_temperature.py",
     "companion/estimation/alignment/missing.py", "companion/autopilot/firmware/heading_parameters.py",
     "companion/autopilot/firmware/port_parameters.py", "companion/configured/profiles.py",

@@ -23,8 +23,8 @@ import zxingcpp
 from companion.cli import main as companion
 from companion.errors import DaemonUnreachableError, StorageError
 from companion.estimation.noise.allan import PROFILES
+from companion.estimation.solution.by_temperature import by_temperature
 from companion.estimation.solution.prior import curve_of
-from companion.estimation.solution.temperature_summary import by_temperature
 from companion.links.system import connection
 from companion.report.by_temperature import biases_by_temperature
 from companion.web import access, app, listener, viewers

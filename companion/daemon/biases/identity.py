@@ -1,4 +1,4 @@
-"""Which sensor an IMU's biases are of, and since when it has been powered."""
+"""Identity of the sensor behind each IMU, and since when it has been powered."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _IN_WORDS: Final = {
     "accel": "accelerometer (device id)",
     "scale": "accelerometer scale",
 }
-"""Of what is not said as it is called."""
+"""Words for keys of the identity; others are said as they are."""
 
 
-class Whose:
-    """Of the IMUs of the configuration."""
+class ImuIdentities:
+    """Identities of the configured IMUs."""
 
     def __init__(
         self,
@@ -45,16 +45,16 @@ class Whose:
 
     @property
     def names(self) -> Collection[str]:
-        """Of the IMUs."""
+        """Names of the IMUs."""
         return self._sources.keys()
 
     def power_up(self, name: str, unix_s: float) -> PowerUp:
-        """Since when the sensor of an IMU has been powered, at a wall clock time."""
+        """Estimate since when an IMU's sensor has been powered, at a wall clock time."""
         up_s = self._collector.up_s(name)
         return PowerUp(host=self._host, since_unix_s=None if up_s is None else round(unix_s - up_s, 1))
 
     def session(self, name: str) -> str:
-        """Another one as soon as the sensor may have been without power."""
+        """Give a word that changes as soon as the sensor may have been without power."""
         if name in self._imus:
             return f"boot {self._vehicle.boots}"
         sensor = self._sensors.get(name)
@@ -63,7 +63,7 @@ class Whose:
         return f"{sensor.link.reconnects} {sensor.decoder.times.clock.breaks} {sorted(sensor.health.counts.items())}"
 
     def zero(self) -> str | None:
-        """Which zero of the gradienter is in force: another one has another error."""
+        """Give the zero of the gradienter in force: another one has another error."""
         gradienter, used = self._config.gradienter, self._alignment.used
         if gradienter is None:
             return None
@@ -72,7 +72,7 @@ class Whose:
         return f"{gradienter.protocol} {gradienter.law} {mounting} {_plain(gradienter.offset_deg)} {at}"
 
     def identity(self, name: str, before: Mapping[str, str]) -> dict[str, str]:
-        """What makes it another sensor, or its biases others, if it changes; `before` where nothing is known now."""
+        """Give what makes it another sensor, or its biases others, if it changes; `before` fills gaps."""
         source = self._sources[name]
         profile = source.profile.name if isinstance(source.profile, Noise) else source.profile
         found: dict[str, str] = {"source": source.source, "profile": profile or "unknown"}
@@ -90,7 +90,7 @@ class Whose:
         return {**before, **found}
 
     def aligned(self, name: str) -> ImuAlignmentRecord | None:
-        """What the alignment in force says of it."""
+        """Give an IMU's part of the alignment in force."""
         record = self._alignment.record
         if record is None or self._alignment.unused is not None:
             return None
@@ -98,7 +98,7 @@ class Whose:
 
 
 def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """What is another one than before, in words."""
+    """Say what differs between two identities; empty: nothing."""
     keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
     return ", ".join(_IN_WORDS.get(key, key) for key in keys)
 
