@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -40,6 +41,8 @@ HELD = Held(
     seen=True,
     averaged_s=30.0,
 )
+OWN = msgspec.structs.replace(HELD, expected=(100.0 * DEG_H, 0.0, 0.0))
+"""An IMU that nobody corrects: its whole bias is expected."""
 
 
 def whys(
@@ -58,21 +61,26 @@ def output(x_deg_h: float) -> Present:
     return Present(residual=(x_deg_h * DEG_H, 0.0, 0.0), sigma_use=SIGMA, sigma=SIGMA)
 
 
-def test_a_fresh_verified_calibration_has_nothing_against_it() -> None:
-    assert whys() == set()
-    assert whys(present=output(0.0)) == set()
-
-
-def test_half_an_hour_is_the_age_limit_of_method_3_item_8() -> None:
-    assert whys(now_s=1799.0) == set()
-    assert whys(now_s=1801.0) == {Why.OLD}
-
-
-def test_three_kelvin_is_the_temperature_limit_either_way_and_an_unknown_temperature_none() -> None:
-    assert whys(temperature_degc=27.9) == set()
-    assert whys(temperature_degc=28.1) == {Why.TEMPERATURE}
-    assert whys(temperature_degc=21.9) == {Why.TEMPERATURE}
-    assert whys(temperature_degc=None) == set()
+@pytest.mark.parametrize(
+    ("seen", "found"),
+    [
+        ({}, set()),
+        ({"now_s": 1799.0}, set()),
+        ({"now_s": 1801.0}, {Why.OLD}),
+        ({"temperature_degc": 27.9}, set()),
+        ({"temperature_degc": 28.1}, {Why.TEMPERATURE}),
+        ({"temperature_degc": 21.9}, {Why.TEMPERATURE}),
+        ({"temperature_degc": None}, set()),
+        # sqrt(5^2 + 5^2) deg/h times three is 21.2 deg/h.
+        ({"present": output(21.0)}, set()),
+        ({"present": output(-21.4)}, {Why.RESIDUAL}),
+        ({"held": OWN, "present": output(101.0)}, set()),
+        ({"held": OWN, "present": output(0.0)}, {Why.RESIDUAL}),
+        ({"held": msgspec.structs.replace(HELD, seen=False)}, {Why.UNSEEN}),
+    ],
+)
+def test_age_temperature_residual_and_effect_are_judged(seen: dict[str, Any], found: set[Why]) -> None:
+    assert whys(**seen) == found
 
 
 def test_where_the_curve_over_temperature_is_known_it_says_how_far_the_bias_is_off() -> None:
@@ -87,22 +95,6 @@ def test_where_the_curve_over_temperature_is_known_it_says_how_far_the_bias_is_o
     seen = Seen(now_s=10.0, temperature_degc=20.0, drift=((90.0 * DEG_H, 0.0, 0.0), (0.0,) * 3))
     (finding,) = judge("gyro", "fc", HELD, GYRO, LIMITS, seen)
     assert finding.words == "gyro fc: about 90 deg/h off, 5 K colder"
-
-
-def test_an_output_off_by_more_than_three_sigma_of_both_sides_is_stale() -> None:
-    # sqrt(5^2 + 5^2) deg/h times three is 21.2 deg/h.
-    assert whys(present=output(21.0)) == set()
-    assert whys(present=output(-21.4)) == {Why.RESIDUAL}
-
-
-def test_an_imu_that_nobody_corrects_is_judged_by_the_change_of_its_whole_bias() -> None:
-    held = msgspec.structs.replace(HELD, expected=(100.0 * DEG_H, 0.0, 0.0))
-    assert whys(held, present=output(101.0)) == set()
-    assert whys(held, present=output(0.0)) == {Why.RESIDUAL}
-
-
-def test_offsets_that_nobody_saw_working_do_not_count() -> None:
-    assert whys(msgspec.structs.replace(HELD, seen=False)) == {Why.UNSEEN}
 
 
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=lambda profile: profile.name)
@@ -142,8 +134,7 @@ def test_a_write_is_worth_it_beyond_two_sigma_and_beyond_the_floor() -> None:
     # What is in force was not known any better: sqrt(5^2 + 5^2) deg/h times two is 14.1.
     assert not worth_writing(output(14.0), HELD, 0.0)
     assert worth_writing(output(-14.3), HELD, 0.0)
-    own = msgspec.structs.replace(HELD, expected=(100.0 * DEG_H, 0.0, 0.0))
-    assert not worth_writing(output(100.0), own, 0.0)
+    assert not worth_writing(output(100.0), OWN, 0.0)
 
 
 def test_a_warm_up_to_come_is_in_the_promise_and_in_no_comparison() -> None:
