@@ -92,7 +92,7 @@ class IntoAutopilot:
         return f"written: {'; '.join(words)}"
 
     async def _find(self, window: Window, *, overwrite: bool) -> tuple[list[Target], list[str], list[str]]:
-        """What is to be written, the same in words, and why other IMUs are left as they are."""
+        """Give the targets of the write, their words, and why other IMUs are left as they are."""
         # The curve of an IMU that is another one now must not be written.
         exchanged = self._memory.forgotten()
         targets: list[Target] = []

@@ -1,4 +1,4 @@
-"""What several flights together say of an IMU: by how much motors move its biases.
+"""Effect of running motors on an IMU's biases, from several flights.
 
 It stands beside what calibrations have found on the ground and never becomes a point of theirs (tests.prior_study): the
 power-up that a log tells of the daemon has seen itself, and better; the log does not say which one that was, so that it
@@ -18,11 +18,11 @@ from companion.physics.units import MG, unit_of
 
 SURE_SIGMAS: Final = 3.0
 _COMMON: Final = {"deg/h": 0.0, "mg": 0.2 * MG}
-"""What all flights of an aircraft have wrong alike: its horizontal accelerometers where it leans."""
+"""Error that all flights of an aircraft share: its horizontal accelerometers where it leans."""
 
 
 class Moved(msgspec.Struct, frozen=True):
-    """By how much motors move the bias of one axis; SI units, one sigma."""
+    """Effect of motors on the bias of one axis; SI units, one sigma."""
 
     imu: int
     axis: str
@@ -31,7 +31,7 @@ class Moved(msgspec.Struct, frozen=True):
 
     @property
     def is_sure(self) -> bool:
-        """Whether it is there, and worth a word."""
+        """True if it is significant and worth a word."""
         return abs(self.moves.value) > SURE_SIGMAS * self.moves.sigma and is_worth_saying(self.axis, self.moves.value)
 
     @property
@@ -45,7 +45,7 @@ class Moved(msgspec.Struct, frozen=True):
 def moved(
     flights: Iterable[Flight], system_id: int | None, imu: int, gyro_id: int | None, accel_id: int | None
 ) -> list[Moved]:
-    """By axis, of the flights of this vehicle with these very sensors: the mean, each by its sigma.
+    """Average by axis over the flights of this vehicle with these sensors, weighted by sigma.
 
     Where they scatter by more than their sigmas, so much wider is that of the mean.
     """
@@ -73,7 +73,7 @@ def moved(
 
 
 def surely_moved(flights: Iterable[Flight], like: Flight) -> list[Moved]:
-    """Of all IMUs of one flight, what is surely there in more than this one."""
+    """List the significant effects on the IMUs of one flight that others confirm."""
     known = list(flights)
     return [
         one

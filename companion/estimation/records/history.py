@@ -1,4 +1,4 @@
-"""What earlier calibrations found of one IMU, and which of it is worth a prior.
+"""History of one IMU's biases, and the part of it that a prediction uses.
 
 Kept are whole biases as they were *measured*, never what a prior has made of them: a prior that learns from itself
 believes itself more with every calibration. One power-up is one point, however often was calibrated in it: the bias
@@ -32,7 +32,7 @@ NEW_AFTER: Final = 3
 """Power-ups in a row that contradict earlier ones and are no outliers any more: the sensor is another one now."""
 KEEP_POWER_UPS: Final = 48
 KEEP_POINTS: Final = 8
-"""Of a power-up."""
+"""Most points of a power-up."""
 NEAR_K: Final = 2.0
 """Temperatures that tell the same."""
 _LATEST: Final = 10
@@ -42,7 +42,7 @@ SAME_START_S: Final = 60.0
 
 
 class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """Since when the sensor has been powered, as well as that can be told.
+    """Start of a sensor's power, as well as it is known.
 
     Two are taken for one where either says so: too few points make a prior cautious, one counted twice makes it bold.
     """
@@ -53,13 +53,13 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fal
     """When the sensor's own device started, by the wall clock; None where it does not tell."""
 
     def is_same(self, other: PowerUp) -> bool:
-        """Whether nothing says that the power was off in between."""
+        """Return False only if the power was surely off in between."""
         if self.host == other.host:
             return True
         return self.started_with(other)
 
     def started_with(self, other: PowerUp) -> bool:
-        """Whether both tell the same start: then the power was on all the while."""
+        """Return True if both tell the same start: the power was on all the while."""
         mine, theirs = self.since_unix_s, other.since_unix_s
         return mine is not None and theirs is not None and abs(mine - theirs) < SAME_START_S
 
@@ -70,9 +70,9 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fa
     bias: tuple[_Bias, _Bias, _Bias]
     sigma_stat: _Sigmas
     sigma_use: _Sigmas
-    """Of the sensor alone, without what the pose adds."""
+    """Sigma of the sensor alone, without the pose's part."""
     sigma_shared: _Sigmas
-    """What the place and the heading add; of an accelerometer without the gradienter's zero."""
+    """Sigma by place and heading; for an accelerometer without the gradienter's zero."""
     suspect: bool = False
     """It contradicted what was known."""
     chosen: bool = False
@@ -80,7 +80,7 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fa
 
     @property
     def is_outlier(self) -> bool:
-        """Whether it contradicted, and nobody has decided for it."""
+        """True for a contradiction that nobody has decided for."""
         return self.suspect and not self.chosen
 
 
@@ -88,26 +88,26 @@ class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False
     """One calibration of one IMU, or one still window."""
 
     started_at: str
-    """Of its record; empty of a still window that nobody calibrated from."""
+    """Start of its record; empty for a still window that no calibration used."""
     unix_s: float
     power_up: PowerUp
     temperature_degc: float | None
     k_s: float = 0.0
-    """How fast that rose."""
+    """Rate of the temperature, K/s."""
     up: Vector
     """Unit vector in the vehicle's axes: the attitude at which the accelerometers' bias was measured."""
     zero: str | None = None
-    """Which zero of the gradienter the accelerometers were measured with; None without them."""
+    """Zero of the gradienter behind the accelerometers' bias; None without them."""
     zero_sigma_rad: float = 0.0
     gyro: Measured | None = None
     accel: Measured | None = None
 
     def of(self, triad: Triad) -> Measured | None:
-        """One half of it."""
+        """Return one triad."""
         return self.gyro if triad == "gyro" else self.accel
 
     def as_chosen(self, *, gyro: bool = True) -> Point:
-        """The same, of a calibration that somebody has asked for and that is in force now; perhaps not of its gyros."""
+        """Mark a contradiction as decided for: its calibration was requested and is in force; `gyro`: gyros too."""
         rates = _as_chosen(self.gyro) if gyro else self.gyro
         return msgspec.structs.replace(self, gyro=rates, accel=_as_chosen(self.accel))
 
@@ -117,7 +117,7 @@ def _as_chosen(found: Measured | None) -> Measured | None:
 
 
 def by_power_up(points: Sequence[Point]) -> list[list[Point]]:
-    """The points of each power-up, in the order in which they were measured."""
+    """Group points by power-up, in the order in which they were measured."""
     groups: list[list[Point]] = []
     for point in points:
         for group in reversed(groups):
@@ -130,7 +130,7 @@ def by_power_up(points: Sequence[Point]) -> list[list[Point]]:
 
 
 def kept(points: Sequence[Point]) -> tuple[Point, ...]:
-    """What of these points is worth keeping: winter is not forgotten in summer.
+    """Choose the points worth keeping: winter is not forgotten in summer.
 
     Where there are too many power-ups that one goes whose temperatures the others have told most often, of several the
     oldest; where one has too many points, its latest and those at the most different temperatures stay.
@@ -156,7 +156,7 @@ def _thinned(group: Sequence[Point]) -> Sequence[Point]:
 
 
 def believed(points: Sequence[Point], triad: Triad) -> list[list[Point]]:
-    """By power-up, what of these points is worth a prior for one triad.
+    """Choose the points for a prediction of one triad, by power-up.
 
     Outliers are left out. `NEW_AFTER` of them in a row are none: then it is what was before them that is left out. So
     it is at once with one that somebody has decided for.

@@ -26,7 +26,7 @@ HeadingFrom = Literal["compass", "autopilot"]
 
 
 def outcome_word(outcome: str) -> str:
-    """What people read for an `Outcome`."""
+    """Say an `Outcome` to people."""
     return "put back" if outcome == "rolled_back" else outcome
 
 
@@ -39,19 +39,19 @@ class PoseSigma(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Pose(msgspec.Struct, frozen=True, kw_only=True):
-    """How the aircraft stood: nose up, right side down, clockwise from true north."""
+    """Attitude of the aircraft: nose up, right side down, clockwise from true north."""
 
     theta_deg: float | None
     gamma_deg: float | None
     psi_deg: float | None
     sigma_deg: PoseSigma
     tilt_from: TiltFrom | None = None
-    """Whose: "accelerometers" are those of an IMU that was held on all sides before."""
+    """"accelerometers": those of an IMU that was held on all sides before."""
     heading_from: HeadingFrom | None = None
 
 
 class Site(msgspec.Struct, frozen=True, kw_only=True):
-    """Where it stood, and who said so."""
+    """Place of the aircraft, and its source."""
 
     latitude_deg: float | None
     height_m: float | None
@@ -61,24 +61,24 @@ class Site(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
-    """What is known of the magnetic field at the compass, and so of the heading."""
+    """Magnetic field at the compass, and the quality of the heading."""
 
     heading_bound_deg: float | None
     """The heading's error exceeds this in one case of twenty; None where the device tells no field, or no place is
     known. 180: the field shows no heading."""
     heading_from: Literal["device", "field"]
-    """Whose tilt compensation: the device's own, or ours with the gradienter."""
+    """Tilt compensation: the device's own, or ours with the gradienter."""
     field_gauss: float | None
-    """As measured; None where the device gives counts only, or no field."""
+    """Measured field; None where the device gives counts only, or no field."""
     field_expected_gauss: float | None
-    """By WMM2025, likewise the next."""
+    """Field and inclination of the Earth by WMM2025."""
     inclination_deg: float | None
     """Down positive; needs a gradienter."""
     inclination_expected_deg: float | None
     device_minus_field_deg: float | None
     """The device's own heading less that from its field and the gradienter, where it gives both."""
     wander_deg: float | None
-    """By how much the heading has changed while nothing else said that the aircraft turned."""
+    """Change of the heading while nothing else showed a turn of the aircraft."""
 
     def in_words(self) -> str:
         """One line for people."""
@@ -106,10 +106,9 @@ def _earths(expected: float | None, form: str) -> str:
 
 
 class Standing(msgspec.Struct, frozen=True, kw_only=True):
-    """What it stood on, and what was known of that one's own turn; the gyros' sigma allows for it."""
+    """Platform under the aircraft, and its own turn; the gyros' sigma allows for it."""
 
     platform: Literal["ground", "deck"]
-    """As configured."""
     turn_deg_s: float | None
     """About the vertical, clockwise seen from above; not taken off. None: nothing told, and the ground was taken for
     fixed to the Earth."""
@@ -132,17 +131,17 @@ class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class GyroPrior(msgspec.Struct, frozen=True, kw_only=True):
-    """What earlier power-ups said of one gyro, and what became of it."""
+    """Prediction of one gyro from earlier power-ups."""
 
     used: bool
-    """Whether it took part in the estimate; a guard it was in any case."""
+    """True if it took part in the estimate; it guards in any case."""
     power_ups: int
-    """Behind it, not counting this one."""
+    """Number of earlier power-ups."""
     temperature_model: bool
-    """A line over temperature; else a mean."""
+    """True: a cubic over temperature; false: a mean."""
     expected_rad_s: Vector
     sigma_rad_s: Vector
-    """Of today's bias about it."""
+    """One sigma of today's bias about the prediction."""
     measured_rad_s: Vector
     """Today's whole bias by the readings alone."""
     shift_sigma: Vector
@@ -150,7 +149,7 @@ class GyroPrior(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AccelPrior(msgspec.Struct, frozen=True, kw_only=True):
-    """Likewise of one accelerometer."""
+    """Prediction of one accelerometer from earlier power-ups; fields as in `GyroPrior`."""
 
     used: bool
     power_ups: int
@@ -162,14 +161,14 @@ class AccelPrior(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Prior(msgspec.Struct, frozen=True, kw_only=True):
-    """What was known of one IMU from before; None where that is less than three power-ups."""
+    """Predictions for one IMU; None: fewer than three earlier power-ups."""
 
     gyro: GyroPrior | None
     accel: AccelPrior | None
 
 
 class Effective(msgspec.Struct, frozen=True, kw_only=True):
-    """What the accelerometers' bias is worth at another attitude: scale errors times 1 g are in it."""
+    """Sigma of the accelerometers' bias at another attitude: scale errors times 1 g are in it."""
 
     scale_from: Literal["assumed", "alignment"]
     """An alignment with tilts has told the scale; else 0.5 % is assumed."""
@@ -183,20 +182,20 @@ class Effective(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WhenWarm(msgspec.Struct, frozen=True, kw_only=True):
-    """What the whole biases will be once the board has warmed up, by the curve over temperature."""
+    """Whole biases that the curve over temperature predicts for the warm board."""
 
     degc: float
-    """Then, by how quickly the board has come to its end at earlier power-ups."""
+    """Temperature of the warm board, by the warm-ups of earlier power-ups."""
     gyro_bias_rad_s: Vector
     gyro_sigma_rad_s: Vector
     accel_bias_m_s2: Vector | None
     accel_sigma_m_s2: Vector | None
     words: tuple[str, ...] = ()
-    """The same for people, of the axes that will move most; empty where that is not worth saying."""
+    """Words for people on the axes that will move most; empty: not worth saying."""
 
 
 class CrossCovariance(msgspec.Struct, frozen=True, kw_only=True):
-    """What two IMUs' errors have in common: tilt, heading, gravity, the Earth's rate."""
+    """Covariance of two IMUs' errors: tilt, heading, gravity and the Earth's rate are common."""
 
     imus: tuple[str, str]
     covariance: tuple[tuple[float | None, ...], ...]
@@ -223,20 +222,20 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     warnings: tuple[str, ...] = ()
     written: dict[str, WrittenParameter] = {}
     prior: Prior | None = None
-    """None: nothing was known from before, or nothing is to be made of it."""
+    """None: no prediction."""
     effective: Effective | None = None
     """None where the accelerometers were not determined."""
     held_back: tuple[Literal["gyro", "accel"], ...] = ()
-    """Measured and not written, since it contradicts earlier ones and nobody had asked: the offsets are as before."""
+    """Measured, not written: it contradicts earlier calibrations and was not requested."""
     unchanged: tuple[Literal["gyro", "accel"], ...] = ()
-    """Measured and not written, since the output is right with the offsets that it has."""
+    """Measured, not written: the offsets in force are as good."""
     gyro_sigma_warm_up_rad_s: Vector | None = None
-    """The part of sigma_use for a warm-up too small to see, which only time takes away."""
+    """Part of sigma_use for a warm-up too small to see; only time removes it."""
     accel_sigma_warm_up_m_s2: Vector | None = None
     when_warm: WhenWarm | None = None
-    """None: it was warm, or nobody knows where it leads."""
+    """None: the board was warm, or the end of its warm-up is unknown."""
     gyro_id: int | None = None
-    """The gyro's device id in the autopilot; None where it has none, or by an older version. Likewise the next."""
+    """Device ids in the autopilot; None: it has none, or the record is of an older version."""
     accel_id: int | None = None
 
     gyro_sigma_in_force_rad_s: Vector | None = None
@@ -299,7 +298,7 @@ def _each(function: Callable[..., float], *vectors: Vector) -> Vector:
 
 
 class Arming(msgspec.Struct, frozen=True, kw_only=True):
-    """What was in force when the aircraft armed.
+    """Calibration in force when the aircraft armed.
 
     "calibrated": by the calibration that began at `calibration`. "checked": offsets of unknown origin, measured to be
     right. "uncalibrated": neither; `reason` says why.
@@ -313,7 +312,7 @@ class Arming(msgspec.Struct, frozen=True, kw_only=True):
     """`started_at` of the record that was in force, wholly or in part."""
     calibrated_ago_s: float | None
     confirmed_ago_s: float | None
-    """Since a still window last agreed with the offsets in force."""
+    """Time since a still window last agreed with the offsets in force."""
     gyro_sigma_use_rad_s: float | None
     """The largest of all axes in force."""
     accel_sigma_use_m_s2: float | None
@@ -347,27 +346,27 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     undone_at: str | None = None
     """UTC, ISO 8601: when what this calibration has written was put back on request."""
     magnetic: Magnetic | None = None
-    """How good the heading can be; None without a compass."""
+    """Quality of the heading; None without a compass."""
     standing: Standing | None = None
     """None: nothing was measured, or by an older version."""
     cross_covariance: tuple[CrossCovariance, ...] = ()
-    """Of every two IMUs."""
+    """Every two IMUs."""
     armings: tuple[Arming, ...] = ()
     """Armings while this calibration was in force; empty in the file, filled in by the history."""
 
     @property
     def written(self) -> dict[str, float]:
-        """What of it has come into the autopilot, by parameter."""
+        """Values written to the autopilot, by parameter."""
         return {name: one.after for imu in self.imus for name, one in imu.written.items()}
 
     @property
     def is_worth_keeping(self) -> bool:
-        """Whether there is something to remember: no, where it was cancelled before anything was measured."""
+        """False for a calibration that was cancelled before anything was measured."""
         return self.state != "cancelled" or bool(self.imus or self.warnings)
 
 
 def to_json(record: Record) -> bytes:
-    """The record as JSON, every key present."""
+    """Encode a record as JSON, every key present."""
     return msgspec.json.encode(record)
 
 

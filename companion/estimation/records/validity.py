@@ -38,7 +38,7 @@ _DIGITS: Final[dict[Triad, int]] = {"gyro": 0, "accel": 2}
 
 
 class Why(enum.Enum):
-    """Why a calibration does not, or does no longer, count as good; the values are what people read."""
+    """Reasons why a calibration does not count as good; the values are what people read."""
 
     NEVER = "not calibrated yet"
     UNDONE = "calibration was undone"
@@ -54,7 +54,7 @@ class Why(enum.Enum):
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True):
-    """What a pilot may set."""
+    """Limits that a pilot may set."""
 
     max_age_s: float
     max_temperature_change_k: float
@@ -64,19 +64,19 @@ class Held(msgspec.Struct, frozen=True, kw_only=True):
     """The gyros or accelerometers of one IMU: what its output must show while the calibration is good."""
 
     calibrated_s: float | None
-    """When it was calibrated; None where the offsets were only measured to be right as they are."""
+    """Time of the calibration; None: the offsets were only measured to be right."""
     confirmed_s: float
-    """When that was seen last."""
+    """Time of the last confirmation."""
     temperature_degc: float | None
-    """Then."""
+    """Temperature at the confirmation."""
     sigma_use: Vector
     """rad/s or m/s^2; what was promised."""
     sigma: Vector
-    """The same without a warm-up to come, which moves old and new offsets alike: what is compared."""
+    """Sigma without the warm-up to come, for comparisons: a warm-up moves old and new offsets alike."""
     expected: Vector
     """Output minus truth while all is well: zero where the autopilot corrects, else the whole bias."""
     seen: bool
-    """Whether its effect was seen in the telemetry."""
+    """True if the effect was seen in the telemetry."""
     averaged_s: float
     """T of V(T, H)."""
 
@@ -102,7 +102,7 @@ def held_of(
 
 
 class Present(msgspec.Struct, frozen=True, kw_only=True):
-    """What the rolling window says now: output minus truth at this pose (rad/s or m/s^2, vehicle FRD)."""
+    """Rolling window now: output minus truth at this pose (rad/s or m/s^2, vehicle FRD)."""
 
     residual: Vector
     sigma_use: Vector
@@ -111,15 +111,15 @@ class Present(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Seen(msgspec.Struct, frozen=True, kw_only=True):
-    """What is known now."""
+    """Present time, temperature and window."""
 
     now_s: float
-    """By the clock of `Held`."""
+    """Time on the clock of `Held`."""
     temperature_degc: float | None = None
     present: Present | None = None
-    """From a still window, if there is one."""
+    """Still window, if there is one."""
     drift: tuple[Vector, Vector] | None = None
-    """By how much the bias has moved with the temperature since `Held`, and its variance; None: not known."""
+    """Change of the bias with the temperature since `Held`, and its variance; None: unknown."""
 
 
 class Finding(msgspec.Struct, frozen=True):
@@ -152,7 +152,7 @@ def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
 
 
 def judge(triad: Triad, name: str, held: Held, model: AllanModel, limits: Limits, seen: Seen) -> list[Finding]:
-    """Everything that speaks against one triad's calibration now; empty while it is good."""
+    """List the reasons against one triad's calibration; empty while it is good."""
     present, drift, temperature_degc = seen.present, seen.drift, seen.temperature_degc
     (unit, words, _), digits = UNITS[triad], _DIGITS[triad]
     found: list[Finding] = []
@@ -177,7 +177,7 @@ def judge(triad: Triad, name: str, held: Held, model: AllanModel, limits: Limits
 
 
 def _off(present: Present, expected: Vector, then: Vector, sigmas: float, floor: float = 0.0) -> list[float]:
-    """By how much the axes are off that are so by more than so many sigmas of what both sides were known with."""
+    """Give the differences of the axes beyond so many sigmas of both sides."""
     return [
         residual - wanted
         for residual, wanted, was, now in zip(present.residual, expected, then, present.sigma, strict=True)
@@ -191,7 +191,7 @@ def worst_axis(held: Held, present: Present) -> float | None:
 
 
 def worth_writing(present: Present, held: Held | None, floor: float) -> bool:
-    """Whether new offsets would better any axis by more than WORTH_SIGMAS of what is known, and more than the floor.
+    """Decide whether new offsets would better any axis by more than WORTH_SIGMAS and more than the floor.
 
     The calibration in force was not known better than its own sigma; the floor is in the same unit.
     """

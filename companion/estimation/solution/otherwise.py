@@ -1,4 +1,4 @@
-"""How the aircraft stands where no gradienter, or no compass, says it.
+"""Attitude without a gradienter or a compass.
 
 Accelerometers whose bias, scale and shear are known from all sides (`alignment.faces`) show which way is up by
 themselves: f = (I + S)^-1 (read - b), and whether they still are what they were by the length of f. It is their own
@@ -24,17 +24,17 @@ from companion.physics.frames import Array, Matrix, symmetric_by
 from companion.physics.units import DEG, MG
 
 UNKNOWN_K: Final = 5.0
-"""Change of temperature that is assumed where it is not known."""
+"""Assumed change of an unknown temperature."""
 _MEAN_S: Final = 12.0
 _SOON_S: Final = 180.0
 LENGTH_SIGMAS: Final = 4.0
-"""By how much the corrected reading may miss gravity before the figures are taken for outdated."""
+"""Largest error of the length of gravity; beyond it the figures of the sides are outdated."""
 
 
 def aged_m_s2(noise: AllanModel, gap_s: float | None, kelvin: float | None) -> float:
-    """One sigma of what has come to the biases of such accelerometers since all sides were measured.
+    """Estimate one sigma of the change of the accelerometers' biases since all sides were measured.
 
-    `gap_s` is how long ago that was, None: it may have been in another power-up; it is warmer now by `kelvin`.
+    `gap_s`: time since then, None: perhaps another power-up. `kelvin`: change of the temperature.
     """
     if gap_s is None:
         wander = CATALOGUE_SCATTER["accel"] ** 2
@@ -57,10 +57,10 @@ class OwnHeading(msgspec.Struct, frozen=True):
 
 
 class Otherwise(msgspec.Struct, frozen=True, kw_only=True):
-    """What is at hand besides gradienter and compass; used where one of them is not there."""
+    """Fallbacks for a missing gradienter or compass."""
 
     sides: dict[str, Sides] = {}
-    """By IMU."""
+    """Figures of the accelerometers from all sides, by IMU."""
     heading: OwnHeading | None = None
 
 
@@ -68,7 +68,7 @@ NOTHING: Final = Otherwise()
 
 
 class Up(NamedTuple):
-    """Which way is up by one IMU's accelerometers alone: a unit vector in the vehicle's axes, and its covariance."""
+    """Up by one IMU's accelerometers alone: a unit vector in the vehicle's axes, and its covariance."""
 
     up: Array
     covariance: Matrix
@@ -76,7 +76,7 @@ class Up(NamedTuple):
 
 
 def up_by_sides(imus: Sequence[ImuWindow], otherwise: Otherwise, local: LocalEarth, warnings: list[str]) -> Up | None:
-    """Up by the first IMU that is known from all sides, and still as it was then; what is not, goes into `warnings`.
+    """Estimate up by the first IMU that was measured on all sides and still agrees with gravity.
 
     Two IMUs are not averaged: their boards may sit differently, and the first one is what the autopilot flies by.
     """
@@ -101,13 +101,13 @@ def up_by_sides(imus: Sequence[ImuWindow], otherwise: Otherwise, local: LocalEar
 
 
 def tilt_in_words(found: Up) -> str:
-    """For the record."""
+    """Say the tilt's origin for the record."""
     sigma_deg = float(np.sqrt(np.linalg.eigvalsh(found.covariance)[-1])) / DEG
     return f"no gradienter: tilt by the accelerometers of imu {found.imu}, known from all sides, to {sigma_deg:.2g} deg"
 
 
 def _force(imu: ImuWindow, known: Sides) -> tuple[Array, Matrix]:
-    """The specific force in the vehicle's axes, (3,), and its covariance, (3, 3)."""
+    """Give the specific force in the vehicle's axes, (3,), and its covariance, (3, 3)."""
     figures, turn = known.figures, known.vehicle_from_sensor
     inverse = np.linalg.inv(response(figures[SCALE], figures[SHEAR]))
     force = inverse @ (turn.T @ np.array(imu.accel_m_s2) - figures[BIAS])

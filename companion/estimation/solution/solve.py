@@ -1,4 +1,4 @@
-"""From the averages of one still stretch to biases with covariances.
+"""Estimates biases with covariances from the averages of one still stretch.
 
 The gradienter gives the direction of up, the compass the heading, the site gravity and the Earth's rate; what each
 sensor should have read follows, and the rest is its bias. "Bias" is the effective one at this pose: a scale error
@@ -54,7 +54,7 @@ _ON_DECK: Final = "on a deck gyros need a compass: without one a slow turn looks
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ImuSolution:
-    """What is left in one IMU's output: mean minus truth, in vehicle FRD, shape (3,); None: not asked for or unknown.
+    """Residual bias in one IMU's output: mean minus truth, in vehicle FRD, shape (3,); None: not asked for or unknown.
 
     `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of a prediction of the next minutes, without what a
     warm-up may do in them: that moves the bias under old and new offsets alike, and no comparison must count it.
@@ -67,23 +67,23 @@ class ImuSolution:
     gyro_rad_s: Array | None
     accel_m_s2: Array | None
     sigma_stat: Array
-    """(6,) as the covariance; what averaging left."""
+    """Sigma that averaging left, (6,), in the order of the covariance."""
     covariance: Matrix
     warnings: tuple[str, ...]
     drifting: tuple[str, ...] = ()
-    """What is to be said of its drift, or what it will be when warm."""
+    """Words on its drift, or on its biases when warm."""
     warm_up_variance: Array = dataclasses.field(default_factory=lambda: np.zeros(6))
     k_s: float = 0.0
-    """How fast its temperature rose."""
+    """Rate of its temperature, K/s."""
     warming: Warming | None = None
-    """What its window tells of slopes; None: nothing."""
+    """Slopes within the window; None: unknown."""
     when_warm: WhenWarm | None = None
     dithered: bool = False
     """The telemetry was seen to follow this IMU's offsets step by step."""
     prior: Prior | None = None
-    """What was known from before, and what became of it."""
+    """Predictions from earlier calibrations, for the record."""
     effective: Effective | None = None
-    """What the accelerometers' bias is worth at another attitude."""
+    """Sigma of the accelerometers' bias at another attitude."""
 
     @property
     def biases(self) -> Pair:
@@ -106,7 +106,7 @@ class ImuSolution:
 
     @property
     def mean_degc(self) -> float | None:
-        """Over the window."""
+        """Mean temperature over the window."""
         path = None if self.warming is None else self.warming.path
         return self.temperature_degc if path is None else path.mean_degc
 
@@ -128,7 +128,7 @@ class Shared:
     """d (accelerometer bias) / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
     reading_sigma_rad: tuple[float, float]
     zero_sigma_rad: float
-    """Of the gradienter's zero, the same in every calibration."""
+    """One sigma of the gradienter's zero, the same in every calibration."""
 
     @property
     def by_zero(self) -> Matrix:
@@ -152,9 +152,9 @@ class Solution:
     unknown: tuple[tuple[str, Triad], ...] = ()
     """IMUs and triads that were asked for and whose readings do not tell; the IMU's warnings say why."""
     magnetic: Magnetic | None = None
-    """How good the heading can be; None without a compass."""
+    """Quality of the heading; None without a compass."""
     turn: Turn = dataclasses.field(default_factory=Turn)
-    """What was known of the platform's own rate."""
+    """Rate of the platform itself."""
     platform: Platform = "ground"
     cross: Mapping[tuple[str, str], Matrix] = dataclasses.field(default_factory=dict)
     """Cross-covariance (6x6) of every two IMUs, in their order."""
@@ -274,7 +274,7 @@ def _pose(truth: Truth) -> Pose:
 
 
 def _shared(truth: Truth, local: LocalEarth, turn: Turn, zero_sigma_rad: float, turn_rad_s: Array) -> Shared:
-    """What one attitude, gravity, Earth's rate and turn of the platform add to the errors of all; method 2.1.
+    """Give the errors of one attitude, gravity, Earth's rate and turn of the platform, common to all; method 2.1.
 
     An attitude error eps makes db_a = eps x f and db_g = eps x w = -[w x] eps; the cross term is kept, since one tilt
     error makes both. What remains unknown of the Earth's rate (latitude, or a heading never measured) comes in with
@@ -296,7 +296,7 @@ def _shared(truth: Truth, local: LocalEarth, turn: Turn, zero_sigma_rad: float, 
 
 
 def _tipped(window: Window, gradienter: GradienterModel | None, truth: Truth, turn_rad_s: Array) -> Array:
-    """What the gyro means of a deck hold of its turn because its axis is another one than the readings alone said."""
+    """Correct the gyro means of a deck's turn for the axis: the truth differs from the gradienter's readings."""
     if window.turn_rad_s is None or window.tilt is None or gradienter is None:
         return np.zeros(3)
     said = gradienter.up(window.tilt.x_deg, window.tilt.y_deg)
@@ -342,7 +342,7 @@ def _estimate(
 
 
 def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
-    """What the gyro means hold of the Earth's rate: all of it as the aircraft stood, or what turning left of it."""
+    """Give the Earth's rate in the gyro means: all of it, or the part that turning left."""
     if imu.by_earth is None or truth.heading_rad is None:
         return truth.earth_rate(local).mean
     c, s = math.cos(truth.heading_rad), math.sin(truth.heading_rad)
@@ -351,7 +351,7 @@ def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
 
 
 def believable(imu: ImuWindow, up: Array, local: LocalEarth) -> ImuWindow:
-    """The same; what cannot be is hidden, with the words that say why and what to do. `up` (3,), vehicle FRD."""
+    """Hide triads with impossible biases, with cause and remedy in words. `up` (3,), vehicle FRD."""
     means = np.array(imu.gyro_rad_s), np.array(imu.accel_m_s2)
     found = implausible(imu.name, *means, local.gravity_m_s2 * up, np.array(imu.mounting), local.remedies.mounting)
     hidden = {triad: Hidden(f"{words}; {local.remedies.any_bias}", useless=True) for triad, words in found.items()}
@@ -359,12 +359,12 @@ def believable(imu: ImuWindow, up: Array, local: LocalEarth) -> ImuWindow:
 
 
 def untold(imu: ImuWindow, asked: Collection[Triad]) -> list[str]:
-    """What this IMU's readings do not tell, or not well, of what is asked for."""
+    """Say which of the asked triads this IMU's readings do not tell, or not well."""
     return list(dict.fromkeys(hidden.words for triad, hidden in imu.hidden.items() if triad in asked))
 
 
 def widened(imu: ImuWindow, asked: Collection[Triad], powered_s: float, variance: Array) -> list[str]:
-    """Why its sigma is wide, where that is for a warm-up; `variance` (6,): what is in it besides."""
+    """Say why the sigma is wide if a warm-up makes it so; `variance` (6,): the other parts."""
     if imu.warming is None or "gyro" not in asked or imu.refused("gyro") is not None:
         return []
     words = imu.warming.in_words(imu.name, powered_s, variance)

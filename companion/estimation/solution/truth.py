@@ -1,4 +1,4 @@
-"""How the aircraft stood, from everything but its gyros: the attitude against which every sensor is held."""
+"""Attitude of the aircraft from everything but its gyros: the reference for every sensor."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What the sensors should have read, from everything but the sensors themselves."""
+    """Reference for the sensors, from everything but themselves."""
 
     up: Array
     up_covariance: Matrix
@@ -34,14 +34,14 @@ class Truth:
     up_by_reading: Matrix | None
     """d up / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
     reading_sigma_rad: tuple[float, float]
-    """Of the gradienter's two means, without its zero."""
+    """Sigma of the gradienter's two means, without its zero."""
     tilt_from: TiltFrom | None
     """None: the accelerometers' own, of which nothing is known."""
     heading_rad: float | None = None
     heading_sigma_rad: float | None = None
     heading_from: HeadingFrom | None = None
     magnetic: Magnetic | None = None
-    """What the compass' field and steadiness say of the heading; None without a compass."""
+    """Quality of the heading by the compass' field and steadiness; None without a compass."""
 
     @property
     def body_from_ned(self) -> Matrix:
@@ -55,7 +55,7 @@ class Truth:
 
 
 def attitude_error_jacobian(up: Array) -> Matrix:
-    """How a change of `up` turns the attitude, at a fixed heading angle: eps = jacobian @ d up, shape (3, 3).
+    """Give the derivative of the attitude by `up`, at a fixed heading: eps = jacobian @ d up, shape (3, 3).
 
     C_hat = (I - [eps x]) C. Roll turns about the body's x axis, pitch about the horizontal axis
     (0, cos gamma, -sin gamma); with gamma = atan2(-u_y, -u_z) and sin theta = u_x.
@@ -75,7 +75,7 @@ def truth_of(
     warnings: list[str],
     otherwise: Otherwise = NOTHING,
 ) -> Truth:
-    """How the aircraft stood, from everything but its gyros; what is missing goes into `warnings`.
+    """Estimate the attitude from everything but the gyros; `warnings` gets a line for each gap.
 
     Raises:
         CalibrationRefusedError: the readings cannot be right together.
@@ -120,7 +120,7 @@ def truth_of(
 
 
 def _with_own_heading(without: Truth, own: OwnHeading, warnings: list[str]) -> Truth:
-    """Where there is no compass of ours: the autopilot's yaw."""
+    """Use the autopilot's yaw as the heading."""
     sigma_rad = own.sigma_deg * DEG
     warnings.append(f"no compass: heading {own.heading_deg:.0f} deg by the autopilot, good to {own.sigma_deg:.0f} deg")
     return dataclasses.replace(

@@ -1,4 +1,4 @@
-"""A bias over temperature as firmwares take it off: a cubic in an IMU's own axes, held at the ends of its span."""
+"""Bias over temperature as firmwares compensate it: a cubic in an IMU's own axes, constant beyond its span."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ZERO: Vector = (0.0, 0.0, 0.0)
 
 
 class Polynomial(msgspec.Struct, frozen=True, kw_only=True):
-    """c0 + c1 d + c2 d^2 + c3 d^3, with d from the reference to the temperature as far as that lies in the span."""
+    """c0 + c1 d + c2 d^2 + c3 d^3; d: the temperature, limited to the span, less the reference."""
 
     coefficients: tuple[Vector, Vector, Vector, Vector] = (ZERO, ZERO, ZERO, ZERO)
     """Constant first; rad/s or m/s^2 and per kelvin, square kelvin, cubic kelvin."""
@@ -25,14 +25,14 @@ class Polynomial(msgspec.Struct, frozen=True, kw_only=True):
     high_degc: float = math.inf
 
     def at(self, degc: float) -> Array:
-        """(3,)."""
+        """Return the bias at a temperature, (3,)."""
         d = min(max(degc, self.low_degc), self.high_degc) - self.reference_degc
         c0, c1, c2, c3 = np.array(self.coefficients)
         value: Array = c0 + (c1 + (c2 + c3 * d) * d) * d
         return value
 
     def zero_at(self, degc: float) -> Polynomial:
-        """The same with another constant, by which it is nothing at this temperature."""
+        """Return the polynomial with the constant that makes it zero at this temperature."""
         c0, *others = self.coefficients
         first, second, third = others
         constant = vector(np.subtract(c0, self.at(degc)))
@@ -43,14 +43,14 @@ NOTHING: Final = Polynomial()
 
 
 def of_curve(curve: Curve, orientation: Matrix, scale: Vector = (1.0, 1.0, 1.0)) -> Polynomial:
-    """How a bias changes over the span that was seen, nothing at the reference.
+    """Convert a curve, over the span that was seen; zero at the reference.
 
     The lag is left out: no firmware knows of one.
 
     Args:
-        curve: of the vehicle's axes.
+        curve: in the vehicle's axes.
         orientation: 3x3, the IMU's axes to the vehicle's.
-        scale: what the IMU's output is multiplied with after that.
+        scale: factor that the firmware applies to the IMU's output afterwards.
     """
     low, high = curve.span_degc
     terms = np.zeros((4, 3))

@@ -1,4 +1,4 @@
-"""Whether what an IMU's thermometer shows is its temperature in degrees Celsius, second by second.
+"""Check of the IMUs' thermometers, second by second.
 
 One that is stuck, in another unit or jumping is not believed: then the IMU counts as one without a thermometer. A
 constant reading alone is no fault: a board comes to rest at some temperature, many parts show steps of 1 K or 1/8 K,
@@ -14,12 +14,12 @@ from typing import Final
 
 LOWEST_DEGC: Final = -40.0
 HIGHEST_DEGC: Final = 105.0
-"""What IMUs are made for, by their data sheets at most."""
+"""Widest range of IMUs' data sheets."""
 _USUAL_DEGC: Final = (10.0, 60.0)
 _NONE_AFTER_S: Final = 10
 _ADJACENT_S: Final = 3
 JUMP_K: Final = 5.0
-"""More than any board warms in a second."""
+"""Change within a second that no board makes."""
 _JUMPS: Final = 2
 _WITHIN_S: Final = 600
 _SAME_K: Final = 1e-6
@@ -27,35 +27,35 @@ _STUCK_S: Final = 60
 _STUCK_ALONE_S: Final = 3 * 3600
 _MOVED_K: Final = 3.0
 _MOVED_FAR_K: Final = 10.0
-"""Of another IMU, beside a thermometer with fine steps, and with coarse ones."""
+"""Change of another IMU beside a stuck thermometer with fine steps, and with coarse ones."""
 _HEATED_DEGC: Final = 38.0
-"""From here on a heater may hold it: autopilots heat to 45 degC and more."""
+"""Least temperature that a heater may hold: autopilots heat to 45 degC and more."""
 _FINE_K: Final = 0.006
-"""Further from all eighths and tenths of a kelvin, as they are when rounded to hundredths, a reading has fine steps."""
+"""Least distance of a reading with fine steps from eighths and tenths of a kelvin, rounded to hundredths."""
 
 
 @dataclasses.dataclass(slots=True)
 class _Shown:
     slot: int
-    """Of the latest reading, or of the first second."""
+    """Second of the latest reading, or the first second."""
     degc: float | None = None
     since: int = 0
-    """The second from which it has shown this."""
+    """Second since which it has shown this value."""
     beside: dict[str, float] = dataclasses.field(default_factory=dict)
-    """What the others showed then."""
+    """Readings of the other IMUs at that second."""
     jumps: deque[int] = dataclasses.field(default_factory=lambda: deque(maxlen=_JUMPS))
     wrong: str = ""
     none: bool = False
 
 
 class Thermometers:
-    """Those of all IMUs: one shows what another hides."""
+    """Thermometers of all IMUs: one reveals a fault of another."""
 
     def __init__(self) -> None:
         self._of: dict[str, _Shown] = {}
 
     def believed(self, name: str, slot: int, degc: float | None) -> float | None:
-        """Take the reading of one second; what of it can be believed."""
+        """Add the reading of one second; return it if it can be believed."""
         one = self._of.get(name)
         if one is None or slot < one.slot:
             one = self._of[name] = _Shown(slot, since=slot)
@@ -76,7 +76,7 @@ class Thermometers:
         return None if one.wrong or jumped else degc
 
     def trouble(self, name: str) -> str:
-        """Why a thermometer is not believed, in a line; empty: it is, or there is none."""
+        """Say in one line why a thermometer is not believed; empty: it is, or there is none."""
         one = self._of.get(name)
         return (
             f"imu {name}: its thermometer {one.wrong}; nothing is learned by it"
@@ -85,7 +85,7 @@ class Thermometers:
         )
 
     def has_none(self, name: str) -> bool:
-        """Whether the IMU is heard without any temperature."""
+        """Return True for an IMU whose messages carry no temperature."""
         return name in self._of and self._of[name].none
 
     def _wrong(self, one: _Shown) -> str:
@@ -107,7 +107,7 @@ class Thermometers:
 
 
 def _unit(shown: float) -> str:
-    """In which other unit it would be a usual temperature."""
+    """Guess the unit in which it would be a usual temperature."""
     low, high = _USUAL_DEGC
     units = {
         "kelvin": shown - 273.15,
