@@ -30,9 +30,9 @@ from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.joint import Weighed, Whole, weigh
 from companion.estimation.solution.prior import (
     Expectation,
-    Expected,
     ExpectedImu,
     Now,
+    Prediction,
     curve_of,
     expect,
     expect_today,
@@ -228,7 +228,7 @@ class BiasMemory:
         earlier, session = self._points(name), self.identities.session(name)
         profile = noise_profile(self._profiles.of(name))
 
-        def today(triad: Triad) -> Expected | None:
+        def today(triad: Triad) -> Prediction | None:
             last = self._today.get((name, triad))
             if last is None or last.session != session:
                 return None

@@ -1,1 +1,1 @@
-"""From a window to biases, sigmas and the record."""
+"""Biases and sigmas from a window, combined with earlier calibrations, and the record."""

@@ -31,7 +31,7 @@ import numpy as np
 from companion.estimation.means.warming import NEXT_S
 from companion.estimation.records.record import AccelPrior, GyroPrior, Prior, WhenWarm
 from companion.estimation.solution.doubt import Doubt, Witness, contradictions
-from companion.estimation.solution.prior import Expectation, Expected, ExpectedImu
+from companion.estimation.solution.prior import Expectation, ExpectedImu, Prediction
 from companion.estimation.solution.solve import ImuSolution, Pair, Shared, Solution, moved
 from companion.estimation.turning.watch import CHANCE_SIGMAS, Turn
 from companion.physics.frames import Array, vector
@@ -77,7 +77,7 @@ class _Known:
 
     imu: int
     triad: Triad
-    expected: Expected
+    expected: Prediction
     measured: Array
     witness: Witness
 
@@ -224,7 +224,7 @@ def _known(solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu]
     return found
 
 
-def _witness(imu: ImuSolution, shared: Shared, triad: Triad, expected: Expected, measured: Array) -> Witness:
+def _witness(imu: ImuSolution, shared: Shared, triad: Triad, expected: Prediction, measured: Array) -> Witness:
     part = rows_of(triad)
     common = shared.covariance[part, part]
     if triad == "accel":

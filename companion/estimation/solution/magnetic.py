@@ -1,4 +1,4 @@
-"""How good a compass heading can be: what its field, its steadiness and the Earth's field say of it.
+"""Quality of a compass heading, judged by its field, its steadiness and the Earth's field.
 
 A disturbance of the field has three parts. Along the field and in the dip it shows, as a wrong strength F and a wrong
 inclination I; across the meridian it turns the heading and shows in nothing. So the visible parts say how large the
@@ -60,14 +60,14 @@ class Heading:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Field:
-    """What the mean field says."""
+    """Heading by the mean field."""
 
     strength_gauss: float | None
     inclination_rad: float | None
     heading_rad: float | None
-    """Of the vehicle, by the compass' north, with our tilt compensation."""
+    """Heading of the vehicle by the compass' north, with our tilt compensation."""
     bound_deg: float | None = None
-    """By how much a disturbance may turn it."""
+    """Largest turn of the heading by a disturbance."""
 
 
 def assess(
@@ -137,7 +137,7 @@ def assess(
 def _look(
     field: FieldWindow, compass: CompassModel, local: LocalEarth, up: Array, up_covariance: Matrix | None
 ) -> _Field:
-    """What the mean field says, and how far a disturbance that would look like this may turn the heading."""
+    """Judge the mean field, and how far a disturbance that would look like this may turn the heading."""
     vector = compass.vehicle_from_sensor @ np.array(field.field)
     size = float(np.linalg.norm(vector))
     strength = size if field.unit == "gauss" else None

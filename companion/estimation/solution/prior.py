@@ -135,7 +135,7 @@ _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0
 
 
-class Expected(msgspec.Struct, frozen=True, kw_only=True):
+class Prediction(msgspec.Struct, frozen=True, kw_only=True):
     """Prediction of one triad's whole bias today, vehicle FRD, rad/s or m/s^2."""
 
     value: Vector
@@ -157,9 +157,9 @@ class ExpectedImu(msgspec.Struct, frozen=True, kw_only=True):
     """Predictions for one IMU."""
 
     name: str
-    earlier: dict[Triad, Expected | None] = {}
+    earlier: dict[Triad, Prediction | None] = {}
     """Prediction from earlier power-ups."""
-    today: dict[Triad, Expected | None] = {}
+    today: dict[Triad, Prediction | None] = {}
     """Prediction from a calibration earlier in this power-up."""
     along: dict[Triad, Along | None] = {}
     """Prediction by the curve for a window in which the temperature changed."""
@@ -187,7 +187,7 @@ class Now(msgspec.Struct, frozen=True, kw_only=True):
     zero: str | None
 
 
-def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, model: AllanModel) -> Expected | None:
+def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, model: AllanModel) -> Prediction | None:
     """Predict today's bias from the earlier power-ups; None: they are too few."""
     groups = [
         group for group in believed(points, triad) if not any(point.power_up.is_same(now.power_up) for point in group)
@@ -216,7 +216,7 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
     # An error that all power-ups share, of one attitude or one place, does not average out.
     together = np.square(curve.shares @ np.array(poses)) + np.max(np.square(shared), axis=0)
     same, other = _zeros([group[-1] for group in groups], curve.shares, now.zero) if triad == "accel" else (0.0, 0.0)
-    return Expected(
+    return Prediction(
         value=vector(value),
         variance=vector(variance + together),
         limit=student_quantile(GATE_SIGMAS, curve.freedom),
@@ -230,7 +230,7 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
 
 def expect_today(
     last: Point, triad: Triad, now: Now, effect: PoseEffect, model: AllanModel, curve: Curve | None = None
-) -> Expected | None:
+) -> Prediction | None:
     """Predict the bias from an earlier calibration in this power-up; None: it did not measure this triad.
 
     The `curve` predicts the change with the temperature; without one, the catalogue's slope widens the sigma.
@@ -247,7 +247,7 @@ def expect_today(
     drift = _in_run(model, max(abs(now.unix_s - last.unix_s), _SHORTEST_GAP_S))
     variance = np.square(found.sigma_use) + np.square(found.sigma_shared) + np.square(pose[0]) + of_change + drift
     same = triad == "accel" and last.zero == now.zero
-    return Expected(
+    return Prediction(
         value=vector(bias[0] + change),
         variance=vector(variance),
         limit=GATE_SIGMAS,

@@ -1,4 +1,4 @@
-"""Where the aircraft stands, what gravity and the Earth's rotation are there, and how sure that is.
+"""Place of the aircraft, with gravity and the Earth's rotation there, and their sigmas.
 
 What is not known widens the sigmas; it is never silently replaced by a default (each gap leaves a warning).
 """
@@ -41,7 +41,7 @@ class Uncertain:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Remedies:
-    """What a user can do about what is missing: in the configuration, or where a command asks for an estimate."""
+    """Remedies for what is missing: in the configuration, or for a command that asks for an estimate."""
 
     latitude: str = "set vehicle.latitude_deg or wait for GPS"
     height: str = "set vehicle.height_m or wait for GPS"
@@ -56,7 +56,7 @@ IN_CONFIGURATION: Final = Remedies()
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Whereabouts:
-    """What is known of place and date, and who said so ("configuration", "autopilot", ...)."""
+    """Place and date, and their source ("configuration", "autopilot", ...)."""
 
     latitude_deg: float | None = None
     longitude_deg: float | None = None
@@ -82,7 +82,7 @@ class LocalEarth:
     remedies: Remedies = IN_CONFIGURATION
 
     def rate_in_body(self, body_from_ned: Matrix, *, heading_known: bool) -> Uncertain:
-        """In body axes; with an unknown heading the horizontal part may point anywhere, and its mean is zero."""
+        """Turn the rate into body axes; of an unknown heading the horizontal part has zero mean and any direction."""
         mean, covariance = self.rate_ned_rad_s, self.rate_ned_covariance
         if not heading_known:
             mean_square_north = mean[0] ** 2 + covariance[0, 0]
@@ -92,7 +92,7 @@ class LocalEarth:
 
 
 def local_earth(where: Whereabouts, remedies: Remedies = IN_CONFIGURATION) -> LocalEarth:
-    """Everything the equations need of a place."""
+    """Compute everything that the equations need of a place."""
     warnings: list[str] = []
     covariance = np.zeros((3, 3))
     gravity: float | None = None

@@ -18,7 +18,7 @@ from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.records.history import PowerUp
 from companion.estimation.request import What
 from companion.estimation.solution.joint import Weighed, Whole, weigh
-from companion.estimation.solution.prior import Expectation, Expected, ExpectedImu, points
+from companion.estimation.solution.prior import Expectation, ExpectedImu, Prediction, points
 from companion.estimation.solution.results import record_of
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution, solve
@@ -31,10 +31,10 @@ Array = NDArray[np.float64]
 ZERO_RAD = 0.1 * DEG
 
 
-def expected(value: Array, sigma: float, **others: Any) -> Expected:
+def expected(value: Array, sigma: float, **others: Any) -> Prediction:
     x, y, z = (float(one) for one in value)
     known = {"limit": 4.5, "power_ups": 8, "weighs": True, **others}
-    return Expected(value=(x, y, z), variance=(sigma**2,) * 3, **known)
+    return Prediction(value=(x, y, z), variance=(sigma**2,) * 3, **known)
 
 
 def imus(

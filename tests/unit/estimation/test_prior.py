@@ -14,8 +14,8 @@ from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.align_record import Determined, ImuAlignmentRecord
 from companion.estimation.records.history import Measured, Point, PowerUp, believed, by_power_up
 from companion.estimation.solution.prior import (
-    Expected,
     Now,
+    Prediction,
     curve_of,
     expect,
     expect_today,
@@ -81,7 +81,7 @@ def some(count: int, seed: int = 1, scale: float = 50.0 * DEG_H) -> Array:
     return np.random.default_rng(seed).normal(0.0, scale, (count, 3))
 
 
-def found(points: Sequence[Point], at: Now | None = None, triad: Triad = "gyro") -> Expected:
+def found(points: Sequence[Point], at: Now | None = None, triad: Triad = "gyro") -> Prediction:
     result = expect(points, triad, at or now(), ASSUMED, STEADY)
     assert result is not None
     return result
