@@ -20,7 +20,7 @@ _WHEN: Final = {"now": "now", "then": "this calibration"}
 
 
 class _Dot(msgspec.Struct, frozen=True):
-    """One still window, or what is expected at a temperature, of one triad."""
+    """One triad in a still window, or as expected at a temperature."""
 
     degc: float
     bias: Vector
@@ -28,7 +28,7 @@ class _Dot(msgspec.Struct, frozen=True):
 
 
 def biases_by_temperature(imus: Sequence[ByTemperature], *, looking_back: bool = False) -> Markup:
-    """Each IMU with its plots, or with what is needed for them; looking back, now is a calibration."""
+    """Draw each IMU's plots, or say what they need; `looking_back`: now is a calibration."""
     return tag("div", *(part for imu in imus for part in _imu(imu, looking_back=looking_back)))
 
 

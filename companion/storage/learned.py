@@ -1,4 +1,4 @@
-"""What is known from before: the alignment in force, the biases of each IMU, how far the time in our signatures is."""
+"""Files of what was learned: alignments, armings, biases of each IMU, the time in our signatures."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from companion.storage.state import BoundedList, StateFile
 
 
 def alignment_in(directory: Path) -> StateFile[align_record.AlignmentRecord]:
-    """`alignment.json` in a storage directory."""
+    """Return the alignment, `alignment.json` in a storage directory."""
     kind, newest = align_record.AlignmentRecord, align_record.FORMAT_VERSION
     return StateFile(directory / "alignment.json", kind, align_record.check, newest)
 
 
 def faces_in(directory: Path) -> StateFile[align_record.FacesRecord]:
-    """`faces.json`, likewise."""
+    """Return the measurement of all sides, `faces.json` in a storage directory."""
     kind, newest = align_record.FacesRecord, align_record.FORMAT_VERSION
     return StateFile(directory / "faces.json", kind, align_record.check_faces, newest)
 
@@ -60,7 +60,7 @@ KEEP_IMUS: Final = 8
 
 
 class KnownImu(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU: which sensor that was, and its points, oldest first."""
+    """Identity and points of one IMU, oldest first."""
 
     identity: dict[str, str]
     points: tuple[history.Point, ...] = ()
@@ -78,12 +78,12 @@ class BiasStore:
         self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, newest=FORMAT_VERSION)
 
     def read(self) -> dict[str, KnownImu]:
-        """By IMU, what is kept; what cannot be used is set aside and begun anew, since nothing hangs on it."""
+        """Read the IMUs; a file that cannot be used is set aside, since nothing depends on it."""
         found = self._file.load()
         return {} if found is None else found.imus
 
     def all(self) -> dict[str, KnownImu]:
-        """The same, for who may not set aside anything.
+        """Read the IMUs without setting aside anything.
 
         Raises:
             StorageError: it cannot be used.
@@ -92,7 +92,7 @@ class BiasStore:
         return {} if found is None else found.imus
 
     def write(self, imus: dict[str, KnownImu]) -> None:
-        """Keep the latest IMUs.
+        """Write the latest IMUs.
 
         Raises:
             StorageError: it could not be written; what was there before still is.
@@ -107,19 +107,19 @@ _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
 
 class SigningTime(msgspec.Struct, frozen=True):
-    """What was used, and when. Ticks are 10 us since 2015."""
+    """Latest time in our signatures. Ticks are 10 us since 2015."""
 
     ticks: int
     reserved: int
-    """None beyond this may have been used before the next one was written."""
+    """Largest tick that may have been used before the next write."""
     uptime_s: float
-    """Of the board, when this was written."""
+    """Uptime of the board at the write."""
     boot_id: str
-    """Which start of the board it was; empty: unknown."""
+    """Boot of the board; empty: unknown."""
 
 
 def this_boot() -> str:
-    """Of the running kernel; empty where it cannot be had."""
+    """Return the boot id of the running kernel; empty where it is unknown."""
     # The service's unit hides the file, and hands the id over instead.
     handed = os.environ.get("COMPANION_BOOT_ID", "")
     if handed:
@@ -131,7 +131,7 @@ def this_boot() -> str:
 
 
 def signing_time_in(directory: Path) -> StateFile[SigningTime]:
-    """What is kept in a storage directory."""
+    """Return the signing time of a storage directory."""
     return StateFile(directory / SIGNING_FILE, SigningTime, _check_time)
 
 
