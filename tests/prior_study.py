@@ -12,7 +12,6 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -66,11 +65,6 @@ class Case:
     """Sigma of the gradienter's zero in force today."""
     earlier_zero_deg: float | None = None
     """Of another one with which all earlier calibrations were made; None: it was today's."""
-
-    flown: float | None = None
-    """If each earlier power-up's flight counted as one more: sigma of what its log says of the bias, an axis."""
-    shaken: float = 0.0
-    """By how much motors move the bias, one sigma an axis, the same in all flights."""
 
     @property
     def unit(self) -> float:
@@ -164,7 +158,6 @@ def one_trial(
     for k in range(case.imus):
         mean = random.normal(0.0, 300.0, 3) if case.triad == "gyro" else random.normal(0.0, 10.0, 3)
         slope = random.normal(0.0, case.slope_per_k, 3)
-        shaken = random.normal(0.0, case.shaken, 3) if case.shaken else np.zeros(3)
 
         def measured(truth: Array, of_zero: Array) -> Array:
             draw = random.uniform(-1.0, 1.0, 3) if case.uniform_stat else random.normal(0.0, 1.0, 3)
@@ -194,13 +187,6 @@ def one_trial(
                     accel=one if case.triad == "accel" else None,
                 )
             )
-            if case.flown is not None:
-                flown = axes(np.full(3, case.flown * unit))
-                value = axes((bias + shaken + random.normal(0.0, case.flown, 3)) * unit)
-                said = msgspec.structs.replace(one, bias=value, sigma_stat=flown, sigma_use=flown)
-                # A log does not say which of the daemon's power-ups it tells of.
-                host = PowerUp(host=f"flight {r}", since_unix_s=None)
-                points.append(msgspec.structs.replace(points[-1], power_up=host, **{case.triad: said}))
         mean = mean + random.normal(0.0, case.ageing, 3) + random.normal(0.0, 1.0, 3) * case.jump
         truth = mean + random.normal(0.0, case.scatter, 3) + slope * (today_degc - 25.0)
         truths.append(truth)
@@ -273,13 +259,6 @@ GOOD: dict[str, Any] = {"stat": 1.6, "use": 5.0}
 """A good gyro after 30 s (method 2.2: ICM-42688-P)."""
 OLD: dict[str, Any] = {"stat": 47.0, "use": 63.0}
 """An ADIS16405 after 10 s (likewise)."""
-FLIGHTS: dict[str, dict[str, Any]] = {
-    "scatter 20, none flown": {},
-    "each flown, as points of 12": {"flown": 12.0},
-    "each flown, as points of 54": {"flown": 54.0},
-    "each flown and shaken by 30": {"flown": 12.0, "shaken": 30.0},
-}
-"""What it would be if flights became points of the memory; they do not."""
 CASES = (
     *(Case(name=f"good gyro, scatter {s:g}", scatter=s, **GOOD) for s in (70.0, 10.0, 2.0, 0.0)),
     *(
@@ -303,7 +282,6 @@ CASES = (
         today_degc=-5.0,
         **OLD,
     ),
-    *(Case(name=f"5 power-ups, {name}", scatter=20.0, power_ups=5, **GOOD, **flown) for name, flown in FLIGHTS.items()),
     Case(name="another good gyro today", scatter=70.0, jump=1800.0, **GOOD),
     Case(name="another old gyro today", scatter=20.0, jump=1800.0, **OLD),
     Case(name="another old gyro, a little", scatter=20.0, jump=200.0, power_ups=20, **OLD),

@@ -1,8 +1,8 @@
 """Effect of running motors on an IMU's biases, from several flights.
 
-It stands beside what calibrations have found on the ground and never becomes a point of theirs (tests.prior_study): the
-power-up that a log tells of the daemon has seen itself, and better; the log does not say which one that was, so that it
-would count twice; and what motors add is no bias of the ground.
+It stands beside the history of calibrations and never becomes a point of it: the daemon has measured that power-up
+itself, and better; the log does not say which one it was, so that it would count twice; and the effect of motors is no
+bias of the ground.
 """
 
 from __future__ import annotations
