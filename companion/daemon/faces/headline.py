@@ -65,7 +65,7 @@ class Headlines:
     def _concern(self) -> str | None:
         """What else the pilot should know of at once, where the rest is well or nothing can be done about it."""
         attitude = None if self._attitude is None else self._attitude.concern
-        return self._devices.watch.implausible() or self._devices.signing.watch.warning or attitude
+        return self._devices.watch.implausible() or self._devices.signing.warning or attitude
 
     def _now(self) -> Headline:
         now_s = asyncio.get_running_loop().time()
