@@ -14,18 +14,18 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from companion import __version__, config
+from companion import __version__, commands, config
 from companion.cli.terminal import (
     FAILED,
     NO_DAEMON,
     USAGE,
     Command,
     Parser,
+    add_fields,
     how_to_start,
     print_json,
     print_lines,
     seconds,
-    within,
 )
 from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError, NobodyHeardError
 from companion.links.system import logs
@@ -85,10 +85,10 @@ def _parser() -> Parser:
         prog="companion", parents=[common], description="Field self-calibration of gyro and accelerometer biases."
     )
     parser.add_argument("--version", action="version", version=f"companion {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    subcommands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
     def add(name: str, command: Command, words: str) -> Parser:
-        sub = commands.add_parser(name, parents=[common], help=words, description=words)
+        sub = subcommands.add_parser(name, parents=[common], help=words, description=words)
         sub.set_defaults(command=command)
         return sub
 
@@ -112,47 +112,23 @@ def _parser() -> Parser:
         "print the arming script for ArduPilot (> APM/scripts/companion_arming.lua), and how to install it",
     )
     local.add_commands(add)
-    add("status", client.status, "what the daemon is doing")
-    calibrate = add("calibrate", client.calibrate, "calibrate now (the aircraft must be disarmed and still)")
-    what = calibrate.add_mutually_exclusive_group()
-    what.add_argument("--gyros", action="store_true", help="gyros only")
-    what.add_argument("--accelerometers", action="store_true", help="accelerometers only")
-    calibrate.add_argument("--wait", action="store_true", help="wait for the end, show progress, print the record")
-    calibrate.add_argument(
-        "--timeout", type=seconds, metavar="S", help="cancel when it has not finished by then (default: no limit)"
-    )
-    calibrate.add_argument(
-        "--reboot", action="store_true", help="restart the autopilot afterwards (PX4's attitude needs it)"
-    )
-    client.add_command(add)
-    add("cancel", client.cancel, "cancel a running calibration")
-    undo = add("undo", client.undo, "put the autopilot's values from before the last calibration back")
-    undo.add_argument(
-        "--force", action="store_true", help="leave what somebody else has changed since, and put the rest back"
-    )
-    add(
-        "autopilot-setup",
-        client.setup,
-        "what the autopilot needs set: heading, gate, offsets, port",
-    )
-    history = add("history", client.history, "list past calibrations")
-    history.add_argument(
-        "-n", "--limit", type=within(1, 1e6, int), default=20, metavar="N", help="the latest N (default 20)"
-    )
-    temperature = add("temperature", client.temperature, "how the gyros' biases follow the temperature, as far as seen")
-    what = temperature.add_mutually_exclusive_group()
-    what.add_argument("--write", action="store_true", help="write the curves into the autopilot (disarmed and still)")
-    what.add_argument(
-        "--overwrite",
-        action="store_true",
-        help="the same, also over a temperature calibration that is not the companion's",
-    )
-    what.add_argument("--undo", action="store_true", help="put back what was there before the curves")
-    add("monitor", monitor.monitor, "watch the daemon until Ctrl-C")
+    for kind, command in (
+        (commands.Status, client.status),
+        (commands.Calibrate, client.calibrate),
+        (commands.Align, client.align),
+        (commands.Cancel, client.cancel),
+        (commands.Undo, client.undo),
+        (commands.AutopilotSetup, client.setup),
+        (commands.History, client.history),
+        (commands.Temperature, client.temperature),
+        (commands.Monitor, monitor.monitor),
+        (commands.Record, client.record),
+    ):
+        add_fields(add(kind.name(), command, kind.help), kind, commands.Interface.COMMAND_LINE)
     add("web-token", local.web_token, "where the page is, and the token that its buttons need")
-    recordings.add_commands(add)
+    recordings.add_command(add)
     flight.add_commands(add)
     profile.add_command(add)
-    ground.add_commands(commands, common)
-    fleet.add_commands(commands, common)
+    ground.add_commands(subcommands, common)
+    fleet.add_commands(subcommands, common)
     return parser

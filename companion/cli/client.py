@@ -7,10 +7,12 @@ import asyncio
 import math
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
+from companion import commands
 from companion.cli import show
-from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds
+from companion.cli.terminal import conclude, load_config, print_lines, request_of
 from companion.formats import Object
 from companion.links.system.control_client import ask
 
@@ -69,9 +71,7 @@ async def status(options: argparse.Namespace) -> int:
 
 async def calibrate(options: argparse.Namespace) -> int:
     """`companion calibrate`; Ctrl-C cancels what is waited for."""
-    what = "gyros" if options.gyros else "accelerometers" if options.accelerometers else "both"
-    wanted = {"command": "calibrate", "what": what, "wait": options.wait}
-    wanted |= {"timeout_s": options.timeout, "reboot": options.reboot}
+    wanted = request_of(options, commands.Calibrate)
     reply = await request(options, wanted, {"command": "cancel"} if options.wait else None)
     if "record" in reply:
         record = reply["record"]
@@ -91,7 +91,7 @@ async def cancel(options: argparse.Namespace) -> int:
 
 async def undo(options: argparse.Namespace, wanted: Object | None = None) -> int:
     """`companion undo`, or that of a single kind of write."""
-    reply = await request(options, wanted or {"command": "undo", "force": options.force})
+    reply = await request(options, wanted or request_of(options, commands.Undo))
     answer = {key: reply.get(key) for key in ("state", "reason", "written", "undone", "undoable")}
     lines = [f"{answer['state']}: {answer['reason']}", show.undo_line(answer["undoable"] or ())]
     return finish(options, reply, answer, lines, good=answer["state"] == "done")
@@ -99,7 +99,7 @@ async def undo(options: argparse.Namespace, wanted: Object | None = None) -> int
 
 async def history(options: argparse.Namespace) -> int:
     """`companion history`."""
-    reply = await request(options, {"command": "history", "limit": options.limit})
+    reply = await request(options, request_of(options, commands.History))
     keys = ("numbers", "records", "armings", "by_hand", "interrupted", "flights")
     answer = {key: reply.get(key, []) for key in keys}
     return finish(options, reply, answer, show.history_lines(**answer), good=True)
@@ -107,15 +107,16 @@ async def history(options: argparse.Namespace) -> int:
 
 async def temperature(options: argparse.Namespace) -> int:
     """`companion temperature`; Ctrl-C cancels a write in the daemon too."""
-    if options.undo:
-        return await undo(options, {"command": "temperature", "action": "undo"})
-    if options.write or options.overwrite:
-        wanted = {"command": "temperature", "action": "write", "overwrite": options.overwrite}
+    wanted = request_of(options, commands.Temperature)
+    if options.action == "undo":
+        return await undo(options, wanted)
+    if options.action == "write" or options.overwrite:
+        wanted["action"] = "write"
         reply = await request(options, wanted, {"command": "cancel"})
         answer: Object = {key: reply.get(key) for key in ("state", "reason", "written")}
         lines = [f"{str(answer['state']).upper()}: {answer['reason']}", *show.curves_written_lines(answer["written"])]
         return finish(options, reply, answer, lines, good=answer["state"] == "done")
-    reply = await request(options, {"command": "temperature"})
+    reply = await request(options, wanted)
     answer = {"imus": reply.get("imus", [])}
     return finish(options, reply, answer, show.temperature_lines(answer["imus"]), good=True)
 
@@ -153,42 +154,9 @@ def _number(value: float | None) -> str:
     return "none" if value is None else f"{value:g}"
 
 
-def add_command(add: AddCommand) -> None:
-    """Add it to the parser of the command line."""
-    parser = add("align", align, "measure the gradienter's zero (by turning), how it sits, or the accelerometers")
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument(
-        "what",
-        nargs="?",
-        choices=("zero", "tilts", "turn", "faces"),
-        metavar="zero|tilts|turn|faces",
-        help="zero: on one spot; tilts: that, and 4 tilts; without a gradienter, turn: level on one spot;"
-        " faces: accelerometers, about 12 stands on any side",
-    )
-    what.add_argument("--show", action="store_true", help="the alignment that is kept")
-    what.add_argument("--forget", action="store_true", help="go back to the configuration's zero and sigma")
-    parser.add_argument(
-        "--headings",
-        type=int,
-        choices=(2, 4),
-        help="2: there, turned, back (of zero without it); 4: every 90 deg (of turn without it)",
-    )
-    parser.add_argument(
-        "--level",
-        action="store_true",
-        help="turn, after faces: write how the board sits (AHRS_TRIM, SENS_BOARD)",
-    )
-    parser.add_argument("--write", action="store_true", help="turn, faces: write what was found to the autopilot")
-    parser.add_argument("--timeout", type=seconds, metavar="S", help="give up after so long (default 900)")
-
-
 async def align(options: argparse.Namespace) -> int:
     """`companion align`; Ctrl-C cancels it in the daemon too."""
-    action = "show" if options.show else "forget" if options.forget else options.what
-    wanted = {"command": "align", "action": action, "headings": options.headings}
-    wanted |= {key: True for key in ("write", "level") if getattr(options, key)}
-    if options.timeout is not None:
-        wanted["timeout_s"] = options.timeout
+    wanted = request_of(options, commands.Align)
     reply = await request(options, wanted, {"command": "cancel"})
     answer = {"alignment": None, **{key: value for key, value in reply.items() if key != "kind"}}
     lines: list[str] = []
@@ -197,8 +165,25 @@ async def align(options: argparse.Namespace) -> int:
         lines = [f"{state}: {answer['reason']}" if answer["reason"] else state]
         lines += stands_lines(answer["alignment"]) if answer["alignment"] else []
         lines += sides_lines(answer.get("accelerometers", ()))
-    good = answer.get("state") in ("done", "in force") or (action == "show" and answer.get("state") != "refused")
+    good = answer.get("state") in ("done", "in force") or (
+        wanted["action"] == "show" and answer.get("state") != "refused"
+    )
     return finish(options, reply, answer, lines, good=good)
+
+
+async def record(options: argparse.Namespace) -> int:
+    """`companion record`."""
+    wanted, stop = request_of(options, commands.Record), {"command": "record", "stop": True}
+    if "file" in wanted:
+        wanted["file"] = str(Path.cwd() / wanted["file"])
+    reply = await request(options, wanted, stop, in_place=True)
+    answer = {key: item for key, item in reply.items() if key != "kind"}
+    lines: list[str] = []
+    if "file" in answer:
+        lost = f", {answer['lost']} messages lost" if answer["lost"] else ""
+        size = f"{answer['seconds']:.0f} s, {answer['bytes'] / 1e6:.1f} MB"
+        lines = [f"{answer['file']}: {size}{lost}; {answer['reason']}"]
+    return finish(options, reply, answer, lines, good=answer.get("state") == "done")
 
 
 def sides_lines(imus: Sequence[Object]) -> list[str]:

@@ -12,7 +12,8 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from companion.cli.terminal import Parser, conclude, seconds, within
+from companion.cli.terminal import Parser, add_fields, conclude, request_of, seconds, within
+from companion.commands import Calibrate, Interface
 from companion.errors import ConfigError, LinkError, NobodyHeardError
 
 if TYPE_CHECKING:
@@ -55,13 +56,7 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
         return sub
 
     calibrate = add("calibrate", _calibrate, "calibrate now and show how it goes; Ctrl-C cancels")
-    what = calibrate.add_mutually_exclusive_group()
-    what.add_argument("--gyros", action="store_true", help="gyros only")
-    what.add_argument("--accelerometers", action="store_true", help="accelerometers only")
-    calibrate.add_argument("--timeout", type=seconds, metavar="S", help="cancel when it has not finished by then")
-    calibrate.add_argument(
-        "--reboot", action="store_true", help="restart the autopilot afterwards, where it needs that"
-    )
+    add_fields(calibrate, Calibrate, Interface.GROUND)
     add("status", _status, "what the companion is doing, its last result and its settings")
     add("cancel", _cancel, "cancel what runs, whoever asked for it")
     add("undo", _undo, "put the autopilot's values from before the last calibration back")
@@ -70,10 +65,8 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
 
 
 async def _calibrate(options: argparse.Namespace) -> int:
-    from companion.estimation.request import What
-
-    what = What.GYROS if options.gyros else What.ACCELEROMETERS if options.accelerometers else What.BOTH
-    return await _on_the_link(options, lambda one: one.calibrate(what, options.timeout, reboot=options.reboot))
+    wanted = Calibrate.read(request_of(options, Calibrate))
+    return await _on_the_link(options, lambda one: one.calibrate(wanted.biases, wanted.timeout_s, reboot=wanted.reboot))
 
 
 async def _status(options: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""`companion record` and `companion replay`."""
+"""`companion replay`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from companion.cli import replay_log, show
-from companion.cli.client import finish, request
-from companion.cli.terminal import AddCommand, conclude, print_lines, seconds
+from companion.cli.terminal import AddCommand, conclude, print_lines
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -21,33 +20,14 @@ MOST_LINES = 20
 """Most differences that are shown; --json has them all."""
 
 
-def add_commands(add: AddCommand) -> None:
-    """Add both to the parser of the command line."""
-    recorder = add("record", record, "record everything to a file until Ctrl-C (the last hour is kept anyway)")
-    recorder.add_argument("file", nargs="?", type=Path, metavar="FILE", help="default: one beside the daemon's own")
-    recorder.add_argument("--seconds", type=seconds, metavar="S", help="default: until Ctrl-C, --stop or 1 GB")
-    recorder.add_argument("--stop", action="store_true", help="end a recording that runs")
+def add_command(add: AddCommand) -> None:
+    """Add `replay` to the parser of the command line."""
     player = add("replay", replay, "run a recording, or anybody's log of an IMU at rest, through the same estimator")
     player.add_argument(
         "files", nargs="+", type=Path, metavar="FILE",
         help="a recording (.mcap), or several that follow on one another; or a log (CSV; .ulg, .bin)",
     )  # fmt: skip
     replay_log.add_options(player)
-
-
-async def record(options: argparse.Namespace) -> int:
-    """`companion record`."""
-    file = None if options.file is None else str(options.file.absolute())
-    stop = {"command": "record", "stop": True}
-    begin = {"command": "record", "file": file, "seconds": options.seconds}
-    reply = await request(options, stop if options.stop else begin, stop, in_place=True)
-    answer = {key: item for key, item in reply.items() if key != "kind"}
-    lines: list[str] = []
-    if "file" in answer:
-        lost = f", {answer['lost']} messages lost" if answer["lost"] else ""
-        size = f"{answer['seconds']:.0f} s, {answer['bytes'] / 1e6:.1f} MB"
-        lines = [f"{answer['file']}: {size}{lost}; {answer['reason']}"]
-    return finish(options, reply, answer, lines, good=answer.get("state") == "done")
 
 
 async def replay(options: argparse.Namespace) -> int:

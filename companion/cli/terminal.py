@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 from urllib.parse import quote
 
-from companion import config
+from companion import commands, config
 from companion.config.sections import Config, Noise, Storage
 from companion.config.words import COMMAND_LINE, refusal_of_words
 from companion.errors import ConfigError
+from companion.formats import Object
 from companion.printable import printable
 
 DONE: Final = 0
@@ -141,7 +142,7 @@ class Parser(argparse.ArgumentParser):
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Name the nearest command or choice, as the configuration does for its keys."""
-        if action.choices is None or value in action.choices:
+        if action.choices is None or value in action.choices or value is argparse.SUPPRESS:
             return
         if (refusal := refusal_of_words(self.prog, str(value))) is not None:
             self.error(refusal)
@@ -168,6 +169,39 @@ def within(least: float, most: float, kind: type[float] = float, unit: str = "")
 
 seconds: Final = within(1e-3, 1e6, unit=" s")
 """The type of an argument that is a time in seconds."""
+_ARGUMENTS: Final = {float: seconds, int: within(1, 1e6, int)}
+
+
+def add_fields(parser: argparse.ArgumentParser, kind: type[commands.Command], by: commands.Interface) -> None:
+    """Add the options of a command, as far as an interface may set its fields."""
+    groups: dict[str, argparse._ActionsContainer] = {}
+    for name, field in kind.fields(by).items():
+        option = field.option
+        to: argparse._ActionsContainer = parser
+        if group := option.group or (name if option.flags else ""):
+            to = groups.get(group) or parser.add_mutually_exclusive_group(required=option.positional)
+            groups[group] = to
+        values = [value for value in field.values if value not in option.flags]
+        if option.positional:
+            shape: dict[str, Any] = {"metavar": option.metavar or "|".join(values), "choices": values or None}
+            # The default of a positional argument would replace the value of a flag.
+            to.add_argument(name, nargs="?", default=argparse.SUPPRESS, help=option.help, **shape)
+        for value, words in option.flags.items():
+            to.add_argument(f"--{value}", dest=name, action="store_const", const=value, help=words)
+        if option.positional or option.flags:
+            continue
+        if field.kind is bool:
+            to.add_argument(f"--{name}", action="store_true", help=option.help)
+        else:
+            names = [each for each in (option.short, f"--{name.removesuffix('_s')}") if each]
+            shape = {"type": _ARGUMENTS[field.kind], "choices": values or None, "metavar": option.metavar}
+            to.add_argument(*names, dest=name, default=option.default, help=option.help, **shape)
+
+
+def request_of(options: argparse.Namespace, kind: type[commands.Command]) -> Object:
+    """Return the request that the options of a command make; it says nothing of what was not given."""
+    given = {name: getattr(options, name, None) for name in kind.fields()}
+    return {"command": kind.name(), **{name: value for name, value in given.items() if value is not None}}
 
 
 def conclude(options: argparse.Namespace, answer: Any, lines: Iterable[object], *, good: bool) -> int:

@@ -27,6 +27,7 @@ from typing import Final, NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion import __version__
+from companion.commands import Calibrate, Cancel, Undo
 from companion.component import requests
 from companion.component.service import CalibrationService, Job, Refusal
 from companion.component.statustext import Say, Severity, Weight
@@ -57,7 +58,7 @@ _WORDS = {
     What.GYROS: "gyros",
     What.ACCELEROMETERS: "accelerometers",
 }
-_NAMES: dict[type, str] = {requests.Calibrate: "Calibration", requests.Undo: "Undo", requests.Cancel: "Cancel"}
+_NAMES: dict[type, str] = {Calibrate: "Calibration", Undo: "Undo", Cancel: "Cancel"}
 """What not everybody may ask for."""
 
 
@@ -84,7 +85,7 @@ class Permission:
 
 class _Running(NamedTuple):
     key: requests.Key
-    request: requests.Calibrate | requests.Undo
+    request: Calibrate | Undo
     job: Job
 
 
@@ -194,9 +195,9 @@ class CommandServer:
 
     def _obey(self, key: requests.Key, request: requests.Request | requests.Refused, now_s: float) -> None:
         match request:
-            case requests.Calibrate() | requests.Undo():
+            case Calibrate() | Undo():
                 self._start(key, request, now_s)
-            case requests.Cancel():
+            case Cancel():
                 self._cancel(key, now_s)
             case requests.SendVersion():
                 self._acknowledge(key, mavlink.MAV_RESULT_ACCEPTED)
@@ -206,21 +207,21 @@ class CommandServer:
                 unsupported = result == mavlink.MAV_RESULT_UNSUPPORTED
                 self._refuse(key, result, reason, now_s, Severity.INFO if unsupported else Severity.WARNING)
 
-    def _start(self, key: requests.Key, request: requests.Calibrate | requests.Undo, now_s: float) -> None:
+    def _start(self, key: requests.Key, request: Calibrate | Undo, now_s: float) -> None:
         name = _NAMES[type(request)]
         if self._running is not None and self._running.job.finished.done():
             self.step(now_s)
         if self._running is not None:
-            other = "an undo" if isinstance(self._running.request, requests.Undo) else "a calibration"
+            other = "an undo" if isinstance(self._running.request, Undo) else "a calibration"
             reason = f"{name} refused: {other} is running"
             self._refuse(key, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, reason, now_s)
             return
         requester = f"mavlink {key.system_id}/{key.component_id}"
         try:
-            if isinstance(request, requests.Undo):
+            if isinstance(request, Undo):
                 job = self._service.start_undo(requester)
             else:
-                job = self._service.start_calibration(request.what, requester, reboot=request.reboot)
+                job = self._service.start_calibration(request.biases, requester, reboot=request.reboot)
         except Exception:
             logger.exception("starting %s failed", name.lower())
             self._refuse(key, mavlink.MAV_RESULT_FAILED, f"{name} failed: internal error, see the log", now_s)
@@ -287,8 +288,8 @@ class CommandServer:
         )
 
 
-def _doing(request: requests.Calibrate | requests.Undo) -> str:
-    return "undoing" if isinstance(request, requests.Undo) else f"calibrating {_WORDS[request.what]}"
+def _doing(request: Calibrate | Undo) -> str:
+    return "undoing" if isinstance(request, Undo) else f"calibrating {_WORDS[request.biases]}"
 
 
 CAPABILITIES = (

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.commands import Calibrate, Cancel, Undo
 from companion.estimation.request import What
 
 CommandMessage = mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message
@@ -29,21 +30,6 @@ class Command(NamedTuple):
     """How often this was sent before; COMMAND_INT cannot say and always counts as new."""
     packet: bytes
     """The whole packet with its sequence number: only a copy that the network made is equal."""
-
-
-class Calibrate(NamedTuple):
-    """Measure and write biases, and restart the autopilot afterwards if asked to."""
-
-    what: What
-    reboot: bool = False
-
-
-class Undo(NamedTuple):
-    """Put the previous values back."""
-
-
-class Cancel(NamedTuple):
-    """Stop what runs."""
 
 
 class SendVersion(NamedTuple):
@@ -96,7 +82,7 @@ def _calibrate(which: float, reboot: float) -> Calibrate | Refused:
         return _denied(f"Calibration refused: param2 {reboot:g}, allowed 0, 1")
     for what in What:
         if which == what.value:
-            return Calibrate(what, reboot == 1.0)
+            return Calibrate.of(what, reboot=reboot == 1.0)
     return _denied(f"Calibration refused: param1 {which:g}, allowed 0, 1, 2")
 
 
@@ -112,7 +98,7 @@ def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refused
             return _denied(f"Calibration refused: param{number} {value:g}, allowed {allowed}")
     chosen = {(1, 1): What.BOTH, (1, 0): What.GYROS, (0, 1): What.ACCELEROMETERS}
     what = chosen.get((int(parameters[0]), int(parameters[4])))
-    return _denied("Calibration refused: set param1 or param5 to 1") if what is None else Calibrate(what)
+    return _denied("Calibration refused: set param1 or param5 to 1") if what is None else Calibrate.of(what)
 
 
 def _request_message(message_id: float) -> SendVersion | Refused:

@@ -22,11 +22,10 @@ from typing import Final, Protocol
 
 import msgspec
 
-from companion.errors import CompanionError
-from companion.estimation.request import What, is_time_limit
+from companion.commands import MAX_SHOWN, Interface, asked_by, shown
+from companion.errors import CalibrationRefusedError, CompanionError
 from companion.formats import Object
 from companion.mqtt.daemon import Ask
-from companion.printable import printable
 
 logger = logging.getLogger(__name__)
 
@@ -36,11 +35,11 @@ MAX_PAYLOAD_BYTES: Final = 4096
 MAX_TRANSACTION: Final = 128
 MAX_NUMBER: Final = 2**53
 """The largest integer that every reader of JSON keeps exactly."""
-MAX_SHOWN: Final = 60
 MAX_PENDING: Final = 8
 """The most requests that wait for their end, such as cancels in the middle of a write."""
 REMEMBERED: Final = 32
 REMEMBER_S: Final = 600.0
+KNOWN: Final = asked_by(Interface.MQTT)
 _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 
@@ -62,8 +61,8 @@ class Misfit(msgspec.Struct, frozen=True):
 
 def parse(command: str, payload: bytes) -> Request | Misfit:
     """Judge a request's payload: a JSON object with known keys, or nothing. Never raises."""
-    if command not in KEYS:
-        return Misfit(None, f"unknown request {command!r}; known: {', '.join(KEYS)}")
+    if command not in KNOWN:
+        return Misfit(None, f"unknown request {command!r}; known: {', '.join(KNOWN)}")
     if len(payload) > MAX_PAYLOAD_BYTES:
         return Misfit(None, f"a payload of {len(payload)} bytes; allowed: at most {MAX_PAYLOAD_BYTES}")
     try:
@@ -72,23 +71,27 @@ def parse(command: str, payload: bytes) -> Request | Misfit:
         why = "nested too deeply" if isinstance(error, RecursionError) else str(error)
         return Misfit(None, f"the payload is not JSON: {why}; allowed: a JSON object, or nothing")
     if not isinstance(content, dict):
-        return Misfit(None, f"the payload is {_shown(content)}; allowed: a JSON object, or nothing")
+        return Misfit(None, f"the payload is {shown(content)}; allowed: a JSON object, or nothing")
     transaction = content.pop("transaction", None)
     if not _is_transaction(transaction):
         return Misfit(
             None,
-            f"'transaction': found {_shown(transaction)}; allowed: a text of at most {MAX_TRANSACTION} characters, or a"
+            f"'transaction': found {shown(transaction)}; allowed: a text of at most {MAX_TRANSACTION} characters, or a"
             " whole number",
         )
+    kind = KNOWN[command]
+    known = kind.fields(Interface.MQTT)
     for key, value in content.items():
-        known = KEYS[command]
         if key not in known:
             near = difflib.get_close_matches(key[:MAX_SHOWN], known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(('transaction', *known))}"
-            return Misfit(transaction, f"unknown key {_shown(key)}; {hint}")
-        fits, allowed = known[key]
-        if not fits(value):
-            return Misfit(transaction, f"{key!r}: found {_shown(value)}; allowed: {allowed}")
+            return Misfit(transaction, f"unknown key {shown(key)}; {hint}")
+        if value is None:
+            return Misfit(transaction, f"{key!r}: found null; allowed: {known[key].allowed}")
+    try:
+        kind.read(content)
+    except CalibrationRefusedError as error:
+        return Misfit(transaction, str(error))
     return Request(command, transaction, content)
 
 
@@ -96,31 +99,6 @@ def _is_transaction(value: object) -> bool:
     if isinstance(value, str):
         return len(value) <= MAX_TRANSACTION
     return value is None or (isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER)
-
-
-def _shown(value: object) -> str:
-    """A value as JSON, short enough for one line."""
-    try:
-        text = msgspec.json.encode(value).decode()
-    except (OverflowError, RecursionError):
-        return "what is too large"
-    text = printable(text)
-    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
-
-
-_WHAT: Final = [what.name.lower() for what in What]
-_FLAG: Final = (lambda value: isinstance(value, bool), "true or false")
-
-KEYS: Final[dict[str, dict[str, tuple[Callable[[object], bool], str]]]] = {
-    "calibrate": {
-        "what": (_WHAT.__contains__, ", ".join(f'"{what}"' for what in _WHAT)),
-        "timeout_s": (is_time_limit, "a number of seconds above 0"),
-        "reboot": _FLAG,
-    },
-    "cancel": {},
-    "undo": {"force": _FLAG},
-}
-"""Of each request, beside its transaction: what fits, and what is allowed in words."""
 
 
 class Respond(Protocol):
@@ -218,7 +196,7 @@ class Requests:
 
     async def _run(self, request: Request) -> None:
         question = {"command": request.command, **request.content}
-        if request.command == "calibrate":
+        if "wait" in KNOWN[request.command].fields():
             question["wait"] = True
         accepted = False
         try:

@@ -19,6 +19,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from companion import __version__
+from companion.commands import Interface, asked_by
 from companion.errors import CompanionError
 from companion.formats import Object, parse_request
 from companion.web.access import TOKEN_HEADER, Access
@@ -34,15 +35,7 @@ MAX_WAITING: Final = 16
 ACTION_WITHIN_S: Final = 10.0
 RECORDS: Final = 10
 
-ACTIONS: Final[dict[str, tuple[str, ...]]] = {
-    "calibrate": ("what",),
-    "align": ("action", "headings", "write", "level"),
-    "cancel": (),
-    "undo": ("force",),
-    "answer": ("number", "words"),
-}
-"""Commands, and the keys of a request's body that are passed on."""
-_ALWAYS: Final[dict[str, Object]] = {"align": {"wait": False}}
+ACTIONS: Final = asked_by(Interface.PAGE)
 
 
 class Site:
@@ -117,8 +110,9 @@ class Site:
         except ValueError as error:
             raise HTTPException(400, f"not a JSON object: {error}") from None
         command = request.url.path.removeprefix("/")
-        asked: Object = {"command": command} | _ALWAYS.get(command, {})
-        asked |= {key: wanted[key] for key in ACTIONS[command] if key in wanted}
+        kind = ACTIONS[command]
+        asked: Object = {"command": command} | ({"wait": False} if "wait" in kind.fields() else {})
+        asked |= {key: wanted[key] for key in kind.fields(Interface.PAGE) if key in wanted}
         try:
             reply = await self._result(asked)
         finally:

@@ -83,7 +83,9 @@ def test_buttons_do_what_the_command_line_does_and_are_refused_in_the_same_words
             rig.double.disarm()
             await rig.until(lambda: rig.service.core.vehicle.arm_state.value == "disarmed", 3.0)
 
-            assert await press(rig, "calibrate", what="nothing") == (409, "calibrate: 'NOTHING' is not understood")
+            allowed = '"both", "gyros", "accelerometers"'
+            wrong = f"calibrate: 'what': found \"nothing\"; allowed: {allowed}"
+            assert await press(rig, "calibrate", what="nothing") == (409, wrong)
             assert await press(rig, "calibrate") == (200, "calibration started")
             job = rig.service.calibrating.manager.job
             assert job is not None

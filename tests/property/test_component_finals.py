@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.commands import Calibrate, Cancel, Undo
 from companion.component import requests
 from companion.component.service import Refusal
 from companion.links.mavlink.link import MavlinkLink
@@ -237,14 +238,14 @@ def test_only_exact_parameters_start_something(command: int, parameters: list[fl
     request = requests.judge(heard[0])
     assert link.received["handler error"] == 0
     match request:
-        case requests.Calibrate(what) if command == CALIBRATE:
-            assert parameters[0] == what.value
-        case requests.Calibrate(what):
+        case Calibrate() if command == CALIBRATE:
+            assert parameters[0] == request.biases.value
+        case Calibrate():
             assert command == PREFLIGHT
-            assert (parameters[0], parameters[4]) == (what.gyros, what.accelerometers)
+            assert (parameters[0], parameters[4]) == (request.biases.gyros, request.biases.accelerometers)
             assert parameters[2] in (0.0, 1.0)  # ground pressure, which Mission Planner ticks by habit
             assert not any([parameters[1], parameters[3], *parameters[5:]])
-        case requests.Undo() | requests.Cancel():
+        case Undo() | Cancel():
             assert command in (UNDO, CANCEL)
         case requests.SendVersion():
             assert (command, parameters[0]) in ((512, 148), (520, 1))

@@ -8,7 +8,8 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.mqtt.requests import KEYS, MAX_PAYLOAD_BYTES, Misfit, parse
+from companion.commands import Interface
+from companion.mqtt.requests import KNOWN, MAX_PAYLOAD_BYTES, Misfit, parse
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -19,7 +20,7 @@ keys = st.sampled_from(["transaction", "what", "timeout_s", "reboot", "force"]) 
 objects = st.dictionaries(keys, values, max_size=4).map(lambda found: json.dumps(found).encode())
 
 
-@given(command=st.sampled_from([*KEYS, "other"]), payload=st.binary(max_size=200) | objects)
+@given(command=st.sampled_from([*KNOWN, "other"]), payload=st.binary(max_size=200) | objects)
 def test_no_payload_raises_and_every_verdict_is_one_short_line(command: str, payload: bytes) -> None:
     verdict = parse(command, payload)
     if isinstance(verdict, Misfit):
@@ -28,7 +29,7 @@ def test_no_payload_raises_and_every_verdict_is_one_short_line(command: str, pay
         msgspec.json.encode({"transaction": verdict.transaction, "reason": verdict.reason})
     else:
         assert len(payload) <= MAX_PAYLOAD_BYTES
-        assert set(verdict.content) <= set(KEYS[command])
+        assert set(verdict.content) <= set(KNOWN[command].fields(Interface.MQTT))
         sent = json.loads(payload) if payload.strip() else {}
         assert verdict.transaction == sent.get("transaction")
         assert verdict.command == command

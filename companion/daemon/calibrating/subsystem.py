@@ -124,18 +124,9 @@ class Calibrating(Subsystem):
         }
 
     async def _calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
-        try:
-            what = What[str(request.get("what", "both")).upper()]
-        except KeyError as error:
-            raise CalibrationRefusedError(f"calibrate: {error} is not understood") from None
-        timeout_s = request.get("timeout_s")
-        if timeout_s is not None and not is_time_limit(timeout_s):
-            raise CalibrationRefusedError(
-                f"calibrate: 'timeout_s': found {timeout_s!r}; allowed: a number of seconds above 0"
-            )
-        reboot = request.get("reboot") is True
+        what, timeout_s, reboot = What[request["what"].upper()], request["timeout_s"], request["reboot"]
         job = _accepted(self.manager.start_calibration(what, f"{face} calibrate", timeout_s, reboot=reboot))
-        if not request.get("wait"):
+        if not request["wait"]:
             yield {"kind": "result", "state": self.manager.state.shown, "reason": "calibration started"}
             return
         async for reply in self._progress(job):

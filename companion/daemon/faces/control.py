@@ -21,6 +21,7 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Final, Self
 
+from companion.commands import ALL
 from companion.errors import CompanionError, LinkError, RequestRefusedError
 from companion.formats import Object, parse_request
 from companion.links.system.control_client import READ_TIMEOUT_S, write_line
@@ -36,7 +37,7 @@ KERNEL_BYTES: Final = 16 * 1024
 INTERNAL_ERROR: Final = "internal error of the daemon; its log has the details"
 MAX_CLIENTS: Final = 16
 """The most connections of each kind: not asked yet, urgent commands, all others."""
-URGENT: Final = ("cancel", "status")
+URGENT: Final = frozenset(name for name, command in ALL.items() if command.urgent)
 """Commands that are served however many others are connected."""
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, get_args
 
 import msgspec
 
+from companion.commands import ALL
 from companion.component.component import Component
 from companion.component.own_parameters import AT_ARM, RESULTS, Parameter
 from companion.component.service import JobResult
@@ -25,7 +26,7 @@ from companion.daemon.faces.headline import Headlines
 from companion.daemon.heading.subsystem import Heading
 from companion.daemon.job import Job
 from companion.daemon.offsets.subsystem import Offsets
-from companion.errors import ConfigError
+from companion.errors import CalibrationRefusedError, ConfigError
 from companion.estimation.records.record import ImuRecord
 from companion.formats import Object
 from companion.physics.units import DEG_H, MG
@@ -101,7 +102,11 @@ class Faces(Subsystem):
         if handler is None:
             yield {"kind": "error", "reason": f"unknown command {command!r}"}
             return
-        async for reply in handler(request, face):
+        try:
+            understood = ALL[str(command)].read(request)
+        except CalibrationRefusedError as error:
+            raise CalibrationRefusedError(f"{command}: {error}") from None
+        async for reply in handler(msgspec.to_builtins(understood), face):
             yield reply
 
     async def _status(self, _request: Object, _face: str) -> AsyncIterator[Object]:
@@ -109,7 +114,7 @@ class Faces(Subsystem):
 
     async def _monitor(self, request: Object, _face: str) -> AsyncIterator[Object]:
         """Stream the status every 0.5 s; with `pose` the attitude every 0.2 s too, a new state or record at once."""
-        if request.get("pose") is not True:
+        if not request["pose"]:
             while True:
                 yield {"kind": "progress", "status": await self.refresh()}
                 await asyncio.sleep(MONITOR_EVERY_S)

@@ -30,7 +30,7 @@ from companion.daemon.job import Job
 from companion.errors import StorageError
 from companion.estimation.means.windows import Window
 from companion.estimation.records.record import to_json
-from companion.estimation.request import What, is_time_limit
+from companion.estimation.request import What
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.site import Whereabouts
 from companion.formats import Object
@@ -322,8 +322,6 @@ class Recorder(Subsystem):
             yield {"kind": "result", **recording.ended.result()}
             return
         seconds, name = request.get("seconds"), request.get("file")
-        if not (seconds is None or is_time_limit(seconds)) or not (name is None or isinstance(name, str)):
-            raise StorageError(f"record: not understood: {request}")
         recording = await self._start(name, seconds)
         most = f"; ends at {recording.most_bytes >> 30} GB" if seconds is None else ""
         while not recording.ended.done():

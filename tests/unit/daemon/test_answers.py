@@ -1,4 +1,4 @@
-"""Requests that ask for what there is not, on the daemon's answers."""
+"""Requests that ask for what there is not, and the table of commands, on the daemon's answers."""
 
 from __future__ import annotations
 
@@ -8,29 +8,63 @@ from typing import Any
 
 import pytest
 
+from companion.commands import ALL, Interface
 from companion.config import parse
 from companion.daemon.process.service import Service
 from companion.errors import CompanionError
 from tests.support.mqtt_daemon import ALONE
 
+SECONDS = "a number of seconds above 0"
+WRONG = [
+    *(
+        (command, key, seconds, SECONDS)
+        for command, key in (("calibrate", "timeout_s"), ("align", "timeout_s"), ("record", "seconds"))
+        for seconds in (float("nan"), -5, 0, float("inf"), 10**400, True, "60", [1])
+    ),
+    ("calibrate", "what", "nothing", '"both", "gyros", "accelerometers"'),
+    ("calibrate", "reboot", 1, "true or false"),
+    ("align", "headings", 3, "2, 4"),
+    ("history", "limit", 0, "a whole number from 1 to 1000000"),
+    ("record", "file", 5, "a path"),
+]
 
-@pytest.mark.parametrize("seconds", ["nan", float("nan"), -5, 0, float("inf"), 10**400, True, "60", [1]])
-@pytest.mark.parametrize(
-    ("request_", "key", "words"),
-    [
-        ({"command": "calibrate"}, "timeout_s", "'timeout_s': found .*; allowed: a number of seconds above 0"),
-        ({"command": "align", "action": "zero"}, "timeout_s", "is not understood"),
-        ({"command": "record"}, "seconds", "not understood"),
-    ],
-)
-def test_a_time_that_is_none_is_refused_in_one_line(
-    tmp_path: Path, request_: dict[str, Any], key: str, words: str, seconds: object
+
+def service(folder: Path) -> Service:
+    return Service(parse(ALONE.format(folder=folder, more=""), "test.toml"))
+
+
+@pytest.mark.parametrize(("command", "key", "value", "allowed"), WRONG)
+def test_a_value_that_is_not_allowed_is_refused_in_one_line(
+    tmp_path: Path, command: str, key: str, value: Any, allowed: str
 ) -> None:
     async def main() -> None:
-        service = Service(parse(ALONE.format(folder=tmp_path, more=""), "test.toml"))
-        with pytest.raises(CompanionError, match=words) as caught:
-            async for _ in service.faces.answer({**request_, key: seconds}):
+        with pytest.raises(CompanionError) as caught:
+            async for _ in service(tmp_path).faces.answer({"command": command, key: value}):
                 pass
-        assert "\n" not in str(caught.value)
+        words = str(caught.value)
+        assert words.startswith(f"{command}: {key!r}: found ")
+        assert words.endswith(f"; allowed: {allowed}")
+        assert "\n" not in words
 
     asyncio.run(main())
+
+
+def test_every_command_of_the_table_is_answered_and_no_other(tmp_path: Path) -> None:
+    """All but `answer`, which the page asks where there is no daemon yet."""
+
+    async def main() -> None:
+        running = service(tmp_path)
+        subsystems = (running.calibrating, running.arming, running.heading, running.recorder)
+        handled = {name for subsystem in subsystems for name in subsystem.commands()}
+        assert handled | {"status", "monitor"} == ALL.keys() - {"answer"}
+
+    asyncio.run(main())
+
+
+def test_pages_and_brokers_may_not_ask_for_everything() -> None:
+    """The rights of a client that is not at the companion's own terminal: docs/security.md."""
+    by = {each: {name for name, kind in ALL.items() if each in kind.by} for each in Interface}
+    assert by[Interface.MQTT] == {"calibrate", "cancel", "undo"}
+    assert by[Interface.PAGE] == {"calibrate", "align", "cancel", "undo", "answer"}
+    assert set(ALL["calibrate"].fields(Interface.PAGE)) == {"what"}
+    assert set(ALL["align"].fields(Interface.PAGE)) == {"action", "headings", "write", "level"}

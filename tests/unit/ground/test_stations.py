@@ -10,7 +10,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from companion.component.requests import Calibrate, Cancel, Command, Key, Refused, Request, Undo, judge
+from companion.commands import Calibrate, Cancel, Undo
+from companion.component.requests import Command, Key, Refused, Request, judge
 from companion.estimation.request import What
 
 SCRIPT = Path(__file__).parents[3] / "docs/ground_stations/mission_planner_companion.py"
@@ -68,10 +69,10 @@ def _run_script(text: str, planner: _MissionPlanner, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("chosen", "expected"),
     [
-        ("calibrate", Calibrate(What.BOTH)),
-        ("gyros", Calibrate(What.GYROS)),
-        ("accelerometers", Calibrate(What.ACCELEROMETERS)),
-        ("calibrate and reboot", Calibrate(What.BOTH, reboot=True)),
+        ("calibrate", Calibrate.of(What.BOTH)),
+        ("gyros", Calibrate.of(What.GYROS)),
+        ("accelerometers", Calibrate.of(What.ACCELEROMETERS)),
+        ("calibrate and reboot", Calibrate.of(What.BOTH, reboot=True)),
         ("cancel", Cancel()),
         ("undo", Undo()),
     ],

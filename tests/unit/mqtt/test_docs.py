@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from companion.commands import Interface
 from companion.config import parse
-from companion.mqtt.requests import KEYS, Request
+from companion.mqtt.requests import KNOWN, Request
 from companion.mqtt.requests import parse as parse_request
 from companion.mqtt.topics import Topics
 
@@ -21,16 +22,16 @@ ROWS = dict(re.findall(r"^\| `([a-z/]+)` \|(.*)\|$", DOCS, re.MULTILINE))
 def test_every_topic_has_its_row_and_no_other() -> None:
     topics = Topics("x")
     ours = {topics.status, topics.state, topics.record, topics.progress, topics.attitude}
-    ours |= {topics.request + command for command in KEYS} | {topics.response + command for command in KEYS}
+    ours |= {topics.request + command for command in KNOWN} | {topics.response + command for command in KNOWN}
     assert {f"x/{row}" for row in ROWS} == ours
 
 
-@pytest.mark.parametrize("command", list(KEYS))
+@pytest.mark.parametrize("command", list(KNOWN))
 def test_the_examples_of_requests_are_taken_and_show_every_key(command: str) -> None:
     (example,) = re.findall(r"`(\{.*\})`", ROWS[f"request/{command}"])
     request = parse_request(command, example.encode())
     assert isinstance(request, Request)
-    assert set(request.content) == set(KEYS[command])
+    assert set(request.content) == set(KNOWN[command].fields(Interface.MQTT))
     assert request.transaction is not None
 
 

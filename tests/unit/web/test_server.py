@@ -131,7 +131,7 @@ def test_an_action_is_asked_for_with_the_token(tmp_path: Path) -> None:
         said = await visit.ask("POST", "/calibrate", body, Origin=own, **visit.good_headers)
         assert (said.status, said.json) == (200, {"state": "waiting", "reason": "calibration started"})
         # Of what was sent only what a button may say goes on.
-        assert visit.companion.asked == [{"command": "calibrate", "what": "gyros"}]
+        assert visit.companion.asked == [{"command": "calibrate", "what": "gyros", "wait": False}]
         typed = visit.page.access.token.upper().replace("-", " ")
         assert (
             await visit.ask("POST", "/cancel", b"", **visit.good_headers | {"X_Companion_Token": typed})

@@ -1,0 +1,318 @@
+"""The table of commands: one class per command, with the types, limits and help of its fields and who may use them.
+
+The options of the command line, the requests of the control socket, of MQTT and of the page are derived from it. The
+MAVLink component maps the parameters of its commands to the same fields. A new command is a class and a place in `ALL`.
+"""
+
+from __future__ import annotations
+
+import enum
+import functools
+import typing
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self
+
+import msgspec
+
+from companion.errors import CalibrationRefusedError
+from companion.estimation.request import LONGEST_S, What
+from companion.formats import Object
+from companion.printable import printable
+
+MAX_SHOWN: Final = 60
+"""The most characters of a value in a refusal."""
+
+
+class Interface(enum.Flag):
+    """The ways by which a command reaches the daemon; the control socket is open to all of them."""
+
+    COMMAND_LINE = enum.auto()
+    GROUND = enum.auto()
+    """`companion ground` over MAVLink."""
+    MQTT = enum.auto()
+    PAGE = enum.auto()
+
+
+_SHELL: Final = Interface.COMMAND_LINE
+_SHELLS: Final = Interface.COMMAND_LINE | Interface.GROUND
+_ALL: Final = _SHELLS | Interface.MQTT | Interface.PAGE
+
+
+class Option(NamedTuple):
+    """Everything about a field but its type."""
+
+    help: str = ""
+    by: Interface = _SHELL
+    """The interfaces that may set the field."""
+    metavar: str | None = None
+    allowed: str = ""
+    """The allowed values in words, where the type does not tell them."""
+    flags: Mapping[str, str] = {}
+    """Values that the command line takes as options of their own (--gyros), with their help."""
+    positional: bool = False
+    """Whether the command line takes the value, where it is none of `flags`, without an option."""
+    short: str = ""
+    default: Any = None
+    """The value for the command line where none is given."""
+    group: str = ""
+    """Options of the same group exclude each other."""
+
+
+class Field(NamedTuple):
+    """A field of a command."""
+
+    name: str
+    type: Any
+    option: Option
+
+    @property
+    def values(self) -> tuple[Any, ...]:
+        """The allowed values, where they are a few; empty: any value of the type."""
+        kinds = (self.type, *typing.get_args(self.type))
+        return next((typing.get_args(kind) for kind in kinds if typing.get_origin(kind) is Literal), ())
+
+    @property
+    def kind(self) -> type:
+        """The plain type of a value: bool, int, float or str."""
+        if self.values:
+            return type(self.values[0])
+        kind = next((each for each in typing.get_args(self.type) if each is not type(None)), self.type)
+        return typing.get_args(kind)[0] if typing.get_origin(kind) is Annotated else kind
+
+    @property
+    def allowed(self) -> str:
+        """The allowed values in words."""
+        if self.type is bool:
+            return "true or false"
+        return self.option.allowed or ", ".join(map(shown, self.values))
+
+
+class Command(msgspec.Struct, frozen=True, kw_only=True, tag_field="command"):
+    """One request to the daemon. The tag is its name."""
+
+    help: ClassVar[str] = ""
+    by: ClassVar[Interface] = _SHELL
+    """The interfaces that may ask for it."""
+    urgent: ClassVar[bool] = False
+    """Whether the control socket keeps places free for it."""
+
+    @classmethod
+    def name(cls) -> str:
+        """Return the name of the command."""
+        return str(cls.__struct_config__.tag)
+
+    @classmethod
+    def fields(cls, by: Interface | None = None) -> dict[str, Field]:
+        """Return the fields by name; only those that an interface may set, if one is given."""
+        fields = _fields(cls)
+        return {name: field for name, field in fields.items() if by is None or by in field.option.by}
+
+    @classmethod
+    def read(cls, request: Object) -> Self:
+        """Read a request; keys that are no fields are ignored, and null counts as not given.
+
+        Raises:
+            CalibrationRefusedError: a value is not allowed.
+        """
+        values = {}
+        for name, field in cls.fields().items():
+            if (value := request.get(name)) is None:
+                continue
+            try:
+                values[name] = msgspec.convert(value, field.type)
+            except (msgspec.ValidationError, OverflowError):
+                reason = f"{name!r}: found {shown(value)}; allowed: {field.allowed}"
+                raise CalibrationRefusedError(reason) from None
+        return cls(**values)
+
+
+@functools.cache
+def _fields(kind: type[Command]) -> dict[str, Field]:
+    hints = typing.get_type_hints(kind, include_extras=True)
+    found = {}
+    for name in kind.__struct_fields__:
+        inner, *notes = typing.get_args(hints[name])
+        found[name] = Field(name, inner, next(note for note in notes if isinstance(note, Option)))
+    return found
+
+
+def shown(value: object) -> str:
+    """A value as JSON, short enough for one line."""
+    try:
+        text = msgspec.json.encode(value).decode()
+    except (OverflowError, RecursionError):
+        return "what is too large"
+    text = printable(text)
+    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
+
+
+_Seconds = Annotated[float, msgspec.Meta(gt=0.0, lt=LONGEST_S)]
+_SECONDS: Final = Option(metavar="S", allowed="a number of seconds above 0")
+_Count = Annotated[int, msgspec.Meta(ge=1, le=10**6)]
+
+
+class Status(Command, frozen=True, tag="status"):
+    """The status of the daemon, once."""
+
+    help = "what the daemon is doing"
+    urgent = True
+
+
+class Monitor(Command, frozen=True, tag="monitor"):
+    """The status of the daemon, until the client goes away."""
+
+    help = "watch the daemon until Ctrl-C"
+    pose: Annotated[bool, Option("attitude, and records as they end, too", by=Interface.MQTT)] = False
+
+
+class Calibrate(Command, frozen=True, tag="calibrate"):
+    """Measure and write biases."""
+
+    help = "calibrate now (the aircraft must be disarmed and still)"
+    by = _ALL
+    what: Annotated[
+        Literal["both", "gyros", "accelerometers"],
+        Option(by=_ALL, flags={"gyros": "gyros only", "accelerometers": "accelerometers only"}),
+    ] = "both"
+    wait: Annotated[bool, Option("wait for the end, show progress, print the record")] = False
+    timeout_s: Annotated[
+        _Seconds | None,
+        _SECONDS._replace(
+            help="cancel when it has not finished by then (default: no limit)", by=_SHELLS | Interface.MQTT
+        ),
+    ] = None
+    reboot: Annotated[
+        bool, Option("restart the autopilot afterwards (PX4's attitude needs it)", by=_SHELLS | Interface.MQTT)
+    ] = False
+
+    @classmethod
+    def of(cls, what: What, *, reboot: bool = False) -> Self:
+        """Make the command from what MAVLink says by number."""
+        return cls.read({"what": what.name.lower(), "reboot": reboot})
+
+    @property
+    def biases(self) -> What:
+        """The biases to calibrate."""
+        return What[self.what.upper()]
+
+
+class Align(Command, frozen=True, tag="align"):
+    """Measure the gradienter's zero, or the accelerometers; show or forget the alignment."""
+
+    help = "measure the gradienter's zero (by turning), how it sits, or the accelerometers"
+    by = _SHELL | Interface.PAGE
+    action: Annotated[
+        Literal["zero", "tilts", "turn", "faces", "show", "forget"] | None,
+        Option(
+            "zero: on one spot; tilts: that, and 4 tilts; without a gradienter, turn: level on one spot;"
+            " faces: accelerometers, about 12 stands on any side",
+            by=by,
+            flags={
+                "show": "the alignment that is kept",
+                "forget": "go back to the configuration's zero and sigma",
+            },
+            positional=True,
+        ),
+    ] = None
+    headings: Annotated[
+        Literal[2, 4] | None,
+        Option("2: there, turned, back (of zero without it); 4: every 90 deg (of turn without it)", by=by),
+    ] = None
+    level: Annotated[bool, Option("turn, after faces: write how the board sits (AHRS_TRIM, SENS_BOARD)", by=by)] = False
+    write: Annotated[bool, Option("turn, faces: write what was found to the autopilot", by=by)] = False
+    wait: Annotated[bool, Option(by=Interface(0))] = True
+    timeout_s: Annotated[_Seconds | None, _SECONDS._replace(help="give up after so long (default 900)")] = None
+
+
+class Cancel(Command, frozen=True, tag="cancel"):
+    """Cancel what runs."""
+
+    help = "cancel a running calibration"
+    by = _ALL
+    urgent = True
+
+
+class Undo(Command, frozen=True, tag="undo"):
+    """Restore the values from before the last write."""
+
+    help = "put the autopilot's values from before the last calibration back"
+    by = _ALL
+    force: Annotated[
+        bool,
+        Option(
+            "leave what somebody else has changed since, and put the rest back",
+            by=_SHELL | Interface.MQTT | Interface.PAGE,
+        ),
+    ] = False
+
+
+class AutopilotSetup(Command, frozen=True, tag="autopilot-setup"):
+    """The parameters that the autopilot needs."""
+
+    help = "what the autopilot needs set: heading, gate, offsets, port"
+
+
+class History(Command, frozen=True, tag="history"):
+    """The last calibrations, alignments, armings and flights."""
+
+    help = "list past calibrations"
+    limit: Annotated[
+        _Count | None,
+        Option(
+            "the latest N (default 20)", metavar="N", short="-n", default=20, allowed="a whole number from 1 to 1000000"
+        ),
+    ] = None
+
+
+class Temperature(Command, frozen=True, tag="temperature"):
+    """The biases over temperature: show, write or restore."""
+
+    help = "how the gyros' biases follow the temperature, as far as seen"
+    action: Annotated[
+        Literal["write", "undo"] | None,
+        Option(
+            flags={
+                "write": "write the curves into the autopilot (disarmed and still)",
+                "undo": "put back what was there before the curves",
+            },
+            group="action",
+        ),
+    ] = None
+    overwrite: Annotated[
+        bool,
+        Option("as --write, also over a temperature calibration that is not the companion's", group="action"),
+    ] = False
+
+
+class Record(Command, frozen=True, tag="record"):
+    """Record all inputs to a file, or end a recording."""
+
+    help = "record everything to a file until Ctrl-C (the last hour is kept anyway)"
+    file: Annotated[
+        str | None,
+        Option("default: one beside the daemon's own", metavar="FILE", positional=True, allowed="a path"),
+    ] = None
+    seconds: Annotated[_Seconds | None, _SECONDS._replace(help="default: until Ctrl-C, --stop or 1 GB")] = None
+    stop: Annotated[bool, Option("end a recording that runs")] = False
+
+
+class Answer(Command, frozen=True, tag="answer"):
+    """Answer a question of the first-run set-up, which a page asks before there is a daemon."""
+
+    by = Interface.PAGE
+    number: Annotated[int | None, Option(by=by, allowed="a whole number")] = None
+    words: Annotated[str | None, Option(by=by, allowed="a text")] = None
+
+
+ALL: Final = {
+    kind.name(): kind
+    for kind in (
+        Status, Calibrate, Align, Cancel, Undo, AutopilotSetup, History, Temperature, Monitor, Record, Answer
+    )
+}  # fmt: skip
+"""The commands by name."""
+
+
+def asked_by(interface: Interface) -> dict[str, type[Command]]:
+    """Return the commands that an interface may ask for."""
+    return {name: kind for name, kind in ALL.items() if interface in kind.by}
