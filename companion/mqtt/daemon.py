@@ -70,8 +70,16 @@ class Daemon:
 
     async def refresh(self) -> None:
         """Read the status and the last record now; keep the old ones where no answer comes."""
-        with contextlib.suppress(CompanionError, TimeoutError):
-            async with asyncio.timeout(SILENT_S), contextlib.aclosing(self.ask(MONITOR)) as replies:
+        # Not asyncio.timeout, which cannot expire in a cancelled task before Python 3.11.4: the end reads here.
+        reading = asyncio.ensure_future(self._read_once())
+        try:
+            await asyncio.wait([reading], timeout=SILENT_S)
+        finally:
+            reading.cancel()
+
+    async def _read_once(self) -> None:
+        with contextlib.suppress(CompanionError):
+            async with contextlib.aclosing(self.ask(MONITOR)) as replies:
                 self._accept(await anext(replies, None))
 
     def _accept(self, reply: Object | None) -> None:
