@@ -11,8 +11,15 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
-from companion.cli.replay_log import add_table_options
-from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds, storage_path
+from companion.cli.replay import add_table_options
+from companion.cli.terminal import (
+    AddCommand,
+    conclude,
+    load_config,
+    print_lines,
+    seconds,
+    storage_path,
+)
 from companion.errors import CalibrationRefusedError, ConfigError, StorageError
 from companion.physics.units import DEG_H, MG
 

@@ -1,30 +1,111 @@
-"""`companion replay` of a log of another program: its options, and its biases."""
+"""`companion replay`: a recording, or anybody's log of an IMU at rest, through the same estimator."""
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
 from companion.cli import show
-from companion.cli.terminal import conclude, print_lines, storage_path, within
+from companion.cli.terminal import AddCommand, conclude, print_lines, storage_path, within
 from companion.errors import ConfigError, StorageError
 from companion.physics.units import unit_of
 
 if TYPE_CHECKING:
     from companion.lab.logs.log import StillLog
+    from companion.lab.replay.engine import Result
     from companion.lab.replay.estimate import Given, Used
     from companion.lab.replay.windows import Windows
 
-MOST_LINES = 12
-"""Most unused pieces that are shown; --json has them all."""
+MOST_DIFFERENCES: Final = 20
+"""The most differences that are printed of a calibration; --json has them all."""
+MOST_PIECES: Final = 12
+"""The most pieces not used, and reasons, that are printed; --json has them all."""
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a log."""
+def add_command(add: AddCommand) -> None:
+    """Add `replay` to the parser of the command line."""
+    player = add("replay", replay, "run a recording, or anybody's log of an IMU at rest, through the same estimator")
+    player.add_argument(
+        "files", nargs="+", type=Path, metavar="FILE",
+        help="a recording (.mcap), or several that follow on one another; or a log (CSV; .ulg, .bin)",
+    )  # fmt: skip
+    _add_log_options(player)
+
+
+async def replay(options: argparse.Namespace) -> int:
+    """`companion replay`."""
+    from companion.lab.logs.log_files import reader_of
+    from companion.lab.logs.recording import is_text
+
+    logs = []
+    for file in options.files:
+        try:
+            logs += [file] if reader_of(file) is not None or is_text(file) else []
+        except OSError as error:
+            raise ConfigError(f"companion replay: {file}: {error.strerror or error}") from None
+    if not logs:
+        return _replay_recording(options)
+    if len(options.files) > 1:
+        raise ConfigError(f"companion replay: found {len(options.files)} files; allowed with a log: one")
+    return _replay_log(options, logs[0])
+
+
+def _replay_recording(options: argparse.Namespace) -> int:
+    from companion.lab.replay import engine
+
+    began_s = time.monotonic()
+    result = engine.replay(options.files)
+    took_s = time.monotonic() - began_s
+    different = [difference for each in result.calibrations for difference in each.differences]
+    lines = _lines(result)
+    reason = lines[-1]
+    good = not different and (result.estimate is None or result.estimate.state == "done")
+    state = "different" if different else "done" if good else "failed"
+    print_lines(
+        f"replayed {result.seconds:.0f} s in {took_s:.1f} s"
+        + (f"; the recording ends early: {result.cut_short}" if result.cut_short else ""),
+        error=True,
+    )
+    for note in result.notes:
+        print_lines(f"note: {note}", error=True)
+    return conclude(options, {"state": state, "reason": reason, **msgspec.to_builtins(result)}, lines, good=good)
+
+
+def _lines(result: Result) -> list[str]:
+    """Describe the result; the last line is the verdict."""
+    from companion.lab.replay.engine import TOLERANCE_SIGMAS
+
+    lines: list[str] = []
+    different = 0
+    worst = [each.worst_sigmas for each in result.calibrations if each.worst_sigmas is not None]
+    for each in result.calibrations:
+        lines.append(f"calibration of {each.record.started_at}")
+        lines += show.record_lines(msgspec.to_builtins(each.record))
+        if each.not_recomputed is not None:
+            lines.append(f"not recomputed: {each.not_recomputed}")
+        different += bool(each.differences)
+        lines += [f"DIFFERENT {difference}" for difference in each.differences[:MOST_DIFFERENCES]]
+        if len(each.differences) > MOST_DIFFERENCES:
+            lines.append(f"... and {len(each.differences) - MOST_DIFFERENCES} more (--json has them all)")
+    if result.estimate is not None:
+        lines.append("no calibration in the recording; what one would have found at its end:")
+        lines += show.record_lines(msgspec.to_builtins(result.estimate))
+        lines.append(result.estimate.reason)
+    elif different:
+        lines.append(f"{different} of {len(result.calibrations)} calibrations came out different")
+    else:
+        agree = f"; biases within {TOLERANCE_SIGMAS:g} sigma (at most {max(worst):.1g})" if worst else ""
+        lines.append(f"{len(worst)} of {len(result.calibrations)} calibrations recomputed{agree}")
+    return lines
+
+
+def _add_log_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a log that is no recording of ours."""
     log = parser.add_argument_group("for a log (docs/recording.md)")
     add_table_options(log)
     log.add_argument("--imu", metavar="NAME", help="which one, where there are several")
@@ -77,7 +158,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_table_options(parser: argparse._ActionsContainer) -> None:
-    """Add the options of a CSV file."""
+    """Add the options that say how to read a CSV file."""
     parser.add_argument(
         "--columns",
         metavar="NAMES",
@@ -88,8 +169,8 @@ def add_table_options(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def replay(options: argparse.Namespace, file: Path) -> int:
-    """Print the biases in a log."""
+def _replay_log(options: argparse.Namespace, file: Path) -> int:
+    """Print the biases that the estimator finds in a log."""
     from companion.lab.replay.estimate import estimate
 
     given = _given(options)
@@ -102,7 +183,7 @@ def replay(options: argparse.Namespace, file: Path) -> int:
         return _windows(options, log, given)
     found = estimate(log, given)
     record = msgspec.to_builtins(found.record)
-    lines = [*show.record_lines(record), *used_lines(found.used, at_rest=given.platform == "ground")]
+    lines = [*show.record_lines(record), *_used_lines(found.used, at_rest=given.platform == "ground")]
     answer = {**record, "log": msgspec.to_builtins(found.used)}
     return conclude(options, answer, lines, good=found.record.state == "done")
 
@@ -150,14 +231,14 @@ def _windows(options: argparse.Namespace, log: StillLog, given: Given) -> int:
         print_lines(f"companion: {reason}", error=True)
     said = {"left_out": log.left_out, "notes": log.notes}
     answer = {"state": state, "reason": reason, "windows": msgspec.to_builtins(found), "log": said}
-    lines = [*window_lines(found), *(f"note: {note}" for note in log.notes)]
+    lines = [*_window_lines(found), *(f"note: {note}" for note in log.notes)]
     return conclude(options, answer, lines, good=bool(found.axes))
 
 
-def window_lines(found: Windows) -> list[str]:
-    """Make the lines of the check of sigma, axis by axis."""
+def _window_lines(found: Windows) -> list[str]:
+    """Say how often the error was within sigma, axis by axis."""
     lines = [f"windows of {found.length_s:g} s: {found.count}, calibrated: {found.done}"]
-    lines += [f"not calibrated: {each.count}: {each.why}" for each in found.refused[:MOST_LINES]]
+    lines += [f"not calibrated: {each.count}: {each.why}" for each in found.refused[:MOST_PIECES]]
     for next_s, axes in itertools.groupby(found.axes, key=lambda each: each.next_s):
         rows = list(axes)
         lines.append(f"against the next {next_s:g} s, {rows[0].pairs} pairs:")
@@ -170,14 +251,14 @@ def window_lines(found: Windows) -> list[str]:
     return lines
 
 
-def used_lines(used: Used, *, at_rest: bool = True) -> list[str]:
-    """Make the lines of the used stretch, and of the reasons against the rest."""
+def _used_lines(used: Used, *, at_rest: bool = True) -> list[str]:
+    """Say which stretch was used, and why not the rest."""
     lines = []
     if used.from_s is not None and used.to_s is not None:
         still = f"; {used.still_s} s of it at rest" if at_rest else ""
         lines.append(f"used: {used.from_s:.0f} to {used.to_s:.0f} s of {used.seconds:.1f} s{still}")
-    lines += [f"not used: {each.from_s:.0f} to {each.to_s:.0f} s: {each.why}" for each in used.unused[:MOST_LINES]]
-    if len(used.unused) > MOST_LINES:
-        lines.append(f"... and {len(used.unused) - MOST_LINES} more (--json has them all)")
+    lines += [f"not used: {each.from_s:.0f} to {each.to_s:.0f} s: {each.why}" for each in used.unused[:MOST_PIECES]]
+    if len(used.unused) > MOST_PIECES:
+        lines.append(f"... and {len(used.unused) - MOST_PIECES} more (--json has them all)")
     lines += [f"left out: {count} lines {why}" for why, count in used.left_out.items()]
     return [*lines, *(f"note: {note}" for note in used.notes)]
