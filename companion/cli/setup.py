@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from companion import config
-from companion.cli.asking import Asking
+from companion.cli.asking import Asking, PageAsking
 from companion.cli.setup_imus import ask_autopilot, daemon_status, parts_given, parts_of
 from companion.cli.show import finding_lines
 from companion.cli.terminal import DONE, FAILED, config_path, load_config, own_name, print_json
@@ -44,8 +44,6 @@ async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
         session = _Session(options, Asking(yes=options.yes, error=options.json))
         await _to_the_end(session)
     else:
-        from companion.cli.by_page import PageAsking
-
         async with PageAsking(_bind(options), _storage(options)) as asking:
             session = _Session(options, asking, goes_on=goes_on)
             await _to_the_end(session)
