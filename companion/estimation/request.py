@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import enum
-from typing import Final, TypeGuard
+from typing import Final
 
 LONGEST_S: Final = 1e6
+"""Time limits are shorter, s."""
 
 
 class What(enum.Enum):
@@ -24,8 +25,3 @@ class What(enum.Enum):
     def accelerometers(self) -> bool:
         """Whether accelerometer biases are asked for."""
         return self is not What.GYROS
-
-
-def is_time_limit(value: object) -> TypeGuard[float]:
-    """Whether this is a number of seconds that something may be given: above 0 and below a million."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < LONGEST_S

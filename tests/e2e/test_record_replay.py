@@ -401,7 +401,6 @@ def test_recording_on_request(tmp_path: Path) -> None:
             for refused, words in (
                 ({"file": str(path), "seconds": 5.0}, "exists already"),
                 ({"file": str(absent), "seconds": 5.0}, f"{absent}: there is no folder {absent.parent}; make it"),
-                ({"seconds": "x"}, "not understood"),
             ):
                 with pytest.raises(StorageError, match=words):
                     await asked(rig, **refused)

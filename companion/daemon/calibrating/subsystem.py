@@ -10,6 +10,7 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.vehicle.own_attitude import OwnAttitude
+from companion.commands import Align
 from companion.component.service import Refusal
 from companion.daemon.biases.into_autopilot import IntoAutopilot
 from companion.daemon.biases.memory import BiasMemory
@@ -36,7 +37,7 @@ from companion.daemon.stands.turning import TurnAsked, Turning
 from companion.errors import CalibrationRefusedError, RequestRefusedError
 from companion.estimation.means.windows import Window
 from companion.estimation.records.record import Record
-from companion.estimation.request import What, is_time_limit
+from companion.estimation.request import What
 from companion.estimation.solution.prior import Expectation
 from companion.formats import Object
 from companion.links.system.listeners import Listeners
@@ -219,10 +220,8 @@ class Calibrating(Subsystem):
         Raises:
             CalibrationRefusedError: the request is not understood.
         """
-        action, headings, timeout_s = (request.get(key) for key in ("action", "headings", "timeout_s"))
-        timeout_s = ALIGN_TIMEOUT_S if timeout_s is None else timeout_s
-        if headings not in (None, 2, HEADINGS) or not is_time_limit(timeout_s):
-            action = None
+        action, headings = request.get("action"), request.get("headings")
+        timeout_s = request.get("timeout_s") or ALIGN_TIMEOUT_S
         kind, what, write = FACES, What.ACCELEROMETERS, request.get("write") is True
         run: Callable[[Job], Awaitable[str]]
         if action == "faces":
@@ -234,7 +233,8 @@ class Calibrating(Subsystem):
             kind, what, missing = ALIGNMENT, What.BOTH, self._aligner.why_not()
             run = partial(self._aligner.run, plan=Plan(action, headings or 2))
         else:
-            raise CalibrationRefusedError(f"align: {request} is not understood")
+            allowed = Align.fields()["action"].allowed
+            raise CalibrationRefusedError(f"align: 'action': found nothing; allowed: {allowed}")
         if self._core.config.vehicle.platform == "deck":
             if kind == ALIGNMENT:
                 return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
