@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
+from companion.estimation.alignment.align import turned
 from companion.estimation.alignment.align_model import Ground, ImuStand, Stand
-from companion.estimation.alignment.faces import Face, Sides, faces
-from companion.estimation.alignment.spot import mounting, turned
+from companion.estimation.alignment.faces import Face, Sides, faces, mounting
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.means.windows import ImuInput, ImuWindow

@@ -12,7 +12,6 @@ import pytest
 
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
-from companion.daemon.stands.align_steps import Plan
 from companion.estimation.records.record import Record
 from companion.estimation.request import What
 from companion.lab.replay.engine import replay
@@ -65,9 +64,8 @@ async def follow(rig: Rig, hands: Hands, job: Job) -> JobResult:
     return job.finished.result()
 
 
-async def aligned(rig: Rig, hands: Hands, plan: Plan) -> JobResult:
-    wanted = {"action": plan.kind, "headings": plan.headings}
-    return await follow(rig, hands, started(rig.service.calibrating.start_alignment(wanted, "test")))
+async def aligned(rig: Rig, hands: Hands) -> JobResult:
+    return await follow(rig, hands, started(rig.service.calibrating.start_alignment({"action": "zero"}, "test")))
 
 
 def test_the_horizontal_accelerometers_become_as_good_as_the_turn(tmp_path: Path) -> None:
@@ -82,7 +80,7 @@ def test_the_horizontal_accelerometers_become_as_good_as_the_turn(tmp_path: Path
             off_mg, sigma_mg = worst_horizontal(before, made)
             assert 1.7 < sigma_mg < 1.8
             assert 1.0 < off_mg < 2.5
-            result = await aligned(made, hands, Plan("zero"))
+            result = await aligned(made, hands)
             assert result.outcome == "done", result
             record = made.service.calibrating.alignment.record
             assert record is not None
@@ -134,7 +132,7 @@ def test_it_outlives_a_restart_and_is_not_used_with_another_configuration(tmp_pa
     async def measure() -> None:
         async with made.running():
             await made.ready()
-            assert (await aligned(made, hands, Plan("zero"))).outcome == "done"
+            assert (await aligned(made, hands)).outcome == "done"
 
     run_virtual(measure())
 
@@ -176,7 +174,7 @@ def test_what_was_calibrated_with_the_old_zero_is_calibrated_anew_by_itself(tmp_
             await made.until(lambda: manager.last is not None and not in_force.findings(made.now_s), 200.0)
             assert manager.last is not None
             assert manager.last.alignment is None
-            assert (await aligned(made, hands, Plan("zero"))).outcome == "done"
+            assert (await aligned(made, hands)).outcome == "done"
             assert [finding.words for finding in in_force.findings(made.now_s)] == ["gradienter aligned since then"]
             await made.until(lambda: manager.last is not None and manager.last.alignment is not None, 150.0)
             await made.until(lambda: not in_force.findings(made.now_s), 60.0)
@@ -261,7 +259,7 @@ def test_px4_and_an_imu_of_our_own(tmp_path: Path) -> None:
     async def main() -> None:
         async with made.running():
             await made.ready()
-            result = await aligned(made, hands, Plan("zero"))
+            result = await aligned(made, hands)
             assert result.outcome == "done", result
             record = made.service.calibrating.alignment.record
             assert record is not None
@@ -280,7 +278,7 @@ def test_a_recording_replays_with_the_zero_that_was_in_force(tmp_path: Path) -> 
     async def main() -> None:
         async with made.running():
             await made.ready()
-            assert (await aligned(made, hands, Plan("zero"))).outcome == "done"
+            assert (await aligned(made, hands)).outcome == "done"
             result, _ = await calibrated(made)
             assert result.outcome == "done"
             await asyncio.sleep(2.0)

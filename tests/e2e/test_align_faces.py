@@ -15,7 +15,7 @@ from companion.cli.client import stands_lines
 from companion.cli.show import status_lines
 from companion.component.service import Refusal
 from companion.daemon.job import Job
-from companion.daemon.stands.by_hand import ByHand
+from companion.daemon.stands.alignment import ByHand
 from companion.estimation.records.align_record import FacesRecord
 from companion.estimation.records.record import Record
 from companion.estimation.request import What

@@ -8,8 +8,7 @@ from companion.autopilot.firmware.heading_parameters import COMPASS
 from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.configured import models
 from companion.daemon.core import Core
-from companion.daemon.stands.alignment import AlignmentInForce
-from companion.daemon.stands.faces_in_force import FacesInForce
+from companion.daemon.stands.alignment import AlignmentInForce, FacesInForce
 from companion.errors import AutopilotError
 from companion.estimation.means.windows import Window
 from companion.estimation.request import What

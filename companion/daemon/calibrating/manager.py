@@ -20,7 +20,7 @@ from companion.component.tunes import Tune
 from companion.daemon.calibrating.run import CalibrationParts, CalibrationRun
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.job import Job, JobCancelledError, Undone
-from companion.daemon.stands.by_hand import ByHand
+from companion.daemon.stands.alignment import ByHand
 from companion.errors import CompanionError, StorageError
 from companion.estimation.machine import Event, State
 from companion.estimation.records.record import Record

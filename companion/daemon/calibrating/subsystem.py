@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
 from functools import partial
 from typing import Final
 
@@ -20,20 +20,12 @@ from companion.daemon.calibrating.run import CalibrationParts
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job
+from companion.daemon.job import ALIGNMENT, TEMPERATURE, Job
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.subsystem import Offsets
-from companion.daemon.stands.accel_writes import AccelWrites
-from companion.daemon.stands.align_steps import HEADINGS, Plan
-from companion.daemon.stands.aligner import Aligner
-from companion.daemon.stands.alignment import AlignmentInForce
-from companion.daemon.stands.by_hand import ByHand
-from companion.daemon.stands.faces_in_force import FacesInForce
-from companion.daemon.stands.facing import Facing
-from companion.daemon.stands.level_writes import LevelWrites
+from companion.daemon.stands.alignment import AlignmentInForce, ByHand, FacesInForce
+from companion.daemon.stands.alignments import KINDS, Alignments
 from companion.daemon.stands.measuring import Measuring
-from companion.daemon.stands.stands import Stands
-from companion.daemon.stands.turning import TurnAsked, Turning
 from companion.errors import CalibrationRefusedError, RequestRefusedError
 from companion.estimation.means.windows import Window
 from companion.estimation.records.record import Record
@@ -66,12 +58,7 @@ class Calibrating(Subsystem):
         self.estimator = Estimator(core, self.alignment, self.faces, own)
         self.on_solved: Listeners[Window, Window, EstimatorInputs, What, Expectation] = Listeners()
         ditherer = Ditherer(core, imus, offsets.writer, offsets.ledger)
-        self.stands = stands = Stands(core, imus, measuring)
-        self._writes = writes = AccelWrites(core, imus, offsets)
-        self._aligner = Aligner(core, stands, self.alignment)
-        self._facing = Facing(core, imus, stands, writes, self.faces)
-        levels = LevelWrites(core, imus, offsets, own)
-        self._turning = Turning(core, imus, stands, writes, levels, self.faces)
+        self.stands = Alignments(core, imus, measuring, offsets, own, self.alignment, self.faces)
         self.by_hand = ByHand(core, imus)
         self._into_autopilot = IntoAutopilot(core, imus, measuring, self.memory, offsets)
         parts = CalibrationParts(core, imus, measuring, ditherer, self.estimator, self.memory, offsets, self.on_solved)
@@ -220,25 +207,17 @@ class Calibrating(Subsystem):
         Raises:
             CalibrationRefusedError: the request is not understood.
         """
-        action, headings = request.get("action"), request.get("headings")
         timeout_s = request.get("timeout_s") or ALIGN_TIMEOUT_S
-        kind, what, write = FACES, What.ACCELEROMETERS, request.get("write") is True
-        run: Callable[[Job], Awaitable[str]]
-        if action == "faces":
-            missing, run = self._writes.why_not(write=write), partial(self._facing.run, write=write)
-        elif action == "turn":
-            asked = TurnAsked(headings or HEADINGS, write=write, level=request.get("level") is True)
-            kind, missing, run = TURN, self._turning.why_not(asked), partial(self._turning.run, asked=asked)
-        elif action in ("zero", "tilts"):
-            kind, what, missing = ALIGNMENT, What.BOTH, self._aligner.why_not()
-            run = partial(self._aligner.run, plan=Plan(action, headings or 2))
-        else:
+        asked = self.stands.parse(request)
+        if asked is None:
             allowed = Align.fields()["action"].allowed
             raise CalibrationRefusedError(f"align: 'action': found nothing; allowed: {allowed}")
+        kind, what = KINDS[asked.action]
         if self._core.config.vehicle.platform == "deck":
             if kind == ALIGNMENT:
                 return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
             return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
+        missing, run = self.stands.blocking_reason(asked), partial(self.stands.run, request=asked)
         return self.manager.start_job(kind, what, by, timeout_s, missing, run)
 
     async def _to_end(self, job: Job, product: str) -> AsyncIterator[Object]:

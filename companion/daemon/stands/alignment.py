@@ -1,38 +1,62 @@
-"""The alignment in force: the gradienter's measured zero, and whether it still belongs to this configuration."""
+"""Results of alignments, on disk and in memory: the gradienter's zero, known accelerometers, and the history."""
 
 from __future__ import annotations
 
+import asyncio
 import logging
+from collections.abc import Mapping
 
 import msgspec
+import numpy as np
 
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.parameters.wire import same_float32
+from companion.component.service import JobResult
 from companion.config.sections import Config
 from companion.configured import models
-from companion.daemon.core import Offload
+from companion.daemon.core import Core, Offload
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import Job
+from companion.errors import StorageError
+from companion.estimation.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Sides
 from companion.estimation.means.pose import GradienterModel
-from companion.estimation.records.align_record import AlignmentRecord, GradienterSettings
+from companion.estimation.means.windows import Window
+from companion.estimation.noise.allan import noise_profile
+from companion.estimation.records.align_record import (
+    AlignmentRecord,
+    FacesImuRecord,
+    FacesRecord,
+    GradienterSettings,
+    Running,
+    TurnRecord,
+)
 from companion.estimation.records.record import AlignmentUsed
+from companion.estimation.solution.otherwise import aged_m_s2
+from companion.formats import Object, utc_now
 from companion.links.system.listeners import Listeners
-from companion.storage.learned import alignment_in
+from companion.physics.frames import Array
+from companion.physics.units import MG
+from companion.storage.changes import PREDICTION, ChangeSet
+from companion.storage.learned import KEEP_DONE, Done, alignment_in, alignments_in, faces_in, this_boot
 
 logger = logging.getLogger(__name__)
 
 
 class AlignmentInForce:
-    """Keeps the alignment on disk, and gives the gradienter's model with it."""
+    """The gradienter's measured zero, and whether it still belongs to this configuration."""
 
     def __init__(self, config: Config, offload: Offload) -> None:
         self._gradienter, self._offload = config.gradienter, offload
         self._store = alignment_in(config.storage.path)
         self.record: AlignmentRecord | None = None
-        """What is kept, whether or not it is used."""
+        """The stored alignment, used or not."""
         self.unused: str | None = None
-        """Why what is kept is not used, in one line; None while it is used, or nothing is kept."""
+        """Reason why the stored alignment is not used, in one line; None while it is used, or without one."""
         self.on_change: Listeners[[]] = Listeners()
-        """Told when another zero is in force."""
+        """Notified when another zero becomes active."""
 
     def load(self) -> None:
-        """Read what was kept before this start; blocking. What cannot be used is set aside and said."""
+        """Load the stored alignment; blocking. A file that cannot be used is set aside, with a warning."""
         self._take(self._store.load())
         if self._store.unusable is not None:
             self.unused = self._store.unusable
@@ -40,17 +64,17 @@ class AlignmentInForce:
             logger.warning("alignment not used: %s", self.unused)
 
     async def keep(self, record: AlignmentRecord) -> None:
-        """Put a new alignment in force, now and after every restart.
+        """Make a new alignment the active one, now and after every restart.
 
         Raises:
-            StorageError: it could not be kept; the one before stays in force.
+            StorageError: it could not be kept; the one before stays active.
         """
         await self._offload(self._store.write, record)
         self._take(record)
         self.on_change.tell()
 
     async def forget(self) -> bool:
-        """Go back to what the configuration says; whether there was anything to forget.
+        """Go back to the configuration's zero; returns whether there was an alignment to forget.
 
         Raises:
             StorageError: the file could not be removed.
@@ -63,24 +87,24 @@ class AlignmentInForce:
         return was
 
     def settings(self) -> GradienterSettings | None:
-        """What an alignment belongs to; None without a gradienter."""
+        """Settings that an alignment belongs to; None without a gradienter."""
         if self._gradienter is None:
             return None
         return msgspec.convert(self._gradienter, GradienterSettings, from_attributes=True)
 
     @property
     def used(self) -> AlignmentUsed | None:
-        """For the record of a calibration: what of it is in force; None where nothing is."""
+        """The active alignment, for the record of a calibration; None without one."""
         if self.record is None or self.unused is not None:
             return None
         return msgspec.convert(self.record, AlignmentUsed, from_attributes=True)
 
     def model(self) -> GradienterModel | None:
-        """The gradienter's model as it is in force."""
+        """Return the gradienter's model with the active zero."""
         return models.aligned(models.gradienter_model(self._gradienter), self.used)
 
     def status(self) -> dict[str, object] | None:
-        """For `companion status`; None where nothing is kept."""
+        """Return the stored alignment for `companion status`; None without one."""
         if self.record is None and self.unused is None:
             return None
         kept = {key: getattr(self.record, key, None) for key in ("kind", "measured_at", "offset_deg", "sigma_deg")}
@@ -98,3 +122,179 @@ class AlignmentInForce:
         if different:
             names = ", ".join(f"gradienter.{key}" for key in different)
             self.unused = f"measured with another {names}: companion align zero, or companion align --forget"
+
+
+class FacesInForce:
+    """The accelerometers' errors known from all sides, for the offsets and scales that are active now."""
+
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
+        self._store, self._offload = faces_in(core.config.storage.path), core.offload
+        self._collector, self._profiles, self._imus = core.collector, core.profiles, imus
+        self._host = this_boot()
+        self.record: FacesRecord | None = None
+
+    def load(self) -> None:
+        """Load the stored record; blocking. A file that cannot be used is set aside."""
+        self.record = self._store.load()
+
+    async def keep(self, record: FacesRecord) -> None:
+        """Replace the stored record.
+
+        Raises:
+            StorageError: it could not be kept; the record before stays.
+        """
+        await self._offload(self._store.write, record)
+        self.record = record
+
+    def status(self) -> list[Object]:
+        """List the bias and scale errors left in the output of each IMU, with their sigmas."""
+        found: list[Object] = []
+        record = self.record
+        for kept in () if record is None else record.imus:
+            now = self._now(kept.name, kept.temperature_degc)
+            if record is None or now is None:
+                continue
+            found.append(
+                {
+                    "name": kept.name,
+                    "measured_at": record.measured_at,
+                    "temperature_degc": kept.temperature_degc,
+                    "bias_left_mg": (now.figures[BIAS] / MG).round(4).tolist(),
+                    "bias_sigma_mg": (now.sigma[BIAS] / MG).round(4).tolist(),
+                    "scale_left": now.figures[SCALE].round(7).tolist(),
+                    "scale_sigma": now.sigma[SCALE].round(7).tolist(),
+                }
+            )
+        return found
+
+    def running(self, name: str) -> Running | None:
+        """Return since when an IMU has been on; None where its device does not tell."""
+        up_s = self._collector.up_s(name)
+        if up_s is None or not self._host:
+            return None
+        return Running(host=self._host, started_s=asyncio.get_running_loop().time() - up_s, up_s=up_s)
+
+    def sides(self, window: Window) -> dict[str, Sides]:
+        """Return the known errors by IMU, for a tilt from these means."""
+        found = {imu.name: self._now(imu.name, imu.temperature_degc) for imu in window.imus}
+        return {name: now for name, now in found.items() if now is not None}
+
+    def _now(self, name: str, temperature_degc: float | None) -> Sides | None:
+        """Return `known` under the active offsets; None also where these are unknown."""
+        calibration = self._imus[name].calibration if name in self._imus else None
+        return None if calibration is None else self.known(name, calibration, temperature_degc)
+
+    def known(self, name: str, calibration: ImuCalibration, temperature_degc: float | None) -> Sides | None:
+        """Return the errors left in one IMU's output, in its own axes; None if this sensor was never measured."""
+        if self.record is None:
+            return None
+        kept = next((imu for imu in self.record.imus if imu.name == name), None)
+        if kept is None or kept.accel_id != calibration.accel_id:
+            return None
+        names = calibration.parameters
+        try:
+            offset = np.array([kept.corrections[one] for one in names.accel_offset])
+            x, y, z = (kept.corrections[one] for one in names.accel_scale)
+        except KeyError:
+            return None
+        return _under(calibration, kept, offset, calibration.in_use((x, y, z)), self._widened(kept, temperature_degc))
+
+    def _widened(self, kept: FacesImuRecord, temperature_degc: float | None) -> float:
+        """Return the widening of the biases' sigma since, m/s^2: drift and temperature, or another power-up."""
+        now, before = self.running(kept.name), kept.running
+        gap_s = now.up_s - before.up_s if now is not None and before is not None and before.is_same(now) else None
+        degrees = kept.temperature_degc, temperature_degc
+        kelvin = None if degrees[0] is None or degrees[1] is None else degrees[1] - degrees[0]
+        return aged_m_s2(noise_profile(self._profiles.of(kept.name)).accel, gap_s, kelvin)
+
+
+def _under(
+    calibration: ImuCalibration,
+    kept: FacesImuRecord,
+    offset: Array,
+    scale: Array,
+    widened_m_s2: float,
+) -> Sides:
+    """Convert the errors to other offsets and scales: output = scale (raw - offset), then and now."""
+    bias, error = np.array(kept.accel_bias_mg.value) * MG, np.array(kept.accel_scale.value)
+    right_offset, right_scale = offset + bias / scale, scale / (1.0 + error)
+    now, taken_off = calibration.in_use(), np.array(calibration.accel_offset_m_s2)
+    figures, sigma = np.zeros(FIGURES), np.zeros(FIGURES)
+    figures[BIAS], figures[SCALE] = now * (right_offset - taken_off), now / right_scale - 1.0
+    figures[SHEAR] = kept.accel_shear.value
+    sigma[BIAS] = np.hypot(np.array(kept.accel_bias_mg.sigma) * MG, widened_m_s2)
+    sigma[SCALE], sigma[SHEAR] = kept.accel_scale.sigma, kept.accel_shear.sigma
+    return Sides(figures, sigma, calibration.orientation)
+
+
+class ByHand:
+    """History of alignments and the parameters that they wrote, for `companion history` and `status`."""
+
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
+        self._file = alignments_in(core.config.storage.path)
+        self._vehicle, self._offload, self._imus = core.vehicle, core.offload, imus
+        self._done: list[Done] = []
+
+    def load(self) -> None:
+        """Load the history; blocking."""
+        self._done = self._file.read()
+
+    async def keep(self, job: Job, result: JobResult) -> None:
+        """Add an alignment that has delivered a record, unless it was cancelled."""
+        record = job.product
+        if result.outcome == "cancelled" or not isinstance(record, AlignmentRecord | FacesRecord | TurnRecord):
+            return
+        board = record.board.written if isinstance(record, TurnRecord) and record.board is not None else {}
+        parts = [board, *([] if isinstance(record, AlignmentRecord) else [imu.written for imu in record.imus])]
+        kept = [(name, one) for part in parts for name, one in part.items() if one.outcome in ("verified", "stored")]
+        done = Done(
+            what="level" if board else record.kind,
+            state=result.outcome,
+            measured_at=record.measured_at,
+            reason=result.reason,
+            system_id=self._vehicle.system_id,
+            written={name: one.after for name, one in kept},
+        )
+        await self._write([*self._done, done][-KEEP_DONE:])
+
+    async def undone(self, step: ChangeSet) -> None:
+        """Note that the writes of a step were undone."""
+        now = utc_now()
+        await self._write(
+            [
+                msgspec.structs.replace(each, undone_at=now) if each.measured_at == step.origin.at else each
+                for each in self._done
+            ]
+        )
+
+    async def _write(self, done: list[Done]) -> None:
+        self._done = done
+        try:
+            await self._offload(self._file.write, done)
+        except StorageError as error:
+            logger.error("the history does not show it: %s", error)  # noqa: TRY400 - one line
+
+    def history(self) -> list[Object]:
+        """List all alignments, the latest first, each with whether it is in force."""
+        return [self._shown(done) for done in reversed(self._done)]
+
+    def latest(self) -> list[Object]:
+        """List the last alignment of each kind on this aircraft, the latest first."""
+        here = {done.what: done for done in self._done if done.system_id == self._vehicle.system_id}
+        here.pop(PREDICTION, None)
+        return [self._shown(done) for done in sorted(here.values(), key=self._done.index, reverse=True)]
+
+    def _shown(self, done: Done) -> Object:
+        return {**msgspec.to_builtins(done), "in_force": self._in_force(done)}
+
+    def _in_force(self, done: Done) -> bool | None:
+        """Return whether the autopilot holds all written values; None where none is read from it."""
+        if done.undone_at is not None:
+            return False
+        if done.system_id != self._vehicle.system_id:
+            return None
+        now: dict[str, float] = {}
+        for imu in self._imus.values():
+            now |= {} if imu.calibration is None else imu.calibration.corrections
+        seen = [same_float32(now[name], value) for name, value in done.written.items() if name in now]
+        return all(seen) if seen else None

@@ -1,12 +1,18 @@
-"""From several still stands to the gradienter's zero, and to what else they tell (method 3.4).
+"""Joint estimate from several still stands: the gradienter's zero, level, and the errors of each IMU (method 3.4).
 
-One still pose cannot tell a zero offset of the gradienter from a bias of the accelerometers; the same spot seen twice,
-turned by 180 degrees, can. Further tilts tell bias from scale and how the gradienter sits against each IMU. Everything
-is estimated together, by Gauss-Newton with priors, so that what the stands do not determine keeps the sigma of what
-was known before: it is widened, never guessed.
+One pose cannot tell a zero offset of the gradienter from a bias of the accelerometers; one spot seen twice, turned by
+180 degrees, can. Further tilts separate bias from scale and show how the gradienter sits against each IMU. All
+unknowns are estimated together by Gauss-Newton with priors: an unknown that the stands do not determine keeps its
+prior sigma.
 
-Readings that do not fit together are refused: every residual is set against what is left of its own sigma (Baarda's
-w-test), which names the stand that is off, and finds a spot that moved before any sum of squares does.
+Without a gradienter (`turned`) the same turn gives the *effective* bias of the level aircraft: the bias proper and the
+board's tilt in one. The slope of the spot changes its sign in the aircraft after half a turn, a bias does not. Its
+sigma depends on how well the marks are met (`Priors.placement_deg`) and, on a slope, on the angle of the turn:
+g sin(slope) / 2 for each radian of a half turn, 0.76 mg for each degree on 5 deg of slope. Quarter turns determine
+their angles themselves, for their readings lie on a circle.
+
+Readings that do not fit together are refused: every residual is compared with its own sigma (Baarda's w-test), which
+names the stand that is off, and finds a spot that moved before any sum of squares does.
 """
 
 from __future__ import annotations
@@ -20,7 +26,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.alignment.align_model import DOWN, Ground, Model, Part, Priors, Row, Stand, Unknowns
+from companion.estimation.alignment.align_model import (
+    DOWN,
+    PRIOR_BIAS_M_S2,
+    PRIOR_SCALE,
+    PRIOR_SHEAR,
+    Ground,
+    Model,
+    Part,
+    Priors,
+    Row,
+    Stand,
+    Unknowns,
+)
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
 from companion.physics.gradienter import Law, up_in_sensor
 from companion.physics.statistics import chi_square_ratio
@@ -28,24 +46,26 @@ from companion.physics.units import DEG, MG
 
 MAX_ROUNDS: Final = 30
 _CONVERGED: Final = 1e-4
-"""Of the prior sigma of each parameter."""
+"""Share of the prior sigma of each unknown."""
 W_LIMIT: Final = 4.5
-"""|w| of one residual: passed by chance once in some thousand alignments of a hundred readings."""
+"""Threshold for |w| of one residual: exceeded by chance once in some thousand alignments of a hundred readings."""
 SPOT_W_LIMIT: Final = 3.9
-"""Of a placement, of which there are few: likewise once in some thousand."""
+"""Threshold for |w| of a placement, of which there are few: once in some thousand alignments."""
 DETERMINED: Final = 0.2
-"""A figure counts as determined where its sigma is below this share of what was known before."""
+"""A figure counts as determined where its sigma is below this share of its prior sigma."""
 _LEAST_REDUNDANCY: Final = 1e-3
 _NINETY_NINE: Final = 2.326
-"""Sigmas that a normal number exceeds in one case of a hundred."""
+"""Sigmas that a normal variable exceeds in one case of a hundred."""
 MOST_TURNED_DEG: Final = 30.0
-"""Of an IMU against the base: more is another orientation than the one configured."""
+"""Largest turn of an IMU against the base: more is another orientation than the one configured."""
 LEVEL: Final = -DOWN
+ALONE: Final = Priors(scale=PRIOR_SCALE, shear=PRIOR_SHEAR, misalignment_deg=3.0, accel_bias_m_s2=PRIOR_BIAS_M_S2)
+"""Priors of uncalibrated accelerometers on a board put in by eye."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Figures:
-    """Three figures with their sigmas, shape (3,), and whether the stands determine each."""
+    """Three figures, their sigmas, and whether the stands determine each; shapes (3,)."""
 
     value: Array
     sigma: Array
@@ -54,25 +74,25 @@ class Figures:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ImuAlignment:
-    """What was found of one IMU, vehicle FRD; of an autopilot's IMU, of its output as it comes."""
+    """Estimate of one IMU, vehicle FRD, without the offsets that an autopilot has subtracted already."""
 
     name: str
     level_bias_m_s2: Array
-    """Effective bias when level: what a calibration there would find, scale and misalignment included; (3,)."""
+    """Effective bias when level, scale and misalignment included, as a calibration there finds it; (3,)."""
     level_covariance_m2_s4: Matrix
     accel_bias_m_s2: Figures
-    """Without scale, shear and misalignment."""
+    """Bias proper, without scale, shear and misalignment."""
     scale: Figures
     shear: Figures
     """xy, xz, yz."""
     misalignment_rad: Figures
-    """Rotation vector from the axes of gradienter and base to this IMU's."""
+    """Rotation vector from the axes of gradienter and base to those of this IMU."""
     gyro_bias_rad_s: Figures
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Complaint:
-    """The residual that fits worst: by how many of its own sigmas, and how much that is in SI units."""
+    """The residual that fits worst: in its own sigmas, and in SI units."""
 
     row: Row
     sigmas: float
@@ -81,31 +101,31 @@ class Complaint:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """The result of `align`."""
+    """Result of `align`."""
 
     offset_deg: Array
-    """What the gradienter shows too much, on top of the configured offset; (2,)."""
+    """Zero of the gradienter on top of the configured offset; (2,)."""
     offset_covariance_deg2: Matrix
     imus: tuple[ImuAlignment, ...]
     slope_deg: float
-    """Of the spot; 0 without one."""
+    """Slope of the spot; 0 without one."""
     attitudes: tuple[Matrix, ...]
     chi_square: float
     freedom: int
     checked: bool
-    """Whether a spot that moved between two stands could have been noticed."""
+    """Whether a spot that moved between two stands would have been noticed."""
     complaint: Complaint | None
 
     @property
     def offset_sigma_deg(self) -> Array:
-        """One sigma per axis, shape (2,)."""
+        """One sigma per axis, (2,)."""
         return np.sqrt(np.diag(self.offset_covariance_deg2))
 
 
 def align(
     law: Law, vehicle_from_sensor: Matrix, stands: Sequence[Stand], ground: Ground, priors: Priors | None = None
 ) -> Alignment:
-    """Estimate everything from all stands, at least one, together; `vehicle_from_sensor` is the gradienter's mounting.
+    """Estimate all unknowns from all stands, at least one; `vehicle_from_sensor` is the gradienter's mounting.
 
     Raises:
         CalibrationRefusedError: the equations cannot be solved: readings that cannot belong together.
@@ -113,7 +133,7 @@ def align(
     model = Model(law, vehicle_from_sensor, stands, ground, priors or Priors())
     try:
         at = model.begin([_first_attitude(law, vehicle_from_sensor, stand) for stand in stands])
-        at, residual, scaled, rows = _solve(model, at)
+        residual, scaled, row_sigma, labels = _solve(model, at)
         for name, imu in zip(model.names, at.imus, strict=True):
             turned_deg = abs(math.remainder(float(np.linalg.norm(imu[Part.MISALIGNMENT])) / DEG, 360.0))
             if turned_deg > MOST_TURNED_DEG:
@@ -125,7 +145,9 @@ def align(
     sought = model.sigma > 0.0
     inverse = np.linalg.inv(scaled.T @ scaled)
     chi_square, freedom = float(residual @ residual), len(residual) - int(sought.sum()) - model.damped
-    complaint, checked = _worst(residual, scaled @ inverse, scaled, rows, model)
+    redundancy = 1.0 - np.einsum("ij,ij->i", scaled @ inverse, scaled)
+    # A stand's placement is checked where the other stands predict it: the rest is its redundancy.
+    checked = any(row.group == "spot" and share > 0.1 for row, share in zip(labels, redundancy, strict=True))
     covariance = np.zeros((model.size, model.size))
     sigma = model.sigma[sought]
     covariance[np.ix_(sought, sought)] = widened_by(chi_square, freedom) * inverse * np.outer(sigma, sigma)
@@ -138,44 +160,50 @@ def align(
         chi_square=chi_square,
         freedom=freedom,
         checked=checked,
-        complaint=complaint,
+        complaint=_worst(residual, redundancy, row_sigma, labels),
     )
 
 
+def turned(stands: Sequence[Stand], ground: Ground) -> Alignment:
+    """Estimate level bias and slope from two or four headings on one spot, without a gradienter.
+
+    Raises:
+        CalibrationRefusedError: the readings cannot belong together.
+    """
+    try:
+        return align("slope", np.eye(3), stands, ground, ALONE)
+    except CalibrationRefusedError:
+        raise CalibrationRefusedError("the readings do not belong together: is the orientation right?") from None
+
+
+_COMPLAINTS: Final = {
+    "spot": "stand {stand} is off by {deg:.2f} deg from the others on this spot ({by}): the spot moved, or the aircraft"
+    " was not put back onto its marks; begin again on firm ground",
+    "compass": "stand {stand}: the heading is off by {deg:.0f} deg ({by}): iron near by? Begin again",
+    "turn": "stand {stand}: it was not turned as the gyros say, off by {deg:.0f} deg ({by}): begin again",
+    "zero": "the gradienter's zero would be off by {deg:.1f} deg, more than can be ({by}): does the aircraft stand"
+    " level on its base, and are law and mounting right?",
+    "gradienter": "stand {stand}: the gradienter is off by {deg:.2f} deg ({by}): check its law and mounting",
+    "accelerometer": "stand {stand}: imu {name} and the gradienter differ by {mg:.1f} mg ({by}): check the gradienter's"
+    " law and mounting, and that nothing is loose",
+    "gyro": "stand {stand}: gyro {name} does not fit the other stands ({by}): still warming up? Begin again",
+}
+_LOOSE: Final = "stand {stand}: imu {name} is off by {mg:.1f} mg ({by}): is something loose? Begin again"
+_UNKNOWN: Final = "the stands do not fit what is known of the sensors ({by}): begin again"
+
+
 def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:
-    """Why the stands do not fit together, and what to do, in one line; `gradienter`: whether there was one."""
+    """Say why the stands do not fit together, and what to do, in one line; `gradienter`: whether there was one."""
     row, size = complaint.row, complaint.size
-    by = f"{complaint.sigmas:.0f} sigma"
-    if row.group == "spot":
-        return (
-            f"stand {row.stand} is off by {size / DEG:.2f} deg from the others on this spot ({by}): the spot moved, or"
-            " the aircraft was not put back onto its marks; begin again on firm ground"
-        )
-    if row.group == "compass":
-        return f"stand {row.stand}: the heading is off by {size / DEG:.0f} deg ({by}): iron near by? Begin again"
-    if row.group == "turn":
-        return f"stand {row.stand}: it was not turned as the gyros say, off by {size / DEG:.0f} deg ({by}): begin again"
-    if row.group == "zero":
-        return (
-            f"the gradienter's zero would be off by {size / DEG:.1f} deg, more than can be ({by}): does the aircraft"
-            " stand level on its base, and are law and mounting right?"
-        )
-    if row.group == "gradienter":
-        return f"stand {row.stand}: the gradienter is off by {size / DEG:.2f} deg ({by}): check its law and mounting"
+    words = _COMPLAINTS.get(row.group, _UNKNOWN)
     if row.group == "accelerometer" and not gradienter:
-        return f"stand {row.stand}: imu {row.name} is off by {size / MG:.1f} mg ({by}): is something loose? Begin again"
-    if row.group == "accelerometer":
-        return (
-            f"stand {row.stand}: imu {row.name} and the gradienter differ by {size / MG:.1f} mg ({by}): check the"
-            " gradienter's law and mounting, and that nothing is loose"
-        )
-    if row.group == "gyro":
-        return f"stand {row.stand}: gyro {row.name} does not fit the other stands ({by}): still warming up? Begin again"
-    return f"the stands do not fit what is known of the sensors ({by}): begin again"
+        words = _LOOSE
+    by = f"{complaint.sigmas:.0f} sigma"
+    return words.format(stand=row.stand, name=row.name, by=by, deg=size / DEG, mg=size / MG)
 
 
 def widened_by(chi_square: float, freedom: int) -> float:
-    """Give the variance of the residuals over that of their sigmas where it is beyond its 99 % point, else 1."""
+    """Return the variance of the residuals over that of their sigmas where it exceeds its 99 % point, else 1."""
     if freedom <= 0:
         return 1.0
     ratio = chi_square / freedom
@@ -192,62 +220,43 @@ def _first_attitude(law: Law, mounting: Matrix, stand: Stand) -> Matrix:
     return body_from_ned(roll, pitch, stand.heading_rad)
 
 
-def _solve(model: Model, at: Unknowns) -> tuple[Unknowns, Array, Matrix, list[Row]]:
-    """Gauss-Newton in units of the prior sigmas: the residuals at the end, and their derivatives in those units."""
+def _solve(model: Model, at: Unknowns) -> tuple[Array, Matrix, Array, list[Row]]:
+    """Iterate `at` to the solution (Gauss-Newton).
+
+    Returns the residuals over their sigmas, their derivatives in units of the prior sigmas, the sigmas, the labels.
+    """
     sought = model.sigma > 0.0
     sigma = model.sigma[sought]
-    for _ in range(MAX_ROUNDS):
-        residual, derivative, rows = model.linearise(at)
+    converged = False
+    for _ in range(MAX_ROUNDS + 1):
+        rows = model.linearise(at)
+        residual, derivative, row_sigma = rows.stacked()
         scaled = derivative[:, sought] * sigma
+        if converged:
+            return residual, scaled, row_sigma, rows.labels
         step = np.linalg.lstsq(scaled, residual, rcond=None)[0]
         whole = np.zeros(model.size)
         whole[sought] = step * sigma
         model.step(at, whole)
         if not np.isfinite(step).all():
             break
-        if np.abs(step).max() < _CONVERGED:
-            residual, derivative, rows = model.linearise(at)
-            return at, residual, derivative[:, sought] * sigma, rows
+        converged = bool(np.abs(step).max() < _CONVERGED)
     raise ValueError("no solution was found")
 
 
-def _worst(
-    residual: Array, by_inverse: Matrix, scaled: Matrix, rows: Sequence[Row], model: Model
-) -> tuple[Complaint | None, bool]:
-    """The residual that is worst against its own sigma, if it is too bad; and whether the spot is checked at all."""
-    redundancy = 1.0 - np.einsum("ij,ij->i", by_inverse, scaled)
+def _worst(residual: Array, redundancy: Array, row_sigma: Array, labels: Sequence[Row]) -> Complaint | None:
+    """Return the residual that is worst against its own sigma, if it is beyond its threshold."""
     usable = redundancy > _LEAST_REDUNDANCY
     w = np.where(usable, residual / np.sqrt(np.where(usable, redundancy, 1.0)), 0.0)
-    # A stand's placement is checked where the other stands foretell it: what they leave of it is its redundancy.
-    on_spot = np.array([row.group == "spot" for row in rows])
-    checked = bool((redundancy[on_spot] > 0.1).any())
-    beyond = np.abs(w) / np.where(on_spot, SPOT_W_LIMIT, W_LIMIT)
+    beyond = np.abs(w) / np.array([SPOT_W_LIMIT if row.group == "spot" else W_LIMIT for row in labels])
     k = int(np.argmax(beyond))
     if beyond[k] <= 1.0:
-        return None, checked
-    units = _units(model, rows[k])
-    # All axes of that reading together: what one axis says depends on how the aircraft is turned.
-    alone = rows[k].group in ("zero", "prior")
-    axes = [k] if alone else [j for j, row in enumerate(rows) if row == rows[k] and usable[j]]
-    size = float(np.linalg.norm(residual[axes] / redundancy[axes])) * units
-    return Complaint(rows[k], abs(float(w[k])), size), checked
-
-
-def _units(model: Model, row: Row) -> float:
-    """Sigma of the residuals of that group, by which they were divided."""
-    if row.group == "spot":
-        return model.priors.placement_deg * DEG
-    if row.group == "zero":
-        return model.priors.offset_deg * DEG
-    if row.stand == 0:
-        return 1.0
-    stand = model.stands[row.stand - 1]
-    if row.group in ("compass", "turn"):
-        return stand.heading_sigma_rad
-    if row.group == "gradienter":
-        return math.hypot(*stand.tilt_sigma_deg) / math.sqrt(2.0) * DEG
-    imu = next(imu for imu in stand.imus if imu.name == row.name)
-    return float(np.mean(imu.accel_sigma_m_s2 if row.group == "accelerometer" else imu.gyro_sigma_rad_s))
+        return None
+    # All axes of that reading together: one axis alone depends on how the aircraft is turned.
+    alone = labels[k].group in ("zero", "prior")
+    axes = [k] if alone else [j for j, row in enumerate(labels) if row == labels[k] and usable[j]]
+    size = float(np.linalg.norm(residual[axes] * row_sigma[axes] / redundancy[axes]))
+    return Complaint(labels[k], abs(float(w[k])), size)
 
 
 def _imu(model: Model, at: Unknowns, covariance: Matrix, k: int) -> ImuAlignment:
@@ -260,7 +269,7 @@ def _imu(model: Model, at: Unknowns, covariance: Matrix, k: int) -> ImuAlignment
     by = model.reading_by(at, k, LEVEL)
     return ImuAlignment(
         name=model.names[k],
-        # Gravity is what the place says, as in a calibration: where it is off, so is that.
+        # With the place's gravity, as in a calibration.
         level_bias_m_s2=model.reading(at, k, LEVEL) - model.ground.gravity_m_s2 * LEVEL,
         level_covariance_m2_s4=by @ covariance @ by.T,
         accel_bias_m_s2=figures(Part.ACCEL_BIAS),

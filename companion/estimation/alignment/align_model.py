@@ -1,8 +1,8 @@
-"""The model behind `align`: what every reading of every stand should be, and how it changes with what is sought.
+"""The model behind `align`: the predicted reading of every sensor in every stand, and its derivatives.
 
-A *stand* is one still window. Sought are, for all stands together: the gradienter's zero; for every IMU its
+A *stand* is one still window. Estimated for all stands together: the gradienter's zero; for every IMU its
 misalignment against the base, accelerometer scale, shear and bias, and gyro bias; gravity and the Earth's rate
-within what the place leaves open; the plane of the spot; and how the aircraft stood each time.
+within the uncertainty of the place; the plane of the spot; and the attitude in each stand.
 
 With u = C_k (0, 0, -1) (up in the vehicle), g, and the Earth's rate W in the ground frame (NED, or, without a north,
 turned about the vertical):
@@ -14,9 +14,9 @@ turned about the vertical):
     turn           of C_k since the stand before, about the vehicle's z axis, (1 + s) times      s: a gyro's scale
     spot           down of the vehicle, seen from the ground, is the normal of the spot: C_k^T z = n + placement
 
-The last line is the level reversal (method 3.4): the spot's true tilt is the same in the
-ground's frame, however the aircraft is turned on it. "Level" is what is parallel to the plane on which it is turned.
-All derivatives are analytic; an attitude error eps is C = (I - [eps x]) C_0, as in `bias`.
+The last line is the level reversal (method 3.4): the spot's true tilt is the same in the ground's frame, however the
+aircraft is turned on it. "Level" is parallel to the plane on which it is turned. All derivatives are analytic; an
+attitude error eps is C = (I - [eps x]) C_0.
 """
 
 from __future__ import annotations
@@ -38,7 +38,11 @@ Group = Literal["gradienter", "accelerometer", "gyro", "compass", "turn", "spot"
 
 _AXES: Final = skew(np.eye(3))
 _ANYHOW_RAD: Final = 1.0
-"""Sigma about the first guess of what only the readings determine: it keeps the equations solvable."""
+"""Weak prior, about the first guess, of unknowns that only the readings determine: keeps the equations solvable."""
+PRIOR_BIAS_M_S2: Final = 100.0 * MG
+PRIOR_SCALE: Final = 0.03
+PRIOR_SHEAR: Final = 0.01
+"""One sigma of an uncalibrated part (ICM-42688-P: 0.5 %, cross axis 1 %; mounted parts are worse)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -54,27 +58,25 @@ class ImuStand:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Stand:
-    """One still window.
-
-    `heading_rad` counts from the same north in all stands, which need not be the true one.
-    """
+    """Means of one still window."""
 
     imus: tuple[ImuStand, ...]
     tilt_deg: tuple[float, float] | None
-    """The gradienter's readings less the configured offset; None where it was out of its range, or there is none."""
+    """The gradienter's readings less the configured offset; None out of its range, or without one."""
     tilt_sigma_deg: tuple[float, float]
     heading_rad: float
+    """From the same north in all stands, which need not be the true one."""
     heading_sigma_rad: float
     on_spot: bool
-    """On the one spot on which the aircraft was turned."""
+    """On the one spot on which the aircraft is turned."""
     counted: bool = False
-    """The heading is that of the stand before and what the gyros counted since (`seconds.counting`), not wrapped; its
-    sigma is that of this turn, but for the gyros' scale (`Priors.turn_scale`)."""
+    """The heading is that of the stand before plus the turn that the gyros counted since (`seconds.counting`), not
+    wrapped; its sigma is that of this turn, without the gyros' scale (`Priors.turn_scale`)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """Gravity and the Earth's rate at the place, and what is open of them."""
+    """Gravity and the Earth's rate at the place, with their uncertainty."""
 
     gravity_m_s2: float
     gravity_sigma_m_s2: float
@@ -85,23 +87,23 @@ class Ground:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Priors:
-    """One sigma of what is known before; 0: taken as it is and not sought (method 3.4, joint MAP covariance)."""
+    """One sigma of each unknown before any reading; 0: known and not estimated (method 3.4, joint MAP covariance)."""
 
     offset_deg: float = 1.0
     placement_deg: float = 0.02
-    """Of each time that the aircraft is put onto the spot, each axis."""
+    """Tilt error of each placement on the spot, each axis."""
     scale: float = 0.005
     shear: float = 0.002
     misalignment_deg: float = 1.0
     accel_bias_m_s2: float = 30.0 * MG
     gyro_bias_rad_s: float = 5.0 * DEG
     turn_scale: float = 0.01
-    """Of the gyros that count turns, the same in all of them."""
+    """Scale error of the gyros that count turns, common to all of them."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Row:
-    """Whose residual a row is: a group, the stand (from 1; 0: none) and the name of an IMU where there is one."""
+    """Label of a residual: its group, stand (from 1; 0: none) and IMU, if any."""
 
     group: Group
     stand: int = 0
@@ -109,7 +111,7 @@ class Row:
 
 
 class Part(enum.IntEnum):
-    """What is sought of an IMU, three figures each: of x, y, z, and of the shear xy, xz, yz."""
+    """Unknowns of an IMU, three figures each: x, y, z, and of the shear xy, xz, yz."""
 
     MISALIGNMENT = 0
     SCALE = 1
@@ -120,16 +122,16 @@ class Part(enum.IntEnum):
 
 @dataclasses.dataclass(slots=True, eq=False)
 class Unknowns:
-    """Everything that is sought, at its present value."""
+    """All unknowns at their present values."""
 
     values: Array
-    """(size,) in SI units, as `Model` has them; zero in the place of the attitudes' errors."""
+    """(size,) in SI units, in the order of `Model`; attitude errors are zero."""
     attitudes: list[Matrix]
     """C_k, body from ground."""
 
     @property
     def gravity_m_s2(self) -> float:
-        """Its strength."""
+        """Strength of gravity."""
         return float(self.values[Model.gravity.start])
 
     @property
@@ -139,7 +141,7 @@ class Unknowns:
 
 
 class Model:
-    """Residuals and their derivatives, every one divided by its sigma."""
+    """Residuals and their derivatives, each divided by its sigma."""
 
     offset, spot, gravity, rate, turn = slice(0, 2), slice(2, 4), slice(4, 5), slice(5, 8), slice(8, 9)
 
@@ -161,51 +163,45 @@ class Model:
         sigma[self.rate] = np.sqrt(np.diag(ground.rate_covariance))
         sigma[self.turn] = priors.turn_scale
         self.damped = 3 * len(stands) + (2 if sigma[2] > 0.0 else 0)
-        """How many parameters only the readings determine."""
+        """Number of unknowns that only the readings determine."""
         angle, bias = priors.misalignment_deg * DEG, (priors.accel_bias_m_s2, priors.gyro_bias_rad_s)
         each = [angle, priors.scale, priors.shear, *bias]
         sigma[self._first_imu :] = np.tile(np.repeat(each, 3), count)
         self.sigma = sigma
-        """Of every parameter before any reading; 0: not sought."""
+        """Sigma of every unknown before any reading; 0: not estimated."""
         self._known = np.zeros(self.size)
         self._known[self.gravity], self._known[self.rate] = ground.gravity_m_s2, ground.rate_rad_s
 
-    # --- where each parameter stands in the vector
-
     def pose(self, stand: int) -> slice:
-        """Attitude error of a stand, counted from 0."""
+        """Place of the attitude error of a stand, counted from 0."""
         return slice(self._poses + 3 * stand, self._poses + 3 * stand + 3)
 
     def imu(self, imu: int, part: Part) -> slice:
-        """One part of an IMU, counted from 0."""
+        """Place of one part of an IMU, counted from 0."""
         start = self._first_imu + 15 * imu + 3 * part
         return slice(start, start + 3)
 
-    # --- values
-
     def begin(self, attitudes: list[Matrix]) -> Unknowns:
-        """A first guess from attitudes alone."""
+        """Return the first guess that attitudes alone give."""
         spots = [a.T @ DOWN for a, stand in zip(attitudes, self.stands, strict=True) if stand.on_spot]
         at = Unknowns(self._known.copy(), list(attitudes))
         at.values[self.spot] = np.mean(spots, axis=0)[:2] if spots else 0.0
         return at
 
     def step(self, at: Unknowns, by: Array) -> None:
-        """Change everything by one step."""
+        """Change all unknowns by one step."""
         at.values = at.values + by
         at.values[self._poses : self._first_imu] = 0.0
         for k in range(len(self.stands)):
             at.attitudes[k] = rotations(-by[self.pose(k)]) @ at.attitudes[k]
 
-    # --- residuals
-
-    def linearise(self, at: Unknowns) -> tuple[Array, Matrix, list[Row]]:
-        """Residuals (n,), their derivatives (n, size), both over sigma, and whose each is.
+    def linearise(self, at: Unknowns) -> Rows:
+        """Return all residuals at these values.
 
         Raises:
             ValueError: the readings cannot belong together.
         """
-        rows = _Rows(self.size)
+        rows = Rows(self.size)
         for k, stand in enumerate(self.stands):
             attitude = at.attitudes[k]
             up = -attitude @ DOWN
@@ -224,18 +220,13 @@ class Model:
                 by[:, self.spot] = -np.eye(2)
         off = at.values - self._known
         off[self.spot] = 0.0  # the readings alone tell it
-        for part in (slice(p, p + 1) for p in range(self.size)):
-            if self.sigma[part] > 0.0:
-                is_zero = part.start < self.offset.stop
-                of_readings = self.spot.start <= part.start < self.spot.stop or (
-                    self._poses <= part.start < self._first_imu
-                )
-                row = Row("zero" if is_zero else "nothing" if of_readings else "prior")
-                by = rows.add(row, -off[part], self.sigma[part])
-                by[0, part] = 1.0
-        return rows.stacked()
+        for part in np.flatnonzero(self.sigma > 0.0):
+            weak = self.spot.start <= part < self.spot.stop or self._poses <= part < self._first_imu
+            group: Group = "zero" if part < self.offset.stop else "nothing" if weak else "prior"
+            rows.add(Row(group), -off[[part]], self.sigma[[part]])[0, part] = 1.0
+        return rows
 
-    def _heading(self, rows: _Rows, at: Unknowns, k: int) -> None:
+    def _heading(self, rows: Rows, at: Unknowns, k: int) -> None:
         stand, attitude = self.stands[k], at.attitudes[k]
         forward = attitude.T[:, 0]
         turn = attitude.T @ -skew(np.array([1.0, 0.0, 0.0]))
@@ -244,7 +235,7 @@ class Model:
         by = rows.add(Row("compass", k + 1), np.array([off]), np.array([stand.heading_sigma_rad]))
         by[:, self.pose(k)] = (forward[0] * turn[1] - forward[1] * turn[0]) / max(across, 1e-6)
 
-    def _turn(self, rows: _Rows, at: Unknowns, k: int) -> None:
+    def _turn(self, rows: Rows, at: Unknowns, k: int) -> None:
         counted = self.stands[k].heading_rad - self.stands[k - 1].heading_rad
         turned = at.attitudes[k] @ at.attitudes[k - 1].T
         sine, cosine = turned[0, 1] - turned[1, 0], turned[0, 0] + turned[1, 1]
@@ -257,7 +248,7 @@ class Model:
             by[:, self.pose(stand)] = across / max(sine**2 + cosine**2, 1e-6)
         by[:, self.turn] = counted
 
-    def _gradienter(self, rows: _Rows, at: Unknowns, k: int, up: Array) -> None:
+    def _gradienter(self, rows: Rows, at: Unknowns, k: int, up: Array) -> None:
         stand = self.stands[k]
         if stand.tilt_deg is None:
             return
@@ -270,7 +261,7 @@ class Model:
         by[:, self.offset] = np.eye(2)
         by[:, self.pose(k)] = by_up @ skew(up)
 
-    def _accelerometer(self, rows: _Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand, up: Array) -> None:
+    def _accelerometer(self, rows: Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand, up: Array) -> None:
         k, i = where
         read = imu.accel_m_s2 - self.reading(at, i, up)
         by = rows.add(Row("accelerometer", k + 1, imu.name), read, imu.accel_sigma_m_s2)
@@ -278,11 +269,11 @@ class Model:
         by[:, self.pose(k)] = at.gravity_m_s2 * _response(at, i) @ skew(up)
 
     def reading(self, at: Unknowns, imu: int, up: Array) -> Array:
-        """What the accelerometers of an IMU, counted from 0, read where `up` is up in the vehicle; (3,)."""
+        """Predict the reading of an IMU's accelerometers, counted from 0, with `up` up in the vehicle; (3,)."""
         return np.asarray(_response(at, imu) @ up * at.gravity_m_s2 + at.imus[imu, Part.ACCEL_BIAS])
 
     def reading_by(self, at: Unknowns, imu: int, up: Array) -> Matrix:
-        """How that changes with everything but the attitude, (3, size)."""
+        """Return the derivative of `reading` by all unknowns but the attitude, (3, size)."""
         misalignment, gravity = at.imus[imu, Part.MISALIGNMENT], at.gravity_m_s2
         stretch, aligned = _stretch(at, imu), rotations(-misalignment) @ up
         by = np.zeros((3, self.size))
@@ -293,7 +284,7 @@ class Model:
         by[:, self.gravity] = (stretch @ aligned)[:, None]
         return by
 
-    def _gyro(self, rows: _Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand) -> None:
+    def _gyro(self, rows: Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand) -> None:
         k, i = where
         rate = at.attitudes[k] @ at.values[self.rate]
         read = imu.gyro_rad_s - rate - at.imus[i, Part.GYRO_BIAS]
@@ -303,29 +294,29 @@ class Model:
         by[:, self.imu(i, Part.GYRO_BIAS)] = np.eye(3)
 
 
-class _Rows:
-    """Residuals and derivatives as they are collected."""
+class Rows:
+    """Residuals and their derivatives by all unknowns."""
 
     def __init__(self, size: int) -> None:
         self._size = size
         self._parts: list[tuple[Array, Matrix, Array]] = []
-        self._labels: list[Row] = []
+        self.labels: list[Row] = []
 
     def add(self, row: Row, residual: Array, sigma: Array) -> Matrix:
         """Add rows; returns their derivatives, to be filled in."""
         derivative = np.zeros((len(residual), self._size))
-        self._labels += [row] * len(residual)
+        self.labels += [row] * len(residual)
         self._parts.append((residual, derivative, sigma))
         return derivative
 
-    def stacked(self) -> tuple[Array, Matrix, list[Row]]:
-        residuals = [residual / sigma for residual, _, sigma in self._parts]
-        derivatives = [derivative / sigma[:, None] for _, derivative, sigma in self._parts]
-        return np.concatenate(residuals), np.vstack(derivatives), self._labels
+    def stacked(self) -> tuple[Array, Matrix, Array]:
+        """Residuals (n,) and derivatives (n, size), both over sigma, and the sigmas (n,)."""
+        residual, derivative, sigma = (np.concatenate(part) for part in zip(*self._parts, strict=True))
+        return residual / sigma, derivative / sigma[:, None], sigma
 
 
 def response(scale: Array, shear: Array) -> Matrix:
-    """I + S, (3, 3), of scale x y z and shear xy, xz, yz."""
+    """Return I + S, (3, 3), of scale x y z and shear xy, xz, yz."""
     return np.diag(1.0 + scale) + symmetric(shear)
 
 
@@ -338,7 +329,7 @@ def _response(at: Unknowns, imu: int) -> Matrix:
 
 
 def _jacobian(vector_rad: Array) -> Matrix:
-    """How exp([v x]) turns on when v grows: exp([(v + d) x]) = exp([(J d) x]) exp([v x]) to first order in d."""
+    """Return J of exp([(v + d) x]) = exp([(J d) x]) exp([v x]), to first order in d."""
     angle = float(np.linalg.norm(vector_rad))
     cross = skew(vector_rad)
     if angle < 1e-6:

@@ -1,22 +1,22 @@
 """Bias, scale and shear of three accelerometers from the length of gravity, in stands of any orientation.
 
-Nothing but the strength of gravity has to be known: however the sensor is held, what it should read is that long
-(Tedaldi, Pretto and Menegatti, ICRA 2014; Skog and Haendel, 2006). With u of length 1, up in the sensor's axes,
+Only the strength of gravity has to be known: in any orientation the corrected reading has that length (Tedaldi, Pretto
+and Menegatti, ICRA 2014; Skog and Haendel, 2006). With u of length 1, up in the sensor's axes,
 
     f = (I + S) g u + b           S symmetric: scale on its diagonal, shear beside it
 
-so that |(I + S)^-1 (f - b)| = g in every stand. A rotation of the three axes together changes no length: how the sensor
-sits in the aircraft is not told here, but by turning it on a spot. Unlike the triangular matrix of that paper, a
-symmetric one gives no axis a place above the others, and its diagonal is what a firmware's scale should be, which
-knows no shear.
+so that |(I + S)^-1 (f - b)| = g in every stand. A common rotation of the axes changes no length: `mounting` finds it,
+from a turn on a spot. Unlike the triangular matrix of that paper, a symmetric one prefers no axis, and its diagonal is
+the scale of a firmware that knows no shear.
 
-Each stand counts by the noise of its own mean, gravity by what the place leaves open of it. So every figure has a
-sigma from the first stand on. A stand that does not fit is found by leaving out one after another.
+Each stand is weighted by the noise of its mean, gravity by the uncertainty of the place, so every figure has a sigma
+from the first stand on. A stand that does not fit is found by leaving out one after another.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Final
 
@@ -24,26 +24,44 @@ import msgspec
 import numpy as np
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.alignment.align import widened_by
-from companion.estimation.alignment.align_model import response
-from companion.physics.frames import Array, Matrix, symmetric_by
+from companion.estimation.alignment.align import LEVEL, ImuAlignment, widened_by
+from companion.estimation.alignment.align_model import PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, response
+from companion.estimation.alignment.poses import Hold, Wish
+from companion.physics.frames import Array, Matrix, roll_pitch_from_up, symmetric_by, vector
 from companion.physics.units import MG
 
 FIGURES: Final = 9
 BIAS: Final = slice(0, 3)
 SCALE: Final = slice(3, 6)
 SHEAR: Final = slice(6, 9)
-PRIOR_BIAS_M_S2: Final = 100.0 * MG
-PRIOR_SCALE: Final = 0.03
-PRIOR_SHEAR: Final = 0.01
-"""One sigma of what a part may have from the factory (ICM-42688-P: 0.5 %, cross axis 1 %; mounted parts are worse)."""
 W_LIMIT: Final = 3.9
-"""|w| of a stand (Baarda): passed by chance once in ten thousand."""
+"""Threshold for |w| of a stand (Baarda): exceeded by chance once in ten thousand."""
 LEAST_SPARE: Final = 2
-"""Stands beyond the figures, below which a wrong one cannot be told from the others."""
+"""Stands beyond the number of figures that it takes to name a wrong one."""
 _MAX_ROUNDS: Final = 30
 _CONVERGED: Final = 1e-8
 _LEAST_REDUNDANCY: Final = 1e-3
+
+ENOUGH_BIAS_M_S2: Final = 0.15 * MG
+ENOUGH_SCALE: Final = 2e-4
+ENOUGH_WANDER: Final = 0.8
+"""Share of a bias' wander that may be open: beyond it a dozen stands make a bad sensor no better."""
+SAME_DEG: Final = 20.0
+"""Two stands within this angle tell hardly more than one."""
+FACE_DEG: Final = 30.0
+"""A stand within this angle of a face has seen it."""
+_STAND_SIGMA_M_S2: Final = 0.03 * MG
+"""Predicted sigma of the mean of a coming stand."""
+_AXES: Final = "xyz"
+_SIDES: Final = {
+    "level": (0, 0, -1),
+    "on its back": (0, 0, 1),
+    "nose up": (1, 0, 0),
+    "nose down": (-1, 0, 0),
+    "left side down": (0, 1, 0),
+    "right side down": (0, -1, 0),
+}
+"""Up in the aircraft's axes, forward, right, down."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -55,24 +73,24 @@ class Face:
 
 
 class Sides(msgspec.Struct, frozen=True):
-    """Accelerometers of one IMU as all sides have told of them, under the offsets and scales in force."""
+    """Errors of one IMU's accelerometers, known from all sides, under the offsets and scales that are active."""
 
     figures: Array
     """(9,), as in `Faces`, in the sensor's axes; m/s^2 and no unit."""
     sigma: Array
-    """One sigma of each, with what time and temperature have added to the biases."""
+    """One sigma of each; time and temperature have widened those of the biases."""
     vehicle_from_sensor: Matrix
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Faces:
-    """What all stands together tell: figures (9,), bias x y z, scale x y z, shear xy xz yz, with their covariance."""
+    """Estimate from all stands: figures (9,), bias x y z, scale x y z, shear xy xz yz, with their covariance."""
 
     figures: Array
     by_stands: Matrix
-    """Their covariance, (9, 9), as the stands tell them."""
+    """Covariance of the figures during the stands, (9, 9)."""
     wander_m_s2: Array
-    """One sigma, (3,), of what the biases do from here to where they are used."""
+    """One sigma, (3,), of the change of the biases until they are used."""
     gravity_m_s2: float
     gravity_sigma_m_s2: float
     up: Matrix
@@ -80,13 +98,13 @@ class Faces:
     left_out: tuple[int, ...]
     """Stands, counted from 0, that do not fit the others."""
     off_m_s2: Array
-    """(stands,) how much longer than gravity each reads, corrected; of one that was left out, by the others."""
+    """(stands,) length of each corrected reading less gravity."""
     in_doubt: tuple[int, ...]
-    """Stands of which one does not fit, and nobody can tell which; the next stand does."""
+    """Stands of which one does not fit; the next stand will tell which."""
 
     @property
     def covariance(self) -> Matrix:
-        """(9, 9), with what the biases wander."""
+        """Covariance of the figures until they are used, (9, 9)."""
         both = self.by_stands.copy()
         both[BIAS, BIAS] += np.diag(self.wander_m_s2**2)
         return both
@@ -100,9 +118,9 @@ class Faces:
 def faces(
     stands: Sequence[Face], gravity_m_s2: float, gravity_sigma_m_s2: float, wander_m_s2: Array | None = None
 ) -> Faces:
-    """Estimate from all stands, at least one; what they do not determine keeps the sigma of what was known before.
+    """Estimate from all stands, at least one; a figure that they do not determine keeps its prior sigma.
 
-    `wander_m_s2` as in `Faces`; None: nothing.
+    `wander_m_s2` as in `Faces`; None: zero.
 
     Raises:
         CalibrationRefusedError: readings that no accelerometer can give.
@@ -140,11 +158,6 @@ def faces(
     )
 
 
-def along(up: Array, gravity_m_s2: float) -> Array:
-    """How the length of a reading changes with the figures, (9,), where `up` is up in the sensor's axes."""
-    return np.concatenate([up, gravity_m_s2 * up**2, gravity_m_s2 * up @ symmetric_by(up)])
-
-
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
     figures: Array
@@ -154,12 +167,10 @@ class _Fit:
 
 
 def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, float]) -> _Fit:
-    """Gauss-Newton with priors, gravity sought too; everything in units of the prior sigmas."""
+    """Estimate the figures and gravity by Gauss-Newton with priors, in units of the prior sigmas."""
     force = np.array([stands[k].accel_m_s2 for k in which])
     variance = np.array([stands[k].sigma_m_s2 for k in which]) ** 2
-    prior = np.concatenate(
-        [np.repeat([PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR], 3), [max(gravity[1], 1e-9)]],
-    )
+    prior = np.append(np.repeat([PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR], 3), max(gravity[1], 1e-9))
     at = np.zeros(FIGURES + 1)
     for _ in range(_MAX_ROUNDS):
         residual, scaled = _linearised(force, variance, at, gravity[0], prior)
@@ -173,12 +184,12 @@ def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, flo
 
 
 def _linearised(force: Matrix, variance: Matrix, at: Array, gravity_m_s2: float, prior: Array) -> tuple[Array, Matrix]:
-    """Residuals over sigma, measured minus foretold, and the derivatives of what is foretold times the prior sigmas."""
+    """Return residuals over sigma, measured minus predicted, and derivatives of the prediction times prior sigmas."""
     inverse = np.linalg.inv(response(at[SCALE], at[SHEAR]))
     inside = (force - at[BIAS]) @ inverse
     lengths = np.linalg.norm(inside, axis=1)
     across = inside / lengths[:, None] @ inverse
-    """By which reading each length goes, (stands, 3)."""
+    """Derivative of each length by its reading, (stands, 3)."""
     sigma = np.sqrt(np.einsum("ki,ki->k", across**2, variance))
     derivative = np.empty((len(force), FIGURES + 1))
     derivative[:, BIAS] = across
@@ -198,7 +209,7 @@ def _judged(residual: Array, scaled: Matrix, at: Array, prior: Array, count: int
     chi_square = float(residual @ residual)
     redundancy = 1.0 - np.einsum("ij,jk,ik->i", scaled[:count], inverse, scaled[:count])
     w = residual / np.sqrt(np.maximum(redundancy, _LEAST_REDUNDANCY))
-    # Against what the other stands scatter, where that is more than their sigmas.
+    # Compared with the scatter of the other stands, where that exceeds their sigmas.
     others = np.maximum((chi_square - w**2) / (freedom - 1), 1.0) if freedom > 1 else np.ones(count)
     covariance = widened_by(chi_square, freedom) * inverse * np.outer(prior, prior)
     return _Fit(
@@ -207,3 +218,125 @@ def _judged(residual: Array, scaled: Matrix, at: Array, prior: Array, count: int
         chi_square=chi_square,
         fits=bool((np.abs(w) <= W_LIMIT * np.sqrt(others)).all()),
     )
+
+
+def missing(found: Faces, vehicle_from_sensor: Matrix) -> Wish | None:
+    """Return the pose that tells most; None where bias and scale of all axes are known well enough, and checked.
+
+    `vehicle_from_sensor`: 3x3, the mounting of the accelerometers in `found`.
+    """
+    wander, gravity = ENOUGH_WANDER * found.wander_m_s2, found.gravity_m_s2
+    # No stand tells an error of the place's gravity: that much of the scale stays open.
+    scale = np.hypot(np.maximum(ENOUGH_SCALE, wander / gravity), found.gravity_sigma_m_s2 / gravity)
+    wanted = np.concatenate([np.maximum(ENOUGH_BIAS_M_S2, wander), scale, np.full(3, np.inf)])
+    sigma = np.sqrt(np.diag(found.by_stands))
+    share = sigma / wanted
+    open_figures = share > 1.0
+    unchecked = len(found.up) - len(found.left_out) < FIGURES + LEAST_SPARE
+    if not open_figures.any() and not unchecked and not found.in_doubt:
+        return None
+    # Where all have been seen, the one that tells most is held once more.
+    sides = _not_seen(found, vehicle_from_sensor) or _all_sides(vehicle_from_sensor)
+    told = {side: _told(found, up) for side, up in sides}
+    if not open_figures.any():
+        words = "a stand does not fit, one more tells which" if found.in_doubt else "nothing checks the others yet"
+        return _wish(max(told, key=lambda side: float(told[side].sum())), words)
+    side = max(told, key=lambda side: float(told[side][open_figures].sum()))
+    worst_first = tuple(_figure(sigma, int(which)) for which in np.argsort(-share) if open_figures[which])
+    told_most = int(np.argmax(np.where(open_figures, told[side] * share, 0.0)))
+    return _wish(side, _figure(sigma, told_most), worst_first)
+
+
+def _wish(side: str, why: str, unknown: tuple[str, ...] = ()) -> Wish:
+    names = side.removeprefix("between ").split(" and ")
+    up = np.sum([_SIDES[name] for name in names], axis=0)
+    return Wish(f"{side}: {why}", Hold(vector(up / np.linalg.norm(up))), unknown)
+
+
+def seen_before(found: Faces, up: Array, vehicle_from_sensor: Matrix) -> int | None:
+    """Return the stand, counted from 0, that was held like this one; None for a new one, or if all sides were seen.
+
+    `up` is in the sensor's axes, (3,), of length 1; `found` is from the stands before.
+    """
+    if not _not_seen(found, vehicle_from_sensor):
+        return None
+    near = found.up @ up
+    near[list(found.left_out)] = -1.0
+    nearest = int(np.argmax(near))
+    return nearest if near[nearest] > np.cos(np.radians(SAME_DEG)) else None
+
+
+def _not_seen(found: Faces, vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
+    """Return faces that no stand so far was near, else edges between them; up in the sensor's axes."""
+    kept = np.delete(found.up, found.left_out, axis=0)
+    sides = _all_sides(vehicle_from_sensor)
+    new = [(name, up) for name, up in sides if (kept @ up).max() < np.cos(np.radians(FACE_DEG))]
+    return [(name, up) for name, up in new if name in _SIDES] or new
+
+
+def _all_sides(vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
+    faces = {name: np.array(up, dtype=np.float64) for name, up in _SIDES.items()}
+    edges = {
+        f"between {a} and {b}": (faces[a] + faces[b]) / np.sqrt(2.0)
+        for a, b in itertools.combinations(faces, 2)
+        if not faces[a] @ faces[b]
+    }
+    return [(name, vehicle_from_sensor.T @ up) for name, up in {**faces, **edges}.items()]
+
+
+def _told(found: Faces, up: Array) -> Array:
+    """Return the share of each figure's variance, (9,), that a stand with `up` upwards would take away."""
+    by = np.concatenate([up, found.gravity_m_s2 * up**2, found.gravity_m_s2 * up @ symmetric_by(up)])
+    gain = found.by_stands @ by
+    return np.asarray(gain**2 / (by @ gain + _STAND_SIGMA_M_S2**2) / np.diag(found.by_stands))
+
+
+def _figure(sigma: Array, which: int) -> str:
+    """Name a bias or a scale, with its sigma."""
+    axis = _AXES[which % 3]
+    if which < SCALE.start:
+        return f"{axis} bias uncertain by {_two_digits(sigma[which] / MG)} mg"
+    return f"{axis} scale uncertain by {_two_digits(100.0 * sigma[which])} %"
+
+
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Mounting:
+    """Tilt of the board against the base: the attitude that its corrected accelerometers show on a level base.
+
+    Roll is right side down, pitch nose up; the covariance (2, 2) is of both.
+    """
+
+    roll_rad: float
+    pitch_rad: float
+    covariance_rad2: Matrix
+
+    @property
+    def sigma_rad(self) -> Array:
+        """One sigma of roll and of pitch, (2,)."""
+        return np.sqrt(np.diag(self.covariance_rad2))
+
+
+def mounting(level: ImuAlignment, known: Sides, gravity_m_s2: float) -> Mounting:
+    """Return the tilt of the board from its level bias and the bias and scale of its accelerometers, both uncorrected.
+
+    Shear is not corrected, as no firmware does it; so the attitude that is corrected by this tilt is right when level.
+    """
+    vehicle_from_sensor = known.vehicle_from_sensor
+    read = vehicle_from_sensor.T @ (level.level_bias_m_s2 + gravity_m_s2 * LEVEL)
+    stretch = 1.0 + known.figures[SCALE]
+    corrected = (read - known.figures[BIAS]) / stretch
+    by = np.zeros((3, FIGURES))
+    by[:, BIAS] = np.diag(-1.0 / stretch)
+    by[:, SCALE] = np.diag(-corrected / stretch)
+    turn = vehicle_from_sensor.T / stretch[:, None]
+    inside = turn @ level.level_covariance_m2_s4 @ turn.T + by @ np.diag(np.square(known.sigma)) @ by.T
+    up = vehicle_from_sensor @ corrected
+    roll, pitch = roll_pitch_from_up(up)
+    # A change d of the reading turns up by up x d / |up|^2, and so do roll and pitch, to first order.
+    x, y, z = up / (up @ up)
+    tilt = np.array([[0.0, z, -y], [-z, 0.0, x]]) @ vehicle_from_sensor
+    return Mounting(roll, pitch, tilt @ inside @ tilt.T)

@@ -10,11 +10,11 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from companion.estimation.alignment.align import DETERMINED, Alignment, Figures, ImuAlignment
-from companion.estimation.alignment.align_model import Stand
-from companion.estimation.alignment.faces import BIAS, PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, SCALE, SHEAR, Faces
+from companion.estimation.alignment.align import DETERMINED, Figures, ImuAlignment
+from companion.estimation.alignment.align_model import PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, Stand
+from companion.estimation.alignment.faces import BIAS, SCALE, SHEAR, Faces, Mounting
 from companion.estimation.records.record import WrittenParameter
-from companion.physics.frames import Array, roll_pitch_from_up, vector
+from companion.physics.frames import Array, Matrix, roll_pitch_from_up, vector
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import Vector
 
@@ -123,9 +123,8 @@ def check(record: AlignmentRecord) -> None:
         raise msgspec.ValidationError(f"offset and sigma {figures} cannot be")
 
 
-def stand_record(stand: Stand, result: Alignment, number: int, seconds: float, configured: Pair) -> StandRecord:
-    """One stand as it turned out; `number` counts from 0."""
-    attitude = result.attitudes[number]
+def stand_record(stand: Stand, attitude: Matrix, seconds: float, configured: Pair) -> StandRecord:
+    """Return the record of one stand, with its estimated attitude (body from ground)."""
     roll, pitch = roll_pitch_from_up(-attitude[:, 2])
     tilt = stand.tilt_deg
     return StandRecord(
@@ -302,9 +301,39 @@ class TurnRecord(SpotRecord, frozen=True, kw_only=True):
     """None where nothing is known from all sides."""
 
 
-def turn_imu_record(
-    imu: ImuAlignment, temperature_degc: float | None, written: dict[str, WrittenParameter], whole_m_s2: Array
-) -> TurnImuRecord:
-    """One IMU in the units that people know."""
-    told = msgspec.convert(imu_record(imu, temperature_degc), TurnImuRecord, from_attributes=True)
-    return msgspec.structs.replace(told, written=written, whole_bias_mg=_axes(whole_m_s2 / MG))
+def turn_imu_record(imu: ImuAlignment, temperature_degc: float | None, whole_m_s2: Array) -> TurnImuRecord:
+    """Return one IMU in the units of the record, before anything is written."""
+    level = msgspec.convert(imu_record(imu, temperature_degc), TurnImuRecord, from_attributes=True)
+    return msgspec.structs.replace(level, whole_bias_mg=_axes(whole_m_s2 / MG))
+
+
+def board_record(board: Mounting, imu: str, faces_measured_at: str) -> BoardRecord:
+    """Return the tilt of the board in degrees, before anything is written."""
+    roll_sigma, pitch_sigma = np.round(board.sigma_rad / DEG, 4).tolist()
+    return BoardRecord(
+        imu=imu,
+        faces_measured_at=faces_measured_at,
+        roll_deg=round(board.roll_rad / DEG, 4),
+        pitch_deg=round(board.pitch_rad / DEG, 4),
+        sigma_deg=(roll_sigma, pitch_sigma),
+    )
+
+
+HandRecord = AlignmentRecord | FacesRecord | TurnRecord
+
+
+def completed(
+    record: HandRecord,
+    warnings: tuple[str, ...],
+    written: dict[str, dict[str, WrittenParameter]],
+    level: dict[str, WrittenParameter],
+) -> HandRecord:
+    """Return the record with its warnings and the parameters written: `written` by IMU, `level` for the board."""
+    replace = msgspec.structs.replace
+    if isinstance(record, AlignmentRecord):
+        return replace(record, warnings=warnings)
+    imus = tuple(replace(imu, written=written.get(imu.name, {})) for imu in record.imus)
+    if isinstance(record, FacesRecord):
+        return replace(record, imus=imus, warnings=warnings)
+    board = None if record.board is None else replace(record.board, written=level)
+    return replace(record, imus=imus, board=board, warnings=warnings)

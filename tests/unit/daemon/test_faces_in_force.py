@@ -14,7 +14,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_
 from companion.cli.client import sides_lines
 from companion.config import parse
 from companion.daemon.core import Core
-from companion.daemon.stands.faces_in_force import FacesInForce
+from companion.daemon.stands.alignment import FacesInForce
 from companion.estimation.alignment.faces import BIAS, SCALE
 from companion.estimation.records.align_record import Determined, FacesImuRecord, FacesRecord, Running
 from companion.physics.frames import rotation_matrix, vector

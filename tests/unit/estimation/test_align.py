@@ -150,12 +150,12 @@ def test_derivatives_are_those_of_the_residuals() -> None:
             at = model.begin([attitude(1.0, 2.0), attitude(-1.0, -2.0, 170.0), attitude(3.0, 29.0)])
             model.step(at, start)
             model.step(at, step)
-            return model.linearise(at)[0]
+            return model.linearise(at).stacked()[0]
 
         at = model.begin([attitude(1.0, 2.0), attitude(-1.0, -2.0, 170.0), attitude(3.0, 29.0)])
         model.step(at, start)
-        _, analytic, rows = model.linearise(at)
-        analytic = analytic * np.array([row.group != "nothing" for row in rows])[:, None]
+        rows = model.linearise(at)
+        analytic = rows.stacked()[1] * np.array([row.group != "nothing" for row in rows.labels])[:, None]
         for k in range(model.size):
             step = np.zeros(model.size)
             step[k] = 1e-6

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.alignment.faces import BIAS, SCALE, SHEAR, Face, Faces, faces
-from companion.estimation.alignment.missing import Missing, missing, seen_before
+from companion.estimation.alignment.faces import BIAS, SCALE, SHEAR, Face, Faces, faces, missing, seen_before
+from companion.estimation.alignment.poses import LEVEL, Hold, Wish
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import MG
 from sim.aircraft import Pose, VirtualAircraft
@@ -166,11 +166,12 @@ def test_it_says_which_stand_is_missing_until_nothing_is(mounting: str) -> None:
     sensor = Sensor(8)
     obeyed: list[str] = []
     stands: list[Face] = []
-    wish: Missing | None = Missing("level", "")
+    wish: Wish | None = Wish("level: ", Hold(LEVEL))
     while wish is not None:
-        assert wish.side not in obeyed
-        obeyed.append(wish.side)
-        pitch_deg, roll_deg = _middle(wish.side)
+        side = wish.words.partition(":")[0]
+        assert side not in obeyed
+        obeyed.append(side)
+        pitch_deg, roll_deg = _middle(side)
         stands.append(sensor.read(turned.T @ sensor.up(pitch_deg, roll_deg)))
         wish = missing(solved(stands), turned)
     assert set(obeyed[:6]) == set(HELD)
@@ -201,7 +202,7 @@ def test_where_every_side_has_been_seen_a_side_may_be_held_again() -> None:
     found = solved(stands)
     wish = missing(found, turned)
     assert wish is not None
-    up = sensor.up(*_middle(wish.side))
+    up = sensor.up(*_middle(wish.words.partition(":")[0]))
     assert seen_before(found, up / np.linalg.norm(up), turned) is None
 
 
@@ -229,6 +230,6 @@ def test_the_words_name_the_worst_figure() -> None:
     found = solved(sensor.held(list(held.values())))
     wish = missing(found, np.eye(3))
     assert wish is not None
-    assert str(wish).startswith("nose down: x ")
+    assert wish.words.startswith("nose down: x ")
     sigma = found.sigma[0] / MG, 100.0 * found.sigma[3]
-    assert str(wish).endswith((f"x bias uncertain by {sigma[0]:.2g} mg", f"x scale uncertain by {sigma[1]:.2g} %"))
+    assert wish.words.endswith((f"x bias uncertain by {sigma[0]:.2g} mg", f"x scale uncertain by {sigma[1]:.2g} %"))

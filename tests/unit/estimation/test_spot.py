@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.estimation.alignment.align import Alignment, Complaint, in_words
+from companion.estimation.alignment.align import ALONE, Alignment, Complaint, in_words, turned
 from companion.estimation.alignment.align_model import Ground, ImuStand, Row, Stand
-from companion.estimation.alignment.faces import Face, Sides, faces
-from companion.estimation.alignment.spot import ALONE, mounting, turned
+from companion.estimation.alignment.faces import Face, Sides, faces, mounting
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG, DEG_H, MG
 from sim.aircraft import Pose, VirtualAircraft

@@ -21,7 +21,7 @@ AT_A_DESK = (
     "companion/cli", "companion/setup", "companion/lab", "companion/recording", "companion/fleet",
     "companion/estimation/solution/by_temperature.py", "companion/estimation/records/flight_record.py",
     "companion/estimation/records/flight_evidence.py", "companion/estimation/solution/by_temperature.py",
-    "companion/estimation/alignment/missing.py", "companion/autopilot/firmware/heading_parameters.py",
+    "companion/autopilot/firmware/heading_parameters.py",
     "companion/autopilot/firmware/port_parameters.py", "companion/configured/profiles.py",
 )  # fmt: skip
 """Packages of which commands print the texts, beside what was typed: their documents explain them."""
@@ -34,6 +34,8 @@ NOT_MESSAGES = {
     "USB device", "on-board port", "on-board port (…)", "autopilot of kind …", "MAVLink component …",
     "last write", "an undo", "at a start", "after a flight", "SERIALn_PROTOCOL = 2, SERIALn_BAUD = …",
     "MAV_1_CONFIG = 102, SER_TEL2_BAUD = …",
+    # Sides of an aircraft, of which a request is made.
+    "on its back", "between … and …",
     # Names of tasks in the log, and keys.
     "MAVLink component", "MAVLink connection", "the page's", "airframe changed", "clock back",
     # Recognises an error of the operating system.

@@ -11,23 +11,20 @@ import numpy as np
 import pytest
 
 from companion.component.statustext import Severity, as_lines
-from companion.daemon.stands.align_steps import (
-    Hold,
-    Plan,
-    Seen,
+from companion.estimation.alignment.poses import (
+    AlignmentRequest,
+    Pose,
     asked_turn_deg,
-    leaned,
+    leaned_deg,
     objection,
-    request,
+    wanted_pose,
 )
-from companion.daemon.stands.stands import Asked
-from companion.estimation.alignment.missing import Missing, up_of
 
 
-def stands(heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Seen:
+def stands(heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Pose:
     theta, gamma = math.radians(pitch_deg), math.radians(roll_deg)
     up = [math.sin(theta), -math.sin(gamma) * math.cos(theta), -math.cos(gamma) * math.cos(theta)]
-    return Seen(np.array(up), heading_deg)
+    return Pose(np.array(up), heading_deg)
 
 
 LEVEL = stands(350.0, 0.4, -0.3)
@@ -36,33 +33,33 @@ LEVEL = stands(350.0, 0.4, -0.3)
 @pytest.mark.parametrize(
     ("plan", "total", "on_spot"),
     [
-        (Plan("zero"), 3, 3),
-        (Plan("zero", headings=4), 4, 4),
-        (Plan("tilts"), 8, 4),
+        (AlignmentRequest("zero"), 3, 3),
+        (AlignmentRequest("zero", headings=4), 4, 4),
+        (AlignmentRequest("tilts"), 8, 4),
     ],
 )
-def test_how_many_stands(plan: Plan, total: int, on_spot: int) -> None:
+def test_how_many_stands(plan: AlignmentRequest, total: int, on_spot: int) -> None:
     assert (plan.total, plan.on_spot) == (total, on_spot)
 
 
 def test_there_and_back() -> None:
-    plan = Plan("zero")
-    assert "marked spot" in request(plan, [])[0]
+    plan = AlignmentRequest("zero")
+    assert "marked spot" in wanted_pose(plan, []).words
     assert objection(plan, [], LEVEL) is None
-    propped = Seen(np.array([np.sin(np.radians(45.0)), 0.0, -np.cos(np.radians(45.0))]), 0.0)
+    propped = Pose(np.array([np.sin(np.radians(45.0)), 0.0, -np.cos(np.radians(45.0))]), 0.0)
     assert objection(plan, [], propped) == "tilted by 45 degrees: stand it on its base"
-    assert "by 180 degrees" in request(plan, [LEVEL])[0]
+    assert "by 180 degrees" in wanted_pose(plan, [LEVEL]).words
     for heading in (170.0, 150.0, 195.0):
         assert objection(plan, [LEVEL], stands(heading)) is None
     said = objection(plan, [LEVEL], stands(90.0))
     assert said == "100 degrees, not 180: turn it by 80 degrees more"
-    assert "the same way" in request(plan, [LEVEL, stands(170.0)])[0]
+    assert "the same way" in wanted_pose(plan, [LEVEL, stands(170.0)]).words
     assert objection(plan, [LEVEL, stands(170.0)], stands(5.0)) is None
     assert objection(plan, [LEVEL, stands(170.0)], stands(170.0)) is not None
 
 
 def test_quarters_in_any_order() -> None:
-    plan = Plan("zero", headings=4)
+    plan = AlignmentRequest("zero", headings=4)
     taken = [LEVEL, stands(260.0)]
     assert objection(plan, taken, stands(80.0)) is None
     assert objection(plan, taken, stands(170.0)) is None
@@ -72,9 +69,9 @@ def test_quarters_in_any_order() -> None:
 
 
 def test_quarters_out_of_order_are_led_to_the_one_that_is_open() -> None:
-    plan = Plan("zero", headings=4, back=True)
+    plan = AlignmentRequest("turn", headings=4)
     taken = [stands(10.0), stands(190.0), stands(283.0)]
-    assert request(plan, taken)[0] == "turn it by 180 degrees on its spot"
+    assert wanted_pose(plan, taken).words == "turn it by 180 degrees on its spot"
     assert objection(plan, taken, stands(6.0)) == "0 degrees again: turn it on by 90 degrees"
     assert objection(plan, taken, stands(185.0)) == "180 degrees again: turn it on by 270 degrees"
     assert asked_turn_deg(plan, [*taken, stands(102.0)]) == 270.0
@@ -83,19 +80,19 @@ def test_quarters_out_of_order_are_led_to_the_one_that_is_open() -> None:
 def test_a_lean_within_a_stand_is_told_from_noise() -> None:
     noise = 0.001 * np.random.default_rng(7).standard_normal((12, 3))
     still = np.array([0.3, -0.2, -9.8]) + noise
-    assert leaned(still) == 0.0
+    assert leaned_deg(still) == 0.0
     slowly = still + np.outer(np.linspace(0.0, 9.81 * math.radians(0.15), 12), [0.0, 1.0, 0.0])
-    assert leaned(slowly) == pytest.approx(0.1, abs=0.02)  # from the middle of the first third to that of the last
-    assert leaned(slowly[:5]) == 0.0
+    assert leaned_deg(slowly) == pytest.approx(0.1, abs=0.02)  # from the middle of the first third to that of the last
+    assert leaned_deg(slowly[:5]) == 0.0
 
 
 def test_tilts_to_sides_not_yet_taken() -> None:
-    plan = Plan("tilts")
+    plan = AlignmentRequest("tilts")
     spot = [stands(350.0), stands(80.0), stands(170.0), stands(260.0)]
-    assert "nose up, nose down, left or right side down" in request(plan, spot)[0]
+    assert "nose up, nose down, left or right side down" in wanted_pose(plan, spot).words
     assert "tilted by 5 degrees only" in (objection(plan, spot, stands(3.0, 5.0)) or "")
     taken = [*spot, stands(3.0, 22.0), stands(9.0, 0.0, -22.0)]
-    assert "not nose up or left side down again" in request(plan, taken)[0]
+    assert "not nose up or left side down again" in wanted_pose(plan, taken).words
     assert "nose up again" in (objection(plan, taken, stands(0.0, 20.0, 5.0)) or "")
     assert objection(plan, taken, stands(0.0, -20.0)) is None
     assert objection(plan, taken, stands(0.0, 1.0, 25.0)) is None
@@ -104,14 +101,14 @@ def test_tilts_to_sides_not_yet_taken() -> None:
 @pytest.mark.parametrize(
     ("plan", "number", "turn_deg"),
     [
-        (Plan("zero"), 1, 180.0),
-        (Plan("zero"), 2, 180.0),
-        (Plan("zero", headings=4, back=True), 4, 90.0),
-        (Plan("tilts"), 3, 90.0),
-        (Plan("tilts"), 4, 0.0),
+        (AlignmentRequest("zero"), 1, 180.0),
+        (AlignmentRequest("zero"), 2, 180.0),
+        (AlignmentRequest("turn", headings=4), 4, 90.0),
+        (AlignmentRequest("tilts"), 3, 90.0),
+        (AlignmentRequest("tilts"), 4, 0.0),
     ],
 )
-def test_a_turn_that_nobody_counted_is_taken_as_asked(plan: Plan, number: int, turn_deg: float) -> None:
+def test_a_turn_that_nobody_counted_is_taken_as_asked(plan: AlignmentRequest, number: int, turn_deg: float) -> None:
     """And always goes on: turned back, the gyros' scale would stay unknown."""
     taken = [stands(asked_turn_deg(plan, [stands(0.0)]) * k + 10.0) for k in range(number)]
     assert asked_turn_deg(plan, taken) == turn_deg
@@ -123,20 +120,20 @@ EDGES = [
 ]
 
 
-def every_request() -> Iterator[Asked]:
+def every_request() -> Iterator[str]:
     """With the longest words and numbers that there can be."""
-    for plan in (Plan("zero"), Plan("zero", headings=4, back=True), Plan("tilts")):
+    for plan in (AlignmentRequest("zero"), AlignmentRequest("turn", headings=4), AlignmentRequest("tilts")):
         spot = [stands(heading) for heading in (0.0, 90.0, 180.0, 270.0, 0.0)][: plan.on_spot]
         tilted = [stands(0.0, 22.0), stands(0.0, -22.0), stands(0.0, 0.0, -22.0), stands(0.0, 0.0, 22.0)]
         taken = [*spot, *tilted][: plan.total]
         for number in range(plan.total):
-            yield Asked(number + 1, plan.total, *request(plan, taken[:number]))
+            yield f"{number + 1} of {plan.total}: {wanted_pose(plan, taken[:number]).words}"
     for side in (*SIDES, *EDGES):
-        yield Asked(24, 24, str(Missing(side, "z scale uncertain by 0.46 %")), Hold(up_of(side)))
+        yield f"24 of 24: {side}: z scale uncertain by 0.46 %"
 
 
 def test_what_is_asked_for_is_one_line_to_be_heard() -> None:
-    spoken = [as_lines(Severity.NOTICE, asked.words)[0][1].rstrip(":") for asked in every_request()]
+    spoken = [as_lines(Severity.NOTICE, asked)[0][1].rstrip(":") for asked in every_request()]
     for words in spoken:
         assert len(words) <= 50, words
         assert not re.search(r"\b(deg|mg|s)\b|[%/;]", words), "no abbreviations: it is spoken"
@@ -145,14 +142,14 @@ def test_what_is_asked_for_is_one_line_to_be_heard() -> None:
 
 
 def test_what_is_wrong_with_a_turn_or_a_tilt_is_one_line_too() -> None:
-    tilts = Plan("tilts")
+    tilts = AlignmentRequest("tilts")
     spot = [stands(heading) for heading in (0.0, 90.0, 180.0, 270.0)]
     tilted = [*spot, stands(0.0, 0.0, 22.0)]
     said = [
-        objection(Plan("zero"), [LEVEL], stands(10.0)),
-        objection(Plan("zero"), [LEVEL, stands(180.0)], stands(180.0)),
-        objection(Plan("zero", headings=4), [LEVEL], stands(224.0)),
-        objection(Plan("zero", headings=4), [LEVEL, stands(270.0)], stands(270.0)),
+        objection(AlignmentRequest("zero"), [LEVEL], stands(10.0)),
+        objection(AlignmentRequest("zero"), [LEVEL, stands(180.0)], stands(180.0)),
+        objection(AlignmentRequest("zero", headings=4), [LEVEL], stands(224.0)),
+        objection(AlignmentRequest("zero", headings=4), [LEVEL, stands(270.0)], stands(270.0)),
         objection(tilts, spot, stands(0.0, 12.0)),
         objection(tilts, tilted, stands(0.0, 0.0, 25.0)),
     ]

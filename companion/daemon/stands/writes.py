@@ -1,7 +1,8 @@
-"""How the board sits in the aircraft, into the autopilot's level: ArduPilot's AHRS_TRIM, PX4's SENS_BOARD_X/Y_OFF.
+"""Writes of alignments to the autopilot: accelerometer offsets and scales, and the level of the board.
 
-ArduPilot turns the attitude that it reports, and that alone. PX4 turns what its IMUs give, so that their telemetry
-shows it within a second; its EKF2 keeps the tilt that it has, and learns the new one slowly, or at a restart.
+The level is ArduPilot's AHRS_TRIM or PX4's SENS_BOARD_X/Y_OFF. ArduPilot turns the attitude that it reports, and that
+alone. PX4 turns the output of its IMUs, so that their telemetry shows it within a second; its EKF2 keeps its tilt, and
+learns the new one slowly, or at a restart.
 """
 
 from __future__ import annotations
@@ -9,51 +10,107 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.ardupilot import TRIM
-from companion.autopilot.firmware.px4 import LEVEL, read_level
+from companion.autopilot.firmware.imu_calibration import output_step
+from companion.autopilot.firmware.px4 import LEVEL, read_level, warnings_about
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
+from companion.daemon.offsets.plan import Plan, Target, WriteLog, left_in
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import AutopilotError, CalibrationRefusedError
-from companion.estimation.alignment.spot import Mounting
+from companion.estimation.alignment.faces import Mounting
 from companion.estimation.machine import Event
-from companion.estimation.means.windows import Window
+from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.records.record import Outcome, WrittenParameter
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix
 from companion.storage.changes import Origin
 
 MOST_DEG: Final = 10.0
 SEEN_DEG: Final = 0.1
-"""What shows in an attitude that wanders by hundredths of a degree; a smaller step is not looked for."""
+"""Least step that shows in an attitude that wanders by hundredths of a degree."""
 SEEN_SHARE: Final = 0.2
 WITHIN_S: Final = 15.0
 USED_AFTER_S: Final = 1.5
-"""Both firmwares look at their parameters once a second."""
+"""Both firmwares read their parameters once a second."""
 LATEST_S: Final = 4.0
-"""Of the attitude counts: on a busy link it comes seconds late, and an estimator wanders."""
+"""Age of the attitude that counts: on a busy link it comes seconds late, and an estimator wanders."""
 POLL_S: Final = 0.25
 _UP: Final = np.array([0.0, 0.0, -1.0])
 REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the new level after that"
 
 
-class _Plan(NamedTuple):
+class AccelWrites:
+    """Writes accelerometer offsets and scales, all or nothing."""
+
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], offsets: Offsets) -> None:
+        self._core, self._imus, self._path = core, imus, offsets.write_path
+
+    def why_not(self, *, write: bool) -> str | None:
+        """Say why nothing can be measured or written; None when it can."""
+        if not self._imus:
+            return "there is no IMU of the autopilot to measure: none is configured"
+        if write and not self._core.wanted.push:
+            return "nothing is written while push.parameters is false"
+        return None
+
+    async def prepare(self) -> None:
+        """Verify, before the first stand, that the parameters are the offsets in use.
+
+        Raises:
+            AutopilotError: they cannot be read, or be made sure.
+            StorageError: the old values could not be kept.
+        """
+        await self._path.offsets_still_hold()
+
+    async def write(self, job: Job, last: Window, changes: Mapping[str, Sequence[Change]], log: WriteLog) -> None:
+        """Write the changes of each IMU; the aircraft stands still as in the last stand.
+
+        Raises:
+            CompanionError: it failed, and why; the old values are restored, or the error names those that are not.
+            JobCancelledError: cancelled; likewise.
+        """
+        if not await self._path.offsets_still_hold():
+            raise CalibrationRefusedError("the offsets were changed in between: align again")
+        means = {imu.name: imu for imu in last.imus}
+        targets = tuple(self._target(means[name], each) for name, each in changes.items())
+        for target in targets:
+            log.warn(target.name, *warnings_about(target.calibration, target.changes))
+        plan = Plan(targets, self._core.vehicle.boots)
+        plan = await self._path.write(job, plan, last, log)
+        for target in targets:
+            kept = log.written.get(target.name, {})
+            seen = {kept[name].outcome for name in target.calibration.parameters.accel_offset if name in kept}
+            if seen == {"verified"}:
+                # One step of the output showed offsets and scales together.
+                plan.mark(log, target.calibration.parameters.accel_scale, "verified")
+        await self._path.settle(job, plan, last, log)
+
+    def _target(self, imu: ImuWindow, changes: Sequence[Change]) -> Target:
+        calibration = self._imus[imu.name].in_force
+        _, step = output_step(calibration, changes, imu.accel_m_s2)
+        solution = left_in(imu, None, -np.array(step))
+        kind = self._imus[imu.name].stream.kind
+        return Target(imu.name, calibration, tuple(changes), solution, kind, watched=True, read_m_s2=imu.accel_m_s2)
+
+
+class _LevelPlan(NamedTuple):
     changes: list[Change]
     turn: Matrix
-    """By which up turns in the vehicle's axes, (3, 3)."""
+    """Rotation of up in the vehicle's axes, (3, 3)."""
 
 
 class LevelWrites:
-    """Writes it, looks for its effect, and puts back what has none."""
+    """Writes the level, verifies its effect, and restores the old one without it."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], offsets: Offsets, own: OwnAttitude) -> None:
         self._core, self._machine, self._imus, self._own = core, core.machine, imus, own
@@ -62,10 +119,10 @@ class LevelWrites:
     async def write(
         self, job: Job, board: Mounting, last: Window, origin: Origin
     ) -> tuple[dict[str, WrittenParameter], str | None]:
-        """Write and look; the aircraft stands still as in the last stand. What was written, and what to know of it.
+        """Write and verify; the aircraft stands still as in the last stand. Returns what was written, and a warning.
 
         Raises:
-            CompanionError: it failed, and why; the old values are back, or it is said which are not.
+            CompanionError: it failed, and why; the old values are restored, or the error names those that are not.
             JobCancelledError: cancelled; likewise.
         """
         if math.degrees(max(abs(board.roll_rad), abs(board.pitch_rad))) > MOST_DEG:
@@ -85,7 +142,7 @@ class LevelWrites:
 
             async def verify() -> None:
                 nonlocal outcome, warning
-                outcome, warning = await self._look(job, plan, before, last)
+                outcome, warning = await self._verify(job, plan, before, last)
                 if outcome is None:
                     raise AutopilotError("the attitude did not follow the new level, or it moved")
                 if warning == REBOOT:
@@ -102,27 +159,27 @@ class LevelWrites:
     def _turns_imus(self) -> bool:
         return self._core.vehicle.firmware == "px4"
 
-    async def _plan(self, board: Mounting) -> _Plan:
-        """What a level aircraft looks like to the board now, and the level under which that is up."""
+    async def _plan(self, board: Mounting) -> _LevelPlan:
+        """Return the level under which the board shows a level aircraft as level."""
         read = self._core.parameters.read
         seen = body_from_ned(board.roll_rad, board.pitch_rad, 0.0) @ _UP
         if not self._turns_imus:
-            # The IMUs know nothing of the trim, and the whole of it is what they show.
+            # The IMUs' output is without the trim: it shows the whole tilt.
             old = [await read(name) for name in TRIM]
             new = [board.roll_rad, board.pitch_rad]
             degrees = np.degrees([old, new])
             turns = [rotation_matrix((float(x), float(y), 0.0)) for x, y in degrees]
-            return _Plan([Change(*each) for each in zip(TRIM, old, new, strict=True)], turns[1] @ turns[0].T)
+            return _LevelPlan([Change(*each) for each in zip(TRIM, old, new, strict=True)], turns[1] @ turns[0].T)
         x, y, z = await read_level(self._core.parameters)
         level = rotation_matrix((x, y, z))
         roll, pitch = np.degrees(roll_pitch_from_up(level.T @ seen)).tolist()
         changes = [Change(LEVEL[0], x, roll), Change(LEVEL[1], y, pitch)]
-        return _Plan(changes, rotation_matrix((roll, pitch, z)) @ level.T)
+        return _LevelPlan(changes, rotation_matrix((roll, pitch, z)) @ level.T)
 
-    async def _look(
-        self, job: Job, plan: _Plan, before: Array | None, last: Window
+    async def _verify(
+        self, job: Job, plan: _LevelPlan, before: Array | None, last: Window
     ) -> tuple[Outcome | None, str | None]:
-        """The outcome, None where nothing followed; and what a pilot should know."""
+        """Watch the attitude; returns the outcome, None if it did not follow, and a warning."""
         loop = asyncio.get_running_loop()
         job.progress(WRITTEN_PERCENT, "watching the attitude take the new level")
         since_s = loop.time() + USED_AFTER_S
@@ -141,8 +198,8 @@ class LevelWrites:
         unseen = before is None and not self._turns_imus
         return ("stored", "the effect of the new level was not seen: no ATTITUDE comes") if unseen else (None, None)
 
-    async def _imus_turned(self, plan: _Plan, last: Window) -> bool:
-        """Whether what the IMUs show has turned; PX4 alone turns it."""
+    async def _imus_turned(self, plan: _LevelPlan, last: Window) -> bool:
+        """Verify that the output of the IMUs has turned; only PX4 turns it."""
         with contextlib.suppress(CalibrationRefusedError):
             for imu in self._imus.values():
                 await imu.refresh()
@@ -162,6 +219,6 @@ def _angle_deg(one: Array, other: Array) -> float:
 
 
 def _follows(before: Array, after: Array, turn: Matrix) -> bool:
-    """Whether up has turned as it had to, nearly."""
+    """Verify that up has turned nearly as predicted."""
     wanted = turn @ before
     return _angle_deg(after, wanted) < max(SEEN_DEG, SEEN_SHARE * _angle_deg(before, wanted))

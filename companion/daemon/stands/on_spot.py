@@ -1,0 +1,336 @@
+"""Alignments that turn the aircraft on one spot: the gradienter's zero (and tilts), and level without one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Final
+
+import numpy as np
+
+from companion.autopilot.firmware.imu_calibration import changes_for, whole_bias
+from companion.autopilot.parameters.change import Change
+from companion.configured import models
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.stands.alignment import AlignmentInForce, FacesInForce
+from companion.daemon.stands.session import ARMED, PoseTask
+from companion.errors import CalibrationRefusedError
+from companion.estimation.alignment.align import Alignment, align, in_words, turned
+from companion.estimation.alignment.align_model import Ground, ImuStand, Stand
+from companion.estimation.alignment.faces import mounting
+from companion.estimation.alignment.poses import (
+    BY_EYE_SIGMA_DEG,
+    AlignmentRequest,
+    Pose,
+    Wish,
+    asked_turn_deg,
+    objection,
+    wanted_pose,
+)
+from companion.estimation.means.pose import CompassModel, up_in_vehicle, vehicle_heading_rad
+from companion.estimation.means.windows import ImuWindow, Window
+from companion.estimation.records.align_record import (
+    AlignmentRecord,
+    HandRecord,
+    TurnRecord,
+    board_record,
+    imu_record,
+    stand_record,
+    turn_imu_record,
+)
+from companion.estimation.solution.draft import Draft
+from companion.estimation.solution.site import LocalEarth
+from companion.physics.frames import Array, vector
+from companion.physics.units import DEG, MG
+
+LEAST_STANDS: Final = 3
+"""Stands from which a zero can be estimated."""
+READING_SIGMA_DEG: Final = 0.005
+"""Noise of one mean of a gradienter (table in method 3.4)."""
+SLOPE_WARNING_DEG: Final = 1.5
+OFFSET_WARNING_SIGMAS: Final = 4.0
+LOOSE_M_S2: Final = 0.5 * MG
+"""Sigma of the level above which the angle of the turn, not the marks, limits it."""
+
+
+class SpotTask(PoseTask):
+    """An alignment on one spot, with its estimate."""
+
+    result: Alignment
+
+    def __init__(self, core: Core, request: AlignmentRequest) -> None:
+        self._core, self._request = core, request
+        self.fit_from = request.total
+
+    def wish(self, poses: Sequence[Pose]) -> Wish | None:  # noqa: D102 - as in the base class
+        return wanted_pose(self._request, poses) if len(poses) < self._request.total else None
+
+    def total(self, number: int) -> int:  # noqa: D102
+        del number
+        return self._request.total
+
+    def _counted(
+        self, windows: Sequence[Window], poses: Sequence[Pose], now: Window, up: Array, first_sigma_deg: float
+    ) -> Pose:
+        """Return a pose whose heading is the turn that the gyros of the first IMU have counted.
+
+        Where samples are missing, as when the autopilot restarts, it was turned as asked.
+        """
+        if not poses:
+            return Pose(up, 0.0, first_sigma_deg)
+        before, imu = windows[-1], now.imus[0]
+        bias = (np.array(before.imus[0].gyro_rad_s) + np.array(imu.gyro_rad_s)) / 2.0
+        counted = self._core.collector.counted(imu.name, before.end_s, now.start_s, bias)
+        turn_deg, sigma_deg = asked_turn_deg(self._request, poses), BY_EYE_SIGMA_DEG
+        if counted is not None:
+            turn_deg, sigma_deg = counted.angle_rad / DEG, counted.sigma_rad / DEG
+        return Pose(up, poses[-1].heading_deg + turn_deg, sigma_deg, counted=True)
+
+    def _refuse(self, *, gradienter: bool) -> None:
+        if self.result.complaint is not None:
+            raise CalibrationRefusedError(in_words(self.result.complaint, gradienter=gradienter))
+
+
+class ZeroTask(SpotTask):
+    """The gradienter's zero, and with tilts how it sits against each IMU."""
+
+    imus_alone: ClassVar[bool] = False
+    if_armed: ClassVar[str | None] = ARMED
+
+    def __init__(self, core: Core, request: AlignmentRequest, kept: AlignmentInForce) -> None:
+        super().__init__(core, request)
+        self.fit_from = LEAST_STANDS
+        self._kept, self._compass = kept, models.compass_model(core.config.compass)
+        self._gradienter = models.gradienter_model(core.config.gradienter)
+        self._zero_deg = (0.0, 0.0) if core.config.gradienter is None else core.config.gradienter.offset_deg
+        self._stands: list[Stand] = []
+
+    def examine(  # noqa: D102
+        self, windows: Sequence[Window], poses: Sequence[Pose], now: Window
+    ) -> tuple[Pose, str | None]:
+        assert self._gradienter is not None
+        if now.tilt is None:
+            raise CalibrationRefusedError("no reading of the gradienter in this stand")
+        try:
+            up = up_in_vehicle(self._gradienter, now.tilt.x_deg, now.tilt.y_deg)
+        except ValueError as error:
+            raise CalibrationRefusedError(str(error)) from None
+        if self._compass is None or now.heading is None:
+            pose = self._counted(windows, poses, now, up, 0.1)  # headings count from the first stand
+        else:
+            heading_deg = vehicle_heading_rad(self._compass, now.heading.heading_deg, up) / DEG
+            pose = Pose(up, heading_deg, math.hypot(self._compass.sigma_deg, now.heading.sigma_deg))
+        return pose, objection(self._request, poses, pose)
+
+    def fit(self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth) -> list[str]:  # noqa: D102
+        assert self._gradienter is not None
+        compass = self._core.config.compass
+        self._stands = as_stands(
+            windows,
+            poses,
+            readable(windows),
+            on_spot=self._request.on_spot,
+            north_deg=local.declination_deg if compass is not None and compass.reference == "magnetic" else 0.0,
+            zero_deg=self._zero_deg,
+        )
+        law, mounted = self._gradienter.law, self._gradienter.vehicle_from_sensor
+        self.result = align(law, mounted, self._stands, ground(local, self._compass))
+        self._refuse(gradienter=True)
+        return []
+
+    def record(  # noqa: D102
+        self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth, draft: Draft
+    ) -> AlignmentRecord:
+        del poses, local
+        result, settings, tilt = self.result, self._kept.settings(), windows[0].tilt
+        assert settings is not None
+        assert self._gradienter is not None
+        if result.slope_deg > SLOPE_WARNING_DEG:
+            draft.warnings.append(
+                f"the spot slopes by {result.slope_deg:.1f} deg, so that each degree of heading error counts: a flatter"
+                " one gives a better zero"
+            )
+        largest_deg, usual_deg = float(np.abs(result.offset_deg).max()), self._gradienter.sigma_deg
+        if largest_deg > OFFSET_WARNING_SIGMAS * usual_deg:
+            draft.warnings.append(
+                f"the zero is off by {largest_deg:.2f} deg, {largest_deg / usual_deg:.0f} times sigma_deg of the"
+                " configuration: does the aircraft stand level on its base, not on wheels nose up?"
+            )
+        x_deg, y_deg = np.round(result.offset_deg, 6).tolist()
+        (xx, xy), (yx, yy) = result.offset_covariance_deg2.tolist()
+        degrees = _temperatures(windows[0])
+        return AlignmentRecord(
+            kind="tilts" if self._request.action == "tilts" else "zero",
+            measured_at=draft.started,
+            gradienter=settings,
+            offset_deg=(x_deg, y_deg),
+            sigma_deg=round(float(result.offset_sigma_deg.max()), 6),
+            covariance_deg2=((xx, xy), (yx, yy)),
+            slope_deg=round(result.slope_deg, 3),
+            checked=result.checked,
+            chi_square=round(result.chi_square, 3),
+            freedom=result.freedom,
+            temperature_degc=tilt.temperature_degc if tilt is not None else None,
+            stands=tuple(
+                stand_record(stand, attitude, window.end_s - window.start_s, self._zero_deg)
+                for stand, attitude, window in zip(self._stands, result.attitudes, windows, strict=True)
+            ),
+            imus=tuple(imu_record(imu, degrees.get(imu.name)) for imu in result.imus),
+        )
+
+    def changes(self) -> dict[str, list[Change]]:  # noqa: D102
+        return {}
+
+    async def keep(self, record: HandRecord) -> None:  # noqa: D102
+        assert isinstance(record, AlignmentRecord)
+        await self._kept.keep(record)
+
+    def summary(self) -> str:  # noqa: D102
+        (x_deg, y_deg), sigma_deg = self.result.offset_deg, self.result.offset_sigma_deg.max()
+        return f"zero x {x_deg:+.3f} y {y_deg:+.3f} deg, sigma {sigma_deg:.3f}; now: companion calibrate"
+
+
+class TurnTask(SpotTask):
+    """Level accelerometers and the slope, without a gradienter; the board's tilt, where all sides are known."""
+
+    def __init__(
+        self, core: Core, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], known: FacesInForce
+    ) -> None:
+        super().__init__(core, request)
+        self._imus, self._known = imus, known
+        self._stands: list[Stand] = []
+
+    def examine(  # noqa: D102
+        self, windows: Sequence[Window], poses: Sequence[Pose], now: Window
+    ) -> tuple[Pose, str | None]:
+        up = np.array(now.imus[0].accel_m_s2)
+        pose = self._counted(windows, poses, now, up / np.linalg.norm(up), 0.01)
+        return pose, objection(self._request, poses, pose)
+
+    def fit(self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth) -> list[str]:  # noqa: D102
+        names = readable(windows, among=self._imus)
+        self._stands = as_stands(windows, poses, names, on_spot=len(poses))
+        self.result = turned(self._stands, ground(local, None))
+        self._refuse(gradienter=False)
+        return []
+
+    def record(  # noqa: D102
+        self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth, draft: Draft
+    ) -> TurnRecord:
+        del poses
+        result, degrees = self.result, _temperatures(windows[-1])
+        if self._request.headings == 2 and _level_sigma_m_s2(result) > LOOSE_M_S2:
+            draft.warnings.append(
+                f"the spot slopes by {result.slope_deg:.1f} deg: turn it the same way both times, or --headings 4"
+            )
+        first, faces = result.imus[0], self._known.record
+        sides = self._known.known(first.name, self._imus[first.name].in_force, degrees.get(first.name))
+        self.board = None if sides is None else mounting(first, sides, local.gravity_m_s2)
+        if self.board is None and self._request.level:
+            raise CalibrationRefusedError("nothing is known from all sides of these accelerometers: align faces again")
+        none = (0.0, 0.0, 0.0)
+        whole = {
+            imu.name: whole_bias(
+                self._imus[imu.name].in_force, none, vector(imu.level_bias_m_s2), degrees.get(imu.name)
+            )[1]
+            for imu in result.imus
+        }
+        return TurnRecord(
+            measured_at=draft.started,
+            slope_deg=round(result.slope_deg, 3),
+            checked=result.checked,
+            chi_square=round(result.chi_square, 3),
+            freedom=result.freedom,
+            stands=tuple(
+                stand_record(stand, attitude, window.end_s - window.start_s, (0.0, 0.0))
+                for stand, attitude, window in zip(self._stands, result.attitudes, windows, strict=True)
+            ),
+            imus=tuple(turn_imu_record(imu, degrees.get(imu.name), np.array(whole[imu.name])) for imu in result.imus),
+            board=None
+            if self.board is None or faces is None
+            else board_record(self.board, first.name, faces.measured_at),
+        )
+
+    def changes(self) -> dict[str, list[Change]]:  # noqa: D102
+        return {
+            imu.name: changes_for(self._imus[imu.name].in_force, None, vector(imu.level_bias_m_s2))
+            for imu in self.result.imus
+        }
+
+    def summary(self) -> str:  # noqa: D102
+        result, board, request = self.result, self.board, self._request
+        words = f"level known to {_level_sigma_m_s2(result) / MG:.2f} mg, the spot slopes by {result.slope_deg:.2f} deg"
+        if board is not None:
+            words += f"; the board sits at roll {board.roll_rad / DEG:+.2f}, pitch {board.pitch_rad / DEG:+.2f} deg"
+        end = "level written" if request.level else "written" if request.write else "not written"
+        return f"{words}: {end}"
+
+
+def as_stands(
+    windows: Sequence[Window],
+    poses: Sequence[Pose],
+    names: Sequence[str],
+    *,
+    on_spot: int,
+    north_deg: float = 0.0,
+    zero_deg: tuple[float, float] = (0.0, 0.0),
+) -> list[Stand]:
+    """Return the stands of these IMUs for the estimator.
+
+    The first `on_spot` stands share the spot; `north_deg` is the poses' north from the true one, `zero_deg` the
+    gradienter's as configured.
+    """
+    stands = []
+    for number, (window, pose) in enumerate(zip(windows, poses, strict=True)):
+        imus, tilt = {imu.name: imu for imu in window.imus}, window.tilt
+        x_sigma_deg, y_sigma_deg = (1.0, 1.0) if tilt is None else (tilt.x_sigma_deg, tilt.y_sigma_deg)
+        stands.append(
+            Stand(
+                imus=tuple(_imu_stand(imus[name]) for name in names),
+                tilt_deg=None if tilt is None else (tilt.x_deg - zero_deg[0], tilt.y_deg - zero_deg[1]),
+                tilt_sigma_deg=(math.hypot(READING_SIGMA_DEG, x_sigma_deg), math.hypot(READING_SIGMA_DEG, y_sigma_deg)),
+                heading_rad=(pose.heading_deg + north_deg) * DEG,
+                heading_sigma_rad=pose.heading_sigma_deg * DEG,
+                on_spot=number < on_spot,
+                counted=pose.counted,
+            )
+        )
+    return stands
+
+
+def _imu_stand(imu: ImuWindow) -> ImuStand:
+    figures = imu.accel_m_s2, imu.accel_sigma_use_m_s2, imu.gyro_rad_s, imu.gyro_sigma_use_rad_s
+    return ImuStand(imu.name, *map(np.array, figures))
+
+
+def readable(windows: Sequence[Window], among: Mapping[str, AutopilotImu] | None = None) -> list[str]:
+    """Return the IMUs, of these or of all, whose accelerometers can be read in all stands.
+
+    Raises:
+        CalibrationRefusedError: there is none.
+    """
+    read = [{imu.name for imu in window.imus if not imu.refused("accel")} for window in windows]
+    names = [imu.name for imu in windows[0].imus if all(imu.name in each for each in read)]
+    names = [name for name in names if among is None or name in among]
+    if not names:
+        raise CalibrationRefusedError("no IMU whose accelerometers can be read")
+    return names
+
+
+def ground(local: LocalEarth, compass: CompassModel | None) -> Ground:
+    """Return gravity and the Earth's rate; without a compass headings count from the first stand, of any direction."""
+    rate = local.rate_in_body(np.eye(3), heading_known=compass is not None)
+    covariance = rate.covariance.copy()
+    if compass is not None and compass.magnetic:
+        east = local.rate_ned_rad_s[0] * local.declination_sigma_deg * DEG
+        covariance[1, 1] += east**2
+    return Ground(local.gravity_m_s2, local.gravity_sigma_m_s2, rate.mean, covariance)
+
+
+def _level_sigma_m_s2(found: Alignment) -> float:
+    return max(float(np.sqrt(np.diag(imu.level_covariance_m2_s4))[:2].max()) for imu in found.imus)
+
+
+def _temperatures(window: Window) -> dict[str, float | None]:
+    return {imu.name: imu.temperature_degc for imu in window.imus}

@@ -1,0 +1,399 @@
+"""One alignment from its first pose to its record: guide an operator, measure, estimate, write, keep.
+
+`PoseSession.run` reads top to bottom. A `PoseTask` says what distinguishes one alignment from another: the poses
+wanted, the acceptance test, the fit and the record. Nobody presses anything between the poses: a movement is seen, and
+the next pose begins when it has ended. So one person alone can follow the ground station's voice or the page.
+"""
+
+from __future__ import annotations
+
+import abc
+import asyncio
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Final
+
+import msgspec
+import numpy as np
+
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.parameters.change import Change
+from companion.component.service import JobResult
+from companion.component.statustext import LINE_BYTES, Severity
+from companion.component.tunes import Tune
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import Job
+from companion.daemon.stands.measuring import POLL_S, Measuring
+from companion.daemon.stands.writes import AccelWrites, LevelWrites
+from companion.errors import CalibrationRefusedError
+from companion.estimation.alignment.faces import Mounting
+from companion.estimation.alignment.poses import LEVEL, AlignmentRequest, Hold, Pose, Wish, leaned_deg
+from companion.estimation.machine import Event
+from companion.estimation.means.windows import Window
+from companion.estimation.records.align_record import HandRecord, completed
+from companion.estimation.records.record import WrittenParameter
+from companion.estimation.solution.draft import Draft
+from companion.estimation.solution.site import LocalEarth
+from companion.physics.units import DEG
+from companion.storage.changes import Origin
+
+STAND_S: Final = 12.0
+"""Seconds of stillness for each stand: averaging beyond 10 s improves no accelerometer (method 2.3)."""
+SETTLE_S: Final = 1.0
+STOP_WITHIN_DEG: Final = 5.0
+"""Say *stop* when the next sample of the turn would be within this angle of the target."""
+TURNS_DEG: Final = 2.0
+"""Least turn within a second that counts as turning."""
+EARLY_S: Final = 3.0
+"""A stand measured for so long that moves was moved too early; before, it is still being set down."""
+STILL_MOVING_S: Final = 20.0
+"""Movement after which the operator is told: a hand or the wind may still be on the aircraft."""
+LEANED_DEG: Final = 0.03
+"""Lean within a stand; half of it is in the mean: as much as an error of the marks."""
+ARMED: Final = "armed during the alignment; the earlier one stays in force"
+
+
+class StandsShown(msgspec.Struct):
+    """Progress of the latest alignment, for a page that may be opened at any time, also after its end."""
+
+    kind: str
+    number: int
+    total: int
+    wish: str
+    hold: Hold
+    unknown: tuple[str, ...] = ()
+    words: str = ""
+    objection: str | None = None
+    """Fault of the latest stand, if it was not the one asked for."""
+    share: float = 0.0
+    """Progress of the present stand, 0 to 1."""
+    done: list[tuple[float, float, float]] = []
+    """Up in the aircraft's axes, of each stand so far, as its accelerometers read it."""
+    outcome: str | None = None
+    """None while it runs."""
+
+
+@dataclasses.dataclass(slots=True, eq=False)
+class SessionState:
+    """All state of one alignment."""
+
+    job: Job
+    shown: StandsShown
+    windows: list[Window] = dataclasses.field(default_factory=list)
+    poses: list[Pose] = dataclasses.field(default_factory=list)
+    first: dict[str, ImuCalibration] = dataclasses.field(default_factory=dict)
+    """Offsets and scales during the first stand, by IMU."""
+
+    # The present pose
+    since_s: float = 0.0
+    """Time since which it has not moved."""
+    moved: bool = False
+    """Moved since the stand before, or since the latest objection."""
+    still_s: float = 0.0
+    moving_since_s: float = math.inf
+    objection: str = ""
+    hold_still_said: bool = False
+    turn_read_s: float = -math.inf
+    turned_deg: float = math.nan
+    stop_said: bool = False
+
+    def begin_pose(self, now_s: float) -> None:
+        """Wait for the next pose; a time before its request does not count, the operator may still correct it."""
+        self.since_s, self.moved = (self.windows[-1].end_s, False) if self.windows else (now_s, True)
+        self.still_s, self.moving_since_s, self.objection, self.hold_still_said = 0.0, math.inf, "", False
+        self.turn_read_s, self.turned_deg, self.stop_said = -math.inf, math.nan, False
+
+
+class PoseTask(abc.ABC):
+    """Poses, acceptance test, fit and record of one alignment; holds its estimate."""
+
+    imus_alone: ClassVar[bool] = True
+    """Neither gradienter nor compass is waited for: turned over, either may fall silent."""
+    if_armed: ClassVar[str | None] = None
+    """Why it fails when the aircraft arms; None: it goes on once disarmed."""
+    fit_from: int
+    """Number of poses from which the estimate is made, after each."""
+    board: Mounting | None = None
+    """Tilt of the board, where it can be known."""
+
+    @abc.abstractmethod
+    def wish(self, poses: Sequence[Pose]) -> Wish | None:
+        """Return the pose wanted next; None: there are enough."""
+
+    @abc.abstractmethod
+    def total(self, number: int) -> int:
+        """Return how many poses there will be, about, when this one is reached."""
+
+    @abc.abstractmethod
+    def examine(self, windows: Sequence[Window], poses: Sequence[Pose], now: Window) -> tuple[Pose, str | None]:
+        """Return the pose of a new window, and why it is not the one asked for, if so."""
+
+    @abc.abstractmethod
+    def fit(self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth) -> list[str]:
+        """Estimate from all stands, blocking, in a thread; returns what the operator should hear.
+
+        Raises:
+            CalibrationRefusedError: the stands do not fit together.
+        """
+
+    @abc.abstractmethod
+    def record(self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth, draft: Draft) -> HandRecord:
+        """Build the record of what was measured, before anything is written; adds warnings to `draft`.
+
+        Raises:
+            CalibrationRefusedError: the estimate cannot be used as requested.
+        """
+
+    @abc.abstractmethod
+    def changes(self) -> dict[str, list[Change]]:
+        """Return the offsets and scales to write, by IMU."""
+
+    def shortfall(self, poses: Sequence[Pose]) -> str | None:
+        """Say what is still unknown after the last pose; then nothing is written or kept."""
+        del poses
+        return None
+
+    async def keep(self, record: HandRecord) -> None:
+        """Make the result the active one.
+
+        Raises:
+            StorageError: it could not be kept; the one before stays active.
+        """
+        del record
+
+    @abc.abstractmethod
+    def summary(self) -> str:
+        """Return the result in one line."""
+
+
+class PoseSession:
+    """Guides one operator through the poses of one alignment at a time."""
+
+    def __init__(
+        self,
+        core: Core,
+        imus: Mapping[str, AutopilotImu],
+        measuring: Measuring,
+        offsets: AccelWrites,
+        levels: LevelWrites,
+    ) -> None:
+        self._core, self._machine, self._collector, self._say = core, core.machine, core.collector, core.say
+        self._imus, self._measuring, self._offsets, self._levels = imus, measuring, offsets, levels
+        self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
+        self.shown: StandsShown | None = None
+        """None before the first alignment."""
+
+    async def run(self, job: Job, request: AlignmentRequest, task: PoseTask) -> str:
+        """Measure all poses, estimate, write and keep; returns the result in one line.
+
+        Raises:
+            CompanionError: it failed, and why; what was written is restored, or the error names what is not.
+            JobCancelledError: cancelled, likewise.
+        """
+        if request.write and request.action == "faces":
+            await self._offsets.prepare()
+        state = self._begin(job, task)
+        windows, poses = state.windows, state.poses
+        while (wish := task.wish(poses)) is not None:
+            await self._measure(state, task, wish)
+            if len(poses) >= task.fit_from:
+                local = await self._core.local_earth()
+                try:
+                    heard = await self._core.offload(task.fit, windows, poses, local)
+                except CalibrationRefusedError:
+                    # Offsets that somebody else has changed meanwhile would explain it.
+                    await self._check_offsets(state)
+                    raise
+                for words in heard:
+                    self._say(Severity.NOTICE, words)
+        await self._check_offsets(state)
+        draft = self._core.draft()
+        draft.warnings += local.warnings
+        record = task.record(windows, poses, local, draft)
+        shortfall = task.shortfall(poses)
+        level: dict[str, WrittenParameter] = {}
+        try:
+            if request.write and shortfall is None:
+                await self._offsets.write(job, windows[-1], task.changes(), draft)
+            elif request.level and task.board is not None:
+                level = await self._write_level(job, task.board, windows[-1], draft)
+        finally:
+            warnings = (*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each))
+            job.deliver(record := completed(record, warnings, draft.written, level))
+        if shortfall is None:
+            await task.keep(record)
+        elif request.write:
+            raise CalibrationRefusedError(f"nothing was written: {shortfall}")
+        if not (request.write or request.level):
+            self._machine.on(Event.NOTHING_TO_WRITE)
+        return task.summary()
+
+    def _begin(self, job: Job, task: PoseTask) -> SessionState:
+        self._collector.count_turns(wanted=True)
+        if task.imus_alone:
+            self._collector.expect(gradienter=False, compass=False)
+        self.shown = shown = StandsShown(job.kind, 1, 1, "", Hold(LEVEL))
+
+        def ended(result: asyncio.Future[JobResult]) -> None:
+            shown.outcome, shown.words, shown.share = result.result().outcome, result.result().reason, 0.0
+            self._collector.count_turns(wanted=False)
+            if task.imus_alone:
+                config = self._core.config
+                self._collector.expect(gradienter=config.gradienter is not None, compass=config.compass is not None)
+
+        job.finished.add_done_callback(ended)
+        return SessionState(job, shown)
+
+    # --- one pose
+
+    async def _measure(self, state: SessionState, task: PoseTask, wish: Wish) -> None:
+        """Wait for the pose that is wanted, and measure it.
+
+        Raises:
+            CalibrationRefusedError: armed, out of time, or what was measured before is void.
+            JobCancelledError: cancelled.
+        """
+        loop, job, shown = asyncio.get_running_loop(), state.job, state.shown
+        number = len(state.poses) + 1
+        total = task.total(number)
+        shown.number, shown.total, shown.wish, shown.hold, shown.unknown = number, total, *wish
+        if number > 1:
+            self._machine.on(Event.MOVED)
+            self._core.tunes.play(Tune.NEXT)
+        request = f"{number} of {total}: {wish.words}"
+        self._say(Severity.NOTICE, request)
+        state.begin_pose(loop.time())
+        while True:
+            now_s = loop.time()
+            status, waiting_for, hold_still_s = await self._measuring.read_state(job, task.if_armed)
+            self._check_known(state)
+            moving = self._watch_movement(state, now_s, request)
+            state.still_s = min(status.still_s, now_s - state.since_s - SETTLE_S)
+            # A stand that only has to go on is measured, and shown so, from its first second on.
+            standing = state.moved and (waiting_for is None or hold_still_s is not None)
+            share = min(max(state.still_s, 0.0) / self._stand_s, 1.0) if standing else 0.0
+            if not state.moved:
+                words = f"{state.objection or wish.words}; waiting for it to move"
+            elif not standing:
+                turned = self._turned(state, wish, now_s) if moving else ""
+                words = f"{state.objection or wish.words}; {turned or waiting_for}"
+            else:
+                turned = self._turned(state, wish, now_s)
+                words = f"measuring, {max(state.still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
+                words += f" ({turned})" if turned else ""
+                if not state.hold_still_said:
+                    state.hold_still_said = True
+                    self._core.prompt(Tune.HOLD_STILL, "Hold still")
+            self._measuring.show(measuring=share > 0.0)
+            job.progress(100.0 * (number - 1 + share) / total, f"{number} of {total}: {words}")
+            shown.words, shown.share, shown.objection = words, round(share, 3), state.objection or None
+            enough = state.moved and waiting_for is None and state.still_s >= self._stand_s
+            if enough and await self._accept(state, task, request, now_s):
+                return
+            await job.pause(POLL_S)
+
+    async def _accept(self, state: SessionState, task: PoseTask, request: str, now_s: float) -> bool:
+        """Take the stand if it is the pose that is wanted; else object."""
+        window = await self._core.window(since_s=state.since_s + SETTLE_S)
+        pose, objection = task.examine(state.windows, state.poses, window)
+        forces = self._collector.forces_m_s2(window.imus[0].name, window.start_s, window.end_s)
+        # A hand that is taken off too slowly for a movement, or soft ground.
+        if (leaned := leaned_deg(np.array(forces))) >= LEANED_DEG:
+            state.since_s = now_s
+            self._object(state, f"it leaned by {leaned:.2g} degrees: hands off, firm ground", request)
+            return False
+        if objection is not None:
+            state.moved = False
+            self._measuring.show(measuring=False)
+            self._object(state, objection, request)
+            return False
+        state.windows.append(window)
+        state.poses.append(pose)
+        if not state.first:
+            state.first = {name: imu.calibration for name, imu in self._imus.items() if imu.calibration is not None}
+        read = np.array(window.imus[0].accel_m_s2)
+        x, y, z = (read / max(float(np.linalg.norm(read)), 1e-9)).round(3).tolist()
+        state.shown.done.append((x, y, z))
+        self._machine.on(Event.ENOUGH)
+        return True
+
+    def _turned(self, state: SessionState, wish: Wish, now_s: float) -> str:
+        """Return the turn since the stand before, read once a second; says once when to stop."""
+        wanted_deg = wish.hold.turn_deg
+        if not state.windows or not wanted_deg:
+            return ""
+        if now_s - state.turn_read_s >= 1.0:
+            last, before_deg = state.windows[-1], state.turned_deg
+            imu = last.imus[0]
+            counted = self._collector.counted(imu.name, last.end_s, now_s, np.array(imu.gyro_rad_s))
+            state.turn_read_s, state.turned_deg = now_s, math.nan if counted is None else abs(counted.angle_rad) / DEG
+            step_deg = state.turned_deg - before_deg
+            is_near = state.turned_deg + step_deg > wanted_deg - STOP_WITHIN_DEG
+            if not state.stop_said and step_deg > TURNS_DEG and is_near:
+                state.stop_said = True
+                self._say(Severity.NOTICE, "Stop turning")
+        return "" if math.isnan(state.turned_deg) else f"turned {state.turned_deg:.0f} of {wanted_deg:.0f} degrees"
+
+    def _watch_movement(self, state: SessionState, now_s: float, request: str) -> bool:
+        """Note a movement; tell the operator if it ended a measurement or lasts long."""
+        glance = self._collector.glance(now_s)
+        if not glance.moving:
+            state.moving_since_s = math.inf
+            return False
+        if glance.moves is not None and state.moved:
+            state.moving_since_s = min(state.moving_since_s, now_s)
+            if state.still_s >= EARLY_S:
+                words = f"it moved after {state.still_s:.0f} of {self._stand_s:.0f} seconds: hands off"
+                self._object(state, words, request)
+            elif now_s - state.moving_since_s >= STILL_MOVING_S:
+                state.moving_since_s = now_s
+                self._say(Severity.NOTICE, "It still moves: set it down, hands off")
+        state.moved, state.since_s, state.still_s = True, now_s, 0.0
+        return True
+
+    def _object(self, state: SessionState, objection: str, request: str) -> None:
+        """Tell the operator; an objection too long to be heard whole is followed by the request."""
+        state.objection, state.hold_still_said = objection, False
+        self._core.prompt(Tune.WRONG, objection)
+        if len(objection) > LINE_BYTES:
+            self._say(Severity.NOTICE, request)
+
+    # --- the autopilot's side
+
+    async def _check_offsets(self, state: SessionState) -> None:
+        """Read the offsets afresh: somebody may have changed them without a word.
+
+        Raises:
+            CalibrationRefusedError: what was measured before is void.
+            AutopilotError: they cannot be read.
+        """
+        for name, imu in self._imus.items():
+            holds = await imu.refresh()
+            self._check_known(state)
+            if not holds:
+                raise _changed(name)
+
+    def _check_known(self, state: SessionState) -> None:
+        for name, imu in self._imus.items():
+            first, now = state.first.get(name), imu.calibration
+            if first is None or now is None or first.corrects_like(now):
+                continue
+            for old, new in ((first.accel_id, now.accel_id), (first.gyro_id, now.gyro_id)):
+                if old != new:
+                    raise CalibrationRefusedError(
+                        f"imu {name} was exchanged in between (device id {old}, now {new}): align again"
+                    )
+            raise _changed(name)
+
+    async def _write_level(self, job: Job, board: Mounting, last: Window, draft: Draft) -> dict[str, WrittenParameter]:
+        written, warning = await self._levels.write(job, board, last, Origin("level", draft.started))
+        if warning is not None:
+            draft.warnings.append(warning)
+            self._say(Severity.WARNING, warning)
+        return written
+
+
+def _changed(name: str) -> CalibrationRefusedError:
+    return CalibrationRefusedError(f"the offsets of imu {name} were changed in between: align again")

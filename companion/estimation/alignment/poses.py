@@ -1,0 +1,202 @@
+"""The poses that an alignment asks for, in words and as a picture, and whether a pose is the one asked for.
+
+A *pose* is one way in which the aircraft is put down or held; a *stand* is the still window measured in it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Final, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+
+from companion.physics.frames import Array, wrap_deg
+from companion.physics.units import DEG
+from companion.samples import Vector
+
+TURN_TOLERANCE_DEG: Final = 30.0
+QUARTER_DEG: Final = 90.0
+LEAST_TILT_DEG: Final = 15.0
+"""Least tilt that separates scale and misalignment from bias: they differ by the tilt's cosine."""
+APART_DEG: Final = 45.0
+"""The least angle between two tilts to different sides."""
+MOST_ASKEW_DEG: Final = 30.0
+"""Largest tilt on the base: a slope, an aircraft that sits on its tail, and a board put in by eye."""
+TILTS: Final = 4
+LEVEL: Final = (0.0, 0.0, -1.0)
+_SIN, _COS = math.sin(24.0 * DEG), math.cos(24.0 * DEG)
+_TILTED: Final = {
+    "nose up": (_SIN, 0.0, -_COS),
+    "nose down": (-_SIN, 0.0, -_COS),
+    "left side down": (0.0, _SIN, -_COS),
+    "right side down": (0.0, -_SIN, -_COS),
+}
+HEADINGS: Final = 4
+LEAST_SECONDS: Final = 6
+LEANED_SIGMAS: Final = 5.0
+BY_EYE_SIGMA_DEG: Final = 10.0
+"""Sigma of a turn that nobody counted and that was made as asked."""
+
+
+class AlignmentRequest(NamedTuple):
+    """One alignment, as the operator asked for it."""
+
+    action: Literal["zero", "tilts", "turn", "faces"]
+    headings: int = 2
+    """2: there, turned by 180 degrees, and on the same way to the first marks; 4: every quarter turn."""
+    write: bool = False
+    """Write offsets (and scales, where all sides tell them) to the autopilot."""
+    level: bool = False
+    """Write how the board sits as the autopilot's level."""
+
+    @property
+    def on_spot(self) -> int:
+        """Number of stands on the one spot; a turn by quarters ends on the first marks again, as a check."""
+        if self.headings == 2 and self.action != "tilts":
+            return 3
+        return HEADINGS + (self.action == "turn")
+
+    @property
+    def total(self) -> int:
+        """Number of stands of an alignment on a spot."""
+        return self.on_spot + (TILTS if self.action == "tilts" else 0)
+
+
+class Hold(msgspec.Struct, frozen=True):
+    """How to hold the aircraft, for a picture."""
+
+    up: Vector
+    """Up in its axes, forward, right, down; length 1."""
+    turn_deg: float = 0.0
+    """Turn on its spot, clockwise from above."""
+
+
+class Wish(NamedTuple):
+    """The pose that is asked for next."""
+
+    words: str
+    """Spoken up to a colon; the rest need not be heard."""
+    hold: Hold
+    unknown: tuple[str, ...] = ()
+    """Figures that the stands so far leave open, the worst first."""
+
+
+class Pose(NamedTuple):
+    """How the aircraft stood."""
+
+    up: Array
+    """Up in its axes, (3,)."""
+    heading_deg: float = 0.0
+    """From the compass' own north, else from the first stand; not wrapped where the gyros counted it."""
+    heading_sigma_deg: float = 0.0
+    counted: bool = False
+    """The sigma is that of the turn since the stand before."""
+
+
+def wanted_pose(request: AlignmentRequest, poses: Sequence[Pose]) -> Wish:
+    """Return what the operator should do after these poses of an alignment on a spot."""
+    if not poses:
+        return Wish("stand it on a firm, marked spot", Hold(LEVEL))
+    if len(poses) >= request.on_spot:
+        done = [_side(poses[0].up, pose.up) for pose in poses[request.on_spot :]]
+        hold = Hold(next((up for side, up in _TILTED.items() if side not in done), LEVEL))
+        if done:
+            return Wish(f"tilt it to another side, prop it up: not {' or '.join(done)} again", hold)
+        return Wish("tilt it 20 to 28 degrees, prop it up: nose up, nose down, left or right side down", hold)
+    hold = Hold(LEVEL, asked_turn_deg(request, poses))
+    if request.on_spot >= HEADINGS:
+        return Wish(f"turn it by {hold.turn_deg:.0f} degrees on its spot", hold)
+    if len(poses) == 1:
+        return Wish("turn it by 180 degrees, onto its marks", hold)
+    return Wish("turn it the same way to its first marks", hold)
+
+
+def asked_turn_deg(request: AlignmentRequest, poses: Sequence[Pose]) -> float:
+    """Return the turn that is asked for after these poses; 0 for a tilt."""
+    if len(poses) >= request.on_spot:
+        return 0.0
+    return _to_next_deg(poses, poses[-1]) if request.on_spot >= HEADINGS else 180.0
+
+
+def objection(request: AlignmentRequest, poses: Sequence[Pose], now: Pose) -> str | None:
+    """Say why this is not the pose that was asked for, and what to do; None when it is."""
+    if not poses:
+        askew_deg = _apart_deg(now.up, np.array(LEVEL))
+        return f"tilted by {askew_deg:.0f} degrees: stand it on its base" if askew_deg > MOST_ASKEW_DEG else None
+    first, number = poses[0], len(poses)
+    if number < request.on_spot:
+        turned_deg = now.heading_deg - first.heading_deg
+        if request.on_spot >= HEADINGS and number < HEADINGS:
+            return _quarter(poses, now)
+        wanted_deg = 180.0 if number == 1 else 0.0
+        off_deg = abs(wrap_deg(turned_deg - wanted_deg))
+        if off_deg > TURN_TOLERANCE_DEG:
+            turned_deg = abs(wrap_deg(turned_deg))
+            return f"{turned_deg:.0f} degrees, not {wanted_deg:.0f}: turn it by {off_deg:.0f} degrees more"
+        return None
+    tilt_deg = _apart_deg(now.up, first.up)
+    if tilt_deg < LEAST_TILT_DEG:
+        return f"tilted by {tilt_deg:.0f} degrees only: make it 20 to 28"
+    azimuth_deg = _azimuth(first.up, now.up)
+    if any(abs(wrap_deg(_azimuth(first.up, one.up) - azimuth_deg)) < APART_DEG for one in poses[request.on_spot :]):
+        return f"{_side(first.up, now.up)} again: tilt it to another side"
+    return None
+
+
+def _quarter(poses: Sequence[Pose], now: Pose) -> str | None:
+    turned_deg = now.heading_deg - poses[0].heading_deg
+    quarters = _quarters(poses[0], now)
+    if abs(wrap_deg(turned_deg - quarters * QUARTER_DEG)) > TURN_TOLERANCE_DEG:
+        return f"{turned_deg % 360.0:.0f} degrees: make it 90, 180 or 270"
+    if any(_quarters(poses[0], pose) == quarters for pose in poses):
+        on_deg = _to_next_deg(poses, now)
+        return f"{quarters * QUARTER_DEG:.0f} degrees again: turn it on by {on_deg:.0f} degrees"
+    return None
+
+
+def _quarters(first: Pose, now: Pose) -> int:
+    return round((now.heading_deg - first.heading_deg) / QUARTER_DEG) % HEADINGS
+
+
+def _to_next_deg(poses: Sequence[Pose], now: Pose) -> float:
+    """Return the turn, clockwise, to the next heading that is still open: the first one, after all others."""
+    done = {_quarters(poses[0], pose) for pose in poses}
+    open_ones = {0} if len(done) == HEADINGS else set(range(HEADINGS)) - done
+    at = _quarters(poses[0], now)
+    return next(turn for turn in range(1, HEADINGS + 1) if (at + turn) % HEADINGS in open_ones) * QUARTER_DEG
+
+
+def _apart_deg(one: Array, other: Array) -> float:
+    return math.degrees(math.acos(float(np.clip(one @ other, -1.0, 1.0))))
+
+
+def _azimuth(level: Array, up: Array) -> float:
+    """Return the direction of the lean, degrees from the nose, right positive; `level` is up on the base."""
+    lean = up - level
+    return math.degrees(math.atan2(-lean[1], -lean[0]))
+
+
+def _side(level: Array, up: Array) -> str:
+    """Name the side that is down."""
+    sides = ("nose down", "right side down", "nose up", "left side down")
+    return sides[round(_azimuth(level, up) / QUARTER_DEG) % 4]
+
+
+def leaned_deg(forces_m_s2: Array) -> float:
+    """Return how far up moved in the aircraft between the thirds of a stand; 0 where it may be noise.
+
+    Args:
+        forces_m_s2: (seconds, 3), means of an accelerometer.
+    """
+    if len(forces_m_s2) < LEAST_SECONDS:
+        return 0.0
+    # Second differences are blind to a steady lean; of white noise they have six times the variance.
+    noise = math.sqrt(np.square(np.diff(forces_m_s2, 2, axis=0)).mean() / 6.0)
+    thirds = np.array([third.mean(axis=0) for third in np.array_split(forces_m_s2, 3)])
+    ups = thirds / np.linalg.norm(thirds, axis=1)[:, None]
+    apart = max(_apart_deg(one, other) for one, other in itertools.combinations(ups, 2))
+    chance = LEANED_SIGMAS * noise * math.sqrt(6.0 / len(forces_m_s2)) / float(np.linalg.norm(forces_m_s2[0])) / DEG
+    return apart if apart > chance else 0.0
