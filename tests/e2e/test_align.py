@@ -13,7 +13,6 @@ import pytest
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from companion.estimation.records.record import Record
-from companion.estimation.request import What
 from companion.lab.replay.engine import replay
 from sim.aircraft import Pose
 from sim.ardupilot.double import offset_names
@@ -185,33 +184,12 @@ def test_what_was_calibrated_with_the_old_zero_is_calibrated_anew_by_itself(tmp_
     run_virtual(main())
 
 
-def test_who_may_start_one_and_how_it_ends(tmp_path: Path) -> None:
+def test_armed_in_the_middle_it_ends(tmp_path: Path) -> None:
     made, _ = rig(tmp_path)
 
     async def main() -> None:
         async with made.running():
-            manager = made.service.calibrating.manager
             await made.ready()
-            # A calibration and an alignment exclude each other.
-            job = started(made.service.calibrating.start_alignment({"action": "zero"}, "test"))
-            refused = manager.start_calibration(What.BOTH, "test")
-            assert isinstance(refused, Refusal)
-            assert "a gradienter alignment is running (" in refused.reason
-            await made.until(lambda: "waiting for it to move" in job.words, 60.0)
-            assert manager.cancel("the test")
-            assert (await job.finished).outcome == "cancelled"
-            running = started(manager.start_calibration(What.BOTH, "test"))
-            refused = made.service.calibrating.start_alignment({"action": "zero"}, "test")
-            assert isinstance(refused, Refusal)
-            assert "a calibration is running" in refused.reason
-            manager.cancel("the test")
-            await running.finished
-            # Nobody turns it: it ends by itself, and says where it was.
-            job = started(made.service.calibrating.start_alignment({"action": "zero", "timeout_s": 40.0}, "test"))
-            result = await job.finished
-            assert result.outcome == "failed"
-            assert "not finished in the time given: 2 of 3" in result.reason
-            # Armed in the middle.
             job = started(made.service.calibrating.start_alignment({"action": "zero"}, "test"))
             await made.until(lambda: "measuring" in job.words, 60.0)
             made.double.arm()

@@ -5,7 +5,7 @@ It needs neither a gradienter nor a level spot. After each stand it says what is
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 import numpy as np
@@ -14,10 +14,10 @@ from companion.autopilot.firmware.imu_calibration import whole_accelerometer
 from companion.autopilot.parameters.change import Change
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.stands.alignment import FacesInForce
-from companion.daemon.stands.session import PoseTask
+from companion.daemon.stands.session import PoseTask, SessionState
 from companion.errors import CalibrationRefusedError
-from companion.estimation.alignment.faces import BIAS, SCALE, Face, Faces, faces, missing, seen_before
-from companion.estimation.alignment.poses import LEVEL, AlignmentRequest, Hold, Pose, Wish
+from companion.estimation.alignment.faces import BIAS, SCALE, Face, FacesEstimate, faces, missing, seen_before
+from companion.estimation.alignment.poses import LEVEL, AlignmentRequest, HeldPose, Hold, Wish
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.records.align_record import FaceRecord, FacesRecord, HandRecord, faces_imu_record
 from companion.estimation.solution.draft import Draft
@@ -36,21 +36,16 @@ class SidesTask(PoseTask):
 
     def __init__(self, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], kept: FacesInForce) -> None:
         self._request, self._imus, self._kept = request, imus, kept
-        self.fit_from = 1
-        self._by_imu: dict[str, Faces] = {}
+        self.total, self.fit_from = EXPECTED, 1
+        self._by_imu: dict[str, FacesEstimate] = {}
         self._missing: Wish | None = _FIRST
 
-    def wish(self, poses: Sequence[Pose]) -> Wish | None:  # noqa: D102 - as in the base class
-        return self._missing if len(poses) < MOST else None
+    def wish(self, state: SessionState) -> Wish | None:  # noqa: D102 - as in the base class
+        return self._missing if len(state.poses) < MOST else None
 
-    def total(self, number: int) -> int:  # noqa: D102
-        return max(EXPECTED, number)
-
-    def examine(  # noqa: D102
-        self, windows: Sequence[Window], poses: Sequence[Pose], now: Window
-    ) -> tuple[Pose, str | None]:
-        del windows, poses
-        pose = Pose(np.array(now.imus[0].accel_m_s2))
+    def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:  # noqa: D102
+        del state
+        pose = HeldPose(np.array(now.imus[0].accel_m_s2))
         imu = next((imu for imu in now.imus if imu.name in self._by_imu), None)
         if imu is None or self._missing is None:
             return pose, None
@@ -59,8 +54,8 @@ class SidesTask(PoseTask):
         again = seen_before(found, up / np.linalg.norm(up), self._imus[imu.name].in_force.orientation)
         return pose, None if again is None else f"it stands as in stand {again + 1}: {self._missing.words}"
 
-    def fit(self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth) -> list[str]:  # noqa: D102
-        del poses
+    def fit(self, state: SessionState, local: LocalEarth) -> list[str]:  # noqa: D102
+        windows = state.windows
         before, self._by_imu, self._missing = self._by_imu, {}, None
         for name, imu in self._imus.items():
             means = [one for window in windows for one in window.imus if one.name == name and not one.refused("accel")]
@@ -78,26 +73,21 @@ class SidesTask(PoseTask):
             for stand in set(found.left_out) - set(before[name].left_out if name in before else ())
         ]
 
-    def shortfall(self, poses: Sequence[Pose]) -> str | None:  # noqa: D102
-        del poses
-        return None if self._missing is None else f"after {MOST} stands {self._missing.words.partition(': ')[2]}"
-
-    def record(  # noqa: D102
-        self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth, draft: Draft
-    ) -> FacesRecord:
-        if (shortfall := self.shortfall(poses)) is not None:
-            draft.warnings.append(shortfall)
+    def record(self, state: SessionState, local: LocalEarth, draft: Draft) -> FacesRecord:  # noqa: D102
+        if self._missing is not None:
+            self.shortfall = f"after {MOST} stands {self._missing.words.partition(': ')[2]}"
+            draft.warnings.append(self.shortfall)
         elif self._request.write:
             draft.warnings += self._scales_left()
         first = next(iter(self._by_imu))
         ups = self._by_imu[first].up @ self._imus[first].in_force.orientation.T
-        degrees = {imu.name: imu.temperature_degc for imu in windows[-1].imus}
+        degrees = {imu.name: imu.temperature_degc for imu in state.windows[-1].imus}
         return FacesRecord(
             measured_at=draft.started,
             gravity_m_s2=local.gravity_m_s2,
             stands=tuple(
                 FaceRecord(up=vector(np.round(up, 5)), seconds=window.end_s - window.start_s)
-                for up, window in zip(ups, windows, strict=True)
+                for up, window in zip(ups, state.windows, strict=True)
             ),
             imus=tuple(
                 faces_imu_record(
@@ -137,7 +127,7 @@ class SidesTask(PoseTask):
         sigma = np.sqrt(np.diag(turn @ np.diag(np.square(imu.accel_sigma_use_m_s2)) @ turn.T))
         return Face(turn @ np.array(imu.accel_m_s2), sigma)
 
-    def _whole_m_s2(self, name: str, found: Faces) -> Array:
+    def _whole_m_s2(self, name: str, found: FacesEstimate) -> Array:
         """Return the bias without any offset, in the sensor's own scale, as an offset would correct it."""
         calibration = self._imus[name].in_force
         return np.asarray(calibration.accel_offset_m_s2) + found.figures[BIAS] / calibration.in_use()

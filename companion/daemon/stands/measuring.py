@@ -1,4 +1,4 @@
-"""The measuring of one still window: what is waited for, and when there is enough."""
+"""Measuring one still window: the reasons to wait, and when there is enough."""
 
 from __future__ import annotations
 
@@ -24,36 +24,36 @@ from companion.estimation.request import What
 from companion.links.system.listeners import Listeners
 
 POLL_S: Final = 0.2
-"""A complete second is looked at when it is; this is how often for whatever else may change."""
+"""Interval at which all but a complete second is checked; a second is handled when it is complete."""
 SAY_WAITING_EVERY_S: Final = 10.0
 SAY_LEFT_EVERY_S: Final = 75.0
-"""Through minutes in which nothing is in the way; the first minute of a deck says nothing yet."""
+"""Interval of messages while nothing is in the way; the first minute of a deck says nothing yet."""
 READ_ATTEMPTS: Final = 2
-"""How often, within one calibration, the autopilot's offsets may fail to be read."""
+"""Failed reads of the autopilot's offsets within one calibration that make it fail."""
 MOST_UPSETS: Final = 5
-"""How often, within one calibration, other offsets may come into force, or the autopilot restart."""
+"""Changes of the offsets, or restarts of the autopilot, within one calibration that make it fail."""
 
 
 class Measuring:
-    """Of one aircraft, for one job at a time."""
+    """Measures still windows of one aircraft, for one job at a time."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._core, self._machine, self._imus = core, core.machine, imus
         self._upsets: dict[str, int] = {}
-        """By IMU, how many there had been before this calibration."""
+        """Number of upsets before this calibration, by IMU."""
         self._said, self._said_s = "", -math.inf
         self.on_measured: Listeners[Window] = Listeners()
         """Notified of every window, in the moment in which it is taken."""
 
     def begin(self) -> None:
-        """A calibration begins, which may measure more than once."""
+        """Begin a calibration, which may measure more than once."""
         self._said, self._said_s = "", -math.inf
         self._upsets = {name: imu.upsets for name, imu in self._imus.items()}
 
     async def read_state(self, job: Job, if_armed: str | None) -> tuple[Status, str | None, int | None]:
-        """How it stands now, what is waited for, and for how many seconds to hold still where that is all.
+        """Return the collector's status, the reason to wait, and the seconds to hold still where that is all.
 
-        `if_armed` is why the job fails where it was armed since it began; None: it goes on once it is disarmed.
+        `if_armed`: reason of the failure if it was armed since the job began; None: it goes on once disarmed.
 
         Raises:
             CalibrationRefusedError: armed (in those words), or out of time.
@@ -72,7 +72,7 @@ class Measuring:
         return status, status.obstacle.words, status.obstacle.hold_still_s
 
     def show(self, *, measuring: bool) -> None:
-        """Let the state table follow."""
+        """Report to the state table whether it measures."""
         if measuring and self._machine.state is State.WAITING:
             self._machine.on(Event.STILL)
         elif not measuring and self._machine.state is State.COLLECTING:
@@ -109,7 +109,7 @@ class Measuring:
             collector.on_second.remove(job.look_again)
 
     def tell(self, job: Job, words: str, every_s: float = SAY_WAITING_EVERY_S) -> None:
-        """Tell whoever has asked what is waited for: news, and not too often."""
+        """Tell the requester what is waited for: changes only, and not too often."""
         now_s = asyncio.get_running_loop().time()
         if words != self._said and not job.automatic and now_s - self._said_s >= every_s:
             self._said, self._said_s = words, now_s
@@ -127,7 +127,7 @@ class Measuring:
                 )
 
     def _wanted(self, what: What) -> Settings:
-        """The targets of what was asked for; the rest may be as bad as it likes."""
+        """Return the targets of the requested biases; the others have none."""
         settings = self._core.wanted.settings
         return msgspec.structs.replace(
             settings,

@@ -14,15 +14,15 @@ from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.stands.alignment import AlignmentInForce, FacesInForce
-from companion.daemon.stands.session import ARMED, PoseTask
+from companion.daemon.stands.session import ARMED, PoseTask, SessionState
 from companion.errors import CalibrationRefusedError
-from companion.estimation.alignment.align import Alignment, align, in_words, turned
+from companion.estimation.alignment.align import Alignment, ImuAlignment, align, in_words, turned
 from companion.estimation.alignment.align_model import Ground, ImuStand, Stand
 from companion.estimation.alignment.faces import mounting
 from companion.estimation.alignment.poses import (
     BY_EYE_SIGMA_DEG,
     AlignmentRequest,
-    Pose,
+    HeldPose,
     Wish,
     asked_turn_deg,
     objection,
@@ -33,6 +33,8 @@ from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.records.align_record import (
     AlignmentRecord,
     HandRecord,
+    StandRecord,
+    TurnImuRecord,
     TurnRecord,
     board_record,
     imu_record,
@@ -58,34 +60,35 @@ class SpotTask(PoseTask):
     """An alignment on one spot, with its estimate."""
 
     result: Alignment
+    stands: Sequence[Stand] = ()
 
     def __init__(self, core: Core, request: AlignmentRequest) -> None:
         self._core, self._request = core, request
-        self.fit_from = request.total
+        self.total = self.fit_from = request.total
 
-    def wish(self, poses: Sequence[Pose]) -> Wish | None:  # noqa: D102 - as in the base class
-        return wanted_pose(self._request, poses) if len(poses) < self._request.total else None
+    def wish(self, state: SessionState) -> Wish | None:  # noqa: D102 - as in the base class
+        return wanted_pose(self._request, state.poses) if len(state.poses) < self.total else None
 
-    def total(self, number: int) -> int:  # noqa: D102
-        del number
-        return self._request.total
-
-    def _counted(
-        self, windows: Sequence[Window], poses: Sequence[Pose], now: Window, up: Array, first_sigma_deg: float
-    ) -> Pose:
+    def _counted(self, state: SessionState, now: Window, up: Array, first_sigma_deg: float) -> HeldPose:
         """Return a pose whose heading is the turn that the gyros of the first IMU have counted.
 
         Where samples are missing, as when the autopilot restarts, it was turned as asked.
         """
-        if not poses:
-            return Pose(up, 0.0, first_sigma_deg)
-        before, imu = windows[-1], now.imus[0]
+        if not state.poses:
+            return HeldPose(up, 0.0, first_sigma_deg)
+        before, imu = state.windows[-1], now.imus[0]
         bias = (np.array(before.imus[0].gyro_rad_s) + np.array(imu.gyro_rad_s)) / 2.0
         counted = self._core.collector.counted(imu.name, before.end_s, now.start_s, bias)
-        turn_deg, sigma_deg = asked_turn_deg(self._request, poses), BY_EYE_SIGMA_DEG
+        turn_deg, sigma_deg = asked_turn_deg(self._request, state.poses), BY_EYE_SIGMA_DEG
         if counted is not None:
             turn_deg, sigma_deg = counted.angle_rad / DEG, counted.sigma_rad / DEG
-        return Pose(up, poses[-1].heading_deg + turn_deg, sigma_deg, counted=True)
+        return HeldPose(up, state.poses[-1].heading_deg + turn_deg, sigma_deg, counted=True)
+
+    def _stand_records(self, state: SessionState, zero_deg: tuple[float, float]) -> tuple[StandRecord, ...]:
+        return tuple(
+            stand_record(stand, attitude, window.end_s - window.start_s, zero_deg)
+            for stand, attitude, window in zip(self.stands, self.result.attitudes, state.windows, strict=True)
+        )
 
     def _refuse(self, *, gradienter: bool) -> None:
         if self.result.complaint is not None:
@@ -104,11 +107,8 @@ class ZeroTask(SpotTask):
         self._kept, self._compass = kept, models.compass_model(core.config.compass)
         self._gradienter = models.gradienter_model(core.config.gradienter)
         self._zero_deg = (0.0, 0.0) if core.config.gradienter is None else core.config.gradienter.offset_deg
-        self._stands: list[Stand] = []
 
-    def examine(  # noqa: D102
-        self, windows: Sequence[Window], poses: Sequence[Pose], now: Window
-    ) -> tuple[Pose, str | None]:
+    def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:  # noqa: D102
         assert self._gradienter is not None
         if now.tilt is None:
             raise CalibrationRefusedError("no reading of the gradienter in this stand")
@@ -117,32 +117,30 @@ class ZeroTask(SpotTask):
         except ValueError as error:
             raise CalibrationRefusedError(str(error)) from None
         if self._compass is None or now.heading is None:
-            pose = self._counted(windows, poses, now, up, 0.1)  # headings count from the first stand
+            pose = self._counted(state, now, up, 0.1)  # headings count from the first stand
         else:
             heading_deg = vehicle_heading_rad(self._compass, now.heading.heading_deg, up) / DEG
-            pose = Pose(up, heading_deg, math.hypot(self._compass.sigma_deg, now.heading.sigma_deg))
-        return pose, objection(self._request, poses, pose)
+            pose = HeldPose(up, heading_deg, math.hypot(self._compass.sigma_deg, now.heading.sigma_deg))
+        return pose, objection(self._request, state.poses, pose)
 
-    def fit(self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth) -> list[str]:  # noqa: D102
+    def fit(self, state: SessionState, local: LocalEarth) -> list[str]:  # noqa: D102
         assert self._gradienter is not None
         compass = self._core.config.compass
-        self._stands = as_stands(
-            windows,
-            poses,
-            readable(windows),
+        self.stands = as_stands(
+            state,
+            readable(state.windows),
             on_spot=self._request.on_spot,
             north_deg=local.declination_deg if compass is not None and compass.reference == "magnetic" else 0.0,
             zero_deg=self._zero_deg,
         )
         law, mounted = self._gradienter.law, self._gradienter.vehicle_from_sensor
-        self.result = align(law, mounted, self._stands, ground(local, self._compass))
+        self.result = align(law, mounted, self.stands, ground(local, self._compass))
         self._refuse(gradienter=True)
         return []
 
-    def record(  # noqa: D102
-        self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth, draft: Draft
-    ) -> AlignmentRecord:
-        del poses, local
+    def record(self, state: SessionState, local: LocalEarth, draft: Draft) -> AlignmentRecord:  # noqa: D102
+        del local
+        windows = state.windows
         result, settings, tilt = self.result, self._kept.settings(), windows[0].tilt
         assert settings is not None
         assert self._gradienter is not None
@@ -172,15 +170,9 @@ class ZeroTask(SpotTask):
             chi_square=round(result.chi_square, 3),
             freedom=result.freedom,
             temperature_degc=tilt.temperature_degc if tilt is not None else None,
-            stands=tuple(
-                stand_record(stand, attitude, window.end_s - window.start_s, self._zero_deg)
-                for stand, attitude, window in zip(self._stands, result.attitudes, windows, strict=True)
-            ),
+            stands=self._stand_records(state, self._zero_deg),
             imus=tuple(imu_record(imu, degrees.get(imu.name)) for imu in result.imus),
         )
-
-    def changes(self) -> dict[str, list[Change]]:  # noqa: D102
-        return {}
 
     async def keep(self, record: HandRecord) -> None:  # noqa: D102
         assert isinstance(record, AlignmentRecord)
@@ -199,27 +191,21 @@ class TurnTask(SpotTask):
     ) -> None:
         super().__init__(core, request)
         self._imus, self._known = imus, known
-        self._stands: list[Stand] = []
 
-    def examine(  # noqa: D102
-        self, windows: Sequence[Window], poses: Sequence[Pose], now: Window
-    ) -> tuple[Pose, str | None]:
+    def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:  # noqa: D102
         up = np.array(now.imus[0].accel_m_s2)
-        pose = self._counted(windows, poses, now, up / np.linalg.norm(up), 0.01)
-        return pose, objection(self._request, poses, pose)
+        pose = self._counted(state, now, up / np.linalg.norm(up), 0.01)
+        return pose, objection(self._request, state.poses, pose)
 
-    def fit(self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth) -> list[str]:  # noqa: D102
-        names = readable(windows, among=self._imus)
-        self._stands = as_stands(windows, poses, names, on_spot=len(poses))
-        self.result = turned(self._stands, ground(local, None))
+    def fit(self, state: SessionState, local: LocalEarth) -> list[str]:  # noqa: D102
+        names = readable(state.windows, among=self._imus)
+        self.stands = as_stands(state, names, on_spot=self.total)
+        self.result = turned(self.stands, ground(local, None))
         self._refuse(gradienter=False)
         return []
 
-    def record(  # noqa: D102
-        self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth, draft: Draft
-    ) -> TurnRecord:
-        del poses
-        result, degrees = self.result, _temperatures(windows[-1])
+    def record(self, state: SessionState, local: LocalEarth, draft: Draft) -> TurnRecord:  # noqa: D102
+        result, degrees = self.result, _temperatures(state.windows[-1])
         if self._request.headings == 2 and _level_sigma_m_s2(result) > LOOSE_M_S2:
             draft.warnings.append(
                 f"the spot slopes by {result.slope_deg:.1f} deg: turn it the same way both times, or --headings 4"
@@ -229,28 +215,23 @@ class TurnTask(SpotTask):
         self.board = None if sides is None else mounting(first, sides, local.gravity_m_s2)
         if self.board is None and self._request.level:
             raise CalibrationRefusedError("nothing is known from all sides of these accelerometers: align faces again")
-        none = (0.0, 0.0, 0.0)
-        whole = {
-            imu.name: whole_bias(
-                self._imus[imu.name].in_force, none, vector(imu.level_bias_m_s2), degrees.get(imu.name)
-            )[1]
-            for imu in result.imus
-        }
         return TurnRecord(
             measured_at=draft.started,
             slope_deg=round(result.slope_deg, 3),
             checked=result.checked,
             chi_square=round(result.chi_square, 3),
             freedom=result.freedom,
-            stands=tuple(
-                stand_record(stand, attitude, window.end_s - window.start_s, (0.0, 0.0))
-                for stand, attitude, window in zip(self._stands, result.attitudes, windows, strict=True)
-            ),
-            imus=tuple(turn_imu_record(imu, degrees.get(imu.name), np.array(whole[imu.name])) for imu in result.imus),
+            stands=self._stand_records(state, (0.0, 0.0)),
+            imus=tuple(self._imu_record(imu, degrees.get(imu.name)) for imu in result.imus),
             board=None
             if self.board is None or faces is None
             else board_record(self.board, first.name, faces.measured_at),
         )
+
+    def _imu_record(self, imu: ImuAlignment, temperature_degc: float | None) -> TurnImuRecord:
+        calibration, level = self._imus[imu.name].in_force, vector(imu.level_bias_m_s2)
+        _, whole = whole_bias(calibration, (0.0, 0.0, 0.0), level, temperature_degc)
+        return turn_imu_record(imu, temperature_degc, np.array(whole))
 
     def changes(self) -> dict[str, list[Change]]:  # noqa: D102
         return {
@@ -268,8 +249,7 @@ class TurnTask(SpotTask):
 
 
 def as_stands(
-    windows: Sequence[Window],
-    poses: Sequence[Pose],
+    state: SessionState,
     names: Sequence[str],
     *,
     on_spot: int,
@@ -282,7 +262,7 @@ def as_stands(
     gradienter's as configured.
     """
     stands = []
-    for number, (window, pose) in enumerate(zip(windows, poses, strict=True)):
+    for number, (window, pose) in enumerate(zip(state.windows, state.poses, strict=True)):
         imus, tilt = {imu.name: imu for imu in window.imus}, window.tilt
         x_sigma_deg, y_sigma_deg = (1.0, 1.0) if tilt is None else (tilt.x_sigma_deg, tilt.y_sigma_deg)
         stands.append(

@@ -11,7 +11,7 @@ import abc
 import asyncio
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import ClassVar, Final
 
 import msgspec
@@ -29,7 +29,7 @@ from companion.daemon.stands.measuring import POLL_S, Measuring
 from companion.daemon.stands.writes import AccelWrites, LevelWrites
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.faces import Mounting
-from companion.estimation.alignment.poses import LEVEL, AlignmentRequest, Hold, Pose, Wish, leaned_deg
+from companion.estimation.alignment.poses import LEVEL, AlignmentRequest, HeldPose, Hold, Wish, leaned_deg
 from companion.estimation.machine import Event
 from companion.estimation.means.windows import Window
 from companion.estimation.records.align_record import HandRecord, completed
@@ -82,7 +82,7 @@ class SessionState:
     job: Job
     shown: StandsShown
     windows: list[Window] = dataclasses.field(default_factory=list)
-    poses: list[Pose] = dataclasses.field(default_factory=list)
+    poses: list[HeldPose] = dataclasses.field(default_factory=list)
     first: dict[str, ImuCalibration] = dataclasses.field(default_factory=dict)
     """Offsets and scales during the first stand, by IMU."""
 
@@ -113,25 +113,25 @@ class PoseTask(abc.ABC):
     """Neither gradienter nor compass is waited for: turned over, either may fall silent."""
     if_armed: ClassVar[str | None] = None
     """Why it fails when the aircraft arms; None: it goes on once disarmed."""
+    total: int
+    """Number of poses, about."""
     fit_from: int
     """Number of poses from which the estimate is made, after each."""
     board: Mounting | None = None
     """Tilt of the board, where it can be known."""
+    shortfall: str | None = None
+    """Figure that is still unknown after the last pose; then nothing is written or kept."""
 
     @abc.abstractmethod
-    def wish(self, poses: Sequence[Pose]) -> Wish | None:
+    def wish(self, state: SessionState) -> Wish | None:
         """Return the pose wanted next; None: there are enough."""
 
     @abc.abstractmethod
-    def total(self, number: int) -> int:
-        """Return how many poses there will be, about, when this one is reached."""
-
-    @abc.abstractmethod
-    def examine(self, windows: Sequence[Window], poses: Sequence[Pose], now: Window) -> tuple[Pose, str | None]:
+    def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:
         """Return the pose of a new window, and why it is not the one asked for, if so."""
 
     @abc.abstractmethod
-    def fit(self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth) -> list[str]:
+    def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
         """Estimate from all stands, blocking, in a thread; returns what the operator should hear.
 
         Raises:
@@ -139,21 +139,16 @@ class PoseTask(abc.ABC):
         """
 
     @abc.abstractmethod
-    def record(self, windows: Sequence[Window], poses: Sequence[Pose], local: LocalEarth, draft: Draft) -> HandRecord:
+    def record(self, state: SessionState, local: LocalEarth, draft: Draft) -> HandRecord:
         """Build the record of what was measured, before anything is written; adds warnings to `draft`.
 
         Raises:
             CalibrationRefusedError: the estimate cannot be used as requested.
         """
 
-    @abc.abstractmethod
     def changes(self) -> dict[str, list[Change]]:
         """Return the offsets and scales to write, by IMU."""
-
-    def shortfall(self, poses: Sequence[Pose]) -> str | None:
-        """Say what is still unknown after the last pose; then nothing is written or kept."""
-        del poses
-        return None
+        return {}
 
     async def keep(self, record: HandRecord) -> None:
         """Make the result the active one.
@@ -195,13 +190,12 @@ class PoseSession:
         if request.write and request.action == "faces":
             await self._offsets.prepare()
         state = self._begin(job, task)
-        windows, poses = state.windows, state.poses
-        while (wish := task.wish(poses)) is not None:
+        while (wish := task.wish(state)) is not None:
             await self._measure(state, task, wish)
-            if len(poses) >= task.fit_from:
+            if len(state.poses) >= task.fit_from:
                 local = await self._core.local_earth()
                 try:
-                    heard = await self._core.offload(task.fit, windows, poses, local)
+                    heard = await self._core.offload(task.fit, state, local)
                 except CalibrationRefusedError:
                     # Offsets that somebody else has changed meanwhile would explain it.
                     await self._check_offsets(state)
@@ -211,14 +205,14 @@ class PoseSession:
         await self._check_offsets(state)
         draft = self._core.draft()
         draft.warnings += local.warnings
-        record = task.record(windows, poses, local, draft)
-        shortfall = task.shortfall(poses)
+        record = task.record(state, local, draft)
+        last, shortfall = state.windows[-1], task.shortfall
         level: dict[str, WrittenParameter] = {}
         try:
             if request.write and shortfall is None:
-                await self._offsets.write(job, windows[-1], task.changes(), draft)
+                await self._offsets.write(job, last, task.changes(), draft)
             elif request.level and task.board is not None:
-                level = await self._write_level(job, task.board, windows[-1], draft)
+                level = await self._write_level(job, task.board, last, draft)
         finally:
             warnings = (*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each))
             job.deliver(record := completed(record, warnings, draft.written, level))
@@ -257,7 +251,7 @@ class PoseSession:
         """
         loop, job, shown = asyncio.get_running_loop(), state.job, state.shown
         number = len(state.poses) + 1
-        total = task.total(number)
+        total = max(task.total, number)
         shown.number, shown.total, shown.wish, shown.hold, shown.unknown = number, total, *wish
         if number > 1:
             self._machine.on(Event.MOVED)
@@ -297,7 +291,7 @@ class PoseSession:
     async def _accept(self, state: SessionState, task: PoseTask, request: str, now_s: float) -> bool:
         """Take the stand if it is the pose that is wanted; else object."""
         window = await self._core.window(since_s=state.since_s + SETTLE_S)
-        pose, objection = task.examine(state.windows, state.poses, window)
+        pose, objection = task.examine(state, window)
         forces = self._collector.forces_m_s2(window.imus[0].name, window.start_s, window.end_s)
         # A hand that is taken off too slowly for a movement, or soft ground.
         if (leaned := leaned_deg(np.array(forces))) >= LEANED_DEG:

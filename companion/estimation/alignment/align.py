@@ -113,7 +113,7 @@ class Alignment:
     chi_square: float
     freedom: int
     checked: bool
-    """Whether a spot that moved between two stands would have been noticed."""
+    """True if a spot that moved between two stands would have been noticed."""
     complaint: Complaint | None
 
     @property

@@ -65,7 +65,7 @@ class Stand:
     """The gradienter's readings less the configured offset; None out of its range, or without one."""
     tilt_sigma_deg: tuple[float, float]
     heading_rad: float
-    """From the same north in all stands, which need not be the true one."""
+    """Heading from a north common to all stands, which need not be the true one."""
     heading_sigma_rad: float
     on_spot: bool
     """On the one spot on which the aircraft is turned."""

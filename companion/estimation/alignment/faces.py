@@ -76,14 +76,14 @@ class Sides(msgspec.Struct, frozen=True):
     """Errors of one IMU's accelerometers, known from all sides, under the offsets and scales that are active."""
 
     figures: Array
-    """(9,), as in `Faces`, in the sensor's axes; m/s^2 and no unit."""
+    """(9,), as in `FacesEstimate`, in the sensor's axes; m/s^2 and no unit."""
     sigma: Array
     """One sigma of each; time and temperature have widened those of the biases."""
     vehicle_from_sensor: Matrix
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Faces:
+class FacesEstimate:
     """Estimate from all stands: figures (9,), bias x y z, scale x y z, shear xy xz yz, with their covariance."""
 
     figures: Array
@@ -117,10 +117,10 @@ class Faces:
 
 def faces(
     stands: Sequence[Face], gravity_m_s2: float, gravity_sigma_m_s2: float, wander_m_s2: Array | None = None
-) -> Faces:
+) -> FacesEstimate:
     """Estimate from all stands, at least one; a figure that they do not determine keeps its prior sigma.
 
-    `wander_m_s2` as in `Faces`; None: zero.
+    `wander_m_s2` as in `FacesEstimate`; None: zero.
 
     Raises:
         CalibrationRefusedError: readings that no accelerometer can give.
@@ -145,7 +145,7 @@ def faces(
     stretch, bias = response(fit.figures[SCALE], fit.figures[SHEAR]), fit.figures[BIAS]
     inside = np.linalg.solve(stretch, np.array([stand.accel_m_s2 - bias for stand in stands]).T).T
     lengths = np.linalg.norm(inside, axis=1)
-    return Faces(
+    return FacesEstimate(
         figures=fit.figures,
         by_stands=fit.covariance,
         wander_m_s2=np.zeros(3) if wander_m_s2 is None else wander_m_s2,
@@ -220,7 +220,7 @@ def _judged(residual: Array, scaled: Matrix, at: Array, prior: Array, count: int
     )
 
 
-def missing(found: Faces, vehicle_from_sensor: Matrix) -> Wish | None:
+def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> Wish | None:
     """Return the pose that tells most; None where bias and scale of all axes are known well enough, and checked.
 
     `vehicle_from_sensor`: 3x3, the mounting of the accelerometers in `found`.
@@ -253,7 +253,7 @@ def _wish(side: str, why: str, unknown: tuple[str, ...] = ()) -> Wish:
     return Wish(f"{side}: {why}", Hold(vector(up / np.linalg.norm(up))), unknown)
 
 
-def seen_before(found: Faces, up: Array, vehicle_from_sensor: Matrix) -> int | None:
+def seen_before(found: FacesEstimate, up: Array, vehicle_from_sensor: Matrix) -> int | None:
     """Return the stand, counted from 0, that was held like this one; None for a new one, or if all sides were seen.
 
     `up` is in the sensor's axes, (3,), of length 1; `found` is from the stands before.
@@ -266,7 +266,7 @@ def seen_before(found: Faces, up: Array, vehicle_from_sensor: Matrix) -> int | N
     return nearest if near[nearest] > np.cos(np.radians(SAME_DEG)) else None
 
 
-def _not_seen(found: Faces, vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
+def _not_seen(found: FacesEstimate, vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
     """Return faces that no stand so far was near, else edges between them; up in the sensor's axes."""
     kept = np.delete(found.up, found.left_out, axis=0)
     sides = _all_sides(vehicle_from_sensor)
@@ -284,7 +284,7 @@ def _all_sides(vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
     return [(name, vehicle_from_sensor.T @ up) for name, up in {**faces, **edges}.items()]
 
 
-def _told(found: Faces, up: Array) -> Array:
+def _told(found: FacesEstimate, up: Array) -> Array:
     """Return the share of each figure's variance, (9,), that a stand with `up` upwards would take away."""
     by = np.concatenate([up, found.gravity_m_s2 * up**2, found.gravity_m_s2 * up @ symmetric_by(up)])
     gain = found.by_stands @ by

@@ -66,7 +66,7 @@ class AlignmentRequest(NamedTuple):
 
 
 class Hold(msgspec.Struct, frozen=True):
-    """How to hold the aircraft, for a picture."""
+    """Attitude in which to hold the aircraft, for a picture."""
 
     up: Vector
     """Up in its axes, forward, right, down; length 1."""
@@ -84,19 +84,19 @@ class Wish(NamedTuple):
     """Figures that the stands so far leave open, the worst first."""
 
 
-class Pose(NamedTuple):
-    """How the aircraft stood."""
+class HeldPose(NamedTuple):
+    """Attitude of the aircraft in one stand."""
 
     up: Array
     """Up in its axes, (3,)."""
     heading_deg: float = 0.0
-    """From the compass' own north, else from the first stand; not wrapped where the gyros counted it."""
+    """Heading from the compass' own north, else from the first stand; not wrapped where the gyros counted it."""
     heading_sigma_deg: float = 0.0
     counted: bool = False
     """The sigma is that of the turn since the stand before."""
 
 
-def wanted_pose(request: AlignmentRequest, poses: Sequence[Pose]) -> Wish:
+def wanted_pose(request: AlignmentRequest, poses: Sequence[HeldPose]) -> Wish:
     """Return what the operator should do after these poses of an alignment on a spot."""
     if not poses:
         return Wish("stand it on a firm, marked spot", Hold(LEVEL))
@@ -114,14 +114,14 @@ def wanted_pose(request: AlignmentRequest, poses: Sequence[Pose]) -> Wish:
     return Wish("turn it the same way to its first marks", hold)
 
 
-def asked_turn_deg(request: AlignmentRequest, poses: Sequence[Pose]) -> float:
+def asked_turn_deg(request: AlignmentRequest, poses: Sequence[HeldPose]) -> float:
     """Return the turn that is asked for after these poses; 0 for a tilt."""
     if len(poses) >= request.on_spot:
         return 0.0
     return _to_next_deg(poses, poses[-1]) if request.on_spot >= HEADINGS else 180.0
 
 
-def objection(request: AlignmentRequest, poses: Sequence[Pose], now: Pose) -> str | None:
+def objection(request: AlignmentRequest, poses: Sequence[HeldPose], now: HeldPose) -> str | None:
     """Say why this is not the pose that was asked for, and what to do; None when it is."""
     if not poses:
         askew_deg = _apart_deg(now.up, np.array(LEVEL))
@@ -146,7 +146,7 @@ def objection(request: AlignmentRequest, poses: Sequence[Pose], now: Pose) -> st
     return None
 
 
-def _quarter(poses: Sequence[Pose], now: Pose) -> str | None:
+def _quarter(poses: Sequence[HeldPose], now: HeldPose) -> str | None:
     turned_deg = now.heading_deg - poses[0].heading_deg
     quarters = _quarters(poses[0], now)
     if abs(wrap_deg(turned_deg - quarters * QUARTER_DEG)) > TURN_TOLERANCE_DEG:
@@ -157,11 +157,11 @@ def _quarter(poses: Sequence[Pose], now: Pose) -> str | None:
     return None
 
 
-def _quarters(first: Pose, now: Pose) -> int:
+def _quarters(first: HeldPose, now: HeldPose) -> int:
     return round((now.heading_deg - first.heading_deg) / QUARTER_DEG) % HEADINGS
 
 
-def _to_next_deg(poses: Sequence[Pose], now: Pose) -> float:
+def _to_next_deg(poses: Sequence[HeldPose], now: HeldPose) -> float:
     """Return the turn, clockwise, to the next heading that is still open: the first one, after all others."""
     done = {_quarters(poses[0], pose) for pose in poses}
     open_ones = {0} if len(done) == HEADINGS else set(range(HEADINGS)) - done

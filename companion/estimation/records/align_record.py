@@ -1,6 +1,6 @@
-"""The records of alignments: of the gradienter's zero, of accelerometers held on all sides, of a turn on one spot.
+"""Records of alignments: the gradienter's zero, accelerometers held on all sides, a turn on one spot.
 
-Their keys are a surface that others rely on, like the calibration's. What is unknown is None, never zero.
+Others rely on their keys. An unknown figure is None, never zero.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from companion.estimation.alignment.align import DETERMINED, Figures, ImuAlignment
 from companion.estimation.alignment.align_model import PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, Stand
-from companion.estimation.alignment.faces import BIAS, SCALE, SHEAR, Faces, Mounting
+from companion.estimation.alignment.faces import BIAS, SCALE, SHEAR, FacesEstimate, Mounting
 from companion.estimation.records.record import WrittenParameter
 from companion.physics.frames import Array, Matrix, roll_pitch_from_up, vector
 from companion.physics.units import DEG, DEG_H, MG
@@ -20,14 +20,14 @@ from companion.samples import Vector
 
 FORMAT_VERSION = 1
 MOST_DEG = 90.0
-"""Of a gradienter's zero and of its sigma."""
+"""Limit of a gradienter's zero and of its sigma."""
 
 Pair = tuple[float, float]
 Kind = Literal["zero", "tilts"]
 
 
 class GradienterSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """The gradienter that an alignment belongs to, as configured when it was measured."""
+    """Configuration of the gradienter when the alignment was measured; with another one it is not used."""
 
     port: str
     protocol: str
@@ -37,7 +37,7 @@ class GradienterSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Determined(msgspec.Struct, frozen=True, kw_only=True):
-    """Three figures, one sigma each; `known`: the stands determine it, else it is little more than was known before."""
+    """Three figures, one sigma each; `known`: the stands determine it, else the sigma is about the prior one."""
 
     value: Vector
     sigma: Vector
@@ -45,21 +45,21 @@ class Determined(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LevelRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU, vehicle FRD. Of an autopilot's IMU all is of its output, from which it has taken its own offsets."""
+    """One IMU, vehicle FRD; an autopilot has subtracted its own offsets already."""
 
     name: str
     temperature_degc: float | None
     level_bias_mg: Vector
-    """The effective accelerometer bias when the base is level: what a calibration there finds."""
+    """Effective accelerometer bias when the base is level, as a calibration there finds it."""
     level_sigma_mg: Vector
     gyro_bias_deg_h: Determined
 
 
 class ImuAlignmentRecord(LevelRecord, frozen=True, kw_only=True):
-    """Likewise, beside a gradienter."""
+    """One IMU beside a gradienter."""
 
     accel_bias_mg: Determined
-    """Without scale, shear and misalignment, each of which looks like a bias in one pose."""
+    """Bias proper, without scale, shear and misalignment, each of which looks like a bias in one pose."""
     accel_scale: Determined
     accel_shear: Determined
     """xy, xz, yz."""
@@ -82,15 +82,15 @@ class StandRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SpotRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """What stands on one spot have in common."""
+    """Keys that all alignments on one spot have."""
 
     format_version: int = FORMAT_VERSION
     measured_at: str
     """UTC, ISO 8601; the host's clock."""
     slope_deg: float
-    """Of the spot."""
+    """Slope of the spot."""
     checked: bool
-    """Whether a spot that moved between the stands would have been noticed."""
+    """True if a spot that moved between the stands would have been noticed."""
     chi_square: float
     freedom: int
     stands: tuple[StandRecord, ...]
@@ -98,22 +98,22 @@ class SpotRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AlignmentRecord(SpotRecord, frozen=True, kw_only=True):
-    """A finished alignment."""
+    """The gradienter's zero, measured by turning."""
 
     kind: Kind
     gradienter: GradienterSettings
     offset_deg: Pair
-    """What the gradienter shows too much, on top of `gradienter.offset_deg`."""
+    """Zero of the gradienter on top of `gradienter.offset_deg`."""
     sigma_deg: float
-    """Of both axes: the larger."""
+    """The larger sigma of both axes."""
     covariance_deg2: tuple[Pair, Pair]
     temperature_degc: float | None
-    """Of the gradienter."""
+    """Temperature of the gradienter."""
     imus: tuple[ImuAlignmentRecord, ...]
 
 
 def check(record: AlignmentRecord) -> None:
-    """Whether a record can be used.
+    """Verify that a record can be used.
 
     Raises:
         msgspec.ValidationError: figures that no gradienter has.
@@ -121,6 +121,114 @@ def check(record: AlignmentRecord) -> None:
     figures = [*record.offset_deg, record.sigma_deg]
     if not np.abs(figures).max() < MOST_DEG or record.sigma_deg <= 0.0:
         raise msgspec.ValidationError(f"offset and sigma {figures} cannot be")
+
+
+SAME_START_S = 30.0
+"""Drift between two clocks in weeks; a restart moves the start by at least the time that it had been on."""
+
+
+class FaceRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """One stand: up in the aircraft's axes, forward, right, down."""
+
+    up: Vector
+    seconds: float
+
+
+class Running(msgspec.Struct, frozen=True, kw_only=True):
+    """One power-up of a sensor; another one has other biases."""
+
+    host: str
+    """Identity of the companion computer's start, whose clock counts."""
+    started_s: float
+    """When the sensor's device started, on that clock."""
+    up_s: float
+    """For how long it had been on."""
+
+    def is_same(self, other: Running) -> bool:
+        """Return whether the power has surely been on in between."""
+        return self.host == other.host != "" and abs(self.started_s - other.started_s) < SAME_START_S
+
+
+class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU, in its own axes; the autopilot has subtracted its offsets already."""
+
+    name: str
+    accel_id: int | None
+    """The accelerometer's device id in the autopilot."""
+    corrections: dict[str, float]
+    """Offsets and scales that were active, by parameter."""
+    temperature_degc: float | None
+    running: Running | None = None
+    """None where the device does not tell since when it has been on."""
+    accel_bias_mg: Determined
+    accel_scale: Determined
+    accel_shear: Determined
+    """xy, xz, yz; no firmware corrects it."""
+    left_out: tuple[int, ...]
+    """Stands, from 1, that do not fit the others."""
+    scatter_mg: float
+    """Rms by which the stands' readings, corrected, miss the length of gravity."""
+    written: dict[str, WrittenParameter]
+    """Empty where nothing was to be written."""
+    whole_bias_mg: Vector | None = None
+    """Bias of the sensor without any offset, as it is written; None: of an earlier version."""
+
+
+class FacesRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """Accelerometers measured on all sides."""
+
+    format_version: int = FORMAT_VERSION
+    kind: Literal["faces"] = "faces"
+    measured_at: str
+    gravity_m_s2: float
+    stands: tuple[FaceRecord, ...]
+    imus: tuple[FacesImuRecord, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def check_faces(record: FacesRecord) -> None:
+    """Verify that a record can be used.
+
+    Raises:
+        msgspec.ValidationError: figures that no accelerometer has.
+    """
+    for imu in record.imus:
+        for found, most in ((imu.accel_bias_mg, 1e4), (imu.accel_scale, 0.5)):
+            if not np.abs([*found.value, *found.sigma]).max() < most or min(found.sigma) <= 0.0:
+                raise msgspec.ValidationError(f"bias or scale of {imu.name} cannot be")
+
+
+class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
+    """One IMU, turned on a spot without a gradienter."""
+
+    written: dict[str, WrittenParameter] = {}
+    """Empty where nothing was to be written."""
+    whole_bias_mg: Vector | None = None
+    """`level_bias_mg` without the autopilot's offsets, as it would be written; None: of an earlier version."""
+
+
+class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """Tilt of the board against the base: the attitude (roll right side down) that it shows on a level base."""
+
+    imu: str
+    """IMU whose accelerometers showed it; their bias and scale are known from all sides."""
+    faces_measured_at: str
+    roll_deg: float
+    pitch_deg: float
+    sigma_deg: tuple[float, float]
+    written: dict[str, WrittenParameter] = {}
+
+
+class TurnRecord(SpotRecord, frozen=True, kw_only=True):
+    """A turn on one spot without a gradienter."""
+
+    kind: Literal["turn"] = "turn"
+    imus: tuple[TurnImuRecord, ...]
+    board: BoardRecord | None = None
+    """None where the accelerometers are not known from all sides."""
+
+
+HandRecord = AlignmentRecord | FacesRecord | TurnRecord
 
 
 def stand_record(stand: Stand, attitude: Matrix, seconds: float, configured: Pair) -> StandRecord:
@@ -139,166 +247,18 @@ def stand_record(stand: Stand, attitude: Matrix, seconds: float, configured: Pai
 
 
 def imu_record(imu: ImuAlignment, temperature_degc: float | None) -> ImuAlignmentRecord:
-    """One IMU in the units that people know."""
+    """Return one IMU in the units of the record."""
     return ImuAlignmentRecord(
         name=imu.name,
         temperature_degc=temperature_degc,
         level_bias_mg=_axes(imu.level_bias_m_s2 / MG),
         level_sigma_mg=_axes(np.sqrt(np.diag(imu.level_covariance_m2_s4)) / MG),
-        accel_bias_mg=determined(imu.accel_bias_m_s2, MG),
-        accel_scale=determined(imu.scale, 1.0),
-        accel_shear=determined(imu.shear, 1.0),
-        misalignment_deg=determined(imu.misalignment_rad, DEG),
-        gyro_bias_deg_h=determined(imu.gyro_bias_rad_s, DEG_H),
+        accel_bias_mg=_determined(imu.accel_bias_m_s2, MG),
+        accel_scale=_determined(imu.scale, 1.0),
+        accel_shear=_determined(imu.shear, 1.0),
+        misalignment_deg=_determined(imu.misalignment_rad, DEG),
+        gyro_bias_deg_h=_determined(imu.gyro_bias_rad_s, DEG_H),
     )
-
-
-def determined(figures: Figures, unit: float) -> Determined:
-    """In another unit, rounded."""
-    x, y, z = (bool(one) for one in figures.determined)
-    return Determined(value=_axes(figures.value / unit), sigma=_axes(figures.sigma / unit), known=(x, y, z))
-
-
-def _axes(values: Array) -> Vector:
-    return vector(np.round(values, 7))
-
-
-SAME_START_S = 30.0
-"""By how much two clocks run apart in weeks; a restart takes away at least all the time that it had been on."""
-
-
-class FaceRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One stand: up in the aircraft's axes, forward, right, down."""
-
-    up: Vector
-    seconds: float
-
-
-class Running(msgspec.Struct, frozen=True, kw_only=True):
-    """Which run of a sensor it was; another one has other biases."""
-
-    host: str
-    """Which start of the companion computer, whose clock counts."""
-    started_s: float
-    """When the sensor's device started, on that clock."""
-    up_s: float
-    """For how long it had been on."""
-
-    def is_same(self, other: Running) -> bool:
-        """Whether the power has surely been on in between."""
-        return self.host == other.host != "" and abs(self.started_s - other.started_s) < SAME_START_S
-
-
-class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU, in its own axes, of its output as it was: what the autopilot takes off already is not in it."""
-
-    name: str
-    accel_id: int | None
-    """The accelerometer's device id in the autopilot."""
-    corrections: dict[str, float]
-    """Offsets and scales in force meanwhile, by parameter."""
-    temperature_degc: float | None
-    running: Running | None = None
-    """None where the device does not tell since when it has been on."""
-    accel_bias_mg: Determined
-    accel_scale: Determined
-    accel_shear: Determined
-    """xy, xz, yz; no firmware takes it off."""
-    left_out: tuple[int, ...]
-    """Stands, from 1, that do not fit the others."""
-    scatter_mg: float
-    """Rms by which the stands' readings, corrected, miss the length of gravity."""
-    written: dict[str, WrittenParameter]
-    """Empty where nothing was to be written."""
-    whole_bias_mg: Vector | None = None
-    """Bias of the sensor without any offset, as it is written; None: of an earlier version."""
-
-
-class FacesRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Finished."""
-
-    format_version: int = FORMAT_VERSION
-    kind: Literal["faces"] = "faces"
-    measured_at: str
-    gravity_m_s2: float
-    stands: tuple[FaceRecord, ...]
-    imus: tuple[FacesImuRecord, ...]
-    warnings: tuple[str, ...] = ()
-
-
-def check_faces(record: FacesRecord) -> None:
-    """Whether a record can be used.
-
-    Raises:
-        msgspec.ValidationError: figures that no accelerometer has.
-    """
-    for imu in record.imus:
-        for found, most in ((imu.accel_bias_mg, 1e4), (imu.accel_scale, 0.5)):
-            if not np.abs([*found.value, *found.sigma]).max() < most or min(found.sigma) <= 0.0:
-                raise msgspec.ValidationError(f"bias or scale of {imu.name} cannot be")
-
-
-def faces_imu_record(
-    found: Faces,
-    *,
-    name: str,
-    accel_id: int | None,
-    corrections: dict[str, float],
-    temperature_degc: float | None,
-    running: Running | None,
-    whole_m_s2: Array,
-) -> FacesImuRecord:
-    """One IMU in the units that people know, before anything is written."""
-    kept = [k for k in range(len(found.off_m_s2)) if k not in found.left_out]
-    return FacesImuRecord(
-        name=name,
-        accel_id=accel_id,
-        corrections=corrections,
-        temperature_degc=temperature_degc,
-        running=running,
-        accel_bias_mg=_determined(found, BIAS, MG, PRIOR_BIAS_M_S2),
-        accel_scale=_determined(found, SCALE, 1.0, PRIOR_SCALE),
-        accel_shear=_determined(found, SHEAR, 1.0, PRIOR_SHEAR),
-        left_out=tuple(k + 1 for k in found.left_out),
-        scatter_mg=round(float(np.sqrt(np.mean(np.square(found.off_m_s2[kept])))) / MG, 4),
-        written={},
-        whole_bias_mg=_axes(whole_m_s2 / MG),
-    )
-
-
-def _determined(found: Faces, part: slice, unit: float, before: float) -> Determined:
-    sigma = found.sigma[part]
-    return determined(Figures(found.figures[part], sigma, sigma < DETERMINED * before), unit)
-
-
-class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
-    """Likewise, and what became of it."""
-
-    written: dict[str, WrittenParameter] = {}
-    """Empty where nothing was to be written."""
-    whole_bias_mg: Vector | None = None
-    """`level_bias_mg` without the autopilot's offsets, as it would be written; None: of an earlier version."""
-
-
-class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """How the board sits against the base: what its attitude (roll right side down) shows too much on a level base."""
-
-    imu: str
-    """Whose accelerometers told; their bias and scale are known from all sides."""
-    faces_measured_at: str
-    roll_deg: float
-    pitch_deg: float
-    sigma_deg: tuple[float, float]
-    written: dict[str, WrittenParameter] = {}
-
-
-class TurnRecord(SpotRecord, frozen=True, kw_only=True):
-    """Finished."""
-
-    kind: Literal["turn"] = "turn"
-    imus: tuple[TurnImuRecord, ...]
-    board: BoardRecord | None = None
-    """None where nothing is known from all sides."""
 
 
 def turn_imu_record(imu: ImuAlignment, temperature_degc: float | None, whole_m_s2: Array) -> TurnImuRecord:
@@ -319,7 +279,37 @@ def board_record(board: Mounting, imu: str, faces_measured_at: str) -> BoardReco
     )
 
 
-HandRecord = AlignmentRecord | FacesRecord | TurnRecord
+def faces_imu_record(
+    found: FacesEstimate,
+    *,
+    name: str,
+    accel_id: int | None,
+    corrections: dict[str, float],
+    temperature_degc: float | None,
+    running: Running | None,
+    whole_m_s2: Array,
+) -> FacesImuRecord:
+    """Return one IMU in the units of the record, before anything is written."""
+
+    def part(place: slice, unit: float, prior: float) -> Determined:
+        sigma = found.sigma[place]
+        return _determined(Figures(found.figures[place], sigma, sigma < DETERMINED * prior), unit)
+
+    kept = [k for k in range(len(found.off_m_s2)) if k not in found.left_out]
+    return FacesImuRecord(
+        name=name,
+        accel_id=accel_id,
+        corrections=corrections,
+        temperature_degc=temperature_degc,
+        running=running,
+        accel_bias_mg=part(BIAS, MG, PRIOR_BIAS_M_S2),
+        accel_scale=part(SCALE, 1.0, PRIOR_SCALE),
+        accel_shear=part(SHEAR, 1.0, PRIOR_SHEAR),
+        left_out=tuple(k + 1 for k in found.left_out),
+        scatter_mg=round(float(np.sqrt(np.mean(np.square(found.off_m_s2[kept])))) / MG, 4),
+        written={},
+        whole_bias_mg=_axes(whole_m_s2 / MG),
+    )
 
 
 def completed(
@@ -337,3 +327,12 @@ def completed(
         return replace(record, imus=imus, warnings=warnings)
     board = None if record.board is None else replace(record.board, written=level)
     return replace(record, imus=imus, board=board, warnings=warnings)
+
+
+def _determined(figures: Figures, unit: float) -> Determined:
+    x, y, z = (bool(one) for one in figures.determined)
+    return Determined(value=_axes(figures.value / unit), sigma=_axes(figures.sigma / unit), known=(x, y, z))
+
+
+def _axes(values: Array) -> Vector:
+    return vector(np.round(values, 7))

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.alignment.faces import BIAS, SCALE, SHEAR, Face, Faces, faces, missing, seen_before
+from companion.estimation.alignment.faces import BIAS, SCALE, SHEAR, Face, FacesEstimate, faces, missing, seen_before
 from companion.estimation.alignment.poses import LEVEL, Hold, Wish
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import MG
@@ -57,7 +57,7 @@ class Sensor:
         return [self.read(self.up(*pose)) for pose in poses]
 
 
-def solved(stands: list[Face]) -> Faces:
+def solved(stands: list[Face]) -> FacesEstimate:
     return faces(stands, SITE.gravity_m_s2, 3e-4)
 
 

@@ -13,7 +13,7 @@ import pytest
 from companion.component.statustext import Severity, as_lines
 from companion.estimation.alignment.poses import (
     AlignmentRequest,
-    Pose,
+    HeldPose,
     asked_turn_deg,
     leaned_deg,
     objection,
@@ -21,32 +21,20 @@ from companion.estimation.alignment.poses import (
 )
 
 
-def stands(heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Pose:
+def stands(heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> HeldPose:
     theta, gamma = math.radians(pitch_deg), math.radians(roll_deg)
     up = [math.sin(theta), -math.sin(gamma) * math.cos(theta), -math.cos(gamma) * math.cos(theta)]
-    return Pose(np.array(up), heading_deg)
+    return HeldPose(np.array(up), heading_deg)
 
 
 LEVEL = stands(350.0, 0.4, -0.3)
-
-
-@pytest.mark.parametrize(
-    ("plan", "total", "on_spot"),
-    [
-        (AlignmentRequest("zero"), 3, 3),
-        (AlignmentRequest("zero", headings=4), 4, 4),
-        (AlignmentRequest("tilts"), 8, 4),
-    ],
-)
-def test_how_many_stands(plan: AlignmentRequest, total: int, on_spot: int) -> None:
-    assert (plan.total, plan.on_spot) == (total, on_spot)
 
 
 def test_there_and_back() -> None:
     plan = AlignmentRequest("zero")
     assert "marked spot" in wanted_pose(plan, []).words
     assert objection(plan, [], LEVEL) is None
-    propped = Pose(np.array([np.sin(np.radians(45.0)), 0.0, -np.cos(np.radians(45.0))]), 0.0)
+    propped = HeldPose(np.array([np.sin(np.radians(45.0)), 0.0, -np.cos(np.radians(45.0))]), 0.0)
     assert objection(plan, [], propped) == "tilted by 45 degrees: stand it on its base"
     assert "by 180 degrees" in wanted_pose(plan, [LEVEL]).words
     for heading in (170.0, 150.0, 195.0):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.estimation.alignment.align import ALONE, Alignment, Complaint, in_words, turned
+from companion.estimation.alignment.align import Alignment, Complaint, in_words, turned
 from companion.estimation.alignment.align_model import Ground, ImuStand, Row, Stand
 from companion.estimation.alignment.faces import Face, Sides, faces, mounting
 from companion.physics.frames import rotation_matrix
@@ -187,47 +187,6 @@ def test_the_covariance_of_the_tilt_is_that_of_what_it_is_made_of() -> None:
         )
         drawn.append([one.roll_rad, one.pitch_rad])
     np.testing.assert_allclose(np.std(drawn, axis=0), said, rtol=0.15)
-
-
-def test_priors_hold_boards_that_were_put_in_by_eye() -> None:
-    assert ALONE.misalignment_deg >= 3.0
-    tilted = solved(on_spot((2.0, 1.0), QUARTERS))
-    assert tilted.imus[0].misalignment_rad.sigma.max() > 1.0 * DEG, "a spot does not tell a bias from a tilted board"
-
-
-def test_hands_hold_it_in_any_orientation_and_put_it_onto_another_spot() -> None:
-    aircraft = VirtualAircraft(Pose(1.0, 2.0, 40.0), SITE)
-    hands = Hands(aircraft)
-    end_s = hands.hold(0.0, 0.0, 180.0)
-    np.testing.assert_allclose(aircraft.truth_at(end_s + 1.0).force_m_s2, [0.0, 0.0, G], atol=1e-9)
-    end_s = hands.hold(end_s + 2.0, -90.0, 0.0)
-    np.testing.assert_allclose(aircraft.truth_at(end_s + 1.0).force_m_s2, [-G, 0.0, 0.0], atol=1e-9)
-    end_s = hands.spot(end_s + 2.0, 3.0, 0.0)
-    assert aircraft.pose_at(end_s + 1.0).pitch_deg == pytest.approx(3.0)
-    end_s = hands.turn(end_s + 2.0, 180.0)
-    assert aircraft.pose_at(end_s + 1.0).pitch_deg == pytest.approx(-3.0)
-    assert "on its back" in hands.obey("hold 1", 0.0)
-
-
-@pytest.mark.parametrize(
-    ("words", "force_g"),
-    [
-        ("[  8 %] 2 of 12: on its back: z bias uncertain by 30 mg; waiting for it to move", (0, 0, 1)),
-        ("3 of 12: between level and nose up: x bias uncertain by 2 mg", (0.5**0.5, 0, -(0.5**0.5))),
-        ("Place vehicle nose DOWN and press any key.", (-1, 0, 0)),
-        ("Place vehicle on its LEFT side and press any key.", (0, 1, 0)),
-    ],
-)
-def test_hands_follow_what_is_asked_for(words: str, force_g: tuple[float, ...]) -> None:
-    aircraft = VirtualAircraft(Pose(1.0, 2.0, 40.0), SITE)
-    hands = Hands(aircraft)
-    assert hands.follow(words, 0.0)
-    np.testing.assert_allclose(aircraft.truth_at(10.0).force_m_s2, np.multiply(force_g, G), atol=1e-9)
-    assert not hands.follow("2 of 12: measuring, 3 of 12 s, hands off", 10.0)
-    assert hands.follow("1 of 5: 100 degrees, not 180: turn it by 80 degrees more", 10.0)
-    assert hands.follow("3 of 3: turn it the same way to its first marks", 20.0)
-    assert aircraft.pose_at(30.0).heading_deg == pytest.approx(40.0)
-    assert aircraft.pose_at(30.0).pitch_deg == pytest.approx(1.0)
 
 
 def test_a_hand_that_stays_on_it_trembles_and_leaves_it_as_it_was() -> None:
