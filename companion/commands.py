@@ -216,7 +216,9 @@ class Align(Command, frozen=True, tag="align"):
     ] = None
     headings: Annotated[
         Literal[2, 4] | None,
-        Option("2: there, turned, back (of zero without it); 4: every 90 deg (of turn without it)", by=by),
+        Option(
+            "2: there, turned by 180 deg, on the same way (zero without it); 4: every 90 deg (turn without it)", by=by
+        ),
     ] = None
     level: Annotated[bool, Option("turn, after faces: write how the board sits (AHRS_TRIM, SENS_BOARD)", by=by)] = False
     write: Annotated[bool, Option("turn, faces: write what was found to the autopilot", by=by)] = False

@@ -9,7 +9,6 @@ from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import ALIGNMENT, FACES, TURN, Job
-from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.alignment import AlignmentInForce, FacesInForce
 from companion.daemon.stands.all_sides import SidesTask
@@ -39,13 +38,12 @@ class Alignments:
         imus: Mapping[str, AutopilotImu],
         measuring: Measuring,
         offsets: Offsets,
-        conclusion: Conclusion,
         own: OwnAttitude,
         alignment: AlignmentInForce,
         faces: FacesInForce,
     ) -> None:
         self._core, self._imus, self._alignment, self._faces = core, imus, alignment, faces
-        self._writes = AccelWrites(core, imus, offsets, conclusion)
+        self._writes = AccelWrites(core, imus, offsets)
         self._session = PoseSession(core, imus, measuring, self._writes, LevelWrites(core, imus, offsets, own))
 
     @property

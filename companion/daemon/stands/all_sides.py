@@ -13,6 +13,7 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import whole_accelerometer
 from companion.autopilot.parameters.change import Change
 from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.offsets.plan import WriteLog
 from companion.daemon.stands.alignment import FacesInForce
 from companion.daemon.stands.session import PoseTask, SessionState
 from companion.errors import CalibrationRefusedError
@@ -20,7 +21,6 @@ from companion.estimation.alignment.faces import BIAS, SCALE, Face, FacesEstimat
 from companion.estimation.alignment.poses import LEVEL, AlignmentRequest, HeldPose, Hold, Wish
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.records.align_record import FaceRecord, FacesRecord, HandRecord, faces_imu_record
-from companion.estimation.solution.draft import Draft
 from companion.estimation.solution.site import LocalEarth
 from companion.physics.frames import Array, vector
 from companion.physics.units import MG
@@ -73,17 +73,17 @@ class SidesTask(PoseTask):
             for stand in set(found.left_out) - set(before[name].left_out if name in before else ())
         ]
 
-    def record(self, state: SessionState, local: LocalEarth, draft: Draft) -> FacesRecord:  # noqa: D102
+    def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> FacesRecord:  # noqa: D102
         if self._missing is not None:
             self.shortfall = f"after {MOST} stands {self._missing.words.partition(': ')[2]}"
-            draft.warnings.append(self.shortfall)
+            log.warnings.append(self.shortfall)
         elif self._request.write:
-            draft.warnings += self._scales_left()
+            log.warnings += self._scales_left()
         first = next(iter(self._by_imu))
         ups = self._by_imu[first].up @ self._imus[first].in_force.orientation.T
         degrees = {imu.name: imu.temperature_degc for imu in state.windows[-1].imus}
         return FacesRecord(
-            measured_at=draft.started,
+            measured_at=log.started,
             gravity_m_s2=local.gravity_m_s2,
             stands=tuple(
                 FaceRecord(up=vector(np.round(up, 5)), seconds=window.end_s - window.start_s)

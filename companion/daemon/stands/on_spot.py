@@ -13,6 +13,7 @@ from companion.autopilot.parameters.change import Change
 from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.offsets.plan import WriteLog
 from companion.daemon.stands.alignment import AlignmentInForce, FacesInForce
 from companion.daemon.stands.session import ARMED, PoseTask, SessionState
 from companion.errors import CalibrationRefusedError
@@ -41,7 +42,6 @@ from companion.estimation.records.align_record import (
     stand_record,
     turn_imu_record,
 )
-from companion.estimation.solution.draft import Draft
 from companion.estimation.solution.site import LocalEarth
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG, MG
@@ -138,20 +138,20 @@ class ZeroTask(SpotTask):
         self._refuse(gradienter=True)
         return []
 
-    def record(self, state: SessionState, local: LocalEarth, draft: Draft) -> AlignmentRecord:  # noqa: D102
+    def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> AlignmentRecord:  # noqa: D102
         del local
         windows = state.windows
         result, settings, tilt = self.result, self._kept.settings(), windows[0].tilt
         assert settings is not None
         assert self._gradienter is not None
         if result.slope_deg > SLOPE_WARNING_DEG:
-            draft.warnings.append(
+            log.warnings.append(
                 f"the spot slopes by {result.slope_deg:.1f} deg, so that each degree of heading error counts: a flatter"
                 " one gives a better zero"
             )
         largest_deg, usual_deg = float(np.abs(result.offset_deg).max()), self._gradienter.sigma_deg
         if largest_deg > OFFSET_WARNING_SIGMAS * usual_deg:
-            draft.warnings.append(
+            log.warnings.append(
                 f"the zero is off by {largest_deg:.2f} deg, {largest_deg / usual_deg:.0f} times sigma_deg of the"
                 " configuration: does the aircraft stand level on its base, not on wheels nose up?"
             )
@@ -160,7 +160,7 @@ class ZeroTask(SpotTask):
         degrees = _temperatures(windows[0])
         return AlignmentRecord(
             kind="tilts" if self._request.action == "tilts" else "zero",
-            measured_at=draft.started,
+            measured_at=log.started,
             gradienter=settings,
             offset_deg=(x_deg, y_deg),
             sigma_deg=round(float(result.offset_sigma_deg.max()), 6),
@@ -204,10 +204,10 @@ class TurnTask(SpotTask):
         self._refuse(gradienter=False)
         return []
 
-    def record(self, state: SessionState, local: LocalEarth, draft: Draft) -> TurnRecord:  # noqa: D102
+    def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> TurnRecord:  # noqa: D102
         result, degrees = self.result, _temperatures(state.windows[-1])
         if self._request.headings == 2 and _level_sigma_m_s2(result) > LOOSE_M_S2:
-            draft.warnings.append(
+            log.warnings.append(
                 f"the spot slopes by {result.slope_deg:.1f} deg: turn it the same way both times, or --headings 4"
             )
         first, faces = result.imus[0], self._known.record
@@ -216,7 +216,7 @@ class TurnTask(SpotTask):
         if self.board is None and self._request.level:
             raise CalibrationRefusedError("nothing is known from all sides of these accelerometers: align faces again")
         return TurnRecord(
-            measured_at=draft.started,
+            measured_at=log.started,
             slope_deg=round(result.slope_deg, 3),
             checked=result.checked,
             chi_square=round(result.chi_square, 3),

@@ -25,6 +25,7 @@ from companion.component.tunes import Tune
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
+from companion.daemon.offsets.plan import WriteLog
 from companion.daemon.stands.measuring import POLL_S, Measuring
 from companion.daemon.stands.writes import AccelWrites, LevelWrites
 from companion.errors import CalibrationRefusedError
@@ -34,7 +35,6 @@ from companion.estimation.machine import Event
 from companion.estimation.means.windows import Window
 from companion.estimation.records.align_record import HandRecord, completed
 from companion.estimation.records.record import WrittenParameter
-from companion.estimation.solution.draft import Draft
 from companion.estimation.solution.site import LocalEarth
 from companion.physics.units import DEG
 from companion.storage.changes import Origin
@@ -139,8 +139,8 @@ class PoseTask(abc.ABC):
         """
 
     @abc.abstractmethod
-    def record(self, state: SessionState, local: LocalEarth, draft: Draft) -> HandRecord:
-        """Build the record of what was measured, before anything is written; adds warnings to `draft`.
+    def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> HandRecord:
+        """Build the record of what was measured, before anything is written; adds warnings to `log`.
 
         Raises:
             CalibrationRefusedError: the estimate cannot be used as requested.
@@ -203,19 +203,19 @@ class PoseSession:
                 for words in heard:
                     self._say(Severity.NOTICE, words)
         await self._check_offsets(state)
-        draft = self._core.draft()
-        draft.warnings += local.warnings
-        record = task.record(state, local, draft)
+        log = WriteLog()
+        log.warnings += local.warnings
+        record = task.record(state, local, log)
         last, shortfall = state.windows[-1], task.shortfall
         level: dict[str, WrittenParameter] = {}
         try:
             if request.write and shortfall is None:
-                await self._offsets.write(job, last, task.changes(), draft)
+                await self._offsets.write(job, last, task.changes(), log)
             elif request.level and task.board is not None:
-                level = await self._write_level(job, task.board, last, draft)
+                level = await self._write_level(job, task.board, last, log)
         finally:
-            warnings = (*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each))
-            job.deliver(record := completed(record, warnings, draft.written, level))
+            warnings = (*log.warnings, *(words for each in log.imu_warnings.values() for words in each))
+            job.deliver(record := completed(record, warnings, log.written, level))
         if shortfall is None:
             await task.keep(record)
         elif request.write:
@@ -381,10 +381,10 @@ class PoseSession:
                     )
             raise _changed(name)
 
-    async def _write_level(self, job: Job, board: Mounting, last: Window, draft: Draft) -> dict[str, WrittenParameter]:
-        written, warning = await self._levels.write(job, board, last, Origin("level", draft.started))
+    async def _write_level(self, job: Job, board: Mounting, last: Window, log: WriteLog) -> dict[str, WrittenParameter]:
+        written, warning = await self._levels.write(job, board, last, Origin("level", log.started))
         if warning is not None:
-            draft.warnings.append(warning)
+            log.warnings.append(warning)
             self._say(Severity.WARNING, warning)
         return written
 
