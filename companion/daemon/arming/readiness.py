@@ -1,7 +1,7 @@
-"""May it arm? The answer is always ready: worked out several times a second, given in microseconds.
+"""The answer to an arming request, and why: prepared four times a second, given in microseconds.
 
 PX4 waits for it with its commander thread stopped (autopilots 5.2), so that nothing may be computed, read or awaited
-once the question is there.
+once the request is there. `Readiness._judge` lists what keeps the gate closed, in the order in which it is reported.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ logger = logging.getLogger(__name__)
 POLL_S: Final = 0.25
 BY_ITSELF: Final = "calibrates by itself"
 STEADY_S: Final = 2.0
-"""How long it must have been still when somebody arms: whoever arms has just let go of it."""
-OLDEST_SAID_S: Final = 2.0
+"""How long it must have been still when somebody arms, who has just let go of it."""
+COUNTDOWN_KEPT_S: Final = 2.0
 """A countdown that was not asked for meanwhile begins anew."""
 OLDEST_ANSWER_S: Final = 1.5
-"""An answer that was not renewed for so long (the loop stood still) is none."""
-_IN_THE_MIDDLE: Final[dict[State, str]] = {
+"""An older answer, which the loop has not renewed, is not given."""
+_STEPS: Final[dict[State, str]] = {
     State.DITHERING: "dithering offsets",
     State.WRITING: "writing offsets",
     State.VERIFYING: "checking new offsets",
@@ -45,16 +45,16 @@ _IN_THE_MIDDLE: Final[dict[State, str]] = {
     State.SETTLING: ADJUSTING,
     State.UNDOING: "putting back old offsets",
 }
-_LOOKED_AT: Final[dict[Why, str]] = {
+_CHECKED_NEXT: Final[dict[Why, str]] = {
     Why.REBOOTED: "checking after restart",
-    Why.UNSEEN: _IN_THE_MIDDLE[State.VERIFYING],
+    Why.UNSEEN: _STEPS[State.VERIFYING],
 }
-"""What the next look at the output tells, and nobody has to do anything about before."""
+"""Findings that the next still window settles without anybody's help."""
 _CLOSED: Final = (Rung.FAULT, Rung.CONFLICT, Rung.SECOND, Rung.UNKNOWN, Rung.PENDING)
-"""What keeps the gate closed whatever is in force; the other rungs have answers of their own."""
+"""Obstacles that close the gate whatever is in force."""
 _WAITS: Final = {
     Rung.UNKNOWN: "no heartbeat from the autopilot",
-    Rung.PENDING: f"{_IN_THE_MIDDLE[State.UNDOING]}: wait",
+    Rung.PENDING: f"{_STEPS[State.UNDOING]}: wait",
 }
 WRITE_S: Final = {"px4": 8.0}
 """Time to write the offsets, by firmware. PX4 takes one vector after another: 7 s for one IMU."""
@@ -63,100 +63,57 @@ OTHER_WRITE_S: Final = 5.0
 LATE_S: Final = 2.0
 """Until the last second of telemetry is complete and judged."""
 EKF_S: Final = {"ardupilot": 3.0}
-"""What its EKF takes to show that it has settled, where the firmware's calibration has reset it."""
+"""Time in which the EKF shows that it has settled, where the firmware's calibration has reset it."""
 MOVED_S: Final = 4.0
-"""An estimate that has slipped by so much is of a look that has begun again."""
+"""An estimate that has slipped by this much belongs to a check that a movement has restarted."""
 
-
-class Forecast:
-    """Of the write that the manager does."""
-
-    def __init__(self, core: Core, manager: CalibrationManager) -> None:
-        self._vehicle, self._collector, self._manager = core.vehicle, core.collector, manager
-        self._min_still_s = core.config.calibration.min_still_s
-        self._promised: tuple[object, float] | None = None
-        """The state, and the time at which its end was promised."""
-
-    @property
-    def whole_s(self) -> float:
-        """From the end of the measurement until the new offsets are known to be right, without a dither."""
-        firmware = self._vehicle.firmware or ""
-        return WRITE_S.get(firmware, OTHER_WRITE_S) + self._check_s + EKF_S.get(firmware, 0.0)
-
-    @property
-    def _check_s(self) -> float:
-        return settle_s(self._vehicle.firmware) + min(self._min_still_s, LOOK_S) + LATE_S
-
-    @property
-    def _job_s(self) -> float:
-        job = self._manager.running
-        return 0.0 if job is None else job.left_s
-
-    def answer(self, now_s: float) -> ArmAnswer:
-        """What is going on and for how long yet, for somebody who may not arm because of it."""
-        state = self._manager.state
-        words = _IN_THE_MIDDLE[state]
-        if state is State.SETTLING:
-            left_s = self._left_s(state, self._job_s, now_s)
-            return ArmAnswer("wait", f"{words}: {left_s:.0f} s at most")
-        if state in (State.UNDOING, State.RESTARTING):
-            return ArmAnswer("wait", f"{words}: wait")
-        return ArmAnswer.hold_still(self._left_s(state, self._estimate_s(state, now_s), now_s), words)
-
-    def _estimate_s(self, state: State, now_s: float) -> float:
-        after_s = EKF_S.get(self._vehicle.firmware or "", 0.0)
-        if state is State.VERIFYING:
-            return self._check_s - self._collector.glance(now_s).still_s + after_s
-        if state is State.DITHERING:
-            return self._job_s + self.whole_s
-        return self.whole_s
-
-    def _left_s(self, state: State, estimate_s: float, now_s: float) -> float:
-        end_s = now_s + estimate_s
-        if self._promised is not None and self._promised[0] is state:
-            promised_s = self._promised[1]
-            # Only a movement makes the look at the telemetry start again.
-            started_again = state is State.VERIFYING and end_s > promised_s + MOVED_S
-            end_s = end_s if started_again else min(end_s, promised_s)
-        self._promised = (state, end_s)
-        return max(1.0, math.ceil(end_s - now_s))
+ArmedState = Literal["calibrated", "checked", "uncalibrated"]
 
 
 class Readiness:
-    """The arm gate's answer, and what goes with it: `run` keeps it fresh."""
+    """The arm gate's answer with its words; `run` keeps it fresh."""
 
     def __init__(
         self, core: Core, owed: RebootOwed, manager: CalibrationManager, in_force: InForce, automatic: Automatic
     ) -> None:
         self._vehicle, self._collector, self._manager = core.vehicle, core.collector, manager
         self._wanted, self._on_deck = core.wanted, core.config.vehicle.platform == "deck"
+        self._min_still_s = core.config.calibration.min_still_s
         self.in_force, self._automatic, self._owed = in_force, automatic, owed
-        self._forecast = Forecast(core, manager)
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
-        self._said = -math.inf, math.inf
-        """When it was said last how long to hold still until it is calibrated, and how long."""
+        self._promised: tuple[State, float] | None = None
+        """State of a write under way, and the time at which its end was promised."""
+        self._countdown = -math.inf, math.inf
+        """Time of the last countdown to a calibration, and the seconds that it named."""
         self._has_gated = False
         self.turns = 0
-        """Looks that came to their end, so that it is seen to go on."""
+        """Completed updates, for the watchdog."""
 
     @property
     def at_arm(self) -> AtArm:
-        """What is to happen at arming; may change at the flight line."""
+        """Action at arming; may change at run time."""
         return self._wanted.at_arm
 
     @property
     def asks_script(self) -> bool:
-        """Whether ArduPilot's script has to be told: while this gates, and to let go when it does no longer."""
+        """Whether ArduPilot's script gets the answer: while this gates, and afterwards, to let go."""
         self._has_gated |= self.at_arm == "gate"
         return self._has_gated and self._vehicle.firmware == "ardupilot"
 
+    @property
+    def owed(self) -> str | None:
+        """Action that the autopilot needs from the pilot before it flies."""
+        return self._owed.words
+
+    # --- the answer
+
     def answer(self) -> ArmAnswer:
-        """The answer as of the last fraction of a second; what can change at once is looked at again."""
+        """Return the prepared answer; only what can change at once is looked at again."""
         if asyncio.get_running_loop().time() - self._answered_s > OLDEST_ANSWER_S:
             return ArmAnswer("wait", "companion is busy: try again")
         if self._manager.state.is_writing and self._answer.verdict == "accept":
-            return ArmAnswer("wait", f"{_IN_THE_MIDDLE[self._manager.state]}: wait")
+            return ArmAnswer("wait", f"{_STEPS[self._manager.state]}: wait")
         return self._answer
 
     async def run(self) -> None:
@@ -165,8 +122,8 @@ class Readiness:
         while True:
             try:
                 self.update()
-                await asyncio.sleep(0)  # a question that has come meanwhile is answered in between
-                # What a write under way makes of the output says nothing about what will be in force after it.
+                await asyncio.sleep(0)  # a request that has arrived meanwhile is answered in between
+                # The output during a write says nothing about the offsets that will be in force after it.
                 if not self._writing and await self._measured(loop.time()):
                     self.update()
                 self.turns += 1
@@ -176,7 +133,7 @@ class Readiness:
             await asyncio.sleep(POLL_S)
 
     async def _measured(self, now_s: float) -> bool:
-        """As `InForce.measure`, with the answer kept fresh while it takes its time: a deck may take seconds."""
+        """Call `InForce.measure`, which may take seconds on a deck, and keep the answer fresh meanwhile."""
         measuring = asyncio.ensure_future(self.in_force.measure(now_s))
         try:
             while not (await asyncio.wait((measuring,), timeout=POLL_S))[0]:
@@ -186,21 +143,25 @@ class Readiness:
         return measuring.result()
 
     def update(self) -> None:
-        """Work out the answer anew."""
+        """Prepare the answer."""
         now_s = asyncio.get_running_loop().time()
         self.in_force.poll(writing=self._writing)
         if self.at_arm == "gate":
-            answer = self._judge(now_s)
-            self._answer = self._swaying(answer, now_s) if self._on_deck else answer
+            self._answer = self._judge(now_s)
+            if self._on_deck and self._answer.hold_still_s is not None:
+                # Nobody can hold a deck still.
+                status = self._collector.status(now_s)
+                meanwhile = "" if self._answer.meanwhile == BY_ITSELF else self._answer.meanwhile
+                self._answer = ArmAnswer("wait", f"wait: {meanwhile or status.left or status.measuring}")
         else:
-            # Nothing is held back; what is said is the state that it would arm in.
+            # Arming is not held back; the answer names the state in which it would arm.
             state, words = self.state(now_s)
             self._answer = ArmAnswer("wait" if state == "uncalibrated" else "accept", words)
         self._answered_s = now_s
 
     @property
     def _writing(self) -> bool:
-        """Whether a job that may write runs, or one that was interrupted is being put in order."""
+        """Whether a job that may write runs, or an interrupted write is being restored."""
         return self._manager.why_not((Rung.BUSY, Rung.PENDING)) is not None
 
     def _judge(self, now_s: float) -> ArmAnswer:
@@ -209,99 +170,117 @@ class Readiness:
             return ArmAnswer("refuse", obstacle.words) if wait is None else ArmAnswer("wait", wait)
         if not self._wanted.push:
             return ArmAnswer("refuse", "writing is off (CMP_PUSH): no gate")
-        glance = self._collector.glance(now_s)
         if self._manager.state.is_writing:
-            return self._forecast.answer(now_s)
+            return self._during_write(now_s)
+        glance = self._collector.glance(now_s)
         if glance.obstacle is not None and not glance.moving:
             return ArmAnswer("refuse", glance.obstacle.words)
         if (reading := self.in_force.reading()) is not None:
             return ArmAnswer("wait", reading)
-        if (looked_at := self.looked_at(now_s)) is not None:
-            return looked_at
+        if (checked := self.looked_at(now_s)) is not None:
+            return checked
         if findings := self.in_force.findings(now_s):
-            why_not = self._automatic.why_not()
-            if why_not is None:
+            remedy = self._automatic.why_not()
+            if remedy is None:
                 return ArmAnswer.hold_still(self.until_calibrated_s(now_s), BY_ITSELF)
-            return ArmAnswer("refuse", f"{findings[0].words}: {why_not}")
+            return ArmAnswer("refuse", f"{findings[0].words}: {remedy}")
         if self.owed is not None:
             return ArmAnswer("refuse", self.owed)
         if glance.moving or glance.steady_s < STEADY_S:
             return ArmAnswer.hold_still(STEADY_S - glance.steady_s)
         return ArmAnswer("accept", self.state(now_s)[1])
 
-    @property
-    def owed(self) -> str | None:
-        """What the pilot has to do to the autopilot before it flies; None when nothing."""
-        return self._owed.words
+    # --- how long yet
 
     def looked_at(self, now_s: float) -> ArmAnswer | None:
-        """For how long to hold still, where the next look at the output will tell; None where it is not waited for."""
+        """Return how long to hold still, where the next still window settles every finding; else None."""
         findings = self.in_force.findings(now_s)
-        if not findings or self.in_force.measured or any(finding.why not in _LOOKED_AT for finding in findings):
+        if not findings or self.in_force.measured or any(finding.why not in _CHECKED_NEXT for finding in findings):
             return None
         left_s = self._wanted.settings.min_still_s + 1.0 - self._collector.glance(now_s).still_s
-        return ArmAnswer.hold_still(left_s, _LOOKED_AT[findings[0].why])
-
-    def _swaying(self, answer: ArmAnswer, now_s: float) -> ArmAnswer:
-        """The same on a deck, which nobody can hold still."""
-        if answer.hold_still_s is None:
-            return answer
-        status = self._collector.status(now_s)
-        meanwhile = "" if answer.meanwhile == BY_ITSELF else answer.meanwhile
-        return ArmAnswer("wait", f"wait: {meanwhile or status.left or status.measuring}")
+        return ArmAnswer.hold_still(left_s, _CHECKED_NEXT[findings[0].why])
 
     def until_calibrated_s(self, now_s: float) -> float:
-        """Seconds of holding still until a calibration by itself would be in force."""
-        status = self._collector.status(now_s)
+        """Seconds of holding still until an automatic calibration would be in force."""
+        status, write_s = self._collector.status(now_s), math.ceil(self._write_s)
         if status.enough:
-            return math.ceil(self._forecast.whole_s)
-        # Before anything is known of the noise this is the longest there is: waiting may only get shorter.
+            return write_s
+        # Before the noise is known this is the longest there is: the wait may only get shorter.
         whole_s = status.still_s / status.progress if status.progress > 0.0 else self._wanted.settings.max_s
-        left_s = max(1.0, math.ceil(whole_s - status.still_s)) + math.ceil(self._forecast.whole_s)
-        asked_s, said_s = self._said
-        # Only a movement makes it longer. Where PX4's readings come in floats from now on it stands still for a moment.
-        if self._collector.glance(now_s).moves is None and now_s - asked_s < OLDEST_SAID_S:
-            left_s = min(left_s, said_s)
-        self._said = now_s, left_s
+        left_s: float = max(1, math.ceil(whole_s - status.still_s)) + write_s
+        named_at_s, named_s = self._countdown
+        # Only a movement makes it longer. Where PX4's readings turn into floats it stops for a moment.
+        if self._collector.glance(now_s).moves is None and now_s - named_at_s < COUNTDOWN_KEPT_S:
+            left_s = min(left_s, named_s)
+        self._countdown = now_s, left_s
         return left_s
+
+    @property
+    def _check_s(self) -> float:
+        """Time to see the effect of new offsets."""
+        return settle_s(self._vehicle.firmware) + min(self._min_still_s, LOOK_S) + LATE_S
+
+    @property
+    def _ekf_s(self) -> float:
+        return EKF_S.get(self._vehicle.firmware or "", 0.0)
+
+    @property
+    def _write_s(self) -> float:
+        """Time from the end of the measurement until the new offsets are verified, without a dither."""
+        return WRITE_S.get(self._vehicle.firmware or "", OTHER_WRITE_S) + self._check_s + self._ekf_s
+
+    def _during_write(self, now_s: float) -> ArmAnswer:
+        state, job = self._manager.state, self._manager.running
+        words, job_s = _STEPS[state], 0.0 if job is None else job.left_s
+        if state is State.SETTLING:
+            return ArmAnswer("wait", f"{words}: {self._promise_s(state, job_s, now_s):.0f} s at most")
+        if state in (State.UNDOING, State.RESTARTING):
+            return ArmAnswer("wait", f"{words}: wait")
+        estimate_s = self._write_s
+        if state is State.VERIFYING:
+            estimate_s = self._check_s - self._collector.glance(now_s).still_s + self._ekf_s
+        elif state is State.DITHERING:
+            estimate_s += job_s
+        return ArmAnswer.hold_still(self._promise_s(state, estimate_s, now_s), words)
+
+    def _promise_s(self, state: State, estimate_s: float, now_s: float) -> float:
+        """Return the seconds left; an earlier promise for the same state holds, unless a movement restarts a check."""
+        end_s = now_s + estimate_s
+        if self._promised is not None and self._promised[0] is state:
+            promised_s = self._promised[1]
+            restarted = state is State.VERIFYING and end_s > promised_s + MOVED_S
+            end_s = end_s if restarted else min(end_s, promised_s)
+        self._promised = (state, end_s)
+        return max(1.0, math.ceil(end_s - now_s))
 
     # --- in words, for arming, status and history
 
-    def state(self, now_s: float) -> tuple[Literal["calibrated", "checked", "uncalibrated"], str]:
-        """In which state it would arm now, in a word and in one short line."""
+    def state(self, now_s: float) -> tuple[ArmedState, str]:
+        """Return the state in which it would arm now, as a word and as one short line."""
         state, words = self._state(now_s)
         held_back = self.in_force.held_back
         if held_back is None or self._manager.state.is_writing:
             return state, words
-        return state, f"{words}; {held_back}; calibrate to write it" if words else f"{held_back}; calibrate to write it"
+        return state, "; ".join(filter(None, (words, held_back, "calibrate to write it")))
 
-    def _state(self, now_s: float) -> tuple[Literal["calibrated", "checked", "uncalibrated"], str]:
-        if (middle := _IN_THE_MIDDLE.get(self._manager.state)) is not None:
-            return "uncalibrated", middle
-        if (reading := self.in_force.reading()) is not None:
-            return "uncalibrated", reading
-        findings = self.in_force.findings(now_s)
-        if findings:
-            return "uncalibrated", findings[0].words
-        if self.owed is not None:
-            return "uncalibrated", self.owed
-        sigmas = ", ".join(self._sigmas())
-        calibrated_s, confirmed_s = self.in_force.calibrated_s, self.in_force.confirmed_s
-        if calibrated_s is not None:
-            return "calibrated", f"calibrated {_ago(now_s - calibrated_s)} ago, {sigmas}"
-        if confirmed_s is not None:
-            return "checked", f"offsets checked {_ago(now_s - confirmed_s)} ago, {sigmas}"
-        return "uncalibrated", "not calibrated yet" if self.in_force.held_back is None else ""
-
-    def _sigmas(self) -> list[str]:
-        gyro, accel = self.in_force.sigma("gyro"), self.in_force.sigma("accel")
-        return [
+    def _state(self, now_s: float) -> tuple[ArmedState, str]:
+        in_force, findings = self.in_force, self.in_force.findings(now_s)
+        against = _STEPS.get(self._manager.state) or in_force.reading() or (findings[0].words if findings else None)
+        if against or self.owed is not None:
+            return "uncalibrated", against or self.owed or ""
+        gyro, accel = in_force.sigma("gyro"), in_force.sigma("accel")
+        sigmas = [
             *([f"{gyro / DEG_H:.1f} deg/h"] if gyro is not None else []),
             *([f"{accel / MG:.2f} mg"] if accel is not None else []),
         ]
+        if in_force.calibrated_s is not None:
+            return "calibrated", ", ".join([f"calibrated {_ago(now_s - in_force.calibrated_s)} ago", *sigmas])
+        if in_force.confirmed_s is not None:
+            return "checked", ", ".join([f"offsets checked {_ago(now_s - in_force.confirmed_s)} ago", *sigmas])
+        return "uncalibrated", "not calibrated yet" if in_force.held_back is None else ""
 
     def _quality(self, triad: Triad, unit: float) -> dict[str, object]:
-        """The largest sigma in force and what is aimed at, in deg/h or mg."""
+        """Return the largest sigma in force and its target, in deg/h or mg."""
         sigma, settings = self.in_force.sigma(triad), self._wanted.settings
         wanted = settings.target_gyro_sigma_rad_s if triad == "gyro" else settings.target_accel_sigma_m_s2
         return {

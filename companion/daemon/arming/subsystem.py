@@ -1,14 +1,17 @@
-"""Arming: what is in force, whether that is good enough, and calibrations by itself that keep it so."""
+"""Arming: the calibration in force, the gate's answer, automatic calibrations, and the history of armings."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import AsyncIterator, Mapping, Sequence
+from typing import Final
 
 import msgspec
 
-from companion.daemon.arming.armings import Armings, with_armings
+from companion.autopilot.vehicle.vehicle import VehicleEvent
+from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.gate_setup import GateSetup
 from companion.daemon.arming.in_force import InForce
@@ -18,16 +21,77 @@ from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import StorageError
-from companion.estimation.records.record import ImuRecord
-from companion.formats import Object
+from companion.estimation.records.record import Arming as ArmingRecord
+from companion.formats import Object, utc_now
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
+from companion.storage.learned import armings_in
 
 logger = logging.getLogger(__name__)
 
 
+QUEUE: Final = 16
+
+
+class Armings:
+    """Report and keep the calibration in force at each arming; `run` writes to disk, off the loop."""
+
+    def __init__(self, core: Core, readiness: Readiness) -> None:
+        self._readiness, self._say, self._offload = readiness, core.say, core.offload
+        self._file = armings_in(core.config.storage.path)
+        self._queue: asyncio.Queue[ArmingRecord] = asyncio.Queue(QUEUE)
+        self.last: ArmingRecord | None = None
+        self.seen_disarmed = False
+        """False: the daemon may have started in flight."""
+        core.vehicle.on_event.add(self._on_event)
+
+    async def run(self) -> None:
+        """Keep every arming until cancelled; those still queued then are written as well."""
+        try:
+            while True:
+                arming = await self._queue.get()
+                try:
+                    await self._offload(self._file.append, arming)
+                except StorageError as error:
+                    logger.warning("arming not kept: %s", error)
+        finally:
+            while not self._queue.empty():
+                with contextlib.suppress(StorageError):
+                    self._file.append(self._queue.get_nowait())
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        self.seen_disarmed |= event == "disarmed"
+        if event != "armed" or not self.seen_disarmed:
+            return  # a daemon that starts in flight sees no arming
+        readiness, in_force = self._readiness, self._readiness.in_force
+        now_s = asyncio.get_running_loop().time()
+        state, words = readiness.state(now_s)
+        calibrated_s, confirmed_s = in_force.calibrated_s, in_force.confirmed_s
+        self.last = ArmingRecord(
+            armed_at=utc_now(),
+            state=state,
+            reason=words,
+            at_arm=readiness.at_arm,
+            calibration=in_force.calibration.started_at if in_force.calibration is not None else None,
+            calibrated_ago_s=None if calibrated_s is None else round(now_s - calibrated_s, 1),
+            confirmed_ago_s=None if confirmed_s is None else round(now_s - confirmed_s, 1),
+            gyro_sigma_use_rad_s=in_force.sigma("gyro"),
+            accel_sigma_use_m_s2=in_force.sigma("accel"),
+        )
+        with contextlib.suppress(asyncio.QueueFull):
+            self._queue.put_nowait(self.last)
+        if readiness.at_arm != "off":
+            uncalibrated = state == "uncalibrated"
+            severity = Severity.WARNING if uncalibrated else Severity.NOTICE
+            self._say(severity, f"Armed{' UNCALIBRATED' if uncalibrated else ''}: {words}", Weight.RESULT)
+
+    def history(self) -> list[ArmingRecord]:
+        """Read all kept armings, newest first; blocking."""
+        return self._file.read()[::-1]
+
+
 class Arming(Subsystem):
-    """May it arm, and what happens when it does."""
+    """All that concerns arming."""
 
     def __init__(self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating) -> None:
         self._core, self._store, self._by_hand = core, calibrating.store, calibrating.by_hand
@@ -68,19 +132,24 @@ class Arming(Subsystem):
         ]
 
     async def _answer_history(self, request: Object, _face: str) -> AsyncIterator[Object]:
-        limit = request.get("limit")
-        number = limit if isinstance(limit, int) and limit > 0 else None
         # A thousand records take longer to read than a ground station waits for an answer.
-        yield await self._core.offload(self._history, number)
+        yield await self._core.offload(self._history, request["limit"])
 
     def _history(self, limit: int | None) -> Object:
         armings = self.armings.history()
+        by_calibration: dict[str | None, list[ArmingRecord]] = {}
+        for arming in reversed(armings):
+            by_calibration.setdefault(arming.calibration, []).append(arming)
         found = self._store.numbered(limit)
-        records = with_armings(list(found.values()), armings)
         return {
             "kind": "result",
             "numbers": list(found),
-            "records": [msgspec.to_builtins(record) for record in records],
+            "records": [
+                msgspec.to_builtins(
+                    msgspec.structs.replace(record, armings=tuple(by_calibration.get(record.started_at, ())))
+                )
+                for record in found.values()
+            ],
             "armings": [msgspec.to_builtins(arming) for arming in armings[:limit]],
             "by_hand": self._by_hand.history()[:limit],
             "interrupted": self._recovery.interruptions()[:limit],
@@ -88,8 +157,8 @@ class Arming(Subsystem):
         }
 
     def _flights(self, limit: int | None) -> list[Object]:
-        """What `companion flight` has kept, without what only plots need."""
-        # What nobody asked for costs the start nothing.
+        """Return the flights that `companion flight` has kept, without the data that only plots need."""
+        # Imported here, as it would slow every start.
         from companion.storage.flights import FlightStore
 
         try:
@@ -104,10 +173,10 @@ class Arming(Subsystem):
 
 
 def shown_calibration(in_force: InForce, now_s: float) -> dict[str, object] | None:
-    """The calibration in force, else the last one if that was good and has not been undone; None without either.
+    """Return the calibration in force for `status`; without one the last good one that was not undone; else None.
 
-    `calibrated_ago_s` and `confirmed_ago_s` are null where that is not known to be in force: a wall clock that was
-    wrong in the field tells no age.
+    `calibrated_ago_s` and `confirmed_ago_s` are null unless it is known to be in force: a wall clock that was wrong in
+    the field gives no age.
     """
     known = in_force.calibration is not None
     record = in_force.calibration or in_force.earlier
@@ -119,21 +188,20 @@ def shown_calibration(in_force: InForce, now_s: float) -> dict[str, object] | No
         "started_at": record.started_at,
         "calibrated_ago_s": round(now_s - calibrated_s, 1) if known and calibrated_s is not None else None,
         "confirmed_ago_s": round(now_s - confirmed_s, 1) if confirmed_s is not None else None,
-        "imus": [_imu(imu, in_force.temperatures_degc.get(imu.name)) for imu in record.imus],
-    }
-
-
-def _imu(imu: ImuRecord, now_degc: float | None) -> dict[str, object]:
-    return {
-        "name": imu.name,
-        "temperature_degc": imu.temperature_degc,
-        "when_warm": [] if imu.when_warm is None else list(imu.when_warm.words),
-        "temperature_now_degc": now_degc,
-        "gyro_bias_deg_h": _scaled(imu.gyro_bias_rad_s, DEG_H, 2),
-        "gyro_sigma_deg_h": _scaled(imu.gyro_sigma_use_rad_s, DEG_H, 2),
-        "accel_bias_mg": _scaled(imu.accel_bias_m_s2, MG, 4),
-        "accel_sigma_mg": _scaled(imu.accel_sigma_use_m_s2, MG, 4),
-        "held_back": list(imu.held_back),
+        "imus": [
+            {
+                "name": imu.name,
+                "temperature_degc": imu.temperature_degc,
+                "when_warm": [] if imu.when_warm is None else list(imu.when_warm.words),
+                "temperature_now_degc": in_force.temperatures_degc.get(imu.name),
+                "gyro_bias_deg_h": _scaled(imu.gyro_bias_rad_s, DEG_H, 2),
+                "gyro_sigma_deg_h": _scaled(imu.gyro_sigma_use_rad_s, DEG_H, 2),
+                "accel_bias_mg": _scaled(imu.accel_bias_m_s2, MG, 4),
+                "accel_sigma_mg": _scaled(imu.accel_sigma_use_m_s2, MG, 4),
+                "held_back": list(imu.held_back),
+            }
+            for imu in record.imus
+        ],
     }
 
 
