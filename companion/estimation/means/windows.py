@@ -206,13 +206,15 @@ def estimates(
     white_part = np.square(white) * leverage
     rest = floor_variance(flicker, walk, seconds, horizon_s) + np.square(quantum)
     use = white_part + rest + going_on
-    of_line = np.square(white) / max(float(np.square(slots - slots.mean()).sum()), 1.0) + wander
-    of_line = np.where(np.isnan(hidden), np.inf, of_line + 3.0 * np.square(quantum / (end_s - slots[0])))
+    # White noise as measured: V(T, H) has the flicker, and flicker that bends the line shows as a slope.
+    spread = max(float(np.square(slots - slots.mean()).sum()), 1.0)
+    by_steps = 3.0 * np.square(quantum / (end_s - slots[0]))
+    no_line = np.isnan(hidden)
     lines = Lines(
         hidden=np.nan_to_num(hidden),
-        hidden_variance=np.where(slope != 0.0, 0.0, of_line),
+        hidden_variance=np.where(no_line, np.inf, np.where(slope != 0.0, 0.0, np.square(measured) / spread + by_steps)),
         ramp=slope,
-        variance=of_line,
+        variance=np.where(no_line, np.inf, np.square(white) / spread + wander + by_steps),
         level_variance=np.square(white) / seconds + rest,
     )
     figures = {

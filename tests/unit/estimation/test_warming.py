@@ -12,7 +12,7 @@ from companion.config.sections import Imu
 from companion.configured.models import imu_input
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.means.warming import Warming, likely_k_s, temperature_rate
-from companion.estimation.noise.allan import WARM_UP, WARM_UP_K, AllanModel, NoiseProfile
+from companion.estimation.noise.allan import WARM_UP, WARM_UP_K, AllanModel, NoiseProfile, noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.physics.units import DEG_H, MG
 from companion.protocols.registry import PROTOCOLS
@@ -83,7 +83,7 @@ def test_what_is_unseen_shrinks_with_age_and_with_a_steady_thermometer() -> None
 
 
 def test_a_part_whose_warm_up_was_learned_is_believed() -> None:
-    model = AllanModel(150.0 * DEG_H, 1.0 * DEG_H, 0.1 * DEG_H)
+    model = AllanModel(500.0 * DEG_H, 1.0 * DEG_H, 0.1 * DEG_H)
     quick = NoiseProfile("quick", model, model)
     calm = NoiseProfile("calm", model, model, warm_up=(WARM_UP[0] / 20.0, WARM_UP[1] / 20.0))
     batches = batches_of(np.random.default_rng(5).normal(0.0, model.white, (10, 6)))
@@ -176,3 +176,18 @@ def test_a_warm_part_whose_thermometer_says_so_pays_nothing() -> None:
 def test_the_table_names_every_case_once() -> None:
     rows = warmup_table._rows()
     assert sorted(map(repr, (case for _, some in rows for case in some))) == sorted(map(repr, cases()))
+
+
+def test_a_minute_of_white_noise_without_a_slope_widens_the_gyros_sigma_by_little() -> None:
+    """The profile's flicker is in V(T, H) already; N = 7.1 deg/h sqrt(s) hides 3.2 deg/h of slope over the lever."""
+    profile = noise_profile("icm42688p")
+    rng = np.random.default_rng(11)
+    sizes = []
+    for _ in range(20):
+        means = np.concatenate(
+            [rng.normal(0.0, model.white, (60, 3)) for model in (profile.gyro, profile.accel)], axis=1
+        )
+        found = window_of(imu("fc", profile), batches_of(means)).warming
+        assert found is not None
+        sizes.append(found.unseen(60.0)[:3])
+    assert np.sqrt(np.mean(sizes)) < 6.0 * DEG_H
