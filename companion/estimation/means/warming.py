@@ -1,10 +1,9 @@
 """Allowance for a warm-up that one window is too short to show, and the drift that it does show.
 
 A slope s moves the mean of the next minute by s (T + 60 s) / 2 from the mean over T. The allowance is the slope
-of the window with its standard error by white noise, times that lever. The age of the part bounds it: a box that was
-switched on rises by `WARM_UP_K` with an unknown time constant, so at the age t it warms by at most WARM_UP_K / (e t).
-A thermometer bounds it better. Flicker bends the line too; a window that shows no slope needs no second allowance for
-it, because V(T, H) has it already.
+of the window with its standard error, times that lever. The age of the part bounds it: a box that was switched on
+rises by `WARM_UP_K` with an unknown time constant, so at the age t it warms by at most WARM_UP_K / (e t). A thermometer
+bounds it better. Flicker bends the line too, but V(T, H) has it already: it counts by half in the standard error.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class Lines(NamedTuple):
     hidden: Floats
     """Slopes that are not significant; zero where the slope is."""
     hidden_variance: Floats
-    """Variance of `hidden` by white noise and quantisation; infinite where the window is too short for a line."""
+    """Variance of `hidden`, flicker and walk counted by half; infinite where the window is too short for a line."""
     ramp: Floats
     """Significant slopes: the reported mean is the end of that line."""
     variance: Floats

@@ -179,7 +179,7 @@ def test_the_table_names_every_case_once() -> None:
 
 
 def test_a_minute_of_white_noise_without_a_slope_widens_the_gyros_sigma_by_little() -> None:
-    """The profile's flicker is in V(T, H) already; N = 7.1 deg/h sqrt(s) hides 3.2 deg/h of slope over the lever."""
+    """The profile's flicker is in V(T, H) already; counted here as a whole it makes 9.0 deg/h."""
     profile = noise_profile("icm42688p")
     rng = np.random.default_rng(11)
     sizes = []
@@ -190,4 +190,4 @@ def test_a_minute_of_white_noise_without_a_slope_widens_the_gyros_sigma_by_littl
         found = window_of(imu("fc", profile), batches_of(means)).warming
         assert found is not None
         sizes.append(found.unseen(60.0)[:3])
-    assert np.sqrt(np.mean(sizes)) < 6.0 * DEG_H
+    assert np.sqrt(np.mean(sizes)) < 8.0 * DEG_H
