@@ -83,7 +83,7 @@ def test_what_is_unseen_shrinks_with_age_and_with_a_steady_thermometer() -> None
 
 
 def test_a_part_whose_warm_up_was_learned_is_believed() -> None:
-    model = AllanModel(500.0 * DEG_H, 1.0 * DEG_H, 0.1 * DEG_H)
+    model = AllanModel(150.0 * DEG_H, 1.0 * DEG_H, 0.1 * DEG_H)
     quick = NoiseProfile("quick", model, model)
     calm = NoiseProfile("calm", model, model, warm_up=(WARM_UP[0] / 20.0, WARM_UP[1] / 20.0))
     batches = batches_of(np.random.default_rng(5).normal(0.0, model.white, (10, 6)))
@@ -177,9 +177,7 @@ def test_a_minute_of_white_noise_without_a_slope_widens_the_gyros_sigma_by_littl
     rng = np.random.default_rng(11)
     sizes = []
     for _ in range(20):
-        means = np.concatenate(
-            [rng.normal(0.0, model.white, (60, 3)) for model in (profile.gyro, profile.accel)], axis=1
-        )
+        means = rng.normal(0.0, np.repeat([profile.gyro.white, profile.accel.white], 3), (60, 6))
         found = window_of(imu("fc", profile), batches_of(means)).warming
         assert found is not None
         sizes.append(found.unseen(60.0)[:3])
