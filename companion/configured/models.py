@@ -7,7 +7,6 @@ import datetime
 from collections.abc import Iterator, Sequence
 from typing import Final, Literal
 
-from companion.autopilot.firmware.port_parameters import baud_of
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu
@@ -57,6 +56,11 @@ def settings(config: Config) -> Settings:
         target_accel_sigma_m_s2=wanted.target_accel_sigma_mg * MG,
         dither=config.push.dither and config.push.parameters,
     )
+
+
+def baud_of(url: str) -> int | None:
+    """Return the speed of a MAVLink url; None where it is no serial line."""
+    return int(url.rpartition(":")[2]) if url.startswith("serial:") else None
 
 
 def imu_rate_hz(config: Config) -> float:

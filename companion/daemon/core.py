@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import msgspec
 
-from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.component.tunes import Tune, Tunes

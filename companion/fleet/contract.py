@@ -13,6 +13,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 import msgspec
 
+from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.estimation.records.flight_record import KeptFlight
 from companion.estimation.solution.by_temperature import ByTemperature
 from companion.physics.units import DEG_H, MG
@@ -130,8 +131,6 @@ class _Calibration(msgspec.Struct, frozen=True):
     alignment: _Zero | None = None
 
 
-_FIRMWARES: Final = {"INS": "ardupilot", "CAL": "px4", "TC": "px4"}
-"""Firmwares by the prefix of their parameters."""
 _ABOUT: Final = ("gyro_id", "accel_id", "temperature_degc", "samples")
 _TRIADS: Final = tuple(name for name in _Imu.__struct_fields__ if name.endswith(("_rad_s", "_m_s2")))
 
@@ -150,7 +149,7 @@ def _calibration(body: bytes) -> Rows:
             figures = {name: value and value[number] for name, value in triads.items()}
             biases.append({**about, "axis": axis, **figures})
     held = [f"{imu.name} {triad}" for imu in told.imus for triad in imu.held_back]
-    prefixes = {name.partition("_")[0] for imu in told.imus for name in imu.written}
+    written = {name for imu in told.imus for name in imu.written}
     zero = told.alignment
     row = {
         "started_at": moment(told.started_at),
@@ -159,7 +158,7 @@ def _calibration(body: bytes) -> Rows:
         "reason": told.reason,
         "held_back": ", ".join(held),
         "undone_at": _at(told.undone_at),
-        "firmware": next((firmware for prefix, firmware in _FIRMWARES.items() if prefix in prefixes), None),
+        "firmware": next((firmware for firmware, ranges in CALIBRATION.items() if written & ranges.keys()), None),
         "heading_bound_deg": told.magnetic and told.magnetic.heading_bound_deg,
         "zero_at": zero and moment(zero.measured_at),
         "zero_x_deg": zero and zero.offset_deg[0],

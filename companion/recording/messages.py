@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.parameters.reading import FirmwareName
 from companion.autopilot.telemetry.imu_samples import EkfBiasReading
-from companion.autopilot.vehicle.vehicle import Firmware
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.solution.otherwise import Otherwise
 from companion.estimation.solution.prior import Expectation
@@ -55,7 +55,7 @@ class ImuState(msgspec.Struct, frozen=True, kw_only=True):
 
     sender: tuple[int, int]
     """System and component id of the autopilot."""
-    firmware: Firmware | None
+    firmware: FirmwareName | None
     instance: int
     message: str | None
     """Name of the `StreamKind` that its samples come in; None: none come."""

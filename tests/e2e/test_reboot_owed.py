@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from companion.autopilot.firmware.px4 import PX4
 from companion.autopilot.parameters.change import Change
 from companion.daemon.offsets.reboot import RebootOwed, owed_in
 from tests.e2e.test_calibration import calibrated, started
@@ -95,7 +96,7 @@ def test_a_restart_that_nobody_saw_shows_in_the_time_since_boot(
         monkeypatch.setenv("COMPANION_BOOT_ID", host)
         now_s = asyncio.get_running_loop().time()
         boot = SimpleNamespace(latest_s=boot_s, latest=None if boot_s is None else (boot_s, now_s))
-        vehicle = SimpleNamespace(system_id=1, boots=0, boot=SimpleNamespace(clock=boot))
+        vehicle = SimpleNamespace(kind=PX4(), system_id=1, boots=0, boot=SimpleNamespace(clock=boot))
         config = SimpleNamespace(storage=SimpleNamespace(path=tmp_path))
         core: Any = SimpleNamespace(config=config, vehicle=vehicle, offload=inline)
         made = RebootOwed(core)

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.autopilot.firmware.ardupilot import parameters_of
+from companion.autopilot.firmware.ardupilot_calibration import parameters_of
 from companion.autopilot.firmware.imu_calibration import (
     ImuCalibration,
     accel_offset_after,

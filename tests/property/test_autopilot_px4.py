@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import changes_for, output_step
-from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.vehicle.parameter_client import ParameterClient
+from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.links.mavlink.link import MavlinkLink
 from companion.samples import Vector

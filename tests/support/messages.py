@@ -31,6 +31,8 @@ NOT_FOR_PEOPLE = {
     "Misfit",
     # Expressions and templates of other tools.
     "compile", "Formatter", "JournalFormatter", "OneLineFormatter",
+    # Reasons beside the parameters that `companion autopilot-setup` prints.
+    "HeadingSetting", "PortRow",
     # Names of tasks.
     "create_task", "Thread",
     # Words to a database.

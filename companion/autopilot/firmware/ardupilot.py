@@ -1,4 +1,4 @@
-"""ArduPilot's bias parameters: names, what R is made of, and what is odd about them.
+"""ArduPilot: parameters of IMUs, level, heading, gate and ports, and what is odd about them.
 
 R is the board orientation, AHRS_ORIENTATION (autopilots 1.2); AHRS_TRIM turns the reported attitude only, never IMU
 data. A calibration leaves `CALTEMP` alone, for then new = old + residual holds (recipe (a) of autopilots 1.6).
@@ -6,84 +6,249 @@ data. A calibration leaves `CALTEMP` alone, for then new = old + residual holds 
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import math
-from typing import Final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
 
-from companion.autopilot.firmware.ardupilot_tcal import TcalParameters, names_of, read_thermal
-from companion.autopilot.firmware.imu_calibration import ACCEL_SCALE_RANGE, ImuCalibration, ImuParameters, read_rivals
-from companion.autopilot.parameters.reading import SCALES, Parameters, read_integer, read_vector
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.firmware import ardupilot_calibration as own_calibration
+from companion.autopilot.firmware.ardupilot_calibration import INSTANCES, ArduPilotParameters, parameters_of
+from companion.autopilot.firmware.base import (
+    Firmware,
+    GyroCalibration,
+    GyroParameters,
+    HeadingSetting,
+    Net,
+    PortRow,
+    RivalKind,
+)
+from companion.autopilot.firmware.imu_calibration import (
+    ACCEL_SCALE_RANGE,
+    DEGC_RANGE,
+    DEVICE_ID_RANGE,
+    SWITCH_RANGE,
+    ImuCalibration,
+    Range,
+    offset_ranges,
+)
+from companion.autopilot.firmware.imu_messages import HIGHRES, RAW, SCALED, SCALED2, SCALED3
+from companion.autopilot.firmware.px4_slots import SlotMemory
+from companion.autopilot.parameters.change import Change
+from companion.autopilot.parameters.reading import (
+    SCALES,
+    FirmwareName,
+    LiveParameters,
+    Parameters,
+    read_integer,
+    read_vector,
+)
 from companion.errors import AutopilotError
+from companion.estimation.temperature.polynomial import Polynomial
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.rotations import ROTATION_NAMES
 
-INSTANCES: Final = (1, 2, 3, 4, 5)
-"""4 and 5 exist from 4.4 on boards with auxiliary instances; no message carries them, so none can be measured."""
-
 TRIM: Final = ("AHRS_TRIM_X", "AHRS_TRIM_Y")
 """Roll and pitch of the board against the aircraft, rad; taken off the attitude, never off IMU data."""
+_TRIM_RANGE: Final = Range(-math.radians(10.0), math.radians(10.0), unit="rad")
+"""ArduPilot cuts it off there."""
+_TCAL_RANGE: Final = Range(-1e6, 1e6)
+"""Millionths of rad/s or m/s^2 a kelvin, square kelvin, cubic kelvin."""
+
+_RIVAL: Final = "INS_GYR_CAL"
+_EXTNAV, _COMPASS, _GYROS = 6.0, 1.0, 0.0
+"""EK3_SRCn_YAW: external navigation, the autopilot's compass, and none: gyros carry it on, GNSS holds it."""
+_HEADING_SCRIPT: Final = "CMPG_HEADING"
+_GATE_SCRIPT: Final = "CMPG_ENABLE"
+"""Parameters of the script (companion/lua): they exist while it runs."""
+
+_MAVLINK_1, _MAVLINK_2 = 1, 2
+_SERIALS: Final = range(1, 9)
+
+_ARDUPILOT_ONLY_DEG: Final = {41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0.0)}
+"""PITCH_7, ROLL_45, ROLL_315 (ArduPilot's rotations.h)."""
+_CUSTOM_NAMES: Final = {
+    100: ("AHRS_CUSTOM_ROLL", "AHRS_CUSTOM_PIT", "AHRS_CUSTOM_YAW"),  # up to 4.1
+    101: ("CUST_ROT1_ROLL", "CUST_ROT1_PITCH", "CUST_ROT1_YAW"),
+    102: ("CUST_ROT2_ROLL", "CUST_ROT2_PITCH", "CUST_ROT2_YAW"),
+}
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class ArduPilotParameters(ImuParameters):
-    """The names of one IMU's parameters; the first instance is irregular, 4 and 5 are again (autopilots 1.1)."""
+def _ranges() -> dict[str, Range]:
+    found: dict[str, Range] = {_RIVAL: SWITCH_RANGE}
+    for names in map(parameters_of, INSTANCES):
+        # The firmware's own gyro calibration, which we start, sets CALTEMP and id: both are restored.
+        tcal = names.tcal
+        found |= {**offset_ranges(names), **dict.fromkeys(tcal.deciding, _TCAL_RANGE)}
+        found |= dict.fromkeys((tcal.gyro_caltemp, tcal.accel_caltemp, tcal.low, tcal.high), DEGC_RANGE)
+        found |= {tcal.enable: SWITCH_RANGE, names.gyro_id: DEVICE_ID_RANGE}
+    return found | dict.fromkeys(TRIM, _TRIM_RANGE)
 
-    tcal: TcalParameters
-    use: str
 
+class ArduPilot(Firmware):
+    """Copter, Plane and Rover with EKF3."""
 
-def parameters_of(instance: int) -> ArduPilotParameters:
-    """The names of one IMU's parameters, `instance` counting from 1.
+    name: FirmwareName = "ardupilot"
+    words = "ArduPilot"
+    mav_autopilot = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+    heartbeat_rate_hz = 5.0
+    """A second is a long time not to know of an arming (autopilots 5.1)."""
+    integers_bytewise = False
+    settle_s = 1.0
+    """The telemetry shows a new offset within 60 ms (its 20 Hz filter); a second covers slower links."""
+    write_s = 5.0
+    """4 s with its own gyro calibration in between."""
+    ekf_reset_s = 3.0
+    imu_messages = {1: (HIGHRES, SCALED, RAW), 2: (SCALED2,), 3: (SCALED3,)}
+    estimator_message = mavlink.MAVLink_ekf_status_report_message
+    faster_log = "LOG_BITMASK with IMU_FAST"
+    ranges = _ranges()
+    rivals = {
+        _RIVAL: RivalKind("at a start", "the next boot measures the gyros itself and overwrites these gyro offsets")
+    }
+    parts = {
+        (0x2B, 0x2B): "bmi088",
+        # ADIS16470, or the better ADIS16477 with the same driver.
+        (0x31, 0x31): "adis16470",
+        (0x34, 0x34): "icm42688p",
+    }
+    """AP_InertialSensor_Backend.h, DevTypes."""
 
-    Raises:
-        AutopilotError: no such instance.
-    """
-    if instance not in INSTANCES:
-        raise AutopilotError(f"IMU {instance} is not known; allowed are {', '.join(map(str, INSTANCES))}")
-    # INS_GYROFFS, INS_GYR2OFFS, INS4_GYROFFS; but INS_GYR1_CALTEMP, INS_TCAL1_ENABLE (`ardupilot_tcal`).
-    ins, n = (f"INS{instance}_", "") if instance > 3 else ("INS_", "" if instance == 1 else str(instance))
-    return ArduPilotParameters(
-        gyro_offset=_xyz(f"{ins}GYR{n}OFFS_{{}}"),
-        accel_offset=_xyz(f"{ins}ACC{n}OFFS_{{}}"),
-        accel_scale=_xyz(f"{ins}ACC{n}SCAL_{{}}"),
-        gyro_id=f"{ins}GYR{n}_ID",
-        accel_id=f"{ins}ACC{n}_ID",
-        tcal=names_of(instance),
-        use=f"{ins}USE{n}",
+    def compass_ratio(self, message: Any) -> float:
+        fit = message.flags & mavlink.EKF_ATTITUDE and not message.flags & mavlink.EKF_UNINITIALIZED
+        return float(message.compass_variance) if fit else 0.0
+
+    # --- IMUs
+
+    async def _read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
+        names = parameters_of(instance)
+        if await parameters.read_optional(names.gyro_offset[0]) is None:
+            raise AutopilotError(f"the autopilot has no IMU {instance}: {names.gyro_offset[0]} does not exist")
+        gyro_id = await read_integer(parameters, names.gyro_id)
+        accel_id = await read_integer(parameters, names.accel_id)
+        for sensor, name, found in (("gyro", names.gyro_id, gyro_id), ("accelerometer", names.accel_id, accel_id)):
+            if found == 0:
+                raise AutopilotError(f"the autopilot has no IMU {instance}: {name} = 0, so there is no {sensor}")
+        thermal = await own_calibration.read_thermal(parameters, instance)
+        calibration = ImuCalibration(
+            instance=instance,
+            parameters=names,
+            gyro_offset_rad_s=await read_vector(parameters, names.gyro_offset),
+            accel_offset_m_s2=await read_vector(parameters, names.accel_offset),
+            accel_scale=await read_vector(parameters, names.accel_scale, *SCALES),
+            gyro_id=gyro_id,
+            accel_id=accel_id,
+            orientation=await _read_board_rotation(parameters),
+            thermal=thermal,
+            zero_is_uncalibrated=True,
+            rivals=await self.read_rivals(parameters),
+        )
+        used = await read_integer(parameters, names.use) != 0
+        return dataclasses.replace(calibration, warnings=_warnings(calibration, names, used=used))
+
+    resets_ekf_by_gyro_calibration = True
+
+    async def read_gyro_parameters(self, parameters: LiveParameters) -> GyroParameters:
+        return await own_calibration.read_gyro_parameters(parameters)
+
+    async def calibrate_gyros(
+        self, parameters: LiveParameters, before: GyroParameters, go_on: Callable[[str], None]
+    ) -> GyroCalibration:
+        return await own_calibration.calibrate_gyros(parameters, before, go_on)
+
+    async def wait_until_gyros_calibrated(self, parameters: LiveParameters, before: Mapping[str, float]) -> None:
+        await own_calibration.wait_until_over(parameters, before)
+
+    async def gyros_measured_at_start(self, parameters: Parameters) -> str | None:
+        return _RIVAL if await parameters.read_optional(_RIVAL) else None
+
+    async def thermal_changes(
+        self,
+        parameters: Parameters,
+        calibration: ImuCalibration,
+        gyro: Polynomial,
+        accel: Polynomial | None,
+        degc: float,
+    ) -> list[Change]:
+        return await own_calibration.thermal_changes(parameters, calibration, gyro, accel, degc)
+
+    # --- level
+
+    async def plan_level(
+        self, parameters: Parameters, roll_rad: float, pitch_rad: float
+    ) -> tuple[list[Change], Matrix]:
+        # The IMUs know nothing of the trim, so the board's whole tilt is the trim.
+        old, new = [await parameters.read(name) for name in TRIM], [roll_rad, pitch_rad]
+        before, after = (rotation_matrix((x, y, 0.0)) for x, y in np.degrees([old, new]).tolist())
+        return list(map(Change, TRIM, old, new)), after @ before.T
+
+    # --- heading from outside
+
+    heading_settings = (
+        HeadingSetting("VISO_TYPE", 1.0, "listens to VISION_POSITION_ESTIMATE"),
+        HeadingSetting("EK3_SRC1_YAW", _EXTNAV, "EKF3 takes its heading from it (source set 1)"),
+        HeadingSetting("EK3_SRC2_YAW", _COMPASS, "where that ends on the ground, from its compass (source set 2)"),
+        HeadingSetting("EK3_SRC3_YAW", _GYROS, "where that ends in flight, from gyros and GNSS (source set 3)"),
+        *(
+            HeadingSetting(f"EK3_SRC{number}_{what}", value, "and the rest as in set 1", like=f"EK3_SRC1_{what}")
+            for number in (2, 3)
+            for what, value in (("POSXY", 3.0), ("VELXY", 3.0), ("POSZ", 1.0), ("VELZ", 3.0))
+        ),
     )
+    heading_watched = (_HEADING_SCRIPT,)
+    heading_risks = ("it will not arm while the stream is away (VisOdom: not healthy)",)
 
+    def heading_net(self, found: Mapping[str, float]) -> Net:
+        fallbacks = found.get("EK3_SRC2_YAW"), found.get("EK3_SRC3_YAW")
+        if fallbacks != (_COMPASS, _GYROS) or not found.get("EK3_SRC3_VELXY"):
+            return "none"
+        return "script" if found.get(_HEADING_SCRIPT) == 1.0 else "command"
 
-async def read_calibration(parameters: Parameters, instance: int) -> ImuCalibration:
-    """Read afresh what ArduPilot corrects one of its IMUs with.
+    def takes_only_our_heading(self, found: Mapping[str, float]) -> bool:
+        return found.get("EK3_SRC1_YAW") == _EXTNAV
 
-    Raises:
-        AutopilotError: no such IMU, its temperature calibration is learning, an orientation or a value that cannot be
-            worked with; or no answer (ParameterTimeoutError).
-    """
-    names = parameters_of(instance)
-    if await parameters.read_optional(names.gyro_offset[0]) is None:
-        raise AutopilotError(f"the autopilot has no IMU {instance}: {names.gyro_offset[0]} does not exist")
-    gyro_id = await read_integer(parameters, names.gyro_id)
-    accel_id = await read_integer(parameters, names.accel_id)
-    for sensor, name, found in (("gyro", names.gyro_id, gyro_id), ("accelerometer", names.accel_id, accel_id)):
-        if found == 0:
-            raise AutopilotError(f"the autopilot has no IMU {instance}: {name} = 0, so there is no {sensor}")
-    thermal = await read_thermal(parameters, instance)
-    calibration = ImuCalibration(
-        instance=instance,
-        parameters=names,
-        gyro_offset_rad_s=await read_vector(parameters, names.gyro_offset),
-        accel_offset_m_s2=await read_vector(parameters, names.accel_offset),
-        accel_scale=await read_vector(parameters, names.accel_scale, *SCALES),
-        gyro_id=gyro_id,
-        accel_id=accel_id,
-        orientation=await read_board_rotation(parameters),
-        thermal=thermal,
-        zero_is_uncalibrated=True,
-        rivals=await read_rivals(parameters),
-    )
-    used = await read_integer(parameters, names.use)
-    return dataclasses.replace(calibration, warnings=_warnings(calibration, names, used=used != 0))
+    async def yaw_is_its_own(self, parameters: Parameters) -> bool:
+        """Whether EKF3 takes its yaw from its compass; one that waits for ours holds 0 deg and finds that good."""
+        return await parameters.read_optional("EK3_SRC1_YAW") in (None, _COMPASS)
+
+    # --- arming
+
+    gate_parameters = (_GATE_SCRIPT,)
+    gate_is_script = True
+
+    async def find_gate_problem(
+        self, parameters: Parameters, system_id: int | None, script_starts_s: float
+    ) -> str | None:
+        enabled = await parameters.read_optional(_GATE_SCRIPT)
+        if enabled is None and script_starts_s:
+            await asyncio.sleep(script_starts_s)
+            enabled = await parameters.read_optional(_GATE_SCRIPT)
+        if enabled is None:
+            return "the arming script does not run (see: companion lua)"
+        return "set CMPG_ENABLE 1" if enabled == 0 else None
+
+    # --- ports: no message tells on which one a component is heard, so all with MAVLink are shown
+
+    port_names = tuple(f"SERIAL{number}_{what}" for number in _SERIALS for what in ("PROTOCOL", "BAUD"))
+
+    def port_rows(self, found: Mapping[str, float], baud: int | None) -> list[PortRow]:
+        rows: list[PortRow] = []
+        for number in _SERIALS:
+            protocol, speed = f"SERIAL{number}_PROTOCOL", f"SERIAL{number}_BAUD"
+            if found.get(protocol) in (_MAVLINK_1, _MAVLINK_2):
+                rows.append(PortRow(protocol, found[protocol], _MAVLINK_2, "MAVLink 2"))
+                if speed in found:
+                    rows.append(PortRow(speed, found[speed], found[speed], "its speed, in thousands"))
+        return rows
+
+    def port_needs(self, baud: int) -> str | None:
+        return f"SERIALn_PROTOCOL = 2, SERIALn_BAUD = {baud // 1000}"
+
+    def forwarding_words(self, closed: Sequence[str]) -> tuple[bool, str]:
+        return True, "none heard (none connected? or a link set not to forward: MAVn_OPTIONS bit 1)"
 
 
 def _warnings(calibration: ImuCalibration, names: ArduPilotParameters, *, used: bool) -> tuple[str, ...]:
@@ -103,27 +268,11 @@ def _warnings(calibration: ImuCalibration, names: ArduPilotParameters, *, used: 
     return tuple(found)
 
 
-def _xyz(pattern: str) -> tuple[str, str, str]:
-    x, y, z = (pattern.format(axis) for axis in "XYZ")
-    return x, y, z
-
-
-_ARDUPILOT_ONLY_DEG: Final = {41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0.0)}
-"""PITCH_7, ROLL_45, ROLL_315 (ArduPilot's rotations.h)."""
-
-_CUSTOM_NAMES: Final = {
-    100: ("AHRS_CUSTOM_ROLL", "AHRS_CUSTOM_PIT", "AHRS_CUSTOM_YAW"),  # up to 4.1
-    101: ("CUST_ROT1_ROLL", "CUST_ROT1_PITCH", "CUST_ROT1_YAW"),
-    102: ("CUST_ROT2_ROLL", "CUST_ROT2_PITCH", "CUST_ROT2_YAW"),
-}
-
-
-async def read_board_rotation(parameters: Parameters) -> Matrix:
-    """The 3x3 matrix from the board's axes to the vehicle's FRD.
+async def _read_board_rotation(parameters: Parameters) -> Matrix:
+    """Read the 3x3 matrix from the board's axes to the vehicle's FRD.
 
     Raises:
-        AutopilotError: an orientation that is not known, or a custom one that is not in force; or as
-            `Parameters.read`.
+        AutopilotError: an unknown orientation, or a custom one that is not in force; or as `Parameters.read`.
     """
     value = await parameters.read("AHRS_ORIENTATION")
     number = round(value) if math.isfinite(value) else -1

@@ -1,14 +1,12 @@
-"""What an autopilot corrects one IMU with, whichever firmware it runs, and the algebra of its offsets.
+"""Corrections of one IMU inside an autopilot, and the algebra of its offsets; the same for every firmware.
 
-Per sample both firmwares compute, with R their rotation from the IMU's axes to the vehicle's (autopilots 1.2, 4.1):
+Per sample a firmware computes, with R its rotation from the IMU's axes to the vehicle's (autopilots 1.2, 4.1):
 
     gyro  = R (raw - gyro_offset)
     accel = R diag(accel_scale) (raw - accel_offset)
 
 so offsets live in the IMU's own axes, before scale and before rotation. A temperature calibration, where one is
-active (`Thermal`), takes its part off `raw` first. The firmwares differ in the names of the parameters, in what R is
-made of and in what they do with a value: `ardupilot` and `px4` read, `firmwares` picks. What in the autopilot itself
-overwrites offsets of ours later is a `Rival`: found here, and said with what it does.
+active (`Thermal`), takes its part off `raw` first. Names, R and the use of a value are each firmware's own.
 """
 
 from __future__ import annotations
@@ -21,9 +19,8 @@ from typing import Final, Literal
 import numpy as np
 
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.reading import Parameters, read_integer
+from companion.autopilot.parameters.reading import SCALES
 from companion.autopilot.parameters.wire import float32, same_float32
-from companion.autopilot.vehicle.vehicle import Firmware
 from companion.errors import CalibrationRefusedError
 from companion.estimation.solution.solve import ImuSolution
 from companion.estimation.temperature.polynomial import NOTHING, Polynomial
@@ -36,13 +33,13 @@ Acts = Literal["at a start", "while still", "after a flight"]
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Rival:
-    """A parameter that is switched on, and what that means for offsets of ours."""
+    """A parameter that makes the autopilot overwrite our offsets."""
 
     parameter: str
     value: int
     acts: Acts
     accelerometers: bool
-    """Whether it overwrites accelerometer offsets too; gyro offsets it always does."""
+    """Whether it overwrites accelerometer offsets as well as gyro offsets."""
     words: str
 
     @property
@@ -52,70 +49,12 @@ class Rival:
 
     @property
     def until_boot(self) -> bool:
-        """Switched off, and acting all the same until the next boot."""
+        """Whether it is switched off and acts all the same until the next boot."""
         return self.value == 0
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Kind:
-    acts: Acts
-    what: str
-    accelerometers: bool = False
-    from_boot: bool = False
-    """Whether only a boot looks at the parameter, so that switching it off stops nothing before that."""
-
-
-_RIVALS: Final[dict[Firmware, dict[str, _Kind]]] = {
-    "ardupilot": {
-        "INS_GYR_CAL": _Kind("at a start", "the next boot measures the gyros itself and overwrites these gyro offsets"),
-    },
-    "px4": {
-        "IMU_GYRO_CAL_EN": _Kind(
-            "while still",
-            "while disarmed and still PX4 overwrites gyro offsets that seem more than 0.57 deg/s (0.01 rad/s) off",
-            from_boot=True,
-        ),
-        "SENS_IMU_AUTOCAL": _Kind(
-            "after a flight",
-            "after a flight PX4 overwrites gyro offsets that seem more than 0.57 deg/s (0.01 rad/s) off, and"
-            " accelerometer offsets more than 5 mg (0.05 m/s^2)",
-            accelerometers=True,
-        ),
-    },
-}
-"""By parameter: what any value but 0 means (autopilots 1.5, 4.3)."""
-
-
-def rivals_of(firmware: Firmware | None) -> tuple[str, ...]:
-    """The parameters that may be rivals on a firmware."""
-    return tuple(_RIVALS.get(firmware or "other", {}))
-
-
-async def read_rivals(parameters: Parameters, seen: dict[str, int] | None = None) -> tuple[Rival, ...]:
-    """Those that are switched on, and those that were and act until the next boot.
-
-    `seen` is kept here from one call to the next: by parameter, the boot (as counted) since which it was seen to be on.
-
-    Raises:
-        AutopilotError: as `Parameters.read_optional`.
-    """
-    found: list[Rival] = []
-    seen = {} if seen is None else seen
-    boots = parameters.vehicle.boots
-    for name, kind in _RIVALS.get(parameters.vehicle.firmware or "other", {}).items():
-        value = await read_integer(parameters, name)
-        if value:
-            words = f"{name} = {value}: {kind.what}; set it to 0 to keep them (push.stop_rivals = true does)"
-            found.append(Rival(name, value, kind.acts, kind.accelerometers, words))
-            seen[name] = boots
-        elif kind.from_boot and seen.get(name) == boots:
-            words = f"{name} is off from the next boot on: until then {kind.what}; reboot the autopilot"
-            found.append(Rival(name, 0, kind.acts, kind.accelerometers, words))
-    return tuple(found)
-
-
 def stop(rivals: Sequence[Rival]) -> list[Change]:
-    """What to write to switch them off."""
+    """Plan the changes that switch rivals off."""
     return [Change(rival.parameter, rival.value, 0.0) for rival in rivals if not rival.until_boot]
 
 
@@ -124,8 +63,8 @@ MAX_GYRO_RESIDUAL_RAD_S: Final = 5.0 * DEG
 deg/s between two gyros for a fault ("Gyros inconsistent"), and current MEMS gyros start within 1 deg/s."""
 
 MAX_ACCEL_RESIDUAL_M_S2: Final = 1.0
-"""As above: the worst parts still flown are specified at 80 mg (0.8 m/s^2, MPU-6000, vertical axis), ArduPilot
-refuses to arm at 0.75 m/s^2 between two accelerometers, and a wrong mounting or gradienter law soon exceeds it."""
+"""The worst accelerometers still flown are specified at 80 mg (0.8 m/s^2, MPU-6000, vertical axis), ArduPilot refuses
+to arm at 0.75 m/s^2 between two accelerometers, and a wrong mounting or gradienter law soon exceeds it."""
 
 MAX_GYRO_OFFSET_RAD_S: Final = 20.0 * DEG
 """Whole offset: the loosest zero-rate specification of a part still flown (MPU-6000, 20 deg/s)."""
@@ -142,6 +81,37 @@ NOT_ZERO_M_S2: Final = 1e-6
 _AXES: Final = "XYZ"
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class Range:
+    """Allowed values of one parameter, both ends included."""
+
+    low: float
+    high: float
+    whole: bool = False
+    unit: str = ""
+
+    def holds(self, value: float) -> bool:
+        """Whether a value is allowed; NaN is not."""
+        return self.low <= value <= self.high and not (self.whole and value != int(value))
+
+    def __str__(self) -> str:
+        kind = "whole numbers " if self.whole else ""
+        return f"{kind}{self.low:.3g} to {self.high:.3g}{self.unit and f' {self.unit}'}"
+
+
+# Wide enough for whatever an autopilot may have had before, which an undo restores; far too narrow for nonsense.
+_GYRO_RAD_S: Final = MAX_GYRO_OFFSET_RAD_S + MAX_GYRO_RESIDUAL_RAD_S + 0.05
+"""An offset from which a calibration still comes to a plausible one, and a far step or a dither beyond it."""
+_ACCEL_M_S2: Final = MAX_ACCEL_OFFSET_M_S2 + MAX_ACCEL_RESIDUAL_M_S2 + 0.4
+GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
+ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
+ACCEL_SCALE: Final = Range(*SCALES)
+DEGC_RANGE: Final = Range(-300.0, 400.0, unit="deg C")
+"""-300: not known. Up to what a thermometer in kelvin shows: the autopilot stores what its own one says."""
+DEVICE_ID_RANGE: Final = Range(0.0, 2.0**24, whole=True)
+SWITCH_RANGE: Final = Range(0.0, 255.0, whole=True)
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ImuParameters:
     """The names of the parameters that correct one IMU; vectors are X, Y, Z in rad/s and m/s^2, an id of 0 is none."""
@@ -153,14 +123,23 @@ class ImuParameters:
     accel_id: str
 
 
+def offset_ranges(names: ImuParameters) -> dict[str, Range]:
+    """Return the allowed values of one IMU's offsets and scales."""
+    return {
+        **dict.fromkeys(names.gyro_offset, GYRO_OFFSET),
+        **dict.fromkeys(names.accel_offset, ACCEL_OFFSET),
+        **dict.fromkeys(names.accel_scale, ACCEL_SCALE),
+    }
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class FarStep:
-    """How far an offset is set wrong first where the firmware would ignore a small change; zero on all axes but one.
+    """Detour of an offset where the firmware ignores a small change; zero on all axes but one.
 
     PX4 ignores a vector that differs by no more than 0.01 (rad/s, m/s^2) from the one in use (autopilots 4.2), and it
-    may read the parameters between any two writes. So what it uses may differ by 0.01 from what it has stored. One axis
-    that steps by twice that, after the others have their new values, brings in whatever was in use before. The axis is
-    the one nearest to the vehicle's vertical: there a wrong value turns the heading, but tilts nothing.
+    may read the parameters between any two writes. So the value in use may differ by 0.01 from the stored one. One axis
+    that steps by twice that brings the whole vector into use. It is the axis nearest to the vehicle's vertical: a wrong
+    value there turns the heading, but tilts nothing.
     """
 
     gyro_rad_s: Vector
@@ -170,26 +149,26 @@ class FarStep:
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Thermal:
-    """What a firmware's temperature calibration takes off the readings of one IMU, in the IMU's axes."""
+    """Temperature calibration of one IMU: what the firmware takes off its readings, in the IMU's axes."""
 
     enabled_by: str = ""
-    """The parameter that has switched it on; empty where it takes nothing off."""
+    """Parameter that has switched it on; empty where it takes nothing off."""
     values: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """What decides about it, by parameter, as far as it was read."""
+    """Parameters of it, as far as they were read."""
     gyro: Polynomial = NOTHING
     accel: Polynomial = NOTHING
 
     def taken_off(self, degc: float | None) -> tuple[Array, Array]:
-        """At a temperature, rad/s and m/s^2, (3,) each; where none is known, nothing."""
+        """Return rad/s and m/s^2 at a temperature, (3,) each; zero where none is known."""
         return (np.zeros(3), np.zeros(3)) if degc is None else (self.gyro.at(degc), self.accel.at(degc))
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ImuCalibration:
-    """What the autopilot corrects one IMU with, as read."""
+    """Corrections of one IMU in the autopilot, as read."""
 
     instance: int
-    """1 to 3: whose telemetry it acts on."""
+    """1 to 3: the IMU on whose telemetry they act."""
     parameters: ImuParameters
     gyro_offset_rad_s: Vector
     accel_offset_m_s2: Vector
@@ -199,11 +178,10 @@ class ImuCalibration:
     orientation: Matrix
     """3x3, the IMU's axes to the vehicle's FRD: R."""
     thermal: Thermal = Thermal()
-    """What is taken off besides, by temperature."""
     zero_is_uncalibrated: bool = False
     """Three accelerometer offsets of exactly zero mean "not calibrated"."""
     far_step: FarStep | None = None
-    """Where the firmware ignores small changes: how they are brought in all the same."""
+    """Detour by which small changes come into use; None where the firmware needs none."""
     gyro_grid_rad_s: float = 0.0
     """Steps of the sensor's own readings behind the telemetry, where they are known and coarse; else 0."""
     accel_grid_m_s2: float = 0.0
@@ -212,12 +190,11 @@ class ImuCalibration:
     accel_offset_may_be_unused: bool = False
     """The parameters may hold other accelerometer offsets than those that the firmware uses."""
     rivals: tuple[Rival, ...] = ()
-    """What in the autopilot overwrites offsets of ours later."""
     warnings: tuple[str, ...] = ()
 
     @property
     def offsets(self) -> dict[str, float]:
-        """By parameter, gyro offsets first."""
+        """Offsets by parameter, gyro offsets first."""
         names = self.parameters
         return {
             **dict(zip(names.gyro_offset, self.gyro_offset_rad_s, strict=True)),
@@ -226,16 +203,16 @@ class ImuCalibration:
 
     @property
     def corrections(self) -> dict[str, float]:
-        """By parameter: everything that acts on this IMU's output, as far as single parameters tell."""
+        """Offsets and scales by parameter."""
         return {**self.offsets, **dict(zip(self.parameters.accel_scale, self.accel_scale, strict=True))}
 
     def in_use(self, accel_scale: Vector | None = None) -> Array:
-        """Of these scales, or of those that were read, what the firmware works with, (3,)."""
+        """Return the scales that the firmware works with, (3,), given these or those that were read."""
         scale = np.asarray(self.accel_scale if accel_scale is None else accel_scale, dtype=np.float64)
         return np.ones(3) if np.linalg.norm(scale - 1.0) <= self.scale_unused_within else scale
 
     def thermal_change(self, triad: Triad, degc: float, then_degc: float) -> Array:
-        """By how much less the output of one half is at another temperature, by `thermal`, (3,), vehicle FRD."""
+        """Return how much less one triad's output is at another temperature, (3,), vehicle FRD."""
         half = 0 if triad == "gyro" else 1
         change = self.thermal.taken_off(then_degc)[half] - self.thermal.taken_off(degc)[half]
         return self.orientation @ (change if triad == "gyro" else np.asarray(self.accel_scale) * change)
@@ -256,7 +233,7 @@ class ImuCalibration:
 
 
 def gyro_offset_after(calibration: ImuCalibration, residual_rad_s: Vector) -> Vector:
-    """The offset that takes a residual (mean output minus truth, FRD) out: gyro_offset + R^-1 residual, as float32."""
+    """Return the offset that takes a residual (output minus truth, FRD) out: gyro_offset + R^-1 residual, float32."""
     _require_plausible(calibration, "gyro residual", residual_rad_s, MAX_GYRO_RESIDUAL_RAD_S)
     step = calibration.orientation.T @ np.asarray(residual_rad_s)
     after = _vector(np.asarray(calibration.gyro_offset_rad_s) + step)
@@ -265,7 +242,7 @@ def gyro_offset_after(calibration: ImuCalibration, residual_rad_s: Vector) -> Ve
 
 
 def accel_offset_after(calibration: ImuCalibration, residual_m_s2: Vector) -> Vector:
-    """The same: accel_offset + diag(1/accel_scale) R^-1 residual."""
+    """Return accel_offset + diag(1/accel_scale) R^-1 residual, float32; never the three zeros of "uncalibrated"."""
     _require_plausible(calibration, "accelerometer residual", residual_m_s2, MAX_ACCEL_RESIDUAL_M_S2)
     step = (calibration.orientation.T @ np.asarray(residual_m_s2)) / np.asarray(calibration.accel_scale)
     after = _vector(np.asarray(calibration.accel_offset_m_s2) + step)
@@ -278,7 +255,7 @@ def accel_offset_after(calibration: ImuCalibration, residual_m_s2: Vector) -> Ve
 def changes_for(
     calibration: ImuCalibration, gyro_residual_rad_s: Vector | None, accel_residual_m_s2: Vector | None
 ) -> list[Change]:
-    """What to write, accelerometers first (autopilots 9.3: the better order); None: that half stays as it is.
+    """Plan the changes of offsets, accelerometers first (autopilots 9.3: the better order); None: that triad stays.
 
     Raises:
         CalibrationRefusedError: a value that is not plausible, see the limits at the top.
@@ -297,17 +274,17 @@ def changes_for(
 
 
 def vector_changes(names: tuple[str, str, str], before: Vector, after: Vector, far: Vector | None) -> list[Change]:
-    """The changes of one vector; an axis on which `far` is not 0 goes by a value that far above old and new."""
+    """Plan the changes of one vector; an axis on which `far` is not 0 goes by a value that far above old and new."""
     steps = (0.0, 0.0, 0.0) if far is None else far
     vias = [max(b, a) + step if step else None for b, a, step in zip(before, after, steps, strict=True)]
     return list(map(Change, names, before, after, vias))
 
 
 def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: Vector) -> list[Change]:
-    """Offsets and scales that take a bias and a scale error out of the output, both of it as it is, in the IMU's axes.
+    """Plan offsets and scales that take a bias and a scale error out of the output, in the IMU's axes.
 
-    Of output = (1 + scale) truth + bias: offset + bias / accel_scale, and accel_scale / (1 + scale). Where the firmware
-    would start without such scales, they become 1, and the offsets right for a level aircraft.
+    With output = (1 + scale) truth + bias: offset + bias / accel_scale, and accel_scale / (1 + scale). Where the
+    firmware would start without such scales, they become 1, and the offsets right for a level aircraft.
 
     Raises:
         CalibrationRefusedError: a value that is not plausible, see the limits at the top.
@@ -336,7 +313,7 @@ def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: V
 def output_step(
     calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector = (0.0, 0.0, 0.0)
 ) -> tuple[Vector, Vector]:
-    """By how much the output must move when the changes are in force: gyro rad/s, accelerometer m/s^2, vehicle FRD.
+    """Return how far the output must move when the changes are in force: rad/s and m/s^2, vehicle FRD.
 
     `accel_m_s2`: the accelerometers' output before them, which a change of scale stretches.
     """
@@ -355,7 +332,7 @@ def output_step(
 def whole_bias(
     calibration: ImuCalibration, gyro_residual_rad_s: Vector, accel_residual_m_s2: Vector, degc: float | None
 ) -> tuple[Vector, Vector]:
-    """The sensor's whole bias: what it would show without any correction (its scale kept) minus truth, vehicle FRD.
+    """Return the sensor's whole bias: output without any correction (its scale kept) minus truth, vehicle FRD.
 
     residual + R (gyro_offset + gyro_thermal), and residual + R diag(accel_scale) (accel_offset + accel_thermal), at the
     temperature of the residual.
@@ -368,14 +345,14 @@ def whole_bias(
 
 
 def whole_of(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:
-    """Whole gyro and accelerometer bias of an IMU whose owner corrects it already."""
+    """Return the whole gyro and accelerometer bias of an IMU that the autopilot corrects already."""
     rate, force = ((0.0, 0.0, 0.0) if one is None else _vector(one) for one in (found.gyro_rad_s, found.accel_m_s2))
     gyro, accel = map(np.array, whole_bias(calibration, rate, force, found.temperature_degc))
     return gyro if found.gyro_rad_s is not None else None, accel if found.accel_m_s2 is not None else None
 
 
 def accel_taken_off(calibration: ImuCalibration) -> Array:
-    """What the offsets take off the accelerometer: diag(accel_scale) accel_offset, (3,), m/s^2, its own axes."""
+    """Return diag(accel_scale) accel_offset, which the output lacks, (3,), m/s^2, in the IMU's axes."""
     scaled: Array = np.asarray(calibration.accel_scale) * np.asarray(calibration.accel_offset_m_s2)
     return scaled
 

@@ -1,143 +1,69 @@
-"""PX4's bias parameters: slots by device id, what R is made of, and what PX4 does with a value (autopilots 4).
+"""PX4: parameters of IMUs, level, heading, gate and ports, and what PX4 does with a value (autopilots 4).
 
     R = R(SENS_BOARD_X/Y/Z_OFF) R(SENS_BOARD_ROT)    of an internal sensor
     R = R(SENS_BOARD_X/Y/Z_OFF) R(CAL_*_ROT)         of an external one
 
-so the level adjustment, unlike ArduPilot's trim, does turn IMU data. A thermal calibration (TC_*,
-`px4_thermal`) takes its part off before the offsets and may be on or off.
+so the level adjustment, unlike ArduPilot's trim, turns IMU data.
 
-The offsets of a sensor stand in the slot that holds its device id, CAL_GYROn_ID and CAL_ACCn_ID. SCALED_IMU, 2 and 3
-show the first, second and third pair of a gyro and an accelerometer, in the order in which their drivers started, and
-no message says which device id that is (autopilots 4.1, 4.5). PX4 itself prefers the slot of the same number, so the
-order of the slots is a good guess; whether it was right shows only in the telemetry after a write. What was learned
-that way is remembered here, by device id.
+Thermal compensation of the gyros, TC_G*, is read and never written (autopilots 10.2). In the sensor's axes it takes off
+X0 + X1 d + X2 d^2 + X3 d^3, with d = T - TREF and T held within TMIN and TMAX, in steps of a kelvin; the offsets in
+CAL_GYROn come off besides. Most boards are built without it, and then have no such parameters.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.firmware.base import Firmware, HeadingSetting, Net, PortRow, RivalKind
 from companion.autopilot.firmware.imu_calibration import (
     ACCEL_SCALE_RANGE,
+    DEGC_RANGE,
+    DEVICE_ID_RANGE,
+    SWITCH_RANGE,
     FarStep,
     ImuCalibration,
     ImuParameters,
-    read_rivals,
+    Range,
+    Thermal,
+    offset_ranges,
 )
+from companion.autopilot.firmware.imu_messages import PX4_FLOATS, SCALED, SCALED2, SCALED3
+from companion.autopilot.firmware.px4_slots import PREFIX, SLOTS, Slot, SlotMemory, read_slots
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.reading import SCALES, Parameters, read_integer, read_vector
+from companion.autopilot.parameters.reading import SCALES, FirmwareName, Parameters, read_integer, read_vector
 from companion.errors import AutopilotError
-from companion.physics.frames import Matrix, rotation_matrix, vector
+from companion.estimation.temperature.polynomial import NOTHING, Polynomial
+from companion.physics.frames import Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix, vector
 from companion.physics.units import MG
 from companion.rotations import ROTATION_NAMES
 from companion.samples import Triad, Vector
 
-SLOTS: Final = 4
 THERMAL_ENABLE: Final = "TC_G_ENABLE"
 LEVEL: Final = ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF", "SENS_BOARD_Z_OFF")
-NO_IMU: Final = 0
-PREFIX: Final[dict[Triad, str]] = {"gyro": "CAL_GYRO", "accel": "CAL_ACC"}
-WORDS: Final[dict[Triad, str]] = {"gyro": "gyro", "accel": "accelerometer"}
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Slot:
-    """One slot that holds a device id."""
-
-    number: int
-    device_id: int
-    enabled: bool
-
-
-class SlotMemory:
-    """Which device is which IMU; since the last restart: which offsets are in use, which rivals act."""
-
-    def __init__(self) -> None:
-        self._instance_of: dict[tuple[Triad, int], int] = {}
-        self._enabled: dict[Triad, int] = {}
-        self._in_use: dict[tuple[str, str, str], tuple[int, Vector]] = {}
-        self.rivals: dict[str, int] = {}
-        """As `read_rivals` keeps it."""
-
-    def learn(self, sensor: Triad, device_id: int, instance: int) -> None:
-        """The offsets in the slot of this device act on the telemetry of this IMU (NO_IMU: of none)."""
-        for other in [key for key, known in self._instance_of.items() if key[0] == sensor and known == instance]:
-            if instance != NO_IMU:
-                del self._instance_of[other]
-        self._instance_of[sensor, device_id] = instance
-
-    def known(self, sensor: Triad, device_id: int) -> int | None:
-        """The IMU that a device was seen to be; NO_IMU: none in the telemetry."""
-        return self._instance_of.get((sensor, device_id))
-
-    def holds_strangers(self, sensor: Triad, imus: int) -> bool:
-        """Whether more slots are in use than there may be IMUs: then one may be of a sensor that is not there."""
-        return self._enabled.get(sensor, 0) > imus
-
-    def forget(self) -> None:
-        """What was learned cannot be true."""
-        self._instance_of.clear()
-
-    def brought_into_use(self, names: tuple[str, str, str], vector: Vector, boots: int) -> None:
-        """A vector of offsets was written in two steps, so that the firmware uses it, until a restart."""
-        self._in_use[names] = (boots, vector)
-
-    def in_use(self, names: tuple[str, str, str], vector: Vector, boots: int) -> bool:
-        """Whether this very vector is known to be used."""
-        return self._in_use.get(names) == (boots, vector)
-
-    def choose(self, sensor: Triad, instance: int, slots: tuple[Slot, ...], like: int | None = None) -> Slot:
-        """The slot to write for an IMU (1 to 3), of all that hold a device id: the known one, else the best guess.
-
-        `like`: the device id of the IMU's other half; of a chip that is both, it is the same.
-
-        Raises:
-            AutopilotError: there is none.
-        """
-        prefix, word = PREFIX[sensor], WORDS[sensor]
-        self._enabled[sensor] = sum(slot.enabled for slot in slots)
-        if not slots:
-            raise AutopilotError(
-                f"PX4 has no {word} in {prefix}0_ID to {prefix}{SLOTS - 1}_ID: calibrate its {word}s once with the"
-                " ground station, so that it knows them"
-            )
-        own = next((slot for slot in slots if self.known(sensor, slot.device_id) == instance), None)
-        if own is None:
-            free = [slot for slot in slots if self.known(sensor, slot.device_id) is None] or [
-                slot for slot in slots if self.known(sensor, slot.device_id) == NO_IMU
-            ]
-            own = next((slot for slot in free if slot.device_id == like), None)
-            if own is None and instance <= len(slots) and slots[instance - 1] in free:
-                own = slots[instance - 1]
-            if own is None and instance <= len(slots):
-                own = next((slot for slot in free if slot.enabled), None)
-        if own is None:
-            raise AutopilotError(
-                f"the autopilot has no IMU {instance}: only {len(slots)} of {prefix}0_ID to {prefix}{SLOTS - 1}_ID"
-                f" hold a {word}"
-            )
-        if not own.enabled:
-            raise AutopilotError(f"IMU {instance}: {prefix}{own.number}_PRIO = 0, so PX4 has this {word} switched off")
-        return own
-
+_LEVEL_RANGE: Final = Range(-45.0, 45.0, unit="deg")
+"""Anything that a user may have set."""
+_TC_RANGE: Final = Range(-10.0, 10.0)
+"""rad/s, and per kelvin, square kelvin, cubic kelvin."""
 
 IGNORED_STEP: Final = 0.01
-"""A vector of offsets no farther than this (rad/s, m/s^2) from the one in use is ignored (autopilots 4.2), and one of
-scales likewise: `set_scale` of src/lib/sensor_calibration/Accelerometer.cpp. After a start 1 is in use."""
-
+"""A vector of offsets no farther than this (rad/s, m/s^2) from the one in use is ignored (autopilots 4.2), and so is a
+vector of scales: `set_scale` of src/lib/sensor_calibration/Accelerometer.cpp. After a start scales of 1 are in use."""
 MARGIN: Final = 1.05
 """Both sides round to 32 bits."""
-
 FAR_GYRO_RAD_S: Final = 0.022
 """1.3 deg/s: more than twice `IGNORED_STEP`, and 22 digits of SCALED_IMU."""
 FAR_ACCEL_M_S2: Final = 0.09
 """9 digits of SCALED_IMU (9.2 mg): the least that `parameters.verify` can tell from no step."""
 FAR_SCALE: Final = 0.022
+GATED_TILT_DEG: Final = 0.3
+"""Tilt kept from before a write above which a restart is owed; a smaller one is what EKF2 shows of the biases of an
+uncalibrated sensor (autopilots 9.3)."""
 
 SIMULATED_GYRO_GRID_RAD_S: Final = math.radians(2000.0 / 32768.0) / 4.0
 SIMULATED_ACCEL_GRID_M_S2: Final = 1e3 * MG / 2048.0 / 4.0
@@ -149,13 +75,21 @@ _INTERNAL: Final = -1
 _SIMULATION_BUS: Final = 4
 _MAYBE_INTERNAL_BUSES: Final = (1, 2)
 """I2C and SPI; whether such a sensor is inside the autopilot is a fact of the board. PX4 keeps it in CAL_*_ROT."""
-
-# Of number 38 both firmwares' drivers know better angles, but PX4 turns calibrated data by these.
 _PX4_ONLY_DEG: Final = {38: (90.0, 68.0, 293.0)}
+"""Of number 38 both firmwares' drivers know better angles, but PX4 turns calibrated data by these."""
+
+_EV_YAW: Final = 8
+"""Bit 3 of EKF2_EV_CTRL."""
+_MAGNETOMETER: Final = 1 << 10
+"""Bit 10 of EKF2_SENS_EN."""
+SHORTEST_TIMEOUT_S: Final = 0.5
+"""COM_ARM_AUTH_TO that leaves time for our answer."""
+_TELEM2: Final = 102
+_LINKS: Final = 3
 
 
 def parameters_of(gyro_slot: int, accel_slot: int) -> ImuParameters:
-    """The names of one IMU's parameters; its gyro and its accelerometer may stand in slots of different numbers."""
+    """Return one IMU's parameter names; its gyro and its accelerometer may stand in slots of different numbers."""
     gyro, accel = f"{PREFIX['gyro']}{gyro_slot}", f"{PREFIX['accel']}{accel_slot}"
     return ImuParameters(
         gyro_offset=(f"{gyro}_XOFF", f"{gyro}_YOFF", f"{gyro}_ZOFF"),
@@ -167,77 +101,209 @@ def parameters_of(gyro_slot: int, accel_slot: int) -> ImuParameters:
 
 
 def thermal_names(sensor: int) -> tuple[str, ...]:
-    """Of one gyro's thermal compensation: ID, TREF, TMIN, TMAX; then the coefficients, the constants first, by axis."""
+    """Return ID, TREF, TMIN and TMAX of one gyro, then the coefficients: the constants first, by axis."""
     own = f"TC_G{sensor}_"
     head = (f"{own}ID", f"{own}TREF", f"{own}TMIN", f"{own}TMAX")
     return (*head, *(f"{own}X{power}_{axis}" for power in range(4) for axis in range(3)))
 
 
-async def read_slots(parameters: Parameters, sensor: Triad) -> tuple[Slot, ...]:
-    """All slots that hold a device id, in order.
+_RIVALS: Final = {
+    "IMU_GYRO_CAL_EN": RivalKind(
+        "while still",
+        "while disarmed and still PX4 overwrites gyro offsets that seem more than 0.57 deg/s (0.01 rad/s) off",
+        from_boot=True,
+    ),
+    "SENS_IMU_AUTOCAL": RivalKind(
+        "after a flight",
+        "after a flight PX4 overwrites gyro offsets that seem more than 0.57 deg/s (0.01 rad/s) off, and"
+        " accelerometer offsets more than 5 mg (0.05 m/s^2)",
+        accelerometers=True,
+    ),
+}
 
-    Raises:
-        AutopilotError: as `Parameters.read_optional`.
-    """
-    found: list[Slot] = []
-    for number in range(SLOTS):
-        device_id = await read_integer(parameters, f"{PREFIX[sensor]}{number}_ID")
-        if device_id:
-            priority = await read_integer(parameters, f"{PREFIX[sensor]}{number}_PRIO")
-            found.append(Slot(number, device_id, enabled=priority != 0))
-    return tuple(found)
+
+def _ranges() -> dict[str, Range]:
+    found = dict.fromkeys((*_RIVALS, THERMAL_ENABLE), SWITCH_RANGE) | dict.fromkeys(LEVEL[:2], _LEVEL_RANGE)
+    for slot in range(SLOTS):
+        # Former versions have written TC_G*: their undo or restore still restores the old values.
+        device_id, *rest = thermal_names(slot)
+        found |= {**offset_ranges(parameters_of(slot, slot)), device_id: DEVICE_ID_RANGE}
+        found |= {**dict.fromkeys(rest[:3], DEGC_RANGE), **dict.fromkeys(rest[3:], _TC_RANGE)}
+    return found
 
 
-async def read_calibration(parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
-    """Read afresh what PX4 corrects one of its IMUs with.
+class PX4(Firmware):
+    """PX4 with EKF2."""
 
-    Raises:
-        AutopilotError: no slot for such an IMU, or it is switched off, or a value that cannot be worked with; or no
-            answer (ParameterTimeoutError).
-    """
-    boots = parameters.vehicle.boots
-    accel = memory.choose("accel", instance, await read_slots(parameters, "accel"))
-    gyro = memory.choose("gyro", instance, await read_slots(parameters, "gyro"), like=accel.device_id)
-    names = parameters_of(gyro.number, accel.number)
-    offset = await read_vector(parameters, names.accel_offset)
-    small = too_small_to_apply_at_boot(offset)
-    orientation = await _read_rotation(parameters, gyro, accel)
-    calibration = ImuCalibration(
-        instance=instance,
-        parameters=names,
-        gyro_offset_rad_s=await read_vector(parameters, names.gyro_offset),
-        accel_offset_m_s2=offset,
-        accel_scale=await read_vector(parameters, names.accel_scale, *SCALES),
-        gyro_id=gyro.device_id,
-        accel_id=accel.device_id,
-        orientation=orientation,
-        far_step=_far_step(orientation),
-        gyro_grid_rad_s=SIMULATED_GYRO_GRID_RAD_S if _bus(gyro) == _SIMULATION_BUS else 0.0,
-        accel_grid_m_s2=SIMULATED_ACCEL_GRID_M_S2 if _bus(accel) == _SIMULATION_BUS else 0.0,
-        scale_unused_within=MARGIN * IGNORED_STEP,
-        accel_offset_may_be_unused=small and not memory.in_use(names.accel_offset, offset, boots),
-        rivals=await read_rivals(parameters, memory.rivals),
+    name: FirmwareName = "px4"
+    words = "PX4"
+    mav_autopilot = mavlink.MAV_AUTOPILOT_PX4
+    late_heartbeat_on_request = True
+    """It cannot be had faster than once a second, so a single lost one would leave the arm state unknown."""
+    integers_bytewise = True
+    takes_nan_position = True
+    settle_s = 2.0
+    """It reads its parameters at most once a second (autopilots 9.2)."""
+    write_s = 8.0
+    """One vector after another: 7 s for one IMU."""
+    imu_messages = {1: (PX4_FLOATS, SCALED), 2: (PX4_FLOATS, SCALED2), 3: (PX4_FLOATS, SCALED3)}
+    tells_ekf_bias = True
+    estimator_message = mavlink.MAVLink_estimator_status_message
+    ranges = _ranges()
+    rivals = _RIVALS
+    parts = {(0x26, 0x26): "icm42688p", (0x58, 0x58): "adis16470", (0x66, 0x6A): "bmi088"}
+    """drv_sensor.h."""
+    ignores_small_steps = True
+    why_no_thermal_write = (
+        "PX4's thermal compensation (TC_*) is not written: the firmware of common boards is built without it"
     )
-    return dataclasses.replace(calibration, warnings=_warnings(calibration))
 
+    def compass_ratio(self, message: Any) -> float:
+        return float(message.mag_ratio) if message.flags & mavlink.ESTIMATOR_ATTITUDE else 0.0
 
-def too_small_to_apply_at_boot(accel_offset_m_s2: Vector) -> bool:
-    """Whether PX4 will start without this vector: it compares with zero then, and small differences are ignored."""
-    return 0.0 < math.hypot(*accel_offset_m_s2) <= MARGIN * IGNORED_STEP
+    # --- IMUs
 
+    async def _read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
+        boots = parameters.vehicle.boots
+        accel = memory.choose("accel", instance, await read_slots(parameters, "accel"))
+        gyro = memory.choose("gyro", instance, await read_slots(parameters, "gyro"), like=accel.device_id)
+        names = parameters_of(gyro.number, accel.number)
+        offset = await read_vector(parameters, names.accel_offset)
+        orientation = await _read_rotation(parameters, gyro, accel)
+        calibration = ImuCalibration(
+            instance=instance,
+            parameters=names,
+            gyro_offset_rad_s=await read_vector(parameters, names.gyro_offset),
+            accel_offset_m_s2=offset,
+            accel_scale=await read_vector(parameters, names.accel_scale, *SCALES),
+            gyro_id=gyro.device_id,
+            accel_id=accel.device_id,
+            orientation=orientation,
+            thermal=await _read_thermal(parameters, gyro.device_id),
+            far_step=_far_step(orientation),
+            gyro_grid_rad_s=SIMULATED_GYRO_GRID_RAD_S if gyro.bus == _SIMULATION_BUS else 0.0,
+            accel_grid_m_s2=SIMULATED_ACCEL_GRID_M_S2 if accel.bus == _SIMULATION_BUS else 0.0,
+            scale_unused_within=MARGIN * IGNORED_STEP,
+            accel_offset_may_be_unused=_too_small_to_apply_at_boot(offset)
+            and not memory.in_use(names.accel_offset, offset, boots),
+            rivals=await self.read_rivals(parameters, memory.rivals),
+        )
+        warnings = [rival.words for rival in calibration.rivals]
+        low, high = ACCEL_SCALE_RANGE
+        if not all(low <= scale <= high for scale in calibration.accel_scale):
+            warnings.append(
+                f"{names.accel_scale[0]}, Y or Z is outside {low} to {high}: the scale calibration looks wrong"
+            )
+        return dataclasses.replace(calibration, warnings=tuple(warnings))
 
-def stale_tilt_deg(changes: Sequence[Change]) -> float:
-    """How far EKF2's tilt may be off until a restart: it learns the step of an accelerometer very slowly; 0 without."""
-    step: dict[str, float] = {}
-    for change in changes:
-        if change.parameter.startswith(PREFIX["accel"]):
-            slot = change.parameter.partition("_")[2].partition("_")[0]
-            step[slot] = math.hypot(step.get(slot, 0.0), change.after - change.before)
-    return math.degrees(max(step.values(), default=0.0) / (1e3 * MG))
+    def stale_tilt_deg(self, changes: Sequence[Change]) -> float:
+        """Return the tilt that EKF2 keeps: it learns a step of level or accelerometers very slowly."""
+        turned_deg = math.hypot(*(change.after - change.before for change in changes if change.parameter in LEVEL))
+        step: dict[str, float] = {}
+        for change in changes:
+            if change.parameter.startswith(PREFIX["accel"]):
+                slot = change.parameter.partition("_")[2].partition("_")[0]
+                step[slot] = math.hypot(step.get(slot, 0.0), change.after - change.before)
+        stale_deg = math.degrees(max(step.values(), default=0.0) / (1e3 * MG))
+        return max(turned_deg, stale_deg) if turned_deg or stale_deg >= GATED_TILT_DEG else 0.0
+
+    # --- level
+
+    level_turns_imus = True
+
+    async def plan_level(
+        self, parameters: Parameters, roll_rad: float, pitch_rad: float
+    ) -> tuple[list[Change], Matrix]:
+        x, y, z = await _read_level(parameters)
+        level = rotation_matrix((x, y, z))
+        seen = body_from_ned(roll_rad, pitch_rad, 0.0) @ (0.0, 0.0, -1.0)
+        roll, pitch = np.degrees(roll_pitch_from_up(level.T @ seen)).tolist()
+        turn: Matrix = rotation_matrix((roll, pitch, z)) @ level.T
+        return [Change(LEVEL[0], x, roll), Change(LEVEL[1], y, pitch)], turn
+
+    # --- heading from outside
+
+    heading_settings = (
+        HeadingSetting("EKF2_EV_CTRL", float(_EV_YAW), "EKF2 takes its heading from external vision", bits=True),
+        HeadingSetting("EKF2_EV_NOISE_MD", 0.0, "with the sigma that we send"),
+        # ev_yaw_control.cpp takes the value, unsquared, for the least variance: sqrt(0.05) rad = 12.8 deg.
+        HeadingSetting("EKF2_EVA_NOISE", 0.05, "as long as that is above 12.8 deg"),
+        HeadingSetting("EKF2_EV_DELAY", 0.0, "our stamps are those of the samples", optional=True),
+    )
+    heading_watched = ("EKF2_MAG_TYPE", "SYS_HAS_MAG", "EKF2_SENS_EN")
+    heading_risks = (
+        "EKF2 believes the companion's heading beside its magnetometer, and resets to it where the two disagree",
+    )
+
+    def heading_net(self, found: Mapping[str, float]) -> Net:
+        return "none" if self.missing_compass(found) else "autopilot"
+
+    def missing_compass(self, found: Mapping[str, float]) -> str | None:
+        if found.get("SYS_HAS_MAG") == 0.0:
+            return "SYS_HAS_MAG = 0"
+        if (kind := found.get("EKF2_MAG_TYPE", 0.0)) not in (0.0, 1.0):
+            return f"EKF2_MAG_TYPE = {kind:g}"
+        return None if int(found.get("EKF2_SENS_EN", _MAGNETOMETER)) & _MAGNETOMETER else "bit 10 of EKF2_SENS_EN"
+
+    # --- arming
+
+    gate_parameters = ("COM_ARM_AUTH_REQ", "COM_ARM_AUTH_ID", "COM_ARM_AUTH_MET", "COM_ARM_AUTH_TO")
+
+    async def find_gate_problem(
+        self, parameters: Parameters, system_id: int | None, script_starts_s: float
+    ) -> str | None:
+        required, system, method, timeout_s = [await parameters.read_optional(name) for name in self.gate_parameters]
+        if required is None:
+            return "this PX4 has no arm authorisation"
+        wrong = [
+            *(["COM_ARM_AUTH_REQ 1"] if required != 1 else []),
+            *([f"COM_ARM_AUTH_ID {system_id}"] if system != system_id else []),
+            *(["COM_ARM_AUTH_MET 0"] if method not in (None, 0) else []),
+            *(["COM_ARM_AUTH_TO 1"] if timeout_s is not None and timeout_s < SHORTEST_TIMEOUT_S else []),
+        ]
+        return f"set {', '.join(wrong)}" if wrong else None
+
+    # --- ports: no message tells on which one a component is heard; MAV_1, on TELEM 2, is meant for it
+
+    port_names = ("MAV_1_CONFIG", "SER_TEL2_BAUD", "MAV_1_FORWARD")
+
+    def port_rows(self, found: Mapping[str, float], baud: int | None) -> list[PortRow]:
+        config, speed, forward = self.port_names
+        rows: list[PortRow] = []
+        if config in found:
+            rows.append(PortRow(config, found[config], _TELEM2, "MAVLink on TELEM 2"))
+        if baud is not None and found.get(config) == _TELEM2 and speed in found:
+            rows.append(PortRow(speed, found[speed], baud, "as in mavlink.url"))
+        if forward in found:
+            rows.append(PortRow(forward, found[forward], 1, "ground stations reach the companion"))
+        return rows
+
+    def port_needs(self, baud: int) -> str | None:
+        return f"MAV_1_CONFIG = 102, SER_TEL2_BAUD = {baud}"
+
+    async def read_closed_links(self, parameters: Parameters) -> list[str]:
+        closed: list[str] = []
+        for number in range(_LINKS):
+            # MAV_n_CONFIG = 0: there is no such link.
+            if await read_integer(parameters, f"MAV_{number}_CONFIG") == 0:
+                continue
+            if await read_integer(parameters, f"MAV_{number}_FORWARD") == 0:
+                closed.append(f"MAV_{number}")
+        return closed
+
+    def forwarding_words(self, closed: Sequence[str]) -> tuple[bool, str]:
+        if not closed:
+            return True, "none heard (none connected?); PX4 forwards between all its links"
+        return False, (
+            f"none heard. PX4 does not forward to or from {', '.join(closed)}: if the companion or the ground station"
+            f" is on {'it' if len(closed) == 1 else 'one of them'}, ground stations can't reach the companion: set"
+            f" {closed[0]}_FORWARD=1 and reboot (no message tells which MAV_n the companion is on; TELEM2 usually is"
+            " MAV_1)"
+        )
 
 
 def accel_offset_with(calibration: ImuCalibration, changes: Sequence[Change]) -> Vector:
-    """The accelerometer offsets after these changes."""
+    """Return the accelerometer offsets after these changes."""
     after = {change.parameter: change.after for change in changes}
     names, before = calibration.parameters.accel_offset, calibration.accel_offset_m_s2
     x, y, z = (after.get(name, old) for name, old in zip(names, before, strict=True))
@@ -245,16 +311,21 @@ def accel_offset_with(calibration: ImuCalibration, changes: Sequence[Change]) ->
 
 
 def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tuple[str, ...]:
-    """What PX4 makes of these changes later, for people."""
+    """Warn of changes that PX4 will not use after a restart."""
     after = accel_offset_with(calibration, changes)
-    if calibration.far_step is None or not too_small_to_apply_at_boot(after):  # None: not PX4
+    if calibration.far_step is None or not _too_small_to_apply_at_boot(after):  # None: not PX4
         return ()
     size = f"{calibration.parameters.accel_offset[0]}, Y and Z are {math.hypot(*after) / MG:.2f} mg in all"
     return (f"{size}: below 1 mg (0.01 m/s^2) PX4 starts without them; calibrate again after a restart",)
 
 
+def _too_small_to_apply_at_boot(accel_offset_m_s2: Vector) -> bool:
+    """Whether PX4 will start without this vector: it compares with zero then, and small differences are ignored."""
+    return 0.0 < math.hypot(*accel_offset_m_s2) <= MARGIN * IGNORED_STEP
+
+
 async def _read_rotation(parameters: Parameters, gyro: Slot, accel: Slot) -> Matrix:
-    level = rotation_matrix(await read_level(parameters))
+    level = rotation_matrix(await _read_level(parameters))
     gyro_mounting = await _read_mounting(parameters, "gyro", gyro)
     accel_mounting = await _read_mounting(parameters, "accel", accel)
     if not np.array_equal(gyro_mounting, accel_mounting):
@@ -266,16 +337,8 @@ async def _read_rotation(parameters: Parameters, gyro: Slot, accel: Slot) -> Mat
     return matrix
 
 
-def _bus(slot: Slot) -> int:
-    return slot.device_id & 0b111
-
-
-async def read_level(parameters: Parameters) -> Vector:
-    """The level adjustment: degrees of roll, pitch, yaw.
-
-    Raises:
-        AutopilotError: as `Parameters.read`, or no angles.
-    """
+async def _read_level(parameters: Parameters) -> Vector:
+    """Read the level adjustment: degrees of roll, pitch, yaw."""
     x, y, z = [await parameters.read(name) for name in LEVEL]
     for name, angle_deg in zip(LEVEL, (x, y, z), strict=True):
         if not math.isfinite(angle_deg):
@@ -284,24 +347,14 @@ async def read_level(parameters: Parameters) -> Vector:
 
 
 async def _read_mounting(parameters: Parameters, sensor: Triad, slot: Slot) -> Matrix:
-    """How a sensor is mounted on the vehicle, level adjustment apart."""
+    """Read the rotation of a sensor against the vehicle, without the level adjustment."""
     own = await read_integer(parameters, f"{PREFIX[sensor]}{slot.number}_ROT")
-    bus = _bus(slot)
-    internal = bus == _SIMULATION_BUS or (bus in _MAYBE_INTERNAL_BUSES and own in (_INTERNAL, None))
+    internal = slot.bus == _SIMULATION_BUS or (slot.bus in _MAYBE_INTERNAL_BUSES and own in (_INTERNAL, None))
     number = await read_integer(parameters, "SENS_BOARD_ROT") if internal else own
     # PX4 takes a number that it does not know for no rotation.
     if number is None or not 0 <= number < len(ROTATION_NAMES):
         number = 0
     return rotation_matrix(_PX4_ONLY_DEG.get(number) or ROTATION_NAMES[number])
-
-
-def _warnings(calibration: ImuCalibration) -> tuple[str, ...]:
-    found = [rival.words for rival in calibration.rivals]
-    low, high = ACCEL_SCALE_RANGE
-    if not all(low <= scale <= high for scale in calibration.accel_scale):
-        name = calibration.parameters.accel_scale[0]
-        found.append(f"{name}, Y or Z is outside {low} to {high}: the scale calibration looks wrong")
-    return tuple(found)
 
 
 def _far_step(orientation: Matrix) -> FarStep:
@@ -311,4 +364,41 @@ def _far_step(orientation: Matrix) -> FarStep:
         gyro_rad_s=vector(FAR_GYRO_RAD_S * vertical),
         accel_m_s2=vector(FAR_ACCEL_M_S2 * vertical),
         scale=vector(FAR_SCALE * vertical),
+    )
+
+
+async def _read_thermal(parameters: Parameters, gyro_id: int) -> Thermal:
+    """Read the thermal compensation of one gyro; it takes nothing off where it is switched off or not built in.
+
+    Whether the module runs cannot be read: it counts as running where it is switched on, as the start script has it.
+    """
+    enable = await read_integer(parameters, THERMAL_ENABLE)
+    if enable is None:
+        return Thermal()
+    switch = {THERMAL_ENABLE: float(enable)}
+    if enable != 1:
+        return Thermal(values=switch)
+    for sensor in range(SLOTS):
+        if await read_integer(parameters, thermal_names(sensor)[0]) == gyro_id:
+            break
+    else:
+        return Thermal(values=switch)
+    found = await parameters.read_many(thermal_names(sensor))
+    if (wrong := next((name for name, value in found.items() if not math.isfinite(value)), None)) is not None:
+        raise AutopilotError(f"{wrong} is {found[wrong]}; a number was expected")
+    polynomial = polynomial_of(sensor, found)
+    acts = any(map(any, polynomial.coefficients))
+    return Thermal(
+        enabled_by=THERMAL_ENABLE if acts else "",
+        values={**switch, **found},
+        gyro=polynomial if acts else NOTHING,
+    )
+
+
+def polynomial_of(sensor: int, values: Mapping[str, float]) -> Polynomial:
+    """Return the bias over temperature that these parameters take off."""
+    _, reference, low, high, *terms = (values[name] for name in thermal_names(sensor))
+    constant, first, second, third = map(vector, np.reshape(terms, (4, 3)))
+    return Polynomial(
+        coefficients=(constant, first, second, third), reference_degc=reference, low_degc=low, high_degc=high
     )

@@ -1,13 +1,18 @@
-"""What is to be changed in the autopilot, and what can become of it."""
+"""Changes of parameters: planned, in the order that PX4's vectors need, and failed.
+
+PX4 ignores a small change of a vector of offsets, unless the vector makes a far step first (`Change.via`).
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar, Literal
+import re
+from collections.abc import Sequence
+from typing import ClassVar, Final, Literal, Protocol
 
 from companion.autopilot.parameters.wire import float32
 from companion.errors import AutopilotError, NotDisarmedError
-from companion.estimation.records.record import WrittenParameter
+from companion.estimation.records.record import Outcome, WrittenParameter
 
 FailureKind = Literal[
     "refused",
@@ -23,12 +28,20 @@ FailureKind = Literal[
 ]
 
 
+POLL_S: Final = 1.1
+"""PX4's readers of parameters let 1 s pass between two looks (autopilots 9.2): after this long each has seen a value.
+After twice that without a write each looks at the next value at once."""
+
+_AXIS: Final = re.compile(r"[XYZ](?=OFF$|SCALE$)|\d$")
+"""Axis in the name of a vector's parameter."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class Change:
-    """One parameter: the value it has, and the value it shall get. All are rounded to float32.
+    """Old and new value of one parameter, rounded to float32.
 
     Where `via` is set the firmware would ignore a small change of the vector: this far value is written first, and when
-    the firmware uses it, the new values of the vector; the same on the way back.
+    the firmware uses it, the new values of the vector; a restore goes the same way.
     """
 
     parameter: str
@@ -49,7 +62,7 @@ class Change:
 
     @property
     def ours(self) -> tuple[float, ...]:
-        """The values that we may have left in the autopilot, besides the old one."""
+        """Values besides the old one that our writes may have left in the autopilot."""
         return (self.after,) if self.via is None else (self.after, self.via)
 
 
@@ -60,7 +73,7 @@ class NothingWrittenError(NotDisarmedError):
 
 
 class WriteFailedError(AutopilotError):
-    """Why a set of parameters is not in force as a whole, and what is in force instead.
+    """A set of parameters is not in force as a whole.
 
     Attributes:
         kind: the cause in a word.
@@ -83,3 +96,52 @@ class WriteFailedError(AutopilotError):
         self.reason = reason
         self.written = written
         self.left_changed = left_changed
+
+
+class FarProbe(Protocol):
+    """Verifies in the telemetry that a far value (`Change.via`) is in use."""
+
+    def mark(self, parameter: str) -> None:
+        """Keep the telemetry until now: the far value of this parameter is written next."""
+
+    async def verify(self, parameter: str) -> str | None:
+        """Compare with the telemetry since; the reason to restore the old values, if there is one."""
+
+
+@dataclasses.dataclass(slots=True)
+class Item:
+    """One parameter of a write, and its state."""
+
+    change: Change
+    sent: bool = False
+    confirmed: bool = False
+    """The autopilot has answered with a value of ours: another one found later is somebody else's."""
+    is_far: bool = False
+    """The value last written is the far one."""
+    read_back: float | None = None
+    outcome: Outcome = "failed"
+    left: bool = False
+
+    def seen(self) -> WrittenParameter:
+        """Return its row in the record."""
+        change = self.change
+        return WrittenParameter(
+            before=change.before, after=change.after, read_back=self.read_back, outcome=self.outcome
+        )
+
+
+ItemVector = tuple[Item, list[Item]]
+"""The axis with a far value, and the others of its vector."""
+
+
+def by_vector(items: Sequence[Item]) -> tuple[list[Item], list[ItemVector]]:
+    """Split into parameters that need no far value, and vectors that do, in order."""
+    vectors: dict[str, ItemVector] = {
+        _AXIS.sub("", item.change.parameter): (item, []) for item in items if item.change.via is not None
+    }
+    plain: list[Item] = []
+    for item in items:
+        if item.change.via is None:
+            vector = vectors.get(_AXIS.sub("", item.change.parameter))
+            (plain if vector is None else vector[1]).append(item)
+    return plain, list(vectors.values())

@@ -1,28 +1,30 @@
-"""What is asked of parameters, whoever has them: an autopilot that answers, or a log in which they stand."""
+"""Parameters as firmwares ask for them: of an autopilot that answers, or of a log in which they stand."""
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Iterable
-from typing import Final, Protocol
+from typing import Final, Literal, Protocol
 
-from companion.autopilot.vehicle.vehicle import Firmware
 from companion.errors import AutopilotError
 from companion.samples import Vector
 
+FirmwareName = Literal["ardupilot", "px4", "other"]
+
 SCALES: Final = (0.5, 2.0)
-"""Of accelerometers, which are divided by; with others nothing is calibrated."""
+"""Accelerometer scales with which a calibration works: it divides by them."""
 
 
 class Owner(Protocol):
-    """Whose they are."""
+    """An autopilot, or a log of one."""
 
     @property
     def name(self) -> str:
         """For people."""
 
     @property
-    def firmware(self) -> Firmware | None:
+    def firmware(self) -> FirmwareName | None:
         """None: not known yet."""
 
     @property
@@ -34,29 +36,63 @@ class Owner(Protocol):
 
 
 class Parameters(Protocol):
-    """Read by name; `ParameterClient` has what they raise."""
+    """Parameters read by name; `ParameterClient` says what they raise."""
 
     @property
     def vehicle(self) -> Owner:
-        """Whose they are."""
+        """Their owner."""
 
     async def read(self, name: str) -> float:
-        """One that must be there."""
+        """Read one that must exist."""
 
     async def read_optional(self, name: str) -> float | None:
-        """None: there is no such parameter."""
+        """Read one; None: there is no such parameter."""
 
     async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
-        """Several; where `optional`, what does not exist is left out."""
+        """Read several; where `optional`, what does not exist is left out."""
+
+
+class DisarmedGuard(Protocol):
+    """Proof that an autopilot is disarmed."""
+
+    async def ensure(self) -> None:
+        """Return in the moment in which it is surely disarmed; raises NotDisarmedError."""
+
+
+class CommandSender(Protocol):
+    """Commands to an autopilot."""
+
+    def send(self, command: int, *parameters: float, timeout_s: float = 0.5) -> asyncio.Future[int | None]:
+        """Send one; the future brings its MAV_RESULT, or None."""
+
+
+class LiveOwner(Owner, Protocol):
+    """An autopilot that takes commands."""
+
+    @property
+    def disarmed(self) -> DisarmedGuard:
+        """To be asked before each command that may only leave while it is disarmed."""
+
+    @property
+    def commands(self) -> CommandSender:
+        """Commands to it."""
+
+
+class LiveParameters(Parameters, Protocol):
+    """Parameters of an autopilot that takes commands."""
+
+    @property
+    def vehicle(self) -> LiveOwner:
+        """Their owner."""
 
 
 async def read_vector(
     parameters: Parameters, names: tuple[str, str, str], low: float = -math.inf, high: float = math.inf
 ) -> Vector:
-    """Three numbers within limits, such as `SCALES`.
+    """Read three numbers within limits, such as `SCALES`.
 
     Raises:
-        AutopilotError: one is not; or as `Parameters.read`.
+        AutopilotError: one is outside; or as `Parameters.read`.
     """
     x, y, z = [await parameters.read(name) for name in names]
     for name, value in zip(names, (x, y, z), strict=True):
@@ -66,7 +102,7 @@ async def read_vector(
 
 
 async def read_integer(parameters: Parameters, name: str) -> int | None:
-    """A whole number, or None where the firmware has no such parameter.
+    """Read a whole number; None where the firmware has no such parameter.
 
     Raises:
         AutopilotError: not a number; or as `Parameters.read_optional`.

@@ -6,14 +6,11 @@ the float field, and refuses a PARAM_SET whose type is not the parameter's own.
 
 from __future__ import annotations
 
-import asyncio
 import math
 import struct
-from typing import Final, NamedTuple
+from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
-from companion.autopilot.vehicle.heartbeats import Firmware
 
 
 def float32(value: float) -> float:
@@ -51,16 +48,6 @@ _HEADER_BYTES: Final = {0xFE: 6, 0xFD: 10}
 REAL32: Final[int] = mavlink.MAV_PARAM_TYPE_REAL32
 
 
-def integers_bytewise(capabilities: int | None, firmware: Firmware | None) -> bool:
-    """Whether integer parameters travel as the bytes of an int32 in the float field, not as a number.
-
-    PX4 always does so, ArduPilot never (autopilots 7.5), whatever an AUTOPILOT_VERSION says that anybody can send.
-    """
-    if firmware in ("ardupilot", "px4"):
-        return firmware == "px4"
-    return bool((capabilities or 0) & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE)
-
-
 def is_integer(kind: int) -> bool:
     """Whether a MAV_PARAM_TYPE is one of the whole numbers of up to 32 bits."""
     return kind in _FORMATS
@@ -92,55 +79,3 @@ def encode(value: float, kind: int, *, bytewise: bool) -> float | None:
     number: float = struct.unpack("<f", carried)[0]
     # A pattern that stands for a signalling NaN does not survive as a float.
     return number if struct.pack("<f", number) == carried else None
-
-
-_ERROR_WORDS: Final = {
-    1: "it does not exist",
-    2: "the value is out of range",
-    3: "no permission",
-    4: "no such component",
-    5: "it is read-only",
-    6: "its type is not supported",
-    7: "its type does not match",
-    8: "it could not be read",
-}
-"""MAV_PARAM_ERROR in words; the generated dialect knows only the first five."""
-
-_INBOX: Final = 64
-
-
-class Inbox:
-    """What arrives about one name during one exchange; when full the oldest answer is dropped."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self._arrived: asyncio.Queue[float | Refusal | Rebooted] = asyncio.Queue(_INBOX)
-
-    def put(self, item: float | Refusal | Rebooted) -> None:
-        """Take what has arrived."""
-        if self._arrived.full():
-            self._arrived.get_nowait()
-        self._arrived.put_nowait(item)
-
-    async def get(self, deadline_s: float) -> float | Refusal | Rebooted | None:
-        """The next item, or None at the deadline (loop's clock)."""
-        try:
-            async with asyncio.timeout_at(deadline_s):
-                return await self._arrived.get()
-        except TimeoutError:
-            return None
-
-
-class Refusal(NamedTuple):
-    """A PARAM_ERROR."""
-
-    code: int
-
-    @property
-    def text(self) -> str:
-        """Why, for people."""
-        return _ERROR_WORDS.get(self.code, f"error {self.code}")
-
-
-class Rebooted:
-    """The autopilot restarted."""

@@ -18,7 +18,8 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.attitude.estimator import Attitude
-from companion.autopilot.vehicle.vehicle import Firmware, Vehicle
+from companion.autopilot.firmware.base import Firmware
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.links.mavlink.link import MavlinkLink
 
 NOWHERE_VARIANCE_M2: Final = 1e4
@@ -46,7 +47,7 @@ def vision_position_estimate(
     covariance[_X] = covariance[_Y] = covariance[_Z] = NOWHERE_VARIANCE_M2
     covariance[_YAW] = sigma_yaw**2
     nowhere = 0.0
-    if firmware == "px4":
+    if firmware.takes_nan_position:
         covariance[_ROLL], covariance[_PITCH] = sigma_roll**2, sigma_pitch**2
         nowhere = math.nan
     return mavlink.MAVLink_vision_position_estimate_message(

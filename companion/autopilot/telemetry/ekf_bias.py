@@ -128,7 +128,7 @@ class EkfBias:
     @property
     def may_look(self) -> bool:
         """Whether something may be typed now."""
-        disarmed = self._vehicle.firmware == "px4" and self._vehicle.arm_state is ArmState.DISARMED
+        disarmed = self._vehicle.kind.tells_ekf_bias and self._vehicle.arm_state is ArmState.DISARMED
         return disarmed and not self._held and asyncio.get_running_loop().time() >= self._from_s
 
     @property

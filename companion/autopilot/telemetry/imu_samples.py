@@ -8,7 +8,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.autopilot.telemetry.imu_messages import Reading
+from companion.autopilot.firmware.imu_messages import Reading
 from companion.samples import ImuSample
 
 TEMPERATURE_AGE_S: Final = 5.0

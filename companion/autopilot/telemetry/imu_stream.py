@@ -15,9 +15,10 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.telemetry import imu_messages
+from companion.autopilot.firmware import imu_messages
+from companion.autopilot.firmware.firmwares import FIRMWARES
+from companion.autopilot.firmware.imu_messages import ImuMessage, StreamKind
 from companion.autopilot.telemetry.ekf_bias import EkfBias
-from companion.autopilot.telemetry.imu_messages import ImuMessage, StreamKind
 from companion.autopilot.telemetry.imu_samples import TEMPERATURE_AGE_S, ImuSamples
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink, Message
@@ -121,9 +122,11 @@ class ImuStream:
 
     @property
     def own_kind(self) -> StreamKind | None:
-        """That of the message which offsets just written are seen by: of PX4 always the integers."""
-        seen_by = self._current if self._vehicle.firmware != "px4" or not self._sources else self._sources[-1]
-        return None if self._current is None or seen_by is None else seen_by.message.kind
+        """Kind of the message in which offsets just written show: never floats that lack the EKF's bias."""
+        if self._current is None:
+            return None
+        seen_by = self._sources[-1] if self._current.message is imu_messages.PX4_FLOATS else self._current
+        return seen_by.message.kind
 
     @property
     def decided(self) -> bool:
@@ -137,8 +140,8 @@ class ImuStream:
 
     async def run(self) -> None:
         """Keep the samples coming until cancelled; raises nothing else."""
-        both = (*imu_messages.ARDUPILOT[self._instance], *imu_messages.PX4[self._instance], imu_messages.PX4_FLOATS)
-        subscriptions = [self._link.subscribe(kind, self._on_message) for kind in {each.message for each in both}]
+        kinds = {each.message for firmware in FIRMWARES for each in firmware.imu_messages[self._instance]}
+        subscriptions = [self._link.subscribe(kind, self._on_message) for kind in kinds]
         subscriptions.append(self._vehicle.on_event.add(self._on_event))
         try:
             while True:
@@ -161,17 +164,14 @@ class ImuStream:
         while not await comes(self._vehicle.found, _TURN_S):
             self.turns += 1
         self._restart.clear()
-        if self._vehicle.firmware == "ardupilot":
-            messages = imu_messages.ARDUPILOT[self._instance]
-        elif self._vehicle.firmware == "px4":
-            messages = (imu_messages.PX4_FLOATS, *imu_messages.PX4[self._instance])
-            if self._ekf_bias.may_look:
-                # Floats that begin late would begin a measurement anew.
-                await comes(self._ekf_bias.settled, BEAT_WITHIN_S / 2.0)
-        else:
+        messages = self._vehicle.kind.imu_messages.get(self._instance)
+        if messages is None:
             self._lose("this autopilot is neither ArduPilot nor PX4: what its IMU messages carry is not known")
             await self._pause(60.0)
             return
+        if self._ekf_bias.may_look:
+            # Floats that begin late would begin a measurement anew.
+            await comes(self._ekf_bias.settled, BEAT_WITHIN_S / 2.0)
         self._sources = [_Source(message, self._rates_hz) for message in messages]
         if messages[0] is imu_messages.PX4_FLOATS and self._rates_hz[0] < SLOWER_RATES_HZ[0]:
             self._sources[0].rates_hz = [_BESIDE_CONSOLE * self._rates_hz[0], *self._rates_hz[1:]]

@@ -16,7 +16,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.vehicle.heartbeats import Firmware
+from companion.autopilot.parameters.reading import FirmwareName
 from companion.links.mavlink.link import MavlinkLink, Message
 
 _COPY_S: Final = 0.5
@@ -149,7 +149,7 @@ class _Wanted:
     message: type[Message]
     rate_hz: float | None
     """None: wanted once, and again after a restart."""
-    of: Firmware | None
+    of: FirmwareName | None
     heard_s: float = -math.inf
     asked_s: float = -math.inf
     pause_s: float = FIRST_PAUSE_S
@@ -162,7 +162,7 @@ class StandingRequests:
         self._commands = commands
         self._wanted: list[_Wanted] = []
 
-    def add(self, message: type[Message], rate_hz: float | None, of: Firmware | None = None) -> None:
+    def add(self, message: type[Message], rate_hz: float | None, of: FirmwareName | None = None) -> None:
         """Want a message from now on, `of` one firmware or all; without a rate, once after every `forget_asking`."""
         self._wanted.append(_Wanted(message, rate_hz, of))
 
@@ -179,7 +179,7 @@ class StandingRequests:
             if wanted.rate_hz is None:
                 wanted.heard_s = -math.inf
 
-    def ask_for_missing(self, now_s: float, firmware: Firmware | None) -> None:
+    def ask_for_missing(self, now_s: float, firmware: FirmwareName | None) -> None:
         """Ask for what has stayed away, unless it was asked for a short time ago."""
         for wanted in self._wanted:
             if wanted.of not in (None, firmware):

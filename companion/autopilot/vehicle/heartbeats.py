@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 import math
 from collections import deque
-from typing import Final, Literal
+from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -99,8 +99,6 @@ class ArmingWatch:
         return self._contradicted and not only_armed and t_s - self._armed_s < _ONLY_DISARMED_S
 
 
-Firmware = Literal["ardupilot", "px4", "other"]
-
 ADOPT_OTHER_COMPONENT_S: Final = 2.0
 """How long an autopilot on another component than 1 must have been heard before it is taken for the one."""
 
@@ -116,12 +114,6 @@ _NOT_AIRCRAFT: Final = frozenset(
 def is_aircraft(message: mavlink.MAVLink_heartbeat_message) -> bool:
     """Whether it claims to be a vehicle with an autopilot: ground stations, gimbals and the like are not."""
     return message.type not in _NOT_AIRCRAFT and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
-
-
-def firmware_of(message: mavlink.MAVLink_heartbeat_message) -> Firmware:
-    """Which firmware a heartbeat is of."""
-    known: dict[int, Firmware] = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", mavlink.MAV_AUTOPILOT_PX4: "px4"}
-    return known.get(message.autopilot, "other")
 
 
 def unique_id(message: mavlink.MAVLink_autopilot_version_message) -> str | None:
@@ -145,14 +137,14 @@ class Latch:
         self._system_id = system_id
         self._candidates: dict[tuple[int, int], float] = {}
 
-    def takes(self, message: mavlink.MAVLink_heartbeat_message, t_s: float) -> bool:
+    def takes(self, message: mavlink.MAVLink_heartbeat_message, t_s: float, *, is_known: bool) -> bool:
         """Whether this heartbeat of an aircraft, heard at `t_s`, is the one to go by from now on."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         if self._system_id not in (None, system) or system == 0:
             return False
         if component == mavlink.MAV_COMP_ID_AUTOPILOT1:
             return True
-        if firmware_of(message) == "other":
+        if not is_known:
             return False
         first_s = self._candidates.setdefault((system, component), t_s)
         return t_s - first_s >= ADOPT_OTHER_COMPONENT_S

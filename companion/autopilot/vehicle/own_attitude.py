@@ -17,9 +17,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.firmware.firmwares import FIRMWARES
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.estimation.solution.otherwise import OwnHeading
 from companion.estimation.solution.site import UNKNOWN_DECLINATION_SIGMA_DEG
+from companion.links.mavlink.link import Message
 from companion.physics.frames import Array, body_from_ned
 from companion.physics.units import DEG
 
@@ -53,8 +55,10 @@ class OwnCompass:
         self._has_compass_s = self._agrees_s = -math.inf
         rate_hz = RATE_HZ if wanted else None
         vehicle.hear(mavlink.MAVLink_sys_status_message, self._on_status, rate_hz)
-        vehicle.hear(mavlink.MAVLink_ekf_status_report_message, self._on_ardupilot, rate_hz, "ardupilot")
-        vehicle.hear(mavlink.MAVLink_estimator_status_message, self._on_px4, rate_hz, "px4")
+        self._vehicle = vehicle
+        for firmware in FIRMWARES:
+            if firmware.estimator_message is not None:
+                vehicle.hear(firmware.estimator_message, self._on_estimator, rate_hz, firmware.name)
 
     def agrees(self, now_s: float) -> bool:
         """Whether both have been said lately."""
@@ -69,16 +73,9 @@ class OwnCompass:
         )
         self._has_compass_s = t_s if fit else -math.inf
 
-    def _on_ardupilot(self, message: mavlink.MAVLink_ekf_status_report_message, t_s: float) -> None:
-        fit = message.flags & mavlink.EKF_ATTITUDE and not message.flags & mavlink.EKF_UNINITIALIZED
-        self._agrees(message.compass_variance, t_s, fit=bool(fit))
-
-    def _on_px4(self, message: mavlink.MAVLink_estimator_status_message, t_s: float) -> None:
-        self._agrees(message.mag_ratio, t_s, fit=bool(message.flags & mavlink.ESTIMATOR_ATTITUDE))
-
-    def _agrees(self, ratio: float, t_s: float, *, fit: bool) -> None:
-        """`ratio`: of the innovation to what is allowed; exactly 0 where nothing is compared."""
-        self._agrees_s = t_s if fit and 0.0 < ratio < 1.0 else -math.inf
+    def _on_estimator(self, message: Message, t_s: float) -> None:
+        if isinstance(message, self._vehicle.kind.estimator_message or ()):
+            self._agrees_s = t_s if 0.0 < self._vehicle.kind.compass_ratio(message) < 1.0 else -math.inf
 
 
 class OwnAttitude:

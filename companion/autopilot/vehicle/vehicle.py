@@ -15,15 +15,16 @@ from typing import Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.firmware.base import Firmware
+from companion.autopilot.firmware.firmwares import FIRMWARES, OTHER, UNHEARD, firmware_with
+from companion.autopilot.parameters.reading import FirmwareName
 from companion.autopilot.vehicle.boot_clock import BootClock, BootWatch
 from companion.autopilot.vehicle.commands import Commands, StandingRequests
 from companion.autopilot.vehicle.disarmed import DisarmedCheck
 from companion.autopilot.vehicle.heartbeats import (
     ArmingWatch,
     ArmState,
-    Firmware,
     Latch,
-    firmware_of,
     is_aircraft,
     unique_id,
     version_text,
@@ -32,15 +33,12 @@ from companion.autopilot.vehicle.whereabouts import TimeAndPlace
 from companion.links.mavlink.link import Handler, M, MavlinkLink, Message
 from companion.links.system.listeners import Listeners
 
-__all__ = ["ArmState", "Firmware", "Moment", "Vehicle", "VehicleEvent"]
+__all__ = ["ArmState", "Moment", "Vehicle", "VehicleEvent"]
 
 logger = logging.getLogger(__name__)
 
 HEARTBEAT_TIMEOUT_S: Final = 2.0
 """Without a heartbeat for this long nobody knows whether the aircraft is armed (autopilots 8)."""
-
-HEARTBEAT_RATE_HZ: Final = 5.0
-"""Asked of ArduPilot on our own link: a second is a long time not to know of an arming (autopilots 5.1)."""
 
 _HEARTBEAT_ID: Final[int] = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 _OVERDUE_S: Final = 1.1
@@ -71,7 +69,8 @@ class Vehicle:
     ) -> None:
         self.system_id: int | None = None
         self.component_id: int = mavlink.MAV_COMP_ID_AUTOPILOT1
-        self.firmware: Firmware | None = None
+        self.kind: Firmware = UNHEARD
+        """Firmware of the latched autopilot, and all that is particular to it."""
         self.version: str | None = None
         """Such as "4.6.1" or "4.8.0-dev"; None until AUTOPILOT_VERSION has come."""
         self.capabilities: int | None = None
@@ -100,7 +99,9 @@ class Vehicle:
         self.found = asyncio.Event()
         """Set while the autopilot is being heard."""
         self._wanted = StandingRequests(self.commands)
-        self._wanted.add(mavlink.MAVLink_heartbeat_message, HEARTBEAT_RATE_HZ, "ardupilot")
+        for each in FIRMWARES:
+            if each.heartbeat_rate_hz is not None:
+                self._wanted.add(mavlink.MAVLink_heartbeat_message, each.heartbeat_rate_hz, each.name)
         self._lost_timer: asyncio.TimerHandle | None = None
         self._tick_timer: asyncio.TimerHandle | None = None
         self._tick_due_s = math.inf
@@ -110,6 +111,11 @@ class Vehicle:
         self.hear(mavlink.MAVLink_autopilot_version_message, self._on_version)
         self.hear(mavlink.MAVLink_global_position_int_message, self.place.hear_estimate)
         self.hear(mavlink.MAVLink_gps_raw_int_message, self.place.hear_receiver)
+
+    @property
+    def firmware(self) -> FirmwareName | None:
+        """Name of its firmware; None before the first heartbeat."""
+        return self.kind.name
 
     @property
     def arm_state(self) -> ArmState:
@@ -148,8 +154,7 @@ class Vehicle:
         """For people: "ArduPilot 4.6.1, system 1"."""
         if self.system_id is None:
             return "no autopilot"
-        words = {"ardupilot": "ArduPilot", "px4": "PX4"}.get(self.firmware or "", "autopilot")
-        return f"{words}{' ' + self.version if self.version else ''}, system {self.system_id}"
+        return f"{self.kind.words}{' ' + self.version if self.version else ''}, system {self.system_id}"
 
     @property
     def why_silent(self) -> str:
@@ -162,7 +167,7 @@ class Vehicle:
         return header.srcComponent == self.component_id and header.srcSystem == self.system_id
 
     def hear(
-        self, message: type[M], handler: Handler[M], rate_hz: float | None = None, of: Firmware | None = None
+        self, message: type[M], handler: Handler[M], rate_hz: float | None = None, of: FirmwareName | None = None
     ) -> None:
         """Hand over every such message of the latched autopilot; with a rate, ask for it (`of` a firmware) too."""
         self._link.subscribe(message, self._of_ours(handler))
@@ -199,7 +204,9 @@ class Vehicle:
     def _on_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, t_s: float) -> None:
         if not is_aircraft(message):
             return
-        if self.system_id is None and self._latch.takes(message, t_s):
+        if self.system_id is None and self._latch.takes(
+            message, t_s, is_known=firmware_with(message.autopilot) is not OTHER
+        ):
             self._latch_on(message)
         if not self.sent(message):
             return
@@ -233,17 +240,17 @@ class Vehicle:
 
     def _is_ours(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
         """Whether a heartbeat under our ids is our vehicle's; ArduPilot and PX4 both are system 1 out of the box."""
-        firmware = firmware_of(message)
-        if firmware == self.firmware:
+        kind = firmware_with(message.autopilot)
+        if kind is self.kind:
             return True
-        if firmware == "other":
+        if kind is OTHER:
             return False  # some device that pretends; whether it is armed means nothing
         if not self._lost:
             self._arming.two_seen(asyncio.get_running_loop().time())
             self._log_conflict()
             return False
         # Another firmware has been flashed while we heard nothing.
-        self.firmware = firmware
+        self.kind = kind
         self.boot.clock = BootClock()
         self._arming.flashed()
         self._restarted()
@@ -269,7 +276,7 @@ class Vehicle:
     def _latch_on(self, message: mavlink.MAVLink_heartbeat_message) -> None:
         self.system_id, self.component_id = message.get_srcSystem(), message.get_srcComponent()
         self._link.join((self.system_id, self.component_id))
-        self.firmware = firmware_of(message)
+        self.kind = firmware_with(message.autopilot)
         self._wanted.add(mavlink.MAVLink_system_time_message, 1.0)
         self._wanted.add(mavlink.MAVLink_global_position_int_message, 1.0)
         self._wanted.add(mavlink.MAVLink_autopilot_version_message, None)
@@ -292,9 +299,7 @@ class Vehicle:
         self._tick_timer = loop.call_at(self._tick_due_s, self._tick)
         if not self._lost:
             overdue = self._heartbeat_s is not None and now_s - self._heartbeat_s > _OVERDUE_S
-            if overdue and self.firmware == "px4":
-                # Its heartbeat cannot be had faster than once a second, so that after a single one that is lost nobody
-                # would know whether it is armed.
+            if overdue and self.kind.late_heartbeat_on_request:
                 self.commands.request_message(_HEARTBEAT_ID)
             self._wanted.ask_for_missing(now_s, self.firmware)
 

@@ -18,9 +18,6 @@ POLL_S: Final = 1.0
 RETRY_S: Final = 30.0
 SCRIPT_STARTS_S: Final = 10.0
 """How long the script is given to answer: scripting starts some seconds after the first heartbeat."""
-SHORTEST_TIMEOUT_S: Final = 0.5
-_PX4: Final = ("COM_ARM_AUTH_REQ", "COM_ARM_AUTH_ID", "COM_ARM_AUTH_MET", "COM_ARM_AUTH_TO")
-_SCRIPT: Final = "CMPG_ENABLE"
 
 
 class GateSetup:
@@ -61,7 +58,7 @@ class GateSetup:
             self._stale.set()
 
     def _on_parameter(self, name: str, value: float) -> None:
-        if self.known and (name in _PX4 or name == _SCRIPT):
+        if self.known and name in self._vehicle.kind.gate_parameters:
             self.known = False
             self._stale.set()
 
@@ -81,33 +78,7 @@ class GateSetup:
         Raises:
             AutopilotError: it does not answer.
         """
-        if self._vehicle.firmware == "px4":
-            return await self._px4()
-        if self._vehicle.firmware == "ardupilot":
-            return await self._ardupilot(script_starts_s)
-        return "this autopilot has no gate that is known here"
-
-    async def _px4(self) -> str | None:
-        required, system, method, timeout_s = [await self._parameters.read_optional(name) for name in _PX4]
-        if required is None:
-            return "this PX4 has no arm authorisation"
-        own = self._vehicle.system_id
-        wrong = [
-            *(["COM_ARM_AUTH_REQ 1"] if required != 1 else []),
-            *([f"COM_ARM_AUTH_ID {own}"] if system != own else []),
-            *(["COM_ARM_AUTH_MET 0"] if method not in (None, 0) else []),
-            *(["COM_ARM_AUTH_TO 1"] if timeout_s is not None and timeout_s < SHORTEST_TIMEOUT_S else []),
-        ]
-        return f"set {', '.join(wrong)}" if wrong else None
-
-    async def _ardupilot(self, script_starts_s: float) -> str | None:
-        enabled = await self._parameters.read_optional(_SCRIPT)
-        if enabled is None and script_starts_s:
-            await asyncio.sleep(script_starts_s)
-            enabled = await self._parameters.read_optional(_SCRIPT)
-        if enabled is None:
-            return "the arming script does not run (see: companion lua)"
-        return "set CMPG_ENABLE 1" if enabled == 0 else None
+        return await self._vehicle.kind.find_gate_problem(self._parameters, self._vehicle.system_id, script_starts_s)
 
     def status(self) -> dict[str, object]:
         """For `companion status` and `check`."""

@@ -11,7 +11,6 @@ import logging
 import math
 from typing import Final, Literal
 
-from companion.autopilot.firmware.firmwares import settle_s
 from companion.autopilot.vehicle.ekf import ADJUSTING
 from companion.component.service import ArmAnswer
 from companion.config.sections import AtArm
@@ -56,14 +55,8 @@ _WAITS: Final = {
     Rung.UNKNOWN: "no heartbeat from the autopilot",
     Rung.PENDING: f"{_STEPS[State.UNDOING]}: wait",
 }
-WRITE_S: Final = {"px4": 8.0}
-"""Time to write the offsets, by firmware. PX4 takes one vector after another: 7 s for one IMU."""
-OTHER_WRITE_S: Final = 5.0
-"""Time to write the offsets elsewhere: 4 s with ArduPilot's own gyro calibration in between."""
 LATE_S: Final = 2.0
 """Until the last second of telemetry is complete and judged."""
-EKF_S: Final = {"ardupilot": 3.0}
-"""Time in which the EKF shows that it has settled, where the firmware's calibration has reset it."""
 MOVED_S: Final = 4.0
 """An estimate that has slipped by this much belongs to a check that a movement has restarted."""
 
@@ -99,7 +92,7 @@ class Readiness:
     def asks_script(self) -> bool:
         """Whether ArduPilot's script gets the answer: while this gates, and afterwards, to let go."""
         self._has_gated |= self.at_arm == "gate"
-        return self._has_gated and self._vehicle.firmware == "ardupilot"
+        return self._has_gated and self._vehicle.kind.gate_is_script
 
     @property
     def owed(self) -> str | None:
@@ -218,16 +211,12 @@ class Readiness:
     @property
     def _check_s(self) -> float:
         """Time to see the effect of new offsets."""
-        return settle_s(self._vehicle.firmware) + min(self._min_still_s, LOOK_S) + LATE_S
-
-    @property
-    def _ekf_s(self) -> float:
-        return EKF_S.get(self._vehicle.firmware or "", 0.0)
+        return self._vehicle.kind.settle_s + min(self._min_still_s, LOOK_S) + LATE_S
 
     @property
     def _write_s(self) -> float:
         """Time from the end of the measurement until the new offsets are verified, without a dither."""
-        return WRITE_S.get(self._vehicle.firmware or "", OTHER_WRITE_S) + self._check_s + self._ekf_s
+        return self._vehicle.kind.write_s + self._check_s + self._vehicle.kind.ekf_reset_s
 
     def _during_write(self, now_s: float) -> ArmAnswer:
         state, job = self._manager.state, self._manager.running
@@ -238,7 +227,7 @@ class Readiness:
             return ArmAnswer("wait", f"{words}: wait")
         estimate_s = self._write_s
         if state is State.VERIFYING:
-            estimate_s = self._check_s - self._collector.glance(now_s).still_s + self._ekf_s
+            estimate_s = self._check_s - self._collector.glance(now_s).still_s + self._vehicle.kind.ekf_reset_s
         elif state is State.DITHERING:
             estimate_s += job_s
         return ArmAnswer.hold_still(self._promise_s(state, estimate_s, now_s), words)

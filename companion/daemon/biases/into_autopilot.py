@@ -9,8 +9,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from companion.autopilot.firmware.ardupilot_tcal import thermal_changes
-from companion.autopilot.firmware.firmwares import why_no_thermal_write
 from companion.autopilot.firmware.imu_calibration import Thermal
 from companion.autopilot.parameters.wire import same_float32
 from companion.component.service import MEASURED_PERCENT
@@ -49,7 +47,7 @@ class IntoAutopilot:
             return "there is no IMU of the autopilot: none is configured"
         if not self._core.wanted.push:
             return "nothing is written while push.parameters is false"
-        return why_no_thermal_write(self._core.vehicle.firmware)
+        return self._core.vehicle.kind.why_no_thermal_write
 
     def why_no_undo(self) -> str | None:
         """Why curves cannot be put back now; None where the latest write is of them."""
@@ -114,7 +112,9 @@ class IntoAutopilot:
                 )
             else:
                 gyro, accel = of_curve(curve, calibration.orientation), self._of_accelerometers(name, curve)
-                changes = await thermal_changes(self._core.parameters, calibration, gyro, accel, degc)
+                changes = await self._core.vehicle.kind.thermal_changes(
+                    self._core.parameters, calibration, gyro, accel, degc
+                )
                 named = {change.parameter for target in targets for change in target.unseen}
                 changes = [change for change in changes if change.parameter not in named]
                 kind = imu.stream.own_kind

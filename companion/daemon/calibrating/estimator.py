@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from companion.autopilot.firmware.heading_parameters import COMPASS
 from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.configured import models
 from companion.daemon.core import Core
@@ -57,12 +56,9 @@ class Estimator:
         )
 
     async def _own_heading(self) -> OwnHeading | None:
-        """Return the autopilot's heading; an EKF3 that waits for an external one holds 0 deg and calls it good."""
+        """Return the autopilot's heading; None where it has none of its own."""
         found, core = self._own.heading(), self._core
-        if found is None or core.vehicle.firmware != "ardupilot":
-            return found
         try:
-            source = await core.parameters.read_optional("EK3_SRC1_YAW")
+            return found if found is not None and await core.vehicle.kind.yaw_is_its_own(core.parameters) else None
         except AutopilotError:
             return None
-        return found if source in (None, COMPASS) else None

@@ -13,8 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Final, NamedTuple
 
 from companion.autopilot.firmware.firmwares import part_of, read_calibration
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, rivals_of
-from companion.autopilot.firmware.px4 import SlotMemory
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.ekf_bias import EkfBias
 from companion.autopilot.telemetry.imu_stream import ImuStream, StreamKind
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
@@ -210,7 +210,7 @@ class AutopilotImu:
 
     def _rival_changed(self, calibration: ImuCalibration, name: str, value: float) -> bool:
         known = {rival.parameter: rival.value for rival in calibration.rivals}
-        return name in rivals_of(self._vehicle.firmware) and known.get(name, 0) != value
+        return name in self._vehicle.kind.rivals and known.get(name, 0) != value
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "rebooted":

@@ -15,16 +15,15 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.port_parameters import baud_of, port_needs
-from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.reading import read_integer
+from companion.autopilot.firmware.firmwares import port_needs
+from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
+from companion.configured.models import baud_of
 from companion.errors import AutopilotError
 from companion.links.mavlink.link import MavlinkLink
 
 logger = logging.getLogger(__name__)
 
-PX4_LINKS: Final = 3
 SILENT_S: Final = 5.0
 """How long without a heartbeat a ground station still counts as there."""
 RETRY_S: Final = 10.0
@@ -36,7 +35,7 @@ class Reach:
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, parameters: ParameterClient, url: str) -> None:
         self._vehicle, self._parameters, self._baud = vehicle, parameters, baud_of(url)
         self._heard_s = -math.inf
-        self._forwards: dict[int, bool] | None = None
+        self._closed: list[str] = []
         self._stale = asyncio.Event()
         self._stale.set()
         link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
@@ -63,23 +62,7 @@ class Reach:
             )
         if asyncio.get_running_loop().time() - self._heard_s < SILENT_S:
             return True, "a ground station is heard; it reaches the companion as component 191 of this vehicle"
-        if self._vehicle.firmware == "px4":
-            return self._px4_words()
-        if self._vehicle.firmware == "ardupilot":
-            return True, "none heard (none connected? or a link set not to forward: MAVn_OPTIONS bit 1)"
-        return True, "none heard"
-
-    def _px4_words(self) -> tuple[bool, str]:
-        closed = [f"MAV_{n}" for n, forwards in (self._forwards or {}).items() if not forwards]
-        if not closed:
-            return True, "none heard (none connected?); PX4 forwards between all its links"
-        example = closed[0]
-        return False, (
-            f"none heard. PX4 does not forward to or from {', '.join(closed)}: if the companion or the ground station"
-            f" is on {'it' if len(closed) == 1 else 'one of them'}, ground stations can't reach the companion: set"
-            f" {example}_FORWARD=1 and reboot (no message tells which MAV_n the companion is on; TELEM2 usually is"
-            " MAV_1)"
-        )
+        return self._vehicle.kind.forwarding_words(self._closed)
 
     async def run(self) -> None:
         """Read what there is to know, again after every restart, until cancelled."""
@@ -88,24 +71,11 @@ class Reach:
             self._stale.clear()
             await self._vehicle.found.wait()
             try:
-                await self._read()
+                self._closed = await self._vehicle.kind.read_closed_links(self._parameters)
             except AutopilotError as error:
                 logger.debug("forwarding is not known yet: %s", error)
                 await asyncio.sleep(RETRY_S)
                 self._stale.set()
-
-    async def _read(self) -> None:
-        if self._vehicle.firmware != "px4":
-            self._forwards = None
-            return
-        found: dict[int, bool] = {}
-        for n in range(PX4_LINKS):
-            # MAV_n_CONFIG = 0: there is no such link.
-            if await read_integer(self._parameters, f"MAV_{n}_CONFIG") != 0:
-                forwards = await read_integer(self._parameters, f"MAV_{n}_FORWARD")
-                if forwards is not None:
-                    found[n] = bool(forwards)
-        self._forwards = found
 
     def _on_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, t_s: float) -> None:
         if message.type == mavlink.MAV_TYPE_GCS:

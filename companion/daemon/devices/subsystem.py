@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Sequence
 
 from companion.autopilot.firmware.imu_calibration import accel_taken_off
-from companion.autopilot.firmware.px4 import SlotMemory
+from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.ekf_bias import EkfBias
 from companion.configured import models
 from companion.configured.models import Role, collect, serial_devices

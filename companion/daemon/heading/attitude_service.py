@@ -11,6 +11,7 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.attitude.estimator import Attitude
+from companion.autopilot.firmware.base import Firmware
 from companion.autopilot.telemetry.attitude_messages import (
     TimesyncResponder,
     attitude_messages,
@@ -18,7 +19,7 @@ from companion.autopilot.telemetry.attitude_messages import (
     vision_position_estimate,
 )
 from companion.autopilot.vehicle.own_attitude import OwnCompass
-from companion.autopilot.vehicle.vehicle import ArmState, Firmware
+from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.statustext import Severity, Weight
 from companion.configured import models
 from companion.daemon.arming.in_force import InForce
@@ -170,8 +171,7 @@ class AttitudeService:
         Its rhythm is that of the reads: by when each turn has got here, every other one would now and then come too
         soon, and be left out.
         """
-        firmware = self._vehicle.firmware
-        if not self.health.pushing or firmware is None:
+        if not self.health.pushing:
             return
         if not self.sender.is_due(self.carrier.heard_s, read_s):
             return
@@ -180,7 +180,7 @@ class AttitudeService:
             self.health.stop("attitude lost: samples were missing for too long")
             return
         levelled = self.difference.levelled(attitude, read_s)
-        self.sender.send(firmware, attitude, levelled, self.carrier.reset_counter, read_s)
+        self.sender.send(self._vehicle.kind, attitude, levelled, self.carrier.reset_counter, read_s)
 
     def _on_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, _t_s: float) -> None:
         if not self._fixed_wing and message.type == mavlink.MAV_TYPE_FIXED_WING:

@@ -14,7 +14,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.heading_parameters import EXTNAV, WANTED, Net, net_of, read_for
+from companion.autopilot.firmware.base import Net
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core
@@ -59,15 +59,15 @@ class Fallback:
         while True:
             await self._vehicle.found.wait()
             self._stale.clear()
-            firmware = self._vehicle.firmware
+            kind = self._vehicle.kind
             await asyncio.sleep(SCRIPT_STARTS_S)
-            if firmware in WANTED:
+            if kind.heading_settings:
                 try:
-                    found = await self._parameters.read_many(read_for(firmware), optional=True)
+                    found = await self._parameters.read_many(kind.heading_names(), optional=True)
                 except AutopilotError as error:
                     logger.info("what the autopilot flies by when our heading ends is not known: %s", error)
                     continue
-                self.net, self._selected = net_of(firmware, found), found.get("EK3_SRC1_YAW") == EXTNAV
+                self.net, self._selected = kind.heading_net(found), kind.takes_only_our_heading(found)
             await self._stale.wait()
 
     def _on_event(self, event: VehicleEvent) -> None:

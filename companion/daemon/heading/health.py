@@ -252,9 +252,9 @@ class Health:
 
     def _wrong(self, now_s: float) -> str | None:
         carrier = self._carrier
-        if self._vehicle.firmware is None:
+        if self._vehicle.system_id is None:
             return "waiting for the autopilot"
-        if self._vehicle.firmware == "other":
+        if not self._vehicle.kind.heading_settings:
             return "this autopilot is neither ArduPilot nor PX4"
         if self._vehicle.conflict is not None:
             return self._vehicle.conflict

@@ -68,7 +68,7 @@ class Resume:
     async def step(self, now_s: float) -> None:
         """Begin, compare, and begin anew where the two do not agree."""
         carrier = self._carrier
-        if not self.pending or self._core.vehicle.firmware is None:
+        if not self.pending or self._core.vehicle.system_id is None:
             return
         if self._core.vehicle.arm_state is ArmState.DISARMED:
             self.pending, carrier.doubt = False, None

@@ -7,17 +7,7 @@ import math
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
-from companion.autopilot.firmware.heading_parameters import (
-    NETS,
-    RISKS,
-    changes_for,
-    net_of,
-    read_for,
-    wanted_for,
-    without_compass,
-)
-from companion.autopilot.firmware.imu_calibration import read_rivals
-from companion.autopilot.firmware.port_parameters import baud_of, port_names, port_rows
+from companion.autopilot.firmware.base import NETS
 from companion.configured import models
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
@@ -59,19 +49,18 @@ class Heading(Subsystem):
 
     async def _answer_setup(self, _request: Object, _face: str) -> AsyncIterator[Object]:
         """What is set, what should be, and what to do: for our heading, the gate, the offsets, and the port."""
-        firmware = self._core.vehicle.firmware
-        found = await self._core.parameters.read_many(read_for(firmware), optional=True)
-        port = await self._core.parameters.read_many(port_names(firmware), optional=True)
-        changes = changes_for(firmware, found)
-        assert firmware is not None  # or it would have been refused
+        firmware = self._core.vehicle.kind
+        found = await self._core.parameters.read_many(firmware.heading_names(), optional=True)
+        port = await self._core.parameters.read_many(firmware.port_names, optional=True)
+        changes = firmware.heading_changes(found)
         sends, todo = (
             self._core.config.push.attitude != "off",
             ", ".join(f"{one.parameter} {one.after:g}" for one in changes),
         )
         # Where no heading is sent and none is taken in, nothing hangs on it.
         concerned = sends or not changes
-        net = net_of(firmware, found)
-        missing = without_compass(firmware, found) if concerned else None
+        net = firmware.heading_net(found)
+        missing = firmware.missing_compass(found) if concerned else None
         if not concerned:
             reason = f"not wanted; for push.attitude: set {todo}; {REBOOT}"
         elif missing is not None:
@@ -87,7 +76,7 @@ class Heading(Subsystem):
             "state": "not applied" if changes or missing is not None else "applied",
             "reason": reason,
             "net": {"kind": net, "words": NETS[net]} if concerned else None,
-            "firmware": firmware,
+            "firmware": firmware.name,
             "parameters": [
                 {
                     "parameter": one.parameter,
@@ -95,13 +84,13 @@ class Heading(Subsystem):
                     "wanted": None if now is None else one.after(found),
                     "why": one.why,
                 }
-                for one in wanted_for(firmware)
+                for one in firmware.heading_settings
                 for now in (found.get(one.parameter),)
             ],
-            "risks": list(RISKS.get(firmware, ())) if concerned else [],
+            "risks": list(firmware.heading_risks) if concerned else [],
             "gate": {"at_arm": self._core.wanted.at_arm, "problem": await self._gate.find_missing(0.0)},
-            "rivals": [rival.words for rival in await read_rivals(self._core.parameters)],
-            "port": [row._asdict() for row in port_rows(firmware, port, baud_of(self._core.config.mavlink.url))],
+            "rivals": [rival.words for rival in await firmware.read_rivals(self._core.parameters)],
+            "port": [row._asdict() for row in firmware.port_rows(port, models.baud_of(self._core.config.mavlink.url))],
         }
 
     def status(self) -> Object:  # noqa: D102

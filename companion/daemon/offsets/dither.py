@@ -17,7 +17,7 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Moment
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -37,9 +37,6 @@ from companion.storage.changes import Changed, ChangeSet
 
 logger = logging.getLogger(__name__)
 
-SETTLE_S: Final = {"ardupilot": 1.0, "px4": 2.5}
-"""Delay of a written offset in the telemetry: ArduPilot's filter 60 ms, PX4's parameter updates a second (autopilots
-9.1, 9.2)."""
 WRITE_S: Final = 0.5
 POLL_S: Final = 0.2
 SLACK_S: Final = 6.0
@@ -159,16 +156,15 @@ class Ditherer:
 
     def _step_s(self) -> float:
         """Duration of a step: write, delay of the telemetry, whole seconds."""
-        return WRITE_S + SETTLE_S.get(self._vehicle.firmware or "", 2.5) + SECONDS + 1.0
+        return WRITE_S + self._vehicle.kind.settle_s + SECONDS + 1.0
 
     def _prepare(self, window: ImuWindow, imu: AutopilotImu) -> _Work:
         calibration, kind = imu.in_force, imu.stream.kind
         if kind is None or not kind.truncates:
             raise AutopilotError(f"imu {window.name}: its integer telemetry has gone")
-        px4 = self._vehicle.firmware == "px4"
         steps_si = np.repeat([kind.gyro_step_rad_s, kind.accel_step_m_s2], 3)
         reading = np.array([*window.gyro_rad_s, *window.accel_m_s2]) / steps_si
-        shifts = shifts_lsb(reading, alternate=px4)
+        shifts = shifts_lsb(reading, alternate=self._vehicle.kind.ignores_small_steps)
         values = tuple(_offsets(calibration, shift * steps_si) for shift in shifts)
         return _Work(imu, calibration, steps_si, values, self._vehicle.boots)
 
@@ -197,7 +193,7 @@ class Ditherer:
         """Collect the seconds of one step once the telemetry shows it; returns words on a movement too."""
         loop = asyncio.get_running_loop()
         written = Moment(self._vehicle)
-        while not written.has_passed(SETTLE_S.get(self._vehicle.firmware or "", 2.5)):
+        while not written.has_passed(self._vehicle.kind.settle_s):
             await job.pause(POLL_S)
             self._check(job, work)
         settled_s = loop.time()

@@ -13,7 +13,6 @@ from typing import Final
 
 import numpy as np
 
-from companion.autopilot.firmware.firmwares import settle_s
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import Observation, Verdict, judge
@@ -70,7 +69,7 @@ async def watch_effect(
     most_s = VERIFY_MAX_S if core.config.vehicle.platform == "ground" else VERIFY_ON_DECK_S
     written = Moment(vehicle)
     words = TELEMETRY
-    while not written.has_passed(settle_s(vehicle.firmware)):
+    while not written.has_passed(vehicle.kind.settle_s):
         go_on(words)
         await asyncio.sleep(POLL_S)
     since_s = loop.time()

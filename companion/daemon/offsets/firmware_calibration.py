@@ -22,17 +22,11 @@ from typing import Final
 
 import msgspec
 
-from companion.autopilot.firmware.gyro_calibration import (
-    GyroParameters,
-    Outcome,
-    calibrate_gyros,
-    changed,
-    read_gyro_parameters,
-)
+from companion.autopilot.firmware.base import GyroOutcome, GyroParameters
 from companion.autopilot.parameters.change import Change, WriteFailedError
-from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.writer import ParameterWriter, kind_of
 from companion.autopilot.vehicle.ekf import SETTLED_RAD_S, EkfWatch
+from companion.autopilot.vehicle.parameter_client import ParameterClient
+from companion.autopilot.vehicle.parameter_writer import ParameterWriter, kind_of
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.config.sections import Platform
 from companion.daemon.offsets.ledger import Ledger
@@ -45,8 +39,8 @@ from companion.storage.changes import ChangeSet
 logger = logging.getLogger(__name__)
 
 WORTH_RAD_S: Final = 20.0 * DEG_H
-"""A step on any axis beyond this: a stale EKF bias turns the heading by the step times some 40 s (autopilots
-9.3.1), here 0.2 deg; and the firmware's calibration rewrites the flash of all instances."""
+"""A step on any axis beyond this: a stale EKF bias turns the heading by the step times 17 to 25 s (autopilots
+9.3.1), here 0.14 deg; and the firmware's calibration rewrites the flash of all instances."""
 
 SETTLE_RESET_S: Final = 60.0
 """After the reset what is left is the tilt error of the old accelerometer offsets: while it fades the EKF takes a part
@@ -77,13 +71,16 @@ class FirmwareCalibration:
         Raises:
             AutopilotError: the autopilot does not answer.
         """
-        if self._vehicle.firmware != "ardupilot" or not gyros or self._platform == "deck":
+        if not gyros or self._platform == "deck":
             # On a deck its mean of half a second is the deck's rate, and would be written to all its gyros.
             return None
         step = max(abs(change.after - change.before) for change in gyros)
+        kind = self._vehicle.kind
+        if not kind.resets_ekf_by_gyro_calibration:
+            return None
         if step <= WORTH_RAD_S and (await self._ekf.bias_rad_s() or 0.0) <= SETTLED_RAD_S:
             return None
-        before = await read_gyro_parameters(self._parameters)
+        before = await kind.read_gyro_parameters(self._parameters)
         if before.tcal:
             warn(
                 f"{', '.join(before.tcal)} is on: the firmware's own gyro calibration, which would reset its EKF, would"
@@ -109,13 +106,13 @@ class FirmwareCalibration:
         try:
             ours = [change for change in changes if change.parameter not in before.values]
             await self._ledger.widen(ChangeSet.of(self._vehicle.system_id, ours, before.values))
-            calibration = await calibrate_gyros(self._parameters, now, go_on)
+            calibration = await self._vehicle.kind.calibrate_gyros(self._parameters, now, go_on)
             go_on(f"writing {len(plan.gyros)} fine gyro offsets")
             coarse = calibration.after.values
             fine = await self._writer.apply([Change(c.parameter, coarse[c.parameter], c.after) for c in plan.gyros])
             collateral = tuple(
                 Change(name, old, new)
-                for name, (old, new) in changed(before, calibration.after).items()
+                for name, (old, new) in before.changed_in(calibration.after).items()
                 if name not in wanted
             )
             await self._ledger.widen(ChangeSet.of(self._vehicle.system_id, (*changes, *collateral)))
@@ -140,7 +137,7 @@ class FirmwareCalibration:
         Returns:
             What a pilot should know when it has not settled; None when it has, or when nothing is to settle.
         """
-        if self._vehicle.firmware != "ardupilot" or not plan.gyros:
+        if not self._vehicle.kind.resets_ekf_by_gyro_calibration or not plan.gyros:
             return None
         try:
             return await self._ekf.settle(settles_within_s(plan.firmware), go_on)
@@ -160,11 +157,13 @@ class FirmwareCalibration:
         back = [change for change in changes if change.parameter not in before.values]
         left: tuple[str, ...]
         try:
-            if self._vehicle.boots != boots and await self._parameters.read_optional("INS_GYR_CAL"):
-                reason += "; the restart has measured the gyros anew (INS_GYR_CAL), so those stay"
+            kind = self._vehicle.kind
+            again = await kind.gyros_measured_at_start(self._parameters) if self._vehicle.boots != boots else None
+            if again is not None:
+                reason += f"; the restart has measured the gyros anew ({again}), so those stay"
             else:
-                now = await read_gyro_parameters(self._parameters)
-                back += [Change(name, old, new) for name, (old, new) in changed(before, now).items()]
+                now = await kind.read_gyro_parameters(self._parameters)
+                back += [Change(name, old, new) for name, (old, new) in before.changed_in(now).items()]
             await self._writer.restore(back)
             left = ()
         except WriteFailedError as failure:
@@ -174,7 +173,7 @@ class FirmwareCalibration:
         raise WriteFailedError(kind_of(error, self._vehicle, boots), reason, _outcomes(changes, left), left) from error
 
 
-def settles_within_s(outcome: Outcome | None) -> float:
+def settles_within_s(outcome: GyroOutcome | None) -> float:
     """How long the EKF is waited for after a write, at most, by what became of the firmware's calibration."""
     return SETTLE_RESET_S if outcome == "reset" else SETTLE_ALONE_S
 

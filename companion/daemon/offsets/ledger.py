@@ -14,11 +14,9 @@ from typing import Final
 
 import msgspec
 
-from companion.autopilot.firmware.firmwares import CALIBRATION
-from companion.autopilot.firmware.gyro_calibration import wait_until_over
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
 from companion.autopilot.parameters.wire import same_float32
-from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core, Offload
@@ -226,7 +224,7 @@ class Recovery:
 
     async def _recover(self, open_set: ChangeSet) -> None:
         await self._vehicle.found.wait()
-        ever_written = CALIBRATION.get(self._vehicle.firmware or "other", {})
+        ever_written = self._vehicle.kind.ranges
         if not ever_written.keys() >= set(open_set.names) or open_set.system_id != self._vehicle.system_id:
             names = ", ".join(open_set.names)
             words = f"Interrupted write on system {open_set.system_id}, not on this aircraft: check there {names}"
@@ -239,7 +237,7 @@ class Recovery:
             await asyncio.sleep(POLL_S)
         if unknown := {changed.parameter: changed.before for changed in open_set.changes if changed.after is None}:
             # The firmware stores its result at its end, over whatever was restored before.
-            await wait_until_over(self._parameters, unknown)
+            await self._vehicle.kind.wait_until_gyros_calibrated(self._parameters, unknown)
         ours, foreign = await self._sort(open_set)
         if ours:
             with changing(self._imus.values()):

@@ -11,9 +11,10 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.autopilot.firmware.gyro_calibration import Outcome as FirmwareOutcome
+from companion.autopilot.firmware.base import GyroOutcome
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
-from companion.autopilot.firmware.px4 import SlotMemory, warnings_about
+from companion.autopilot.firmware.px4 import warnings_about
+from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -87,7 +88,7 @@ class Plan:
     """Restarts of the autopilot seen when the plan was made."""
     collateral: tuple[Change, ...] = ()
     """Other changes by the firmware's own gyro calibration: offsets, temperatures and ids of other gyros."""
-    firmware: FirmwareOutcome | None = None
+    firmware: GyroOutcome | None = None
     """Outcome of the firmware's gyro calibration; None where it was not used."""
 
     @property

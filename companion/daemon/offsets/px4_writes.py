@@ -21,11 +21,11 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, vector_changes
-from companion.autopilot.firmware.px4 import IGNORED_STEP, MARGIN, NO_IMU, WORDS, SlotMemory, accel_offset_with
-from companion.autopilot.parameters.change import Change, WriteFailedError
-from companion.autopilot.parameters.items import FarProbe
-from companion.autopilot.parameters.writer import ParameterWriter
-from companion.autopilot.telemetry import imu_messages
+from companion.autopilot.firmware.imu_messages import Reading
+from companion.autopilot.firmware.px4 import IGNORED_STEP, MARGIN, accel_offset_with
+from companion.autopilot.firmware.px4_slots import NO_IMU, WORDS, SlotMemory
+from companion.autopilot.parameters.change import Change, FarProbe, WriteFailedError
+from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Moment, Vehicle
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
@@ -89,9 +89,9 @@ class _Samples:
     """Latest telemetry of all IMUs."""
 
     def __init__(self) -> None:
-        self._kept: dict[int, deque[tuple[float, imu_messages.Reading]]] = {}
+        self._kept: dict[int, deque[tuple[float, Reading]]] = {}
 
-    def add(self, instance: int, t_s: float, reading: imu_messages.Reading) -> None:
+    def add(self, instance: int, t_s: float, reading: Reading) -> None:
         kept = self._kept.setdefault(instance, deque())
         kept.append((t_s, reading))
         while kept[0][0] < t_s - KEPT_S:
@@ -136,11 +136,11 @@ class _FarStepWatch:
         self._heard.clear()
         self._unknown.clear()
         self._samples, self._boots = _Samples(), self._vehicle.boots
-        subscriptions = [self._subscribe(instance) for instance in imu_messages.PX4]
+        subscriptions = [self._subscribe(instance) for instance in self._vehicle.kind.imu_messages]
         asked: list[int] = []
         try:
             await asyncio.sleep(HEAR_S)
-            for instance, (message, *_) in imu_messages.PX4.items():
+            for instance, (*_, message) in self._vehicle.kind.imu_messages.items():
                 if instance not in self._heard:
                     asked.append(message.message.id)
                     self._unknown.add(instance)
@@ -159,7 +159,7 @@ class _FarStepWatch:
             now_s = asyncio.get_running_loop().time()
             self._before = {
                 instance: self._samples.mean(instance, step.sensor, now_s - BEFORE_S, now_s)
-                for instance in imu_messages.PX4
+                for instance in self._vehicle.kind.imu_messages
             }
 
     async def verify(self, parameter: str) -> str | None:
@@ -189,7 +189,7 @@ class _FarStepWatch:
         """IMUs that made the step by then, and those that did not; what is neither is in none."""
         moved: list[int] = []
         still: list[int] = []
-        for instance in imu_messages.PX4:
+        for instance in self._vehicle.kind.imu_messages:
             was, now = self._before.get(instance), self._samples.mean(instance, step.sensor, from_s, to_s)
             if was is None or now is None:
                 continue
@@ -205,7 +205,7 @@ class _FarStepWatch:
             self._unknown.discard(instance)
 
     def _subscribe(self, instance: int) -> Callable[[], None]:
-        kind = imu_messages.PX4[instance][0]
+        kind = self._vehicle.kind.imu_messages[instance][-1]
 
         def take(message: Message, t_s: float) -> None:
             reading = kind.decode(message) if self._vehicle.sent(message) else ""

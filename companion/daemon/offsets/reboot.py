@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -19,7 +18,6 @@ import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.autopilot.firmware.px4 import LEVEL, stale_tilt_deg
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.commands import result_name
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
@@ -32,9 +30,6 @@ from companion.storage.state import StateFile
 
 logger = logging.getLogger(__name__)
 
-GATED_TILT_DEG: Final = 0.3
-"""Tilt kept by PX4 from before a write, above which it has to be restarted before it flies. A smaller one is what its
-EKF2 shows of the biases of an uncalibrated sensor (autopilots 9.3)."""
 CLOCK_STEP_S: Final = 0.5
 """Apparent step back of the autopilot's clock by late packets."""
 OWED_POLL_S: Final = 1.0
@@ -148,13 +143,12 @@ class RebootOwed:
         Raises:
             StorageError: that a restart is owed cannot be kept.
         """
-        level = {change.parameter: change.after - change.before for change in changes if change.parameter in LEVEL}
-        turned_deg, stale_deg = math.hypot(*level.values()), stale_tilt_deg(changes)
-        if turned_deg == 0.0 and stale_deg < GATED_TILT_DEG:
+        stale_deg = self._vehicle.kind.stale_tilt_deg(changes)
+        if stale_deg == 0.0:
             return
         # A small step after a large one leaves what the large one has left.
         left_deg = self._owed.tilt_deg if self._owed is not None and self.words is not None else 0.0
-        tilt_deg = max(left_deg, turned_deg, stale_deg)
+        tilt_deg = max(left_deg, stale_deg)
         now_s, boot_s = asyncio.get_running_loop().time(), self._vehicle.boot.clock.latest_s
         owed = _Owed(self._vehicle.system_id or 0, round(tilt_deg, 2), boot_s or 0.0, self._host, now_s)
         await self._offload(self._file.write, owed)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
-from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.ekf import EkfWatch
+from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration

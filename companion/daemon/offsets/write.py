@@ -15,7 +15,7 @@ from typing import Final
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
 from companion.autopilot.parameters.verify import Verdict
 from companion.autopilot.parameters.wire import same_float32
-from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity, Weight

@@ -13,9 +13,9 @@ from typing import Final, Literal
 
 import msgspec
 
-from companion.autopilot.firmware.port_parameters import baud_of, port_needs
+from companion.autopilot.firmware.firmwares import port_needs
 from companion.config.sections import UNKNOWN, Config, Imu
-from companion.configured.models import SerialDevice, cannot_work, doubtful, serial_devices
+from companion.configured.models import SerialDevice, baud_of, cannot_work, doubtful, serial_devices
 from companion.daemon.devices.sensor_health import ABSENT
 from companion.daemon.faces.control import process_behind
 from companion.daemon.process.service import Service

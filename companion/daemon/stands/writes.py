@@ -16,9 +16,8 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from companion.autopilot.firmware.ardupilot import TRIM
 from companion.autopilot.firmware.imu_calibration import output_step
-from companion.autopilot.firmware.px4 import LEVEL, read_level, warnings_about
+from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
@@ -32,7 +31,7 @@ from companion.estimation.alignment.faces import Mounting
 from companion.estimation.machine import Event
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.records.record import Outcome, WrittenParameter
-from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix
+from companion.physics.frames import Array, Matrix
 from companion.storage.changes import Origin
 
 MOST_DEG: Final = 10.0
@@ -45,7 +44,6 @@ USED_AFTER_S: Final = 1.5
 LATEST_S: Final = 4.0
 """Age of the attitude that counts: on a busy link it comes seconds late, and an estimator wanders."""
 POLL_S: Final = 0.25
-_UP: Final = np.array([0.0, 0.0, -1.0])
 REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the new level after that"
 
 
@@ -127,7 +125,9 @@ class LevelWrites:
         """
         if math.degrees(max(abs(board.roll_rad), abs(board.pitch_rad))) > MOST_DEG:
             raise CalibrationRefusedError("the board would sit more than 10 deg askew: no level is for that")
-        plan = await self._plan(board)
+        plan = _LevelPlan(
+            *await self._core.vehicle.kind.plan_level(self._core.parameters, board.roll_rad, board.pitch_rad)
+        )
         with self._own.asked():
             job.progress(MEASURED_PERCENT, "reading the autopilot's attitude")
             before = await self._own.up_since(asyncio.get_running_loop().time())
@@ -157,24 +157,7 @@ class LevelWrites:
 
     @property
     def _turns_imus(self) -> bool:
-        return self._core.vehicle.firmware == "px4"
-
-    async def _plan(self, board: Mounting) -> _LevelPlan:
-        """Return the level under which the board shows a level aircraft as level."""
-        read = self._core.parameters.read
-        seen = body_from_ned(board.roll_rad, board.pitch_rad, 0.0) @ _UP
-        if not self._turns_imus:
-            # The IMUs' output is without the trim: it shows the whole tilt.
-            old = [await read(name) for name in TRIM]
-            new = [board.roll_rad, board.pitch_rad]
-            degrees = np.degrees([old, new])
-            turns = [rotation_matrix((float(x), float(y), 0.0)) for x, y in degrees]
-            return _LevelPlan([Change(*each) for each in zip(TRIM, old, new, strict=True)], turns[1] @ turns[0].T)
-        x, y, z = await read_level(self._core.parameters)
-        level = rotation_matrix((x, y, z))
-        roll, pitch = np.degrees(roll_pitch_from_up(level.T @ seen)).tolist()
-        changes = [Change(LEVEL[0], x, roll), Change(LEVEL[1], y, pitch)]
-        return _LevelPlan(changes, rotation_matrix((roll, pitch, z)) @ level.T)
+        return self._core.vehicle.kind.level_turns_imus
 
     async def _verify(
         self, job: Job, plan: _LevelPlan, before: Array | None, last: Window

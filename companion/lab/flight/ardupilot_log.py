@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.autopilot.firmware.ardupilot import ArduPilot
 from companion.lab.flight.inertial import joined
 from companion.lab.flight.log import Boot, Estimated, FlownImu, Place, Start, changes, starts
 from companion.lab.logs.dataflash import dataflash
@@ -65,7 +66,7 @@ def _boot(start: Start) -> Boot:
     lanes = _lanes(start)
     simulated = bool(start.instances("SIM"))
     return Boot(
-        firmware="ardupilot",
+        firmware=ArduPilot.name,
         imus=tuple(_imu(start, number, parameters, cores) for number in start.instances("IMU")),
         solution=joined(_in_use(start, "XKQ", lanes), _in_use(start, "XKF1", lanes)),
         truth=joined(start.rows("SIM"), start.rows("SIM2")),

@@ -12,6 +12,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from companion.autopilot.firmware.firmwares import firmware_named
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.noise.allan import PROFILES, noise_profile
@@ -194,8 +195,9 @@ async def _imu(
     if len(failed_s):
         after_s = failed_s[0] - stages.armed_s
         notes.append(f"the autopilot found it failed {after_s:.0f} s after arming: what it read then is left aside")
-    if imu.rate_hz < _SLOW_HZ and boot.firmware == "ardupilot" and not imu.means:
-        notes.append(f"logged at {imu.rate_hz:.0f} Hz only: LOG_BITMASK with IMU_FAST would tell more")
+    faster_log = firmware_named(boot.firmware).faster_log
+    if imu.rate_hz < _SLOW_HZ and faster_log and not imu.means:
+        notes.append(f"logged at {imu.rate_hz:.0f} Hz only: {faster_log} would tell more")
     if len(found.t_s) < 2:
         in_air = None
     ground = [] if in_air is None else _stood(found, stages, reference, world)

@@ -11,10 +11,10 @@ import numpy as np
 
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
-from companion.autopilot.firmware.px4 import SlotMemory
+from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import Change
+from companion.autopilot.parameters.reading import FirmwareName
 from companion.autopilot.parameters.wire import same_float32
-from companion.autopilot.vehicle.vehicle import Firmware
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.records.record import Record
 from companion.lab.flight.log import FlownImu
@@ -25,11 +25,11 @@ from companion.samples import Triad
 class _Logged:
     """Parameters of a log behind the interface of an autopilot's parameters."""
 
-    def __init__(self, firmware: Firmware, values: Mapping[str, float]) -> None:
+    def __init__(self, firmware: FirmwareName, values: Mapping[str, float]) -> None:
         self._values = values
         self.vehicle = self
         self.name: Final = "log"
-        self.firmware: Final[Firmware] = firmware
+        self.firmware: Final[FirmwareName] = firmware
         self.boots: Final = 1
 
     async def hear_boot_time(self) -> bool:
@@ -48,7 +48,7 @@ class _Logged:
         return {name: await self.read(name) for name in names if not optional or name in self._values}
 
 
-async def calibration_in(firmware: Firmware, values: Mapping[str, float], imu: FlownImu) -> ImuCalibration:
+async def calibration_in(firmware: FirmwareName, values: Mapping[str, float], imu: FlownImu) -> ImuCalibration:
     """Read what the autopilot corrected an IMU with from the parameters in the log.
 
     Raises:

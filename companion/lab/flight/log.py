@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.autopilot.vehicle.vehicle import Firmware
+from companion.autopilot.parameters.reading import FirmwareName
 from companion.lab.flight.inertial import Navigation
 from companion.lab.logs.log import DROPOUTS, PARAMETERS, Block
 from companion.physics.frames import Floats
@@ -163,7 +163,7 @@ class Place(msgspec.Struct, frozen=True):
 class Boot(msgspec.Struct, frozen=True, kw_only=True):
     """Log of one start of the autopilot, whichever firmware wrote it; times in s on its clock."""
 
-    firmware: Firmware
+    firmware: FirmwareName
     imus: tuple[FlownImu, ...]
     solution: Navigation | None
     truth: Navigation | None = None

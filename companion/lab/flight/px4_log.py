@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from companion.autopilot.firmware.px4 import PX4
 from companion.lab.flight.inertial import Navigation, joined
 from companion.lab.flight.log import Boot, Estimated, FlownImu, Place, Start, ascending, changes, starts
 from companion.lab.logs.log import US, Progress
@@ -59,7 +60,7 @@ def read(path: Path, progress: Progress) -> Iterator[Boot]:
 def _boot(start: Start) -> Boot:
     armed, landed = start.rows("actuator_armed"), start.rows("vehicle_land_detected")
     return Boot(
-        firmware="px4",
+        firmware=PX4.name,
         imus=_imus(start),
         solution=_navigation(start, ""),
         truth=_navigation(start, "_groundtruth"),

@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import msgspec
 
-from companion.autopilot.telemetry import imu_messages
-from companion.autopilot.telemetry.imu_messages import ImuMessage, Reading
+from companion.autopilot.firmware.firmwares import FIRMWARES, firmware_named
+from companion.autopilot.firmware.imu_messages import PX4_FLOATS, ImuMessage, Reading
 from companion.autopilot.telemetry.imu_samples import EkfBiasReading, ImuSamples
 from companion.config.sections import Config
 from companion.configured.models import Role, parts_of, serial_devices
@@ -24,10 +24,7 @@ UNUSABLE: Final = (
 """Errors that a message raises which nobody could have written."""
 Part = tuple[Role, Sample]
 _KINDS: Final = {
-    each.message
-    for table in (imu_messages.ARDUPILOT, imu_messages.PX4)
-    for sources in table.values()
-    for each in sources
+    each.message for firmware in FIRMWARES for sources in firmware.imu_messages.values() for each in sources
 }
 
 
@@ -68,7 +65,7 @@ class _AutopilotImu:
         reading = source.decode(message)
         if not isinstance(reading, Reading) or reading.all_zero:
             return None
-        name, floats = source.kind.message, source is imu_messages.PX4_FLOATS
+        name, floats = source.kind.message, source is PX4_FLOATS
         if not self.samples.accept(name, reading, t_s) or name != state.message or state.calibration is None:
             return None
         if floats and bias is None:
@@ -77,10 +74,7 @@ class _AutopilotImu:
 
 
 def _source(state: ImuState, kind: type[Message]) -> ImuMessage | None:
-    if state.firmware == "px4":
-        sources = (imu_messages.PX4_FLOATS, *imu_messages.PX4.get(state.instance, ()))
-    else:
-        sources = imu_messages.ARDUPILOT.get(state.instance, ())
+    sources = firmware_named(state.firmware).imu_messages.get(state.instance, ())
     return next((each for each in sources if each.message is kind), None)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.ardupilot import parameters_of
+from companion.autopilot.firmware.ardupilot_calibration import parameters_of
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import (
     ImuCalibration,
@@ -19,7 +19,7 @@ from companion.autopilot.firmware.imu_calibration import (
     output_step,
     whole_bias,
 )
-from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.errors import AutopilotError, AutopilotRebootedError, CalibrationRefusedError
 from companion.links.mavlink.link import MavlinkLink

@@ -9,8 +9,9 @@ from typing import cast
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.gyro_calibration import TIMEOUT_S, GyroParameters, calibrate_gyros
-from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.firmware.ardupilot_calibration import TIMEOUT_S, calibrate_gyros
+from companion.autopilot.firmware.base import GyroParameters
+from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.errors import NotDisarmedError
 from tests.support.virtual_time import run_virtual

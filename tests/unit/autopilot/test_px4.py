@@ -13,10 +13,11 @@ import pytest
 
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
-from companion.autopilot.firmware.px4 import NO_IMU, Slot, SlotMemory, stale_tilt_deg, warnings_about
+from companion.autopilot.firmware.px4 import PX4, warnings_about
+from companion.autopilot.firmware.px4_slots import NO_IMU, Slot, SlotMemory
 from companion.autopilot.parameters.change import Change, WriteFailedError
-from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.vehicle.parameter_client import ParameterClient
+from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.errors import AutopilotError, NotDisarmedError, ParameterRefusedError
 from companion.links.mavlink.link import MavlinkLink
@@ -247,8 +248,10 @@ def test_accelerometer_offsets_below_a_milli_g_in_all_are_warned_about() -> None
 
 def test_new_accelerometer_offsets_leave_a_stale_tilt_and_new_gyro_offsets_do_not() -> None:
     found = read(ScriptedPx4())
-    assert stale_tilt_deg(changes_for(found, None, (0.05, 0.0, 0.0))) == pytest.approx(0.292, abs=0.001)
-    assert stale_tilt_deg(changes_for(found, (0.05, 0.0, 0.0), None)) == 0.0
+    assert PX4().stale_tilt_deg(changes_for(found, None, (0.1, 0.0, 0.0))) == pytest.approx(0.585, abs=0.001)
+    assert PX4().stale_tilt_deg(changes_for(found, None, (0.05, 0.0, 0.0))) == 0.0  # 0.29 deg: no restart for that
+    assert PX4().stale_tilt_deg([Change("SENS_BOARD_X_OFF", 0.0, 0.2)]) == pytest.approx(0.2)
+    assert PX4().stale_tilt_deg(changes_for(found, (0.05, 0.0, 0.0), None)) == 0.0
 
 
 # --- changes that PX4 would ignore

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.px4_thermal import polynomial_of
+from companion.autopilot.firmware.px4 import polynomial_of
 from sim.aircraft import VirtualAircraft
 from sim.imu_model import DEG_H, ImuModel
 from sim.px4.defaults import SIMULATED_IDS

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.wire import integers_bytewise
 from companion.autopilot.vehicle.boot_clock import BootClock
 from companion.autopilot.vehicle.heartbeats import ArmingWatch
+from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.autopilot.vehicle.whereabouts import Position
 from companion.links.mavlink.link import MavlinkLink
@@ -467,7 +467,7 @@ def test_integers_are_bytes_on_px4_only_whatever_anybody_says_of_its_capabilitie
         vehicle = Vehicle(link)
         heartbeat(link, autopilot=autopilot)
         vehicle.capabilities = capabilities
-        assert integers_bytewise(vehicle.capabilities, vehicle.firmware) == expected
+        assert ParameterClient(link, vehicle).integers_bytewise == expected
         vehicle.close()
 
     run_virtual(main())

@@ -7,8 +7,8 @@ from collections.abc import AsyncIterator
 import pytest
 
 from companion.autopilot.parameters.change import Change, WriteFailedError
-from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.vehicle.parameter_client import ParameterClient
+from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, f32, flying_on

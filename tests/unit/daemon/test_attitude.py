@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from companion.attitude.estimator import Attitude
 from companion.attitude.quaternion import Quaternion
-from companion.autopilot.firmware.heading_parameters import changes_for
+from companion.autopilot.firmware.ardupilot import ArduPilot
+from companion.autopilot.firmware.base import OtherFirmware
+from companion.autopilot.firmware.px4 import PX4
 from companion.autopilot.telemetry.attitude_messages import attitude_messages, vision_position_estimate
 from companion.config import parse
 from companion.config.sections import Imu
@@ -108,7 +110,7 @@ def over_the_wire(message: mavlink.MAVLink_message) -> Any:
 
 
 def test_ardupilot_adds_the_variances_so_only_one_is_sent() -> None:
-    heard = over_the_wire(vision_position_estimate("ardupilot", attitude(), 3))
+    heard = over_the_wire(vision_position_estimate(ArduPilot(), attitude(), 3))
     cov = heard.covariance
     assert math.sqrt(cov[15] + cov[18] + cov[20]) == pytest.approx(math.radians(2.0), rel=1e-6)
     assert (heard.x, heard.y, heard.z) == (0.0, 0.0, 0.0)
@@ -118,7 +120,7 @@ def test_ardupilot_adds_the_variances_so_only_one_is_sent() -> None:
 
 
 def test_px4_gets_each_variance_and_no_position() -> None:
-    heard = over_the_wire(vision_position_estimate("px4", attitude(), 259))
+    heard = over_the_wire(vision_position_estimate(PX4(), attitude(), 259))
     assert all(map(math.isnan, (heard.x, heard.y, heard.z)))
     assert [heard.covariance[k] for k in (15, 18, 20)] == pytest.approx([1e-4, 4e-4, math.radians(2.0) ** 2])
     assert all(map(math.isfinite, heard.covariance))
@@ -150,7 +152,7 @@ def test_the_rate_on_the_average_and_the_spacing_always(rate_hz: float, samples_
     for k, late_s in enumerate(jitter):
         t_s, now_s = 5.0 + k / samples_hz, 5.0 + k / samples_hz + float(late_s)
         if sender.is_due(t_s, now_s):
-            sender.send("ardupilot", attitude(t_s), attitude(t_s), 0, now_s)
+            sender.send(ArduPilot(), attitude(t_s), attitude(t_s), 0, now_s)
             sent.append((t_s, now_s))
     gaps = np.diff(np.array(sent), axis=0)
     assert gaps.min() >= 0.02 - 1e-5
@@ -169,7 +171,7 @@ def test_the_autopilot_gets_what_is_levelled_and_people_what_is_ours() -> None:
     link: Any = SimpleNamespace(send=send)
     ours, levelled = attitude(yaw_deg=40.0), attitude(yaw_deg=41.0)
     service: Any = SimpleNamespace(
-        _vehicle=SimpleNamespace(firmware="px4"),
+        _vehicle=SimpleNamespace(kind=PX4()),
         health=SimpleNamespace(pushing=True),
         sender=Sender(link, 30.0, full=True),
         carrier=SimpleNamespace(heard_s=12.5, now=lambda: ours, reset_counter=0),
@@ -204,13 +206,13 @@ def test_a_slow_line_keeps_half_of_itself(url: str, rate_hz: float) -> None:
 
 def test_other_bits_of_the_mask_stay() -> None:
     found = {"EKF2_EV_CTRL": 7.0, "EKF2_EV_NOISE_MD": 0.0, "EKF2_EVA_NOISE": 0.05}
-    (change,) = changes_for("px4", found)
+    (change,) = PX4().heading_changes(found)
     assert (change.parameter, change.before, change.after) == ("EKF2_EV_CTRL", 7.0, 15.0)
-    assert changes_for("px4", found | {"EKF2_EV_CTRL": 15.0}) == []
+    assert PX4().heading_changes(found | {"EKF2_EV_CTRL": 15.0}) == []
 
 
 def test_an_autopilot_without_external_navigation_is_refused() -> None:
     with pytest.raises(AutopilotError, match="VISO_TYPE"):
-        changes_for("ardupilot", {"EK3_SRC1_YAW": 1.0})
+        ArduPilot().heading_changes({"EK3_SRC1_YAW": 1.0})
     with pytest.raises(AutopilotError, match="neither ArduPilot nor PX4"):
-        changes_for("other", {})
+        OtherFirmware().heading_names()

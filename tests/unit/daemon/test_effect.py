@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.ardupilot import parameters_of
+from companion.autopilot.firmware.ardupilot_calibration import parameters_of
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import Verdict

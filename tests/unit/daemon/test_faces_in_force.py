@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.ardupilot import parameters_of
+from companion.autopilot.firmware.ardupilot_calibration import parameters_of
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, whole_accelerometer
 from companion.cli.client import sides_lines
 from companion.config import parse

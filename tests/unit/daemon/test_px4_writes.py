@@ -14,10 +14,10 @@ import pytest
 
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
-from companion.autopilot.firmware.px4 import NO_IMU, SlotMemory
+from companion.autopilot.firmware.px4_slots import NO_IMU, SlotMemory
 from companion.autopilot.parameters.change import Change, WriteFailedError
-from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.vehicle.parameter_client import ParameterClient
+from companion.autopilot.vehicle.parameter_writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.offsets.px4_writes import Px4Writes, step_from_far

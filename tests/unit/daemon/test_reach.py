@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.daemon.devices.reach import Reach
 from companion.links.mavlink.link import MavlinkLink

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from companion.autopilot.telemetry import imu_messages
+from companion.autopilot.firmware import imu_messages
 from companion.estimation.temperature.thermometer import Thermometers
 
 Degc = Callable[[int], float | None]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.telemetry.imu_messages import ARDUPILOT
+from companion.autopilot.firmware.ardupilot import ArduPilot
 from companion.cli import main as companion
 from companion.config import parse
 from companion.config.sections import Config, Noise
@@ -332,7 +332,10 @@ def recording(
     """A recording of noise; at `written_s` the daemon wrote offsets, which moved the gyros by 100 deg/h."""
     config = parse(SMALLEST.format("bmi088"), "x.toml")
     (instance, kind) = next(
-        (instance, each.kind) for instance, all_ in ARDUPILOT.items() for each in all_ if each.kind.message == message
+        (instance, each.kind)
+        for instance, all_ in ArduPilot.imu_messages.items()
+        for each in all_
+        if each.kind.message == message
     )
     state = ImuState(
         sender=(1, 1),

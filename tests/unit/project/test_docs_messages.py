@@ -21,8 +21,7 @@ AT_A_DESK = (
     "companion/cli", "companion/setup", "companion/lab", "companion/recording", "companion/fleet",
     "companion/estimation/solution/by_temperature.py", "companion/estimation/records/flight_record.py",
     "companion/estimation/records/flight_evidence.py", "companion/estimation/solution/by_temperature.py",
-    "companion/autopilot/firmware/heading_parameters.py",
-    "companion/autopilot/firmware/port_parameters.py", "companion/configured/profiles.py",
+    "companion/configured/profiles.py",
 )  # fmt: skip
 """Packages of which commands print the texts, beside what was typed: their documents explain them."""
 
@@ -33,7 +32,8 @@ NOT_MESSAGES = {
     # Kinds of port in `companion ports`, of sender, of writer, of undo; names of parameters of a port.
     "USB device", "on-board port", "on-board port (…)", "autopilot of kind …", "MAVLink component …",
     "last write", "an undo", "at a start", "after a flight", "SERIALn_PROTOCOL = 2, SERIALn_BAUD = …",
-    "MAV_1_CONFIG = 102, SER_TEL2_BAUD = …",
+    "MAV_1_CONFIG = 102, SER_TEL2_BAUD = …", "LOG_BITMASK with IMU_FAST",
+    "SYS_HAS_MAG = 0", "EKF2_MAG_TYPE = …", "bit 10 of EKF2_SENS_EN",
     # Sides of an aircraft, of which a request is made.
     "on its back", "between … and …",
     # Names of tasks in the log, and keys.
@@ -41,6 +41,7 @@ NOT_MESSAGES = {
     # Recognises an error of the operating system.
     "Operation timed out",
     # Complete in themselves: nothing to do, or said by what the person has just asked for.
+    "EKF2 believes the companion's heading beside its magnetometer, and resets to it where the two disagree",
     "whole numbers", "… of … s were not still and are left out", "no noise profile … (known: …)", "nothing measured",
     "there is no IMU of the autopilot: none is configured", "the configuration's zero and sigma are in force",
     "there was no alignment to forget", "one of them", "the companion ends", "starts with companion run",

@@ -12,22 +12,11 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Iterable, Iterator
-from typing import Final
+from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.wire import (
-    REAL32,
-    Inbox,
-    Rebooted,
-    Refusal,
-    decode,
-    encode,
-    float32,
-    integers_bytewise,
-    is_integer,
-    same_float32,
-)
+from companion.autopilot.parameters.wire import REAL32, decode, encode, float32, is_integer, same_float32
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.errors import (
     AutopilotRebootedError,
@@ -58,6 +47,58 @@ _AT_ONCE: Final = 6
 """Requests in flight: ArduPilot queues some twenty and answers one every few milliseconds."""
 
 
+_ERROR_WORDS: Final = {
+    1: "it does not exist",
+    2: "the value is out of range",
+    3: "no permission",
+    4: "no such component",
+    5: "it is read-only",
+    6: "its type is not supported",
+    7: "its type does not match",
+    8: "it could not be read",
+}
+"""MAV_PARAM_ERROR in words; the generated dialect knows only the first five."""
+
+_INBOX: Final = 64
+
+
+class _Inbox:
+    """What arrives about one name during one exchange; when full the oldest answer is dropped."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._arrived: asyncio.Queue[float | _Refusal | _Rebooted] = asyncio.Queue(_INBOX)
+
+    def put(self, item: float | _Refusal | _Rebooted) -> None:
+        """Take what has arrived."""
+        if self._arrived.full():
+            self._arrived.get_nowait()
+        self._arrived.put_nowait(item)
+
+    async def get(self, deadline_s: float) -> float | _Refusal | _Rebooted | None:
+        """The next item, or None at the deadline (loop's clock)."""
+        try:
+            async with asyncio.timeout_at(deadline_s):
+                return await self._arrived.get()
+        except TimeoutError:
+            return None
+
+
+class _Refusal(NamedTuple):
+    """A PARAM_ERROR."""
+
+    code: int
+
+    @property
+    def text(self) -> str:
+        """Why, for people."""
+        return _ERROR_WORDS.get(self.code, f"error {self.code}")
+
+
+class _Rebooted:
+    """The autopilot restarted."""
+
+
 class ParameterClient:
     """The parameters of one autopilot."""
 
@@ -68,7 +109,7 @@ class ParameterClient:
         self._link = link
         self._repeated = 0.0
         """Share of requests that were answered only after a repetition, of late."""
-        self._inboxes: list[Inbox] = []
+        self._inboxes: list[_Inbox] = []
         self.on_value: Listeners[[str, float]] = Listeners()
         """Told of every PARAM_VALUE of the autopilot, whoever caused it."""
         self._answering: str | None = None
@@ -180,7 +221,7 @@ class ParameterClient:
         kind = await self._type_of(name)
         whole = is_integer(kind)
         wanted = value if whole else float32(value)
-        carried = encode(wanted, kind, bytewise=self._bytewise)
+        carried = encode(wanted, kind, bytewise=self.integers_bytewise)
         if not math.isfinite(wanted) or carried is None:
             what = "a whole number" if whole else "a number"
             raise ParameterRefusedError(f"{name}: {value} is not {what} that may be written")
@@ -196,7 +237,7 @@ class ParameterClient:
                 self.writes += self._link.send(message, self.vehicle.disarmed.proven)
                 deadline_s = asyncio.get_running_loop().time() + _TIMEOUT_S
                 while (answer := await self._next(inbox, deadline_s)) is not None:
-                    if isinstance(answer, Refusal):
+                    if isinstance(answer, _Refusal):
                         raise ParameterRefusedError(f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer.text}")
                     if answer == wanted if whole else same_float32(answer, wanted):
                         self._learn_loss(tries)
@@ -216,8 +257,11 @@ class ParameterClient:
         return self._answering is not None
 
     @property
-    def _bytewise(self) -> bool:
-        return integers_bytewise(self.vehicle.capabilities, self.vehicle.firmware)
+    def integers_bytewise(self) -> bool:
+        """Whether integers travel as bytes; a known firmware says so, whatever a forged AUTOPILOT_VERSION does."""
+        if (known := self.vehicle.kind.integers_bytewise) is not None:
+            return known
+        return bool((self.vehicle.capabilities or 0) & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE)
 
     async def _ensure_disarmed(self, name: str) -> None:
         try:
@@ -226,8 +270,8 @@ class ParameterClient:
             raise NotDisarmedError(f"{name} is not written: {error}") from error
 
     @contextlib.contextmanager
-    def _exchange(self, name: str) -> Iterator[Inbox]:
-        inbox = Inbox(name)
+    def _exchange(self, name: str) -> Iterator[_Inbox]:
+        inbox = _Inbox(name)
         self._inboxes.append(inbox)
         try:
             yield inbox
@@ -244,13 +288,13 @@ class ParameterClient:
     def _learn_loss(self, tries: int) -> None:
         self._repeated += _LOSS_MEMORY * (float(tries > 1) - self._repeated)
 
-    async def _next(self, inbox: Inbox, deadline_s: float) -> float | Refusal | None:
+    async def _next(self, inbox: _Inbox, deadline_s: float) -> float | _Refusal | None:
         answer = await inbox.get(deadline_s)
-        if isinstance(answer, Rebooted):
+        if isinstance(answer, _Rebooted):
             raise AutopilotRebootedError(f"{self.vehicle.name} restarted while {inbox.name} was exchanged")
         return answer
 
-    async def _ask(self, inbox: Inbox, name: str, index: int) -> float | Refusal | None:
+    async def _ask(self, inbox: _Inbox, name: str, index: int) -> float | _Refusal | None:
         """One PARAM_REQUEST_READ and the first answer to it."""
         message = mavlink.MAVLink_param_request_read_message(*self._target(), _wire_name(name), index)
         self._link.send(message)
@@ -259,7 +303,7 @@ class ParameterClient:
             self._answering = inbox.name if index < 0 else self._answering
         return answer
 
-    async def _ask_repeatedly(self, name: str, tries: Iterable[int]) -> tuple[float | Refusal | None, int]:
+    async def _ask_repeatedly(self, name: str, tries: Iterable[int]) -> tuple[float | _Refusal | None, int]:
         """The first answer, and how many requests there were."""
         count = 0
         with self._exchange(name) as inbox:
@@ -280,7 +324,7 @@ class ParameterClient:
 
     async def _type_of(self, name: str) -> int:
         """The type to write a parameter as; only firmware that carries integers byte by byte minds."""
-        if not self._bytewise:
+        if not self.integers_bytewise:
             return REAL32
         if name not in self._types:
             await self.read(name)
@@ -292,7 +336,7 @@ class ParameterClient:
         return self.vehicle.system_id, self.vehicle.component_id
 
     def _on_value(self, message: mavlink.MAVLink_param_value_message, _t_s: float) -> None:
-        name, value = message.param_id, decode(message, bytewise=self._bytewise)
+        name, value = message.param_id, decode(message, bytewise=self.integers_bytewise)
         self._absent.discard(name)
         if len(self._types) < _REMEMBERED_TYPES or name in self._types:
             self._types[name] = message.param_type
@@ -309,7 +353,7 @@ class ParameterClient:
             return
         for inbox in self._inboxes:
             if inbox.name == message.param_id:
-                inbox.put(Refusal(message.error))
+                inbox.put(_Refusal(message.error))
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "rebooted":
@@ -317,7 +361,7 @@ class ParameterClient:
             self._absent.clear()
             self._types.clear()
             for inbox in self._inboxes:
-                inbox.put(Rebooted())
+                inbox.put(_Rebooted())
 
 
 def _wire_name(name: str) -> bytes:

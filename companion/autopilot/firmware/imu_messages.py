@@ -104,9 +104,6 @@ SCALED3: Final = ImuMessage(_integer_kind("SCALED_IMU3"), mavlink.MAVLink_scaled
 RAW: Final = ImuMessage(_integer_kind("RAW_IMU"), mavlink.MAVLink_raw_imu_message, _raw)
 """Its name notwithstanding: calibrated and filtered, the same as SCALED_IMU (ArduPilot)."""
 
-ARDUPILOT: Final = {1: (HIGHRES, SCALED, RAW), 2: (SCALED2,), 3: (SCALED3,)}
-
-PX4: Final = {1: (SCALED,), 2: (SCALED2,), 3: (SCALED3,)}
-"""Never HIGHRES_IMU as it comes: PX4 takes EKF2's own estimate of the bias off it, so at rest it tells nothing."""
 PX4_FLOATS: Final = dataclasses.replace(HIGHRES, kind=dataclasses.replace(HIGHRES.kind, message="HIGHRES_IMU+bias"))
-"""That of the IMU that PX4 flies by, once the estimate is known and put back (`telemetry.ekf_bias`)."""
+"""HIGHRES_IMU of the IMU that PX4 flies by. PX4 takes EKF2's own estimate of the bias off it, so at rest it tells
+nothing until that is known and added again (`telemetry.ekf_bias`)."""

@@ -17,10 +17,19 @@ from typing import Final
 from msgspec import structs
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.change import Change, FailureKind, NothingWrittenError, WriteFailedError
-from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.items import POLL_S, FarProbe, Item, ItemVector, by_vector
+from companion.autopilot.parameters.change import (
+    POLL_S,
+    Change,
+    FailureKind,
+    FarProbe,
+    Item,
+    ItemVector,
+    NothingWrittenError,
+    WriteFailedError,
+    by_vector,
+)
 from companion.autopilot.parameters.wire import same_float32
+from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Moment, Vehicle
 from companion.errors import (
     AutopilotError,

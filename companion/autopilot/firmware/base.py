@@ -1,0 +1,382 @@
+"""What the companion may ask of an autopilot firmware; a new firmware is one subclass of `Firmware`.
+
+A plain `Firmware` is an autopilot that nobody has heard yet, `OtherFirmware` one that is not known here. Both answer
+every question, with "no" or a reason in words; nothing is measured or written there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, Literal, NamedTuple
+
+from companion.autopilot.firmware.imu_calibration import Acts, ImuCalibration, Range, Rival
+from companion.autopilot.firmware.imu_messages import ImuMessage
+from companion.autopilot.firmware.px4_slots import SlotMemory
+from companion.autopilot.parameters.change import Change
+from companion.autopilot.parameters.reading import FirmwareName, LiveParameters, Parameters, read_integer
+from companion.autopilot.parameters.wire import same_float32
+from companion.config.sections import Profile
+from companion.errors import AutopilotError, AutopilotRebootedError
+from companion.estimation.temperature.polynomial import Polynomial
+from companion.links.mavlink.link import Message
+from companion.physics.frames import Matrix
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class RivalKind:
+    """Effect of a parameter that makes the firmware overwrite offsets, at any value but 0."""
+
+    acts: Acts
+    what: str
+    accelerometers: bool = False
+    from_boot: bool = False
+    """Only a boot reads the parameter, so switching it off stops nothing before the next one."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class HeadingSetting:
+    """One parameter that the firmware needs to use our heading, and the reason."""
+
+    parameter: str
+    value: float
+    why: str
+    bits: bool = False
+    """The bits of `value` are to be set; others stay."""
+    optional: bool = False
+    like: str = ""
+    """Another parameter whose value is wanted; `value` where that does not exist."""
+
+    def after(self, found: Mapping[str, float]) -> float:
+        """Return the wanted value, given the parameters as read."""
+        value = found.get(self.like, self.value)
+        return float(int(found[self.parameter]) | int(value)) if self.bits else value
+
+
+Net = Literal["script", "command", "autopilot", "none"]
+"""Who switches to another heading when ours ends; "autopilot": it does so by itself."""
+
+NETS: Final[dict[Net, str]] = {
+    "script": "if our heading ends in flight, the script goes on by gyros and GNSS within a second",
+    "command": "if our heading ends, the companion asks for gyros and GNSS, but not if its board dies (companion lua)",
+    "autopilot": "if our heading ends, the autopilot goes back to its magnetometer",
+    "none": "if our heading ends there is none: fly only where you can land by hand",
+}
+
+
+class PortRow(NamedTuple):
+    """One parameter of the companion's port, as it is and as it should be."""
+
+    parameter: str
+    now: float
+    wanted: float
+    why: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class GyroParameters:
+    """Every parameter that the firmware's own gyro calibration writes."""
+
+    values: Mapping[str, float]
+    gyros: tuple[int, ...]
+    """Instances with a gyro behind them."""
+    tcal: tuple[str, ...]
+    """Switches of temperature calibrations that are on: there the calibration changes what an offset means."""
+
+    def changed_in(self, after: GyroParameters) -> dict[str, tuple[float, float]]:
+        """Return what differs later: values before and after, by name."""
+        return {
+            name: (old, after.values[name])
+            for name, old in self.values.items()
+            if name in after.values and not same_float32(old, after.values[name])
+        }
+
+
+GyroOutcome = Literal["reset", "not converged", "unanswered", "not run"]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class GyroCalibration:
+    """End of the firmware's own gyro calibration.
+
+    "reset": converged, the EKF's gyro bias is reset. "not converged": the firmware stored its best guess, did not
+    reset the EKF, and refuses to arm ("Gyros not calibrated") until a gyro calibration succeeds or it restarts.
+    "unanswered": it ran, and the answer was lost. "not run": refused or lost, nothing has changed.
+    """
+
+    outcome: GyroOutcome
+    words: str
+    """For people; empty for "reset"."""
+    after: GyroParameters
+
+
+class Firmware:
+    """One firmware; this class itself stands for an autopilot that has not been heard."""
+
+    name: FirmwareName | None = None
+    words = "autopilot"
+    mav_autopilot: int | None = None
+    """MAV_AUTOPILOT in its heartbeats."""
+
+    # --- the link
+
+    heartbeat_rate_hz: float | None = None
+    """Heartbeat rate to ask for on our own link; None: the firmware has a fixed one."""
+    late_heartbeat_on_request = False
+    """Whether a heartbeat that is overdue is requested."""
+    integers_bytewise: bool | None = None
+    """Whether integer parameters travel as bytes in the float field; None: see AUTOPILOT_VERSION."""
+    takes_nan_position = False
+    """Whether a position that is unknown goes out as NaN."""
+
+    # --- time that things take
+
+    settle_s = 2.0
+    """Time after a write in which the telemetry may still show the old offsets."""
+    write_s = 5.0
+    """Time to write the offsets of one IMU."""
+    ekf_reset_s = 0.0
+    """Time for the EKF to show that it has settled after the firmware's own gyro calibration."""
+
+    # --- telemetry
+
+    imu_messages: Mapping[int, tuple[ImuMessage, ...]] = {}
+    """Messages with the samples of each IMU, the best first; offsets just written show in the last."""
+    tells_ekf_bias = False
+    """Whether HIGHRES_IMU lacks the EKF's bias, which the console tells."""
+    estimator_message: type[Message] | None = None
+    """Message that says whether the estimator's yaw agrees with its magnetometer."""
+
+    def compass_ratio(self, message: Any) -> float:
+        """Return innovation over gate of the compass; 0 where nothing is compared."""
+        del message
+        return 0.0
+
+    faster_log = ""
+    """Setting that makes it log its IMUs faster."""
+
+    # --- calibration of an IMU
+
+    ranges: Mapping[str, Range] = {}
+    """Every parameter that the companion ever writes by a calibration or its undo, with what it may have held."""
+    rivals: Mapping[str, RivalKind] = {}
+    """Parameters that make the firmware overwrite our offsets."""
+    parts: Mapping[tuple[int, int], Profile] = {}
+    """Catalogue's names by the device types of gyro and accelerometer; the numbers are each firmware's own."""
+    ignores_small_steps = False
+    """Whether a small change of an offset may be stored and not used."""
+
+    async def read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
+        """Read what the autopilot corrects one of its IMUs (1 to 3) with.
+
+        Raises:
+            AutopilotError: no such IMU, a value that cannot be worked with, or as `Parameters.read`; or the autopilot
+                restarted meanwhile (AutopilotRebootedError).
+        """
+        vehicle = parameters.vehicle
+        boots = vehicle.boots
+        found = await self._read_calibration(parameters, instance, memory)
+        await vehicle.hear_boot_time()
+        if vehicle.boots != boots:
+            raise AutopilotRebootedError(f"{vehicle.name} restarted while the parameters of IMU {instance} were read")
+        return found
+
+    async def _read_calibration(self, parameters: Parameters, instance: int, memory: SlotMemory) -> ImuCalibration:
+        raise AutopilotError("this autopilot is neither ArduPilot nor PX4; it is not supported")
+
+    async def read_rivals(self, parameters: Parameters, seen: dict[str, int] | None = None) -> tuple[Rival, ...]:
+        """Read the rivals that are switched on, and those that were and act until the next boot.
+
+        `seen` is kept from one call to the next: the boot, as counted, in which each parameter was last seen on.
+
+        Raises:
+            AutopilotError: as `Parameters.read_optional`.
+        """
+        found: list[Rival] = []
+        seen = {} if seen is None else seen
+        boots = parameters.vehicle.boots
+        for name, kind in self.rivals.items():
+            value = await read_integer(parameters, name)
+            if value:
+                words = f"{name} = {value}: {kind.what}; set it to 0 to keep them (push.stop_rivals = true does)"
+                found.append(Rival(name, value, kind.acts, kind.accelerometers, words))
+                seen[name] = boots
+            elif kind.from_boot and seen.get(name) == boots:
+                words = f"{name} is off from the next boot on: until then {kind.what}; reboot the autopilot"
+                found.append(Rival(name, 0, kind.acts, kind.accelerometers, words))
+        return tuple(found)
+
+    # --- around a write
+
+    def stale_tilt_deg(self, changes: Sequence[Change]) -> float:
+        """Return the tilt that the EKF may keep from before these changes until a restart; 0: none owes one."""
+        del changes
+        return 0.0
+
+    resets_ekf_by_gyro_calibration = False
+    """Whether its own gyro calibration resets its EKF's gyro bias, and AHRS shows that bias."""
+
+    async def read_gyro_parameters(self, parameters: LiveParameters) -> GyroParameters:
+        """Read what the firmware's own gyro calibration writes.
+
+        Raises:
+            AutopilotError: no answer, or it restarted meanwhile.
+        """
+        raise NotImplementedError
+
+    async def calibrate_gyros(
+        self, parameters: LiveParameters, before: GyroParameters, go_on: Callable[[str], None]
+    ) -> GyroCalibration:
+        """Let the firmware calibrate its gyros, once."""
+        raise NotImplementedError
+
+    async def wait_until_gyros_calibrated(self, parameters: LiveParameters, before: Mapping[str, float]) -> None:
+        """After an interruption, wait for the end of a gyro calibration that may have been started."""
+
+    async def gyros_measured_at_start(self, parameters: Parameters) -> str | None:
+        """Return the parameter by which a restart measures the gyros anew, or None."""
+        del parameters
+        return None
+
+    # --- temperature calibration
+
+    why_no_thermal_write: str | None = None
+    """Why no curve is written into the firmware's temperature calibration; None: it is."""
+
+    async def thermal_changes(
+        self,
+        parameters: Parameters,
+        calibration: ImuCalibration,
+        gyro: Polynomial,
+        accel: Polynomial | None,
+        degc: float,
+    ) -> list[Change]:
+        """Plan curves over temperature so that the output at this temperature stays as it is."""
+        raise AutopilotError(self.why_no_thermal_write or "this autopilot is neither ArduPilot nor PX4: no curves")
+
+    # --- level
+
+    level_turns_imus = False
+    """Whether the level turns the IMUs' data, or only the attitude that is reported."""
+
+    async def plan_level(
+        self, parameters: Parameters, roll_rad: float, pitch_rad: float
+    ) -> tuple[list[Change], Matrix]:
+        """Plan the level of a board that sits so; also the turn of up in the vehicle's axes that it makes, (3, 3)."""
+        raise AutopilotError("this autopilot is neither ArduPilot nor PX4; its level is not known")
+
+    # --- heading from outside
+
+    heading_settings: tuple[HeadingSetting, ...] = ()
+    heading_watched: tuple[str, ...] = ()
+    """Other parameters that decide what happens to our heading."""
+    heading_risks: tuple[str, ...] = ()
+
+    def heading_names(self) -> list[str]:
+        """List the parameters that the questions about the heading need.
+
+        Raises:
+            AutopilotError: no autopilot yet, or a firmware that is not known.
+        """
+        if self.name is None:
+            raise AutopilotError("no autopilot has been heard yet")
+        if not self.heading_settings:
+            raise AutopilotError("this autopilot is neither ArduPilot nor PX4; what takes a heading there is not known")
+        wanted = [name for one in self.heading_settings for name in (one.parameter, one.like) if name]
+        return [*wanted, *self.heading_watched]
+
+    def heading_changes(self, found: Mapping[str, float]) -> list[Change]:
+        """Plan the changes that make the firmware use our heading; empty where all is set.
+
+        Raises:
+            AutopilotError: this autopilot lacks a parameter, so it cannot use a heading.
+        """
+        changes = []
+        for setting in self.heading_settings:
+            before = found.get(setting.parameter)
+            if before is None:
+                if setting.optional:
+                    continue
+                raise AutopilotError(f"this autopilot has no {setting.parameter}: it cannot take in a heading")
+            after = setting.after(found)
+            if not same_float32(before, after):
+                changes.append(Change(setting.parameter, before, after))
+        return changes
+
+    def heading_net(self, found: Mapping[str, float]) -> Net:
+        """Tell who switches to another heading when ours ends."""
+        del found
+        return "none"
+
+    def takes_only_our_heading(self, found: Mapping[str, float]) -> bool:
+        """Whether the firmware takes its heading from outside and from nowhere else."""
+        del found
+        return False
+
+    def missing_compass(self, found: Mapping[str, float]) -> str | None:
+        """Return the parameter that leaves it without a compass it needs, or None."""
+        del found
+        return None
+
+    async def yaw_is_its_own(self, parameters: Parameters) -> bool:
+        """Whether its yaw comes from its own sensors, as far as parameters tell.
+
+        Raises:
+            AutopilotError: as `Parameters.read_optional`.
+        """
+        del parameters
+        return True
+
+    # --- arming
+
+    gate_parameters: tuple[str, ...] = ()
+    gate_is_script = False
+    """Whether a script on the flight controller gates, which is told the verdict."""
+
+    async def find_gate_problem(
+        self, parameters: Parameters, system_id: int | None, script_starts_s: float
+    ) -> str | None:
+        """Return what has to be set so that the autopilot asks before it arms, for people; None: nothing.
+
+        `script_starts_s`: time to wait for a script that does not run yet.
+
+        Raises:
+            AutopilotError: it does not answer.
+        """
+        del parameters, system_id, script_starts_s
+        return "this autopilot has no gate that is known here"
+
+    # --- the port, and ground stations behind it
+
+    port_names: tuple[str, ...] = ()
+    """Parameters of the ports that the companion may be on; some releases and boards lack some."""
+
+    def port_rows(self, found: Mapping[str, float], baud: int | None) -> list[PortRow]:
+        """List the parameters of the companion's port; `baud`: of our serial line, None without one."""
+        del found, baud
+        return []
+
+    def port_needs(self, baud: int) -> str | None:
+        """Return the settings that the autopilot's end of a serial line needs; None: not known."""
+        del baud
+        return None
+
+    async def read_closed_links(self, parameters: Parameters) -> list[str]:
+        """Read which of its links do not forward messages.
+
+        Raises:
+            AutopilotError: as `Parameters.read_optional`.
+        """
+        del parameters
+        return []
+
+    def forwarding_words(self, closed: Sequence[str]) -> tuple[bool, str]:
+        """Tell whether all is well while no ground station is heard, and the facts with the fix."""
+        del closed
+        return True, "none heard"
+
+
+class OtherFirmware(Firmware):
+    """An autopilot that is neither of those that are known."""
+
+    name = "other"
