@@ -101,9 +101,9 @@ class ExternalVision:
         reset = counter != self._counter
         self._heard_s, self._counter = loop_s, counter
         self.consumed += 1
-        floor = parameters["EKF2_EVA_NOISE"]
+        # ev_yaw_control.cpp takes the parameter, a sigma by its name, for the least variance.
         given = parameters["EKF2_EV_NOISE_MD"] == 0 and math.isfinite(variance)
-        self.sigma_rad = max(math.sqrt(max(variance, 0.0)), floor) if given else floor
+        self.sigma_rad = math.sqrt(max(variance if given else 0.0, parameters["EKF2_EVA_NOISE"], 1e-4))
         if not int(parameters["EKF2_EV_CTRL"]) & YAW_BIT:
             if self.active:
                 self.active = False

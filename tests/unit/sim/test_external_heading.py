@@ -124,6 +124,17 @@ def test_ardupilot_adds_the_variances_with_a_floor() -> None:
     run_virtual(main())
 
 
+def test_px4_takes_its_parameter_unsquared_for_the_least_variance() -> None:
+    async def main() -> None:
+        async with line(PX4Double, PX4) as on:
+            await on.stream(TRUE_DEG, 0.2, variance=1e-4)
+            assert math.degrees(on.double.vision.sigma_rad) == pytest.approx(12.8, abs=0.05)
+            await on.stream(TRUE_DEG, 0.2, variance=0.09)
+            assert on.double.vision.sigma_rad == pytest.approx(0.3)
+
+    run_virtual(main())
+
+
 def test_ardupilot_drops_what_comes_within_20_ms_by_its_stamp() -> None:
     async def main() -> None:
         async with line(ArduPilotDouble, ARDUPILOT) as on:
