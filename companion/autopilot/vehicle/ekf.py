@@ -1,7 +1,7 @@
 """The autopilot's own estimate of the gyro biases, as ArduPilot tells it: AHRS (#163), omegaI = minus that estimate.
 
 After a step in the offsets EKF3 goes on with its old estimate, is wrong by minus the step, and turns the heading by
-that times some 40 s before it has learned (autopilots 1.7, 9.3.1). With right offsets nothing is left to estimate, so
+that times 17 to 25 s before it has learned (autopilots 1.7, 9.3.1). With right offsets nothing is left to estimate, so
 what omegaI still shows is how far it is from settled.
 """
 
@@ -23,7 +23,7 @@ from companion.physics.units import DEG
 ADJUSTING: Final = "EKF adjusting"
 SETTLED_RAD_S: Final = 0.02 * DEG
 """Per axis: 72 deg/h. An EKF whose bias has just been reset wanders up to 52 deg/h on the ground (autopilots
-9.3.1); and 72 deg/h for the 40 s that it lasts turn the heading by 0.8 deg, less than a compass knows."""
+9.3.1); and 72 deg/h times 25 s turn the heading by 0.5 deg, less than a compass knows."""
 
 _AHRS: Final[int] = mavlink.MAVLINK_MSG_ID_AHRS
 _RATE_HZ: Final = 4.0
