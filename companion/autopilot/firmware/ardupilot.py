@@ -9,18 +9,22 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware import ardupilot_calibration as own_calibration
-from companion.autopilot.firmware.ardupilot_calibration import INSTANCES, ArduPilotParameters, parameters_of
+from companion.autopilot.firmware.ardupilot_calibration import (
+    AT_START,
+    INSTANCES,
+    ArduPilotParameters,
+    GyrosAtRest,
+    parameters_of,
+)
 from companion.autopilot.firmware.base import (
     Firmware,
-    GyroCalibration,
-    GyroParameters,
     HeadingSetting,
     Net,
     PortRow,
@@ -41,7 +45,6 @@ from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import (
     SCALES,
     FirmwareName,
-    LiveParameters,
     Parameters,
     read_integer,
     read_vector,
@@ -58,7 +61,6 @@ _TRIM_RANGE: Final = Range(-math.radians(10.0), math.radians(10.0), unit="rad")
 _TCAL_RANGE: Final = Range(-1e6, 1e6)
 """Millionths of rad/s or m/s^2 a kelvin, square kelvin, cubic kelvin."""
 
-_RIVAL: Final = "INS_GYR_CAL"
 _EXTNAV, _COMPASS, _GYROS = 6.0, 1.0, 0.0
 """EK3_SRCn_YAW: external navigation, the autopilot's compass, and none: gyros carry it on, GNSS holds it."""
 _HEADING_SCRIPT: Final = "CMPG_HEADING"
@@ -78,7 +80,7 @@ _CUSTOM_NAMES: Final = {
 
 
 def _ranges() -> dict[str, Range]:
-    found: dict[str, Range] = {_RIVAL: SWITCH_RANGE}
+    found: dict[str, Range] = {AT_START: SWITCH_RANGE}
     for names in map(parameters_of, INSTANCES):
         # The firmware's own gyro calibration, which we start, sets CALTEMP and id: both are restored.
         tcal = names.tcal
@@ -103,11 +105,12 @@ class ArduPilot(Firmware):
     """4 s with its own gyro calibration in between."""
     ekf_reset_s = 3.0
     imu_messages = {1: (HIGHRES, SCALED, RAW), 2: (SCALED2,), 3: (SCALED3,)}
+    gyro_calibration = GyrosAtRest()
     estimator_message = mavlink.MAVLink_ekf_status_report_message
     faster_log = "LOG_BITMASK with IMU_FAST"
     ranges = _ranges()
     rivals = {
-        _RIVAL: RivalKind("at a start", "the next boot measures the gyros itself and overwrites these gyro offsets")
+        AT_START: RivalKind("at a start", "the next boot measures the gyros itself and overwrites these gyro offsets")
     }
     parts = {
         (0x2B, 0x2B): "bmi088",
@@ -148,22 +151,6 @@ class ArduPilot(Firmware):
         )
         used = await read_integer(parameters, names.use) != 0
         return dataclasses.replace(calibration, warnings=_warnings(calibration, names, used=used))
-
-    resets_ekf_by_gyro_calibration = True
-
-    async def read_gyro_parameters(self, parameters: LiveParameters) -> GyroParameters:
-        return await own_calibration.read_gyro_parameters(parameters)
-
-    async def calibrate_gyros(
-        self, parameters: LiveParameters, before: GyroParameters, go_on: Callable[[str], None]
-    ) -> GyroCalibration:
-        return await own_calibration.calibrate_gyros(parameters, before, go_on)
-
-    async def wait_until_gyros_calibrated(self, parameters: LiveParameters, before: Mapping[str, float]) -> None:
-        await own_calibration.wait_until_over(parameters, before)
-
-    async def gyros_measured_at_start(self, parameters: Parameters) -> str | None:
-        return _RIVAL if await parameters.read_optional(_RIVAL) else None
 
     async def thermal_changes(
         self,

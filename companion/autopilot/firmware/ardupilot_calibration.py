@@ -26,7 +26,7 @@ from typing import Final, Literal
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.base import GyroCalibration, GyroOutcome, GyroParameters
+from companion.autopilot.firmware.base import GyroCalibration, GyroOutcome, GyroParameters, OwnGyroCalibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, ImuParameters, Thermal, vector_changes
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import LiveParameters, Parameters, read_integer
@@ -53,6 +53,9 @@ _LOST_AFTER_S: Final = 3.0
 _LOOK_S: Final = 0.25
 _AFTERWARDS_S: Final = 0.5
 """Time from the last offset to the end of the command: the saving, and the EKF's reset."""
+
+AT_START: Final = "INS_GYR_CAL"
+"""1: every start measures the gyros anew."""
 
 Names = tuple[str, str, str]
 
@@ -206,107 +209,93 @@ async def thermal_changes(
 # --- gyros
 
 
-async def read_gyro_parameters(parameters: LiveParameters) -> GyroParameters:
-    """Read every parameter that the gyro calibration writes, of all instances.
+class GyrosAtRest(OwnGyroCalibration):
+    """Gyro calibration by command; see the top of this file."""
 
-    Raises:
-        AutopilotError: no answer, or it restarted meanwhile.
-    """
-    vehicle = parameters.vehicle
-    boots = vehicle.boots
-    instances = {number: parameters_of(number) for number in INSTANCES}
-    first = await parameters.read_many((names.gyro_offset[0] for names in instances.values()), optional=True)
-    present = {number: names for number, names in instances.items() if names.gyro_offset[0] in first}
-    if not present:
-        raise AutopilotError("the autopilot has no gyro offsets")
-    rest = await parameters.read_many(name for names in present.values() for name in names.gyro_offset[1:])
-    more = [name for names in present.values() for name in (names.tcal.gyro_caltemp, names.gyro_id, names.tcal.enable)]
-    found = await parameters.read_many(more, optional=True)
-    if vehicle.boots != boots:
-        raise AutopilotRebootedError(f"{vehicle.name} restarted while its gyro parameters were read")
-    tcal = tuple(names.tcal.enable for names in present.values() if found.get(names.tcal.enable))
-    values = {name: value for name, value in {**first, **rest, **found}.items() if not name.endswith("_ENABLE")}
-    gyros = tuple(number for number, names in present.items() if found.get(names.gyro_id, 1.0))
-    return GyroParameters(values, gyros, tcal)
-
-
-async def calibrate_gyros(
-    parameters: LiveParameters, before: GyroParameters, go_on: Callable[[str], None]
-) -> GyroCalibration:
-    """Let the firmware calibrate its gyros, once; returns when it is surely over.
-
-    `before` was read just now; `go_on` is called with the progress in words.
-
-    Raises:
-        NotDisarmedError: not disarmed when the command was about to leave: nothing was done.
-        AutopilotRebootedError: the autopilot restarted meanwhile; any of its gyro parameters may have changed.
-        AutopilotError: it does not answer any more; any of its gyro parameters may have changed.
-    """
-    vehicle = parameters.vehicle
-    loop = asyncio.get_running_loop()
-    boots = vehicle.boots
-
-    def require_same_boot() -> None:
+    async def read(self, parameters: LiveParameters) -> GyroParameters:
+        vehicle = parameters.vehicle
+        boots = vehicle.boots
+        instances = {number: parameters_of(number) for number in INSTANCES}
+        first = await parameters.read_many((names.gyro_offset[0] for names in instances.values()), optional=True)
+        present = {number: names for number, names in instances.items() if names.gyro_offset[0] in first}
+        if not present:
+            raise AutopilotError("the autopilot has no gyro offsets")
+        rest = await parameters.read_many(name for names in present.values() for name in names.gyro_offset[1:])
+        more = [
+            name for names in present.values() for name in (names.tcal.gyro_caltemp, names.gyro_id, names.tcal.enable)
+        ]
+        found = await parameters.read_many(more, optional=True)
         if vehicle.boots != boots:
-            raise AutopilotRebootedError(f"{vehicle.name} restarted during its gyro calibration")
+            raise AutopilotRebootedError(f"{vehicle.name} restarted while its gyro parameters were read")
+        tcal = tuple(names.tcal.enable for names in present.values() if found.get(names.tcal.enable))
+        values = {name: value for name, value in {**first, **rest, **found}.items() if not name.endswith("_ENABLE")}
+        gyros = tuple(number for number, names in present.items() if found.get(names.gyro_id, 1.0))
+        return GyroParameters(values, gyros, tcal)
 
-    go_on("the autopilot calibrates its gyros: keep the aircraft still")
-    try:
-        await vehicle.disarmed.ensure()
-    except NotDisarmedError as error:
-        raise NotDisarmedError(f"the firmware's gyro calibration was not started: {error}") from error
-    answer = vehicle.commands.send(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 1.0, timeout_s=TIMEOUT_S)
-    sent_s = loop.time()
-    try:
-        while loop.time() < sent_s + TIMEOUT_S:
-            if answer.done():
-                await asyncio.sleep(_LOOK_S)  # reading without a pause would fill the line
-            else:
-                await asyncio.wait([answer], timeout=_LOOK_S)
+    async def run(
+        self, parameters: LiveParameters, before: GyroParameters, go_on: Callable[[str], None]
+    ) -> GyroCalibration:
+        vehicle = parameters.vehicle
+        loop = asyncio.get_running_loop()
+        boots = vehicle.boots
+
+        def require_same_boot() -> None:
+            if vehicle.boots != boots:
+                raise AutopilotRebootedError(f"{vehicle.name} restarted during its gyro calibration")
+
+        def result() -> int | None:
+            return answer.result() if answer.done() else None
+
+        go_on("the autopilot calibrates its gyros: keep the aircraft still")
+        try:
+            await vehicle.disarmed.ensure()
+        except NotDisarmedError as error:
+            raise NotDisarmedError(f"the firmware's gyro calibration was not started: {error}") from error
+        answer = vehicle.commands.send(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 1.0, timeout_s=TIMEOUT_S)
+        sent_s = loop.time()
+        try:
+            while loop.time() < sent_s + TIMEOUT_S:
+                if answer.done():
+                    await asyncio.sleep(_LOOK_S)  # reading without a pause would fill the line
+                else:
+                    await asyncio.wait([answer], timeout=_LOOK_S)
+                require_same_boot()
+                state = await _look(parameters, before)
+                if state == "ended":
+                    # An acknowledgement that is still on its way says more than its absence.
+                    await asyncio.wait([answer], timeout=_AFTERWARDS_S)
+                    break
+                if state == "untouched" and (result() is not None or loop.time() > sent_s + _LOST_AFTER_S):
+                    break
+                if loop.time() > sent_s + 1.0:
+                    go_on(
+                        f"the autopilot calibrates its gyros for {loop.time() - sent_s:.0f} s: keep the aircraft still"
+                    )
+            await asyncio.sleep(_AFTERWARDS_S)
+            after = await self.read(parameters)
             require_same_boot()
-            state = await _look(parameters, before)
-            if state == "ended":
-                # An acknowledgement that is still on its way says more than its absence.
-                await asyncio.wait([answer], timeout=_AFTERWARDS_S)
+            return _judge(before, after, result())
+        finally:
+            answer.cancel()
+
+    async def wait_until_over(self, parameters: LiveParameters, before: Mapping[str, float]) -> None:
+        # Old offsets, or zeros, tell nothing while it may run: it stores its result at its end.
+        vehicle = parameters.vehicle
+        loop = asyncio.get_running_loop()
+        boots, since_s = vehicle.boots, loop.time()
+        vectors = [names for number in INSTANCES if set(names := parameters_of(number).gyro_offset) <= before.keys()]
+        while loop.time() < since_s + TIMEOUT_S and vehicle.boots == boots:
+            now = await parameters.read_many([name for names in vectors for name in names], optional=True)
+            fitted = [names for names in vectors if any(before[name] or now.get(name) for name in names)]
+            same = all(same_float32(now.get(name, 0.0), before[name]) for names in fitted for name in names)
+            runs = not all(any(now.get(name) for name in names) for names in fitted)
+            if fitted and not runs and (not same or loop.time() > since_s + _LOST_AFTER_S):
                 break
-            if state == "untouched" and (_answered(answer) is not None or loop.time() > sent_s + _LOST_AFTER_S):
-                break
-            if loop.time() > sent_s + 1.0:
-                go_on(f"the autopilot calibrates its gyros for {loop.time() - sent_s:.0f} s: keep the aircraft still")
+            await asyncio.sleep(_LOOK_S)
         await asyncio.sleep(_AFTERWARDS_S)
-        after = await read_gyro_parameters(parameters)
-        require_same_boot()
-        return _judge(before, after, _answered(answer))
-    finally:
-        answer.cancel()
 
-
-def _answered(answer: asyncio.Future[int | None]) -> int | None:
-    """Return the result that has come, or None."""
-    return answer.result() if answer.done() else None
-
-
-async def wait_until_over(parameters: LiveParameters, before: Mapping[str, float]) -> None:
-    """After an interruption, wait until a gyro calibration that may have been started has ended, or never ran.
-
-    Old offsets, or zeros, tell nothing while it may run: it stores its result at its end.
-
-    Raises:
-        AutopilotError: the autopilot does not answer.
-    """
-    vehicle = parameters.vehicle
-    loop = asyncio.get_running_loop()
-    boots, since_s = vehicle.boots, loop.time()
-    vectors = [names for number in INSTANCES if set(names := parameters_of(number).gyro_offset) <= before.keys()]
-    while loop.time() < since_s + TIMEOUT_S and vehicle.boots == boots:
-        now = await parameters.read_many([name for names in vectors for name in names], optional=True)
-        fitted = [names for names in vectors if any(before[name] or now.get(name) for name in names)]
-        same = all(same_float32(now.get(name, 0.0), before[name]) for names in fitted for name in names)
-        runs = not all(any(now.get(name) for name in names) for names in fitted)
-        if fitted and not runs and (not same or loop.time() > since_s + _LOST_AFTER_S):
-            break
-        await asyncio.sleep(_LOOK_S)
-    await asyncio.sleep(_AFTERWARDS_S)
+    async def runs_at_start(self, parameters: Parameters) -> str | None:
+        return AT_START if await parameters.read_optional(AT_START) else None
 
 
 def _judge(before: GyroParameters, after: GyroParameters, result: int | None) -> GyroCalibration:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, Protocol
 
 from companion.autopilot.firmware.imu_calibration import Acts, ImuCalibration, Range, Rival
 from companion.autopilot.firmware.imu_messages import ImuMessage
@@ -108,6 +108,29 @@ class GyroCalibration:
     words: str
     """For people; empty for "reset"."""
     after: GyroParameters
+
+
+class OwnGyroCalibration(Protocol):
+    """A firmware's own calibration of its gyros; all of it raises AutopilotError where no answer comes."""
+
+    async def read(self, parameters: LiveParameters) -> GyroParameters:
+        """Read every parameter that it writes, of all instances."""
+
+    async def run(
+        self, parameters: LiveParameters, before: GyroParameters, go_on: Callable[[str], None]
+    ) -> GyroCalibration:
+        """Let the firmware calibrate, once; `before` was read just now, `go_on` is called with the progress in words.
+
+        Raises:
+            NotDisarmedError: not disarmed when the command was about to leave: nothing was done.
+            AutopilotError: no answer any more, or a restart; any of its parameters may have changed.
+        """
+
+    async def wait_until_over(self, parameters: LiveParameters, before: Mapping[str, float]) -> None:
+        """After an interruption, wait until one that may have been started has ended, or never ran."""
+
+    async def runs_at_start(self, parameters: Parameters) -> str | None:
+        """Return the parameter by which it runs at every start, or None."""
 
 
 class Firmware:
@@ -213,30 +236,8 @@ class Firmware:
         del changes
         return 0.0
 
-    resets_ekf_by_gyro_calibration = False
-    """Whether its own gyro calibration resets its EKF's gyro bias, and AHRS shows that bias."""
-
-    async def read_gyro_parameters(self, parameters: LiveParameters) -> GyroParameters:
-        """Read what the firmware's own gyro calibration writes.
-
-        Raises:
-            AutopilotError: no answer, or it restarted meanwhile.
-        """
-        raise NotImplementedError
-
-    async def calibrate_gyros(
-        self, parameters: LiveParameters, before: GyroParameters, go_on: Callable[[str], None]
-    ) -> GyroCalibration:
-        """Let the firmware calibrate its gyros, once."""
-        raise NotImplementedError
-
-    async def wait_until_gyros_calibrated(self, parameters: LiveParameters, before: Mapping[str, float]) -> None:
-        """After an interruption, wait for the end of a gyro calibration that may have been started."""
-
-    async def gyros_measured_at_start(self, parameters: Parameters) -> str | None:
-        """Return the parameter by which a restart measures the gyros anew, or None."""
-        del parameters
-        return None
+    gyro_calibration: OwnGyroCalibration | None = None
+    """Its own gyro calibration, where that resets the EKF's gyro bias and AHRS shows that bias."""
 
     # --- temperature calibration
 

@@ -378,11 +378,10 @@ async def _read_thermal(parameters: Parameters, gyro_id: int) -> Thermal:
     switch = {THERMAL_ENABLE: float(enable)}
     if enable != 1:
         return Thermal(values=switch)
-    for sensor in range(SLOTS):
-        if await read_integer(parameters, thermal_names(sensor)[0]) == gyro_id:
-            break
-    else:
+    ids = [await read_integer(parameters, thermal_names(sensor)[0]) for sensor in range(SLOTS)]
+    if gyro_id not in ids:
         return Thermal(values=switch)
+    sensor = ids.index(gyro_id)
     found = await parameters.read_many(thermal_names(sensor))
     if (wrong := next((name for name, value in found.items() if not math.isfinite(value)), None)) is not None:
         raise AutopilotError(f"{wrong} is {found[wrong]}; a number was expected")

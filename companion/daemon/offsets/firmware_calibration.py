@@ -2,15 +2,15 @@
 
 The order that leaves ArduPilot's EKF right (autopilots 9.3.1): accelerometer offsets, the firmware's gyro calibration,
 which alone resets the EKF's gyro bias, then our fine gyro offsets over its coarse ones. Ours are written before it as
-well: what the autopilot refuses is known while all can still be put back, and if the one command that is sent gets
+well: what the autopilot refuses is known while all can still be restored, and if the one command that is sent gets
 lost, nothing else is missing than the reset.
 
 The fine offsets are known beforehand: per sample the output is R (raw - offset), so the whole bias in board axes,
 offset + R^-1 residual, does not depend on the offset in force. With a temperature calibration it would: the firmware's
 calibration sets CALTEMP too, and with it what is taken off `raw`. There it is left out and the EKF settles by itself.
 
-The calibration also overwrites gyro offsets that nobody asked us to change. All of them are kept before and come back
-with every roll-back and undo.
+The calibration also overwrites gyro offsets that nobody asked us to change. All of them are kept before, and restored
+by every roll-back and undo.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Final
 
 import msgspec
 
-from companion.autopilot.firmware.base import GyroOutcome, GyroParameters
+from companion.autopilot.firmware.base import GyroOutcome, GyroParameters, OwnGyroCalibration
 from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.vehicle.ekf import SETTLED_RAD_S, EkfWatch
 from companion.autopilot.vehicle.parameter_client import ParameterClient
@@ -39,15 +39,13 @@ from companion.storage.changes import ChangeSet
 logger = logging.getLogger(__name__)
 
 WORTH_RAD_S: Final = 20.0 * DEG_H
-"""A step on any axis beyond this: a stale EKF bias turns the heading by the step times 17 to 25 s (autopilots
-9.3.1), here 0.14 deg; and the firmware's calibration rewrites the flash of all instances."""
-
+"""Step on any axis above which the calibration is worth the flash of all instances that it rewrites: a stale EKF bias
+turns the heading by the step times 17 to 25 s (autopilots 9.3.1), here 0.14 deg."""
 SETTLE_RESET_S: Final = 60.0
-"""After the reset what is left is the tilt error of the old accelerometer offsets: while it fades the EKF takes a part
-of it for gyro bias (a step of 30 mg: 850 deg/h for a moment, settled after 26 s on the real firmware)."""
-
+"""Longest wait for the EKF after the reset: while the tilt error of the old accelerometer offsets fades, it takes a
+part of it for gyro bias (a step of 30 mg: 850 deg/h for a moment, settled after 26 s on the real firmware)."""
 SETTLE_ALONE_S: Final = 150.0
-"""By itself EKF3 takes about two minutes (autopilots 9.3.1: 140 s)."""
+"""Longest wait for the EKF by itself: EKF3 takes about two minutes (autopilots 9.3.1: 140 s)."""
 
 
 class FirmwareCalibration:
@@ -66,21 +64,19 @@ class FirmwareCalibration:
         self._writer, self._ledger, self._ekf = writer, ledger, ekf
 
     async def prepare(self, gyros: Sequence[Change], warn: Callable[[str], None]) -> GyroParameters | None:
-        """What it would overwrite, or None when it is not worth it or not allowed (then `warn` is told).
+        """Read what it would overwrite; None when it is not worth it, or not allowed (then `warn` is called).
 
         Raises:
             AutopilotError: the autopilot does not answer.
         """
-        if not gyros or self._platform == "deck":
+        own = self._vehicle.kind.gyro_calibration
+        if own is None or not gyros or self._platform == "deck":
             # On a deck its mean of half a second is the deck's rate, and would be written to all its gyros.
             return None
         step = max(abs(change.after - change.before) for change in gyros)
-        kind = self._vehicle.kind
-        if not kind.resets_ekf_by_gyro_calibration:
-            return None
         if step <= WORTH_RAD_S and (await self._ekf.bias_rad_s() or 0.0) <= SETTLED_RAD_S:
             return None
-        before = await kind.read_gyro_parameters(self._parameters)
+        before = await own.read(self._parameters)
         if before.tcal:
             warn(
                 f"{', '.join(before.tcal)} is on: the firmware's own gyro calibration, which would reset its EKF, would"
@@ -89,103 +85,96 @@ class FirmwareCalibration:
             return None
         return before
 
-    async def write(self, plan: Plan, before: GyroParameters, draft: WriteLog, go_on: Callable[[str], None]) -> Plan:
-        """All offsets, the firmware's calibration, the gyro offsets again: all, or all the old values are back.
+    async def write(self, plan: Plan, before: GyroParameters, log: WriteLog, go_on: Callable[[str], None]) -> Plan:
+        """Write all offsets, calibrate, write the gyro offsets again: all of it, or all the old values are restored.
 
-        In a transaction of these changes, which grows with what the firmware may change besides. The plan with that,
-        and how the calibration ended.
+        Runs in a transaction, which grows with what the firmware changes besides. Returns the plan with those changes
+        and the outcome of the calibration.
 
         Raises:
-            NothingWrittenError: as `ParameterWriter.apply`.
-            WriteFailedError: as `ParameterWriter.apply`.
+            NothingWrittenError, WriteFailedError: as `ParameterWriter.apply`.
         """
-        boots, changes = self._vehicle.boots, plan.changes
+        own = self._vehicle.kind.gyro_calibration
+        assert own is not None
+        boots, changes, system_id = self._vehicle.boots, plan.changes, self._vehicle.system_id
         written = await self._writer.apply(changes)
         wanted = {change.parameter: change.after for change in changes}
         now = dataclasses.replace(before, values={n: wanted.get(n, value) for n, value in before.values.items()})
         try:
             ours = [change for change in changes if change.parameter not in before.values]
-            await self._ledger.widen(ChangeSet.of(self._vehicle.system_id, ours, before.values))
-            calibration = await self._vehicle.kind.calibrate_gyros(self._parameters, now, go_on)
+            await self._ledger.widen(ChangeSet.of(system_id, ours, before.values))
+            calibration = await own.run(self._parameters, now, go_on)
             go_on(f"writing {len(plan.gyros)} fine gyro offsets")
             coarse = calibration.after.values
             fine = await self._writer.apply([Change(c.parameter, coarse[c.parameter], c.after) for c in plan.gyros])
-            collateral = tuple(
-                Change(name, old, new)
-                for name, (old, new) in before.changed_in(calibration.after).items()
-                if name not in wanted
-            )
-            await self._ledger.widen(ChangeSet.of(self._vehicle.system_id, (*changes, *collateral)))
+            changed = before.changed_in(calibration.after).items()
+            collateral = tuple(Change(name, old, new) for name, (old, new) in changed if name not in wanted)
+            await self._ledger.widen(ChangeSet.of(system_id, (*changes, *collateral)))
         except CompanionError as error:
-            await self._put_back(changes, before, boots, error)
+            await self._restore(own, changes, before, boots, error)
             raise
-        # What was in force before all this is what the record says, not the firmware's coarse value in between.
+        # The record holds what was in force before all this, not the firmware's coarse value in between.
         written |= {c.parameter: msgspec.structs.replace(fine[c.parameter], before=c.before) for c in plan.gyros}
-        plan.note(draft, written)
+        plan.note(log, written)
         if calibration.words:
-            draft.warnings.append(calibration.words)
+            log.warnings.append(calibration.words)
         if collateral:
-            draft.warnings.append(
+            log.warnings.append(
                 "the firmware's gyro calibration, which resets its EKF, has changed others too:"
                 f" {', '.join(c.parameter for c in collateral)}; undo puts them back"
             )
         return dataclasses.replace(plan, collateral=collateral, firmware=calibration.outcome)
 
     async def settle(self, plan: Plan, go_on: Callable[[str], None]) -> str | None:
-        """After new gyro offsets: wait until the EKF agrees with them.
-
-        Returns:
-            What a pilot should know when it has not settled; None when it has, or when nothing is to settle.
-        """
-        if not self._vehicle.kind.resets_ekf_by_gyro_calibration or not plan.gyros:
+        """After new gyro offsets, wait until the EKF agrees; returns what a pilot should know if it has not."""
+        if self._vehicle.kind.gyro_calibration is None or not plan.gyros:
             return None
         try:
             return await self._ekf.settle(settles_within_s(plan.firmware), go_on)
         finally:
             self._ekf.stop()
 
-    async def _put_back(
-        self, changes: Sequence[Change], before: GyroParameters, boots: int, error: CompanionError
+    async def _restore(
+        self,
+        own: OwnGyroCalibration,
+        changes: Sequence[Change],
+        before: GyroParameters,
+        boots: int,
+        error: CompanionError,
     ) -> None:
-        """Our old values, and everything that the firmware's calibration may have changed.
+        """Restore our old values, and everything that the firmware's calibration may have changed.
 
         Raises:
-            WriteFailedError: always; what went wrong, and what could not be put back.
+            WriteFailedError: always; what went wrong, and what could not be restored.
         """
         logger.warning("writing around the firmware's gyro calibration: %s; putting everything back", error)
         reason = error.reason if isinstance(error, WriteFailedError) else str(error)
         back = [change for change in changes if change.parameter not in before.values]
-        left: tuple[str, ...]
+        left: tuple[str, ...] = ()
         try:
-            kind = self._vehicle.kind
-            again = await kind.gyros_measured_at_start(self._parameters) if self._vehicle.boots != boots else None
+            again = await own.runs_at_start(self._parameters) if self._vehicle.boots != boots else None
             if again is not None:
                 reason += f"; the restart has measured the gyros anew ({again}), so those stay"
             else:
-                now = await kind.read_gyro_parameters(self._parameters)
+                now = await own.read(self._parameters)
                 back += [Change(name, old, new) for name, (old, new) in before.changed_in(now).items()]
             await self._writer.restore(back)
-            left = ()
         except WriteFailedError as failure:
             left = failure.left_changed
         except AutopilotError:
             left = tuple(dict.fromkeys((*(change.parameter for change in back), *before.values)))
-        raise WriteFailedError(kind_of(error, self._vehicle, boots), reason, _outcomes(changes, left), left) from error
+        outcomes = {
+            change.parameter: WrittenParameter(
+                before=change.before,
+                after=change.after,
+                read_back=None if change.parameter in left else change.before,
+                outcome="failed" if change.parameter in left else "rolled_back",
+            )
+            for change in changes
+        }
+        raise WriteFailedError(kind_of(error, self._vehicle, boots), reason, outcomes, left) from error
 
 
 def settles_within_s(outcome: GyroOutcome | None) -> float:
-    """How long the EKF is waited for after a write, at most, by what became of the firmware's calibration."""
+    """Return the longest wait for the EKF after a write, by the outcome of the firmware's calibration."""
     return SETTLE_RESET_S if outcome == "reset" else SETTLE_ALONE_S
-
-
-def _outcomes(changes: Sequence[Change], left: Sequence[str]) -> dict[str, WrittenParameter]:
-    """After everything was put back, but for what is left."""
-    return {
-        change.parameter: WrittenParameter(
-            before=change.before,
-            after=change.after,
-            read_back=None if change.parameter in left else change.before,
-            outcome="failed" if change.parameter in left else "rolled_back",
-        )
-        for change in changes
-    }

@@ -235,9 +235,10 @@ class Recovery:
             return
         while self._vehicle.arm_state is not ArmState.DISARMED:
             await asyncio.sleep(POLL_S)
-        if unknown := {changed.parameter: changed.before for changed in open_set.changes if changed.after is None}:
+        unknown = {changed.parameter: changed.before for changed in open_set.changes if changed.after is None}
+        if unknown and (own := self._vehicle.kind.gyro_calibration) is not None:
             # The firmware stores its result at its end, over whatever was restored before.
-            await self._vehicle.kind.wait_until_gyros_calibrated(self._parameters, unknown)
+            await own.wait_until_over(self._parameters, unknown)
         ours, foreign = await self._sort(open_set)
         if ours:
             with changing(self._imus.values()):

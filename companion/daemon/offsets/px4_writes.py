@@ -1,8 +1,8 @@
-"""What a write to PX4 needs besides the writing: whose output it moves, and which offsets are in use at all.
+"""Far steps of a write to PX4: whose output each moves, and which offsets are in use at all.
 
-Which slot belongs to which SCALED_IMU is a guess (autopilot.firmware.px4) until a far value is in use and seen in the
-telemetry of all IMUs. The far step is large beside noise and truncation, and only one sensor makes one at a time; the
-small change itself often could not be seen at all.
+Which slot belongs to which SCALED_IMU is a guess (autopilot.firmware.px4_slots) until a far value is in use and seen in
+the telemetry of all IMUs. The far step is large beside noise and truncation, and only one sensor makes one at a time;
+the small change itself often could not be seen at all.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import logging
 import math
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import Final
 
@@ -42,21 +42,21 @@ RATE_HZ: Final = 50.0
 """Rate asked of IMUs that nobody listens to otherwise."""
 HEAR_S: Final = 0.4
 BEFORE_S: Final = 1.0
-"""Telemetry before a far value that its effect is compared with."""
+"""Telemetry before a far value with which the telemetry after it is compared."""
 MEAN_S: Final = 0.4
 """Telemetry that shows the far value in use, without a reading from before."""
 PATIENCE_S: Final = 2.5
-"""How long an effect is waited for: where somebody else writes too, PX4 reads ours up to 1 s later."""
+"""Longest wait for an effect: where somebody else writes too, PX4 reads ours up to 1 s later."""
 KEPT_S: Final = 4.0
 LEAST_SAMPLES: Final = 5
 MATCH: Final = 0.2
-"""Share of the expected step by which the output may miss it besides what PX4 ignores."""
+"""Share of the expected step by which the output may miss it, besides what PX4 ignores."""
 CHECK_S: Final = 0.1
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class FarStep:
-    """What the output of one IMU must do when a far value comes into force in the slot of one of its sensors."""
+class ExpectedStep:
+    """Step of one IMU's output when a far value comes into force in the slot of one of its sensors."""
 
     instance: int
     sensor: Triad
@@ -69,101 +69,111 @@ class FarStep:
     """Share of the step by which the offsets in use may have differed from the parameters."""
 
     def moved(self, made: Array) -> bool:
-        """Whether an output that moved by so much followed it."""
+        """Whether an output that made this step followed the far value."""
         return bool(np.linalg.norm(made - self.step) < (self.unknown + MATCH) * np.linalg.norm(self.step))
 
     def stayed(self, made: Array) -> bool:
-        """Whether an output that moved by so much did not follow it."""
+        """Whether an output that made this step did not follow the far value."""
         return bool(np.linalg.norm(made) < (1.0 - self.unknown - MATCH) * np.linalg.norm(self.step))
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class FarMean:
-    """An output while a far value was in force: mean and its sigma, (3,), rad/s or m/s^2, vehicle FRD."""
+    """Mean output while a far value was in force, and its sigma, (3,), rad/s or m/s^2, vehicle FRD."""
 
     mean: Array
     sigma: Array
 
 
-class _Samples:
-    """Latest telemetry of all IMUs."""
+class Px4Writes:
+    """Watches the telemetry over a write by far values, and learns the slots; other firmwares need none."""
 
-    def __init__(self) -> None:
-        self._kept: dict[int, deque[tuple[float, Reading]]] = {}
-
-    def add(self, instance: int, t_s: float, reading: Reading) -> None:
-        kept = self._kept.setdefault(instance, deque())
-        kept.append((t_s, reading))
-        while kept[0][0] < t_s - KEPT_S:
-            kept.popleft()
-
-    def mean(self, instance: int, sensor: Triad, from_s: float, to_s: float) -> FarMean | None:
-        found = [
-            reading.gyro_rad_s if sensor == "gyro" else reading.accel_m_s2
-            for t_s, reading in self._kept.get(instance, ())
-            if from_s <= t_s <= to_s
-        ]
-        if len(found) < LEAST_SAMPLES:
-            return None
-        values = np.array(found)
-        return FarMean(values.mean(axis=0), values.std(axis=0, ddof=1) / math.sqrt(len(found)))
-
-
-class _FarStepWatch:
-    """Watches the telemetry of all IMUs over a write by far values, and tells the memory what was seen."""
-
-    def __init__(self, link: MavlinkLink, vehicle: Vehicle, memory: SlotMemory) -> None:
-        self.means: dict[tuple[int, Triad], FarMean] = {}
-        """By instance, of the latest far value: only of what moved as it should."""
-        self._link, self._vehicle, self._memory = link, vehicle, memory
-        self.learned = False
-        """Whether the last look has told anything of the slots that was not known."""
-        self._samples = _Samples()
-        self._steps: Mapping[str, FarStep] = {}
+    def __init__(
+        self, link: MavlinkLink, vehicle: Vehicle, writer: ParameterWriter, ledger: Ledger, memory: SlotMemory, say: Say
+    ) -> None:
+        self._link, self._vehicle, self._writer, self._ledger = link, vehicle, writer, ledger
+        self._memory, self._say = memory, say
+        self._steps: dict[str, ExpectedStep] = {}
+        """Of the write under way, by parameter."""
+        self._means: dict[tuple[int, Triad], FarMean] = {}
+        """By instance, under the latest far value; only of outputs that moved as expected."""
+        self._learned = False
+        """Whether the last look told anything new of the slots."""
         self._boots = 0
+        self._samples: defaultdict[int, deque[tuple[float, Reading]]] = defaultdict(deque)
         self._before: dict[int, FarMean | None] = {}
-        self._heard: set[int] = set()
         self._unknown: set[int] = set()
-        """IMUs of which nobody could say whether there is such a one."""
+        """IMUs that may exist and were not heard."""
 
     @contextlib.asynccontextmanager
-    async def watching(self, steps: Mapping[str, FarStep]) -> AsyncIterator[FarProbe | None]:
-        """Collect from now on; gives what verifies the far values, by parameter (None: there are none)."""
-        self.means, self.learned, self._steps = {}, False, steps
-        if not steps:
-            yield None
-            return
-        self._heard.clear()
-        self._unknown.clear()
-        self._samples, self._boots = _Samples(), self._vehicle.boots
-        subscriptions = [self._subscribe(instance) for instance in self._vehicle.kind.imu_messages]
-        asked: list[int] = []
+    async def standing_by(
+        self, targets: Sequence[tuple[ImuCalibration, Sequence[Change], Vector]]
+    ) -> AsyncIterator[FarProbe | None]:
+        """Watch over a write of these changes; gives the probe of far values (None: there are none).
+
+        The third of each target is its accelerometers' output before.
+        """
+        self._means, self._learned, self._steps = {}, False, {}
+        for calibration, changes, read in targets:
+            self._steps |= far_steps(calibration, changes, read)
         try:
-            await asyncio.sleep(HEAR_S)
-            for instance, (*_, message) in self._vehicle.kind.imu_messages.items():
-                if instance not in self._heard:
-                    asked.append(message.message.id)
-                    self._unknown.add(instance)
-                    answer = self._vehicle.commands.request_message_interval(message.message.id, RATE_HZ)
-                    answer.add_done_callback(functools.partial(self._answered, instance))
-            yield self
-        finally:
-            for unsubscribe in subscriptions:
-                unsubscribe()
-            for message_id in asked:
-                self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 0.0)
+            async with self._listening():
+                yield self if self._steps else None
+        except WriteFailedError as error:
+            if self._vehicle.arm_state is ArmState.ARMED:
+                # One offset may be wrong on purpose, and while it is armed nobody may mend that.
+                for name in self._writer.left_far:
+                    self._say(Severity.CRITICAL, _danger(self._steps[name]), Weight.RESULT)
+            if error.kind == "not as believed" and not self._learned:
+                # Nothing was learned: the same slot again, and not for ever.
+                raise WriteFailedError("without effect", error.reason, error.written, error.left_changed) from error
+            raise
+        # Only a write that succeeded comes here.
+        for calibration, changes, _ in targets:
+            names, written = calibration.parameters.accel_offset, {change.parameter for change in changes}
+            if calibration.far_step is not None and written.intersection(names):
+                self._memory.brought_into_use(names, accel_offset_with(calibration, changes), self._vehicle.boots)
+
+    def seen_far(self, calibration: ImuCalibration) -> Mapping[Triad, FarMean]:
+        """Return the means of an IMU's output under the far values of the last write, where they were seen."""
+        return {of: mean for (number, of), mean in self._means.items() if number == calibration.instance}
+
+    async def make_sure(self, imus: Sequence[AutopilotImu]) -> bool:
+        """Bring offsets that may not be in use into use, unchanged; True when there were any.
+
+        Raises:
+            AutopilotError: this failed; the recovery restores what may be left.
+            StorageError: the values could not be kept, so nothing was written.
+        """
+        unsure = [imu for imu in imus if imu.in_force.accel_offset_may_be_unused]
+        targets = [(imu.in_force, _same_again(imu.in_force), (0.0, 0.0, 0.0)) for imu in unsure]
+        changes = [change for _, each, _ in targets for change in each]
+        if not changes:
+            return False
+        logger.info("bringing offsets into use that PX4 may have ignored: %s", ", ".join(c.parameter for c in changes))
+        try:
+            async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
+                with changing(unsure):
+                    async with self.standing_by(targets) as probe:
+                        await self._writer.apply(changes, probe)
+                await self._ledger.undone()
+        except WriteFailedError as error:
+            if error.kind != "not as believed" or error.left_changed:
+                raise
+            # Something was learned: the offsets are read again, from another slot.
+        return True
+
+    # --- the probe
 
     def mark(self, parameter: str) -> None:
         """Keep the means until now."""
         if (step := self._steps.get(parameter)) is not None:
             now_s = asyncio.get_running_loop().time()
-            self._before = {
-                instance: self._samples.mean(instance, step.sensor, now_s - BEFORE_S, now_s)
-                for instance in self._vehicle.kind.imu_messages
-            }
+            imus = self._vehicle.kind.imu_messages
+            self._before = {instance: self._mean(instance, step.sensor, now_s - BEFORE_S, now_s) for instance in imus}
 
     async def verify(self, parameter: str) -> str | None:
-        """Remember whose output moved; why this is not as it was believed, if so."""
+        """Learn whose output moved; returns why this is not as it was believed, or None."""
         if (step := self._steps.get(parameter)) is None:
             return None
         since, loop = Moment(self._vehicle), asyncio.get_running_loop()
@@ -181,16 +191,40 @@ class _FarStepWatch:
             # A restart brings other offsets into use by itself: whoever moved or did not, it says nothing.
             return None
         moved, still = self._moves(step, from_s, loop.time())
-        if step.instance in moved and (now := self._samples.mean(step.instance, step.sensor, from_s, loop.time())):
-            self.means[step.instance, step.sensor] = now
+        if step.instance in moved and (now := self._mean(step.instance, step.sensor, from_s, loop.time())):
+            self._means[step.instance, step.sensor] = now
         return self._conclude(step, moved, still)
 
-    def _moves(self, step: FarStep, from_s: float, to_s: float) -> tuple[list[int], list[int]]:
-        """IMUs that made the step by then, and those that did not; what is neither is in none."""
+    def _conclude(self, step: ExpectedStep, moved: list[int], still: list[int]) -> str | None:
+        word = WORDS[step.sensor]
+        if moved == [step.instance]:
+            self._memory.learn(step.sensor, step.device_id, step.instance)
+            return None
+        if len(moved) == 1 and step.instance in still:
+            self._correct(step, moved[0])
+            return f"the offsets in {step.slot} act on the {word} of IMU {moved[0]}, not of IMU {step.instance}"
+        if not moved and step.instance in still:
+            words = f"the offsets in {step.slot} do not act on the {word} of IMU {step.instance}"
+            if self._memory.holds_strangers(step.sensor, len(self._samples.keys() | self._unknown)):
+                self._correct(step, NO_IMU)
+                return words
+            # Every slot is somebody's: there is another reason, and what would be tried next is another IMU's.
+            return f"{words}: PX4 does not use what it has stored, or it moved"
+        if len(moved) > 1:
+            return f"the offsets in {step.slot} seem to act on IMU {' and '.join(map(str, moved))} at once"
+        logger.warning("%s: it cannot be told yet which IMU its offsets act on", step.slot)
+        return None
+
+    def _correct(self, step: ExpectedStep, instance: int) -> None:
+        self._learned = True
+        self._memory.learn(step.sensor, step.device_id, instance)
+
+    def _moves(self, step: ExpectedStep, from_s: float, to_s: float) -> tuple[list[int], list[int]]:
+        """Find the IMUs that made the step by then, and those that surely did not."""
         moved: list[int] = []
         still: list[int] = []
         for instance in self._vehicle.kind.imu_messages:
-            was, now = self._before.get(instance), self._samples.mean(instance, step.sensor, from_s, to_s)
+            was, now = self._before.get(instance), self._mean(instance, step.sensor, from_s, to_s)
             if was is None or now is None:
                 continue
             made = now.mean - was.mean
@@ -199,6 +233,33 @@ class _FarStepWatch:
             elif step.stayed(made):
                 still.append(instance)
         return moved, still
+
+    # --- the telemetry of all IMUs
+
+    @contextlib.asynccontextmanager
+    async def _listening(self) -> AsyncIterator[None]:
+        if not self._steps:
+            yield
+            return
+        self._samples.clear()
+        self._unknown.clear()
+        self._boots = self._vehicle.boots
+        messages = {instance: each[-1].message for instance, each in self._vehicle.kind.imu_messages.items()}
+        subscriptions = [self._subscribe(instance) for instance in messages]
+        asked: list[int] = []
+        try:
+            await asyncio.sleep(HEAR_S)
+            for instance in messages.keys() - self._samples.keys():
+                asked.append(messages[instance].id)
+                self._unknown.add(instance)
+                answer = self._vehicle.commands.request_message_interval(messages[instance].id, RATE_HZ)
+                answer.add_done_callback(functools.partial(self._answered, instance))
+            yield
+        finally:
+            for unsubscribe in subscriptions:
+                unsubscribe()
+            for message_id in asked:
+                self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 0.0)
 
     def _answered(self, instance: int, answer: asyncio.Future[int | None]) -> None:
         if answer.result() is not None:
@@ -210,154 +271,56 @@ class _FarStepWatch:
         def take(message: Message, t_s: float) -> None:
             reading = kind.decode(message) if self._vehicle.sent(message) else ""
             if not isinstance(reading, str) and not reading.all_zero:
-                self._heard.add(instance)
-                self._samples.add(instance, t_s, reading)
+                kept = self._samples[instance]
+                kept.append((t_s, reading))
+                while kept[0][0] < t_s - KEPT_S:
+                    kept.popleft()
 
         return self._link.subscribe(kind.message, take)
 
-    def _conclude(self, step: FarStep, moved: list[int], still: list[int]) -> str | None:
-        word = WORDS[step.sensor]
-        if moved == [step.instance]:
-            self._memory.learn(step.sensor, step.device_id, step.instance)
+    def _mean(self, instance: int, sensor: Triad, from_s: float, to_s: float) -> FarMean | None:
+        found = [
+            reading.gyro_rad_s if sensor == "gyro" else reading.accel_m_s2
+            for t_s, reading in self._samples.get(instance, ())
+            if from_s <= t_s <= to_s
+        ]
+        if len(found) < LEAST_SAMPLES:
             return None
-        if len(moved) == 1 and step.instance in still:
-            self._learn(step, moved[0])
-            return f"the offsets in {step.slot} act on the {word} of IMU {moved[0]}, not of IMU {step.instance}"
-        if not moved and step.instance in still:
-            words = f"the offsets in {step.slot} do not act on the {word} of IMU {step.instance}"
-            if self._memory.holds_strangers(step.sensor, len(self._heard | self._unknown)):
-                self._learn(step, NO_IMU)
-                return words
-            # Every slot is somebody's: there is another reason, and what would be tried next is another IMU's.
-            return f"{words}: PX4 does not use what it has stored, or it moved"
-        if len(moved) > 1:
-            return f"the offsets in {step.slot} seem to act on IMU {' and '.join(map(str, moved))} at once"
-        logger.warning("%s: it cannot be told yet which IMU its offsets act on", step.slot)
-        return None
-
-    def _learn(self, step: FarStep, instance: int) -> None:
-        self.learned = True
-        self._memory.learn(step.sensor, step.device_id, instance)
+        values = np.array(found)
+        return FarMean(values.mean(axis=0), values.std(axis=0, ddof=1) / math.sqrt(len(found)))
 
 
-class Px4Writes:
-    """Stands by while parameters are written; of ArduPilot's it has nothing to say."""
-
-    def __init__(
-        self,
-        link: MavlinkLink,
-        vehicle: Vehicle,
-        writer: ParameterWriter,
-        ledger: Ledger,
-        memory: SlotMemory,
-        say: Say,
-    ) -> None:
-        self._vehicle, self._writer, self._ledger = vehicle, writer, ledger
-        self._watch, self._memory, self._say = _FarStepWatch(link, vehicle, memory), memory, say
-
-    @contextlib.asynccontextmanager
-    async def standing_by(
-        self, targets: Sequence[tuple[ImuCalibration, Sequence[Change], Vector]]
-    ) -> AsyncIterator[FarProbe | None]:
-        """Over a write of these changes; gives what verifies the far values (None: no need).
-
-        The last of each target is what its accelerometers read.
-        """
-        steps: dict[str, FarStep] = {}
-        for calibration, changes, read in targets:
-            steps |= far_steps(calibration, changes, read)
-        try:
-            async with self._watch.watching(steps) as probe:
-                yield probe
-        except WriteFailedError as error:
-            if self._vehicle.arm_state is ArmState.ARMED:
-                # One offset may be wrong on purpose, and while it is armed nobody may mend that.
-                for name in self._writer.left_far:
-                    self._say(Severity.CRITICAL, _danger(steps[name]), Weight.RESULT)
-            if error.kind == "not as believed" and not self._watch.learned:
-                # Nothing was learned: the same slot again, and not for ever.
-                raise WriteFailedError("without effect", error.reason, error.written, error.left_changed) from error
-            raise
-        # Only a write that came to its end comes here.
-        for calibration, changes, _ in targets:
-            written = {change.parameter for change in changes}
-            if calibration.far_step is not None and written.intersection(calibration.parameters.accel_offset):
-                after = accel_offset_with(calibration, changes)
-                self._memory.brought_into_use(calibration.parameters.accel_offset, after, self._vehicle.boots)
-
-    def seen_far(self, calibration: ImuCalibration) -> Mapping[Triad, FarMean]:
-        """The output of an IMU while the far values of the last write were in force, as far as it was seen."""
-        return {of: mean for (number, of), mean in self._watch.means.items() if number == calibration.instance}
-
-    async def make_sure(self, imus: Sequence[AutopilotImu]) -> bool:
-        """Bring offsets that may not be in use into use, unchanged; True when there were any.
-
-        Raises:
-            AutopilotError: this failed; the recovery puts right what may be left.
-            StorageError: the values could not be kept, so nothing was written.
-        """
-        unsure = [imu for imu in imus if imu.in_force.accel_offset_may_be_unused]
-        changes = [change for imu in unsure for change in _again(imu.in_force)]
-        if not changes:
-            return False
-        logger.info("bringing offsets into use that PX4 may have ignored: %s", ", ".join(c.parameter for c in changes))
-        targets = [(imu.in_force, _again(imu.in_force), (0.0, 0.0, 0.0)) for imu in unsure]
-        try:
-            async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
-                with changing(unsure):
-                    async with self.standing_by(targets) as probe:
-                        await self._writer.apply(changes, probe)
-                await self._ledger.undone()
-        except WriteFailedError as error:
-            if error.kind != "not as believed" or error.left_changed:
-                raise
-            # Something was learned: the offsets are read again, from another slot.
-        return True
-
-
-def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> Mapping[str, FarStep]:
-    """What the output must do when each far value comes into use, by parameter; it reads `accel_m_s2` before."""
-    names, found = calibration.parameters, {}
+def far_steps(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> dict[str, ExpectedStep]:
+    """Return the step of the output when each far value comes into use, by parameter; `accel_m_s2` is read before."""
+    names, found = calibration.parameters, dict[str, ExpectedStep]()
     for change in changes:
         if change.via is None:
             continue
-        old, far, _ = _outputs(calibration, changes, change, accel_m_s2)
-        triad = _triad(calibration, change.parameter)
-        step = far[triad] - old[triad]
-        device_id, name = (
-            (calibration.gyro_id, names.gyro_id) if triad == "gyro" else (calibration.accel_id, names.accel_id)
-        )
-        if not step.any() or device_id is None:
-            continue
-        slot = name.removesuffix("_ID")
-        unknown = MARGIN * IGNORED_STEP / abs(change.via - change.before)
-        found[change.parameter] = FarStep(calibration.instance, triad, device_id, slot, step, unknown)
+        triad, old, far, _ = _outputs(calibration, changes, change, accel_m_s2)
+        device_id, name = calibration.accel_id, names.accel_id
+        if triad == "gyro":
+            device_id, name = calibration.gyro_id, names.gyro_id
+        if (step := far - old).any() and device_id is not None:
+            unknown = MARGIN * IGNORED_STEP / abs(change.via - change.before)
+            slot = name.removesuffix("_ID")
+            found[change.parameter] = ExpectedStep(calibration.instance, triad, device_id, slot, step, unknown)
     return found
 
 
 def step_from_far(calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector) -> Mapping[Triad, Array]:
-    """By how much the output must move from the last far value of each triad to all new ones, rad/s and m/s^2."""
+    """Return the step of the output from the last far value of each triad to all new ones, rad/s and m/s^2."""
     found: dict[Triad, Array] = {}
     for change in changes:
         if change.via is not None:
-            triad = _triad(calibration, change.parameter)
-            _, far, new = _outputs(calibration, changes, change, accel_m_s2)
-            found[triad] = new[triad] - far[triad]
+            triad, _, far, new = _outputs(calibration, changes, change, accel_m_s2)
+            found[triad] = new - far
     return found
-
-
-def _triad(calibration: ImuCalibration, parameter: str) -> Triad:
-    gyro = calibration.parameters.gyro_offset
-    return "gyro" if parameter in gyro else "accel"
-
-
-_Output = Mapping[Triad, Array]
 
 
 def _outputs(
     calibration: ImuCalibration, changes: Sequence[Change], one: Change, accel_m_s2: Vector
-) -> tuple[_Output, _Output, _Output]:
-    """Output, less that before all changes: before one far value, with it in use, and after all changes."""
+) -> tuple[Triad, Array, Array, Array]:
+    """Return triad and output, less that before all changes: before one far value, under it, and after all changes."""
     names, done = calibration.parameters, set[str]()
     vectors = (names.gyro_offset, names.accel_offset, names.accel_scale)
     for earlier in changes[: changes.index(one)]:
@@ -365,24 +328,24 @@ def _outputs(
             done |= {name for vector in vectors if earlier.parameter in vector for name in vector}
     old = {change.parameter: change.after if change.parameter in done else change.before for change in changes}
     new = {change.parameter: change.after for change in changes}
+    triad: Triad = "gyro" if one.parameter in names.gyro_offset else "accel"
 
-    def output(values: Mapping[str, float]) -> _Output:
+    def output(values: Mapping[str, float]) -> Array:
         there = [dataclasses.replace(change, after=values[change.parameter]) for change in changes]
-        gyro, accel = output_step(calibration, there, accel_m_s2)
-        return {"gyro": np.array(gyro), "accel": np.array(accel)}
+        return np.array(output_step(calibration, there, accel_m_s2)[0 if triad == "gyro" else 1])
 
-    return output(old), output(old | {one.parameter: one.far}), output(new)
+    return triad, output(old), output(old | {one.parameter: one.far}), output(new)
 
 
-def _danger(step: FarStep) -> str:
-    """What a pilot sees of a far value in flight."""
+def _danger(step: ExpectedStep) -> str:
+    """Tell the pilot the effect of a far value in flight."""
     size = float(np.linalg.norm(step.step))
     if step.sensor == "gyro":
         return f"DISARM NOW: yaw rate wrong by {size / DEG:.1f} deg/s"
     return f"DISARM NOW: vertical acceleration wrong by {size / MG:.0f} mg"
 
 
-def _again(calibration: ImuCalibration) -> list[Change]:
+def _same_again(calibration: ImuCalibration) -> list[Change]:
     offset, far = calibration.accel_offset_m_s2, calibration.far_step
     if far is None:
         return []
