@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.firmware.imu_messages import EkfBiasReading
 from companion.autopilot.parameters.reading import FirmwareName
-from companion.autopilot.telemetry.imu_samples import EkfBiasReading
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.solution.otherwise import Otherwise
 from companion.estimation.solution.prior import Expectation

@@ -1,1 +1,1 @@
-"""What is particular to ArduPilot and PX4: which parameters hold what, and who else changes them."""
+"""Firmwares: one object each for all that is particular to ArduPilot or PX4."""

@@ -172,7 +172,7 @@ async def read_thermal(parameters: Parameters, instance: int) -> Thermal:
 async def thermal_changes(
     parameters: Parameters, calibration: ImuCalibration, gyro: Polynomial, accel: Polynomial | None, degc: float
 ) -> list[Change]:
-    """As `Firmware.thermal_changes`, with curves about 35 degC.
+    """Plan curves about 35 degC, as `Firmware.thermal_changes`.
 
     The offsets belong to this temperature from then on. Without a curve of the accelerometers, one that is in force
     stays, held at the ends of the new span; one that is not is cleared, for it would come into force with the gyros'.

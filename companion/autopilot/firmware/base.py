@@ -1,4 +1,4 @@
-"""What the companion may ask of an autopilot firmware; a new firmware is one subclass of `Firmware`.
+"""Questions to an autopilot firmware; a new firmware is one subclass of `Firmware`.
 
 A plain `Firmware` is an autopilot that nobody has heard yet, `OtherFirmware` one that is not known here. Both answer
 every question, with "no" or a reason in words; nothing is measured or written there.
@@ -54,7 +54,7 @@ class HeadingSetting:
 
 
 Net = Literal["script", "command", "autopilot", "none"]
-"""Who switches to another heading when ours ends; "autopilot": it does so by itself."""
+"""Switch to another heading when ours ends, by whom; "autopilot": it does so by itself."""
 
 NETS: Final[dict[Net, str]] = {
     "script": "if our heading ends in flight, the script goes on by gyros and GNSS within a second",
@@ -237,7 +237,7 @@ class Firmware:
         return 0.0
 
     gyro_calibration: OwnGyroCalibration | None = None
-    """Its own gyro calibration, where that resets the EKF's gyro bias and AHRS shows that bias."""
+    """Own gyro calibration, where that resets the EKF's gyro bias and AHRS shows that bias."""
 
     # --- temperature calibration
 

@@ -76,7 +76,7 @@ _SIMULATION_BUS: Final = 4
 _MAYBE_INTERNAL_BUSES: Final = (1, 2)
 """I2C and SPI; whether such a sensor is inside the autopilot is a fact of the board. PX4 keeps it in CAL_*_ROT."""
 _PX4_ONLY_DEG: Final = {38: (90.0, 68.0, 293.0)}
-"""Of number 38 both firmwares' drivers know better angles, but PX4 turns calibrated data by these."""
+"""Number 38: both firmwares' drivers know better angles, but PX4 turns calibrated data by these."""
 
 _EV_YAW: Final = 8
 """Bit 3 of EKF2_EV_CTRL."""

@@ -51,7 +51,7 @@ async def read_slots(parameters: Parameters, sensor: Triad) -> tuple[Slot, ...]:
 
 
 class SlotMemory:
-    """Which device is which IMU; and since the last restart, which offsets are in use and which rivals act."""
+    """Device of each IMU as learned; since the last restart, offsets in use and rivals that act."""
 
     def __init__(self) -> None:
         self._instance_of: dict[tuple[Triad, int], int] = {}

@@ -1,4 +1,4 @@
-"""Did the written offsets have their effect? Judged from the telemetry before and after.
+"""Effect of written offsets, judged from the telemetry before and after.
 
 A parameter that reads back right proves nothing about the value in use: PX4 stores a small change and goes on with
 the old one, and a wrong orientation or sign moves the wrong axis (autopilots 4.2, 8.6). So the step that the output
@@ -24,7 +24,7 @@ from companion.physics.frames import Array, Matrix
 from companion.samples import Vector
 
 SIGMAS: Final = 4.0
-"""How far from its hypothesis a figure may lie, in standard deviations."""
+"""Largest distance of a figure from its hypothesis, in standard deviations."""
 
 VISIBLE_SIGMAS: Final = 2 * SIGMAS
 
@@ -49,10 +49,10 @@ class Observation:
     after: Vector
     after_sigma: Vector
     expected_step: Vector
-    """What the output had to move by (`imu_calibration.output_step`)."""
+    """Step that the output had to make (`imu_calibration.output_step`)."""
     truth: Vector
     tolerance: float
-    """What may remain of the residual besides noise."""
+    """Residual allowed besides noise."""
     orientation: Matrix | None = None
     """3x3, the parameters' axes to the vehicle's; None: they are the same."""
     resolution: float = 0.0
@@ -77,7 +77,7 @@ class Verdict:
 
     axes: tuple[AxisVerdict, AxisVerdict, AxisVerdict]
     fraction_sigma: float | None
-    """Of the share of the expected step that was made, over all axes; None when nothing was to be moved."""
+    """Sigma of the share of the expected step that was made, over all axes; None when nothing had to move."""
     problems: tuple[str, ...]
     hidden: tuple[str, ...]
     """The parameters whose step could not be judged."""
@@ -88,7 +88,7 @@ class Verdict:
         return not self.problems
 
     def outcome(self, parameter: str) -> Literal["verified", "stored", "failed"]:
-        """What the record says of a parameter that read back right."""
+        """Return the outcome of a parameter that read back right."""
         word = next(axis.word for axis in self.axes if axis.parameter == parameter)
         if word in ("not seen", "wrong"):
             return "failed"

@@ -1,4 +1,4 @@
-"""How a parameter travels: as a 32 bit float, which is what both autopilots keep and what is compared (autopilots 7.5).
+"""Encoding of a parameter on the wire: a 32 bit float, which both autopilots keep (autopilots 7.5).
 
 ArduPilot sends every value as a number and ignores the type it is sent back. PX4 puts the bytes of an integer into
 the float field, and refuses a PARAM_SET whose type is not the parameter's own.

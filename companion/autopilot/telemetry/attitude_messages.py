@@ -25,7 +25,7 @@ from companion.links.mavlink.link import MavlinkLink
 NOWHERE_VARIANCE_M2: Final = 1e4
 """Variance of a position that is none: ArduPilot bounds its sigma to 100 m."""
 _X, _Y, _Z, _ROLL, _PITCH, _YAW = 0, 6, 11, 15, 18, 20
-"""Where the diagonal stands in the upper right triangle, row by row."""
+"""Indices of the diagonal in the upper right triangle, row by row."""
 _U32: Final = 2**32
 
 

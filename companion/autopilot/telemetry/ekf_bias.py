@@ -21,7 +21,7 @@ from typing import Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.telemetry.imu_samples import EkfBiasReading
+from companion.autopilot.firmware.imu_messages import EkfBiasReading
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners
@@ -46,7 +46,7 @@ _SHELL: Final = mavlink.SERIAL_CONTROL_DEV_SHELL
 _ASKING: Final = mavlink.SERIAL_CONTROL_FLAG_RESPOND | mavlink.SERIAL_CONTROL_FLAG_EXCLUSIVE
 _UNITS: Final = np.repeat([1e-3, 1e-2], 3)
 _JUMP: Final = 0.5 * _UNITS
-"""From one look to the next: 100 deg/h, 0.5 mg."""
+"""Largest step from one look to the next: 100 deg/h, 0.5 mg."""
 _STEADY: Final = 0.02 * _UNITS
 """Within a second, before it is used: 4 deg/h, 0.02 mg."""
 

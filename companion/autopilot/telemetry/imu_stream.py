@@ -17,9 +17,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware import imu_messages
 from companion.autopilot.firmware.firmwares import FIRMWARES
-from companion.autopilot.firmware.imu_messages import ImuMessage, StreamKind
+from companion.autopilot.firmware.imu_messages import TEMPERATURE_AGE_S, ImuMessage, ImuSamples, StreamKind
 from companion.autopilot.telemetry.ekf_bias import EkfBias
-from companion.autopilot.telemetry.imu_samples import TEMPERATURE_AGE_S, ImuSamples
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.system.waiting import comes
@@ -36,10 +35,10 @@ SLOWER_RATES_HZ: Final = (100.0, 50.0, 40.0, 25.0, 10.0)
 """Tried in turn when a rate is denied: ArduPilot allows 1.25 times its loop rate, Plane's 50 Hz loop 40 Hz."""
 
 _ASKS: Final = 3
-"""How often a message is asked for that nobody refuses and that does not come."""
+"""Requests for a message that nobody refuses and that does not come."""
 
 _BETTER_AGAIN_S: Final = 30.0
-"""How often a better message that merely never came is asked for again."""
+"""Time between requests for a better message that merely never came."""
 
 _LOOK_S: Final = 0.25
 _TURN_S: Final = 1.0
@@ -47,10 +46,10 @@ BEAT_WITHIN_S: Final = 20.0
 """A request may wait behind fifteen others, each of which goes unanswered (`autopilot.commands`)."""
 _REFUSED: Final = -1
 _BESIDE_CONSOLE: Final = 0.85
-"""What the bias' answers leave of the rate on a slow line."""
+"""Share of the rate that the bias' answers leave on a slow line."""
 _TEMPERATURE_RATE_HZ: Final = 2.0
 _SEEN_BY_RATE_HZ: Final = 4.0
-"""Of PX4's integers beside its floats: a write looks who is there for 0.4 s (`daemon.offsets.px4_writes`)."""
+"""Rate of PX4's integers beside its floats: a write looks who is there for 0.4 s (`daemon.offsets.px4_writes`)."""
 _ABSENT_AFTER: Final = 10
 """Readings of nothing but zeros in a row, and there is no such IMU."""
 
@@ -70,7 +69,7 @@ class _Source:
 
     @property
     def name(self) -> str:
-        """Of the message."""
+        """Name of the message."""
         return self.message.kind.message
 
     @property
@@ -102,7 +101,7 @@ class ImuStream:
         on_kind_change: Callable[[StreamKind | None], None],
     ) -> None:
         self.kind: StreamKind | None = None
-        """What the samples come from; None while there are none."""
+        """Kind of message that brings the samples; None while there are none."""
         self.samples = 0
         self._starting = f"waiting for the autopilot to start IMU {instance}"
         self.problem = self._starting

@@ -1,1 +1,1 @@
-"""What the autopilot is and says of itself: heartbeats, arm state, place, clock; and commands to it."""
+"""The autopilot on the link: heartbeats, arm state, place, clock, estimator; commands to it, and its parameters."""

@@ -46,7 +46,7 @@ class BootClock:
 
     @property
     def latest_s(self) -> float | None:
-        """That time alone."""
+        """The time since boot that was heard last."""
         return None if self._last is None else self._last[0]
 
     def rebooted(self, boot_s: float, t_s: float) -> bool:

@@ -135,7 +135,7 @@ class Commands:
 
 
 def result_name(result: int) -> str:
-    """As the dialect calls a MAV_RESULT."""
+    """Return the dialect's name of a MAV_RESULT."""
     known = mavlink.enums["MAV_RESULT"].get(result)
     return known.name if known is not None else str(result)
 

@@ -1,23 +1,33 @@
-"""The autopilot's own estimate of the gyro biases, as ArduPilot tells it: AHRS (#163), omegaI = minus that estimate.
+"""The autopilot's own estimator: its gyro biases, its attitude (ATTITUDE, #30), and whether its yaw is a heading.
 
-After a step in the offsets EKF3 goes on with its old estimate, is wrong by minus the step, and turns the heading by
-that times 17 to 25 s before it has learned (autopilots 1.7, 9.3.1). With right offsets nothing is left to estimate, so
-what omegaI still shows is how far it is from settled.
+ArduPilot tells its gyro biases in AHRS (#163): omegaI is minus the estimate. After a step in the offsets EKF3 goes on
+with its old estimate, is wrong by minus the step, and turns the heading by that times 17 to 25 s before it has learned
+(autopilots 1.7, 9.3.1). With right offsets nothing is left to estimate, so omegaI shows how far it is from settled.
+
+No message gives a sigma of the yaw. It is a heading while the autopilot has a healthy magnetometer (SYS_STATUS) and
+its estimator compares one with its yaw and finds them agreeing (EKF_STATUS_REPORT, ESTIMATOR_STATUS): then it is as
+good as a compass next to motors and wires is, and no better.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 from collections import deque
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Iterator
+from typing import Final, NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.firmware.firmwares import FIRMWARES
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.estimation.solution.otherwise import OwnHeading
+from companion.estimation.solution.site import UNKNOWN_DECLINATION_SIGMA_DEG
+from companion.links.mavlink.link import Message
 from companion.links.system.waiting import comes
+from companion.physics.frames import Array, body_from_ned
 from companion.physics.units import DEG
 
 ADJUSTING: Final = "EKF adjusting"
@@ -26,12 +36,12 @@ SETTLED_RAD_S: Final = 0.02 * DEG
 9.3.1); and 72 deg/h times 25 s turn the heading by 0.5 deg, less than a compass knows."""
 
 _AHRS: Final[int] = mavlink.MAVLINK_MSG_ID_AHRS
-_RATE_HZ: Final = 4.0
-_MEAN_S: Final = 2.0
+_AHRS_RATE_HZ: Final = 4.0
+_AHRS_MEAN_S: Final = 2.0
 _OLDEST_S: Final = 10.0
 _FIRST_WITHIN_S: Final = 1.5
 _ASKS: Final = 3
-_LOOK_S: Final = 0.25
+_AHRS_LOOK_S: Final = 0.25
 
 
 class EkfWatch:
@@ -74,7 +84,7 @@ class EkfWatch:
         while True:
             if self._vehicle.boots != boots:
                 return "the autopilot restarted while its EKF settled"
-            bias = self._mean(_MEAN_S)
+            bias = self._mean(_AHRS_MEAN_S)
             if bias is not None and bias <= SETTLED_RAD_S:
                 return None
             if self._vehicle.arm_state is ArmState.ARMED:
@@ -88,7 +98,7 @@ class EkfWatch:
             if min(silent_s, loop.time() - asked_s) > _FIRST_WITHIN_S:
                 asked_s = loop.time()
                 self._ask()
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.sleep(_AHRS_LOOK_S)
 
     def stop(self) -> None:
         """No more AHRS on our account: back to the autopilot's own rate."""
@@ -98,14 +108,14 @@ class EkfWatch:
 
     def _ask(self) -> None:
         self._asked = True
-        self._vehicle.commands.request_message_interval(_AHRS, _RATE_HZ)
+        self._vehicle.commands.request_message_interval(_AHRS, _AHRS_RATE_HZ)
 
     def _mean(self, at_least_s: float) -> float | None:
-        """Of the last 2 s, or of as much more as it takes on a busy line to see so long; None when it was not."""
+        """Average the last 2 s, or as much more as a busy line needs for 2 s of readings; None without."""
         now_s = asyncio.get_running_loop().time()
         taken: list[tuple[float, float, float, float]] = []
         for each in reversed(self._seen):
-            if taken and (now_s - each[0] > _OLDEST_S or taken[0][0] - taken[-1][0] >= _MEAN_S):
+            if taken and (now_s - each[0] > _OLDEST_S or taken[0][0] - taken[-1][0] >= _AHRS_MEAN_S):
                 break
             taken.append(each)
         if not taken or now_s - taken[0][0] > _OLDEST_S or taken[0][0] - taken[-1][0] < at_least_s:
@@ -121,3 +131,116 @@ class EkfWatch:
 
 def _words(bias_rad_s: float | None) -> str:
     return "bias unknown" if bias_rad_s is None else f"{bias_rad_s / DEG:.2f} deg/s"
+
+
+HEADING_SIGMA_DEG: Final = 10.0
+"""Sigma of an autopilot's compass that agrees with its gyros; next to iron, or badly calibrated, it is off by more."""
+RATE_HZ: Final = 1.0
+STEADY_DEG: Final = 2.0
+"""Largest turn of yaw in `KEPT_S` while the aircraft stands: else the estimator is still looking for it."""
+KEPT_S: Final = 5.0
+QUICK_HZ: Final = 5.0
+LEAST: Final = 4
+LEAST_S: Final = 1.0
+LOOK_S: Final = 0.2
+OLD_S: Final = 5.0
+_MAGNETOMETER: Final[int] = mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
+
+
+class Angles(NamedTuple):
+    """Angles of ATTITUDE, rad."""
+
+    t_s: float
+    roll: float
+    pitch: float
+    yaw: float
+
+
+class OwnCompass:
+    """Whether its magnetometer is well and agrees with its yaw; `wanted`: asks for what tells it, all the time."""
+
+    def __init__(self, vehicle: Vehicle, *, wanted: bool) -> None:
+        self._has_compass_s = self._agrees_s = -math.inf
+        rate_hz = RATE_HZ if wanted else None
+        vehicle.hear(mavlink.MAVLink_sys_status_message, self._on_status, rate_hz)
+        self._vehicle = vehicle
+        for firmware in FIRMWARES:
+            if firmware.estimator_message is not None:
+                vehicle.hear(firmware.estimator_message, self._on_estimator, rate_hz, firmware.name)
+
+    def agrees(self, now_s: float) -> bool:
+        """Whether both have been said lately."""
+        return min(self._has_compass_s, self._agrees_s) >= now_s - OLD_S
+
+    def _on_status(self, message: mavlink.MAVLink_sys_status_message, t_s: float) -> None:
+        fit = (
+            message.onboard_control_sensors_present
+            & message.onboard_control_sensors_enabled
+            & message.onboard_control_sensors_health
+            & _MAGNETOMETER
+        )
+        self._has_compass_s = t_s if fit else -math.inf
+
+    def _on_estimator(self, message: Message, t_s: float) -> None:
+        if isinstance(message, self._vehicle.kind.estimator_message or ()):
+            self._agrees_s = t_s if 0.0 < self._vehicle.kind.compass_ratio(message) < 1.0 else -math.inf
+
+
+class OwnAttitude:
+    """Listens to the latched autopilot; `wanted`: asks for what the heading needs, all the time."""
+
+    def __init__(self, vehicle: Vehicle, *, wanted: bool) -> None:
+        self._vehicle, self._wanted = vehicle, wanted
+        self._seen: deque[Angles] = deque(maxlen=256)
+        self._compass = OwnCompass(vehicle, wanted=wanted)
+        vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, RATE_HZ if wanted else None)
+
+    def heading(self) -> OwnHeading | None:
+        """Return its yaw from true north; None while it has none that can be believed."""
+        now_s = asyncio.get_running_loop().time()
+        seen = self._since(now_s - KEPT_S)
+        if len(seen) < 2 or not self._compass.agrees(now_s):
+            return None
+        last = seen[-1].yaw
+        turned = [(one.yaw - last + math.pi) % (2.0 * math.pi) - math.pi for one in seen]
+        if max(turned) - min(turned) > STEADY_DEG * DEG:
+            return None
+        # Without a place it knows no declination.
+        north_deg = 0.0 if self._vehicle.place.position is not None else UNKNOWN_DECLINATION_SIGMA_DEG
+        return OwnHeading((last + sum(turned) / len(turned)) / DEG % 360.0, math.hypot(HEADING_SIGMA_DEG, north_deg))
+
+    @contextlib.contextmanager
+    def asked(self) -> Iterator[None]:
+        """Meanwhile ATTITUDE comes several times a second."""
+        commands, message_id = self._vehicle.commands, int(mavlink.MAVLINK_MSG_ID_ATTITUDE)
+        commands.request_message_interval(message_id, QUICK_HZ)
+        try:
+            yield
+        finally:
+            # 0: the firmware's own rate.
+            interval_us = 1e6 / RATE_HZ if self._wanted else 0.0
+            commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)
+
+    def up(self, since_s: float) -> Array | None:
+        """Mean direction of up in the vehicle's axes, (3,), of a second at least from then on; None before that."""
+        seen = self._since(since_s)
+        if len(seen) < LEAST or seen[-1].t_s - seen[0].t_s < LEAST_S:
+            return None
+        ups = [body_from_ned(one.roll, one.pitch, 0.0) @ (0.0, 0.0, -1.0) for one in seen]
+        return np.asarray(np.mean(ups, axis=0))
+
+    async def up_since(self, since_s: float) -> Array | None:
+        """Wait for it a few seconds; None: this autopilot does not tell."""
+        loop = asyncio.get_running_loop()
+        give_up_s = loop.time() + OLD_S
+        while (found := self.up(since_s)) is None and loop.time() < give_up_s:
+            await asyncio.sleep(LOOK_S)
+        return found
+
+    def _since(self, t_s: float) -> list[Angles]:
+        return [one for one in self._seen if one.t_s >= t_s]
+
+    def _on_attitude(self, message: mavlink.MAVLink_attitude_message, t_s: float) -> None:
+        angles = (message.roll, message.pitch, message.yaw)
+        if all(map(math.isfinite, angles)):
+            self._seen.append(Angles(t_s, *angles))

@@ -1,4 +1,4 @@
-"""What heartbeats say: which of all on a network is the autopilot's, and whether it is armed. Pure, time comes in.
+"""Heartbeats: which of all on a network are the autopilot's, and whether it is armed. Pure, time comes in.
 
 Anybody on an unsigned link can say "disarmed" under the autopilot's ids, as often as he likes; but the autopilot's own
 heartbeats are heard too. So "armed" outweighs "disarmed", and who says both by turns is not believed at all.
@@ -14,7 +14,7 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 ARMED_HOLDS_S: Final = 3.0
-"""How long an armed heartbeat outweighs disarmed ones: autopilots send at least one a second, and two may be lost."""
+"""Time for which an armed heartbeat outweighs disarmed ones: one comes a second at least, and two may be lost."""
 
 _CHANGES: Final = 4
 _CHANGES_WITHIN_S: Final = 5.0
@@ -26,7 +26,7 @@ been silenced; "armed" is believed earlier, as it permits nothing."""
 _RESTARTS_S: Final = 1.0
 """Within this time no autopilot restarts twice; two whose times since boot alternate seem to."""
 _TWO_HOLDS_S: Final = 5.0
-"""How long after the last sign of a second autopilot under our vehicle's ids nothing is believed of either."""
+"""Time after the last sign of a second autopilot under our vehicle's ids in which nothing is believed of either."""
 
 
 class ArmState(enum.Enum):
@@ -67,7 +67,7 @@ class ArmingWatch:
         self._armed = armed
 
     def restarted(self, t_s: float) -> None:
-        """What came before says nothing of now; only "armed" still counts, as a restart can be forged too."""
+        """Forget what came before; only "armed" still counts, as a restart can be forged too."""
         self._armed = None
         if t_s - self._restarted_s < _RESTARTS_S:
             self.two_seen(t_s)
@@ -88,7 +88,7 @@ class ArmingWatch:
         self._two_s = t_s
 
     def conflict(self, t_s: float, system_id: int | None) -> str | None:
-        """What is wrong when two autopilots speak under the ids of one; then nothing is believed of either."""
+        """Describe two autopilots under the ids of one, of which nothing is believed; None without."""
         if self.contradicts_itself(t_s):
             return f"system id {system_id} says armed and disarmed by turns: two autopilots, or a forger"
         return f"two autopilots have system id {system_id}" if t_s - self._two_s < _TWO_HOLDS_S else None
@@ -100,7 +100,7 @@ class ArmingWatch:
 
 
 ADOPT_OTHER_COMPONENT_S: Final = 2.0
-"""How long an autopilot on another component than 1 must have been heard before it is taken for the one."""
+"""Time for which an autopilot on another component than 1 must have been heard before it is latched."""
 
 _NOT_AIRCRAFT: Final = frozenset(
     getattr(mavlink, f"MAV_TYPE_{name}")

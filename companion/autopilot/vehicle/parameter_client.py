@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
@@ -27,6 +28,7 @@ from companion.errors import (
 )
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners
+from companion.links.system.waiting import comes
 
 _NO_ERROR: Final = 0
 _DOES_NOT_EXIST: Final = 1
@@ -34,7 +36,7 @@ _REMEMBERED_TYPES: Final = 4096
 """More parameters than any firmware has; what is not remembered is asked for."""
 
 _TIMEOUT_S: Final = 1.0
-"""Of each request."""
+"""Time limit of each request."""
 _TRIES: Final = 4
 _TRIES_MORE: Final = 8
 """While the autopilot's heartbeats come, or the line is known to lose packets: with a fifth of them lost both ways
@@ -59,29 +61,26 @@ _ERROR_WORDS: Final = {
 }
 """MAV_PARAM_ERROR in words; the generated dialect knows only the first five."""
 
-_INBOX: Final = 64
-
 
 class _Inbox:
-    """What arrives about one name during one exchange; when full the oldest answer is dropped."""
+    """Answers about one name during one exchange; when full the oldest is dropped."""
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self._arrived: asyncio.Queue[float | _Refusal | _Rebooted] = asyncio.Queue(_INBOX)
+        self._items: deque[float | _Refusal | _Rebooted] = deque(maxlen=64)
+        self._arrived = asyncio.Event()
 
     def put(self, item: float | _Refusal | _Rebooted) -> None:
-        """Take what has arrived."""
-        if self._arrived.full():
-            self._arrived.get_nowait()
-        self._arrived.put_nowait(item)
+        """Add an answer."""
+        self._items.append(item)
+        self._arrived.set()
 
     async def get(self, deadline_s: float) -> float | _Refusal | _Rebooted | None:
-        """The next item, or None at the deadline (loop's clock)."""
-        try:
-            async with asyncio.timeout_at(deadline_s):
-                return await self._arrived.get()
-        except TimeoutError:
-            return None
+        """Return the next answer, or None at the deadline (loop's clock); cancelled tasks may wait here too."""
+        if not self._items:
+            self._arrived.clear()
+            await comes(self._arrived, deadline_s - asyncio.get_running_loop().time())
+        return self._items.popleft() if self._items else None
 
 
 class _Refusal(NamedTuple):
@@ -105,13 +104,13 @@ class ParameterClient:
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
         self.writes = 0
-        """How many PARAM_SET have left, repetitions included."""
+        """PARAM_SET messages sent, repetitions included."""
         self._link = link
         self._repeated = 0.0
         """Share of requests that were answered only after a repetition, of late."""
         self._inboxes: list[_Inbox] = []
         self.on_value: Listeners[[str, float]] = Listeners()
-        """Told of every PARAM_VALUE of the autopilot, whoever caused it."""
+        """Notified of every PARAM_VALUE of the autopilot, whoever caused it."""
         self._answering: str | None = None
         self._absent: set[str] = set()
         """Names that this boot of the autopilot has shown not to have: told by silence, that takes seconds to learn."""

@@ -45,22 +45,22 @@ from companion.estimation.records.record import WrittenParameter
 logger = logging.getLogger(__name__)
 
 TAKEN_S: Final = 1.3
-"""How long after the last value PX4 has taken it into use; until then the one on the way acts."""
+"""Time until PX4 uses the last value; until then the far one acts."""
 
 _LATE_ECHO_S: Final = 0.3
 """Let answers to earlier writes pass before reading back: ArduPilot answers to X with Y and Z, old ones, as well."""
 
 _RECOVERY_S: Final = 30.0
-"""How long a restarted or silent autopilot is awaited before its old values are given up."""
+"""Longest wait for a restarted or silent autopilot before its old values are given up."""
 
 _PUT_BACK_S: Final = 60.0
-"""How long putting back may take in all, of an autopilot whose heartbeat comes but who answers badly."""
+"""Longest restore in all, of an autopilot whose heartbeat comes but who answers badly."""
 
 _TELL_REBOOT_S: Final = 2.0
 """After heartbeats have come back: how long the time since boot is awaited."""
 
 _ROUNDS: Final = 2
-"""How often putting back is tried; a late echo may have passed for a confirmation the first time."""
+"""Attempts of a restore; a late echo may have passed for a confirmation the first time."""
 
 
 class _Failure(Exception):  # noqa: N818 - never leaves this module
@@ -77,7 +77,7 @@ class ParameterWriter:
         """Outcomes of the last operation, whatever its end: also when it was cancelled."""
         self.left_changed: tuple[str, ...] = ()
         self.left_far: tuple[str, ...] = ()
-        """Those of them that have their far value."""
+        """Parameters of `left_changed` that have their far value."""
         self._parameters = parameters
         self._vehicle = vehicle
         self._lock = asyncio.Lock()
@@ -338,7 +338,7 @@ class ParameterWriter:
             logger.warning("%s is not put back yet: %s", change.parameter, error)
 
     async def _read_in_force(self, name: str) -> float | None:
-        """What is in force, or None when it cannot be known; a restart meanwhile only means asking again."""
+        """Read the value in force; None when it cannot be known. A restart meanwhile only means asking again."""
         if not self._vehicle.alive or self._late():
             return None
         for _ in range(2):
@@ -352,7 +352,7 @@ class ParameterWriter:
         return None
 
     async def _wait_disarmed(self) -> bool:
-        """Whether it is disarmed; while that is unknown it is awaited, for a limited time in all."""
+        """Wait until the arm state is known, for a limited time in all; whether it is disarmed."""
         loop = asyncio.get_running_loop()
         # The state may become known without an event, so there is none to wait for.
         while self._vehicle.arm_state is ArmState.UNKNOWN and loop.time() < self._give_up_s:

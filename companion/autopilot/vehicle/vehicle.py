@@ -49,7 +49,7 @@ _SLOWEST: Final = 5.0
 _POLL_S: Final = 0.05
 
 VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
-"""What `Vehicle.on_event` tells. "found": latched, or heard again after "lost". "armed" and "disarmed": the heartbeat
+"""Events of `Vehicle.on_event`. "found": latched, or heard again after "lost". "armed" and "disarmed": the heartbeat
 says so and the one before, if any, said otherwise; so the first heartbeat of all brings "found" and one of them.
 "disarmed" comes when that is believed: 3 s after the last armed heartbeat."""
 
@@ -95,7 +95,7 @@ class Vehicle:
         self._conflict_logged = False
         self._lost = True
         self.on_event: Listeners[[VehicleEvent]] = Listeners()
-        """Told of events, in the order in which they are seen."""
+        """Notified of events, in the order in which they are seen."""
         self.found = asyncio.Event()
         """Set while the autopilot is being heard."""
         self._wanted = StandingRequests(self.commands)
@@ -133,7 +133,7 @@ class Vehicle:
 
     @property
     def conflict(self) -> str | None:
-        """What is wrong when two autopilots speak under the ids of one; then the arm state is UNKNOWN."""
+        """Description of two autopilots under the ids of one; then the arm state is UNKNOWN. None without."""
         return self._arming.conflict(asyncio.get_running_loop().time(), self.system_id)
 
     @property

@@ -1,4 +1,4 @@
-"""What the autopilot says of time and place, as far as it can be believed.
+"""Time and place by the autopilot, as far as they can be believed.
 
 A place is believed when it may be one, and once it has been said again. While the aircraft stands still it does not
 change by more than matters: what is farther off is believed only after it has been said for half a minute without
@@ -33,7 +33,7 @@ CONFIRMED_AFTER_S: Final = 2.5
 """A first place, which is sent once a second: what one packet says is not enough."""
 SETTLED_AFTER_S: Final = 30.0
 SILENT_S: Final = 5.0
-"""How long a place counts as said after it was said last."""
+"""Time for which a place counts after it was said last."""
 
 _OR_SET: Final = "(or set vehicle.latitude_deg, longitude_deg, height_m)"
 _EARTH_RADIUS_M: Final = 6_371_000.0
@@ -43,7 +43,7 @@ _RECEIVER: Final = "autopilot GPS_RAW_INT"
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Position:
-    """Where the autopilot believes to be; the height is above mean sea level."""
+    """Position by the autopilot; the height is above mean sea level."""
 
     latitude_deg: float
     longitude_deg: float
@@ -71,7 +71,7 @@ class TimeAndPlace:
         """The place that is believed."""
         self._is_carried = is_carried
         self._anchor: Position | None = None
-        """What other places are compared with: it stays where it is while the aircraft stands still."""
+        """Place that others are compared with; it stays while the aircraft stands still."""
         self._claim: _Claim | None = None
         self._unix_minus_loop_s: float | None = None
 

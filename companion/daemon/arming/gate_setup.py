@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 POLL_S: Final = 1.0
 RETRY_S: Final = 30.0
 SCRIPT_STARTS_S: Final = 10.0
-"""How long the script is given to answer: scripting starts some seconds after the first heartbeat."""
+"""Time that the script is given to answer: scripting starts some seconds after the first heartbeat."""
 
 
 class GateSetup:
@@ -29,7 +29,7 @@ class GateSetup:
         self._stale = asyncio.Event()
         self._said: str | None = None
         self.problem: str | None = None
-        """What has to be set, for people; None while all is well or not known yet."""
+        """Settings that are missing, for people; None while all is well or not known yet."""
         self.known = False
         core.vehicle.on_event.add(self._on_event)
         core.parameters.on_value.add(self._on_parameter)
@@ -71,9 +71,9 @@ class GateSetup:
             self._say(Severity.WARNING, f"NO GATE: {self.problem}", Weight.RESULT)
 
     async def find_missing(self, script_starts_s: float = SCRIPT_STARTS_S) -> str | None:
-        """What has to be set so that the autopilot asks, for people; None: nothing.
+        """Return what has to be set so that the autopilot asks, for people; None: nothing.
 
-        ArduPilot's script is waited for where it does not run yet.
+        `script_starts_s`: time to wait for a script that does not run yet.
 
         Raises:
             AutopilotError: it does not answer.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from companion.autopilot.vehicle.own_attitude import OwnAttitude
+from companion.autopilot.vehicle.ekf import OwnAttitude
 from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.stands.alignment import AlignmentInForce, FacesInForce

@@ -9,7 +9,7 @@ from typing import Final
 
 import msgspec
 
-from companion.autopilot.vehicle.own_attitude import OwnAttitude
+from companion.autopilot.vehicle.ekf import OwnAttitude
 from companion.commands import Align
 from companion.component.service import Refusal
 from companion.daemon.biases.into_autopilot import IntoAutopilot

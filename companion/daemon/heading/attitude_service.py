@@ -18,7 +18,7 @@ from companion.autopilot.telemetry.attitude_messages import (
     microseconds,
     vision_position_estimate,
 )
-from companion.autopilot.vehicle.own_attitude import OwnCompass
+from companion.autopilot.vehicle.ekf import OwnCompass
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.statustext import Severity, Weight
 from companion.configured import models

@@ -94,9 +94,9 @@ class Px4Writes:
         self._link, self._vehicle, self._writer, self._ledger = link, vehicle, writer, ledger
         self._memory, self._say = memory, say
         self._steps: dict[str, ExpectedStep] = {}
-        """Of the write under way, by parameter."""
+        """Steps of the write under way, by parameter."""
         self._means: dict[tuple[int, Triad], FarMean] = {}
-        """By instance, under the latest far value; only of outputs that moved as expected."""
+        """Means under the latest far value, by instance; only of outputs that moved as expected."""
         self._learned = False
         """Whether the last look told anything new of the slots."""
         self._boots = 0

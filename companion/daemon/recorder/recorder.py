@@ -18,7 +18,7 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from companion.autopilot.telemetry.imu_samples import EkfBiasReading
+from companion.autopilot.firmware.imu_messages import EkfBiasReading
 from companion.component.service import JobResult
 from companion.configured import models
 from companion.daemon.calibrating.estimator import EstimatorInputs

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from companion.autopilot.vehicle.own_attitude import OwnAttitude
+from companion.autopilot.vehicle.ekf import OwnAttitude
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import ALIGNMENT, FACES, TURN, Job

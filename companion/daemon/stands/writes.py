@@ -19,7 +19,7 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import output_step
 from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.vehicle.own_attitude import OwnAttitude
+from companion.autopilot.vehicle.ekf import OwnAttitude
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu

@@ -8,8 +8,7 @@ from typing import Any, Final
 import msgspec
 
 from companion.autopilot.firmware.firmwares import FIRMWARES, firmware_named
-from companion.autopilot.firmware.imu_messages import PX4_FLOATS, ImuMessage, Reading
-from companion.autopilot.telemetry.imu_samples import EkfBiasReading, ImuSamples
+from companion.autopilot.firmware.imu_messages import PX4_FLOATS, EkfBiasReading, ImuMessage, ImuSamples, Reading
 from companion.config.sections import Config
 from companion.configured.models import Role, parts_of, serial_devices
 from companion.errors import StorageError
