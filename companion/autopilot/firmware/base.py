@@ -134,7 +134,10 @@ class OwnGyroCalibration(Protocol):
 
 
 class Firmware:
-    """One firmware; this class itself stands for an autopilot that has not been heard."""
+    """One firmware; this class itself stands for an autopilot that has not been heard.
+
+    Whatever reads parameters raises AutopilotError where one cannot be read.
+    """
 
     name: FirmwareName | None = None
     words = "autopilot"
@@ -172,7 +175,6 @@ class Firmware:
 
     def compass_ratio(self, message: Any) -> float:
         """Return innovation over gate of the compass; 0 where nothing is compared."""
-        del message
         return 0.0
 
     faster_log = ""
@@ -211,9 +213,6 @@ class Firmware:
         """Read the rivals that are switched on, and those that were and act until the next boot.
 
         `seen` is kept from one call to the next: the boot, as counted, in which each parameter was last seen on.
-
-        Raises:
-            AutopilotError: as `Parameters.read_optional`.
         """
         found: list[Rival] = []
         seen = {} if seen is None else seen
@@ -233,7 +232,6 @@ class Firmware:
 
     def stale_tilt_deg(self, changes: Sequence[Change]) -> float:
         """Return the tilt that the EKF may keep from before these changes until a restart; 0: none owes one."""
-        del changes
         return 0.0
 
     gyro_calibration: OwnGyroCalibration | None = None
@@ -306,26 +304,18 @@ class Firmware:
 
     def heading_net(self, found: Mapping[str, float]) -> Net:
         """Tell who switches to another heading when ours ends."""
-        del found
         return "none"
 
     def takes_only_our_heading(self, found: Mapping[str, float]) -> bool:
         """Whether the firmware takes its heading from outside and from nowhere else."""
-        del found
         return False
 
     def missing_compass(self, found: Mapping[str, float]) -> str | None:
         """Return the parameter that leaves it without a compass it needs, or None."""
-        del found
         return None
 
     async def yaw_is_its_own(self, parameters: Parameters) -> bool:
-        """Whether its yaw comes from its own sensors, as far as parameters tell.
-
-        Raises:
-            AutopilotError: as `Parameters.read_optional`.
-        """
-        del parameters
+        """Whether its yaw comes from its own sensors, as far as parameters tell."""
         return True
 
     # --- arming
@@ -340,11 +330,7 @@ class Firmware:
         """Return what has to be set so that the autopilot asks before it arms, for people; None: nothing.
 
         `script_starts_s`: time to wait for a script that does not run yet.
-
-        Raises:
-            AutopilotError: it does not answer.
         """
-        del parameters, system_id, script_starts_s
         return "this autopilot has no gate that is known here"
 
     # --- the port, and ground stations behind it
@@ -354,26 +340,18 @@ class Firmware:
 
     def port_rows(self, found: Mapping[str, float], baud: int | None) -> list[PortRow]:
         """List the parameters of the companion's port; `baud`: of our serial line, None without one."""
-        del found, baud
         return []
 
     def port_needs(self, baud: int) -> str | None:
         """Return the settings that the autopilot's end of a serial line needs; None: not known."""
-        del baud
         return None
 
     async def read_closed_links(self, parameters: Parameters) -> list[str]:
-        """Read which of its links do not forward messages.
-
-        Raises:
-            AutopilotError: as `Parameters.read_optional`.
-        """
-        del parameters
+        """Read which of its links do not forward messages."""
         return []
 
     def forwarding_words(self, closed: Sequence[str]) -> tuple[bool, str]:
         """Tell whether all is well while no ground station is heard, and the facts with the fix."""
-        del closed
         return True, "none heard"
 
 

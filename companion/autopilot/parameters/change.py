@@ -75,12 +75,8 @@ class NothingWrittenError(NotDisarmedError):
 class WriteFailedError(AutopilotError):
     """A set of parameters is not in force as a whole.
 
-    Attributes:
-        kind: the cause in a word.
-        written: every parameter of the set with its outcome: "rolled_back" (the old value is in force again),
-            "failed" (never written, or not put back: then it is in `left_changed` too, and `read_back` says what
-            is in force, None when that cannot be known).
-        left_changed: the parameters of which the old value is not, or not surely, in force.
+    `written` has every parameter of the set: "rolled_back" (restored) or "failed" (never written, or not restored; then
+    `read_back` is the value in force, if known). `left_changed` names those whose old value may not be in force.
     """
 
     def __init__(

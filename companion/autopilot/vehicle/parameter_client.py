@@ -139,17 +139,12 @@ class ParameterClient:
         )
 
     async def read_optional(self, name: str) -> float | None:
-        """Like `read`, but None when the autopilot has no such parameter.
+        """Read as `read`; None when the autopilot has no such parameter.
 
-        Firmware from ArduPilot 4.7 and PX4 1.17 on says so (PARAM_ERROR); older ones are silent. Silence means that
-        it does not exist only while heartbeats come and the autopilot answers for another parameter right after;
-        otherwise requests do not reach it. ArduPilot 4.8 is often silent too: its PARAM_ERROR to a read may leave by
-        another of its links. So what is absent is remembered until it restarts or announces the name.
-
-        Raises:
-            ParameterTimeoutError: no answer to anything.
-            ParameterRefusedError: PARAM_ERROR other than that it does not exist.
-            AutopilotRebootedError: the autopilot restarted meanwhile.
+        Firmware from ArduPilot 4.7 and PX4 1.17 on says so (PARAM_ERROR). Older ones are silent, and ArduPilot 4.8
+        often too, as its PARAM_ERROR may leave by another link. Silence means absence only while heartbeats come and
+        the autopilot answers for another parameter right after. An absent name is remembered until it restarts or
+        announces it.
         """
         if name in self._absent:
             return None
@@ -181,11 +176,7 @@ class ParameterClient:
         return None
 
     async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
-        """Read several by name, a few requests at a time; where `optional`, what does not exist is left out.
-
-        Raises:
-            ParameterTimeoutError, ParameterRefusedError, AutopilotRebootedError: as `read` and `read_optional`.
-        """
+        """Read several by name, a few requests at a time; where `optional`, what does not exist is left out."""
         wanted = list(names)
         read = self.read_optional if optional else self.read
         found: dict[str, float] = {}
@@ -200,14 +191,10 @@ class ParameterClient:
         return found
 
     async def write(self, name: str, value: float) -> float:
-        """Set a parameter and wait for the autopilot to confirm that very value.
+        """Set a parameter and wait for the autopilot to confirm that value, within 1 ulp.
 
-        It is sent as the type that the autopilot has told of it; a REAL32 is rounded to float32. Another value in
-        between may be an answer to somebody else's write, so the wait goes on; if nothing else comes it is what the
-        autopilot made of ours.
-
-        Returns:
-            The confirmed value, within 1 ulp of what was asked.
+        It is sent as the type that the autopilot has announced; a REAL32 is rounded to float32. Another value in
+        between may answer somebody else's write, so the wait goes on; if nothing else comes it counts as the answer.
 
         Raises:
             NotDisarmedError: armed, or unknown whether armed, when a PARAM_SET was about to leave. If it was a

@@ -1,9 +1,7 @@
-"""Several parameters as one: all of them are written, or the old values are back, or it is said which are not.
+"""Several parameters as one: all are written, or the old values restored, or the error names those that are not.
 
-MAVLink knows no transaction, so this is the nearest thing to one (autopilots 8): a fresh look at each old
-value, guarded writes one by one, a fresh read-back of every one, a last look at the arm state; and on any failure
-the old values again in reverse order, just as guarded. What cannot be put back, because the aircraft armed or fell
-silent, is in the error by name.
+MAVLink knows no transaction, so this is the nearest thing to one (autopilots 8): read each old value, write one by one,
+each guarded, read every one back, check the arm state again; on any failure restore in reverse order, just as guarded.
 """
 
 from __future__ import annotations
@@ -87,15 +85,12 @@ class ParameterWriter:
     async def apply(self, changes: Sequence[Change], probe: FarProbe | None = None) -> dict[str, WrittenParameter]:
         """Write all changes or none; a parameter that already has its new value is not written again.
 
-        Vectors with a far value (`Change.via`) come last and one at a time, each verified by `probe`.
-
-        Returns:
-            Every parameter as "stored": read back afresh, its effect not yet looked at.
+        Vectors with a far value (`Change.via`) come last and one at a time, each verified by `probe`. Returns every
+        parameter as "stored": read back, its effect not verified. A cancel first restores the old values.
 
         Raises:
             NothingWrittenError: not disarmed at the start, or the autopilot is just calibrating itself.
             WriteFailedError: nothing, or everything that could be, is as before.
-            asyncio.CancelledError: cancelled; the old values are put back first, see `written`.
         """
         async with self._lock:
             items = self._begin(changes)
@@ -120,17 +115,13 @@ class ParameterWriter:
             return self._publish(items)
 
     async def restore(self, changes: Sequence[Change]) -> dict[str, WrittenParameter]:
-        """Put back `before` of every change, last first: after a verification that failed.
+        """Restore `before` of every change, last first, as far as possible; returns them as "rolled_back".
 
-        As much as can be is put back. A value that is neither `before` nor `after` is somebody else's and is left.
-
-        Returns:
-            Every parameter as "rolled_back".
+        A value that is neither `before` nor `after` is somebody else's and is left.
 
         Raises:
-            NothingWrittenError: as `apply`; nothing was put back.
-            WriteFailedError: `left_changed` names what could not be put back.
-            asyncio.CancelledError: cancelled; see `written`.
+            NothingWrittenError: as `apply`; nothing was restored.
+            WriteFailedError: `left_changed` names what could not be restored.
         """
         async with self._lock:
             items = self._begin(changes)
@@ -144,14 +135,9 @@ class ParameterWriter:
             return self.written
 
     async def undo(self, changes: Sequence[Change]) -> dict[str, WrittenParameter]:
-        """Put back `before` of every change, or none: refused when somebody has changed one since.
+        """Restore `before` of every change, or none: refused when somebody has changed one since.
 
-        Returns:
-            Every parameter as "rolled_back", `before` and `after` as in the changes.
-
-        Raises:
-            NothingWrittenError, WriteFailedError, asyncio.CancelledError: as `apply`; "rolled_back" in the
-                error then means that the value from before the undo is in force.
+        Raises as `apply`; "rolled_back" in the error then means that the value from before the undo is in force.
         """
         swapped = [dataclasses.replace(c, before=c.after, after=c.before) for c in reversed(changes)]
         done = await self.apply(swapped)

@@ -1,0 +1,44 @@
+"""The firmware objects: who asks which firmware it is, and what an unknown one answers."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from companion.autopilot.firmware.base import Firmware
+from companion.autopilot.firmware.firmwares import FIRMWARES, OTHER, UNHEARD, firmware_named, firmware_with
+from companion.autopilot.parameters.reading import FirmwareName
+from companion.errors import AutopilotError
+
+ROOT = Path(__file__).parents[3]
+AT_HOME = ("companion/autopilot/firmware/", "companion/autopilot/parameters/reading.py")
+
+
+def test_no_other_package_names_a_firmware() -> None:
+    names = {str(one.name) for one in FIRMWARES}
+    found = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path in sorted((ROOT / "companion").rglob("*.py"))
+        if not str(path.relative_to(ROOT)).startswith(AT_HOME)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and node.value in names
+    ]
+    assert found == []
+
+
+def test_every_name_has_an_object_and_every_heartbeat_one() -> None:
+    assert {firmware_named(name).name for name in get_args(FirmwareName)} == set(get_args(FirmwareName))
+    assert [firmware_with(one.mav_autopilot or 0) for one in FIRMWARES] == list(FIRMWARES)
+    assert firmware_with(99) is OTHER
+    assert firmware_named(None) is UNHEARD
+
+
+@pytest.mark.parametrize("firmware", [UNHEARD, OTHER])
+def test_an_unknown_one_has_nothing_to_measure_or_to_write(firmware: Firmware) -> None:
+    assert (firmware.imu_messages, firmware.ranges, firmware.rivals, firmware.gyro_calibration) == ({}, {}, {}, None)
+    assert firmware.forwarding_words([]) == (True, "none heard")
+    with pytest.raises(AutopilotError):
+        firmware.heading_names()
