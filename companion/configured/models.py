@@ -7,7 +7,7 @@ import datetime
 from collections.abc import Iterator, Sequence
 from typing import Final, Literal
 
-from companion.autopilot.telemetry.imu_stream import StreamKind
+from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu
 from companion.estimation.collector.outlook import Settings

@@ -50,7 +50,6 @@ from companion.autopilot.parameters.reading import (
     read_vector,
 )
 from companion.errors import AutopilotError
-from companion.estimation.temperature.polynomial import Polynomial
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.rotations import ROTATION_NAMES
 
@@ -152,17 +151,7 @@ class ArduPilot(Firmware):
         used = await read_integer(parameters, names.use) != 0
         return dataclasses.replace(calibration, warnings=_warnings(calibration, names, used=used))
 
-    async def thermal_changes(
-        self,
-        parameters: Parameters,
-        calibration: ImuCalibration,
-        gyro: Polynomial,
-        accel: Polynomial | None,
-        degc: float,
-    ) -> list[Change]:
-        return await own_calibration.thermal_changes(parameters, calibration, gyro, accel, degc)
-
-    # --- level
+    thermal_changes = staticmethod(own_calibration.thermal_changes)
 
     async def plan_level(
         self, parameters: Parameters, roll_rad: float, pitch_rad: float

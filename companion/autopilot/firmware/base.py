@@ -155,8 +155,6 @@ class Firmware:
     takes_nan_position = False
     """Whether a position that is unknown goes out as NaN."""
 
-    # --- time that things take
-
     settle_s = 2.0
     """Time after a write in which the telemetry may still show the old offsets."""
     write_s = 5.0
@@ -237,8 +235,6 @@ class Firmware:
     gyro_calibration: OwnGyroCalibration | None = None
     """Own gyro calibration, where that resets the EKF's gyro bias and AHRS shows that bias."""
 
-    # --- temperature calibration
-
     why_no_thermal_write: str | None = None
     """Why no curve is written into the firmware's temperature calibration; None: it is."""
 
@@ -252,8 +248,6 @@ class Firmware:
     ) -> list[Change]:
         """Plan curves over temperature so that the output at this temperature stays as it is."""
         raise AutopilotError(self.why_no_thermal_write or "this autopilot is neither ArduPilot nor PX4: no curves")
-
-    # --- level
 
     level_turns_imus = False
     """Whether the level turns the IMUs' data, or only the attitude that is reported."""

@@ -351,12 +351,6 @@ def whole_of(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | N
     return gyro if found.gyro_rad_s is not None else None, accel if found.accel_m_s2 is not None else None
 
 
-def accel_taken_off(calibration: ImuCalibration) -> Array:
-    """Return diag(accel_scale) accel_offset, which the output lacks, (3,), m/s^2, in the IMU's axes."""
-    scaled: Array = np.asarray(calibration.accel_scale) * np.asarray(calibration.accel_offset_m_s2)
-    return scaled
-
-
 def _require_plausible(calibration: ImuCalibration, what: str, vector: Vector, limit: float) -> None:
     instance, (unit, words) = calibration.instance, (DEG, "deg/s") if "gyro" in what else (1.0, "m/s^2")
     for axis, value in zip(_AXES, vector, strict=True):

@@ -207,8 +207,6 @@ class PX4(Firmware):
         stale_deg = math.degrees(max(step.values(), default=0.0) / (1e3 * MG))
         return max(turned_deg, stale_deg) if turned_deg or stale_deg >= GATED_TILT_DEG else 0.0
 
-    # --- level
-
     level_turns_imus = True
 
     async def plan_level(

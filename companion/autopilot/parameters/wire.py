@@ -34,7 +34,7 @@ def _rank(value: float) -> int:
     return bits if bits >= 0 else -(bits & 0x7FFFFFFF)
 
 
-_FORMATS: Final[dict[int, str]] = {
+INTEGER_FORMATS: Final[dict[int, str]] = {
     mavlink.MAV_PARAM_TYPE_UINT8: "<B",
     mavlink.MAV_PARAM_TYPE_INT8: "<b",
     mavlink.MAV_PARAM_TYPE_UINT16: "<H",
@@ -48,28 +48,23 @@ _HEADER_BYTES: Final = {0xFE: 6, 0xFD: 10}
 REAL32: Final[int] = mavlink.MAV_PARAM_TYPE_REAL32
 
 
-def is_integer(kind: int) -> bool:
-    """Whether a MAV_PARAM_TYPE is one of the whole numbers of up to 32 bits."""
-    return kind in _FORMATS
-
-
 def decode(message: mavlink.MAVLink_param_value_message, *, bytewise: bool) -> float:
     """The value that a PARAM_VALUE means; integers of 32 bits are exact in a Python float."""
-    if not bytewise or message.param_type not in _FORMATS:
+    if not bytewise or message.param_type not in INTEGER_FORMATS:
         return float(message.param_value)
     # The bytes as they came: a float that is no number would lose some of its bits on the way through one. The value
     # is the first field of the payload (param_value float, count, index, id, type).
     packet = bytes(message.get_msgbuf() or b"")
     start = _HEADER_BYTES.get(packet[0], len(packet)) if packet else 0
     carried = packet[start : start + 4] or struct.pack("<f", message.param_value)
-    return float(struct.unpack_from(_FORMATS[message.param_type], carried.ljust(4, b"\0"))[0])
+    return float(struct.unpack_from(INTEGER_FORMATS[message.param_type], carried.ljust(4, b"\0"))[0])
 
 
 def encode(value: float, kind: int, *, bytewise: bool) -> float | None:
     """The float that carries a value as a type; None when none can (a fraction, out of range, no number)."""
-    if not bytewise or kind not in _FORMATS:
+    if not bytewise or kind not in INTEGER_FORMATS:
         return value
-    form = _FORMATS[kind]
+    form = INTEGER_FORMATS[kind]
     try:
         if value != int(value):
             return None

@@ -24,8 +24,6 @@ from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.system.waiting import comes
 from companion.samples import ImuSample
 
-__all__ = ["ImuStream", "StreamKind"]
-
 logger = logging.getLogger(__name__)
 
 SILENCE_S: Final = 2.0

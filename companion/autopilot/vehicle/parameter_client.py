@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.wire import REAL32, decode, encode, float32, is_integer, same_float32
+from companion.autopilot.parameters.wire import INTEGER_FORMATS, REAL32, decode, encode, float32, same_float32
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.errors import (
     AutopilotRebootedError,
@@ -67,15 +67,15 @@ class _Inbox:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self._items: deque[float | _Refusal | _Rebooted] = deque(maxlen=64)
+        self._items: deque[float | _Refusal | AutopilotRebootedError] = deque(maxlen=64)
         self._arrived = asyncio.Event()
 
-    def put(self, item: float | _Refusal | _Rebooted) -> None:
+    def put(self, item: float | _Refusal | AutopilotRebootedError) -> None:
         """Add an answer."""
         self._items.append(item)
         self._arrived.set()
 
-    async def get(self, deadline_s: float) -> float | _Refusal | _Rebooted | None:
+    async def get(self, deadline_s: float) -> float | _Refusal | AutopilotRebootedError | None:
         """Return the next answer, or None at the deadline (loop's clock); cancelled tasks may wait here too."""
         if not self._items:
             self._arrived.clear()
@@ -92,10 +92,6 @@ class _Refusal(NamedTuple):
     def text(self) -> str:
         """Why, for people."""
         return _ERROR_WORDS.get(self.code, f"error {self.code}")
-
-
-class _Rebooted:
-    """The autopilot restarted."""
 
 
 class ParameterClient:
@@ -205,7 +201,7 @@ class ParameterClient:
             AutopilotRebootedError: the autopilot restarted meanwhile; it may have had its effect.
         """
         kind = await self._type_of(name)
-        whole = is_integer(kind)
+        whole = kind in INTEGER_FORMATS
         wanted = value if whole else float32(value)
         carried = encode(wanted, kind, bytewise=self.integers_bytewise)
         if not math.isfinite(wanted) or carried is None:
@@ -276,8 +272,8 @@ class ParameterClient:
 
     async def _next(self, inbox: _Inbox, deadline_s: float) -> float | _Refusal | None:
         answer = await inbox.get(deadline_s)
-        if isinstance(answer, _Rebooted):
-            raise AutopilotRebootedError(f"{self.vehicle.name} restarted while {inbox.name} was exchanged")
+        if isinstance(answer, AutopilotRebootedError):
+            raise answer
         return answer
 
     async def _ask(self, inbox: _Inbox, name: str, index: int) -> float | _Refusal | None:
@@ -347,7 +343,7 @@ class ParameterClient:
             self._absent.clear()
             self._types.clear()
             for inbox in self._inboxes:
-                inbox.put(_Rebooted())
+                inbox.put(AutopilotRebootedError(f"{self.vehicle.name} restarted while {inbox.name} was exchanged"))
 
 
 def _wire_name(name: str) -> bytes:

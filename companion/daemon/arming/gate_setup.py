@@ -43,7 +43,9 @@ class GateSetup:
             await self._vehicle.found.wait()
             self._stale.clear()
             try:
-                self.problem = await self.find_missing()
+                self.problem = await self._vehicle.kind.find_gate_problem(
+                    self._parameters, self._vehicle.system_id, SCRIPT_STARTS_S
+                )
             except AutopilotError as error:
                 logger.info("whether the gate is set up is not known: %s", error)
                 self._stale.set()
@@ -69,16 +71,6 @@ class GateSetup:
             self._said = self.problem
             logger.warning("arming is not gated: %s", self.problem)
             self._say(Severity.WARNING, f"NO GATE: {self.problem}", Weight.RESULT)
-
-    async def find_missing(self, script_starts_s: float = SCRIPT_STARTS_S) -> str | None:
-        """Return what has to be set so that the autopilot asks, for people; None: nothing.
-
-        `script_starts_s`: time to wait for a script that does not run yet.
-
-        Raises:
-            AutopilotError: it does not answer.
-        """
-        return await self._vehicle.kind.find_gate_problem(self._parameters, self._vehicle.system_id, script_starts_s)
 
     def status(self) -> dict[str, object]:
         """For `companion status` and `check`."""

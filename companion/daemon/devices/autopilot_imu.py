@@ -14,9 +14,10 @@ from typing import Final, NamedTuple
 
 from companion.autopilot.firmware.firmwares import part_of, read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.ekf_bias import EkfBias
-from companion.autopilot.telemetry.imu_stream import ImuStream, StreamKind
+from companion.autopilot.telemetry.imu_stream import ImuStream
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.config.sections import Imu
 from companion.configured import models

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 
-from companion.autopilot.firmware.imu_calibration import accel_taken_off
+import numpy as np
+
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.ekf_bias import EkfBias
 from companion.configured import models
@@ -116,4 +117,8 @@ class Devices(Subsystem):
         if imu is None:
             return UNTOUCHED
         known = imu.calibration
-        return None if known is None else Corrected(known.orientation.T, accel_taken_off(known))
+        return (
+            None
+            if known is None
+            else Corrected(known.orientation.T, np.multiply(known.accel_scale, known.accel_offset_m_s2))
+        )

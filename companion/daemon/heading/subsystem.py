@@ -33,7 +33,7 @@ class Heading(Subsystem):
     """The pose that people see, and the attitude that is pushed."""
 
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating, arming: Arming) -> None:
-        self._core, self._gate = core, arming.gate_setup
+        self._core = core
         self.attitude: AttitudeService | None = None
         """None unless a heading is pushed."""
         if core.config.push.attitude != "off":
@@ -53,6 +53,7 @@ class Heading(Subsystem):
         found = await self._core.parameters.read_many(firmware.heading_names(), optional=True)
         port = await self._core.parameters.read_many(firmware.port_names, optional=True)
         changes = firmware.heading_changes(found)
+        gate = await firmware.find_gate_problem(self._core.parameters, self._core.vehicle.system_id, 0.0)
         sends, todo = (
             self._core.config.push.attitude != "off",
             ", ".join(f"{one.parameter} {one.after:g}" for one in changes),
@@ -88,7 +89,7 @@ class Heading(Subsystem):
                 for now in (found.get(one.parameter),)
             ],
             "risks": list(firmware.heading_risks) if concerned else [],
-            "gate": {"at_arm": self._core.wanted.at_arm, "problem": await self._gate.find_missing(0.0)},
+            "gate": {"at_arm": self._core.wanted.at_arm, "problem": gate},
             "rivals": [rival.words for rival in await firmware.read_rivals(self._core.parameters)],
             "port": [row._asdict() for row in firmware.port_rows(port, models.baud_of(self._core.config.mavlink.url))],
         }

@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
+from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import Observation, Verdict, judge
-from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import ArmState, Moment
 from companion.config.sections import Noise
 from companion.daemon.core import Core

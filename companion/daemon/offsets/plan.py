@@ -13,10 +13,10 @@ import numpy as np
 
 from companion.autopilot.firmware.base import GyroOutcome
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
+from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.errors import AutopilotError
 from companion.estimation.means.windows import ImuWindow

@@ -148,16 +148,12 @@ class LevelWrites:
                 if warning == REBOOT:
                     await self._owed.after(plan.changes)
 
-            imus = list(self._imus.values()) if self._turns_imus else []
+            imus = list(self._imus.values()) if self._core.vehicle.kind.level_turns_imus else []
             await self._path.commit(plan.changes, origin, imus, apply, verify)
         assert outcome is not None
         for event in (Event.VERIFIED, Event.CONCLUDED):
             self._machine.on(event)
         return {name: msgspec.structs.replace(one, outcome=outcome) for name, one in written.items()}, warning
-
-    @property
-    def _turns_imus(self) -> bool:
-        return self._core.vehicle.kind.level_turns_imus
 
     async def _verify(
         self, job: Job, plan: _LevelPlan, before: Array | None, last: Window
@@ -176,9 +172,9 @@ class LevelWrites:
                 if _follows(before, now, plan.turn):
                     return "verified", None
             await job.pause(POLL_S)
-        if self._turns_imus and await self._imus_turned(plan, last):
+        if self._core.vehicle.kind.level_turns_imus and await self._imus_turned(plan, last):
             return "verified", REBOOT
-        unseen = before is None and not self._turns_imus
+        unseen = before is None and not self._core.vehicle.kind.level_turns_imus
         return ("stored", "the effect of the new level was not seen: no ATTITUDE comes") if unseen else (None, None)
 
     async def _imus_turned(self, plan: _LevelPlan, last: Window) -> bool:

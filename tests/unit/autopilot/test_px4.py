@@ -107,14 +107,6 @@ def test_what_is_no_whole_number_is_not_written_to_an_integer(value: float) -> N
     run_virtual(main())
 
 
-def test_an_older_firmware_is_silent_where_a_newer_one_sends_an_error() -> None:
-    async def main() -> None:
-        async with aboard(ScriptedPx4(param_errors=False)) as stage:
-            assert await stage.client.read_optional("CAL_GYRO9_ID") is None
-
-    run_virtual(main())
-
-
 # --- slots
 
 

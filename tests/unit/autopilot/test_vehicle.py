@@ -64,17 +64,6 @@ async def aboard(autopilot: ScriptedAutopilot, **wire: float) -> AsyncIterator[t
     vehicle.close()
 
 
-def test_state_is_unknown_before_the_first_heartbeat() -> None:
-    async def main() -> None:
-        vehicle = Vehicle(MavlinkLink())
-        assert state(vehicle) is ArmState.UNKNOWN
-        assert vehicle.heartbeat_age_s is None
-        assert latched(vehicle) is None
-        vehicle.close()
-
-    run_virtual(main())
-
-
 def test_disarmed_is_believed_once_no_armed_heartbeat_has_come_for_three_seconds() -> None:
     async def main() -> None:
         link = MavlinkLink()
@@ -162,6 +151,7 @@ def test_state_follows_heartbeats_and_is_unknown_two_seconds_after_the_last() ->
         events: list[tuple[float, str]] = []
         loop = asyncio.get_running_loop()
         vehicle.on_event.add(lambda event: events.append((round(loop.time() - 1000.0, 3), event)))
+        assert (state(vehicle), vehicle.heartbeat_age_s, latched(vehicle)) == (ArmState.UNKNOWN, None, None)
         heartbeat(link)
         assert state(vehicle) is ArmState.DISARMED
         await asyncio.sleep(1.0)
