@@ -124,7 +124,7 @@ async def run(options: argparse.Namespace) -> int:
     footprint.prepare()
     from companion.daemon.process import run as process
 
-    await process.run(config, config_path(options))
+    await process.run(config)
     return DONE
 
 

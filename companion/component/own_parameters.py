@@ -96,17 +96,6 @@ class OwnParameters:
             self._values[name] = value
             self._request(name)
 
-    def change(self, name: str, value: float) -> None:
-        """Change what a ground station may change, from inside: `on_set` is called, whatever the limits are.
-
-        Raises:
-            ValueError: it is beyond them; ground stations go on seeing the old value.
-        """
-        on_set = self._by_name[name].on_set
-        if on_set is not None:
-            on_set(value)
-        self.set(name, value)
-
     def step(self, now_s: float) -> float:
         """Send the values that are due; return when the next one is (infinity: none waits)."""
         if not self._pending or not self._link.connected:

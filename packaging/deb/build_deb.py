@@ -348,8 +348,7 @@ def control(stage: Path, work: Path, version: str, python: str) -> dict[str, str
         "Architecture": output_of("dpkg", "--print-architecture"),
         "Maintainer": maintainer(),
         "Installed-Size": str(-(-size // 1024)),
-        # /bin/kill, by which the unit reloads, is of procps.
-        "Depends": f"{python}, procps, {libraries(stage, work)}",
+        "Depends": f"{python}, {libraries(stage, work)}",
         "Recommends": "systemd, udev",
         "Section": "science",
         "Priority": "optional",

@@ -78,7 +78,6 @@ def test_the_life_of_the_service(tmp_path: Path) -> None:
             await serial_ports_alone(machine)
             await spoken_to_by_the_group_alone(machine)
             await calibrated(machine)
-            await reloaded(machine, configuration)
             await killed(machine)
             await hung(machine)
             await removed(machine)
@@ -207,27 +206,6 @@ async def calibrated(machine: Machine) -> None:
     # With the configuration of setup it may have calibrated by itself before.
     kept = {one["started_at"]: one["state"] for one in history["records"]}  # type: ignore[attr-defined]
     assert kept[record["started_at"]] == "done"
-
-
-async def reloaded(machine: Machine, configuration: str) -> None:
-    await machine.write(CONFIGURATION, configuration.replace('at_arm = "off"', 'at_arm = "of"'))
-    await machine.run("systemctl", "reload", "companion")
-
-    async def refused() -> bool:
-        return "reload refused" in (await machine.show("companion", "StatusText"))["StatusText"]
-
-    await until(refused)
-    assert (await machine.show("companion", "ActiveState"))["ActiveState"] == "active"
-    # What went wrong is found by its level.
-    _, out, _ = await machine.run("journalctl", "--unit=companion", "--priority=err", "--output=cat", "--no-pager")
-    assert "'calibration.at_arm': found 'of'; allowed:" in out
-    await machine.write(CONFIGURATION, configuration)
-    await machine.run("systemctl", "reload", "companion")
-    await until(lambda: gone(machine, "reload refused"))
-
-
-async def gone(machine: Machine, words: str) -> bool:
-    return words not in (await machine.show("companion", "StatusText"))["StatusText"]
 
 
 async def killed(machine: Machine) -> None:

@@ -179,10 +179,6 @@ class Rivalry:
         stopped = {r.words for r in calibration.rivals if not r.until_boot} if self.stop_rivals else set()
         return [warning for warning in calibration.warnings if warning not in stopped]
 
-    def switch(self, *, stop_rivals: bool) -> None:
-        """Change whether rivals are switched off with the next write."""
-        self.stop_rivals = stop_rivals
-
     def _on_event(self, event: VehicleEvent) -> None:
         now_s = asyncio.get_running_loop().time()
         if event == "armed":

@@ -1,1 +1,1 @@
-"""The process: what runs, who watches it, reload, and the check without running."""
+"""The process: what runs, who watches it, and the check without running."""

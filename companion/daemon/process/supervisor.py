@@ -97,8 +97,6 @@ class Supervisor:
         watched = watched_of(service)
         self.beats = Beats(watched)
         self._tasks = {each.name: each.task for each in watched}
-        self.note = ""
-        """Said before everything else in the status; empty: nothing."""
         self.stopping = False
         """The tasks are being ended: nobody is missed any more."""
         self._missed: set[str] = set()
@@ -142,9 +140,7 @@ class Supervisor:
     def _words(self, overdue: dict[str, float]) -> str:
         if not self._manager.listens:
             return ""
-        notes = [self.note] if self.note else []
-        if self.stopping:
-            notes.append("stopping")
+        notes = ["stopping"] if self.stopping else []
         notes += [f"HUNG: {name}" for name in overdue]
         try:
             return "; ".join([*notes, status_line(self._service.status())])

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import os
 import socket
-import time
 from collections.abc import Mapping
 from typing import Self
 
@@ -54,12 +53,8 @@ class ServiceManager:
         return self._socket is not None
 
     def ready(self) -> bool:
-        """Started, or started again after a reload."""
+        """Report that the start is complete."""
         return self._send("READY=1")
-
-    def reloading(self) -> bool:
-        """A reload begins; `ready` ends it. The time is what Type=notify-reload (systemd 253) wants with it."""
-        return self._send("RELOADING=1", f"MONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
     def stopping(self) -> bool:
         """The end begins."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 from contextlib import AbstractAsyncContextManager
-from types import SimpleNamespace
-from typing import cast
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -15,8 +13,6 @@ from companion.component.commands import MAX_REMEMBERED, Permission
 from companion.component.own_parameters import Parameter
 from companion.config import parse
 from companion.config.sections import EVERYBODY, Senders
-from companion.daemon.process.run import RELOADABLE
-from companion.daemon.process.service import Service
 from companion.errors import ConfigError
 from tests.support.component import (
     ACCEPTED,
@@ -207,10 +203,3 @@ def test_a_key_file_alone_means_that_signatures_are_required(monkeypatch: pytest
     off = parse(GOOD.replace("[[imu]]", 'signing = "off"\nsigning_key_file = "/etc/k"\n[[imu]]', 1), "x.toml").mavlink
     assert off.signing_mode == "off"
     assert str(off.signing_key_path) == "/etc/k"
-
-
-def test_a_reload_changes_who_may() -> None:
-    faces = SimpleNamespace(component=SimpleNamespace(permission=Permission(Senders(EVERYBODY))))
-    RELOADABLE["mavlink.allow"](cast("Service", SimpleNamespace(faces=faces)), ("254",))
-    assert faces.component.permission.refuses((255, 190), "undo") != ""
-    assert faces.component.permission.refuses((254, 190), "undo") == ""

@@ -17,7 +17,7 @@ from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.config import parse
 from companion.configured.models import doubtful
 from companion.daemon.devices import signing as daemon_signing
-from companion.daemon.devices.signing import AHEAD_S, MAX_NAMED, LinkSigning
+from companion.daemon.devices.signing import AHEAD_S, LinkSigning
 from companion.errors import StorageError
 from companion.links.mavlink import signing as link_signing
 from companion.links.mavlink.link import MavlinkLink
@@ -261,18 +261,14 @@ def test_who_is_not_believed_is_told_of_once(tmp_path: Path, caplog: pytest.LogC
                 assert before is None
                 one.signing.admits(b"\xfd\x00\x00\x00\x00\x01\x01\x00\x00\x00\x00\x00")
                 await asyncio.sleep(1.5)
-                assert one.rejecting == "1 unsigned messages dropped: the autopilot does not sign on this link"
+                assert str(one.rejecting).startswith("1 messages dropped: the autopilot does not sign on this link")
                 for system in range(2, 250):
                     one.signing.admits(b"\xfd\x00\x00\x00\x00" + bytes([system]) + b"\xbe\x00\x00\x00\x00\x00")
 
     with caplog.at_level(logging.WARNING):
         run_virtual(main())
     lines = [record.getMessage() for record in caplog.records]
-    assert lines[:2] == [
-        "mavlink: 255/190 does not sign: its messages are dropped",
-        "mavlink: 1/1 does not sign: its messages are dropped",
-    ]
-    assert len(lines) == MAX_NAMED
+    assert lines == ["mavlink: 255/190 does not sign: its messages are dropped"]
 
 
 def test_off_is_off_and_a_key_without_use_is_doubted() -> None:
