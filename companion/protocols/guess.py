@@ -24,7 +24,6 @@ _SURE_FRAMES: Final = 4
 _MUCH_TEXT: Final = 0.9
 _CONSOLE: Final = re.compile(rb"\blogin: |\bPassword: |Linux version \d|\[ {0,4}\d+\.\d{6}\] |\bgetty\b")
 _MODEM: Final = re.compile(rb"(?:^|[\r\n])AT(?:[+&^$][A-Z]|[EZVI]\d?[\r\n])")
-_WORDS: Final = re.compile(rb"[ -~]*[A-Za-z]{3}[ -~]*")
 _NOT_PLAIN: Final = bytes(byte for byte in range(256) if byte not in b"\t\r\n" and not 0x20 <= byte < 0x7F)
 _MAVLINK_OVERHEAD: Final = {0xFD: 12, 0xFE: 8}
 _MAVLINK_RUN: Final = 4
@@ -115,15 +114,6 @@ def looks_garbled(data: bytes) -> bool:
 def plain_share(data: bytes) -> float:
     """The share of bytes that a text may hold, 0 to 1; 0 of nothing."""
     return len(data.translate(None, _NOT_PLAIN)) / len(data) if data else 0.0
-
-
-def banner_in(data: bytes) -> str:
-    """The first whole line of words in it, at most 40 letters: what a device says when it starts; else empty."""
-    for line in data[: max(data.rfind(b"\n"), data.rfind(b"\r")) + 1].splitlines():
-        match = _WORDS.search(line)
-        if match is not None and line[:1] not in b"$#":
-            return match[0].decode("ascii").strip()[:40]
-    return ""
 
 
 def is_mavlink(data: bytes) -> bool:

@@ -13,7 +13,7 @@ from typing import Final
 
 from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import Decoder
-from companion.protocols.guess import banner_in, likeliest, looks_garbled, strangers
+from companion.protocols.guess import likeliest, looks_garbled, strangers
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 
 SILENT: Final = "silent"
@@ -45,11 +45,6 @@ _HARMLESS: Final = frozenset(
 )
 _DAMAGED_SHARE: Final = 0.1
 _DAMAGED_FRAMES: Final = 3
-_RESTART_GAP_S: Final = 0.3
-_RESTART_GAP_PERIODS: Final = 4.0
-_BACK_S: Final = 0.5
-_TICKS_S: Final = (1e-9, 1e-6, 1e-4, 1e-3)
-_WRAP_BITS: Final = (16, 24, 32, 64)
 _MOST_DAMAGE_NAMED: Final = 3
 
 
@@ -83,22 +78,17 @@ class StreamHealth:
         """Since when they have been near that; of a gradienter or compass."""
         self.speaks: str | None = None
         """The protocol that the bytes are instead."""
-        self.events: list[Trouble] = []
-        """What happened once and is over, for whoever asks to take away: a restart, a clock that went back."""
         self._tail = b""
-        self._first_bad_s: float | None = None
         self._reading: object = None
         self._near: tuple[float, ...] | None = None
         self._same = 0
-        self._clock_s: float | None = None
-        self._period_s = 0.0
         self._marks: deque[_Mark] = deque()
         self._guessed_s = -math.inf
         self._guess = ""
 
     def opened(self) -> None:
         """The port was opened (again): what came before has no continuation."""
-        self._tail, self._first_bad_s, self._clock_s = b"", None, None
+        self._tail = b""
         self.last_byte_s = self.unchanged_since_s = self._reading = None
         self.near_since_s = self._near = None
         self._same = 0
@@ -112,34 +102,15 @@ class StreamHealth:
         """Bytes were read at `t_s` and have completed these samples."""
         self.last_byte_s = t_s
         if not samples:
-            if self._first_bad_s is None:
-                self._first_bad_s = t_s
             self._tail = (self._tail + data)[-TAIL_BYTES:]
             return
-        if self._tail:
-            self._look_for_a_banner(t_s)
-        before_s, self.last_sample_s = self.last_sample_s, t_s
-        if before_s is not None and t_s - before_s < 1.5:
-            self._period_s += 0.1 * ((t_s - before_s) - self._period_s)
-        self._first_bad_s = None
+        self._tail, self.last_sample_s = b"", t_s
         self._compare(samples[-1], len(samples), t_s)
-
-    def _look_for_a_banner(self, t_s: float) -> None:
-        """Text and a pause before the samples go on: the device has started anew."""
-        tail, self._tail = self._tail, b""
-        if self.last_sample_s is None:
-            return
-        pause_s = t_s - self.last_sample_s
-        if pause_s > max(_RESTART_GAP_S, _RESTART_GAP_PERIODS * self._period_s) and (said := banner_in(tail)):
-            self.events.append(
-                Trouble("restarted", f"it started anew by itself after {pause_s:.1f} s (it said {said!r})")
-            )
 
     def _compare(self, sample: Sample, count: int, t_s: float) -> None:
         reading: object
         if isinstance(sample, ImuSample):
             reading = (sample.gyro_rad_s, sample.accel_m_s2)
-            self._look_at_clock(sample.t_device_s)
         elif isinstance(sample, TiltSample):
             reading = (sample.x_deg, sample.y_deg)
             self._look_whether_near(reading, t_s)
@@ -163,13 +134,6 @@ class StreamHealth:
             )
         ):
             self._near, self.near_since_s = angles_deg, t_s
-
-    def _look_at_clock(self, clock_s: float | None) -> None:
-        before_s, self._clock_s = self._clock_s, clock_s
-        if clock_s is None or before_s is None or clock_s > before_s - _BACK_S or _wraps(before_s):
-            return
-        words = f"its clock went back from {before_s:.1f} s to {clock_s:.1f} s: it has started anew"
-        self.events.append(Trouble("clock back", words))
 
     def trouble(self, now_s: float) -> Trouble | None:
         """What is wrong with what comes, or with nothing coming, at `now_s` on an open port."""
@@ -245,8 +209,3 @@ def _valueless(lately: _Mark) -> Trouble | None:
     if (count := lately.rejected[reasons.OVER_RANGE]) and count >= least:
         return Trouble(reasons.OVER_RANGE, f"{count} readings are over range: level it")
     return None
-
-
-def _wraps(clock_s: float) -> bool:
-    """Whether a counter of a usual width and tick was about to begin again."""
-    return any(0.0 <= (2**bits) * tick - clock_s < 1.0 for bits in _WRAP_BITS for tick in _TICKS_S)

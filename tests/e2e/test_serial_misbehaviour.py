@@ -10,16 +10,12 @@ import asyncio
 import contextlib
 import logging
 import os
-import socket
 import threading
-from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from companion.daemon.devices.sensor_health import RENEW_AFTER_S, RENEW_POLLED_AFTER_S
-from companion.links.serial import port as serial_port
 from companion.links.system.connection import BURST_BYTES, BYTES_PER_S
 from sim.uart import Setting
 from tests.support.chatter import RECOVERY_S, Chatter, Listening, compass_frame, imu_frame, listening, tilt_frame
@@ -59,170 +55,6 @@ async def over(one: Listening, caplog: pytest.LogCaptureFixture) -> None:
 @pytest.fixture(autouse=True)
 def _log(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-
-
-# Plugs ----------------------------------------------------------------------------------------------------------------
-
-
-def test_replugged_under_another_name_while_its_own_is_another_devices(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """/dev/ttyUSB0 and 1 are exchanged by the replugging; the configuration names the first by the kernel's name."""
-    name = tmp_path / "dev/serial/by-id/usb-FTDI_A-if00-port0"
-    first, second = tmp_path / "dev/ttyUSB0", tmp_path / "dev/ttyUSB1"
-    name.parent.mkdir(parents=True)
-    name.symlink_to("../../ttyUSB0")
-
-    async def main() -> None:
-        async with (
-            Chatter(first, tilt_frame) as device,
-            Chatter(second, compass_frame) as other,
-            listening("gradienter", "inclinometer_xy", first) as one,
-        ):
-            await one.data()
-            await asyncio.sleep(0.6)  # a look that finds all well
-            name.unlink()
-            device.unplug()
-            other.unplug()
-            other.plug(first)
-            await one.until(lambda: "is another device now" in one.words)
-            await asyncio.sleep(2.0)
-            rejected = one.sensor.decoder.rejected.total()
-            device.plug(second)
-            name.symlink_to("../../ttyUSB1")
-            await one.data(RECOVERY_S)
-            assert one.sensor.decoder.rejected.total() <= rejected + 1
-
-    asyncio.run(main())
-
-
-def test_a_device_that_was_replaced_for_good_is_taken_after_a_while(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(serial_port, "FAITHFUL_S", 2.0)
-    name = tmp_path / "dev/serial/by-id/usb-FTDI_A-if00-port0"
-    first = tmp_path / "dev/ttyUSB0"
-    name.parent.mkdir(parents=True)
-    name.symlink_to("../../ttyUSB0")
-
-    async def main() -> None:
-        async with Chatter(first, tilt_frame) as device, listening("gradienter", "inclinometer_xy", first) as one:
-            await one.data()
-            await asyncio.sleep(0.6)
-            name.unlink()
-            device.unplug()
-            device.plug(first)  # another adapter, with another serial number
-            await one.until(lambda: "is another device now" in one.words)
-            await one.data(2.0 + RECOVERY_S)
-
-    asyncio.run(main())
-
-
-# tcp:// ---------------------------------------------------------------------------------------------------------------
-
-
-@contextlib.asynccontextmanager
-async def server(backlog: int = 8) -> AsyncIterator[tuple[socket.socket, str]]:
-    with socket.create_server(("127.0.0.1", 0), backlog=backlog) as listener:
-        listener.setblocking(False)
-        yield listener, f"tcp://127.0.0.1:{listener.getsockname()[1]}"
-
-
-async def talk(peer: socket.socket, frame: Callable[[int], bytes] = tilt_frame) -> None:
-    loop = asyncio.get_running_loop()
-    number = 0
-    with contextlib.suppress(OSError):
-        while True:
-            await loop.sock_sendall(peer, frame(number))
-            number += 1
-            await asyncio.sleep(0.1)
-
-
-@pytest.mark.parametrize(
-    ("kind", "protocol", "frame", "renew_after_s"),
-    [
-        ("imu", "imu_line", imu_frame, RENEW_AFTER_S),
-        # One that might have to be told to stream is given the time for that.
-        ("gradienter", "inclinometer_xy", tilt_frame, RENEW_POLLED_AFTER_S),
-    ],
-)
-def test_a_peer_that_accepts_and_says_nothing(
-    kind: str, protocol: str, frame: Callable[[int], bytes], renew_after_s: float, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Its new connections speak when the cause has ended; the one that was open then stays silent for ever."""
-    name = "own" if kind == "imu" else kind
-
-    async def main() -> None:
-        loop = asyncio.get_running_loop()
-        peers: list[socket.socket] = []
-        talking: list[asyncio.Task[None]] = []
-        speaks = False
-
-        async def serve(listener: socket.socket) -> None:
-            while True:
-                peer, _ = await loop.sock_accept(listener)
-                peers.append(peer)
-                if speaks:
-                    talking.append(asyncio.create_task(talk(peer, frame)))
-
-        async with server() as (listener, url), listening(kind, protocol, url) as one:
-            serving = asyncio.create_task(serve(listener))
-            await lasts(one, caplog, "silent", "silent")
-            await one.until(lambda: len(peers) >= 2, renew_after_s + 1.0)
-            speaks = True
-            took_s = await one.data(renew_after_s + 1.5)
-            assert took_s <= renew_after_s + 1.0
-            assert one.counts["renewed"] >= 1
-            await one.until(lambda: good_again(caplog, name), 3.0)
-            for task in (serving, *talking):
-                task.cancel()
-            await asyncio.gather(serving, *talking, return_exceptions=True)
-            for peer in peers:
-                peer.close()
-        # Not a line for every attempt.
-        assert len(said(caplog, name, "")) == 1
-
-    asyncio.run(main())
-
-
-def test_a_cable_that_is_pulled_and_plugged_in_again(caplog: pytest.LogCaptureFixture) -> None:
-    """No FIN, and nobody answers a SYN meanwhile: the queue of a listener that accepts nobody is full."""
-
-    async def main() -> None:
-        loop = asyncio.get_running_loop()
-        async with server(backlog=0) as (listener, url), listening("gradienter", "inclinometer_xy", url) as one:
-            first, _ = await loop.sock_accept(listener)
-            talking = asyncio.create_task(talk(first))
-            await one.data()
-            talking.cancel()  # the cable is out; `first` stays open, and says nothing ever again
-            blockers = []
-            for _ in range(3):
-                blocker = socket.socket()
-                blocker.setblocking(False)
-                with contextlib.suppress(BlockingIOError):
-                    blocker.connect(listener.getsockname())
-                blockers.append(blocker)
-            await one.until(lambda: "no answer within" in one.words)
-            await asyncio.sleep(3.0)
-            for blocker in blockers:
-                blocker.close()
-            peers = []
-
-            async def serve() -> None:
-                while True:
-                    peer, _ = await loop.sock_accept(listener)
-                    peers.append((peer, asyncio.create_task(talk(peer))))
-
-            serving = asyncio.create_task(serve())  # the cable is in again
-            await one.data(RECOVERY_S)
-            serving.cancel()
-            for peer, task in peers:
-                task.cancel()
-                peer.close()
-            first.close()
-            await asyncio.gather(serving, talking, *(task for _, task in peers), return_exceptions=True)
-
-    asyncio.run(main())
 
 
 # The line -------------------------------------------------------------------------------------------------------------

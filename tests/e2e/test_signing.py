@@ -211,6 +211,53 @@ def lines(caplog: pytest.LogCaptureFixture, words: str) -> int:
     return sum(words in record.getMessage() for record in caplog.records)
 
 
+def no_longer_signing(rig: Rig) -> None:
+    for channel in rig.autopilot.channels:
+        channel._codec.signing = mavlink.MAVLinkSigning()
+
+
+def test_an_autopilot_that_wants_signatures_is_named_though_nobody_asks_it_for_anything(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            await asyncio.sleep(3.0)
+            rig.autopilot.require_signatures(KEY, now())
+            await asyncio.sleep(8.0)
+            status = rig.service.status()
+            assert "give the companion its key" in status["vehicle"]["signing"]["summary"]
+            assert not status["vehicle"]["signing"]["good"]
+            await asyncio.sleep(40.0)
+            assert lines(caplog, "the autopilot wants signatures") == 1
+            no_longer_signing(rig)
+            await asyncio.sleep(5.0)
+            assert rig.service.status()["vehicle"]["signing"] is None
+            texts = "\n".join(rig.ground.texts())
+            assert "Autopilot answers again" in texts
+
+    run_virtual(main())
+
+
+def test_an_autopilot_that_signs_and_takes_unsigned_messages_is_not_complained_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As over USB."""
+
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            rig.autopilot.require_signatures(KEY, now())
+            for channel in rig.autopilot.channels:
+                channel._codec.signing.allow_unsigned_callback = lambda *_: True
+            await asyncio.sleep(20.0)
+            assert rig.service.core.vehicle.signs
+            assert rig.service.status()["vehicle"]["signing"] is None
+            assert lines(caplog, "answers nothing") == 0
+
+    run_virtual(main())
+
+
 def test_another_key_is_named_once_and_forgotten_when_the_keys_are_the_same(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import logging
 import math
 from collections import deque
@@ -125,14 +124,6 @@ class SensorWatch:
         self._witness = MotionWitness()
         self._has_failed = False
         self._say = say
-        for sensor in sensors:
-            sensor.health.on_implausible.add(functools.partial(self._tell, sensor))
-
-    def _tell(self, sensor: SerialSensor, trouble: Trouble) -> None:
-        """To the ground stations: no calibration comes to an end with it, and what was written with it may be wrong."""
-        self._say(
-            Severity.WARNING, f"{sensor.name}: {trouble.words.removeprefix(f'{sensor.link.settings}: ')}", Weight.NEWS
-        )
 
     async def run(self) -> None:
         """Look until cancelled."""
@@ -151,8 +142,12 @@ class SensorWatch:
         """One look at all of them."""
         self._witness.update(self._collector.imu_seconds(), self._corrected)
         for sensor in self._sensors:
-            found = sensor.health.update(now_s, None if "imu" in sensor.kinds else self._stuck(sensor))
+            found, is_news = sensor.health.update(now_s, None if "imu" in sensor.kinds else self._stuck(sensor))
             if found is not None and found.implausible:
+                if is_news:
+                    # No calibration comes to an end with it, and what was written with it may be wrong.
+                    words = found.words.removeprefix(f"{sensor.link.settings}: ")
+                    self._say(Severity.WARNING, f"{sensor.name}: {words}", Weight.NEWS)
                 self._collector.reset(f"{sensor.name}: {found.words}", sensor.name if sensor.kinds == {"imu"} else None)
 
     def _stuck(self, sensor: SerialSensor) -> Trouble | None:

@@ -123,7 +123,7 @@ class SerialSensor:
             budget=Budget(),
             on_gap=self._on_gap,
         )
-        self.health = SensorHealth(self.link, self.protocol, self.decoder, polled=self.dialogue is not None)
+        self.health = SensorHealth(self.link, self.protocol, self.decoder)
         self.on_bytes: Listeners[str, bytes | None, float] = Listeners()
         """Told (name, bytes, time) before they are decoded; without bytes: some are missing."""
         self.on_samples: Listeners[Sequence[Sample], float] = Listeners()
@@ -138,7 +138,6 @@ class SerialSensor:
         self._look_at_s = -math.inf
         self._held_by = ""
         self._openings = 0
-        self._breaks = 0
         self._told: set[str] = set()
 
     async def run(self) -> None:
@@ -179,9 +178,6 @@ class SerialSensor:
         samples = self.decoder.receive(data, t_s)
         if samples and self.on_samples:
             self.on_samples.tell(samples, t_s)
-        if (breaks := self.decoder.times.clock.breaks) != self._breaks:
-            self._breaks = breaks
-            logger.warning("%s: the device restarted, or its clock jumped; measuring afresh", self.link.name)
         self.health.stream.took(data, samples, t_s)
         for sample in samples:
             if isinstance(sample, CompassSample) and any(role.refuses(sample) for role in self.device.roles):

@@ -30,6 +30,10 @@ AHEAD_S: Final = 30.0
 """Signature time reserved by one write to disk, hence the most that it jumps ahead after a power cut. Senders more
 than a minute behind are refused at first (specification), so it stays well below that."""
 RESERVE_BEFORE_TICKS: Final = 5 * TICKS_PER_S
+UNANSWERED: Final = 3
+"""Unanswered requests in a row, one a second, after which the autopilot is taken to want signatures."""
+ASK_AGAIN_S: Final = 30.0
+"""Pause before an autopilot that has answered is asked again."""
 AFTER_S: Final = 3.0
 """Time without a verified message before a fault is reported: longer than a key takes to be changed."""
 REPEAT_S: Final = 60.0
@@ -37,9 +41,10 @@ REPEAT_S: Final = 60.0
 AHEAD_OF_CLOCK_S: Final = 86400.0
 """Signature time this far ahead of the system's clock comes from a wrong clock, not from a board without power."""
 
-_Fault = Literal["other key", "unsigned", "old", "ahead"]
+_Fault = Literal["wants ours", "other key", "unsigned", "old", "ahead"]
 _COUNTED: Final[tuple[Literal["other key", "unsigned", "old"], ...]] = ("other key", "unsigned", "old")
 _FAULTS: Final[dict[_Fault, str]] = {
+    "wants ours": "the autopilot wants signatures: give the companion its key (signing_key_file)",
     "other key": "the autopilot signs with another key: give both the same one",
     "unsigned": "the autopilot does not sign on this link: give it the companion's key",
     "old": "the autopilot's signatures are old, not believed: wait some seconds, or restart it",
@@ -53,10 +58,14 @@ _SENDERS: Final[dict[Reason, str]] = {
 
 
 class LinkSigning:
-    """Sign and verify one link; report whether the autopilot's messages are accepted."""
+    """Sign and verify one link; report whether the autopilot and the companion accept each other's messages.
+
+    An autopilot that signs while the companion has no key may still accept unsigned messages, so it is asked: by
+    TIMESYNC, which both firmwares answer at once, armed or not (autopilots 2, 4.5).
+    """
 
     def __init__(self, config: Config, link: MavlinkLink, vehicle: Vehicle, say: Say, offload: Offload) -> None:
-        self._config, self._vehicle, self._say, self._offload = config, vehicle, say, offload
+        self._config, self._link, self._vehicle, self._say, self._offload = config, link, vehicle, say, offload
         self.mode = config.mavlink.signing_mode
         self.signing: Signing | None = None
         self.trouble = ""
@@ -73,7 +82,11 @@ class LinkSigning:
         """Refused messages of the autopilot, or of a sender that claims to be one, since its last verified one."""
         self._verified = False
         self._bad_since_s: float | None = None
-        if self.mode != "off":
+        self._asked = self._unanswered = 0
+        self._ask_s = -math.inf
+        if self.mode == "off":
+            link.subscribe(mavlink.MAVLink_timesync_message, self._on_timesync)
+        else:
             # From the first byte on: messages before the key is read are refused too.
             self.signing = link.signing = Signing(required=self.mode == "require")
             self.signing.on_verified, self.signing.on_refused = self._on_verified, self._on_refused
@@ -94,19 +107,18 @@ class LinkSigning:
 
     async def run(self) -> None:
         """Keep time and key, and report faults, until cancelled."""
-        if (signing := self.signing) is None:
-            return
+        signing = self.signing
         try:
             while True:
-                if signing.key is None:
+                if signing is not None and signing.key is None:
                     self._read_key(signing)
-                elif signing.clock.now() > self._reserved - RESERVE_BEFORE_TICKS:
+                elif signing is not None and signing.clock.now() > self._reserved - RESERVE_BEFORE_TICKS:
                     await self._reserve(signing, AHEAD_S)
-                self._update(signing, asyncio.get_running_loop().time())
+                self._update(asyncio.get_running_loop().time())
                 await asyncio.sleep(PERIOD_S)
         finally:
             # An orderly end reserves nothing: the next start continues from here.
-            if signing.key is not None:
+            if signing is not None and signing.key is not None:
                 await asyncio.shield(self._reserve(signing, 0.0))
 
     # --- key and time
@@ -174,11 +186,15 @@ class LinkSigning:
             text = f"Somebody {words}, and is ignored: system {system}, component {component}"
             self._say(Severity.WARNING, text, Weight.NEWS)
 
+    def _on_timesync(self, message: mavlink.MAVLink_timesync_message, _t_s: float) -> None:
+        if message.tc1 and message.ts1 == self._asked and self._vehicle.sent(message):
+            self._unanswered, self._ask_s = 0, asyncio.get_running_loop().time() + ASK_AGAIN_S
+
     # --- faults
 
-    def _update(self, signing: Signing, now_s: float) -> None:
+    def _update(self, now_s: float) -> None:
         """Find the present fault, and report a change."""
-        found = self._find_fault(signing, now_s)
+        found = self._refused_by_autopilot(now_s) if self.signing is None else self._refuses(self.signing, now_s)
         if found == self._fault:
             return
         self._fault = found
@@ -187,12 +203,21 @@ class LinkSigning:
                 self._reported_s[found], self._fault_reported = now_s, True
                 logger.warning("mavlink: %s", _FAULTS[found])
                 self._say(Severity.WARNING, _FAULTS[found], Weight.NEWS)
-        elif self._fault_reported:
+        elif self._fault_reported and (self.signing is not None or self._vehicle.alive):
             self._fault_reported = False
-            logger.info("mavlink: Autopilot's signatures are right again")
-            self._say(Severity.NOTICE, "Autopilot's signatures are right again", Weight.NEWS)
+            words = "Autopilot answers again" if self.signing is None else "Autopilot's signatures are right again"
+            logger.info("mavlink: %s", words)
+            self._say(Severity.NOTICE, words, Weight.NEWS)
 
-    def _find_fault(self, signing: Signing, now_s: float) -> _Fault | None:
+    def _refused_by_autopilot(self, now_s: float) -> _Fault | None:
+        if not self._vehicle.alive or not self._vehicle.signs:
+            self._unanswered, self._ask_s = 0, -math.inf
+        elif now_s >= self._ask_s:
+            self._asked, self._unanswered = round(now_s * 1e9), self._unanswered + 1
+            self._link.send(mavlink.MAVLink_timesync_message(0, self._asked))
+        return "wants ours" if self._unanswered > UNANSWERED else None
+
+    def _refuses(self, signing: Signing, now_s: float) -> _Fault | None:
         if self._verified:
             self._verified = False
             self._refused.clear()
@@ -231,9 +256,10 @@ class LinkSigning:
         return f"{self._refused[found]} messages dropped: {_FAULTS[self._cause(self.signing, found)]}"
 
     def status(self) -> dict[str, Any] | None:
-        """For `companion status`; None while signing is off."""
-        if (signing := self.signing) is None:
+        """For `companion status`; None while signing is off and no fault is found."""
+        if self.signing is None and self._fault is None:
             return None
+        signing = self.signing or Signing(required=False)
         fault = self.rejecting or self.trouble or self.warning
         doubted = signing.doubted.total()
         counts = f"{signing.verified} messages checked"

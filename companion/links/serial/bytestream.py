@@ -29,8 +29,6 @@ COLLECT_S = 0.0205
 What it brings is stamped that much late at worst (where the device has no clock of its own), as behind a USB adapter.
 A little more than the 20 ms within which an autopilot takes one heading (autopilots 6): each read brings one.
 """
-JUDGED_S = 0.1
-"""How often a stream is judged anew, whether to collect it: what comes in bunches is no other stream."""
 FULLEST_LINE = 0.9
 """The greatest share of a line's time that a stream may fill to be collected."""
 OUT_BUFFER_BYTES = 16384
@@ -125,10 +123,8 @@ class ByteLink:
         self._reconnection = Reconnection(name, Backoff(cap_s=LONGEST_PAUSE_S), worth_s=WORTH_S, on_state=on_state)
         self._descriptor: int | None = None
         self._reads = 0
-        """That brought something since `_reads_since`, a time and the bytes received by then."""
+        """Reads that brought bytes since `_reads_since`, a time and the bytes received by then."""
         self._reads_since = (0.0, 0)
-        self._attempts = 0
-        """Reads of a stream that is collected, since then too, whether they brought something or not."""
         self._collecting: asyncio.TimerHandle | None = None
         """The next read, while bytes are collected; None: each wakes the loop."""
         self._lost: asyncio.Future[str] | None = None
@@ -171,16 +167,6 @@ class ByteLink:
             self._reconnection.backoff.reset()
         return lost.result()
 
-    def confirm(self) -> None:
-        """What is open is the right device: after a loss it is looked for by its lasting name first."""
-        self._opener.confirm()
-
-    def renew(self, reason: str) -> None:
-        """Open it anew: a peer that vanished without a word keeps its connection open for ever. Not worth a warning."""
-        if self._descriptor is not None:
-            self._reconnection.excuse()
-            self._lose(f"{self.settings.url}: {reason}")
-
     def write(self, data: bytes) -> bool:
         """Send, or keep in the bounded out-buffer; False when closed or full: then nothing of `data` is sent."""
         if self._descriptor is None or len(self._out) + len(data) > OUT_BUFFER_BYTES:
@@ -211,7 +197,7 @@ class ByteLink:
         if self._opened_before:
             self.reconnects += 1
         self._opened_before = True
-        self._reads, self._attempts, self._reads_since = 0, 0, (loop.time(), self.bytes_received)
+        self._reads, self._reads_since = 0, (loop.time(), self.bytes_received)
         loop.add_reader(descriptor, self._readable)
         self._reconnection.up(f"{self.settings.url} is open")
 
@@ -225,20 +211,18 @@ class ByteLink:
             if now_s - self._reads_since[0] < QUICK_READS * QUICK_S and self._fits_the_line(now_s):
                 loop.remove_reader(self._descriptor)
                 self._collecting = loop.call_at(now_s + COLLECT_S, self._collected)
-            self._reads, self._attempts, self._reads_since = 0, 0, (now_s, self.bytes_received)
+            self._reads, self._reads_since = 0, (now_s, self.bytes_received)
 
     def _collected(self) -> None:
-        """Read what has come in the meantime; where that is little, let the next byte wake the loop again."""
+        """Read what has come in the meantime; where that is nothing, let the next byte wake the loop again."""
         loop = asyncio.get_running_loop()
         now_s = loop.time()
         # First of all: whatever happens in this turn, there will be another.
         self._collecting = loop.call_at(now_s + COLLECT_S, self._collected)
-        self._attempts += 1
-        self._reads += self._read(now_s)
-        if self._descriptor is None or self._paused is not None or now_s - self._reads_since[0] < JUDGED_S:
+        goes_on = self._read(now_s) and self._fits_the_line(now_s)
+        if self._descriptor is None or self._paused is not None:
             return
-        goes_on = 2 * self._reads > self._attempts and self._fits_the_line(now_s)
-        self._reads, self._attempts, self._reads_since = 0, 0, (now_s, self.bytes_received)
+        self._reads, self._reads_since = 0, (now_s, self.bytes_received)
         if not goes_on:
             self._stop_collecting()
             loop.add_reader(self._descriptor, self._readable)
@@ -302,7 +286,7 @@ class ByteLink:
         except OSError:
             pass  # empty, or gone: the reader will find it
         self._on_gap()
-        self._reads, self._attempts, self._reads_since = 0, 0, (loop.time(), self.bytes_received)
+        self._reads, self._reads_since = 0, (loop.time(), self.bytes_received)
         loop.add_reader(self._descriptor, self._readable)
 
     def _flush(self) -> None:

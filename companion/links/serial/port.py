@@ -17,17 +17,15 @@ import stat
 import termios
 import threading
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from companion.errors import LinkError
-from companion.links.serial.ports import find_holders, lasting_name
+from companion.links.serial.ports import find_holders
 
 Parity = Literal["none", "even", "odd"]
 
 OPEN_DEADLINE_S = 5.0
 """A healthy USB port opens in some milliseconds; a driver that hangs must not hang the daemon."""
-FAITHFUL_S = 20.0
-"""How long after its loss a device is waited for by its lasting name, whatever bears its old one meanwhile."""
 
 
 def open_serial(path: str, baud: int, parity: Parity) -> int:
@@ -153,90 +151,54 @@ class SerialOpener:
     def __init__(self, path: str, baud: int, parity: Parity) -> None:
         self._path, self._baud, self._parity = path, baud, parity
         self._thread: threading.Thread | None = None
-        self._known: str | None = None
-        self._seen: str | None = None
-        self._since_s: float | None = None
-
-    def confirm(self) -> None:
-        """What was opened last is the right device: remember it by the name that a new plugging does not change."""
-        self._known, self._since_s = self._seen, None
-
-    def _names(self) -> tuple[str, str | None]:
-        """What to open, and of which device only."""
-        if self._known is None:
-            return self._path, None
-        loop = asyncio.get_running_loop()
-        if self._since_s is None:
-            self._since_s = loop.time()
-        if loop.time() - self._since_s > FAITHFUL_S and not os.path.exists(self._known):
-            return self._path, None  # somebody has put another one in its place
-        return self._known, self._path
 
     async def open(self) -> int:
         """Return the descriptor of the opened port; when cancelled, whatever is still opened is closed again.
-
-        The kernel's names (/dev/ttyUSB0) go to whoever is plugged in first. A device that was found to be the right
-        one, and has a lasting name, is therefore opened by that after a loss.
 
         Raises:
             LinkError: one line that names the port and the cause.
         """
         if self._thread is not None and self._thread.is_alive():
             raise LinkError(f"{self._path}: the driver still hangs in the last attempt to open; replug the device")
-        path, instead_of = self._names()
         loop = asyncio.get_running_loop()
-        opened: asyncio.Future[_Opened] = loop.create_future()
+        opened: asyncio.Future[int] = loop.create_future()
         self._thread = threading.Thread(
-            target=_attempt, args=(loop, opened, path, self._baud, self._parity), name=f"open {self._path}", daemon=True
+            target=self._attempt, args=(loop, opened), name=f"open {self._path}", daemon=True
         )
         self._thread.start()
-        found: _Opened | None = None
+        descriptor: int | None = None
         try:
             async with asyncio.timeout(OPEN_DEADLINE_S):
-                found = await opened
+                descriptor = await opened
         except TimeoutError:
-            raise LinkError(f"{path}: the driver has not opened it within {OPEN_DEADLINE_S:g} s") from None
-        except LinkError as error:
-            if instead_of is None or not os.path.exists(instead_of):  # noqa: ASYNC240 - a look into /dev
-                raise
-            raise LinkError(f"{error}; {instead_of} is another device now") from None
+            raise LinkError(f"{self._path}: the driver has not opened it within {OPEN_DEADLINE_S:g} s") from None
         finally:
             # Cancelled between the thread's word and our turn: it is nobody's otherwise.
-            if found is None and opened.done() and not opened.cancelled() and opened.exception() is None:
-                close_serial(opened.result().descriptor)
-        self._seen = found.lasting_name
-        return found.descriptor
+            if descriptor is None and opened.done() and not opened.cancelled() and opened.exception() is None:
+                close_serial(opened.result())
+        return descriptor
 
+    def _attempt(self, loop: asyncio.AbstractEventLoop, opened: asyncio.Future[int]) -> None:
+        """Open the port (in a thread), and hand it over on the loop; close it when nobody waits for it any more."""
+        found: int | LinkError
+        try:
+            found = open_serial(self._path, self._baud, self._parity)
+        except LinkError as error:
+            found = error
+        except Exception as error:  # noqa: BLE001 - a thread that died silently would leave its caller waiting
+            found = LinkError(f"{self._path}: cannot be opened: {error!r}")
 
-class _Opened(NamedTuple):
-    descriptor: int
-    lasting_name: str | None
+        def hand_over() -> None:
+            if isinstance(found, LinkError):
+                if not opened.done():
+                    opened.set_exception(found)
+            elif opened.done():
+                close_serial(found)
+            else:
+                opened.set_result(found)
 
-
-def _attempt(
-    loop: asyncio.AbstractEventLoop, opened: asyncio.Future[_Opened], path: str, baud: int, parity: Parity
-) -> None:
-    """Open a port (in a thread), and hand it over on the loop; what nobody waits for any more is closed."""
-    found: _Opened | LinkError
-    try:
-        descriptor = open_serial(path, baud, parity)
-        found = _Opened(descriptor, lasting_name(path))
-    except LinkError as error:
-        found = error
-    except Exception as error:  # noqa: BLE001 - a thread that died silently would leave its caller waiting
-        found = LinkError(f"{path}: cannot be opened: {error!r}")
-
-    def hand_over() -> None:
-        if isinstance(found, LinkError):
-            if not opened.done():
-                opened.set_exception(found)
-        elif opened.done():
-            close_serial(found.descriptor)
-        else:
-            opened.set_result(found)
-
-    try:
-        loop.call_soon_threadsafe(hand_over)
-    except RuntimeError:  # the loop has been closed meanwhile
-        if isinstance(found, _Opened):
-            close_serial(found.descriptor)
+        try:
+            loop.call_soon_threadsafe(hand_over)
+        except RuntimeError:  # the loop has been closed meanwhile
+            if isinstance(found, int):
+                close_serial(found)

@@ -7,7 +7,6 @@ cannot be pointed elsewhere, and it hides the platform UARTs, among them the Ras
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,6 @@ from companion.printable import printable
 ROOT = Path("/")
 _BY_ID, _BY_PATH = "/dev/serial/by-id/", "/dev/serial/by-path/"
 _TEXT_LIMIT = 80
-_PASSING_NAME = re.compile(r"/dev/tty(?:USB|ACM)\d+$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,20 +70,6 @@ def find_holders(device: str, root: Path = ROOT) -> tuple[Holder, ...]:
     return tuple(_holders_by_device(root).get(resolve(root, device), ()))
 
 
-def lasting_name(device: str) -> str | None:
-    """The name by which whatever bears a kernel's passing name at present is found after the next plugging.
-
-    None where the name is no passing one, or there is no better (no udev). What stands before /dev is kept.
-    """
-    if (match := _PASSING_NAME.search(device)) is None:
-        return None
-    root = Path(device[: match.start()] or "/")
-    links = _links_by_device(root).get(resolve(root, match[0]), [])
-    usb = _node_with(root, _hardware(root, match[0]), "idVendor")
-    names = _best_first(_under(_BY_ID, links), _under(_BY_PATH, links), read_attribute(usb / "serial") if usb else None)
-    return str(root / names[0].lstrip("/")) if names else None
-
-
 def _under(folder: str, links: list[str]) -> tuple[str, ...]:
     return tuple(link for link in links if link.startswith(folder))
 
@@ -93,10 +77,6 @@ def _under(folder: str, links: list[str]) -> tuple[str, ...]:
 def _best_first(by_id: tuple[str, ...], by_path: tuple[str, ...], serial_number: str | None) -> tuple[str, ...]:
     """Chips without a serial number (CH340, PL2303) of one kind all claim the same by-id name; the last one gets it."""
     return by_id + by_path if serial_number else by_path + by_id
-
-
-def _hardware(root: Path, device: str) -> Path:
-    return (root / "sys/class/tty" / device.rpartition("/")[2] / "device").resolve()
 
 
 def _describe(

@@ -57,7 +57,7 @@ class Reconnection:
         self.retry_s: float | None = None
         """When it is tried again, by the loop's clock; None: it is being tried, or there."""
         self._name, self._worth_s, self._on_state = name, worth_s, on_state
-        self._warned = self._excused = False
+        self._warned = False
         self._up_s = math.inf
         self._told: tuple[bool, str] | None = None
 
@@ -81,24 +81,18 @@ class Reconnection:
             await asyncio.sleep(delay_s)
             self.retry_s = None
 
-    def excuse(self) -> None:
-        """The loss that comes now is our own doing: not worth a warning, nor a pause."""
-        self._excused = True
-        self.backoff.reset()
-
     def up(self, words: str) -> None:
         """There is a connection."""
-        level = logging.DEBUG if self._excused else logging.INFO
-        logger.log(level, "%s: %s%s", self._name, words, " again" if self._warned else "")
+        logger.info("%s: %s%s", self._name, words, " again" if self._warned else "")
         self._up_s = asyncio.get_running_loop().time()
-        self._warned = self._excused = False
+        self._warned = False
         self._say(True, words)  # noqa: FBT003
 
     def down(self, reason: str) -> None:
         """There is none."""
         self.last_error = reason
-        logger.log(logging.DEBUG if self._warned or self._excused else logging.WARNING, "%s: %s", self._name, reason)
-        self._warned = self._warned or not self._excused
+        logger.log(logging.DEBUG if self._warned else logging.WARNING, "%s: %s", self._name, reason)
+        self._warned = True
         self._say(False, reason)  # noqa: FBT003
 
     def end(self) -> None:

@@ -11,7 +11,6 @@ from companion.config import parse
 from companion.config.sections import Config
 from companion.daemon.process.check import sensor_findings, system_findings, where_it_may_be
 from companion.links.serial.faults import PortFault, port_faults, same_ports
-from companion.links.serial.ports import lasting_name
 from tests.support.usb_tree import UsbTree
 
 CONFIG = """
@@ -170,8 +169,6 @@ def test_a_name_that_changes_is_told_the_one_that_stays(board: Board) -> None:
     # The CH340 has no serial number: where it is plugged in is what stays.
     remedies = [fault.remedy for fault in port_faults("/dev/ttyUSB1", root=board.root) if "order of" in fault.words]
     assert remedies == ['set port = "/dev/serial/by-path/platform-soc-usb-0:1.2:1.0-port0"']
-    assert lasting_name(f"{board.root}/dev/ttyUSB0") == f"{board.root}{FTDI_ID}"
-    assert lasting_name("/dev/ttyAMA0") is None
 
 
 def test_the_mini_uart_of_a_raspberry_pi(board: Board) -> None:

@@ -10,7 +10,6 @@ import pytest
 from companion.protocols.guess import (
     COMMON_BAUDS,
     Line,
-    banner_in,
     candidates,
     likeliest,
     lines_to_try,
@@ -155,10 +154,3 @@ def test_what_was_believed_is_tried_first_then_what_devices_come_with_and_nothin
     assert {line.baud for line in lines} >= set(COMMON_BAUDS)
     assert {line.parity for line in lines if line.baud == 9600} == {"none", "even", "odd"}
     assert str(Line(9600, "even")) == "9600 8E1"
-
-
-def test_a_banner_is_a_whole_line_of_words() -> None:
-    assert banner_in(b"\x00\x80HMR3300 V1.00\r\n12") == "HMR3300 V1.00"
-    assert banner_in(b"12, 3.4, 5\r\nHMR33") == ""
-    assert banner_in(b"$VNRRG,01\r\n") == ""
-    assert len(banner_in(b"word " * 100 + b"\n")) <= 40

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import pytest
-
 from companion.protocols.decoding import reasons
 from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
 from companion.protocols.stream_health import SILENT_AFTER_S, StreamHealth
 from companion.samples import CompassSample, ImuSample, TiltSample
-from tests.support.chatter import imu_frame, tilt_frame
+from tests.support.chatter import imu_frame
 
 
 def imu(t_s: float, clock_s: float | None = None, x: float = 0.0) -> ImuSample:
@@ -37,54 +35,6 @@ def test_equal_readings_of_an_imu_do_after_a_second_and_twenty() -> None:
         assert (found is not None) == (tick >= 20), tick
     slow.took(b"x", [imu(10.0, x=1e-6)], 10.0)
     assert slow.trouble(10.0) is None
-
-
-@pytest.mark.parametrize(
-    ("before_s", "after_s", "went_back"),
-    [
-        (100.0, 0.1, True),
-        (100.0, 99.9, False),  # a jitter of some stack of its own; the order of samples is others' business
-        (100.0, 100.02, False),
-        (4294.96, 0.01, False),  # microseconds in 32 bits
-        (65.5, 0.02, False),  # milliseconds in 16 bits
-        (429496.7, 0.0, False),  # 0.1 ms in 32 bits
-        (4000.0, 0.01, True),
-    ],
-)
-def test_a_clock_that_goes_back_and_one_that_begins_again(before_s: float, after_s: float, went_back: bool) -> None:
-    health = StreamHealth("imu_line", ImuLineDecoder())
-    health.took(b"x", [imu(1.0, before_s)], 1.0)
-    health.took(b"x", [imu(1.02, after_s)], 1.02)
-    assert [event.key for event in health.events] == (["clock back"] if went_back else [])
-
-
-def test_after_a_reconnection_the_clock_may_be_another() -> None:
-    health = StreamHealth("imu_line", ImuLineDecoder())
-    health.took(b"x", [imu(1.0, 100.0)], 1.0)
-    health.opened()
-    health.took(b"x", [imu(2.0, 0.1)], 2.0)
-    assert health.events == []
-
-
-def test_a_pause_without_words_is_no_restart_and_words_without_a_pause_neither() -> None:
-    decoder = InclinometerXyDecoder()
-    health = StreamHealth("inclinometer_xy", decoder)
-
-    def take(data: bytes, t_s: float) -> None:
-        health.took(data, decoder.feed(data, t_s), t_s)
-
-    for tick in range(30):
-        take(tilt_frame(tick), 0.1 * tick)
-    take(tilt_frame(1)[:9], 3.5)  # the loop was busy
-    take(tilt_frame(1)[9:], 4.5)
-    take(b"DPL2 V1.8.0\r\n", 4.52)
-    take(tilt_frame(2), 4.6)
-    assert health.events == []
-    take(b"DPL2 V1.8.0\r\nSN:1234\r\n", 6.0)
-    take(tilt_frame(3), 6.1)
-    (event,) = health.events
-    assert event.key == "restarted"
-    assert "'DPL2 V1.8.0'" in event.words
 
 
 def test_what_was_damaged_two_seconds_ago_is_over() -> None:
