@@ -22,7 +22,6 @@ from companion.errors import CompanionError
 from companion.storage.state import remove_durably, write_atomically
 
 EXECUTABLE: Final = "/opt/companion/bin/companion"
-"""As the shipped unit names it."""
 
 _STAMP: Final = "# Put here by `companion install-service`; sha256 of what follows: "
 _STAMPED: Final = re.compile(re.escape(_STAMP).encode() + rb"([0-9a-f]{64})\n")
@@ -50,11 +49,7 @@ CONFIGURATION: Final = "companion.toml"
 
 
 def folder() -> Path:
-    """Where the shipped files are: inside the package of a wheel, else at the top of the checkout.
-
-    Raises:
-        CompanionError: neither is there.
-    """
+    """Return the folder of the shipped files, in a wheel or a checkout; raise CompanionError where there is none."""
     here = Path(__file__).resolve().parent
     for candidate in (here / "systemd", here.parents[1] / "systemd"):
         if (candidate / SERVICE.source).is_file():
@@ -63,11 +58,7 @@ def folder() -> Path:
 
 
 def content(shipped: Shipped, *, executable: str = EXECUTABLE) -> bytes:
-    """A shipped file as it is to be installed, without its stamp.
-
-    Raises:
-        CompanionError: it is missing, or the executable's path cannot stand in a unit.
-    """
+    """Return a shipped file for this executable, without stamp; raise CompanionError where that cannot be."""
     text = (folder() / shipped.source).read_text(encoding="utf-8")
     if shipped in UNITS:
         if not re.fullmatch(r"/[\w.+/@-]+", executable):
@@ -100,7 +91,6 @@ UDEV_RUNS: Final = Path("/run/udev/control")
 
 Outcome = Literal["written", "updated", "unchanged", "kept", "removed", "absent", "done", "failed", "skipped"]
 Run = Callable[[Sequence[str]], str | None]
-"""Runs a command; None when it succeeded, else why it did not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +118,6 @@ class Target:
     """Where to install."""
 
     root: Path
-    """The machine's, or a folder that is to become one."""
     prefix: Path
     """Whose `lib` takes what is ours."""
     executable: str
@@ -155,11 +144,7 @@ def own_executable() -> str:
 
 
 def install(target: Target, run: Run | None = None) -> Iterator[Step]:
-    """Put everything in place; each step as it is done.
-
-    Raises:
-        CompanionError: it cannot be installed from here, or not by this user, or a package has brought the service.
-    """
+    """Install step by step; raise CompanionError for another user, or where a package has brought the service."""
     if target.is_this_machine:
         _check_not_packaged(_START_PACKAGED)
         _check_user(target, "install-service")
@@ -173,11 +158,7 @@ def install(target: Target, run: Run | None = None) -> Iterator[Step]:
 
 
 def start_service(run: Run | None = None) -> Iterator[Step]:
-    """Have this machine's service run with the configuration that is there now, and at every boot.
-
-    Raises:
-        CompanionError: as `install`.
-    """
+    """Have the service run now and at every boot; raise CompanionError as `install`."""
     if _is_packaged():
         for command in ("enable", "restart"):
             yield _command(_HERE, run or _run, "systemctl", command, "companion.service")
@@ -191,11 +172,7 @@ def how_to_start() -> str:
 
 
 def uninstall(target: Target, run: Run | None = None) -> Iterator[Step]:
-    """Take away what `install` has put there; the owner's configuration and the records stay.
-
-    Raises:
-        CompanionError: not by this user, or a package has brought the service.
-    """
+    """Remove what `install` wrote; configuration and records stay. Raise CompanionError as `install`."""
     if target.is_this_machine:
         _check_not_packaged("sudo apt remove companion")
         _check_user(target, "uninstall-service")
@@ -230,7 +207,6 @@ def _write(target: Target, path: Path, data: bytes, outcome: Outcome, words: str
 
 
 def _configuration(target: Target, there: str, absent: str = "") -> Step:
-    """It is never touched; what is said where there is one, and where there is none."""
     path = target.path(SAMPLE).with_name(CONFIGURATION)
     return Step(str(path), "kept", there) if path.exists() else Step(str(path), "absent", absent)
 
@@ -273,11 +249,7 @@ def _check_user(target: Target, command: str) -> None:
 
 
 def _check_reach(executable: str) -> None:
-    """Refuse an installation that the service, which is nobody's account, could not run.
-
-    Raises:
-        CompanionError: what it could not reach, and what to do.
-    """
+    """Raise CompanionError where the service, nobody's account, could not run this installation."""
     package = Path(companion.__file__).parent
     for path in (Path(executable), package, Path(sys.base_prefix)):
         why = unreachable(path)

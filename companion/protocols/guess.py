@@ -48,9 +48,7 @@ class Candidate:
     kinds: tuple[Kind, ...]
     """What a device with this protocol may serve as, what it is bought as first."""
     accepted: int
-    """Frames that were understood."""
     rejected: int
-    """What began like a frame and gave none; the cut one at the beginning does not count."""
 
     @property
     def likely(self) -> bool:

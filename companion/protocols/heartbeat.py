@@ -61,7 +61,6 @@ def heartbeats(data: bytes) -> list[Heartbeat]:
 
 
 def _checksum(data: bytes) -> int:
-    """CRC-16/MCRF4XX, which MAVLink calls X.25."""
     value = 0xFFFF
     for byte in data:
         value ^= byte

@@ -104,11 +104,7 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
 
 
 def main_kind(name: str) -> Kind:
-    """What a device of this protocol is bought as; another role that it has is a help at a pinch.
-
-    Raises:
-        ConfigError: there is no such protocol.
-    """
+    """Return what such a device is mainly bought as; raise ConfigError for an unknown protocol."""
     kinds: tuple[Kind, ...] = ("compass", "imu", "gradienter")
     for kind in kinds:
         if name in PROTOCOLS[kind]:

@@ -20,15 +20,12 @@ SILENT: Final = "silent"
 SILENT_AFTER_S: Final = 3.0
 TAIL_BYTES: Final = 1024
 SPAN_S: Final = 2.0
-"""What happened so long ago is over."""
 GUESS_EVERY_S: Final = 5.0
 STUCK_S: Final = 1.0
 STUCK_SAMPLES: Final = 20
-"""Of an IMU: in six channels of a living one some last digit moves. Of a gradienter or compass nothing follows from
-equal digits; whether it has turned meanwhile decides, and that others know."""
+"""Equal readings of an IMU that prove a fault: six channels always move. A still gradienter repeats its digits."""
 NEAR_DEG: Final = 0.5
-"""Far less than what would have to be seen of a tilt or a turn. Whoever takes the aircraft in hand may be the cause of
-the hang: then the first of the equal readings comes in the middle of the motion, and the pose before it counts."""
+"""A reading this near the last counts as near; whoever moves the aircraft may be the cause of a hang."""
 
 _HARMLESS: Final = frozenset(
     {
@@ -77,7 +74,6 @@ class StreamHealth:
         self.near_since_s: float | None = None
         """Since when they have been near that; of a gradienter or compass."""
         self.speaks: str | None = None
-        """The protocol that the bytes are instead."""
         self._tail = b""
         self._reading: object = None
         self._near: tuple[float, ...] | None = None
@@ -190,7 +186,6 @@ class StreamHealth:
         )
 
     def _lately(self, now_s: float) -> _Mark:
-        """What was accepted and rejected within the last `SPAN_S` or a little more."""
         marks, decoder = self._marks, self._decoder
         if not marks or now_s - marks[-1].t_s >= SPAN_S / 4:
             marks.append(_Mark(now_s, decoder.accepted, Counter(decoder.rejected)))
@@ -201,7 +196,6 @@ class StreamHealth:
 
 
 def _valueless(lately: _Mark) -> Trouble | None:
-    """Whole frames without a value in them."""
     least = _DAMAGED_SHARE * max(lately.accepted, 1)
     if (count := lately.rejected[reasons.NON_FINITE]) and count >= least:
         words = f"NaN in {count} whole frames: the device has no valid reading; switch its power off and on"

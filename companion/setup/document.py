@@ -24,8 +24,6 @@ _KEY: Final = re.compile(r"(?:(?P<off>#)|\s*)(?P<key>\w+)\s*=.*?(?P<comment>\s+#
 
 @dataclass
 class _Block:
-    """A section's lines, its header the first; or what stands before all sections."""
-
     name: str
     on: bool
     lines: list[str]
@@ -60,11 +58,7 @@ def toml(value: Any) -> str:
 
 
 def render(text: str, wanted: Mapping[str, Any]) -> str:
-    """The text, changed so far that it says what is wanted; lines that say so already stay as they are.
-
-    Raises:
-        CompanionError: it is written in a way in which single lines cannot be changed.
-    """
+    """Change a text until it says what is wanted, line by line; raise CompanionError where that is impossible."""
     blocks = list(_blocks(text))
     now = tomllib.loads(text)
     for name, section in wanted.items():
@@ -101,7 +95,6 @@ def _is_on(line: str) -> bool:
 
 
 def _comment_above(lines: Sequence[str], end: int) -> list[str]:
-    """The comment that ends right before a line."""
     begin = end
     while begin and lines[begin - 1].startswith("# "):
         begin -= 1
@@ -119,7 +112,6 @@ def _blocks(text: str) -> Iterator[_Block]:
 
 
 def _section(blocks: list[_Block], name: str) -> _Block:
-    """The table of that name: one that is on, else one that is switched on, else a new one at the end."""
     if (found := _first(blocks, name, on=True) or _switched_on(blocks, name)) is not None:
         return found
     blocks[-1].lines.append("")
@@ -138,7 +130,6 @@ def _switched_on(blocks: Sequence[_Block], name: str) -> _Block | None:
 
 
 def _set_list(blocks: list[_Block], name: str, now: Sequence[Table], wanted: Sequence[Table]) -> None:
-    """Change the tables that are there, and add those that are not."""
     there = [block for block in blocks if block.name == name and block.on]
     for index, table in enumerate(wanted):
         if index < len(there):
@@ -150,7 +141,6 @@ def _set_list(blocks: list[_Block], name: str, now: Sequence[Table], wanted: Seq
 
 
 def _behind(blocks: list[_Block], name: str) -> _Block:
-    """A new table of a list, behind the last one that is on."""
     last = max((index for index, block in enumerate(blocks) if block.name == name and block.on), default=-1)
     before = blocks[last]
     cut = before.last_key() + 1

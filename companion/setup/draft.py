@@ -35,11 +35,9 @@ class Question:
     """One of the things that cannot be found out."""
 
     key: str
-    """As in the file: gradienter.law."""
     words: str
     hint: str
     now: str
-    """The answer that holds if none is given."""
     put: Callable[[str], None]
     """Take an answer; raises ConfigError, in one line, where it is none."""
     choices: Sequence[str]
@@ -53,25 +51,16 @@ class Draft:
     is_new: bool
     wanted: Table = field(init=False)
     guessed: set[str] = field(init=False, default_factory=set)
-    """Keys that nobody has said and no document tells."""
 
     def __post_init__(self) -> None:
         self.wanted = tomllib.loads(self.text)
 
     def result(self) -> str:
-        """The text that it has become.
-
-        Raises:
-            CompanionError: single lines of it cannot be changed.
-        """
+        """Return the new text; raise CompanionError where single lines of it cannot be changed."""
         return render(self.text, self.wanted)
 
     def parsed(self) -> Config:
-        """The configuration that it has become.
-
-        Raises:
-            ConfigError: in one line, what is wrong.
-        """
+        """Parse the new text; raise ConfigError with one line where it is wrong."""
         # Names of saved profiles are for the daemon to look up.
         return config.parse(self.result(), "answer", lambda _, name: name)
 
@@ -97,11 +86,7 @@ class Draft:
         return found
 
     def take_url(self, url: str) -> None:
-        """The autopilot is there.
-
-        Raises:
-            ConfigError: nothing can be.
-        """
+        """Set the autopilot's url; raise ConfigError where it is none."""
         self._put("mavlink", "url", url)
         self.is_new = False
 
@@ -111,11 +96,7 @@ class Draft:
         self._put("control", "socket", str(path.absolute().with_name("companion.sock")))
 
     def show_page(self, bind: str) -> None:
-        """Let the daemon have its page there, unless it has one.
-
-        Raises:
-            ConfigError: it is no address.
-        """
+        """Add the page at an address unless there is one; raise ConfigError where it is no address."""
         if "web" not in self.wanted:
             self._put("web", "bind", bind)
 
@@ -233,7 +214,6 @@ class Draft:
         self._put(kind, "mounting", _mounting(words), "ROTATION_NONE")
 
     def _put(self, name: str, key: str, value: Any, default: Any = None) -> None:
-        """Let a section say it; what holds anyway need not be said."""
         before = copy.deepcopy(self.wanted)
         section = self.section("imu") if name == "imu" else self.wanted.get(name)
         if value != default or key in (section or {}):
@@ -268,7 +248,6 @@ def one_of(words: str, allowed: Sequence[str]) -> str:
 
 
 def _mounting(words: str) -> str | list[float]:
-    """A mounting as it is typed: an angle, three of them, or a rotation's name."""
     name = words.strip().upper().replace(" ", "_")
     for candidate in (name, f"ROTATION_{name}"):
         if candidate in ROTATIONS_DEG:

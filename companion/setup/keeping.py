@@ -20,11 +20,7 @@ def sample() -> str:
 
 
 def begin(path: Path) -> Draft:
-    """The configuration as it is; the sample where there is none, or only the sample.
-
-    Raises:
-        ConfigError: there is one, and it cannot be used; in one line.
-    """
+    """Load the configuration, or the sample where there is none; raise ConfigError where it cannot be used."""
     try:
         text = read_regular(path, config.MOST_BYTES).decode()
     except FileNotFoundError:
@@ -54,11 +50,7 @@ def holds(path: Path, text: str) -> bool:
 
 
 def put(path: Path, text: str) -> Path | None:
-    """Write the file at once and whole; where the old content went, None if it is nobody's, or there was none.
-
-    Raises:
-        StorageError: it cannot be written; then the old one is still there.
-    """
+    """Write the file atomically, keep the old one beside it, and return that path; None where nobody owned it."""
     # What is behind a link is replaced, not the link.
     path = path.resolve()
     kept, mode = None, installing.MODE

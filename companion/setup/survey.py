@@ -43,7 +43,6 @@ class FoundDevice:
     protocol: str
     line: Line
     kind: Kind
-    """What it is bought as."""
 
     def __str__(self) -> str:
         """For people."""

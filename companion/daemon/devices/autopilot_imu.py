@@ -36,8 +36,6 @@ CONFIRMED_WITHIN_S: Final = 3.0
 
 
 class _Announced(NamedTuple):
-    """A value that is not the one in force as far as we know; who says so is not known."""
-
     name: str
     value: float
     t_s: float
@@ -51,13 +49,10 @@ class AutopilotImu:
         self.calibration: ImuCalibration | None = None
         """What the autopilot subtracts, as read; None while that is not known."""
         self.problem = "not read yet"
-        """Why the offsets are not known, in one line."""
         self.failures = 0
-        """How often reading the offsets has failed in a row."""
         self.upsets = 0
         """How often the autopilot has restarted or other offsets have come into force, not by us."""
         self.upset = ""
-        """The latest of these, in a few words."""
         self.on_sample: Listeners[ImuSample] = Listeners()
         """Told of every sample, whatever the offsets behind it."""
         self.on_counting: Listeners[ImuSample] = Listeners()
@@ -65,13 +60,10 @@ class AutopilotImu:
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
         """Told of every reading: what was read before, unless we have written since, and what is in force now."""
         self.on_change: Listeners[[]] = Listeners()
-        """Notified after `calibration` or `input` has changed."""
         self.input = models.imu_input(core.profiles.imu(self.name), None)
-        """What the collector knows of its stream."""
         self._slots, self._ekf_bias, self._profiles = slots, ekf_bias, core.profiles
         self._vehicle, self._parameters, self._collector = core.vehicle, core.parameters, core.collector
         self._known: ImuCalibration | None = None
-        """What was read last, unless we have written since."""
         self._ours = 0
         self._announced: _Announced | None = None
         self._pause_s = 0.0
@@ -124,21 +116,13 @@ class AutopilotImu:
 
     @property
     def in_force(self) -> ImuCalibration:
-        """What the autopilot subtracts.
-
-        Raises:
-            AutopilotError: not known at the moment.
-        """
+        """Return the calibration that the autopilot subtracts; raise AutopilotError while it is not known."""
         if self.calibration is None:
             raise AutopilotError(f"imu {self.name}: {self.problem}")
         return self.calibration
 
     async def refresh(self) -> bool:
-        """Read the offsets afresh; False, and what was collected is void, if they are not those assumed.
-
-        Raises:
-            AutopilotError: they cannot be read, or this IMU cannot be calibrated.
-        """
+        """Read the offsets; False, with samples voided, where they differ. Raise AutopilotError if unreadable."""
         assumed, announced, self._announced = self.calibration, self._announced, None
         why = "the autopilot's offsets were read anew" if announced is None else f"{announced.name} was changed"
         try:

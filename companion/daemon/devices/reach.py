@@ -25,7 +25,6 @@ from companion.links.mavlink.link import MavlinkLink
 logger = logging.getLogger(__name__)
 
 SILENT_S: Final = 5.0
-"""How long without a heartbeat a ground station still counts as there."""
 RETRY_S: Final = 10.0
 
 

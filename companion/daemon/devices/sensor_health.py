@@ -62,10 +62,7 @@ class SensorHealth:
         return Trouble(FLOOD, f"floods us ({rate}); the surplus is thrown away: another device, or a loop-back?")
 
     def update(self, now_s: float, stuck: Trouble | None = None) -> tuple[Trouble | None, bool]:
-        """Count and log what has changed; return the trouble, and whether it was logged as a warning now.
-
-        Called about twice a second. `stuck`: the reading stays while other sensors see the aircraft move.
-        """
+        """Count and log changes, twice a second; return the trouble, and whether it was logged as a warning now."""
         self._stuck = stuck
         since_s, before = self._received
         if now_s - since_s >= 1.0:
@@ -103,7 +100,6 @@ class SensorHealth:
         return self._warn(found, now_s)
 
     def _warn(self, what: Trouble, now_s: float) -> bool:
-        """Log a trouble; return whether as a warning."""
         again = now_s - self._warned_s.get(what.key, -AGAIN_S) < AGAIN_S
         self._warned_s[what.key] = now_s
         level = logging.DEBUG if again else logging.WARNING

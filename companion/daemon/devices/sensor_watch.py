@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 PERIOD_S: Final = 0.5
 REMEMBERED_S: Final = 300
 TILTED_DEG: Final = 3.0
-"""The least tilt that shows a hanging sensor: 300 steps of the coarsest gradienter, far beyond the error of a mean."""
+"""Least tilt that shows a hanging sensor: 300 steps of the coarsest gradienter, far beyond the error of a mean."""
 TILTED_SECONDS: Final = 3
 BEFORE_S: Final = 3.0
 """How long before the first of its equal headings a compass may have begun to hang: until then it was near them."""
@@ -40,7 +40,6 @@ class Corrected(NamedTuple):
     """What an owner has made of an IMU's readings."""
 
     back: Matrix = np.eye(3)
-    """(3, 3), from the axes that it has turned them to into the IMU's own."""
     accel_m_s2: Array = np.zeros(3)
     """(3,), what it takes off the accelerometer, in the IMU's own axes."""
 
@@ -151,7 +150,6 @@ class SensorWatch:
                 self._collector.reset(f"{sensor.name}: {found.words}", sensor.name if sensor.kinds == {"imu"} else None)
 
     def _stuck(self, sensor: SerialSensor) -> Trouble | None:
-        """A still gradienter or compass may repeat its digits for minutes; one that is moved may not."""
         since_s = sensor.health.stream.unchanged_since_s
         last_s = sensor.health.stream.last_sample_s
         if since_s is None or last_s is None:

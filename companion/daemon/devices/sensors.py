@@ -29,10 +29,8 @@ COARSE_S: Final = 0.25
 LIVELY_S: Final = 1.0
 """How long after something was said a conversation counts as going on."""
 LOOK_AGAIN_S: Final = 60.0
-"""How long a port-holder check stays valid."""
 HELD_AGAIN_S: Final = 5.0
 MOST_WORDS: Final = 20
-"""The most different messages to one device that are logged."""
 
 _WANTED: Final[dict[Kind, str]] = {"imu": "rates", "gradienter": "tilt", "compass": "heading"}
 
@@ -168,7 +166,6 @@ class SerialSensor:
         self.decoder.interrupted()
 
     def _is_lively(self, t_s: float) -> bool:
-        """Whether a conversation with it goes on, in which the answer to each word is waited for."""
         return t_s - self._spoke_s < LIVELY_S
 
     def receive(self, data: bytes, t_s: float) -> None:
@@ -222,7 +219,6 @@ class SerialSensor:
             self._tell(self.text)
 
     def _tell(self, words: str) -> None:
-        """In the log, once: a device that is not there is asked again for the whole day."""
         if words and words not in self._told and len(self._told) < MOST_WORDS:
             self._told.add(words)
             logger.info("%s: %s", self.link.name, words)

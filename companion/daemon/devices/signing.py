@@ -69,7 +69,6 @@ class LinkSigning:
         self.mode = config.mavlink.signing_mode
         self.signing: Signing | None = None
         self.trouble = ""
-        """Why there is no key; empty when there is one."""
         self._stored = signing_time_in(config.storage.path)
         self._reserved = 0
         self._write_failed = self._setup_reported = False
@@ -155,7 +154,6 @@ class LinkSigning:
     # --- messages
 
     def _on_setup(self, message: mavlink.MAVLink_setup_signing_message, _t_s: float) -> None:
-        """Report an attempt to set a key over the wire, which is never followed."""
         if not self._setup_reported:
             self._setup_reported = True
             logger.warning(
@@ -193,7 +191,6 @@ class LinkSigning:
     # --- faults
 
     def _update(self, now_s: float) -> None:
-        """Find the present fault, and report a change."""
         found = self._refused_by_autopilot(now_s) if self.signing is None else self._refuses(self.signing, now_s)
         if found == self._fault:
             return

@@ -45,7 +45,6 @@ class Devices(Subsystem):
         self.signing = LinkSigning(core.config, core.link, core.vehicle, core.say, core.offload)
         self.reach = Reach(core.link, core.vehicle, core.parameters, core.config.mavlink.url)
         self.on_pose: Listeners[Sample] = Listeners()
-        """Told of every reading of gradienter and compass that counts."""
 
     @property
     def not_heard(self) -> str:

@@ -76,7 +76,6 @@ class Child:
             await _end(process)
 
     async def _watch(self, process: Process) -> str:
-        """Read reports until the child ends, or is silent for too long; return why."""
         reading = asyncio.get_running_loop().create_task(self._read(process))
         try:
             silent_s, heard = 0.0, self._report
@@ -110,7 +109,6 @@ StartChild = Callable[[str, str, ChildSettings], Child]
 
 
 async def _end(process: Process) -> None:
-    """Ask the process to end, and kill it where it does not."""
     # A pipe that still holds what nobody read stays open, and keeps `wait` from returning.
     drained = asyncio.ensure_future(_drain(process))
     if process.returncode is None:
@@ -127,13 +125,11 @@ async def _end(process: Process) -> None:
 
 
 async def _drain(process: Process) -> None:
-    """Read and discard what the process still writes."""
     while process.stdout is not None and await process.stdout.read(REPORT_LIMIT):
         pass
 
 
 def _kill(process: Process) -> None:
-    """Kill a process, which may have ended meanwhile."""
     with contextlib.suppress(ProcessLookupError):
         process.kill()
 

@@ -50,9 +50,7 @@ class ControlServer:
         self._server: asyncio.Server | None = None
         self._clients: set[asyncio.Task[None]] = set()
         self._silent: dict[asyncio.Task[None], None] = {}
-        """Clients that have not asked yet, the oldest first."""
         self._served: Counter[bool] = Counter()
-        """How many are served, urgent or not."""
 
     async def __aenter__(self) -> Self:
         """Bind the socket, replacing a stale one; a LinkError where another daemon answers, or it cannot be bound."""
@@ -104,7 +102,6 @@ class ControlServer:
             pass  # the client went away, or is deaf; what it asked for goes on
 
     async def _request(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Object | None:
-        """What a client asks; None: nothing that can be understood, which it is told; TimeoutError: not in time."""
         try:
             async with asyncio.timeout(REQUEST_TIMEOUT_S):
                 line = await reader.readline()
@@ -115,7 +112,6 @@ class ControlServer:
             return None
 
     async def _take(self, request: Object, writer: asyncio.StreamWriter) -> None:
-        """Answer a request if there is a place for one of its kind."""
         if (client := asyncio.current_task()) is not None:
             self._silent.pop(client, None)
         urgent = request.get("command") in URGENT

@@ -126,7 +126,6 @@ class Headlines:
         return Headline("WAITING", words, "wait")
 
     def _gate(self) -> Headline:
-        """Where arming is held back, what the autopilot is answered."""
         answer = self._readiness.answer()
         if answer.verdict == "accept":
             return Headline("READY", answer.words, "good")

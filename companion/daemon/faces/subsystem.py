@@ -91,11 +91,7 @@ class Faces(Subsystem):
         return (self._start_child or Child)(name, module, settings)
 
     async def answer(self, request: Object, face: str | None = None) -> AsyncIterator[Object]:
-        """Answer one request of the control socket, whose key `face` names the child process that sent it.
-
-        Raises:
-            CompanionError: the request is refused, or could not be carried out, and why.
-        """
+        """Answer a request; `face`: the child process that sent it. Raise CompanionError if it is refused."""
         command = request.get("command")
         face = face or FACES.get(str(request.get("face")), "companion")
         handler = self._handlers.get(command) if isinstance(command, str) else None
@@ -181,7 +177,6 @@ class Faces(Subsystem):
         }
 
     def _mqtt_status(self) -> Object:
-        """Return the MQTT process's report, and the fleet's part of it under its own key."""
         if self.mqtt is None:
             return {"mqtt": None, "fleet": None}
         report: Object = {"connected": False, "fleet": None} | self.mqtt.status()
@@ -210,10 +205,7 @@ class Faces(Subsystem):
 
 
 def own_parameters(wanted: Wanted) -> list[Parameter]:
-    """CMP_*: targets, at_arm, push and tunes may be set; the last result is shown.
-
-    What a ground station sets holds until the daemon restarts: the configuration file is the aircraft owner's.
-    """
+    """List the CMP_* parameters. What a ground station sets holds until the daemon restarts."""
     assert set(AT_ARM) == set(get_args(AtArm))
     gyro, accel = wanted.settings.target_gyro_sigma_rad_s / DEG_H, wanted.settings.target_accel_sigma_m_s2 / MG
 
@@ -243,6 +235,5 @@ def _whole(name: str, value: float) -> int:
 
 
 def _worst(imus: tuple[ImuRecord, ...], triad: Triad, unit: float) -> float:
-    """The largest sigma of all axes in its unit; 0 where nothing was found."""
     values = [value for imu in imus for value in imu.sigma_in_force(triad) or ()]
     return min(max(values, default=0.0) / unit, LARGEST)

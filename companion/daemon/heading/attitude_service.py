@@ -107,7 +107,6 @@ class AttitudeService:
     def __init__(self, core: Core, devices: Devices, in_force: InForce, calibrating: Calibrating) -> None:
         config, link, vehicle = core.config, core.link, core.vehicle
         self.turns = 0
-        """Of `run`, so that it is seen to go on."""
         self._config, self._vehicle, self._say = config, vehicle, core.say
         self.carrier = Carrier(core, carrying_imu(config), in_force, calibrating.alignment)
         self.difference = Difference(vehicle, self.carrier.now, self.carrier.kept_at)
@@ -264,7 +263,6 @@ class AttitudeService:
 
     @property
     def _restarted(self) -> bool:
-        """Whether it started in flight, and nothing has been pushed yet."""
         return self.resume.pending and self._vehicle.arm_state is ArmState.ARMED
 
     @property

@@ -42,7 +42,6 @@ KEPT_S: Final = 5.0
 """A still window ends up to two seconds ago; with what came since the alignment is carried on to now."""
 _NO_STAND: Final = {False: "waiting for an alignment: hold still", True: "waiting for an alignment: not on a deck"}
 STOOD_S: Final = 7.0
-"""How far back the seconds of an alignment may lie; five good ones are enough."""
 CHECK_EVERY_S: Final = 10.0
 """How often the carried attitude is compared with how the aircraft stands."""
 TILT_FLOOR_RAD: Final = 0.5 * DEG
@@ -62,10 +61,7 @@ def carrying_imu(config: Config) -> Imu:
 
 
 def settings_of(imu: Imu, record: ImuRecord, local: LocalEarth, gyro_step_rad_s: float) -> AttitudeSettings | None:
-    """How the estimator is to take this IMU's samples; None where its gyros were not calibrated.
-
-    `record`: of the calibration in force; `gyro_step_rad_s`: of a stream of truncated integers, else 0.
-    """
+    """Return the estimator's settings from the active record; None without calibrated gyros."""
     serial = imu.source == "serial"
     gyro = record.gyro_bias_rad_s if serial else _left(record, record.residual_gyro_rad_s, "gyro")
     accel = record.accel_bias_m_s2 if serial else _left(record, record.residual_accel_m_s2, "accel")
@@ -128,11 +124,7 @@ class Stand:
 def stand_of(
     window: Window, where: Whereabouts, gradienter: GradienterModel | None, compass: CompassModel | None
 ) -> Stand:
-    """Work it out; for a thread.
-
-    Raises:
-        CalibrationRefusedError: the readings cannot be right together.
-    """
+    """Estimate the stand; blocking. Raise CalibrationRefusedError where the readings contradict each other."""
     local = local_earth(where)
     truth = truth_of(window, gradienter if window.tilt is not None else None, compass, local, [])
     turn = truth.body_from_ned
@@ -166,9 +158,7 @@ class Carrier:
         self.gyro_step_rad_s = 0.0
         """Of a stream of truncated integers; 0 of one of floats."""
         self.waiting_for = "waiting for a calibration"
-        """What an alignment needs."""
         self.doubt: str | None = None
-        """Why what began in flight is not to be pushed yet."""
         self._core = core
         self._config, self._vehicle, self._collector = core.config, core.vehicle, core.collector
         self._in_force, self._alignment, self._offload = in_force, alignment, core.offload
@@ -264,7 +254,6 @@ class Carrier:
                     self._align(stand)
 
     async def _follow_calibration(self) -> None:
-        """Take the biases of a new calibration; forget those that are in force no longer."""
         found = self._in_force.record_of(self.imu.name)
         if found is None and self.imu.source == "serial":
             found = self._record  # what was undone or replaced is the autopilot's; this bias is still the sensor's

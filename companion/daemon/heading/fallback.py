@@ -41,7 +41,6 @@ class Fallback:
     def __init__(self, core: Core) -> None:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
         self.net: Net | None = None
-        """None: not known yet."""
         self._selected = False
         self._stale = asyncio.Event()
         self._pushed_since_s = math.inf

@@ -46,7 +46,6 @@ TOLD_HEADING_DEG: Final = 8.0
 SMOOTHED_S: Final = 3.0
 """The two differ for moments by their filters' delays; over so long what lasts is left."""
 OLD_S: Final = 2.0
-"""How old the autopilot's attitude may be to be compared with."""
 STEEP_RAD: Final = math.radians(60.0)
 """Pitch beyond which roll and heading can hardly be told apart."""
 FORGETS_PER_S: Final = 0.02
@@ -56,10 +55,7 @@ _DOWN: Final[Triple] = (0.0, 0.0, 1.0)
 
 
 class Difference:
-    """Listens to ATTITUDE of the latched autopilot; ours comes back from other stations under our own number.
-
-    `now`: our attitude at the last sample; `kept_at`: what is remembered of an instant before.
-    """
+    """Difference of our attitude to the latched autopilot's, by its ATTITUDE messages."""
 
     def __init__(
         self,
@@ -76,7 +72,6 @@ class Difference:
         self.latest: tuple[float, float] | None = None
         """As `tilt_rad` and `heading_rad`, not smoothed; None where it is too steep to tell them apart."""
         self.heard_s = -math.inf
-        """When the two were compared last."""
         self.forget()
         vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, ATTITUDE_RATE_HZ)
 
@@ -87,7 +82,6 @@ class Difference:
         self._down_now: Triple = (0.0, 0.0, 0.0)
         self._since_s = math.inf
         self.straying = Straying()
-        """Of our heading against the autopilot's gyros."""
 
     def is_heard(self, now_s: float) -> bool:
         """Whether the autopilot tells its attitude."""
@@ -210,9 +204,7 @@ class Health:
         self._carrier, self._difference, self._vehicle, self._own_agrees = carrier, difference, vehicle, own_agrees
         self.pushing = False
         self.why_not = carrier.waiting_for
-        """Why nothing is pushed; empty while it is."""
         self.warning: str | None = None
-        """That the two attitudes differ, in words."""
         self._stopped = False
         self._good_since_s: float | None = None
         self._differs_since_s: float | None = None

@@ -56,14 +56,11 @@ class Resume:
         self._store, self._memory = calibrating.store, calibrating.memory
         self._imu = imus.get(carrier.imu.name)
         self.pending = True
-        """Whether nothing has agreed yet since the start, and nobody has seen the aircraft disarmed."""
         self._record: Record | None = None
         self._looked = False
-        """For a record: disks are not asked again and again in flight."""
         self._differs: str | None = None
         self._agrees: bool | None = None
         self._since_s = self._unknown_s = 0.0
-        """Since when it is so, and until when our heading was not known."""
 
     async def step(self, now_s: float) -> None:
         """Begin, compare, and begin anew where the two do not agree."""
@@ -85,7 +82,6 @@ class Resume:
             carrier.doubt = self._differs or HEADING_UNKNOWN
 
     async def _begin(self, now_s: float) -> str | None:
-        """Begin from what is known; else say what is missing."""
         name, theirs = self._carrier.imu.name, self._difference.theirs
         if theirs is None or now_s - theirs[0] > FRESH_S:
             return "waiting for the autopilot's attitude"

@@ -35,7 +35,6 @@ class Heading(Subsystem):
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating, arming: Arming) -> None:
         self._core = core
         self.attitude: AttitudeService | None = None
-        """None unless a heading is pushed."""
         if core.config.push.attitude != "off":
             # What nobody asked for costs the start nothing.
             from companion.daemon.heading.attitude_service import AttitudeService
@@ -48,7 +47,6 @@ class Heading(Subsystem):
         return {"autopilot-setup": self._answer_setup}
 
     async def _answer_setup(self, _request: Object, _face: str) -> AsyncIterator[Object]:
-        """What is set, what should be, and what to do: for our heading, the gate, the offsets, and the port."""
         firmware = self._core.vehicle.kind
         found = await self._core.parameters.read_many(firmware.heading_names(), optional=True)
         port = await self._core.parameters.read_many(firmware.port_names, optional=True)
@@ -140,10 +138,7 @@ class PoseNow:
         return self.now()
 
     def now(self) -> Object | None:
-        """The pose as JSON can hold it; None without a fresh reading of the gradienter.
-
-        The heading is magnetic as long as the declination has not been looked up.
-        """
+        """Return the pose; None without a fresh tilt. The heading is magnetic while no declination is known."""
         if self._carried is not None and (carried := self._carried()) is not None:
             return carried
         now_s = asyncio.get_running_loop().time()

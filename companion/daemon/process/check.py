@@ -58,12 +58,10 @@ class Finding:
 
 
 def _section(sensor: SerialDevice) -> str:
-    """Where its keys stand."""
     return f'[[imu]] "{sensor.name}"' if sensor.kind == "imu" else f"[{sensor.kind}]"
 
 
 def _ports(config: Config) -> dict[str, str]:
-    """Ports of this machine, by the names of those that use them."""
     ports = {sensor.name: sensor.port for sensor in serial_devices(config) if not sensor.settings.is_tcp}
     if config.mavlink.url.startswith("serial:"):
         ports["autopilot"] = config.mavlink.url.removeprefix("serial:").rpartition(":")[0]
@@ -96,11 +94,7 @@ def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> l
 
 
 async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -> list[Finding]:
-    """Why no good samples come from a sensor, as far as its bytes tell.
-
-    `status`: of a daemon, or of a check that has just listened; `may_listen`: no daemon runs, so that ports may be
-    tried at other settings.
-    """
+    """Explain from its bytes why a sensor gives no good samples; `may_listen`: no daemon has the ports."""
     devices = {device["name"]: device for device in status["devices"]}
     sick = [sensor for sensor in serial_devices(config) if devices.get(sensor.name, {}).get("trouble") in _TO_BE_TRIED]
     tried: dict[str, Heard | str] = {}
@@ -166,11 +160,7 @@ def _other_protocol(sensor: SerialDevice, protocol: str) -> tuple[str, str]:
 async def run_check(
     config: Config, seconds: float, say: Callable[[str], object] = lambda _words: None
 ) -> list[Finding]:
-    """Check everything the configuration names, listening for some seconds, which it says before where no daemon runs.
-
-    Raises:
-        CompanionError: something that makes the check itself impossible.
-    """
+    """Check everything the configuration names; without a daemon listen to the ports for some seconds."""
     findings = [Finding("configuration", good=True, words="understood")]
     status: Object | None = None
     ours = {os.getpid()}
@@ -244,7 +234,6 @@ async def answering_imus(config: Config, imus: Sequence[Imu]) -> dict[str, str |
 
 
 def _autopilot(config: Config, vehicle: Object) -> Finding:
-    """Whether it is heard; where not, what its end of the line needs."""
     if (age_s := vehicle["heartbeat_age_s"]) is not None:
         if age_s < LOST_S:
             return Finding("autopilot", good=True, words=vehicle["summary"])
@@ -259,7 +248,6 @@ def _autopilot(config: Config, vehicle: Object) -> Finding:
 
 
 def _device(device: Object, elsewhere: Finding | None) -> Finding:
-    """How a device does by its own account; and where it may be, if it is not where it should."""
     name, words, port = device["name"], device["summary"], device.get("port", "")
     if device.get("trouble") == ABSENT and port.startswith("/") and not os.path.exists(port) and elsewhere is not None:
         return Finding(name, good=False, words=f"{words}; {elsewhere.words}", remedy=elsewhere.remedy, port=port)

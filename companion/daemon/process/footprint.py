@@ -20,10 +20,7 @@ def prepare() -> None:
 
 
 def settle() -> None:
-    """Call it once when everything is there; it holds the loop for as long as one collection of everything takes.
-
-    That would come anyway, and again and again: what is there by now stays, and is never looked through again.
-    """
+    """Call it once when everything is imported: what exists by then is never scanned for garbage again."""
     gc.collect()
     gc.freeze()
     gc.enable()

@@ -26,11 +26,7 @@ SETTLED_AFTER_S: Final = 3.0
 
 
 async def run(config: Config) -> None:
-    """Run the daemon until SIGTERM or SIGINT.
-
-    Raises:
-        CompanionError: it cannot start.
-    """
+    """Run the daemon until SIGTERM or SIGINT; raise CompanionError where it cannot start."""
     manager = ServiceManager.from_environment()
     try:
         await _Process(Service(config), manager).run()

@@ -31,7 +31,6 @@ logger = logging.getLogger(__name__)
 SETTLED_WITHIN_S: Final = 20.0
 """A small board takes seconds to start the MQTT process, and a silent broker 10 s to be given up."""
 LISTEN_TURN_S: Final = 0.1
-"""Wait between two decisions whether to listen on, in seconds."""
 
 
 class Service:
@@ -64,11 +63,7 @@ class Service:
         )
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
-        """Run until cancelled, reachable on the control socket from `on_ready` on.
-
-        Raises:
-            CompanionError: it cannot start (another daemon runs, or works with the same storage).
-        """
+        """Run until cancelled; `on_ready`: the control socket answers. Raise CompanionError where it cannot start."""
         for words in (*models.cannot_work(self.config), *models.doubtful(self.config)):
             logger.warning("%s", words)
         control = self.config.control
@@ -79,10 +74,7 @@ class Service:
                 await self.serve()
 
     async def serve(self, *, mavlink: bool = True, ports: bool = True) -> None:
-        """Do the work until cancelled, then leave the autopilot in order.
-
-        Without `mavlink` the link has been put on a wire already; without `ports` somebody hands bytes to the sensors.
-        """
+        """Work until cancelled, then leave the autopilot in order; without `mavlink` or `ports` others feed bytes."""
         for subsystem in (self.devices, self.offsets, self.calibrating):
             subsystem.load()
         transport: list[Task] = [("mavlink", self._connect)] if mavlink else []

@@ -36,7 +36,6 @@ class Turning(Protocol):
     """Whose work goes on by turns."""
 
     turns: int
-    """How many it has begun."""
 
 
 class Watched(NamedTuple):
@@ -45,7 +44,6 @@ class Watched(NamedTuple):
     name: str
     task: str
     within_s: float
-    """How long a turn of it may take."""
     who: Turning
 
 

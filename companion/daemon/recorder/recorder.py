@@ -62,7 +62,6 @@ MOST_OPEN_END_BYTES: Final = 1 << 30
 """Size at which a recording without a stated length ends: 27 hours of a 200 Hz IMU beside 100 Hz telemetry."""
 PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
-"""The longest that the daemon's end waits for the disk."""
 INTERNAL: Final = "internal error; the log has the details"
 HOW_TO_INSTALL: Final = (
     "recording needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
@@ -96,7 +95,6 @@ class Recorder(Subsystem):
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating) -> None:
         config = core.config
         self.fault: str | None = None
-        """Why the ring is not written, in one line; None while all is well."""
         self.tape = Tape()
         self._core, self._offload, self._manager = core, core.offload, calibrating.manager
         self._alignment = calibrating.alignment
@@ -311,7 +309,6 @@ class Recorder(Subsystem):
         return {"record": self._answer}
 
     async def _answer(self, request: Object, _face: str) -> AsyncIterator[Object]:
-        """Begin, and tell how it goes until it ends; or end it."""
         if request.get("stop") is True:
             if (recording := self._on_request) is None:
                 raise StorageError("nothing is being recorded on request")

@@ -27,7 +27,6 @@ M = TypeVar("M", bound=mavlink.MAVLink_message)
 Handler = Callable[[M, float], None]
 Direction = Literal["in", "out"]
 Sender = tuple[int, int]
-"""System and component."""
 
 _COMPACT_BYTES = 4096
 _ANYBODYS = frozenset(mavlink.mavlink_map[number].msgname for number in NEVER_SIGNED)
@@ -72,9 +71,7 @@ class MavlinkLink:
         self.dropped = 0
         """Messages that could not be sent: no transport was attached, or its buffer was full."""
         self.signing: Signing | None = None
-        """Signs what is sent and judges what comes; None: nobody does."""
         self.autopilot: Sender | None = None
-        """The autopilot that this link is for; None while it is not known."""
         self._codec: Codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None
@@ -82,7 +79,6 @@ class MavlinkLink:
         self._attached = 0
         self._handlers: dict[str, Listeners[Message, float]] = {}
         self.on_bytes: Listeners[Direction, bytes | None, float | None] = Listeners()
-        """Listeners to all traffic: direction, bytes, time of arrival; bytes None: some were lost here."""
 
     @property
     def system_id(self) -> int:

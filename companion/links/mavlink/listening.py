@@ -26,7 +26,6 @@ class HeardUdp:
 
     port: int
     senders: tuple[Heartbeat, ...]
-    """Autopilots first."""
     datagrams: int
     from_here: bool
 
@@ -37,11 +36,7 @@ class HeardUdp:
 
 
 async def listen_udp(port: int) -> HeardUdp:
-    """Take what comes to a port until an autopilot is heard, or the time is over; nothing is sent.
-
-    Raises:
-        LinkError: the port cannot be opened; mostly because another program has it.
-    """
+    """Receive until an autopilot is heard or time is over; raise LinkError where the port cannot be opened."""
     heard = _Heard()
     try:
         transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(

@@ -28,7 +28,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.errors import LinkError
 
 EPOCH_S: Final = 1420070400
-"""2015-01-01 UTC."""
 TICKS_PER_S: Final = 100_000
 LAST: Final = 2**48 - 1
 LATE_TICKS: Final = 60 * TICKS_PER_S
@@ -137,7 +136,6 @@ class Signing:
         self.clock = clock or SigningClock()
         self.verified = 0
         self.doubted: Counter[Reason] = Counter()
-        """Refused messages."""
         self.on_verified: Callable[[int, int], object] = lambda _system, _component: None
         self.on_refused: Callable[[Reason, int, int], object] = lambda _reason, _system, _component: None
         self._streams: dict[tuple[int, int, int], int] = {}
@@ -204,11 +202,7 @@ MAX_FILE_BYTES: Final = 1024
 
 
 def read_key(path: Path) -> bytes:
-    """Read the 32 bytes of the key from its file.
-
-    Raises:
-        LinkError: one line that names the file and what is wrong with it, and nothing of its content.
-    """
+    """Read the 32 bytes of the key; raise LinkError, without any of its content, where the file holds none."""
     try:
         with path.open("rb") as file:
             rights = os.fstat(file.fileno()).st_mode

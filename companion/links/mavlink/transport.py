@@ -60,11 +60,7 @@ async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None
 
 
 def parse_url(url: str) -> tuple[str, str, int]:
-    """Kind ("udpin", "udpout", "tcp", "serial"), host or path, and port or baud rate of a MAVLink url.
-
-    Raises:
-        LinkError: it is none; says what is allowed.
-    """
+    """Return kind, host or path, and port or baud rate of a MAVLink url; raise LinkError for any other text."""
     match = _URL.fullmatch(url)
     if match is None or (match["kind"] != "serial" and int(match["number"]) > 65535):
         raise LinkError(
@@ -76,7 +72,6 @@ def parse_url(url: str) -> tuple[str, str, int]:
 async def _run_udp(
     link: MavlinkLink, url: str, address: tuple[str, int], *, listen: bool, on_state: OnState | None
 ) -> None:
-    """Open the socket again whenever it fails or its local address is gone."""
     reconnection = Reconnection("mavlink", Backoff(), worth_s=_TURN_S, on_state=on_state)
 
     def factory() -> _Udp:
@@ -179,8 +174,6 @@ class _Udp(asyncio.DatagramProtocol):
 
 
 class _Speaker(_Udp):
-    """udpout: one target, from which alone we hear."""
-
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self.link.attach(lambda data: self.send_to(data, None), self.settled)
@@ -199,7 +192,6 @@ class _Listener(_Udp):
         super().__init__(link)
         self._heard_s: dict[Peer, float] = {}
         self._autopilots: set[Peer] = set()
-        """Those of them that have spoken for the autopilot."""
 
     def datagram_received(self, data: bytes, addr: Peer) -> None:
         t_s = self.now_s()

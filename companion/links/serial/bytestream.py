@@ -39,7 +39,6 @@ BEAT_S = 1.0
 BEAT_WITHIN_S = 8.0
 """An open that takes all the time it may, and the longest pause after it."""
 FLOOD_PAUSE_S = 0.05
-"""How long a port that brings too much is left alone."""
 MOST_READS = 64
 """So often a port is read before something may be written to it; the kernel keeps less than these bring."""
 DISCARD_BYTES = 65536
@@ -74,11 +73,7 @@ class PortSettings:
         return (10 if self.parity == "none" else 11) / self.baud
 
     def address(self) -> tuple[str, int]:
-        """Host and port of a tcp:// url.
-
-        Raises:
-            LinkError: the url names no host or no port from 1 to 65535.
-        """
+        """Return host and port of a tcp:// url; raise LinkError where either is missing or wrong."""
         try:
             parts = urlsplit(self.url)
             host, port = parts.hostname, parts.port
@@ -118,7 +113,6 @@ class ByteLink:
         self.turns = 0
         """Turns of `run`, one at least every `BEAT_WITHIN_S`, whether bytes come or not."""
         self.last_byte_s: float | None = None
-        """The loop's time of the last read that brought bytes."""
         self._on_bytes, self._on_turn, self._on_gap = on_bytes, on_turn, on_gap
         self._reconnection = Reconnection(name, Backoff(cap_s=LONGEST_PAUSE_S), worth_s=WORTH_S, on_state=on_state)
         self._descriptor: int | None = None
@@ -153,7 +147,6 @@ class ByteLink:
                 self._reconnection.end()
 
     async def _once(self) -> str:
-        """Open the port and wait for its loss; why it is lost."""
         self._turn()
         descriptor = await self._open()
         before = self.bytes_received
@@ -233,10 +226,7 @@ class ByteLink:
             self._collecting = None
 
     def _fits_the_line(self, now_s: float) -> bool:
-        """Whether the line, as it is set, could have carried what came since `_reads_since`.
-
-        Behind USB the speed may mean nothing, and dating a collected frame by it would put it before the one before it.
-        """
+        """Return whether the line could have carried the bytes since `_reads_since`; on USB it need not."""
         since_s, bytes_then = self._reads_since
         carried = self.bytes_received - bytes_then
         return carried * self.settings.seconds_per_byte <= FULLEST_LINE * (now_s - since_s)
@@ -264,7 +254,6 @@ class ByteLink:
         return True
 
     def _pause(self) -> None:
-        """Leave the port alone for a moment: whatever it sends, the others on this loop have their turn."""
         loop = asyncio.get_running_loop()
         assert self._descriptor is not None
         self._stop_collecting()
@@ -305,7 +294,6 @@ class ByteLink:
         loop.remove_writer(self._descriptor)
 
     def _explain(self, error: OSError | None) -> str:
-        """What a failed read or write means; None for a read that brought no bytes."""
         url = self.settings.url
         if self.settings.is_tcp:
             return f"{url}: {'the other side closed the connection' if error is None else words_of(error)}"

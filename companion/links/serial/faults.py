@@ -29,7 +29,6 @@ class PortFault:
     words: str
     remedy: str
     good: bool = False
-    """A remark: it works at present."""
 
     def __str__(self) -> str:
         return f"{self.words}: {self.remedy}"
@@ -39,11 +38,7 @@ def port_faults(
     port: str, *, is_fast: bool = False, ours: Sequence[int] = (), among: Sequence[SerialPort] | None = None,
     root: Path = ROOT,
 ) -> list[PortFault]:  # fmt: skip
-    """What is wrong with a configured port, worst first.
-
-    `is_fast`: a sensor whose samples must not come in bunches; `ours`: processes that may have it open; `among`: all
-    ports, if somebody has listed them already.
-    """
+    """List the faults of a port, worst first. `is_fast`: an IMU; `ours`: our processes; `among`: all ports."""
     device = resolve(root, port)
     ports = list_ports(root) if among is None else among
     found = next((one for one in ports if one.device == device), None)
@@ -162,7 +157,6 @@ def _processes(root: Path) -> Iterator[tuple[int, str, tuple[str, ...]]]:
 
 
 def _udev_properties(device: str, root: Path) -> dict[str, str] | None:
-    """What udev knows of a port; None where there is no udev to ask."""
     try:
         number = (root / "sys/class/tty" / device.removeprefix("/dev/") / "dev").read_text().strip()
         lines = (root / f"run/udev/data/c{number}").read_text(errors="replace").splitlines()

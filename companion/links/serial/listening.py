@@ -50,10 +50,8 @@ class Heard:
     """The setting at which somebody is understood; None: nobody is."""
     candidate: Candidate | None
     stranger: str | None
-    """Who it is when it is no sensor, in a few words."""
     bytes_heard: int
     heartbeat: Heartbeat | None = None
-    """Of the autopilot that speaks there."""
 
 
 def ports_to_try(found: Sequence[SerialPort]) -> list[str]:
@@ -82,11 +80,7 @@ async def listen_to_all(
 
 
 async def listen(path: str, first: Sequence[Line] = (), root: Path = ROOT) -> Heard:
-    """Try line settings, those believed first, until a device is understood; about half a minute at the most.
-
-    Raises:
-        LinkError: the port cannot be opened, or another program holds it.
-    """
+    """Try line settings, likely ones first, for half a minute at most; raise LinkError if it cannot be opened."""
     if holders := [holder for holder in find_holders(path, root) if holder.pid != os.getpid()]:
         who = ", ".join(f"{holder.name}, process {holder.pid}" for holder in holders)
         raise LinkError(f"{path}: in use by another program ({who}); a port serves one reader only")
@@ -120,7 +114,6 @@ async def listen(path: str, first: Sequence[Line] = (), root: Path = ROOT) -> He
 
 
 async def _bytes_at(path: str, line: Line, most_s: float) -> bytes:
-    """What comes at one setting, until somebody is surely understood, or surely nobody."""
     loop = asyncio.get_running_loop()
     descriptor = await SerialOpener(path, line.baud, line.parity).open()
     data = bytearray()

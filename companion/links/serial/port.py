@@ -61,10 +61,7 @@ def open_serial(path: str, baud: int, parity: Parity) -> int:
 
 
 def close_serial(descriptor: int) -> None:
-    """Close a port so that it can be opened again.
-
-    A pseudo-terminal (socat, a simulator) lives on while its other end is open, and TIOCEXCL with it.
-    """
+    """Close a port, without the exclusive lock that a pseudo-terminal would keep while its other end is open."""
     with contextlib.suppress(OSError):  # gone already, or a socket
         fcntl.ioctl(descriptor, termios.TIOCNXCL)
     os.close(descriptor)
@@ -153,11 +150,7 @@ class SerialOpener:
         self._thread: threading.Thread | None = None
 
     async def open(self) -> int:
-        """Return the descriptor of the opened port; when cancelled, whatever is still opened is closed again.
-
-        Raises:
-            LinkError: one line that names the port and the cause.
-        """
+        """Return the descriptor of the opened port, none when cancelled; raise LinkError with port and cause."""
         if self._thread is not None and self._thread.is_alive():
             raise LinkError(f"{self._path}: the driver still hangs in the last attempt to open; replug the device")
         loop = asyncio.get_running_loop()
@@ -179,7 +172,6 @@ class SerialOpener:
         return descriptor
 
     def _attempt(self, loop: asyncio.AbstractEventLoop, opened: asyncio.Future[int]) -> None:
-        """Open the port (in a thread), and hand it over on the loop; close it when nobody waits for it any more."""
         found: int | LinkError
         try:
             found = open_serial(self._path, self._baud, self._parity)

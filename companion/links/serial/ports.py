@@ -47,7 +47,6 @@ class SerialPort:
     latency_timer_ms: int | None
     """FTDI only; above 1 ms the samples of a fast sensor arrive in bunches."""
     holders: tuple[Holder, ...]
-    """Processes that have it open, as far as we may look into them."""
     is_console: bool
     """The kernel's command line names it as a console: its messages would mix with the sensor's bytes."""
 
@@ -120,7 +119,6 @@ def _driver(hardware: Path) -> str | None:
 
 
 def _node_with(root: Path, hardware: Path, attribute: str) -> Path | None:
-    """The nearest node on the way up that has an attribute: the USB device has idVendor."""
     for node in (hardware, *hardware.parents):
         if node == root.resolve():
             return None
@@ -136,7 +134,6 @@ def _usb_description(usb: Path) -> str:
 
 
 def _links_by_device(root: Path) -> dict[str, list[str]]:
-    """Symbolic links in /dev, /dev/serial/by-id and /dev/serial/by-path, by the device that they lead to."""
     found: dict[str, list[str]] = {}
     for folder in ("dev/serial/by-id", "dev/serial/by-path", "dev"):
         for entry in entries(root / folder):

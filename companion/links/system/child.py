@@ -44,7 +44,6 @@ class ChildSettings(msgspec.Struct, frozen=True):
     config: Config
     log_level: str = "INFO"
     only_listening: str | None = None
-    """Why the child must change nothing: `companion check` runs it. None in the daemon."""
 
 
 class ChildWork(Protocol):
@@ -58,10 +57,7 @@ class ChildWork(Protocol):
 
 
 def run_child(make: Callable[[ChildSettings], ChildWork], *, memory_mib: int) -> None:
-    """Run a child process until its daemon ends it or is gone.
-
-    `memory_mib` limits its data (RLIMIT_DATA): beyond it an allocation fails in the child, and the child ends.
-    """
+    """Run a child process until its daemon ends; an allocation beyond `memory_mib` of data ends the child."""
     limit = memory_mib * 1024 * 1024
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     threading.stack_size(STACK_BYTES)

@@ -62,10 +62,7 @@ class Reconnection:
         self._told: tuple[bool, str] | None = None
 
     async def keep(self, once: Callable[[], Awaitable[str]]) -> NoReturn:
-        """Have one connection after another, until cancelled.
-
-        `once` opens one, calls `up`, and returns at its end with the reason, or raises it as a LinkError.
-        """
+        """Connect again and again. `once` calls `up`, and returns why it ended or raises LinkError."""
         loop = asyncio.get_running_loop()
         while True:
             self._up_s = math.inf
@@ -106,7 +103,6 @@ class Reconnection:
 
 
 CONNECT_DEADLINE_S: Final = 2.0
-"""The kernel asks at once and after a second; a host that has come back is asked again within 2 s of that."""
 
 
 def words_of(error: OSError) -> str:
@@ -115,11 +111,7 @@ def words_of(error: OSError) -> str:
 
 
 async def connect_tcp(url: str, address: tuple[str, int]) -> int:
-    """Connect to the first address of a host that answers; return the socket's descriptor.
-
-    Raises:
-        LinkError: one line that names the address and the cause.
-    """
+    """Connect to the first address of a host that answers and return the descriptor; raise LinkError with the cause."""
     host, port = address
     try:
         async with asyncio.timeout(CONNECT_DEADLINE_S):
@@ -185,7 +177,6 @@ class Budget:
         self._bytes_per_s, self._burst_bytes = bytes_per_s, burst_bytes
         self._left, self._t_s = burst_bytes, 0.0
         self.exceeded_s: float | None = None
-        """When it was last empty; None: never."""
 
     def left(self, now_s: float) -> float:
         """How many may be taken."""

@@ -22,15 +22,10 @@ from companion.formats import Object
 LINE_LIMIT: Final = 32 * 1024 * 1024
 """The longest answer, a history of 1000 records, is below 8 MB."""
 READ_TIMEOUT_S: Final = 10.0
-"""A peer that reads nothing for this long is given up."""
 
 
 async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
-    """Send one request to the daemon and yield its replies; the last has kind "result" or "error".
-
-    Raises:
-        DaemonUnreachableError: nobody answers at the socket, or the daemon went away in the middle.
-    """
+    """Send one request and yield the replies; raise DaemonUnreachableError where no daemon answers to the end."""
     try:
         reader, writer = await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)
     except OSError as error:

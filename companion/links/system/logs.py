@@ -28,11 +28,8 @@ BURST: Final = 10.0
 
 @dataclasses.dataclass(slots=True)
 class _Place:
-    """A line of the program that logs."""
-
     budget: Budget = dataclasses.field(default_factory=lambda: Budget(LINES_PER_S, BURST))
     left_out: int = 0
-    """Since the last line that was written."""
 
 
 class LimitedHandler(logging.StreamHandler[TextIO]):

@@ -16,10 +16,7 @@ logger = logging.getLogger(__name__)
 
 
 class ServiceManager:
-    """Tells whoever started us, at a path or "@" and an abstract name; does nothing where nobody wants to be told.
-
-    Within `watchdog_s` of the last `alive` we are taken for hung; None: nobody looks.
-    """
+    """Notify the service manager at a path or "@" name, if any; `watchdog_s`: its limit between two `alive`."""
 
     def __init__(self, address: str | None, watchdog_s: float | None = None) -> None:
         self._address = address or ""
@@ -81,7 +78,6 @@ class ServiceManager:
             self._socket = None
 
     def _send(self, *lines: str) -> bool:
-        """One datagram; False when it could not be delivered (said once) or nobody is there."""
         if self._socket is None:
             return False
         # A name that begins with "@" is in no folder, and begins with a zero to the kernel.

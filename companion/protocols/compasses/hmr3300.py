@@ -91,10 +91,7 @@ class Hmr3300Decoder(LineDecoder):
 
 
 class Hmr3300Dialogue(PollDialogue):
-    """`*Q` asks for one line, and is obeyed only while the stream is stopped.
-
-    `*S` would start the stream, but toggles it: a device that streams behind a bad contact would be stopped.
-    """
+    """`*Q` asks a stopped HMR3300 for one line. `*S` would start the stream, but toggles it, so it is never sent."""
 
     QUESTION = b"*Q\r\n"
     PERIOD_S = 0.125

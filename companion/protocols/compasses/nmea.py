@@ -28,7 +28,6 @@ from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
 HOLD_S: Final = 3.0
-"""How long a sentence keeps its precedence after it was last heard."""
 
 North = Literal["magnetic", "true"] | None
 
@@ -174,7 +173,6 @@ class NmeaDecoder(SentenceDecoder):
 
 
 def _check_statuses(statuses: tuple[bytes, bytes, bytes]) -> None:
-    """Heading, pitch and roll: a tilt beyond its alarm level leaves nothing that could be used."""
     if not _STATUSES.issuperset(statuses):
         raise RejectedError(reasons.NOT_A_MEASUREMENT)
     if b"C" in statuses:
@@ -184,7 +182,6 @@ def _check_statuses(statuses: tuple[bytes, bytes, bytes]) -> None:
 
 
 def _easting(field: bytes, side: bytes) -> float:
-    """A deviation, to the east positive."""
     value = float(field)
     if not 0.0 <= value <= 180.0:
         raise out_of_range(value)

@@ -64,10 +64,7 @@ _UT_PER_GAUSS: Final = 100.0
 
 
 class PniDecoder(FrameDecoder):
-    """Frames of a PNI compass; gives `CompassSample`, and `MagSample` in gauss where the frame has the field.
-
-    A frame with pitch and roll but no heading gives a `TiltSample` (law "euler").
-    """
+    """Frames of a PNI compass; gives `CompassSample`, `MagSample`, and `TiltSample` where there is no heading."""
 
     _little = False
     _contrary = 0
@@ -124,7 +121,6 @@ class PniDecoder(FrameDecoder):
         return samples
 
     def _values(self, buffer: bytes, parts: list[tuple[int, int]]) -> dict[int, float]:
-        """The floats of a frame by component, in the byte order in which they are a measurement."""
         raw = b"".join(buffer[place : place + _SIZES[part]] for part, place in parts)
         names = [part for part, _ in parts for _ in range(_SIZES[part] // 4)]
         big, little = (struct.unpack(f"{order}{len(names)}f", raw) for order in "><")
@@ -142,7 +138,6 @@ class PniDecoder(FrameDecoder):
 
 
 def _possible(names: list[int], values: tuple[float, ...]) -> bool:
-    """Whether all of these can have been measured (a float that is none is in no range)."""
     for part, value in zip(names, values, strict=True):
         least, greatest, smallest = _LIMITS[part]
         if not least <= value <= greatest or 0.0 < abs(value) < smallest or (part == _HEADING and value == 360.0):
@@ -151,7 +146,6 @@ def _possible(names: list[int], values: tuple[float, ...]) -> bool:
 
 
 def _components(buffer: bytes, at: int, end: int) -> list[tuple[int, int]]:
-    """Component and place of its value, as far as they have arrived, of the data frame from `at` to `end`."""
     here, last = at + 4, end - 2
     parts: list[tuple[int, int]] = []
     if at + 3 >= len(buffer):

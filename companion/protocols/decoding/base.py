@@ -22,7 +22,6 @@ from companion.samples import Sample, Vector
 AHEAD_S = 0.5
 """How far a stream may be ahead of its line; beyond, a baud rate means nothing on that port (USB without a UART)."""
 _STALL_S = 10.0
-"""How long bytes may have waited unread."""
 
 
 class RejectedError(Exception):
@@ -51,18 +50,13 @@ class Decoder(ABC):
         self._read_s: float | None = None
         self._ahead_s = 0.0
         self.accepted = 0
-        """Frames that gave samples."""
         self.rejected: Counter[str] = Counter()
         """Frames, or what began like one, that gave none, by reason."""
         self.warned: Counter[str] = Counter()
         """Frames that gave samples and said something against them, by what they said."""
 
     def receive(self, data: bytes, t_s: float) -> list[Sample]:
-        """Take the next bytes, read at `t_s` on the host's clock; return the samples that they complete.
-
-        A sample's time is when it was taken, as well as can be told; a counter and a device clock are unwrapped. A
-        sample whose time cannot be told is counted in `times.dropped`.
-        """
+        """Decode bytes read at `t_s` on the host's clock; return their samples, timed and counted."""
         samples = self.feed(data, t_s)
         if self.seconds_per_byte:
             self._check_line(len(data), t_s)
@@ -80,10 +74,7 @@ class Decoder(ABC):
 
     @abstractmethod
     def feed(self, data: bytes, t_s: float) -> list[Sample]:
-        """Take the next bytes, read at `t_s` on the host's clock; return the samples that they complete, as they came.
-
-        A sample's time is that of its frame's last byte: `t_s` less the line time of what came after it.
-        """
+        """Decode bytes read at `t_s` on the host's clock; a sample's time is that of its frame's last byte."""
 
     @abstractmethod
     def interrupted(self) -> None:
@@ -186,13 +177,9 @@ class SentenceDecoder(Decoder):
 
     @abstractmethod
     def _read(self, body: bytes, t_s: float, samples: list[Sample]) -> None:
-        """Append the samples, one or more, of what stood between "$" and "*"; its checksum was right.
-
-        What is to be counted as rejected raises RejectedError, or ValueError as `float`; nothing was appended then.
-        """
+        """Append the samples of a body with a right checksum; RejectedError or ValueError reject it."""
 
     def _last_sentence(self, text: bytes) -> bytes:
-        """What begins at the last "$" and is not too long yet; the sentences cut short before it are counted."""
         _, *begun = text.split(b"$")
         if not begun:
             return b""
@@ -246,11 +233,7 @@ ANY_TEMPERATURE = 800.0
 
 
 def numbers(fields: list[bytes]) -> list[float]:
-    """Decimal numbers from the fields of a sentence.
-
-    Raises:
-        RejectedError: one of them is not a number, or not a finite one.
-    """
+    """Parse decimal numbers; raise RejectedError unless all are finite."""
     try:
         values = list(map(float, fields))
     except ValueError:
@@ -262,11 +245,7 @@ def numbers(fields: list[bytes]) -> list[float]:
 
 
 def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | None) -> None:
-    """Check one sample of an IMU.
-
-    Raises:
-        RejectedError: a value is not finite, or beyond what any IMU can measure.
-    """
+    """Raise RejectedError where a value of an IMU is not finite, or beyond what any IMU can measure."""
     gx, gy, gz = gyro_rad_s
     ax, ay, az = accel_m_s2
     temperature = temperature_degc or 0.0
@@ -292,11 +271,7 @@ def out_of_range(value: float) -> RejectedError:
 
 
 def full_circle(heading_deg: float) -> float:
-    """The same heading, where a device has rounded 359.96 to 360.0.
-
-    Raises:
-        RejectedError: it is beyond a circle.
-    """
+    """Return the heading, with 360.0 (359.96 rounded) as 0; raise RejectedError beyond a circle."""
     if heading_deg == 360.0:
         return 0.0
     if not 0.0 <= heading_deg < 360.0:
@@ -305,17 +280,12 @@ def full_circle(heading_deg: float) -> float:
 
 
 def check_vector(vector: Vector) -> None:
-    """Check a vector for which no limit is known.
-
-    Raises:
-        RejectedError: a component is not finite.
-    """
+    """Raise RejectedError where a component is not finite."""
     if not math.isfinite(sum(vector)):
         raise RejectedError(reasons.NON_FINITE)
 
 
 WAIT: Final = -1
-"""More bytes are needed to tell."""
 ECHO: Final = "echo of a command"
 """Our own words, or another master's, on a line that both sides hear."""
 
@@ -361,10 +331,7 @@ class FrameDecoder(Decoder):
 
     @abstractmethod
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        """Read what begins at `at`, of which `origin` is the buffer's place in the stream.
-
-        Returns where to go on, always further on, or `WAIT`. How much of it has arrived must not change the outcome.
-        """
+        """Parse at `at` (`origin`: stream position of the buffer); return where to go on, or `WAIT`."""
 
     def _skip_to(self, start: bytes, buffer: bytes, at: int) -> int:
         found = buffer.find(start, at)
@@ -383,7 +350,6 @@ class FrameDecoder(Decoder):
         return end
 
     def _accept(self, samples: list[Sample], found: Callable[..., list[Sample]], *arguments: object, end: int) -> int:
-        """Take in what `found(*arguments)` reads in a whole frame, which may reject it, and go on at `end`."""
         try:
             samples += found(*arguments)
             self.accepted += 1
@@ -392,7 +358,6 @@ class FrameDecoder(Decoder):
         return end
 
     def _time_of(self, end: int) -> float:
-        """When the byte before stream position `end` was on the line."""
         chunks = self._chunks
         while chunks[0][0] < end:
             chunks.popleft()

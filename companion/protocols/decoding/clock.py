@@ -46,12 +46,10 @@ class DeviceClock:
 
     def __init__(self, wraps_s: float | None) -> None:
         self.restarts = 0
-        """How often the device was seen to restart: its clock went back, or counts from a time when nothing was heard.
-        """
+        """How often the device was seen to restart."""
         self.jumps = 0
         """How often its clock jumped forward, or fell behind without a restart."""
         self.device_s = 0.0
-        """The clock as of the last sample, unwrapped."""
         self._wraps_s = wraps_s
         self._raw_s = math.nan
         self._arrival_s = math.nan
@@ -151,10 +149,7 @@ class SampleTimes:
         self._newest_s = -math.inf
 
     def place(self, samples: list[Sample], read_s: float, frame_s: float = 0.0) -> list[Sample]:
-        """The samples of one feed, timed when their frame's last byte had come, with their times; some get none.
-
-        They were taken before the first byte of a frame, `frame_s` long, was sent.
-        """
+        """Place the samples of one feed, timed at their frame's last byte; `frame_s`: line time of a frame."""
         placed: list[Sample] = []
         frame_at_s, frame_t_s = math.nan, math.nan
         clock = self.clock

@@ -40,10 +40,7 @@ class Dialogue(ABC):
 
 
 class PollDialogue(Dialogue):
-    """Asks for one reading after another, each only after the answer to the last; silent while the device speaks.
-
-    What the device says without having been asked ends the asking, until it has been silent for `SILENT_S` again.
-    """
+    """Poll one reading after another, each after the answer to the last; silent while the device streams by itself."""
 
     QUESTION: ClassVar[bytes]
     SET_UP: ClassVar[bytes] = b""
@@ -52,7 +49,6 @@ class PollDialogue(Dialogue):
     NAME: ClassVar[str]
     _quiet_until_s = _next_s = 0.0
     _asked_s: float | None = None
-    """When the question was put that has not been answered yet."""
     _since_asked = 0
     _set_up = False
     _unanswered = 0

@@ -55,7 +55,6 @@ def fletcher(data: bytes) -> bytes:
 
 
 def _decode(buffer: bytes, at: int, stop: int, t_s: float) -> list[Sample]:
-    """The samples in a packet that begins at `at`, whose checksum is right and begins at `stop`."""
     if buffer[at + 2] != _SENSOR_DATA:
         raise RejectedError(reasons.REPLY if buffer[at + 2] < _SENSOR_DATA else reasons.NOTHING_OF_USE)
     found: dict[int, Vector] = {}

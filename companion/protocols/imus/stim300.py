@@ -152,12 +152,10 @@ class Stim300Decoder(FrameDecoder):
         self._forget()
 
     def _forget(self) -> None:
-        """It may be another device, or the same with other settings."""
         self._in_step = True
         self._accel_bits = [_ASSUMED_BITS] * 3
         self._range_known = False
         self._rest_bits = self._rest_ticks = 0
-        """The range in which gravity has been seen, and for how long."""
         self._counter: int | None = None
         self._imu_unit_right = self._inclination_unit_right = True
 
@@ -188,7 +186,6 @@ class Stim300Decoder(FrameDecoder):
         return self._accept(samples, self._decode, layout, frame, self._time_of(origin + end), end=end)
 
     def _special(self, identifier: int, frame: bytes) -> None:
-        """Learn the ranges and units from a configuration datagram."""
         if identifier not in CONFIGURATION:
             return
         codes = (frame[_ACCEL_RANGE] >> 4, frame[_ACCEL_RANGE] & 0x0F, frame[_ACCEL_RANGE + 1] >> 4)
@@ -201,7 +198,6 @@ class Stim300Decoder(FrameDecoder):
         self._inclination_unit_right = frame[_INCLINATION_UNIT] & 0x0D == 0
 
     def _decode(self, layout: Layout, frame: bytes, t_s: float) -> list[Sample]:
-        """The samples in one normal mode datagram."""
         values = layout.values.unpack_from(frame)
         counter, latency_us = values[layout.counter], values[layout.counter + 1]
         t_s -= latency_us * 1e-6
@@ -278,7 +274,6 @@ def _int24(values: tuple[int, ...], at: int) -> Vector:
 
 
 def _temperature(values: tuple[int, ...], at: int | None) -> float | None:
-    """The mean of three; None where there is none, or its status is not good."""
     if at is None or values[at + 3]:
         return None
     return (values[at] + values[at + 1] + values[at + 2]) / 768.0

@@ -85,11 +85,7 @@ _PARTS = {
 
 
 def header_bytes(groups: int) -> int:
-    """The length of a header, from the sync byte to the last mask, that announces these groups.
-
-    Raises:
-        RejectedError: a group that is not known here, or none.
-    """
+    """Return the length of a header with these groups; raise RejectedError for an unknown group, or none."""
     if groups == 0 or groups & ~_KNOWN_GROUPS:
         raise RejectedError(reasons.UNKNOWN_GROUP)
     return 2 + 2 * groups.bit_count()
@@ -107,11 +103,7 @@ class Layout:
     temperature: int | None
 
     def samples(self, frame: bytes, start: int, t_s: float) -> list[Sample]:
-        """The samples in a frame that begins at `start` and has passed its CRC.
-
-        Raises:
-            RejectedError: a value is not finite or out of range, or there is nothing of use in it.
-        """
+        """Return the samples of a frame at `start` with a right CRC; raise RejectedError where none is of use."""
         values = self.payload.unpack_from(frame, start + self.payload_offset)
         if self.imu is None:
             raise RejectedError(reasons.NOTHING_OF_USE)
@@ -125,11 +117,7 @@ class Layout:
 
 
 def layout_of(header: bytes) -> Layout:
-    """Read a whole header.
-
-    Raises:
-        RejectedError: a field that is not known here, or a group without fields.
-    """
+    """Parse a whole header; raise RejectedError for an unknown field, or a group without fields."""
     places: dict[str, int] = {}
     code, count = "<", 0
     masks = iter(struct.unpack_from(f"<{len(header) // 2 - 1}H", header, 2))
@@ -161,7 +149,6 @@ def _first(places: dict[str, int], names: tuple[str, ...]) -> int | None:
 
 
 def _pair(places: dict[str, int]) -> tuple[int, int] | None:
-    """Where rate and acceleration stand: both compensated, else both uncompensated, else whatever there is."""
     for kind in (slice(0, 2), slice(2, 4), slice(0, 4)):
         gyro, accel = _first(places, _RATES[kind]), _first(places, _ACCELERATIONS[kind])
         if gyro is not None and accel is not None:
@@ -203,7 +190,6 @@ class VectorNavDecoder(FrameDecoder):
         return match.start() if match else len(buffer)
 
     def _binary(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        """Where to go on after what begins with a sync byte, or `WAIT` for more bytes."""
         available, header = len(buffer) - at, self._header
         layout = self._layouts.get(header) if header and buffer.startswith(header, at) else None
         if layout is None:
@@ -230,7 +216,6 @@ class VectorNavDecoder(FrameDecoder):
         return self._accept(samples, layout.samples, buffer, at, self._time_of(origin + end), end=end)
 
     def _sentence(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        """Where to go on after what begins with a "$", or `WAIT` for more bytes."""
         begin = buffer[at : at + 3]
         if not b"$VN".startswith(begin):
             return at + 1
@@ -252,7 +237,6 @@ _SENTENCES: dict[bytes, tuple[int, slice, slice]] = {
 
 
 def _decode(sentence: bytes, t_s: float) -> list[Sample]:
-    """The samples in one sentence, `$VN...*hh`."""
     head, *fields = body_of_sentence(sentence).split(b",")
     if head == b"VNERR":
         raise RejectedError("VNERR")

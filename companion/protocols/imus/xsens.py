@@ -75,7 +75,6 @@ class XsensDecoder(FrameDecoder):
         return self._accept(samples, self._decode, buffer, data, end - 1, self._time_of(origin + end), end=end)
 
     def _decode(self, buffer: bytes, field: int, stop: int, t_s: float) -> list[Sample]:
-        """The samples in the fields from `field` to `stop` of a message whose checksum is right."""
         vectors: dict[int, Vector] = {}
         counter: int | None = None
         t_device_s: float | None = None
@@ -126,7 +125,6 @@ def _unsigned(data: bytes, size: int) -> int:
 
 
 def _numbers(data: bytes, number_format: int, count: int) -> list[float]:
-    """`count` numbers in one of the four formats."""
     if number_format == 2:
         if len(data) != 6 * count:
             raise RejectedError(reasons.FIELD_COUNT)

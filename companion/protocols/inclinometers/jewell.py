@@ -64,7 +64,6 @@ class JewellDecoder(LineDecoder):
 
 
 def _why(text: bytes, *, cut: bool) -> str:
-    """Why this is no line, or no line any more."""
     if DAMAGED.search(text):
         return reasons.PARITY
     if cut:
@@ -96,7 +95,6 @@ def _reading(text: bytes, t_s: float) -> TiltSample:
 
 
 def _degrees(field: bytes, unit: bytes) -> float:
-    """A tilt of an XDR sentence."""
     if _TILTS[unit].fullmatch(field) is None:
         raise RejectedError(reasons.NOT_A_MEASUREMENT)
     return float(field) if unit == b"D" else math.degrees(float(field) * 1e-6)

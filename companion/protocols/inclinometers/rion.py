@@ -66,7 +66,6 @@ class RionDecoder(FrameDecoder):
 
 
 def _measurement(data: bytes, t_s: float) -> Sample:
-    """The angles of an answer, by its length."""
     if len(data) == 9:
         pitch_deg, roll_deg, heading_deg = (_degrees(data[at : at + 3], 100) for at in (0, 3, 6))
         if not 0.0 <= heading_deg < 360.0 or max(abs(pitch_deg), abs(roll_deg)) > 90.0:
