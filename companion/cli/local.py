@@ -89,7 +89,6 @@ def add_commands(add: AddCommand) -> None:
         service.add_argument(
             "--prefix", type=Path, default=Path("/usr/local"), help="whose lib takes the unit (default /usr/local)"
         )
-        service.add_argument("--dry-run", action="store_true", help="only tell what would be done")
         if command is install:
             service.add_argument("--executable", metavar="PATH", help="the companion (default: the one that runs this)")
     sub = add("report", report, "make a page (one HTML file) of a calibration or flight: needs no daemon, no network")
@@ -248,21 +247,19 @@ async def uninstall(options: argparse.Namespace) -> int:
 def _target(options: argparse.Namespace, executable: str) -> Target:
     from companion.installation.install import Target
 
-    return Target(Path(options.root).absolute(), options.prefix, executable, dry_run=options.dry_run)
+    return Target(Path(options.root).absolute(), options.prefix, executable)
 
 
 def _tell(options: argparse.Namespace, steps: Iterable[Step]) -> int:
     done: list[Step] = []
     for step in steps:
         done.append(step)
-        print_lines(step.line(dry_run=options.dry_run), error=options.json)
+        print_lines(step.line(), error=options.json)
     failed = [step for step in done if step.outcome == "failed"]
     if options.json:
         reason = "; ".join(f"{step.what}: {step.words}" for step in failed)
-        state = "failed" if failed else "would be done" if options.dry_run else "done"
+        state = "failed" if failed else "done"
         print_json({"state": state, "reason": reason, "steps": [dataclasses.asdict(step) for step in done]})
-    elif options.dry_run:
-        print_lines("this was a dry run: nothing was changed", error=True)
     return FAILED if failed else DONE
 
 

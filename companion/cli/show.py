@@ -162,7 +162,6 @@ def _counts(device: Object) -> str:
         "repeated": (device.get("dropped") or {}).get("repeated"),
         "too late": device.get("too_late"),
         "restarts": device.get("restarts"),
-        "clock jumps": device.get("clock_jumps"),
     }
     return "".join(f"; {number} {what}" for what, number in words.items() if number)
 

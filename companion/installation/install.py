@@ -95,22 +95,15 @@ Run = Callable[[Sequence[str]], str | None]
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One thing that was, or with a dry run would be, done."""
+    """One thing that was done."""
 
     what: str
     outcome: Outcome
     words: str = ""
 
-    def line(self, *, dry_run: bool = False) -> str:
+    def line(self) -> str:
         """For people."""
-        outcome = _WOULD.get(self.outcome, self.outcome) if dry_run else self.outcome
-        return f"{outcome:{13 if dry_run else 9}}  {self.what}" + (f": {self.words}" if self.words else "")
-
-
-_WOULD: Final[dict[Outcome, str]] = {
-    "written": "would write", "updated": "would update", "removed": "would remove", "done": "would do",
-}  # fmt: skip
-"""What is said of a step that a dry run leaves out; what is only found is said as ever."""
+        return f"{self.outcome:9}  {self.what}" + (f": {self.words}" if self.words else "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +114,6 @@ class Target:
     prefix: Path
     """Whose `lib` takes what is ours."""
     executable: str
-    dry_run: bool = False
 
     @property
     def is_this_machine(self) -> bool:
@@ -147,21 +139,20 @@ def install(target: Target, run: Run | None = None) -> Iterator[Step]:
     """Install step by step; raise CompanionError for another user, or where a package has brought the service."""
     if target.is_this_machine:
         _check_not_packaged(_START_PACKAGED)
-        _check_user(target, "install-service")
+        _check_user("install-service")
         _check_reach(target.executable)
     for shipped in OURS:
-        wanted = stamped(content(shipped, executable=target.executable))
-        yield _put(target, target.path(shipped), wanted)
+        yield _put(target.path(shipped), stamped(content(shipped, executable=target.executable)))
     yield _configuration(target, "yours; what is new is in companion.toml.sample", "sudo companion setup makes it")
     if target.is_this_machine:
-        yield from _activate(target, run or _run)
+        yield from _activate(run or _run)
 
 
 def start_service(run: Run | None = None) -> Iterator[Step]:
     """Have the service run now and at every boot; raise CompanionError as `install`."""
     if _is_packaged():
         for command in ("enable", "restart"):
-            yield _command(_HERE, run or _run, "systemctl", command, "companion.service")
+            yield _command(run or _run, "systemctl", command, "companion.service")
         return
     yield from install(dataclasses.replace(_HERE, executable=own_executable()), run)
 
@@ -175,35 +166,28 @@ def uninstall(target: Target, run: Run | None = None) -> Iterator[Step]:
     """Remove what `install` wrote; configuration and records stay. Raise CompanionError as `install`."""
     if target.is_this_machine:
         _check_not_packaged("sudo apt remove companion")
-        _check_user(target, "uninstall-service")
+        _check_user("uninstall-service")
         if systemd_runs():
-            yield _command(target, run or _run, "systemctl", "disable", "--now", "companion.service")
-            yield _command(target, run or _run, "systemctl", "stop", "companion-setup.service")
+            yield _command(run or _run, "systemctl", "disable", "--now", "companion.service")
+            yield _command(run or _run, "systemctl", "stop", "companion-setup.service")
     for shipped in OURS:
-        yield _take(target, target.path(shipped))
+        yield _take(target.path(shipped))
     yield _configuration(target, "yours")
     if target.is_this_machine:
-        yield from _reload(target, run or _run)
+        yield from _reload(run or _run)
     state = target.root / "var/lib/private/companion"
     if state.is_dir():
         yield Step(str(state), "kept", "records and values for undo; remove it if they are not wanted any more")
 
 
-def _put(target: Target, path: Path, wanted: bytes) -> Step:
+def _put(path: Path, wanted: bytes) -> Step:
     found = _read(path)
     if found == wanted:
         return Step(str(path), "unchanged")
-    if found is None:
-        return _write(target, path, wanted, "written")
-    if is_untouched(found):
-        return _write(target, path, wanted, "updated")
-    return Step(str(path), "kept", "changed by hand; remove it to get the new one")
-
-
-def _write(target: Target, path: Path, data: bytes, outcome: Outcome, words: str = "") -> Step:
-    if not target.dry_run:
-        write_atomically(path, data, mode=MODE, parents=True)
-    return Step(str(path), outcome, words)
+    if found is not None and not is_untouched(found):
+        return Step(str(path), "kept", "changed by hand; remove it to get the new one")
+    write_atomically(path, wanted, mode=MODE, parents=True)
+    return Step(str(path), "written" if found is None else "updated")
 
 
 def _configuration(target: Target, there: str, absent: str = "") -> Step:
@@ -211,14 +195,13 @@ def _configuration(target: Target, there: str, absent: str = "") -> Step:
     return Step(str(path), "kept", there) if path.exists() else Step(str(path), "absent", absent)
 
 
-def _take(target: Target, path: Path) -> Step:
+def _take(path: Path) -> Step:
     found = _read(path)
     if found is None:
         return Step(str(path), "absent")
     if not is_untouched(found):
         return Step(str(path), "kept", "changed by hand")
-    if not target.dry_run:
-        remove_durably(path)
+    remove_durably(path)
     return Step(str(path), "removed")
 
 
@@ -243,8 +226,8 @@ def _check_not_packaged(instead: str) -> None:
         raise CompanionError(f"this companion is a Debian package, and its service came with it: {instead}")
 
 
-def _check_user(target: Target, command: str) -> None:
-    if os.geteuid() != 0 and not target.dry_run:
+def _check_user(command: str) -> None:
+    if os.geteuid() != 0:
         raise CompanionError(f"this needs root: sudo {own_executable()} {command}")
 
 
@@ -278,26 +261,26 @@ def unreachable(path: Path) -> str | None:
     return None
 
 
-def _activate(target: Target, run: Run) -> Iterator[Step]:
+def _activate(run: Run) -> Iterator[Step]:
     if not systemd_runs():
         yield Step("systemd", "skipped", "does not run here: nothing was started")
         return
-    yield from _reload(target, run)
-    yield _command(target, run, "systemctl", "enable", "companion.service")
-    yield _command(target, run, "systemctl", "restart", "companion.service")
+    yield from _reload(run)
+    yield _command(run, "systemctl", "enable", "companion.service")
+    yield _command(run, "systemctl", "restart", "companion.service")
 
 
-def _reload(target: Target, run: Run) -> Iterator[Step]:
+def _reload(run: Run) -> Iterator[Step]:
     if not systemd_runs():
         return
-    yield _command(target, run, "systemctl", "daemon-reload")
-    yield _command(target, run, "systemctl", "restart", "systemd-modules-load.service")
+    yield _command(run, "systemctl", "daemon-reload")
+    yield _command(run, "systemctl", "restart", "systemd-modules-load.service")
     if not UDEV_RUNS.exists():
         yield Step("udev", "skipped", "does not run here: its rules hold from the next start on")
     else:
-        yield _command(target, run, "udevadm", "control", "--reload")
+        yield _command(run, "udevadm", "control", "--reload")
         subsystems = ("--subsystem-match=tty", "--subsystem-match=usb-serial")
-        yield _command(target, run, "udevadm", "trigger", *subsystems)
+        yield _command(run, "udevadm", "trigger", *subsystems)
 
 
 def systemd_runs() -> bool:
@@ -311,10 +294,8 @@ def is_service() -> bool:
     return systemd_runs() and any(Path(folder, "systemd/system", SERVICE.source).exists() for folder in folders)
 
 
-def _command(target: Target, run: Run, *words: str) -> Step:
+def _command(run: Run, *words: str) -> Step:
     line = " ".join(words)
-    if target.dry_run:
-        return Step(line, "done")
     why = run(words)
     return Step(line, "done") if why is None else Step(line, "failed", why)
 

@@ -7,6 +7,7 @@ One device on one port may be IMU, gradienter and compass at once. A decoder giv
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -40,7 +41,7 @@ class ProtocolInfo:
     baud: int
     parity: Literal["none", "even", "odd"]
     decoder: type[Decoder]
-    dialogue: type[Dialogue] | None = None
+    dialogue: Callable[[], Dialogue] | None = None
     """What has to be said to it; None for a device that speaks by itself or that we have nothing safe to say to."""
     lag_s: float = 0.0
     """Time constant with which its reading follows the truth: fluid, pendulum, filters."""

@@ -16,6 +16,7 @@ from companion.links.serial.bytestream import ByteLink
 from companion.links.serial.ports import find_holders
 from companion.links.system.connection import Budget
 from companion.links.system.listeners import Listeners
+from companion.protocols.decoding.clock import LATE
 from companion.protocols.registry import Kind
 from companion.protocols.stream_health import SILENT_AFTER_S
 from companion.samples import CompassSample, Sample
@@ -90,7 +91,8 @@ class SensorRole:
             "reconnects": sensor.link.reconnects,
             "words": words,
             "shared_with": others,
-            **sensor.decoder.times.status(),
+            "restarts": sensor.decoder.times.clock.breaks,
+            "too_late": sensor.decoder.times.dropped[LATE],
             **sensor.health.status(),
         }
 

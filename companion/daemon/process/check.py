@@ -16,12 +16,11 @@ import msgspec
 from companion.autopilot.firmware.firmwares import port_needs
 from companion.config.sections import UNKNOWN, Config, Imu
 from companion.configured.models import SerialDevice, baud_of, cannot_work, doubtful, serial_devices
-from companion.daemon.devices.sensor_health import ABSENT
 from companion.daemon.faces.control import process_behind
 from companion.daemon.process.service import Service
 from companion.errors import DaemonDeniedError, DaemonUnreachableError
 from companion.formats import Object
-from companion.links.serial.faults import port_faults, same_ports, unnamed
+from companion.links.serial.faults import port_faults, same_ports
 from companion.links.serial.listening import Heard, listen_to_all
 from companion.links.serial.ports import ROOT, list_ports
 from companion.links.system.control_client import ask
@@ -41,13 +40,12 @@ _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line of the check: whose, whether all is well, in words, what to type (empty: nothing), and of which port."""
+    """One line of the check: whose, whether all is well, in words, and what to type (empty: nothing)."""
 
     name: str
     good: bool
     words: str
     remedy: str = ""
-    port: str = ""
 
     @property
     def verdict(self) -> Literal["ok", "warning", "wrong"]:
@@ -68,28 +66,19 @@ def _ports(config: Config) -> dict[str, str]:
     return ports
 
 
-def where_it_may_be(config: Config, root: Path = ROOT) -> Finding | None:
-    """Where a device may be whose port is not there; None where nothing else is plugged in."""
-    free = unnamed(list_ports(root), list(_ports(config).values()), root)
-    if not free:
-        return None
-    words = f"not in the configuration: {', '.join(free)}; companion ports --listen tells what is there"
-    return Finding("ports", good=False, words=words, remedy="companion ports --listen")
-
-
 def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> list[Finding]:
     """What the system has against the configured ports."""
     ports = _ports(config)
     among = list_ports(root)
     fast = {sensor.name for sensor in serial_devices(config) if sensor.kind == "imu"}
     found = [
-        Finding(name, fault.good, str(fault), fault.remedy, port)
+        Finding(name, fault.good, str(fault), fault.remedy)
         for name, port in ports.items()
         for fault in port_faults(port, is_fast=name in fast, ours=ours, among=among, root=root)
     ]
     for first, second, device in same_ports(ports, root):
-        words = f"{first} and {second} are one and the same port, {device}"
-        found.append(Finding(second, good=False, words=f"{words}: give each its own", remedy="", port=device))
+        words = f"{first} and {second} are one and the same port, {device}: give each its own"
+        found.append(Finding(second, good=False, words=words))
     return found
 
 
@@ -112,7 +101,7 @@ async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -
 def _explain(sensor: SerialDevice, device: Object, heard: Heard | str | None, *, may_listen: bool) -> list[Finding]:
     def bad(words: str, remedy: str = "") -> list[Finding]:
         said = f"{words}: {remedy}" if remedy else words
-        return [Finding(sensor.name, good=False, words=said, remedy=remedy, port=sensor.port)]
+        return [Finding(sensor.name, good=False, words=said, remedy=remedy)]
 
     if isinstance(heard, str):
         return []  # its device's own line has said so
@@ -189,8 +178,7 @@ async def run_check(
     findings.append(_autopilot(config, vehicle))
     if (signing := vehicle["signing"]) is not None:
         findings.append(Finding("signing", good=signing["good"], words=signing["summary"]))
-    elsewhere = where_it_may_be(config)
-    findings += [_device(device, elsewhere) for device in status["devices"]]
+    findings += [Finding(device["name"], device["good"], device["summary"]) for device in status["devices"]]
     findings += system_findings(config, list(ours))
     findings += await sensor_findings(config, status, may_listen=not is_running)
     findings += [Finding("warning", good=True, words=words) for words in status["warnings"]]
@@ -245,13 +233,6 @@ def _autopilot(config: Config, vehicle: Object) -> Finding:
         needs = f"{port_needs(None, baud)}; TX to RX"
     remedy = f"{needs}; companion setup looks for it elsewhere"
     return Finding("autopilot", good=False, words=f"{vehicle['summary']}: {remedy}", remedy=remedy)
-
-
-def _device(device: Object, elsewhere: Finding | None) -> Finding:
-    name, words, port = device["name"], device["summary"], device.get("port", "")
-    if device.get("trouble") == ABSENT and port.startswith("/") and not os.path.exists(port) and elsewhere is not None:
-        return Finding(name, good=False, words=f"{words}; {elsewhere.words}", remedy=elsewhere.remedy, port=port)
-    return Finding(name, device["good"], words, port=port)
 
 
 def _profile(profile: Object) -> Finding:

@@ -56,10 +56,9 @@ FLUSH_S: Final = 1.0
 RETRY_S: Final = 60.0
 DEFAULT_MB: Final = 64
 """Default size of the ring: some 100 minutes of a 200 Hz IMU beside 100 Hz telemetry."""
-MOST_FILE_BYTES: Final = 4 << 30
-"""Size at which a recording of a stated length ends: no more fits into a file on many USB sticks."""
-MOST_OPEN_END_BYTES: Final = 1 << 30
-"""Size at which a recording without a stated length ends: 27 hours of a 200 Hz IMU beside 100 Hz telemetry."""
+MOST_BYTES: Final = 4 << 30, 1 << 30
+"""Sizes at which a recording with and without a stated length ends: what fits into a file on many USB sticks, and 27
+hours of a 200 Hz IMU beside 100 Hz telemetry."""
 PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
 INTERNAL: Final = "internal error; the log has the details"
@@ -81,12 +80,8 @@ class _OnRequest:
     """Messages that were lost in all when it began."""
     since_s: float
     until_s: float | None
+    most_bytes: int
     ended: asyncio.Future[Object]
-
-    @property
-    def most_bytes(self) -> int:
-        """Size at which it ends by itself."""
-        return MOST_OPEN_END_BYTES if self.until_s is None else MOST_FILE_BYTES
 
 
 class Recorder(Subsystem):
@@ -158,12 +153,9 @@ class Recorder(Subsystem):
 
     def _on_measured(self, window: Window) -> None:
         collector = self._core.collector
+        begun_s, turn, wander_deg = collector.begun_s, collector.turn, collector.wander_deg
         measured = Measured(
-            start_s=window.start_s,
-            end_s=window.end_s,
-            wander_deg=collector.wander_deg,
-            begun_s=collector.begun_s,
-            turn=collector.turn,
+            start_s=window.start_s, end_s=window.end_s, wander_deg=wander_deg, begun_s=begun_s, turn=turn
         )
         self.tape.put(messages.MEASURED, _now_s(), messages.encode(measured))
 
@@ -257,7 +249,10 @@ class Recorder(Subsystem):
             if ring.is_full and not self._manager.state.busy:
                 await self._in_thread(ring.close)
         except StorageError as error:
-            self._stop_ring(str(error))
+            self._ring_again_s = _now_s() + RETRY_S
+            # Logged once: it may stay so for the whole day.
+            logger.log(logging.WARNING if self.fault is None else logging.DEBUG, "recordings: %s", error)
+            self.fault = str(error)
         else:
             if self.fault is not None:
                 logger.info("recordings: written again")
@@ -280,12 +275,6 @@ class Recorder(Subsystem):
         except Exception as error:
             logger.exception("recordings: internal error")
             raise StorageError(INTERNAL) from error
-
-    def _stop_ring(self, why: str) -> None:
-        self._ring_again_s = _now_s() + RETRY_S
-        # Said once: it may stay so for the whole day.
-        logger.log(logging.WARNING if self.fault is None else logging.DEBUG, "recordings: %s", why)
-        self.fault = why
 
     async def _flush_file(self, recording: _OnRequest, batch: list[Message], beginning: Beginning) -> None:
         try:
@@ -346,7 +335,9 @@ class Recorder(Subsystem):
             raise
         now_s = loop.time()
         until_s = None if seconds is None else now_s + seconds
-        recording = self._on_request = _OnRequest(file, self.tape.lost_in_all, now_s, until_s, loop.create_future())
+        recording = self._on_request = _OnRequest(
+            file, self.tape.lost_in_all, now_s, until_s, MOST_BYTES[seconds is None], loop.create_future()
+        )
         if not self.tape.is_on:
             self._begin()
         logger.info("recording to %s", path)
@@ -361,25 +352,28 @@ class Recorder(Subsystem):
         self._on_request = None
         if self._ring is None:
             self.tape.end()
-        size = recording.file.bytes_written
         try:
             await self._in_thread(recording.file.close)
         except StorageError as error:
             why, state = str(error), "failed"
-        seconds = _now_s() - recording.since_s
         logger.log(logging.INFO if state == "done" else logging.WARNING, "recording ended: %s", why)
         recording.ended.set_result(
             {
                 "state": state,
                 "reason": why,
                 "file": str(recording.file.path),
-                "seconds": round(seconds, 1),
-                "bytes": size,
                 "most_bytes": recording.most_bytes,
                 "messages": recording.file.messages,
-                "lost": self.tape.lost_in_all - recording.lost_before,
+                **self._progress(recording),
             }
         )
+
+    def _progress(self, recording: _OnRequest) -> Object:
+        return {
+            "seconds": round(_now_s() - recording.since_s, 1),
+            "bytes": recording.file.bytes_written,
+            "lost": self.tape.lost_in_all - recording.lost_before,
+        }
 
     def tasks(self) -> Sequence[Task]:  # noqa: D102
         return [("recorder", self.run)]
@@ -389,17 +383,8 @@ class Recorder(Subsystem):
         recording: Object = {
             "fault": self.fault,
             "lost": self.tape.lost_in_all,
-            "ring": None
-            if ring is None
-            else {"directory": str(ring.folder), "bytes": ring.bytes_in_all, "most_bytes": ring.most_bytes},
-            "file": None
-            if asked is None
-            else {
-                "path": str(asked.file.path),
-                "seconds": round(_now_s() - asked.since_s, 1),
-                "bytes": asked.file.bytes_written,
-                "lost": self.tape.lost_in_all - asked.lost_before,
-            },
+            "ring": ring and {"directory": str(ring.folder), "bytes": ring.bytes_in_all, "most_bytes": ring.most_bytes},
+            "file": None if asked is None else {"path": str(asked.file.path), **self._progress(asked)},
         }
         return {"recording": recording}
 

@@ -17,9 +17,7 @@ from companion.links.serial.ports import ROOT, Holder, SerialPort, entries, list
 SLOW_TIMER_MS: Final = 1
 _GETTY: Final = re.compile(r"a?getty|login|mgetty|getty")
 _USUAL_MODEMS_FREE: Final = ("ID_MM_DEVICE_IGNORE", "ID_MM_PORT_IGNORE", "ID_MM_TTY_BLACKLIST")
-_MINI_UART: Final = re.compile(r"bcm2835-aux-uart")
 _PASSING: Final = re.compile(r"/dev/tty(USB|ACM)\d+")
-_MOST_NAMED: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,24 +46,7 @@ def port_faults(
     faults += [_second_reader(device, holder) for holder in holders if holder.pid not in said]
     if found is None:
         return faults
-    faults += _timer(found, is_fast=is_fast)
-    faults += _name(port, found)
-    if found.driver is not None and _MINI_UART.search(found.driver):
-        faults.append(
-            PortFault(
-                f"{device} is the Raspberry Pi's mini-UART: its speed follows the core's clock, and it has no parity",
-                "dtoverlay=disable-bt in /boot/firmware/config.txt puts the good UART there; then a reboot",
-                good=True,
-            )
-        )
-    return faults
-
-
-def unnamed(ports: Sequence[SerialPort], configured: Sequence[str], root: Path = ROOT) -> list[str]:
-    """Ports that the configuration does not name, each by its best name: where a lost device may be."""
-    named = {resolve(root, port) for port in configured}
-    free = [port.stable_name or port.device for port in ports if port.device not in named]
-    return free[:_MOST_NAMED]
+    return [*faults, *_timer(found, is_fast=is_fast), *_name(port, found)]
 
 
 def same_ports(configured: dict[str, str], root: Path = ROOT) -> list[tuple[str, str, str]]:

@@ -11,6 +11,7 @@ is believed only if it follows a whole line end: the rest "3.4, 18.6, -0.5" of a
 
 from __future__ import annotations
 
+import functools
 import re
 from typing import ClassVar
 
@@ -90,9 +91,5 @@ class Hmr3300Decoder(LineDecoder):
         return CompassSample(t_s, heading_deg)
 
 
-class Hmr3300Dialogue(PollDialogue):
-    """`*Q` asks a stopped HMR3300 for one line. `*S` would start the stream, but toggles it, so it is never sent."""
-
-    QUESTION = b"*Q\r\n"
-    PERIOD_S = 0.125
-    NAME = "*Q"
+# One line, while the stream is stopped. `*S` would start the stream, but toggles it, so it is never sent.
+Hmr3300Dialogue = functools.partial(PollDialogue, b"*Q\r\n", "*Q", period_s=0.125)

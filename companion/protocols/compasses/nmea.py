@@ -19,6 +19,7 @@ for HPR: that one is corrected for whatever has been entered in the device.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Final, Literal
 
@@ -202,13 +203,6 @@ def _tilt(field: bytes) -> float:
     return value
 
 
-class Hmr3000Dialogue(PollDialogue):
-    """`$PTNT,HPR*78` to an HMR3000, which comes with all its sentences switched off; to others an unknown sentence.
-
-    It measures 13.75 times a second (HMR3000 manual, p. 8). It could be told to stream, but keeps the rates of its
-    sentences in EEPROM (3.8).
-    """
-
-    QUESTION = b"$PTNT,HPR*78\r\n"
-    PERIOD_S = 0.1
-    NAME = "$PTNT,HPR*78"
+# For an HMR3000, which comes with all its sentences switched off; an unknown sentence to others. It measures 13.75
+# times a second (HMR3000 manual, p. 8). To stream it would have to keep the rates of its sentences in EEPROM (3.8).
+Hmr3000Dialogue = functools.partial(PollDialogue, b"$PTNT,HPR*78\r\n", "$PTNT,HPR*78", period_s=0.1)

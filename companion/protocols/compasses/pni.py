@@ -15,9 +15,10 @@ what is a measurement in only one of them says which it is, twice running before
 from __future__ import annotations
 
 import binascii
+import functools
 import math
 import struct
-from typing import ClassVar, Final
+from typing import Final
 
 from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import ECHO, WAIT, FrameDecoder, RejectedError
@@ -171,17 +172,12 @@ def frame(frame_id: int, payload: bytes = b"") -> bytes:
     return body + struct.pack(">H", binascii.crc_hqx(body, 0))
 
 
-class PniDialogue(PollDialogue):
-    """Asks a silent compass for data, ten times a second at most (57 bytes with the answer, 15 ms at 38400 baud).
-
-    First it chooses what the answers hold, which a device forgets with its power: kSave is "the ONLY command that
-    causes the device to save information" (TRAX p. 46), and it is never sent. A device in continuous mode speaks by
-    itself, and is left alone.
-    """
-
-    QUESTION: ClassVar[bytes] = frame(_GET_DATA)
-    SET_UP: ClassVar[bytes] = frame(
-        _SET_COMPONENTS, bytes((8, _HEADING, _PITCH, _ROLL, _DISTORTION, _CALIBRATED, *_MAG))
-    )
-    PERIOD_S: ClassVar[float] = 0.1
-    NAME: ClassVar[str] = "kGetData"
+# The components chosen are forgotten with the power: kSave is "the ONLY command that causes the device to save
+# information" (TRAX p. 46), and it is never sent. Question and answer have 57 bytes, 15 ms at 38400 baud.
+PniDialogue = functools.partial(
+    PollDialogue,
+    frame(_GET_DATA),
+    "kGetData",
+    period_s=0.1,
+    set_up=frame(_SET_COMPONENTS, bytes((8, _HEADING, _PITCH, _ROLL, _DISTORTION, _CALIBRATED, *_MAG))),
+)

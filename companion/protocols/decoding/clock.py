@@ -35,9 +35,6 @@ LATE_S: Final = 1.0
 _WRAP_S: Final = 2.0
 _WRAP_SHARE: Final = 0.01
 """A clock that wraps has advanced as the host's has, but for a stall and for what the two differ by."""
-_BOOT_S: Final = 2.0
-"""By so much more than it was not heard a device that restarted meanwhile may have been up: what waited unread."""
-
 LATE: Final = "late"
 
 
@@ -45,16 +42,12 @@ class DeviceClock:
     """Maps one device's clock to the host's; it starts again at 0 after `wraps_s`, by its format, or never."""
 
     def __init__(self, wraps_s: float | None) -> None:
-        self.restarts = 0
-        """How often the device was seen to restart."""
-        self.jumps = 0
-        """How often its clock jumped forward, or fell behind without a restart."""
+        self.breaks = 0
+        """How often the samples before and after could not be told to be one device's without a pause."""
         self.device_s = 0.0
+        """The clock as of the last sample, unwrapped."""
         self._wraps_s = wraps_s
-        self._raw_s = math.nan
-        self._arrival_s = math.nan
-        self._offset_s = math.nan
-        self._restarted_in_silence = False
+        self._raw_s = self._arrival_s = self._offset_s = math.nan
         self._new_span(math.nan)
 
     def _new_span(self, arrival_s: float) -> None:
@@ -66,24 +59,18 @@ class DeviceClock:
         self.device_s = self._raw_s = raw_s
         self._arrival_s = arrival_s
         self._offset_s = arrival_s - raw_s
-        self._restarted_in_silence = False
         self._new_span(arrival_s)
         return arrival_s
 
-    @property
-    def breaks(self) -> int:
-        """How often what came before and after could not be told to be one device without a pause."""
-        return self.restarts + self.jumps
-
     def remap(self) -> None:
-        """The times at which samples arrived so far were wrong."""
+        """Forget the offset: the times at which samples arrived so far were wrong."""
         self._offset_s = math.nan
 
     def host_s(self, raw_s: float, arrival_s: float) -> float | None:
-        """The host's time of a device time, at most `arrival_s`, when it had come; None where that cannot be told.
+        """Return the host's time of a finite device time, at most `arrival_s`; None where that cannot be told.
 
-        Both are finite. None lasts as long as samples come `LATE_S` or more after their time: at most `SPAN_S` when it
-        is the clock that has changed, and while there is a backlog otherwise.
+        None lasts as long as samples come `LATE_S` or more after their time: at most `SPAN_S` when it is the clock
+        that has changed, and while there is a backlog otherwise.
         """
         if math.isnan(self._offset_s):
             return self._start(raw_s, arrival_s)
@@ -92,21 +79,16 @@ class DeviceClock:
         if advance_s < 0.0 or elapsed_s - advance_s > LATE_S:
             advance_s = self._unwrapped(advance_s, elapsed_s)
         if advance_s < 0.0:
-            self.restarts += 1
+            self.breaks += 1
             return self._start(raw_s, arrival_s)
         self.device_s += advance_s
         self._raw_s, self._arrival_s = raw_s, arrival_s
         self._offset_s += CREEP * advance_s
         delay_s = arrival_s - self.device_s - self._offset_s
         if delay_s < 0.0:
-            self.jumps += delay_s < -LATE_S
+            self.breaks += delay_s < -LATE_S
             self._offset_s += delay_s
             delay_s = 0.0
-        if delay_s <= LATE_S:
-            self._restarted_in_silence = False
-        elif elapsed_s > LATE_S:
-            # It has been up for no longer than nothing was heard of it.
-            self._restarted_in_silence = raw_s <= elapsed_s + _BOOT_S
         self._least_s = min(self._least_s, delay_s)
         self._seen += 1
         if arrival_s >= self._span_end_s and self._seen >= SPAN_SAMPLES:
@@ -131,9 +113,7 @@ class DeviceClock:
         if least_s <= STEP_S:
             return 0.0
         self._offset_s += least_s
-        if least_s > LATE_S:
-            self.restarts += self._restarted_in_silence
-            self.jumps += not self._restarted_in_silence
+        self.breaks += least_s > LATE_S
         return least_s
 
 
@@ -156,38 +136,25 @@ class SampleTimes:
         for sample in samples:
             at_s = sample.t_s
             if isinstance(sample, ImuSample):
-                raw_s, sequence = sample.t_device_s, sample.sequence
-                breaks = clock.breaks
+                raw_s, sequence, before = sample.t_device_s, sample.sequence, clock.breaks
                 t_s: float | None = at_s - frame_s
                 device_s: float | None = None
                 if raw_s is not None and math.isfinite(raw_s):
-                    t_s = clock.host_s(raw_s, at_s - frame_s)
-                    device_s = clock.device_s
-                    anew, breaks = breaks, clock.breaks
-                    if sequence is not None:
-                        sequence = self._counted(sequence, breaks > anew)
-                elif sequence is not None:
-                    sequence = self._counted(sequence, False)  # noqa: FBT003
+                    t_s, device_s = clock.host_s(raw_s, at_s - frame_s), clock.device_s
+                if sequence is not None:
+                    sequence = self._counted(sequence, anew=clock.breaks > before)
                 if t_s is None:
                     self.dropped[LATE] += 1
                     continue
                 t_s = self._in_order(t_s, read_s)
                 gyro, accel, warm = sample.gyro_rad_s, sample.accel_m_s2, sample.temperature_degc
-                placed.append(ImuSample(t_s, gyro, accel, warm, sequence, device_s, breaks))
+                placed.append(ImuSample(t_s, gyro, accel, warm, sequence, device_s, clock.breaks))
                 # Whatever else the same frame brought was taken at the same time.
                 frame_at_s, frame_t_s = at_s, t_s
             else:
                 t_s = frame_t_s if at_s == frame_at_s else self._in_order(at_s - frame_s, read_s)
                 placed.append(msgspec.structs.replace(sample, t_s=t_s))
         return placed
-
-    def status(self) -> dict[str, object]:
-        """For people: what the device's clock did, and what was dropped for it."""
-        return {
-            "restarts": self.clock.restarts,
-            "clock_jumps": self.clock.jumps,
-            "too_late": self.dropped[LATE],
-        }
 
     def _in_order(self, t_s: float, read_s: float) -> float:
         """A device does not sample backwards; what seems so is the line time of bytes that came faster than that."""
@@ -196,7 +163,7 @@ class SampleTimes:
         self._newest_s = t_s
         return t_s
 
-    def _counted(self, raw: int, anew: bool) -> int:  # noqa: FBT001 - one caller
+    def _counted(self, raw: int, *, anew: bool) -> int:
         """The counter, unwrapped; one that went back counts on by one, so that nothing seems lost."""
         last, self._raw_sequence = self._raw_sequence, raw
         if last is None:

@@ -42,16 +42,16 @@ class Dialogue(ABC):
 class PollDialogue(Dialogue):
     """Poll one reading after another, each after the answer to the last; silent while the device streams by itself."""
 
-    QUESTION: ClassVar[bytes]
-    SET_UP: ClassVar[bytes] = b""
-    """Said before the first question, and before the one after a question in vain: it may have been without power."""
-    PERIOD_S: ClassVar[float]
-    NAME: ClassVar[str]
-    _quiet_until_s = _next_s = 0.0
-    _asked_s: float | None = None
-    _since_asked = 0
-    _set_up = False
-    _unanswered = 0
+    def __init__(self, question: bytes, name: str, *, period_s: float, set_up: bytes = b"") -> None:
+        self.period_s = period_s
+        self._question, self._name = question, name
+        self._first = set_up + question
+        """Sent first, and after a question in vain: the device may have been without power."""
+        self._quiet_until_s = self._next_s = 0.0
+        self._asked_s: float | None = None
+        """Time of the question that has not been answered yet."""
+        self._since_asked = self._unanswered = 0
+        self._set_up = False
 
     def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
         self._quiet_until_s, self._asked_s, self._set_up, self._unanswered = t_s + SILENT_S, None, False, 0
@@ -71,15 +71,15 @@ class PollDialogue(Dialogue):
                 return b""
             self._asked_s, self._set_up = None, False
             self._unanswered += 1
-            if self._since_asked > len(self.SET_UP + self.QUESTION):  # more than an echo: it speaks, if not to us
+            if self._since_asked > len(self._first):  # more than an echo: it speaks, if not to us
                 self._quiet_until_s = t_s + SILENT_S
         if t_s < max(self._quiet_until_s, self._next_s):
             return b""
-        self._asked_s, self._next_s, self._since_asked = t_s, t_s + self.PERIOD_S, 0
+        self._asked_s, self._next_s, self._since_asked = t_s, t_s + self.period_s, 0
         answers = ", no answer yet" if self._unanswered else ""
-        self.words = f"asked {1.0 / self.PERIOD_S:.0f} times a second with {self.NAME}{answers}"
+        self.words = f"asked {1.0 / self.period_s:.0f} times a second with {self._name}{answers}"
         set_up, self._set_up = self._set_up, True
-        return self.QUESTION if set_up else self.SET_UP + self.QUESTION
+        return self._question if set_up else self._first
 
 
 class WakeDialogue(Dialogue):

@@ -10,6 +10,7 @@ first. Commands are single letters that the device echoes; an echo in front of a
 
 from __future__ import annotations
 
+import functools
 import re
 from typing import ClassVar, Literal
 
@@ -124,12 +125,6 @@ class InclinometerXyDecoder(LineDecoder):
         self._decimals, self._fewer_running = decimals, 0
 
 
-class InclinometerXyDialogue(PollDialogue):
-    """`R` asks for one reading, which all of them give while their stream is stopped (DPG2 p. 11, BEI p. 12).
-
-    The letter that starts the stream differs, and a BEI in its setup level would store it.
-    """
-
-    QUESTION = b"R"
-    PERIOD_S = 0.2
-    NAME = "R"
+# One reading, which all of them give while their stream is stopped (DPG2 p. 11, BEI p. 12). The letter that starts the
+# stream differs, and a BEI in its setup level would store it.
+InclinometerXyDialogue = functools.partial(PollDialogue, b"R", "R", period_s=0.2)

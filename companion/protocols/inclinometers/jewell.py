@@ -14,6 +14,7 @@ Where there is no checksum the shape of a line must be whole: all numbers padded
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from typing import ClassVar, Final
@@ -106,12 +107,6 @@ def _sample(t_s: float, x_deg: float, y_deg: float, temperature_degc: float | No
     return TiltSample(t_s, x_deg, y_deg, temperature_degc)
 
 
-class JewellDialogue(PollDialogue):
-    """`*9900XY` to a Jewell tiltmeter: one reading in the format that is set, from whichever target it is (99).
-
-    It could be told to stream, but keeps its output settings (Tuff Tilt Digital manual, p. 15).
-    """
-
-    QUESTION = b"*9900XY\r\n"
-    PERIOD_S = 0.2
-    NAME = "*9900XY"
+# One reading in the format that is set, of any target (99). It could be told to stream, but keeps its output settings
+# (Tuff Tilt Digital manual, p. 15).
+JewellDialogue = functools.partial(PollDialogue, b"*9900XY\r\n", "*9900XY", period_s=0.2)

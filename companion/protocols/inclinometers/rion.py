@@ -14,7 +14,8 @@ said to be the compass', and is read as that. Records of floats (0x94) are not a
 
 from __future__ import annotations
 
-from typing import ClassVar, Final
+import functools
+from typing import Final
 
 from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import ECHO, WAIT, FrameDecoder, RejectedError
@@ -86,12 +87,7 @@ def _degrees(digits: bytes, per_degree: int) -> float:
     return -value if text[0] == "1" else value
 
 
-class RionDialogue(PollDialogue):
-    """Asks a silent device for its angles, as HCM370B p. 11 and HCM705B p. 12 have it: it comes in this mode.
-
-    Five times a second at most: 19 bytes with the answer (HCA726: 21), 22 ms at 9600 baud, 88 ms at 2400.
-    """
-
-    QUESTION: ClassVar[bytes] = bytes((_START[0], 4, 0, _READ, 4 + _READ))
-    PERIOD_S: ClassVar[float] = 0.2
-    NAME: ClassVar[str] = "68 04 00 04 08"
+# The mode it comes in (HCM370B p. 11, HCM705B p. 12). Question and answer have up to 21 bytes, 97 ms at 2400 baud.
+RionDialogue = functools.partial(
+    PollDialogue, bytes((_START[0], 4, 0, _READ, 4 + _READ)), "68 04 00 04 08", period_s=0.2
+)

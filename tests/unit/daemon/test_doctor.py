@@ -9,8 +9,8 @@ import pytest
 
 from companion.config import parse
 from companion.config.sections import Config
-from companion.daemon.process.check import sensor_findings, system_findings, where_it_may_be
-from companion.links.serial.faults import PortFault, port_faults, same_ports
+from companion.daemon.process.check import sensor_findings, system_findings
+from companion.links.serial.faults import port_faults, same_ports
 from tests.support.usb_tree import UsbTree
 
 CONFIG = """
@@ -171,13 +171,6 @@ def test_a_name_that_changes_is_told_the_one_that_stays(board: Board) -> None:
     assert remedies == ['set port = "/dev/serial/by-path/platform-soc-usb-0:1.2:1.0-port0"']
 
 
-def test_the_mini_uart_of_a_raspberry_pi(board: Board) -> None:
-    (fault,) = port_faults("/dev/ttyS0", root=board.root)
-    assert fault == PortFault(fault.words, fault.remedy, good=True)
-    assert "mini-UART" in fault.words
-    assert "dtoverlay=disable-bt" in fault.remedy
-
-
 def device(name: str, speaks: str | None, trouble: str | None = "undecodable") -> dict[str, object]:
     return {"name": name, "trouble": trouble, "speaks": speaks}
 
@@ -207,16 +200,6 @@ def test_one_port_under_two_names(board: Board) -> None:
     ]
     found = system_findings(config(gradienter="/dev/ttyUSB0"), [], board.root)
     assert any("own and gradienter are one and the same port, /dev/ttyUSB0" in one.words for one in found)
-
-
-def test_a_port_that_is_gone_is_told_which_are_there(board: Board) -> None:
-    gone = config(gradienter="/dev/ttyUSB7")
-    assert system_findings(gone, [], board.root) == [], "its own line says that it is gone"
-    found = where_it_may_be(gone, board.root)
-    assert found is not None
-    assert "platform-soc-usb-0:1.2:1.0-port0" in found.words
-    assert FTDI_ID not in found.words, "that one is the IMU's"
-    assert found.remedy == "companion ports --listen"
 
 
 def test_the_autopilots_port_is_looked_at_too(board: Board) -> None:

@@ -29,8 +29,8 @@ SAMPLE = CONFIGURATION + ".sample"
 EXECUTABLE = "/opt/elsewhere/bin/companion"
 
 
-def target(root: Path, *, dry_run: bool = False, executable: str = EXECUTABLE) -> Target:
-    return Target(root, Path("/usr/local"), executable, dry_run=dry_run)
+def target(root: Path, *, executable: str = EXECUTABLE) -> Target:
+    return Target(root, Path("/usr/local"), executable)
 
 
 def outcomes(root: Path, steps: Sequence[object]) -> dict[str, str]:
@@ -77,15 +77,6 @@ def test_uninstalling_leaves_nothing_and_can_be_repeated(tmp_path: Path) -> None
     assert set(outcomes(tmp_path, list(uninstall(target(tmp_path)))).values()) == {"absent"}
 
 
-def test_a_dry_run_tells_and_changes_nothing(tmp_path: Path) -> None:
-    assert "written" in outcomes(tmp_path, list(install(target(tmp_path, dry_run=True)))).values()
-    assert tree(tmp_path) == {}
-    list(install(target(tmp_path)))
-    before = tree(tmp_path)
-    assert "removed" in outcomes(tmp_path, list(uninstall(target(tmp_path, dry_run=True)))).values()
-    assert tree(tmp_path) == before
-
-
 def test_a_path_that_cannot_stand_in_a_unit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CompanionError, match="allowed: an absolute path without spaces"):
         list(install(target(tmp_path, executable="/opt/my companion/bin/companion")))
@@ -105,12 +96,10 @@ def test_what_the_service_could_not_reach_is_named(tmp_path: Path, monkeypatch: 
 
 def test_the_command_says_line_by_line_what_it_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["install-service", "--root", str(tmp_path), "--prefix", "/usr", "--executable", EXECUTABLE]
-    assert cli.main([*words, "--dry-run"]) == 0
-    told = capsys.readouterr()
-    assert f"would write    {tmp_path}/usr/lib/systemd/system/companion.service" in told.out.splitlines()
-    assert "nothing was changed" in told.err
     assert cli.main([*words, "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    told = capsys.readouterr()
+    assert f"written    {tmp_path}/usr/lib/systemd/system/companion.service" in told.err.splitlines()
+    answer = json.loads(told.out)
     assert answer["state"] == "done"
     assert [step["outcome"] for step in answer["steps"]] == [*["written"] * 5, "absent"]
     assert cli.main(["uninstall-service", "--root", str(tmp_path), "--prefix", "/usr"]) == 0
@@ -134,7 +123,7 @@ def test_the_service_of_a_debian_package_is_left_to_it(
         ("install-service", "sudo systemctl enable --now companion"),
         ("uninstall-service", "sudo apt remove companion"),
     ):
-        assert cli.main([command, "--dry-run"]) == 1
+        assert cli.main([command]) == 1
         assert capsys.readouterr().err.strip().endswith(f"is a Debian package, and its service came with it: {instead}")
 
 

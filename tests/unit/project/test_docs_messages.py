@@ -37,7 +37,7 @@ NOT_MESSAGES = {
     # Sides of an aircraft, of which a request is made.
     "on its back", "between … and …",
     # Names of tasks in the log, and keys.
-    "MAVLink component", "MAVLink connection", "the page's", "airframe changed", "clock back",
+    "MAVLink component", "MAVLink connection", "the page's", "airframe changed",
     # Recognises an error of the operating system.
     "Operation timed out",
     # Complete in themselves: nothing to do, or said by what the person has just asked for.

@@ -97,7 +97,7 @@ def test_a_stopped_gradienter_is_polled_and_left_alone_when_it_streams_again(mak
     assert set(line.words) == {b"R"}
     assert line.said[0][0] >= SILENT_S
     assert not device.streaming
-    assert line.samples == pytest.approx(10.0 / InclinometerXyDialogue.PERIOD_S, rel=0.25)
+    assert line.samples == pytest.approx(10.0 / InclinometerXyDialogue().period_s, rel=0.25)
     assert line.dialogue.words == "asked 5 times a second with R"
     device.command(b"S" if make is Gradienter else b"F", line.now_s)  # by another hand
     line.run(2.0)
@@ -124,7 +124,7 @@ def test_a_stopped_hmr3300_is_polled() -> None:
     line = Conversation(device, Hmr3300Decoder(), Hmr3300Dialogue())
     line.run(12.0)
     assert set(line.words) == {b"*Q\r\n"}
-    assert line.samples == pytest.approx(10.0 / Hmr3300Dialogue.PERIOD_S, rel=0.35)
+    assert line.samples == pytest.approx(10.0 / Hmr3300Dialogue().period_s, rel=0.35)
     assert not device.streaming
 
 
@@ -145,7 +145,7 @@ def test_an_hmr3000_without_sentences_is_polled() -> None:
     line.run(12.0)
     assert set(line.words) == {b"$PTNT,HPR*78\r\n"}
     assert line.said[0][0] >= SILENT_S
-    assert line.samples == pytest.approx(10.0 / Hmr3000Dialogue.PERIOD_S, rel=0.25)
+    assert line.samples == pytest.approx(10.0 / Hmr3000Dialogue().period_s, rel=0.25)
     assert line.samples >= len(line.said) - 1
     assert line.dialogue.words == "asked 10 times a second with $PTNT,HPR*78"
 
