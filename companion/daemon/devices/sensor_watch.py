@@ -7,7 +7,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.sensors import SerialSensor
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.seconds.batch import Batch
-from companion.physics.frames import Array, Matrix
+from companion.physics.frames import Array
 from companion.protocols.stream_health import Trouble
 
 logger = logging.getLogger(__name__)
@@ -36,15 +36,8 @@ TURNING_RAD_S: Final = math.radians(12.0)
 """The least rate that counts as turning; less may be a bias, of up to 10 deg/s."""
 
 
-class Corrected(NamedTuple):
-    """What an owner has made of an IMU's readings."""
-
-    back: Matrix = np.eye(3)
-    accel_m_s2: Array = np.zeros(3)
-    """(3,), what it takes off the accelerometer, in the IMU's own axes."""
-
-
-UNTOUCHED: Final = Corrected()
+NO_OFFSETS: Final = object()
+"""Of an IMU whose readings nobody changes."""
 
 
 class MotionWitness:
@@ -55,19 +48,23 @@ class MotionWitness:
 
     def __init__(self) -> None:
         self._seconds: dict[str, deque[tuple[int, Array, float]]] = {}
+        self._offsets: dict[str, object] = {}
 
-    def update(self, latest: Mapping[str, Batch], corrected: Callable[[str], Corrected | None]) -> None:
-        """Take note of the last whole second of each IMU.
+    def update(self, latest: Mapping[str, Batch], offsets_of: Callable[[str], object]) -> None:
+        """Note the last whole second of each IMU.
 
-        `corrected`: what was done to its readings before they came to us; None while that is not known. It is taken
-        back: new offsets, or another orientation of the board, must not look like a tilt.
+        `offsets_of`: what an owner has taken off its readings, or None while that is not known. An IMU with other
+        offsets, or another orientation of the board, begins anew as a witness: they must not look like a tilt.
         """
         for name, batch in latest.items():
             seconds = self._seconds.setdefault(name, deque(maxlen=REMEMBERED_S))
-            known = corrected(name)
-            if known is None or (seconds and seconds[-1][0] == batch.slot):
+            offsets = offsets_of(name)
+            if offsets is None or (seconds and seconds[-1][0] == batch.slot):
                 continue
-            rate, force = known.back @ batch.mean[:3], known.back @ batch.mean[3:] + known.accel_m_s2
+            if self._offsets.get(name) is not offsets:
+                self._offsets[name] = offsets
+                seconds.clear()
+            rate, force = batch.mean[:3], batch.mean[3:]
             size = float(np.linalg.norm(force))
             if size > 0.0:
                 down = force / size
@@ -115,11 +112,11 @@ class SensorWatch:
         self,
         sensors: Sequence[SerialSensor],
         collector: RollingCollector,
-        corrected: Callable[[str], Corrected | None] = lambda name: UNTOUCHED,
+        offsets_of: Callable[[str], object] = lambda name: NO_OFFSETS,
         say: Say = lambda *what: None,
     ) -> None:
         self._sensors, self._collector = sensors, collector
-        self._corrected = corrected
+        self._offsets_of = offsets_of
         self._witness = MotionWitness()
         self._has_failed = False
         self._say = say
@@ -139,7 +136,7 @@ class SensorWatch:
 
     def update(self, now_s: float) -> None:
         """One look at all of them."""
-        self._witness.update(self._collector.imu_seconds(), self._corrected)
+        self._witness.update(self._collector.imu_seconds(), self._offsets_of)
         for sensor in self._sensors:
             found, is_news = sensor.health.update(now_s, None if "imu" in sensor.kinds else self._stuck(sensor))
             if found is not None and found.implausible:

@@ -101,10 +101,7 @@ class SerialSensor:
     """One serial device: read once, decoded once, for all its roles; `take` gets what each takes of each sample."""
 
     def __init__(
-        self,
-        device: SerialDevice,
-        take: Callable[[Role, Sample], None],
-        offload: Offload = asyncio.to_thread,
+        self, device: SerialDevice, take: Callable[[Role, Sample], None], offload: Offload = asyncio.to_thread
     ) -> None:
         settings = device.settings
         self.device = device
@@ -116,12 +113,7 @@ class SerialSensor:
         name = ", ".join(role.name for role in device.roles)
         self.kinds = frozenset(role.kind for role in device.roles)
         self.link = ByteLink(
-            settings,
-            self.receive,
-            name=name,
-            on_state=self._on_state,
-            budget=Budget(),
-            on_gap=self._on_gap,
+            settings, self.receive, name=name, on_state=self._on_state, budget=Budget(), on_gap=self._on_gap
         )
         self.health = SensorHealth(self.link, self.protocol, self.decoder)
         self.on_bytes: Listeners[str, bytes | None, float] = Listeners()

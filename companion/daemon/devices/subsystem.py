@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 
-import numpy as np
-
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.ekf_bias import EkfBias
 from companion.configured import models
@@ -14,7 +12,7 @@ from companion.configured.models import Role, collect, serial_devices
 from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.reach import Reach
-from companion.daemon.devices.sensor_watch import UNTOUCHED, Corrected, SensorWatch
+from companion.daemon.devices.sensor_watch import NO_OFFSETS, SensorWatch
 from companion.daemon.devices.sensors import SensorRole, SerialSensor
 from companion.daemon.devices.signing import LinkSigning
 from companion.estimation.means.pose import up_in_vehicle
@@ -41,7 +39,7 @@ class Devices(Subsystem):
             self.ekf_bias.settled.set()
         self.imus = {imu.name: AutopilotImu(core, imu, self.slots, self.ekf_bias, rate_hz) for imu in imus}
         self.sensors = [SerialSensor(device, self._take, core.offload) for device in serial_devices(core.config)]
-        self.watch = SensorWatch(self.sensors, core.collector, self._corrected, core.say)
+        self.watch = SensorWatch(self.sensors, core.collector, self._offsets_of, core.say)
         self.signing = LinkSigning(core.config, core.link, core.vehicle, core.say, core.offload)
         self.reach = Reach(core.link, core.vehicle, core.parameters, core.config.mavlink.url)
         self.on_pose: Listeners[Sample] = Listeners()
@@ -111,13 +109,6 @@ class Devices(Subsystem):
         if reading is not None:
             self.on_pose.tell(reading)
 
-    def _corrected(self, name: str) -> Corrected | None:
+    def _offsets_of(self, name: str) -> object:
         imu = self.imus.get(name)
-        if imu is None:
-            return UNTOUCHED
-        known = imu.calibration
-        return (
-            None
-            if known is None
-            else Corrected(known.orientation.T, np.multiply(known.accel_scale, known.accel_offset_m_s2))
-        )
+        return NO_OFFSETS if imu is None else imu.calibration

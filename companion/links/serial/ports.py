@@ -166,21 +166,11 @@ def _holders_by_device(root: Path) -> dict[str, list[Holder]]:
                 target = os.readlink(descriptor)
             except OSError:
                 continue
-            if target.startswith("/dev/") and target not in seen and not _is_namesake(descriptor, target):
+            if target.startswith("/dev/") and target not in seen:
                 seen.add(target)
                 holder = Holder(int(process.name), read_attribute(process / "comm") or "?")
                 found.setdefault(target, []).append(holder)
     return found
-
-
-def _is_namesake(descriptor: Path, target: str) -> bool:
-    """Whether a pseudo-terminal is a container's, which counts its own from 0; its serial ports are ours."""
-    if not target.startswith("/dev/pts/"):
-        return False
-    try:
-        return descriptor.stat().st_dev != os.stat(target).st_dev
-    except OSError:
-        return True  # there is none of that name here
 
 
 def _consoles(root: Path) -> set[str]:

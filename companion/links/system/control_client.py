@@ -29,10 +29,9 @@ async def ask(path: Path, request: Object) -> AsyncGenerator[Object, None]:
     try:
         reader, writer = await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)
     except OSError as error:
-        why = {
-            errno.ENOENT: "no such socket",
-            errno.ECONNREFUSED: "nobody listens there",
-        }.get(error.errno or 0, str(error))
+        why = {errno.ENOENT: "no such socket", errno.ECONNREFUSED: "nobody listens there"}.get(
+            error.errno or 0, str(error)
+        )
         if error.errno == errno.EACCES:
             raise DaemonDeniedError(f"the daemon at {path} may not be asked: {_who_may(path)}") from None
         raise DaemonUnreachableError(f"no daemon answers at {path} ({why})") from None

@@ -15,6 +15,7 @@ after it; older firmware gave some bits other meanings, which then fails the CRC
 from __future__ import annotations
 
 import binascii
+import functools
 import re
 import struct
 from dataclasses import dataclass
@@ -116,6 +117,7 @@ class Layout:
         return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, None, t_device_s)]
 
 
+@functools.lru_cache(maxsize=16)
 def layout_of(header: bytes) -> Layout:
     """Parse a whole header; raise RejectedError for an unknown field, or a group without fields."""
     places: dict[str, int] = {}
@@ -158,7 +160,6 @@ def _pair(places: dict[str, int]) -> tuple[int, int] | None:
 
 SENTENCE_LIMIT = 250
 """Bytes of a sentence after its "$"; the longest asynchronous one has some 200."""
-LAYOUTS_KEPT = 16
 
 _SYNC = 0xFA
 _DOLLAR = ord("$")
@@ -175,12 +176,6 @@ class VectorNavDecoder(FrameDecoder):
     device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
     clock_from_start: ClassVar[bool] = True
 
-    def __init__(self, seconds_per_byte: float = 0.0) -> None:
-        super().__init__(seconds_per_byte)
-        self._layouts: dict[bytes, Layout] = {}
-        self._header = b""
-        """Header of the last good frame: the next one most likely has it too."""
-
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         if buffer[at] == _SYNC:
             return self._binary(buffer, at, origin, samples)
@@ -190,29 +185,21 @@ class VectorNavDecoder(FrameDecoder):
         return match.start() if match else len(buffer)
 
     def _binary(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        available, header = len(buffer) - at, self._header
-        layout = self._layouts.get(header) if header and buffer.startswith(header, at) else None
-        if layout is None:
-            if available < 2:
+        available = len(buffer) - at
+        if available < 2:
+            return WAIT
+        try:
+            header_size = header_bytes(buffer[at + 1])
+            if available < header_size:
                 return WAIT
-            try:
-                header_size = header_bytes(buffer[at + 1])
-                if available < header_size:
-                    return WAIT
-                header = buffer[at : at + header_size]
-                layout = self._layouts.get(header) or layout_of(header)
-            except RejectedError as error:
-                return self._reject(error.reason, at + 1)
+            layout = layout_of(buffer[at : at + header_size])
+        except RejectedError as error:
+            return self._reject(error.reason, at + 1)
         if available < layout.frame_bytes:
             return WAIT
         end = at + layout.frame_bytes
         if binascii.crc_hqx(buffer[at + 1 : end], 0) != 0:
             return self._reject(reasons.CHECKSUM, at + 1)
-        if header not in self._layouts:
-            if len(self._layouts) >= LAYOUTS_KEPT:
-                self._layouts.clear()
-            self._layouts[header] = layout
-        self._header = header
         return self._accept(samples, layout.samples, buffer, at, self._time_of(origin + end), end=end)
 
     def _sentence(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
