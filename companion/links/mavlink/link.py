@@ -3,17 +3,13 @@
 pymavlink's generated dialect class is the codec; `mavutil` is not used (it blocks, prints, and weighs 41 MiB).
 No socket is opened here: a transport (links.mavlink_transport, or a test's) hands received bytes to `receive` and
 gives `attach` a function that sends.
-
-pymavlink has to decode a message to tell its name; an autopilot sends hundreds a second, most of which nobody here
-wants. So frames in the common case (version 2, unsigned, whole, their checksum right) are told here. Format: MAVLink
-developer guide, "Packet Serialization".
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import Final, Literal, TypeVar
+from typing import Literal, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -30,28 +26,6 @@ Sender = tuple[int, int]
 
 _COMPACT_BYTES = 4096
 _ANYBODYS = frozenset(mavlink.mavlink_map[number].msgname for number in NEVER_SIGNED)
-
-HEADER_BYTES: Final = 10
-CHECKSUM_BYTES: Final = 2
-MARKER: Final = 0xFD
-KINDS: Final[dict[int, Kind]] = mavlink.mavlink_map
-_EXTRA: Final[dict[Kind, bytes]] = {}
-
-
-def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
-    """Give kind and end of the message that begins there; None unless whole, unsigned, intact and of version 2."""
-    size = len(data)
-    if size - at < HEADER_BYTES + CHECKSUM_BYTES or data[at] != MARKER or data[at + 2]:
-        return None
-    end = at + HEADER_BYTES + data[at + 1] + CHECKSUM_BYTES
-    kind = KINDS.get(data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16)
-    if kind is None or end > size:
-        return None
-    extra = _EXTRA.get(kind)
-    if extra is None:
-        extra = _EXTRA[kind] = bytes((kind.crc_extra,))
-    checksum = mavlink.x25crc(data[at + 1 : end - 2] + extra).crc
-    return (kind, end) if checksum == data[end - 2] | data[end - 1] << 8 else None
 
 
 class MavlinkLink:
@@ -148,8 +122,8 @@ class MavlinkLink:
         if self.on_bytes:
             self.on_bytes.tell("in", data, t_s)
         attached = self._attached
-        for name, _, message in self._frames(data):
-            self._dispatch(name, message, t_s)
+        for message in self._frames(data):
+            self._dispatch(message, t_s)
             if self._attached != attached:
                 return  # what came over another transport ends here
         # The codec frees its buffer only when a read happens to end on a frame's end; a busy serial link may not
@@ -171,37 +145,17 @@ class MavlinkLink:
             self.received["bad"] += 1
             self.on_bytes.tell("in", None, None)
         self._forget_received()
-        for name, sender, message in frames:
-            if name not in _ANYBODYS:
-                admit(sender)
-            self._dispatch(name, message, t_s)
+        for message in frames:
+            if message.get_type() not in _ANYBODYS:
+                admit((message.get_srcSystem(), message.get_srcComponent()))
+            self._dispatch(message, t_s)
 
-    def _frames(self, data: bytes) -> Iterator[tuple[str, Sender, Message | None]]:
-        """Name, sender and message of what is whole and admitted; no message where nobody wants it.
-
-        Of good frames at the front only those that somebody wants are decoded. The codec gets everything from the first
-        frame on that is anything special: signed, of version 1, damaged, cut off.
-        """
-        if self._codec.buf:
-            data = self.half_received + data
-            self._forget_received()
-        at = 0
-        while self.signing is None and (found := kind_at(data, at)) is not None:
-            kind, end = found
-            message = None
-            if self._handlers.get(kind.msgname):
-                try:
-                    message = self._codec.decode(bytearray(data[at:end]))
-                except mavlink.MAVError:
-                    break
-            yield kind.msgname, (data[at + 5], data[at + 6]), message
-            at = end
-        if at == len(data):
-            return
-        message = self._next_message(data[at:])
+    def _frames(self, data: bytes) -> Iterator[Message]:
+        """Messages that are whole and admitted."""
+        message = self._next_message(data)
         while message is not None:
             if self._admits(message):
-                yield message.get_type(), (message.get_srcSystem(), message.get_srcComponent()), message
+                yield message
             message = self._next_message(b"")
 
     def _admits(self, message: Message) -> bool:
@@ -230,7 +184,8 @@ class MavlinkLink:
         self._codec.buf = bytearray()
         self._codec.buf_index = 0
 
-    def _dispatch(self, name: str, message: Message | None, t_s: float) -> None:
+    def _dispatch(self, message: Message, t_s: float) -> None:
+        name = message.get_type()
         self.received[name] += 1
-        if message is not None and name in self._handlers and (failed := self._handlers[name].tell(message, t_s)):
+        if name in self._handlers and (failed := self._handlers[name].tell(message, t_s)):
             self.received["handler error"] += failed
