@@ -130,7 +130,7 @@ async def run(options: argparse.Namespace) -> int:
 async def _first_run(path: Path) -> None:
     """Have it asked for, by whoever may write it; others are told by the daemon's own start that it is missing."""
     from companion.cli import setup as session
-    from companion.setup.keeping import is_writable
+    from companion.setup.draft import is_writable
 
     if is_writable(path):
         asks = Parser()

@@ -25,7 +25,7 @@ from companion.links.mavlink.listening import USUAL_PORTS
 from companion.links.serial.listening import ports_to_try
 from companion.links.serial.ports import list_ports
 from companion.protocols.registry import Kind
-from companion.setup import keeping
+from companion.setup import draft as drafting
 from companion.setup.document import active_lines
 from companion.setup.draft import Draft, Question, part_key, storage_beside
 from companion.setup.survey import Survey, same_port, same_url, survey
@@ -103,7 +103,7 @@ class _Session:
             CompanionError: it cannot go on; `so_far` says what has become of the file.
         """
         say = self.asking.say
-        if not keeping.is_writable(self._path):
+        if not drafting.is_writable(self._path):
             raise CompanionError(
                 f"{self._path} is not yours to write: sudo companion setup, or companion -c FILE setup for a file of"
                 " your own"
@@ -133,7 +133,7 @@ class _Session:
         draft.parsed()
         text = draft.result()
         self.answer |= {"guessed": sorted(draft.guessed), "configuration": draft.wanted}
-        if not keeping.holds(self._path, text):
+        if not drafting.holds(self._path, text):
             say("", f"{self._path} will say (and, as comments, all defaults):", "")
             say(*(f"    {line}" if line else "" for line in active_lines(text)))
             if not await self.asking.agrees("Write it?"):
@@ -147,14 +147,14 @@ class _Session:
 
     async def _begin(self) -> Draft:
         try:
-            draft = keeping.begin(self._path)
+            draft = drafting.begin(self._path)
         except ConfigError as error:
             if self.asking.yes:
                 raise
             self.asking.say(str(error))
             if not await self.asking.agrees("Begin anew? The old file is kept beside it.", by_default=False):
                 raise CompanionError("that file has to be mended first") from None
-            return Draft(keeping.sample(), is_new=True)
+            return Draft(drafting.sample(), is_new=True)
         if not draft.is_new:
             self.asking.say(f"{self._path} is there: what it says holds where you answer nothing else.")
         return draft
@@ -273,7 +273,7 @@ class _Session:
                 self.asking.say(f"{question.key}: {question.now}{guess}")
 
     def _write(self, text: str) -> None:
-        kept = keeping.put(self._path, text)
+        kept = drafting.put(self._path, text)
         self.so_far = f"{self._path} is written"
         self.asking.say(f"Written: {self._path}" + (f" (the old one: {kept.name})" if kept is not None else ""))
         if kept is not None:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import copy
 import functools
+import itertools
 import math
+import os
 import re
+import stat
 import tomllib
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -16,12 +19,14 @@ from companion import config
 from companion.config.sections import UNKNOWN, Config, Law, Platform
 from companion.config.words import shown
 from companion.errors import CompanionError, ConfigError
+from companion.installation import install as installing
 from companion.links.mavlink.transport import parse_url
 from companion.protocols.guess import Line
 from companion.protocols.registry import PROTOCOLS, Kind
 from companion.rotations import ROTATIONS_DEG
 from companion.setup.document import Table, render
 from companion.setup.survey import FoundDevice
+from companion.storage.state import read_regular, write_atomically
 
 UNDOCUMENTED_LAW: Final = "axis"
 """What is taken where no document says it and nobody answers; it is then said to be a guess."""
@@ -272,3 +277,55 @@ def mounting_words(mounting: Any) -> str:
         return "0"
     yaw = mounting.removeprefix("ROTATION_YAW_")
     return yaw if yaw.isdigit() else mounting
+
+
+# --- the file on disk
+
+
+def sample() -> str:
+    """The sample configuration that this companion brings."""
+    return installing.content(installing.SAMPLE).decode()
+
+
+def begin(path: Path) -> Draft:
+    """Load the configuration, or the sample where there is none; raise ConfigError where it cannot be used."""
+    try:
+        text = read_regular(path, config.MOST_BYTES).decode()
+    except FileNotFoundError:
+        return Draft(sample(), is_new=True)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    if text == sample():
+        return Draft(text, is_new=True)
+    config.parse(text, str(path), lambda _, name: name)
+    return Draft(text, is_new=False)
+
+
+def is_writable(path: Path) -> bool:
+    """Whether the file may be written, or made."""
+    folder = path.parent
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+
+
+def holds(path: Path, text: str) -> bool:
+    """Whether the file is there and says just this."""
+    try:
+        return read_regular(path, config.MOST_BYTES) == text.encode()
+    except OSError:
+        return False
+
+
+def put(path: Path, text: str) -> Path | None:
+    """Write the file atomically, keep the old one beside it, and return that path; None where nobody owned it."""
+    # What is behind a link is replaced, not the link.
+    path = path.resolve()
+    kept, mode = None, installing.MODE
+    if path.exists() and not holds(path, sample()):
+        mode = stat.S_IMODE(path.stat().st_mode)
+        names = (path.with_name(f"{path.name}.old{number}") for number in itertools.count(1))
+        kept = next(name for name in names if not name.exists())
+        write_atomically(kept, path.read_bytes(), mode=mode)
+    write_atomically(path, text.encode(), mode=mode, parents=True)
+    return kept

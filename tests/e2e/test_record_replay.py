@@ -427,7 +427,7 @@ def test_recording_on_request_ends_with_the_daemon_in_order(tmp_path: Path) -> N
 
 
 def test_a_recording_without_a_length_ends_at_its_size_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder_module, "MOST_OPEN_END_BYTES", 1 << 17)
+    monkeypatch.setattr(recorder_module, "MOST_BYTES", (1 << 32, 1 << 17))
 
     async def main() -> list[Object]:
         async with asyncio.timeout(300.0), Rig(tmp_path, own_imu=True).running() as rig:

@@ -352,6 +352,7 @@ class Recorder(Subsystem):
         self._on_request = None
         if self._ring is None:
             self.tape.end()
+        written = self._progress(recording)
         try:
             await self._in_thread(recording.file.close)
         except StorageError as error:
@@ -364,7 +365,7 @@ class Recorder(Subsystem):
                 "file": str(recording.file.path),
                 "most_bytes": recording.most_bytes,
                 "messages": recording.file.messages,
-                **self._progress(recording),
+                **written,
             }
         )
 

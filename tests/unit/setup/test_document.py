@@ -15,8 +15,7 @@ from companion.config import parse
 from companion.errors import CompanionError, ConfigError
 from companion.protocols.guess import Line
 from companion.setup.document import active_lines, render
-from companion.setup.draft import Draft
-from companion.setup.keeping import sample
+from companion.setup.draft import Draft, sample
 from companion.setup.survey import FoundDevice
 
 SAMPLE = sample()

@@ -11,7 +11,7 @@ from companion.links.mavlink.listening import HeardUdp
 from companion.links.serial.listening import Heard
 from companion.protocols.guess import Candidate, Line
 from companion.protocols.heartbeat import Heartbeat
-from companion.setup import keeping
+from companion.setup import draft as drafting
 from companion.setup.draft import Draft
 from companion.setup.survey import FoundDevice, Survey, same_url
 from tests.unit.setup.test_document import OWN
@@ -97,11 +97,11 @@ def test_of_two_devices_of_a_kind_both_are_told() -> None:
 def test_the_old_file_is_kept_and_a_link_is_followed(tmp_path: Path) -> None:
     real, link = tmp_path / "real" / "c.toml", tmp_path / "c.toml"
     link.symlink_to(real)
-    assert keeping.put(link, keeping.sample()) is None
-    assert keeping.put(link, "first") is None, "the sample is nobody's work"
+    assert drafting.put(link, drafting.sample()) is None
+    assert drafting.put(link, "first") is None, "the sample is nobody's work"
     real.chmod(0o640)
-    assert keeping.put(link, "second") == real.with_name("c.toml.old1")
-    assert keeping.put(link, "third") == real.with_name("c.toml.old2")
+    assert drafting.put(link, "second") == real.with_name("c.toml.old1")
+    assert drafting.put(link, "third") == real.with_name("c.toml.old2")
     assert link.is_symlink()
     assert {path.name: path.read_text() for path in real.parent.iterdir()} == {
         "c.toml": "third",
@@ -109,14 +109,14 @@ def test_the_old_file_is_kept_and_a_link_is_followed(tmp_path: Path) -> None:
         "c.toml.old2": "second",
     }
     assert {path.stat().st_mode & 0o777 for path in real.parent.iterdir()} == {0o640}
-    assert keeping.holds(link, "third")
-    assert not keeping.holds(tmp_path / "none", "third")
+    assert drafting.holds(link, "third")
+    assert not drafting.holds(tmp_path / "none", "third")
 
 
 def test_where_nothing_can_be_written_that_is_said_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert keeping.is_writable(tmp_path / "not" / "yet" / "there.toml")
+    assert drafting.is_writable(tmp_path / "not" / "yet" / "there.toml")
     monkeypatch.setattr("os.access", lambda *_: False)
     missing = tmp_path / "c.toml"
     assert cli.main(["-c", str(missing), "setup", "--yes"]) == 1
