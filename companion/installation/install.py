@@ -43,9 +43,7 @@ RULES: Final = Shipped("rules.d/70-companion.rules", "lib/udev/rules.d/70-compan
 MODULES: Final = Shipped("modules-load.d/companion.conf", "lib/modules-load.d/companion.conf")
 SAMPLE: Final = Shipped("companion.toml", "companion.toml.sample")
 OURS: Final = (*UNITS, RULES, MODULES, SAMPLE)
-"""What is replaced by a new version."""
 CONFIGURATION: Final = "companion.toml"
-"""Its owner's, beside the sample: `companion setup` writes it."""
 
 
 def folder() -> Path:
@@ -79,7 +77,6 @@ def is_untouched(data: bytes) -> bool:
 
 
 MODE: Final = 0o644
-"""Anybody may read them; passwords have files of their own."""
 COMMAND_TIMEOUT_S: Final = 120.0
 HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - named, not used
 """What the unit hides from the service: ProtectHome and PrivateTmp."""
@@ -112,7 +109,6 @@ class Target:
 
     root: Path
     prefix: Path
-    """Whose `lib` takes what is ours."""
     executable: str
 
     @property

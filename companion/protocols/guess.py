@@ -15,7 +15,6 @@ from companion.protocols.registry import PROTOCOLS, Kind, main_kind
 Parity = Literal["none", "even", "odd"]
 
 COMMON_BAUDS: Final = (9600, 115200, 19200, 38400, 57600, 230400, 460800, 921600, 4800, 2400, 1200)
-"""The likeliest first; whatever a family in the registry comes with stands before them."""
 ENOUGH_BYTES: Final = 1500
 """Six frames of the longest kind: where none of them was one, more will not be."""
 
@@ -46,7 +45,6 @@ class Candidate:
 
     protocol: str
     kinds: tuple[Kind, ...]
-    """What a device with this protocol may serve as, what it is bought as first."""
     accepted: int
     rejected: int
 

@@ -42,13 +42,11 @@ class ProtocolInfo:
     parity: Literal["none", "even", "odd"]
     decoder: type[Decoder]
     dialogue: Callable[[], Dialogue] | None = None
-    """What has to be said to it; None for a device that speaks by itself or that we have nothing safe to say to."""
     lag_s: float = 0.0
     """Time constant with which its reading follows the truth: fluid, pendulum, filters."""
     sigma_deg: float | None = None
     """How well such a device's tilt (gradienter) or heading (compass, level) is known where nobody says better."""
     tilted_sigma_deg: float | None = None
-    """The same for a compass that does not stand level; None: as `sigma_deg`."""
     law: Law | None = None
     """What the documents say a gradienter's two readings are; None: they do not, the user must."""
 

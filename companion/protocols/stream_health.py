@@ -52,7 +52,6 @@ class Trouble:
     key: str
     words: str
     implausible: bool = False
-    """Its readings look good and are not: nothing may be measured with them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +69,7 @@ class StreamHealth:
         self.last_sample_s: float | None = None
         self.last_byte_s: float | None = None
         self.unchanged_since_s: float | None = None
-        """Since when all readings have been the same, digit for digit."""
         self.near_since_s: float | None = None
-        """Since when they have been near that; of a gradienter or compass."""
         self.speaks: str | None = None
         self._tail = b""
         self._reading: object = None

@@ -29,9 +29,7 @@ from companion.setup.survey import FoundDevice
 from companion.storage.state import read_regular, write_atomically
 
 UNDOCUMENTED_LAW: Final = "axis"
-"""What is taken where no document says it and nobody answers; it is then said to be a guess."""
 _LASTING: Final = {"name", "source", "mounting", "profile", "autopilot_instance"}
-"""What stays when another make of device takes a section over."""
 _NAMES: Final[dict[Kind, str]] = {"gradienter": "gradienter", "compass": "compass", "imu": "companion's own IMU"}
 
 
@@ -44,7 +42,6 @@ class Question:
     hint: str
     now: str
     put: Callable[[str], None]
-    """Take an answer; raises ConfigError, in one line, where it is none."""
     choices: Sequence[str]
 
 

@@ -54,7 +54,6 @@ class Survey:
     """What was heard on every port that was listened to."""
 
     serial: dict[str, Heard | str]
-    """By port; words: why it was not listened to."""
     udp: dict[int, HeardUdp | str]
 
     @property
@@ -109,7 +108,6 @@ def same_url(one: str, other: str) -> bool:
 
 
 Tell = Callable[[str, str], None]
-"""Is told what was heard at a place, in words."""
 
 
 async def survey(ports: Sequence[str], udp: Sequence[int], tell: Tell, believed: Believed) -> Survey:

@@ -54,7 +54,6 @@ class AutopilotImu:
         """How often the autopilot has restarted or other offsets have come into force, not by us."""
         self.upset = ""
         self.on_sample: Listeners[ImuSample] = Listeners()
-        """Told of every sample, whatever the offsets behind it."""
         self.on_counting: Listeners[ImuSample] = Listeners()
         """Told of every sample that counts, before the collector: for what must not wait."""
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()

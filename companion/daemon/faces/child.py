@@ -29,7 +29,6 @@ SILENT_S: Final = 5.0 * REPORT_EVERY_S
 END_WITHIN_S: Final = 3.0
 """The MQTT process publishes the last state and "offline" before it ends."""
 WORTH_S: Final = 30.0
-"""A child that lasted this long is started again at once."""
 REPORT_LIMIT: Final = 256 * 1024
 
 
@@ -105,7 +104,6 @@ class Child:
 
 
 StartChild = Callable[[str, str, ChildSettings], Child]
-"""Makes a child of a name, a module and settings; tests run the work of one in their own loop."""
 
 
 async def _end(process: Process) -> None:

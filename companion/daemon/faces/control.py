@@ -38,7 +38,6 @@ INTERNAL_ERROR: Final = "internal error of the daemon; its log has the details"
 MAX_CLIENTS: Final = 16
 """The most connections of each kind: not asked yet, urgent commands, all others."""
 URGENT: Final = tuple(name for name, command in ALL.items() if command.urgent)
-"""Commands that are served however many others are connected."""
 
 
 class ControlServer:

@@ -63,7 +63,6 @@ class Headlines:
         return Headline(headline.word, f"{concern}; {headline.reason}", "wait" if good else headline.tone)
 
     def _concern(self) -> str | None:
-        """What else the pilot should know of at once, where the rest is well or nothing can be done about it."""
         attitude = None if self._attitude is None else self._attitude.concern
         return self._devices.watch.implausible() or self._devices.signing.warning or attitude
 

@@ -88,12 +88,10 @@ def settings_of(imu: Imu, record: ImuRecord, local: LocalEarth, gyro_step_rad_s:
 
 
 def _level_sigma(record: ImuRecord) -> Vector | None:
-    """Of the bias as the level aircraft's, which it mostly is in flight, however it stood when it was calibrated."""
     return record.accel_sigma_use_m_s2 if record.effective is None else record.effective.level_sigma_m_s2
 
 
 def _left(record: ImuRecord, residual: Vector | None, triad: Triad) -> Vector | None:
-    """What an autopilot's stream still has in it: nothing, if it was written; else what was found there."""
     outcomes = outcomes_of(triad, record.written)
     return _ZERO if outcomes and outcomes <= {"verified", "stored"} else residual
 
@@ -154,9 +152,7 @@ class Carrier:
         self.reset_counter = 0
         """Counts the alignments at which the heading jumped."""
         self.airspeed_m_s: float | None = None
-        """Forward, of a fixed wing in the air; None elsewhere, and where nobody says it."""
         self.gyro_step_rad_s = 0.0
-        """Of a stream of truncated integers; 0 of one of floats."""
         self.waiting_for = "waiting for a calibration"
         self.doubt: str | None = None
         self._core = core

@@ -33,7 +33,6 @@ TILT_SIGMA_DEG: Final = 15.0
 DIFFERS_SIGMAS: Final = 3.0
 DIFFERS_S: Final = 5.0
 ATTITUDE_RATE_HZ: Final = 10.0
-"""Rate of ATTITUDE asked of the autopilot, for comparison."""
 THEIR_TILT_DEG: Final = 2.0
 """One sigma of the error of the autopilot's own tilt, with trim (AHRS_TRIM) and mounting errors."""
 THEIR_HEADING_DEG: Final = 5.0
@@ -159,7 +158,6 @@ class Difference:
             self._cosine += gain * (math.cos(their_yaw - yaw) - self._cosine)
 
     def _late_s(self, boot_s: float, t_s: float) -> float:
-        """How much later than the quickest this message came; a restart or a leap begins anew."""
         offset_s = t_s - boot_s
         if self._offset_s is None or abs(offset_s - self._offset_s) > OLD_S:
             self._offset_s = offset_s
@@ -212,7 +210,6 @@ class Health:
         self._alignments = 0
         self._strayed: str | None = None
         self._has_ours = False
-        """Whether the autopilot has had our heading since its start."""
         vehicle.on_event.add(self._on_event)
 
     def _on_event(self, event: VehicleEvent) -> None:

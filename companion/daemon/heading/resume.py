@@ -130,7 +130,6 @@ class Resume:
 
 
 def _left_by(in_force: ImuCalibration, found: ImuRecord) -> ImuRecord:
-    """What the autopilot's present offsets leave of what was found in its IMU."""
     whole = found.gyro_bias_rad_s, found.accel_bias_m_s2
     taken_off = whole_bias(in_force, _ZERO, _ZERO, found.temperature_degc)
     gyro, accel = (None if a is None else vector(np.subtract(a, b)) for a, b in zip(whole, taken_off, strict=True))
@@ -138,7 +137,6 @@ def _left_by(in_force: ImuCalibration, found: ImuRecord) -> ImuRecord:
 
 
 def _place(record: Record, where: Whereabouts) -> LocalEarth:
-    """Where the calibration was: the autopilot's position is believed too late. Blocking."""
     site = record.site
     if site is None or site.declination_deg is None:
         return local_earth(where)

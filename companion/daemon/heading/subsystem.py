@@ -185,7 +185,6 @@ class PoseNow:
         }
 
     async def _look_up(self, now_s: float) -> None:
-        """Looked up rarely: the aircraft does not get far in a minute, and the magnetic model takes its time."""
         if now_s - self._looked_up_s >= DECLINATION_EVERY_S or self._declination_deg is None:
             where: Whereabouts = models.whereabouts(self._core.config, self._core.vehicle)
             if where.latitude_deg is not None:

@@ -30,9 +30,7 @@ from companion.protocols.registry import PROTOCOLS, main_kind
 STOP_FIRST: Final = "to try other speeds: sudo systemctl stop companion, then companion check again"
 ONLY_CHECKING: Final = "only a check is running: start companion run"
 LOST_S: Final = 5.0
-"""So long after its last heartbeat, of which there is one a second, an autopilot is gone."""
 HEARTBEAT_WITHIN_S: Final = 4.0
-"""Wait for the first heartbeat, of which there is one a second."""
 IMUS_MOST_S: Final = 30.0
 """Longest wait for an autopilot to show which IMUs it has: a slow line and lost packets, with all retries."""
 _TO_BE_TRIED: Final = ("undecodable", "damaged")
@@ -236,7 +234,6 @@ def _autopilot(config: Config, vehicle: Object) -> Finding:
 
 
 def _profile(profile: Object) -> Finding:
-    """Report the noise profile of one IMU; warn of an unknown part, with its price."""
     name, words = f"profile {profile['imu']}", profile["summary"]
     if profile["name"] not in (None, UNKNOWN):
         return Finding(name, good=True, words=words)

@@ -24,9 +24,7 @@ FEEDS_PER_LIMIT: Final = 4.0
 """A manager that gives less time than the usual is fed so often within it: one feed may be late."""
 MARGIN_S: Final = 2.0
 COMPONENT_S: Final = 5.0
-"""Deadline of the component, whose heartbeat is due every second."""
 ESTIMATOR_S: Final = 10.0
-"""A look is due every quarter of a second; a small board that solves a full window may take two."""
 
 AUTOMATIC_S: Final = 180.0
 """Deadline of what may have to read a dozen parameters over a bad radio link, each with all its retries."""
@@ -58,7 +56,6 @@ class Beats:
     def __init__(self, watched: Sequence[Watched]) -> None:
         self._watched = watched
         self._last = {each.name: (each.who.turns, 0.0) for each in watched}
-        """By name: turns when somebody looked last, and how long it has been the same turn."""
 
     def update(self, since_last_look_s: float) -> dict[str, float]:
         """Let time pass; the tasks that are overdue, and for how many seconds they have not gone on."""
@@ -96,7 +93,6 @@ class Supervisor:
         self.beats = Beats(watched)
         self._tasks = {each.name: each.task for each in watched}
         self.stopping = False
-        """The tasks are being ended: nobody is missed any more."""
         self._missed: set[str] = set()
         self._status_failed = False
 

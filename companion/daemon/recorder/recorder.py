@@ -52,7 +52,6 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 FLUSH_S: Final = 1.0
-"""Interval of writes, and what a power cut costs."""
 RETRY_S: Final = 60.0
 DEFAULT_MB: Final = 64
 """Default size of the ring: some 100 minutes of a 200 Hz IMU beside 100 Hz telemetry."""
@@ -77,7 +76,6 @@ def _coarse(where: Whereabouts) -> tuple[object, ...]:
 class _OnRequest:
     file: RecordingFile
     lost_before: int
-    """Messages that were lost in all when it began."""
     since_s: float
     until_s: float | None
     most_bytes: int

@@ -38,12 +38,10 @@ class MavlinkLink:
     def __init__(self, *, system_id: int = 1, component_id: int = 191) -> None:
         self.component_id = component_id
         self.turns = 0
-        """Turns of the transport's loop: a sign of life for the supervisor."""
         self.received: Counter[str] = Counter()
         """Messages by type, plus "bad" (failed checks), "unknown" (not in the dialect) and "handler error"."""
         self.sent = 0
         self.dropped = 0
-        """Messages that could not be sent: no transport was attached, or its buffer was full."""
         self.signing: Signing | None = None
         self.autopilot: Sender | None = None
         self._codec: Codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)

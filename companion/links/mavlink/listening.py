@@ -14,7 +14,6 @@ from companion.protocols.heartbeat import Heartbeat, heartbeats
 USUAL_PORTS: Final = (14540, 14550, 14551)
 """PX4's for companions, the ground stations', and the second one that routers are usually given."""
 LISTEN_S: Final = 3.0
-"""Time for two heartbeats, and one that is lost."""
 LISTEN_TURNS: Final = 30
 """Turns of the loop in that time, each of which reads what has arrived: a process that gets little of the processor
 listens longer."""

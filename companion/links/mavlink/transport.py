@@ -27,7 +27,6 @@ MOST_DATAGRAM_BYTES = 65536
 """UDP carries no more; asyncio makes room for four times that, afresh for every datagram, which costs more than all the
 rest of its reading: so much memory is got from the kernel, and given back, page by page."""
 RESOLVE_DEADLINE_S = 5.0
-"""For the host's name; without a network a resolver takes its time."""
 _TURN_S = 1.0
 _URL = re.compile(r"(?P<kind>udpin|udpout|tcp|serial):(?P<where>.+):(?P<number>\d+)")
 # The target's host is up but nobody listens yet (or it restarts): keep sending, it will come.
@@ -100,8 +99,6 @@ async def _run_udp(
 
 
 class _Udp(asyncio.DatagramProtocol):
-    """What both kinds of UDP share: receiving, sending at once or not at all, and an end."""
-
     def __init__(self, link: MavlinkLink) -> None:
         self.link = link
         loop = asyncio.get_running_loop()
@@ -208,7 +205,6 @@ class _Listener(_Udp):
             self.link.attach(self._send_to_all, self.settled)
 
     def _make_room(self) -> bool:
-        """Let the autopilot's own address have the place of somebody else, the one who has been silent for longest."""
         others = self._heard_s.keys() - self._autopilots
         if not others:
             return False

@@ -32,20 +32,15 @@ A little more than the 20 ms within which an autopilot takes one heading (autopi
 FULLEST_LINE = 0.9
 """The greatest share of a line's time that a stream may fill to be collected."""
 OUT_BUFFER_BYTES = 16384
-"""Over a second at 115200 baud; what waits longer than that is better dropped than sent."""
 LONGEST_PAUSE_S = 1.0
-"""The longest pause between attempts: whatever has come back is open again within 3 s, the opening included."""
 BEAT_S = 1.0
 BEAT_WITHIN_S = 8.0
-"""An open that takes all the time it may, and the longest pause after it."""
 FLOOD_PAUSE_S = 0.05
 MOST_READS = 64
 """So often a port is read before something may be written to it; the kernel keeps less than these bring."""
 DISCARD_BYTES = 65536
 DISCARD_READS = 16
-"""After a pause so much is thrown away at the most, a millisecond's work; the rest waits in the kernel, not here."""
 WORTH_S = 2.0
-"""A connection that lived this long, or that brought bytes, starts the back-off afresh."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,11 +102,9 @@ class ByteLink:
         self.settings = settings
         self.name = name
         self.budget = budget
-        """How much is taken in; None: whatever comes. What comes beyond it is thrown away unread."""
         self.bytes_received = 0
         self.reconnects = 0
         self.turns = 0
-        """Turns of `run`, one at least every `BEAT_WITHIN_S`, whether bytes come or not."""
         self.last_byte_s: float | None = None
         self._on_bytes, self._on_turn, self._on_gap = on_bytes, on_turn, on_gap
         self._reconnection = Reconnection(name, Backoff(cap_s=LONGEST_PAUSE_S), worth_s=WORTH_S, on_state=on_state)
@@ -120,7 +113,6 @@ class ByteLink:
         """Reads that brought bytes since `_reads_since`, a time and the bytes received by then."""
         self._reads_since = (0.0, 0)
         self._collecting: asyncio.TimerHandle | None = None
-        """The next read, while bytes are collected; None: each wakes the loop."""
         self._lost: asyncio.Future[str] | None = None
         self._out = bytearray()
         self._opener = SerialOpener(settings.url, settings.baud, settings.parity)
@@ -207,7 +199,6 @@ class ByteLink:
             self._reads, self._reads_since = 0, (now_s, self.bytes_received)
 
     def _collected(self) -> None:
-        """Read what has come in the meantime; where that is nothing, let the next byte wake the loop again."""
         loop = asyncio.get_running_loop()
         now_s = loop.time()
         # First of all: whatever happens in this turn, there will be another.

@@ -33,12 +33,9 @@ SILENT_S: Final = 3.0
 """How long the first setting is listened to before the port is called silent: a talker is seen at every speed."""
 LINE_S: Final = 1.0
 LINE_MOST_S: Final = 2.5
-"""For a device that sends once a second: two of its frames."""
 FEW_BYTES: Final = 100
 PARITY_BAUDS: Final = 4
-"""Speeds at which the parities are tried: those whose bytes looked most like text."""
 _MOST_BYTES: Final = 131072
-"""More than 921600 baud bring in the time."""
 _LOOK_S: Final = 0.1
 
 
@@ -47,7 +44,6 @@ class Heard:
     """What listening has found."""
 
     line: Line | None
-    """The setting at which somebody is understood; None: nobody is."""
     candidate: Candidate | None
     stranger: str | None
     bytes_heard: int

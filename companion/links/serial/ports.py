@@ -31,24 +31,19 @@ class SerialPort:
     """One serial port as found; what is unknown is None, or an empty tuple."""
 
     device: str
-    """The kernel's name, such as /dev/ttyUSB0; changes with the order of plugging."""
     stable_name: str | None
-    """The name to put into a configuration: by-id if the device has a serial number, else by-path; an on-board port's
-    own name is stable. None for a USB port without links (no udev)."""
+    """The name for a configuration: by-id with a serial number, else by-path; None for a USB port without udev."""
     by_id: tuple[str, ...]
     by_path: tuple[str, ...]
     aliases: tuple[str, ...]
-    """Other links in /dev to it, such as /dev/serial0 or one made by a udev rule."""
     description: str
     driver: str | None
     vendor_id: int | None
     product_id: int | None
     serial_number: str | None
     latency_timer_ms: int | None
-    """FTDI only; above 1 ms the samples of a fast sensor arrive in bunches."""
     holders: tuple[Holder, ...]
     is_console: bool
-    """The kernel's command line names it as a console: its messages would mix with the sensor's bytes."""
 
 
 def list_ports(root: Path = ROOT) -> list[SerialPort]:

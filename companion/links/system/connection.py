@@ -18,7 +18,6 @@ from companion.errors import LinkError
 logger = logging.getLogger(__name__)
 
 OnState = Callable[[bool, str], object]
-"""Told whether there is a connection, and where, or why not."""
 
 
 class Backoff:
@@ -53,9 +52,7 @@ class Reconnection:
     def __init__(self, name: str, backoff: Backoff, *, worth_s: float, on_state: OnState | None = None) -> None:
         self.backoff = backoff
         self.last_error = ""
-        """Why there is, or last was, no connection; one line for people."""
         self.retry_s: float | None = None
-        """When it is tried again, by the loop's clock; None: it is being tried, or there."""
         self._name, self._worth_s, self._on_state = name, worth_s, on_state
         self._warned = False
         self._up_s = math.inf
@@ -167,7 +164,6 @@ async def _connect(loop: asyncio.AbstractEventLoop, endpoint: socket.socket, add
 BYTES_PER_S: Final = 262144.0
 """More than any sensor sends: an IMU at 1 kHz with frames of 200 bytes, with some to spare; a line at 2.6 Mbaud."""
 BURST_BYTES: Final = 65536.0
-"""What may have gathered in the kernel while the loop was busy."""
 
 
 class Budget:

@@ -20,7 +20,6 @@ from companion.errors import DaemonDeniedError, DaemonUnreachableError
 from companion.formats import Object
 
 LINE_LIMIT: Final = 32 * 1024 * 1024
-"""The longest answer, a history of 1000 records, is below 8 MB."""
 READ_TIMEOUT_S: Final = 10.0
 
 

@@ -23,7 +23,6 @@ _PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, log
 
 LINES_PER_S: Final = 0.1
 BURST: Final = 10.0
-"""The most lines of each place in the program: more than a day at the flight line makes at once."""
 
 
 @dataclasses.dataclass(slots=True)

@@ -194,7 +194,6 @@ def _easting(field: bytes, side: bytes) -> float:
 
 
 def _tilt(field: bytes) -> float:
-    """A tilt of a transducer; empty where the device is beyond its range (HMR3000 manual, XDR)."""
     if not field:
         raise RejectedError(reasons.OVER_RANGE)
     value = float(field)

@@ -27,7 +27,6 @@ from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
 SHORTEST: Final = 5
 LONGEST: Final = 200
-"""A frame may have 4096 bytes by the protocol; one with all components that there are has 97."""
 
 DISTORTION: Final = "magnetic distortion"
 """The device says that its magnetometer is beyond its range (80 to 150 uT by model): its heading is worth nothing."""
@@ -69,7 +68,6 @@ class PniDecoder(FrameDecoder):
 
     _little = False
     _contrary = 0
-    """Frames running that are measurements only in the other byte order."""
 
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         if buffer[at]:

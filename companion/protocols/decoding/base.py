@@ -48,14 +48,11 @@ class Decoder(ABC):
         self.seconds_per_byte = seconds_per_byte
         self.times = SampleTimes(self.device_clock_wraps_s, self.sequence_modulus)
         self.frame_bytes = 0
-        """Length of the latest frame that gave samples; 0 where the decoder does not tell."""
         self._read_s: float | None = None
         self._ahead_s = 0.0
         self.accepted = 0
         self.rejected: Counter[str] = Counter()
-        """Frames, or what began like one, that gave none, by reason."""
         self.warned: Counter[str] = Counter()
-        """Frames that gave samples and said something against them, by what they said."""
 
     def receive(self, data: bytes, t_s: float) -> list[Sample]:
         """Decode bytes read at `t_s` on the host's clock; return their samples, timed and counted."""
@@ -141,10 +138,8 @@ class SentenceDecoder(Decoder):
     """
 
     LIMIT: ClassVar[int] = 160
-    """Bytes of a sentence from its "$" on; what is longer is none."""
 
     _partial = b""
-    """From the "$" of the sentence under way; empty outside of one."""
 
     def feed(self, data: bytes, t_s: float) -> list[Sample]:  # noqa: D102 - as in the base class
         text = self._partial + data.replace(b"\r", b"\n")
@@ -326,7 +321,6 @@ class FrameDecoder(Decoder):
         return len(buffer) if found < 0 else found
 
     def _find_mark(self, mark: bytes, buffer: bytes, at: int) -> int:
-        """Where to go on when no mark of two bytes stands at `at`: `WAIT` where its second byte has not come yet."""
         if buffer[at] != mark[0]:
             return self._skip_to(mark[:1], buffer, at)
         if len(buffer) == at + 1:

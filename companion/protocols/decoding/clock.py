@@ -96,7 +96,6 @@ class DeviceClock:
         return None if delay_s > LATE_S else arrival_s - delay_s
 
     def _unwrapped(self, advance_s: float, elapsed_s: float) -> float:
-        """How far the clock went on since the last sample; negative: it went back, and not because it wraps."""
         if self._wraps_s is None:
             return advance_s
         turns = round((elapsed_s - advance_s) / self._wraps_s)
@@ -107,7 +106,6 @@ class DeviceClock:
         return advance_s
 
     def _step(self, arrival_s: float) -> float:
-        """At the end of a span: by how much the offset has to rise now, which it then does."""
         least_s = self._least_s
         self._new_span(arrival_s)
         if least_s <= STEP_S:

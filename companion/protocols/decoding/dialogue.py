@@ -16,7 +16,6 @@ ANSWER_S: Final = 1.0
 """How long an answer is waited for before the device is asked again; none of those polled here documents a delay."""
 PATIENCE: Final = 3
 AGAIN_S: Final = 5.0
-"""The pause between questions after `PATIENCE` of them that nobody has answered."""
 LONGEST_PAUSE_S: Final = 64.0
 
 
@@ -24,7 +23,6 @@ class Dialogue(ABC):
     """The companion's half of the conversation with one device, on one opened port after another."""
 
     words = ""
-    """What was last asked of the device, for people; empty while nothing was ("stream started with S")."""
 
     @abstractmethod
     def opened(self, t_s: float) -> None:

@@ -30,7 +30,6 @@ from companion.samples import ImuSample, Sample, TiltSample, Vector
 
 FRAME_BYTES: Final = 11
 ALONE: Final = "without company"
-"""A frame whose sum is right, but none follows it."""
 
 _START: Final = b"\x55"
 _FIRST_TYPE, _LAST_TYPE = 0x50, 0x5F

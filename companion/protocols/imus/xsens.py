@@ -23,7 +23,6 @@ from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.samples import ImuSample, Sample, Vector
 
 MAX_DATA_BYTES: Final = 1024
-"""The longest message of inertial data has some 200."""
 
 _MARK = b"\xfa\xff"
 _MT_DATA_2 = 0x36

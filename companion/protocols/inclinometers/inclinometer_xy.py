@@ -65,7 +65,6 @@ class InclinometerXyDecoder(LineDecoder):
         return None
 
     def _frame_bytes(self, line: bytes) -> int:
-        """Both lines: a pair is taken together, before the first of them is sent."""
         return self._x_bytes + len(line) + 1
 
     def _why_no_axis(self, line: bytes, *, cut: bool) -> str:
@@ -76,7 +75,6 @@ class InclinometerXyDecoder(LineDecoder):
         return reasons.SINGLE_AXIS if _SINGLE_AXIS.fullmatch(line.strip(b"\r")) else reasons.NOT_A_MEASUREMENT
 
     def _pass_over(self, before: bytes, *, cut: bool) -> None:
-        """What stands in front of the last axis of a line: an echo, or something that has lost its line end."""
         if not cut and _ECHO.fullmatch(before):
             return
         self.rejected[reasons.PARITY if DAMAGED.search(before) else reasons.TOO_LONG if cut else reasons.CUT_SHORT] += 1

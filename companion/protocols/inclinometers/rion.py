@@ -23,7 +23,6 @@ from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, Sample, TiltSample
 
 LONGEST: Final = 51
-"""0x94 with nine records."""
 
 _START: Final = b"\x68"
 _READ, _ANSWER, _REPLY_BIT = 0x04, 0x84, 0x80
@@ -79,7 +78,6 @@ def _measurement(data: bytes, t_s: float) -> Sample:
 
 
 def _degrees(digits: bytes, per_degree: int) -> float:
-    """An angle from its packed digits, the first of which is the sign."""
     text = digits.hex()
     if not text.isdecimal() or text[0] not in "01":
         raise RejectedError(reasons.NOT_A_NUMBER)
