@@ -26,7 +26,6 @@ from companion.links.serial.listening import ports_to_try
 from companion.links.serial.ports import list_ports
 from companion.protocols.registry import Kind
 from companion.setup import draft as drafting
-from companion.setup.document import active_lines
 from companion.setup.draft import Draft, Question, part_key, storage_beside
 from companion.setup.survey import Survey, same_port, same_url, survey
 
@@ -135,7 +134,7 @@ class _Session:
         self.answer |= {"guessed": sorted(draft.guessed), "configuration": draft.wanted}
         if not drafting.holds(self._path, text):
             say("", f"{self._path} will say (and, as comments, all defaults):", "")
-            say(*(f"    {line}" if line else "" for line in active_lines(text)))
+            say(*(f"    {line}" for line in text.splitlines() if line and not line.startswith("#")))
             if not await self.asking.agrees("Write it?"):
                 raise CompanionError("not wanted")
             self._write(text)

@@ -6,7 +6,6 @@ line of the sample becomes a line that counts, a section that is commented out i
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 import tomllib
@@ -73,32 +72,6 @@ def render(text: str, wanted: Mapping[str, Any]) -> str:
     except tomllib.TOMLDecodeError:
         pass
     raise CompanionError("the file is not written line by line, so it cannot be changed line by line")
-
-
-def active_lines(text: str) -> list[str]:
-    """What counts of a file, each line below the comment that explains it."""
-    shown: list[str] = []
-    blocks = list(_blocks(text))
-    for before, block in itertools.pairwise(blocks):
-        if not block.on or not any(_is_on(line) for line in block.lines[1:]):
-            continue
-        shown += ["", *_comment_above(before.lines, len(before.lines)), block.lines[0]]
-        for index, line in enumerate(block.lines[1:], 1):
-            if _is_on(line):
-                shown += [*_comment_above(block.lines, index), line]
-    return shown[1:]
-
-
-def _is_on(line: str) -> bool:
-    match = _KEY.match(line)
-    return match is not None and match["off"] is None
-
-
-def _comment_above(lines: Sequence[str], end: int) -> list[str]:
-    begin = end
-    while begin and lines[begin - 1].startswith("# "):
-        begin -= 1
-    return list(lines[begin:end])
 
 
 def _blocks(text: str) -> Iterator[_Block]:

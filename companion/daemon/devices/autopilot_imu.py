@@ -187,14 +187,12 @@ class AutopilotImu:
         if known.contradicts({name: value}):
             # Anybody can say so; `refresh` asks the autopilot, and voids what was collected if it is true.
             self._announced = self._announced or _Announced(name, value, asyncio.get_running_loop().time())
-        elif not self._rival_changed(known, name, value):
-            return  # else what is in force is the same, but not what will become of it
+        else:
+            rivals = {rival.parameter: rival.value for rival in known.rivals}
+            if name not in self._vehicle.kind.rivals or rivals.get(name, 0) == value:
+                return  # else what is in force is the same, but not what will become of it
         self._pause_s = REREAD_EVERY_S
         self._stale.set()
-
-    def _rival_changed(self, calibration: ImuCalibration, name: str, value: float) -> bool:
-        known = {rival.parameter: rival.value for rival in calibration.rivals}
-        return name in self._vehicle.kind.rivals and known.get(name, 0) != value
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "rebooted":

@@ -159,9 +159,6 @@ class SerialSensor:
         self.on_bytes.tell(self.name, None, now_s)
         self.decoder.interrupted()
 
-    def _is_lively(self, t_s: float) -> bool:
-        return t_s - self._spoke_s < LIVELY_S
-
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes that were read at `t_s`."""
         if self.on_bytes:
@@ -186,7 +183,8 @@ class SerialSensor:
         """Ask what is due: often while a conversation goes on, seldom otherwise, so that a stream costs no ticks."""
         loop = asyncio.get_running_loop()
         while True:
-            await asyncio.sleep(TICK_S if self._is_lively(loop.time()) else COARSE_S)
+            is_lively = loop.time() - self._spoke_s < LIVELY_S
+            await asyncio.sleep(TICK_S if is_lively else COARSE_S)
             if self.link.connected and loop.time() >= self._look_at_s:
                 await self._look_for_others()
             self._speak(loop.time())

@@ -75,6 +75,8 @@ def settings_of(imu: Imu, record: ImuRecord, local: LocalEarth, gyro_step_rad_s:
     # What is left of the steps where the rate is too small to be told from none.
     covariance = covariance + np.eye(3) * gyro_step_rad_s**2 / 12.0
     unknown = UNCALIBRATED_ACCEL_MG * MG
+    # In flight the aircraft is mostly level, however it stood when it was calibrated.
+    level = record.accel_sigma_use_m_s2 if record.effective is None else record.effective.level_sigma_m_s2
     return AttitudeSettings(
         vehicle_from_sensor=rotation_matrix(imu.mounting if serial else "ROTATION_NONE"),
         gravity_m_s2=local.gravity_m_s2,
@@ -83,12 +85,8 @@ def settings_of(imu: Imu, record: ImuRecord, local: LocalEarth, gyro_step_rad_s:
         gyro_bias_rad_s=gyro,
         gyro_covariance=covariance,
         accel_bias_m_s2=accel or _ZERO,
-        accel_sigma_m_s2=(_level_sigma(record) if accel else None) or (unknown, unknown, unknown),
+        accel_sigma_m_s2=(level if accel else None) or (unknown, unknown, unknown),
     )
-
-
-def _level_sigma(record: ImuRecord) -> Vector | None:
-    return record.accel_sigma_use_m_s2 if record.effective is None else record.effective.level_sigma_m_s2
 
 
 def _left(record: ImuRecord, residual: Vector | None, triad: Triad) -> Vector | None:

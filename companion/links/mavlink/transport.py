@@ -202,7 +202,7 @@ class _Listener(_Udp):
             self._autopilots.add(peer)
         self._heard_s[peer] = t_s
         if not self.link.connected:
-            self.link.attach(self._send_to_all, self.settled)
+            self.link.attach(lambda data: sum(self.send_to(data, peer) for peer in self._heard_s) > 0, self.settled)
 
     def _make_room(self) -> bool:
         others = self._heard_s.keys() - self._autopilots
@@ -214,10 +214,6 @@ class _Listener(_Udp):
     def error_received(self, exc: Exception) -> None:
         # One peer that cannot be reached is its own trouble; it is forgotten once silent.
         return
-
-    def _send_to_all(self, data: bytes) -> bool:
-        sent = [self.send_to(data, peer) for peer in self._heard_s]
-        return any(sent)
 
     def _turn(self) -> None:
         now_s = self.now_s()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import re
 import tomllib
 from typing import Any
 
@@ -14,7 +13,7 @@ from hypothesis import strategies as st
 from companion.config import parse
 from companion.errors import CompanionError, ConfigError
 from companion.protocols.guess import Line
-from companion.setup.document import active_lines, render
+from companion.setup.document import render
 from companion.setup.draft import Draft, sample
 from companion.setup.survey import FoundDevice
 
@@ -84,17 +83,6 @@ def test_a_file_that_is_not_written_line_by_line_is_refused() -> None:
     wanted["mavlink"]["url"] = "udpin:0.0.0.0:2"
     with pytest.raises(CompanionError, match="line by line"):
         render(text, wanted)
-
-
-def test_its_comments_are_shown_with_what_counts() -> None:
-    draft = Draft(SAMPLE, is_new=True)
-    draft.take_url("udpin:127.0.0.1:14550")
-    draft.take(TILT)
-    shown = active_lines(draft.result())
-    at = shown.index('law = "axis"')
-    assert shown[at - 1].startswith("# What its two readings mean")
-    assert not any(re.match(r"#\w", line) for line in shown), "defaults are in the file alone"
-    assert tomllib.loads("\n".join(shown)).keys() == {"mavlink", "imu", "gradienter"}
 
 
 def test_a_device_that_is_there_again_keeps_what_its_owner_has_said_of_it() -> None:
