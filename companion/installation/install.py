@@ -1,8 +1,4 @@
-"""Puts the files of the service in place and takes them away again, and says of each what it did.
-
-What is there already and as it should be is left alone; what its owner has changed is never overwritten; everything
-can be done again and again.
-"""
+"""Installs and removes the files of the service, idempotently; what its owner has changed is never overwritten."""
 
 from __future__ import annotations
 

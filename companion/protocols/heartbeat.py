@@ -1,7 +1,6 @@
-"""Whether an autopilot speaks: MAVLink's HEARTBEAT in bytes as they come, at the one speed at which its sum is right.
+"""MAVLink HEARTBEATs in raw bytes: does an autopilot speak at this speed?
 
-One is enough. Format: MAVLink developer guide, "Packet Serialization", and HEARTBEAT (0) of the common messages: nine
-bytes, the last of which is never zero, so version 2 never cuts it short.
+One is enough. Its nine bytes end with one that is never zero, so version 2 never cuts it short.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Which protocols there are, under the names that the configuration uses, and how their lines are set by default.
+"""Protocols by their names in the configuration, and their devices' default line settings.
 
-One device on one port may be IMU, gradienter and compass at once. A decoder gives the tilt of one frame once: as a
-`TiltSample`, or as the pitch and roll of its `CompassSample`; `part_for` says what each role takes of it.
+A decoder gives the tilt of a frame once, as `TiltSample` or in its `CompassSample`; `part_for` splits it by role.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""The configuration file as a text that people read: values are changed in it, comments and all else stay.
-
-What is written is the sample configuration with values in it, or the owner's own file with other values: a commented
-line of the sample becomes a line that counts, a section that is commented out is switched on.
-"""
+"""The configuration file as text: values are changed in it, comments stay, commented lines and sections switch on."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""One IMU of the autopilot: its telemetry, and the offsets that were in force while that was sent.
+"""One IMU of the autopilot: its telemetry, and the offsets subtracted in it.
 
-The telemetry has the autopilot's offsets subtracted already. So samples count only while these offsets are known, and
-when anybody changes one of them (a ground station, another companion, a reboot), what was collected before is void.
+Samples count only while these offsets are known; a change by anybody voids what was collected before.
 """
 
 from __future__ import annotations

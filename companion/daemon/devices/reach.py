@@ -1,9 +1,7 @@
-"""Can ground stations reach the companion? If not: why, and what to do, in words.
+"""Whether ground stations reach the companion, and if not, why.
 
-A ground station's command to component 191 passes through the autopilot. Both firmwares forward it only to a link on
-which they have heard a heartbeat of that component; ours goes out from the first second on. PX4 besides forwards only
-between links that both have MAV_n_FORWARD = 1, which is 0 by default on all but MAV_0, and it takes effect at a start.
-No MAVLink message tells which MAV_n our own link is (autopilots 5.4).
+Both firmwares forward a command for component 191 only to a link on which they hear its heartbeat. PX4 forwards only
+between links with MAV_n_FORWARD = 1 at its start; no message tells which MAV_n our link is (autopilots 5.4).
 """
 
 from __future__ import annotations

@@ -41,10 +41,7 @@ NO_OFFSETS: Final = object()
 
 
 class MotionWitness:
-    """Whether the aircraft has tilted or turned since some instant, as its IMUs saw it.
-
-    In the IMUs' own axes: the angle between two directions of gravity, and the turn about it, need no mounting.
-    """
+    """Whether the aircraft has tilted or turned, as its IMUs saw it in their own axes: no mounting is needed."""
 
     def __init__(self) -> None:
         self._seconds: dict[str, deque[tuple[int, Array, float]]] = {}
@@ -73,10 +70,7 @@ class MotionWitness:
                 seconds.append((batch.slot, down, turned_deg))
 
     def tilted_deg(self, near_since_s: float, since_s: float, until_s: float) -> float:
-        """By how much it has tilted since `near_since_s`, and stayed so since `since_s`; the least that any IMU saw.
-
-        So long the sensor has shown about, and exactly, what it shows now; `until_s`: its latest reading.
-        """
+        """Return the least tilt that any IMU saw since `near_since_s`, if it has lasted since `since_s`."""
         return min((self._tilted_deg(each, since_s) for each in self._heard(near_since_s, until_s)), default=0.0)
 
     @staticmethod

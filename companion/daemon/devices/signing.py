@@ -1,8 +1,4 @@
-"""Signing in the daemon: the key, the time that outlives restarts, and words about refused senders.
-
-The key file is read again each second until it holds a key. Until then everything is refused where a signature is
-required.
-"""
+"""Signing in the daemon: the key, read each second until there is one; the time over restarts; refused senders."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
-"""The control socket: how the command line talks to the running daemon.
+"""Control socket: how the command line and the child processes talk to the running daemon.
 
-A Unix stream socket, for the daemon's own user alone (mode 0600) or for a group too (0660). One request a connection,
-one JSON object a line: the client sends {"command": ..., ...}; the daemon answers with any number of
-{"kind": "progress", ...} and one last line {"kind": "result", ...} or {"kind": "error", "reason": ...}. A client that
-goes away stops nothing: what it started goes on, and another client can watch or cancel it.
+A Unix stream socket of the daemon's user (mode 0600) or a group (0660). One request a connection, one JSON object a
+line: progress lines, then one of kind "result" or "error". A client that goes away stops nothing.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""The estimator in the daemon: what feeds it, when it is aligned, and with what.
-
-Samples go through at once, in the turn of the loop in which they were read. Everything else (a new calibration, an
-alignment, the phase of flight) is looked at a few times a second.
-"""
+"""The attitude estimator in the daemon: its samples, at once; its calibration and alignment, a few times a second."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""What ArduPilot flies by when our heading ends: in flight gyros and GNSS, source set 3 (autopilots 10.4).
+"""The source set that ArduPilot flies by when our heading ends: gyros and GNSS in flight, set 3 (autopilots 10.4).
 
-No compass, which may have come to lie since the take-off, with nobody to compare it: the compass, source set 2, is for
-the ground. The script on the flight controller sees to it (companion/lua); where there is none, the companion asks.
-Nobody does then if its board dies. PX4 goes back to its magnetometer by itself.
+The compass, set 2, is for the ground: in flight nobody could compare it. The script on the flight controller selects
+(companion/lua); without it the companion asks. PX4 goes back to its magnetometer by itself.
 """
 
 from __future__ import annotations

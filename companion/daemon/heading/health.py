@@ -188,12 +188,10 @@ def disagreements(attitude: Attitude, tilt_rad: float, heading_rad: float) -> tu
 
 
 class Health:
-    """Judges; `judge` several times a second.
+    """Judges whether the attitude may be pushed; `judge` several times a second.
 
     A heading that differs stops the push if the two have agreed since the last alignment, or if the autopilot's is its
-    compass' and not ours: then one of the two compasses lies. Else it has none, or one that is to be replaced by ours.
-    What turns in flight while the autopilot's gyros do not is not pushed again before it is aligned on the ground.
-    `own_agrees`: whether the autopilot's compass is well and agrees with its yaw at a time.
+    own compass' (`own_agrees`): one of the two compasses lies. Drift in flight ends with an alignment only.
     """
 
     def __init__(

@@ -1,8 +1,6 @@
-"""A daemon that starts in flight: the attitude begins again by what is on disk and what is measured, or not at all.
+"""A daemon that starts in flight: the attitude begins again from the last calibration, or not at all.
 
-Of the attitude itself nothing is kept: seconds later, in a turn, it would be worth nothing. Biases and place are those
-of the last calibration; roll and pitch are the autopilot's, and the heading is our compass'. Nothing is pushed before
-all that has gone along with the autopilot's own attitude for a while.
+Roll and pitch are the autopilot's, the heading is our compass'. Nothing is pushed before both agree for a while.
 """
 
 from __future__ import annotations

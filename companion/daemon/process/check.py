@@ -200,13 +200,7 @@ async def run_check(
 
 
 async def answering_imus(config: Config, imus: Sequence[Imu]) -> dict[str, str | None]:
-    """Find out which of these autopilot IMUs exist, and their parts by device id (None: not known). Writes nothing.
-
-    An IMU exists if its offsets can be read and its samples come. Listening ends when that is decided for every IMU.
-
-    Raises:
-        CompanionError: something that makes asking itself impossible.
-    """
+    """Find out which of these autopilot IMUs exist, by offsets and samples; return their parts (None: not known)."""
     alone = msgspec.structs.replace(config, imu=list(imus), gradienter=None, compass=None, mqtt=None, web=None)
     service = Service(alone, only_listening=ONLY_CHECKING)
 

@@ -1,7 +1,6 @@
-"""The daemon as a process: signals, and whoever started it.
+"""The daemon as a process. SIGTERM and SIGINT end it in order, with old values restored and exit code 0.
 
-SIGTERM and SIGINT end it in order: what runs is cancelled at its next safe point, old values are put back, and the
-exit code is 0. SIGHUP is ignored: a companion run by hand goes on when its terminal closes.
+SIGHUP is ignored: a companion run by hand goes on when its terminal closes.
 """
 
 from __future__ import annotations

@@ -36,8 +36,7 @@ LISTEN_TURN_S: Final = 0.1
 class Service:
     """The daemon, subsystem by subsystem; each knows only those above it here.
 
-    A test may have put the link on a wire of its own. `offload` runs a blocking call elsewhere; `only_listening` says
-    why nothing may be started, where it must change nothing; `child` runs the page's and the MQTT process.
+    `only_listening`: why nothing may be started or changed; `link`, `offload` and `child` are a test's.
     """
 
     def __init__(
@@ -104,11 +103,9 @@ class Service:
         await run_transport(self.core.link, self.config.mavlink.url)
 
     async def listen(self, goes_on: Callable[[float], bool]) -> Object:
-        """Open everything, listen, and return the status; for `companion check`, writes nothing.
+        """Open everything, listen while `goes_on`, and return the status, for `companion check`; writes nothing.
 
-        `goes_on`: whether to continue after so many seconds. Seconds are counted in turns of the loop, each of which
-        reads what has arrived: a process that gets little of the processor listens longer, and not to less.
-        `only_listening` must be set.
+        Seconds are counted in turns of the loop, each of which reads what has arrived: a slow process listens longer.
         """
         self.devices.load()
         tasks = [("mavlink", self._connect), *self.faces.tasks(), *self.devices.tasks(), *self.arming.tasks()]

@@ -1,7 +1,6 @@
-"""Watches the long-lived tasks and tells the service manager: alive, and what is being done.
+"""Watches the long-lived tasks and feeds the service manager's watchdog while all go on.
 
-The watchdog is fed only while the sensors', the autopilot's and the estimator's tasks all go on. Which one does not is
-said in the log, with the place where it waits, before the manager ends the process and starts a fresh one.
+A task that does not is logged with the place where it waits, before the manager ends the process.
 """
 
 from __future__ import annotations
@@ -46,11 +45,9 @@ class Watched(NamedTuple):
 
 
 class Beats:
-    """Who still goes on.
+    """Tasks that go on, by their counted turns: a loop that turns proves nothing of a task that waits for ever.
 
-    A loop that turns proves nothing of a task in it that waits for ever. So each task counts its turns, and how long
-    one has lasted counts in looks: while the whole loop stands still nobody ages, or every task would be blamed for
-    what one blocking call has done (and that the service manager sees by itself).
+    The age of a turn counts in calls of `update`: while the whole loop stands still nobody ages.
     """
 
     def __init__(self, watched: Sequence[Watched]) -> None:

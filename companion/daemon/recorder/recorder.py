@@ -1,8 +1,6 @@
-"""Keeps the last hour and a half of all inputs in a ring of files, and records to a file on request.
+"""Keeps the inputs of the last hour and a half in a ring of files, and records to a file on request.
 
-It listens to the inputs of a calibration: bytes of the devices and of the link, ticks, the parameters in force, windows
-and records. Sensing and MAVLink never wait for it: messages go into a bounded queue, a thread empties that once a
-second, and a disk that is full, slow or gone costs recordings only.
+Sensing and MAVLink never wait for it: a thread empties a bounded queue once a second.
 """
 
 from __future__ import annotations

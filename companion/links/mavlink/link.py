@@ -1,8 +1,7 @@
-"""MAVLink on one link: packing, parsing, sequence numbers, and who wants to hear which message.
+"""MAVLink on one link: packing, parsing, sequence numbers, and subscriptions.
 
-pymavlink's generated dialect class is the codec; `mavutil` is not used (it blocks, prints, and weighs 41 MiB).
-No socket is opened here: a transport (links.mavlink_transport, or a test's) hands received bytes to `receive` and
-gives `attach` a function that sends.
+The codec is pymavlink's dialect class; `mavutil` blocks, prints, and weighs 41 MiB. A transport hands received bytes
+to `receive` and gives `attach` a function that sends.
 """
 
 from __future__ import annotations
@@ -29,11 +28,7 @@ _ANYBODYS = frozenset(mavlink.mavlink_map[number].msgname for number in NEVER_SI
 
 
 class MavlinkLink:
-    """One MAVLink connection as one component sees it.
-
-    `system_id` changes while running: it is latched from the autopilot's heartbeat. All calls are made on
-    the event loop's thread; handlers must not block.
-    """
+    """One MAVLink connection as one component sees it, under the system id of the autopilot that was latched."""
 
     def __init__(self, *, system_id: int = 1, component_id: int = 191) -> None:
         self.component_id = component_id
@@ -77,11 +72,7 @@ class MavlinkLink:
         self.turns += 1
 
     def attach(self, transmit: Callable[[bytes], object] | None, settled: Callable[[], bool] = lambda: True) -> None:
-        """Give the function that sends bytes, or None while there is none. What was half received is forgotten.
-
-        A `transmit` that returns False has dropped the bytes because its buffer is full. `settled` does its part of
-        our own `settled`.
-        """
+        """Give the function that sends (False: its buffer is full), or None, and the transport's part of `settled`."""
         self._transmit, self._settled = transmit, settled
         self._attached += 1
         self._forget_received()
@@ -92,10 +83,9 @@ class MavlinkLink:
         return self._settled()
 
     def send(self, message: mavlink.MAVLink_message, allowed: Callable[[], bool] = lambda: True, /) -> bool:
-        """Send a message now; False (and counted) when no transport is attached or its buffer is full.
+        """Send a message now; False, and counted, when no transport is attached or its buffer is full.
 
-        `allowed` is asked once the bytes are ready, as the last thing before they leave; False: they do not. It sends
-        nothing itself.
+        `allowed` is asked as the last thing before the bytes leave.
         """
         data = message.pack(self._codec)
         if self.signing is not None:
@@ -131,10 +121,9 @@ class MavlinkLink:
             self._codec.buf_index = 0
 
     def receive_datagram(self, datagram: bytes, t_s: float, admit: Callable[[Sender], None]) -> None:
-        """Take a datagram, which holds whole messages: of one that is cut off nothing is carried into the next.
+        """Parse a datagram of whole messages; `admit` learns each sender before its message has any effect.
 
-        `admit` is told who sent each message that may have an effect, before it has any; not of a radio's own, which
-        anybody may send without a signature.
+        A radio's own messages are not admitted by anybody: they come without a signature.
         """
         if self.on_bytes:
             self.on_bytes.tell("in", datagram, t_s)

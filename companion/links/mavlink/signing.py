@@ -125,10 +125,9 @@ class SigningClock:
 
 
 class Signing:
-    """Sign what one link sends and verify what it receives.
+    """Sign what one link sends and verify what it receives; without a key everything is refused.
 
-    With `required` a message that is not signed with the key (32 bytes) is dropped, else only counted. Without a key
-    nothing is signed and everything is refused.
+    With `required` a refused message is dropped, else only counted.
     """
 
     def __init__(self, *, required: bool, key: bytes | None = None, clock: SigningClock | None = None) -> None:

@@ -1,8 +1,6 @@
-"""Carries a MAVLink link's bytes: UDP, TCP or a serial line, for as long as it takes.
+"""Carries a MAVLink link's bytes over UDP, TCP or a serial line, and comes back by itself.
 
-Urls as in the configuration: `udpin:HOST:PORT` (listen, answer whoever speaks), `udpout:HOST:PORT` (speak first),
-`tcp:HOST:PORT` (connect) and `serial:PATH:BAUD`. All come back by themselves; the link is attached only while there
-is somebody, or at least somewhere, to send to.
+The link is attached only while there is somebody, or at least somewhere, to send to.
 """
 
 from __future__ import annotations
@@ -36,13 +34,7 @@ Peer = tuple[Any, ...]
 
 
 async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None = None) -> None:
-    """Keep `link` connected through `url` until cancelled.
-
-    `on_state(connected, words)` tells of every change; for UDP the words hold the local address.
-
-    Raises:
-        LinkError: the url is none of ours. A peer that is not there is no error.
-    """
+    """Keep `link` connected through `url` until cancelled; raise LinkError where the url is wrong."""
     kind, where, number = parse_url(url)
     if kind in ("udpin", "udpout"):
         await _run_udp(link, url, (where, number), listen=kind == "udpin", on_state=on_state)

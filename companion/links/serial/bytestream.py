@@ -1,8 +1,4 @@
-"""A port that comes back by itself: the one place that knows a serial port from `tcp://`.
-
-Whatever was opened ends as one non-blocking descriptor on the event loop, read with `os.read`: one code path, no
-thread in the hot path, and full control over the instant of the time stamp and over when a dead port is closed.
-"""
+"""A serial port or `tcp://` that comes back by itself: one non-blocking descriptor, read on the event loop."""
 
 from __future__ import annotations
 
@@ -24,11 +20,8 @@ QUICK_READS = 20
 QUICK_S = 0.0015
 """How many reads, and how close together in the mean, mark a stream whose every byte would wake the loop."""
 COLLECT_S = 0.0205
-"""How long such a stream is collected before the next read: a wake-up costs far more than the bytes that it brings.
-
-What it brings is stamped that much late at worst (where the device has no clock of its own), as behind a USB adapter.
-A little more than the 20 ms within which an autopilot takes one heading (autopilots 6): each read brings one.
-"""
+"""How long such a stream is collected before the next read, as behind a USB adapter: a wake-up costs far more than its
+bytes. A little more than the 20 ms within which an autopilot takes one heading (autopilots 6)."""
 FULLEST_LINE = 0.9
 """The greatest share of a line's time that a stream may fill to be collected."""
 OUT_BUFFER_BYTES = 16384
@@ -80,12 +73,10 @@ class PortSettings:
 
 
 class ByteLink:
-    """Bytes of one port to `on_bytes(data, t_s)`, for as long as `run` runs; opens again after every loss.
+    """Bytes of one port to `on_bytes(data, t_s)` while `run` runs; opens again after every loss.
 
-    `t_s` is the loop's time at which the chunk was read. `on_state(connected, reason)` tells of every change, of the
-    reason too while attempts go on; a decoder should be told (`Decoder.interrupted`), as bytes are missing between
-    two connections, and where `on_gap` tells of bytes that were thrown away. All calls are made on the loop's thread;
-    the callbacks must neither block nor raise.
+    `on_state(connected, reason)` reports every change, `on_gap` bytes thrown away. Callbacks must neither block nor
+    raise.
     """
 
     def __init__(

@@ -1,7 +1,6 @@
-"""Listening to a port at one line setting after another until somebody is understood; never says a byte.
+"""Listening to a port at one line setting after another until a device is understood; sends nothing.
 
-Opening a port is not without effect: DTR rises, and a board like the Arduino starts anew. So nobody's port is listened
-to without being asked for, and never one that another program holds.
+Opening raises DTR, which restarts boards like the Arduino: a port is listened to on request only, and never if held.
 """
 
 from __future__ import annotations

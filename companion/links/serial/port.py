@@ -1,7 +1,6 @@
-"""Opening a serial port so that nobody else reads from it, and saying in one line why that failed.
+"""Opening a serial port exclusively, and the cause in one line where that failed.
 
-pyserial does the opening and the portable part of the settings; what it does not do is done here: TIOCEXCL, parity
-checking, and VMIN = 1. Its object is dropped at once and only the file descriptor goes on to the event loop.
+pyserial opens; TIOCEXCL, parity checking and VMIN = 1 are added here. Only the descriptor is kept.
 """
 
 from __future__ import annotations
@@ -29,13 +28,7 @@ OPEN_DEADLINE_S = 5.0
 
 
 def open_serial(path: str, baud: int, parity: Parity) -> int:
-    """Open a port raw, 8 data bits, one stop bit, no flow control, non-blocking; return its descriptor.
-
-    Blocks for as long as the driver does: the event loop calls it through `SerialOpener`.
-
-    Raises:
-        LinkError: one line that names the port and the cause.
-    """
+    """Open a port raw, 8 data bits, one stop bit, no flow control, non-blocking; blocks while the driver does."""
     import serial  # 10 ms that a daemon without serial ports need not spend
 
     try:
@@ -138,11 +131,9 @@ def _is_character_device(path: str) -> bool:
 
 
 class SerialOpener:
-    """Opens one port, again and again, without ever holding up the event loop or the exit of the process.
+    """Opens one port without ever holding up the event loop or the exit of the process.
 
-    The open and the first ioctls of a USB bridge are control transfers: tens of milliseconds when all is well, for
-    ever when the driver hangs. So each attempt runs in a daemon thread of its own. The loop's executor would not
-    do: its threads are few, and asyncio waits for them before the process may end.
+    An open may hang with its driver for ever, so each attempt runs in a daemon thread: asyncio would wait for its own.
     """
 
     def __init__(self, path: str, baud: int, parity: Parity) -> None:

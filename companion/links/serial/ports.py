@@ -1,7 +1,6 @@
-"""Which serial ports there are, under which name each is found again, and who holds it: for `companion ports`.
+"""Serial ports, their stable names, and who holds them: for `companion ports`.
 
-Read from sysfs, /dev/serial and /proc, all below a `root` that a test may replace. pyserial's list is not used: it
-cannot be pointed elsewhere, and it hides the platform UARTs, among them the Raspberry Pi's mini-UART.
+Read from sysfs, /dev/serial and /proc below a `root` that a test may replace. pyserial's list hides platform UARTs.
 """
 
 from __future__ import annotations

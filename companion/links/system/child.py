@@ -1,8 +1,7 @@
-"""A child process of the daemon: how the page's and the MQTT process start, report and end.
+"""A child process of the daemon (`companion.daemon.faces.child`): how it starts, reports and ends.
 
-The daemon side is `companion.daemon.faces.child`. The child reads its settings from stdin, one line of JSON, and ends
-when stdin ends: the daemon is gone. It writes its status to stdout, one JSON object a line, at least every
-`REPORT_EVERY_S`; a child that falls silent is killed and started again. Its log goes to the daemon's stderr.
+It reads its settings from stdin, one line of JSON, and ends when stdin ends. It writes its status to stdout, one JSON
+object a line, at least every `REPORT_EVERY_S`, and its log to the daemon's stderr.
 """
 
 from __future__ import annotations

@@ -21,11 +21,7 @@ OnState = Callable[[bool, str], object]
 
 
 class Backoff:
-    """Delays 0.2, 0.4, 0.8 ... s up to a cap; `reset` after an attempt that was worth something.
-
-    There is no jitter: what is retried here is one device or one server by one client, so nothing gathers into a
-    herd, and a fixed rhythm is easier to recognise in a log.
-    """
+    """Delays 0.2, 0.4, 0.8 ... s up to a cap; `reset` after a useful attempt. No jitter: there is no herd."""
 
     def __init__(self, first_s: float = 0.2, cap_s: float = 2.0) -> None:
         self._first_s, self._cap_s = first_s, cap_s
@@ -43,10 +39,9 @@ class Backoff:
 
 
 class Reconnection:
-    """One connection that is opened again for as long as it takes; a loss is warned of once, until it is back.
+    """One connection that is opened again and again; a loss is warned of once, until it is back.
 
-    A connection that lasted `worth_s` starts the pauses afresh. `on_state` is told of every change, of the reason too
-    while attempts go on; it must neither block nor raise.
+    A connection that lasted `worth_s` resets the pauses.
     """
 
     def __init__(self, name: str, backoff: Backoff, *, worth_s: float, on_state: OnState | None = None) -> None:
@@ -123,12 +118,7 @@ async def connect_tcp(url: str, address: tuple[str, int]) -> int:
 
 
 async def connect(host: str, port: int) -> int:
-    """Connect to the first address of a host that answers, for as long as the system tries; return the descriptor.
-
-    Raises:
-        OSError: none does; of a host that is not known, `socket.gaierror`.
-        UnicodeError: the host cannot be a name.
-    """
+    """Connect to the first address that answers; return the descriptor. Raise OSError or UnicodeError if none."""
     loop = asyncio.get_running_loop()
     failed = OSError("the host has no address")
     for family, kind, protocol, _, found in await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM):

@@ -1,7 +1,6 @@
-"""How the daemon's log looks: for people on a terminal, with priorities in the journal, and never a flood.
+"""The daemon's log: for people on a terminal, with priorities in the journal.
 
-Much of what is logged, somebody on the link can cause as often as he likes. Each place of the program has so many lines
-a minute; the rest is counted, and the count is said.
+Each place of the program has so many lines a minute, as others can cause them at will; the rest is counted.
 """
 
 from __future__ import annotations

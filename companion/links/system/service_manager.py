@@ -1,8 +1,4 @@
-"""What the service manager is told: ready, what is being done, still alive, stopping. The sd_notify(3) protocol.
-
-Our own few lines and no library: PyPI's sdnotify has slept since 2016 and swallows every error, libsystemd's binding
-needs a compiler, and the protocol is one datagram of text lines.
-"""
+"""Notifications to the service manager by the sd_notify(3) protocol: one datagram of text lines."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""What all decoders share: counting, framing of lines, sentences and binary frames, and checks.
+"""Framing of lines, sentences and binary frames, counting, and checks, for all decoders.
 
-A decoder is fed bytes as they come, in any split, and gives samples; it never raises for what it is fed. How the
-bytes were split changes neither the samples nor the counts. Whatever waits for its end is bounded. A frame that is not
-one costs only its first byte: in what it took for its own, a good frame may begin.
+A decoder never raises for the bytes it is fed. Their splits change neither samples nor counts, and what waits for its
+end is bounded. A false frame costs only its first byte: in it a good frame may begin.
 """
 
 from __future__ import annotations
@@ -81,11 +80,7 @@ class Decoder(ABC):
 
 
 class LineDecoder(Decoder):
-    r"""Frames a protocol of lines that end in "\n"; a subclass reads one line at a time.
-
-    A line longer than `LIMIT` is given as its last `LIMIT` bytes and marked as cut, so that noise without any line
-    end costs no memory.
-    """
+    r"""Frames a protocol of lines that end in "\n"; a longer line is given as its last `LIMIT` bytes, marked as cut."""
 
     LIMIT: ClassVar[int] = 80
     _partial = b""
@@ -132,10 +127,7 @@ class LineDecoder(Decoder):
 
 
 class SentenceDecoder(Decoder):
-    r"""Frames a protocol of sentences `$...`; a subclass reads one at a time.
-
-    A sentence may end in "\r", "\n" or both; a "$" always begins a new one. What is outside of sentences is skipped.
-    """
+    r"""Frames sentences `$...` that end in "\r", "\n" or both, or where the next "$" begins one."""
 
     LIMIT: ClassVar[int] = 160
 
@@ -194,13 +186,7 @@ def xor_checksum(body: bytes) -> int:
 
 
 def body_of_sentence(sentence: bytes) -> bytes:
-    """Check a sentence without its line end, `$body*hh`, and return the body.
-
-    Four hexadecimal digits are a CRC-16/XMODEM instead, as VectorNav devices may be set to send (UM001, 3.8).
-
-    Raises:
-        RejectedError: there is no checksum, or it is wrong.
-    """
+    """Return the body of `$body*hh`, or of VectorNav's CRC-16/XMODEM `*hhhh` (UM001, 3.8); raise RejectedError."""
     body, _, digits = sentence[1:].rpartition(b"*")
     if len(digits) not in (2, 4) or sentence[-1 - len(digits)] != ord("*"):
         raise RejectedError(reasons.NO_CHECKSUM)

@@ -1,13 +1,9 @@
-"""When a sample was taken, by the host's clock: what the line, a device's own clock and its counter tell of it.
+"""Times of samples on the host's clock, by a device's own clock and its counter.
 
-A read comes late by anything: the frame's way through the line, a USB adapter that hands over every 16 ms, a host that
-was busy for 60 ms. A device's clock knows better, but not what time it is here. Between the two lies an offset, and the
-least delay ever seen tells it best: the running minimum of (read - device), which may creep upwards as fast as two
-crystals drift apart. It is causal, forgives every stall, and leaves only the least delay in, which nobody can see from
-one end (sensors 4.4; dawonn/vectornav#88 and ethz-asl's cuckoo_time_translator discuss the choice).
-
-A clock that went back, or that has advanced by far less than the host's, is a device that restarted (its biases are
-new ones); one that jumped forward belongs to another device, or the host slept. Either way it is mapped afresh.
+A read comes late by the line, a USB adapter, or a busy host. The offset between the two clocks is the running minimum
+of (read - device), which may creep upwards as two crystals drift apart: causal, and immune to stalls (sensors 4.4).
+A clock that went back or fell behind belongs to a device that restarted; one that jumped forward to another device,
+or the host slept. Either way it is mapped afresh.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""What is said to a device so that it speaks: polls, and commands to start a stream that has been stopped.
+"""Polls, and commands to start a stream that has been stopped. Pure: time comes in, bytes go out.
 
-Only what leaves no trace in a device is ever said: nothing that it stores, nothing that toggles unless its state has
-been seen, nothing while it speaks by itself. `read_only = true` in the configuration keeps us silent altogether.
-Pure: time comes in, bytes go out.
+Nothing is sent that a device stores or toggles, nothing while it streams, nothing with `read_only = true`.
 """
 
 from __future__ import annotations
@@ -81,11 +79,7 @@ class PollDialogue(Dialogue):
 
 
 class WakeDialogue(Dialogue):
-    """Says one thing after another to a device that keeps silent, so that it streams again, and begins again.
-
-    A device that sends anything, be it what it was not asked for, is left alone. Pauses double from one attempt to the
-    next, so that a device that is off is not shouted at for ever.
-    """
+    """Sends one command after another to a silent device, with doubling pauses; leaves one that speaks alone."""
 
     SAYINGS: ClassVar[tuple[tuple[bytes, str], ...]]
     _quiet_since_s: float | None = None

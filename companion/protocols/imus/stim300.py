@@ -105,10 +105,9 @@ FRAME_BYTES: Final = {name: layout.frame_bytes for name, layout in NORMAL_MODE.i
 
 
 def is_whole(frame: bytes) -> bool:
-    """Whether the CRC at the end of a datagram is right.
+    """Whether the CRC-32/MPEG-2 at the end of a datagram, padded with zeros to whole words, is right.
 
-    CRC-32/MPEG-2 over the datagram and as many zero bytes as fill its last word, which are not sent. It is zlib's CRC
-    with all bits in the other order and without the last inversion, so zlib can do the work on mirrored bytes.
+    It is zlib's CRC with all bits in the other order and without the last inversion: zlib works on mirrored bytes.
     """
     mirrored = frame.translate(_REVERSED)
     body = mirrored[:-CRC_BYTES]

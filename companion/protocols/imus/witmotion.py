@@ -44,11 +44,7 @@ _WRONG_SUM: Final = 0
 
 
 class WitMotionDecoder(FrameDecoder):
-    """Frames of a WitMotion device; gives `ImuSample` and `TiltSample`.
-
-    Acceleration and rate of one epoch are neighbours on the wire and make one `ImuSample`, timed at the latter's end;
-    without its neighbour neither is used.
-    """
+    """Frames of a WitMotion device; gives `ImuSample`, of neighbouring acceleration and rate, and `TiltSample`."""
 
     _good_at = -1
     """Stream position of a frame that was found good when it followed another, or that waits for one to follow."""
