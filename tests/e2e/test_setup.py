@@ -159,7 +159,7 @@ def test_a_person_answers_and_has_a_configuration_that_works(tmp_path: Path) -> 
             await terminal.answer(r"IMU 2 of the autopilot \(fc2\)", "")
             assert made.left() == set()
             shown = await terminal.says(r"Write it\?")
-            assert "law = \"euler\"" in shown
+            assert 'law = "euler"' in shown
             await terminal.answer("", "")
             checked = await terminal.says("Next:")
             assert await terminal.ended() == 0, terminal.screen

@@ -1,7 +1,7 @@
 """MAVLink on one link: packing, parsing, sequence numbers, and subscriptions.
 
 The codec is pymavlink's dialect class; `mavutil` blocks, prints, and weighs 41 MiB. A transport hands received bytes
-to `receive` and gives `attach` a function that sends.
+to `receive` and gives `attach` a function that sends. Frames that nobody wants are told by `kind_at`, not decoded.
 """
 
 from __future__ import annotations
@@ -25,6 +25,18 @@ Sender = tuple[int, int]
 
 _COMPACT_BYTES = 4096
 _ANYBODYS = frozenset(mavlink.mavlink_map[number].msgname for number in NEVER_SIGNED)
+
+
+def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
+    """Return kind and end of a whole, unsigned, intact frame of version 2; None for anything else."""
+    if len(data) - at < 12 or data[at] != mavlink.PROTOCOL_MARKER_V2 or data[at + 2]:
+        return None
+    end = at + 12 + data[at + 1]
+    kind: Kind | None = mavlink.mavlink_map.get(int.from_bytes(data[at + 7 : at + 10], "little"))
+    if kind is None or end > len(data):
+        return None
+    checksum = mavlink.x25crc(data[at + 1 : end - 2] + bytes((kind.crc_extra,))).crc
+    return (kind, end) if checksum == int.from_bytes(data[end - 2 : end], "little") else None
 
 
 class MavlinkLink:
@@ -110,8 +122,8 @@ class MavlinkLink:
         if self.on_bytes:
             self.on_bytes.tell("in", data, t_s)
         attached = self._attached
-        for message in self._frames(data):
-            self._dispatch(message, t_s)
+        for name, _, message in self._frames(data):
+            self._dispatch(name, message, t_s)
             if self._attached != attached:
                 return  # what came over another transport ends here
         # The codec frees its buffer only when a read happens to end on a frame's end; a busy serial link may not
@@ -132,17 +144,36 @@ class MavlinkLink:
             self.received["bad"] += 1
             self.on_bytes.tell("in", None, None)
         self._forget_received()
-        for message in frames:
-            if message.get_type() not in _ANYBODYS:
-                admit((message.get_srcSystem(), message.get_srcComponent()))
-            self._dispatch(message, t_s)
+        for name, sender, message in frames:
+            if name not in _ANYBODYS:
+                admit(sender)
+            self._dispatch(name, message, t_s)
 
-    def _frames(self, data: bytes) -> Iterator[Message]:
-        """Messages that are whole and admitted."""
-        message = self._next_message(data)
+    def _frames(self, data: bytes) -> Iterator[tuple[str, Sender, Message | None]]:
+        """Yield name, sender and message of whole admitted frames; no message where nobody wants it.
+
+        The codec gets everything from the first frame on that `kind_at` does not know.
+        """
+        if self._codec.buf:
+            data = self.half_received + data
+            self._forget_received()
+        at = 0
+        while self.signing is None and (found := kind_at(data, at)) is not None:
+            kind, end = found
+            message = None
+            if self._handlers.get(kind.msgname):
+                try:
+                    message = self._codec.decode(bytearray(data[at:end]))
+                except mavlink.MAVError:
+                    break
+            yield kind.msgname, (data[at + 5], data[at + 6]), message
+            at = end
+        if at == len(data):
+            return
+        message = self._next_message(data[at:])
         while message is not None:
             if self._admits(message):
-                yield message
+                yield message.get_type(), (message.get_srcSystem(), message.get_srcComponent()), message
             message = self._next_message(b"")
 
     def _admits(self, message: Message) -> bool:
@@ -171,8 +202,7 @@ class MavlinkLink:
         self._codec.buf = bytearray()
         self._codec.buf_index = 0
 
-    def _dispatch(self, message: Message, t_s: float) -> None:
-        name = message.get_type()
+    def _dispatch(self, name: str, message: Message | None, t_s: float) -> None:
         self.received[name] += 1
-        if name in self._handlers and (failed := self._handlers[name].tell(message, t_s)):
+        if message is not None and name in self._handlers and (failed := self._handlers[name].tell(message, t_s)):
             self.received["handler error"] += failed
