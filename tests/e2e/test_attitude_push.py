@@ -17,7 +17,6 @@ from companion.daemon.heading.attitude_service import AttitudeService
 from companion.daemon.job import Job
 from companion.estimation.request import What
 from sim.aircraft import Pose
-from sim.flight import BankedCircles
 from sim.motions import Turn
 from sim.scenario import site_at
 from tests.support.rig import Rig
@@ -379,28 +378,6 @@ def test_a_yaw_that_is_nobodys_does_not_stand_against_ours(tmp_path: Path) -> No
             compass.heading_error_deg = 40.0
             await flying.calibrate()
             await flying.pushing(30.0)
-
-    run_virtual(main())
-
-
-def test_circles_without_end_tilt_nothing(tmp_path: Path) -> None:
-    """35 degrees of bank for half a minute, with the airspeed of a fixed wing."""
-
-    async def main() -> None:
-        route = BankedCircles(start_s=35.0)
-        pose = Pose(heading_deg=40.0)
-        async with flight(tmp_path, route=route, pose=pose, vehicle="plane", feed_s=0.04, imu_rate_hz=25.0) as flying:
-            rig = flying.rig
-            assert rig.aircraft.time_at(rig.now_s) < 32.0
-            rig.double.airspeed_m_s = 15.0
-            rig.autopilot.arm()
-            while rig.aircraft.time_at(rig.now_s) < 70.0:
-                await flying.sleep(5.0)
-                last = flying.witness.of(Vision)[-1]
-                roll, pitch, yaw = rig.aircraft.angles_rad(last.usec * 1e-6 - rig.aircraft.loop_time_of(0.0))
-                assert (last.roll, last.pitch) == pytest.approx((roll, pitch), abs=math.radians(1.0))
-                assert abs(math.remainder(last.yaw - yaw, 2.0 * math.pi)) < math.radians(2.0)
-            assert flying.attitude.carrier.airspeed_m_s == 15.0
 
     run_virtual(main())
 

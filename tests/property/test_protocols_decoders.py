@@ -18,7 +18,7 @@ from companion.protocols.compasses.nmea import NmeaDecoder
 from companion.protocols.compasses.os5000 import Os5000Decoder
 from companion.protocols.compasses.pni import LONGEST as PNI_LONGEST
 from companion.protocols.compasses.pni import PniDecoder
-from companion.protocols.decoding.base import Decoder, FrameDecoder, LineDecoder, SentenceDecoder, xor_checksum
+from companion.protocols.decoding.base import Decoder, FrameDecoder, LineDecoder, SentenceDecoder
 from companion.protocols.imus import xsens as xsens_protocol
 from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.protocols.imus.mip import MipDecoder
@@ -58,7 +58,6 @@ from tests.support.frames import (
     wit,
     wit_imu,
     xbus,
-    xor,
     xsens_imu,
 )
 
@@ -334,11 +333,6 @@ def test_a_good_frame_after_anything_is_found(kind: type[Decoder], data: st.Data
     # A false start may claim up to the longest frame; only what comes after that shows it to be one.
     samples = decoder.feed(before + GOOD[kind], 0.0) + decoder.feed(bytes(LIMITS.get(kind, VECTORNAV_BYTES)), 0.0)
     assert samples[-1:] == alone
-
-
-@given(st.binary(max_size=400))
-def test_the_folded_checksum_is_the_bytewise_one(body: bytes) -> None:
-    assert xor_checksum(body) == xor(body)
 
 
 @given(st.integers(0, 65535), st.integers(0, 2**32 - 1), triples, triples)

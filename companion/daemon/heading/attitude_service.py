@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -97,7 +97,7 @@ class Sender:
 
 
 def is_sane(attitude: Attitude) -> bool:
-    """Whether everything in it is a number."""
+    """Return whether everything in it is a number."""
     return all(map(math.isfinite, (*attitude.quaternion, *attitude.sigma_rad, *attitude.rate_rad_s, attitude.t_s)))
 
 
@@ -128,7 +128,7 @@ class AttitudeService:
         self._started_s, self._late_told = math.inf, False
         self._autopilot_imu = devices.imus.get(self.carrier.imu.name)
         if self._autopilot_imu is not None:
-            take = self._guarded(self._on_autopilot_samples)
+            take = self._guarded(self._on_imu)
             self._autopilot_imu.on_counting.add(lambda sample: take((sample,), sample.t_s))
         for sensor in devices.sensors:
             if any(role.name == self.carrier.imu.name for role in sensor.roles):
@@ -152,17 +152,10 @@ class AttitudeService:
         return guarded
 
     def _on_imu(self, samples: Sequence[Sample], read_s: float) -> None:
-        found = [sample for sample in samples if isinstance(sample, ImuSample)]
-        if not found:
-            return
-        self.carrier.add(found)
-        self._push(read_s)
-
-    def _on_autopilot_samples(self, samples: Sequence[Sample], read_s: float) -> None:
-        step = self.carrier.gyro_step_rad_s
-        found = [sample for sample in samples if isinstance(sample, ImuSample)]
-        self.carrier.add([without_truncation(sample, step) for sample in found] if step else found)
-        self._push(read_s)
+        found, step = [sample for sample in samples if isinstance(sample, ImuSample)], self.carrier.gyro_step_rad_s
+        if found:
+            self.carrier.add([without_truncation(sample, step) for sample in found] if step else found)
+            self._push(read_s)
 
     def _push(self, read_s: float) -> None:
         """Send what is due, in the turn of the loop that brought the samples.
@@ -307,13 +300,8 @@ class AttitudeService:
             "timesync_answers": self.timesync.answered,
             "safety_net": self.fallback.net,
             **_angles(attitude),
-            "sigma_deg": None
-            if attitude is None
-            else dict(zip(("roll", "pitch", "heading"), (round(s / DEG, 3) for s in attitude.sigma_rad), strict=True)),
-            "difference_deg": {
-                "tilt": round(difference.tilt_rad / DEG, 2),
-                "heading": round(difference.heading_rad / DEG, 2),
-            }
+            "sigma_deg": attitude and _degrees(zip(("roll", "pitch", "heading"), attitude.sigma_rad, strict=True), 3),
+            "difference_deg": _degrees((("tilt", difference.tilt_rad), ("heading", difference.heading_rad)), 2)
             if known
             else None,
         }
@@ -329,8 +317,10 @@ class AttitudeService:
 def _angles(attitude: Attitude | None) -> Object:
     if attitude is None:
         return {"roll_deg": None, "pitch_deg": None, "heading_deg": None}
-    return {
-        "roll_deg": round(attitude.roll_rad / DEG, 3),
-        "pitch_deg": round(attitude.pitch_rad / DEG, 3),
-        "heading_deg": round(attitude.yaw_rad / DEG % 360.0, 2) % 360.0,
-    }
+    heading_deg = round(attitude.yaw_rad / DEG % 360.0, 2) % 360.0
+    tilt = _degrees((("roll_deg", attitude.roll_rad), ("pitch_deg", attitude.pitch_rad)), 3)
+    return {**tilt, "heading_deg": heading_deg}
+
+
+def _degrees(angles_rad: Iterable[tuple[str, float]], digits: int) -> Object:
+    return {name: round(angle / DEG, digits) for name, angle in angles_rad}

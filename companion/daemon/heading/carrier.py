@@ -310,8 +310,3 @@ class Carrier:
         self.alignments += 1
         roll, pitch, yaw = (angle / DEG for angle in (after.roll_rad, after.pitch_rad, after.yaw_rad))
         logger.info("attitude aligned: roll %.2f, pitch %.2f, heading %.1f deg", roll, pitch, yaw % 360.0)
-
-    @property
-    def compass_refused_s(self) -> float:
-        """For how long the compass has disagreed."""
-        return 0.0 if self.estimator is None else self.estimator.compass.refused_for_s(self.heard_s)

@@ -274,8 +274,8 @@ class Health:
             return f"heading sigma {heading:.0f} deg > {HEADING_SIGMA_DEG:.0f}"
         if max(roll, pitch) > TILT_SIGMA_DEG and abs(attitude.pitch_rad) < math.radians(80.0):
             return f"tilt sigma {max(roll, pitch):.0f} deg > {TILT_SIGMA_DEG:.0f}"
-        if carrier.compass_refused_s > REFUSED_S:
-            return f"compass disagrees for {carrier.compass_refused_s:.0f} s"
+        if (refused_s := estimator.compass.refused_for_s(carrier.heard_s)) > REFUSED_S:
+            return f"compass disagrees for {refused_s:.0f} s"
         return self._differs(now_s, attitude)
 
     def _differs(self, now_s: float, attitude: Attitude) -> str | None:

@@ -27,8 +27,7 @@ import math
 import re
 import struct
 import zlib
-from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import ClassVar, Final, NamedTuple
 
 from companion.physics.units import DEG, G
 from companion.protocols.decoding import reasons
@@ -51,17 +50,16 @@ _VECTOR = "bHbHbHB"
 _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Where the parts of one normal mode datagram stand among its unpacked values; None: it does not have them."""
+class Layout(NamedTuple):
+    """One normal mode datagram: its unpacked values, and the places of its parts among them."""
 
-    frame_bytes: int
     values: struct.Struct
-    accel: int | None
-    inclination: int | None
-    gyro_temperature: int | None
-    inclination_temperature: int | None
-    counter: int
+    places: dict[str, int]
+
+    @property
+    def frame_bytes(self) -> int:
+        """Size with the CRC."""
+        return self.values.size + CRC_BYTES
 
 
 def _layout(*, accel: bool, inclination: bool, temperature: bool, extra: bool) -> Layout:
@@ -77,16 +75,8 @@ def _layout(*, accel: bool, inclination: bool, temperature: bool, extra: bool) -
             code, count = code + "hhhB", count + 4
     if extra:
         code, count = code + "xxxB", count + 1
-    values = struct.Struct(code + "BH")
-    return Layout(
-        frame_bytes=values.size + CRC_BYTES,
-        values=values,
-        accel=places.get("accel"),
-        inclination=places.get("inclination"),
-        gyro_temperature=places.get("gyro_temperature"),
-        inclination_temperature=places.get("inclination_temperature"),
-        counter=count,
-    )
+    places["counter"] = count
+    return Layout(struct.Struct(code + "BH"), places)
 
 
 def _normal_mode() -> dict[int, Layout]:
@@ -198,18 +188,19 @@ class Stim300Decoder(FrameDecoder):
 
     def _decode(self, layout: Layout, frame: bytes, t_s: float) -> list[Sample]:
         values = layout.values.unpack_from(frame)
-        counter, latency_us = values[layout.counter], values[layout.counter + 1]
+        places = layout.places
+        counter, latency_us = values[places["counter"] :]
         t_s -= latency_us * 1e-6
         samples: list[Sample] = []
         refused: RejectedError | None = None
-        if layout.accel is not None:
+        if "accel" in places:
             try:
-                samples.append(self._imu(layout, layout.accel, values, counter, t_s))
+                samples.append(self._imu(places, values, counter, t_s))
             except RejectedError as error:
                 refused = error
-        if layout.inclination is not None:
+        if "inclination" in places:
             try:
-                samples.append(self._tilt(layout, layout.inclination, values, t_s))
+                samples.append(self._tilt(places, values, t_s))
             except RejectedError as error:
                 if samples:
                     self.rejected[error.reason] += 1
@@ -218,7 +209,8 @@ class Stim300Decoder(FrameDecoder):
             raise refused or RejectedError(reasons.NOTHING_OF_USE)
         return samples
 
-    def _imu(self, layout: Layout, accel: int, values: tuple[int, ...], counter: int, t_s: float) -> ImuSample:
+    def _imu(self, places: dict[str, int], values: tuple[int, ...], counter: int, t_s: float) -> ImuSample:
+        accel = places["accel"]
         if not self._imu_unit_right:
             raise RejectedError(OUTPUT_UNIT)
         if values[6] or values[accel + 6]:
@@ -230,7 +222,7 @@ class Stim300Decoder(FrameDecoder):
         bx, by, bz = self._accel_bits
         gyro_rad_s = (gx * _GYRO_SCALE, gy * _GYRO_SCALE, gz * _GYRO_SCALE)
         accel_m_s2 = (ax * G / (1 << bx), ay * G / (1 << by), az * G / (1 << bz))
-        temperature_degc = _temperature(values, layout.gyro_temperature)
+        temperature_degc = _temperature(values, places.get("gyro_temperature"))
         check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
         return ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, counter)
 
@@ -247,7 +239,8 @@ class Stim300Decoder(FrameDecoder):
         elif not 0.7 < magnitude / (1 << _ASSUMED_BITS) < 1.4:
             raise RejectedError(RANGE_NOT_KNOWN)
 
-    def _tilt(self, layout: Layout, inclination: int, values: tuple[int, ...], t_s: float) -> TiltSample:
+    def _tilt(self, places: dict[str, int], values: tuple[int, ...], t_s: float) -> TiltSample:
+        inclination = places["inclination"]
         if not self._inclination_unit_right:
             raise RejectedError(OUTPUT_UNIT)
         if values[inclination + 6]:
@@ -260,7 +253,7 @@ class Stim300Decoder(FrameDecoder):
             raise RejectedError(reasons.OVER_RANGE)
         right_down = math.asin(y / gravity) / DEG
         nose_up = math.asin(x / gravity) / DEG
-        temperature_degc = _temperature(values, layout.inclination_temperature)
+        temperature_degc = _temperature(values, places.get("inclination_temperature"))
         return TiltSample(t_s, right_down if z > 0 else -right_down, nose_up, temperature_degc)
 
 

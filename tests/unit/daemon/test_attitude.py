@@ -135,12 +135,6 @@ def test_the_quaternion_is_of_length_one_in_single_precision(yaw_deg: float) -> 
     assert abs(1.0 - float(np.linalg.norm(q))) < 1e-6  # PX4 would allow 1e-5
 
 
-def test_what_is_not_a_number_is_not_sent() -> None:
-    assert is_sane(attitude())
-    assert not is_sane(attitude(sigma_deg=math.nan))
-    assert not is_sane(attitude(math.inf))
-
-
 @pytest.mark.parametrize(
     ("rate_hz", "samples_hz"), [(30.0, 200.0), (50.0, 200.0), (50.0, 1000.0), (50.0, 137.0), (40.0, 25.0)]
 )
@@ -216,3 +210,9 @@ def test_an_autopilot_without_external_navigation_is_refused() -> None:
         ArduPilot().heading_changes({"EK3_SRC1_YAW": 1.0})
     with pytest.raises(AutopilotError, match="neither ArduPilot nor PX4"):
         OtherFirmware().heading_names()
+
+
+def test_what_is_not_a_number_is_not_sent() -> None:
+    assert is_sane(attitude())
+    assert not is_sane(attitude(sigma_deg=math.nan))
+    assert not is_sane(attitude(math.inf))

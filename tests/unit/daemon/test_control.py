@@ -260,16 +260,3 @@ def test_who_does_not_read_is_given_up(tmp_path: Path, monkeypatch: pytest.Monke
                 writer.transport.abort()
 
     asyncio.run(main())
-
-
-def test_a_long_answer_reaches_who_reads_it(tmp_path: Path) -> None:
-    path = tmp_path / "control.sock"
-
-    async def long(request: Object) -> AsyncIterator[Object]:
-        yield {"kind": "result", "records": ["x" * 1000] * 5000}
-
-    async def main() -> list[Object]:
-        async with ControlServer(path, long):
-            return await _all(path, {"command": "history"})
-
-    assert asyncio.run(main())[0]["records"] == ["x" * 1000] * 5000

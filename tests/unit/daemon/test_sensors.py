@@ -26,10 +26,6 @@ from companion.links.serial.bytestream import ByteLink
 from companion.protocols.decoding.dialogue import Dialogue
 from companion.protocols.registry import PROTOCOLS, ProtocolInfo
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
-from sim.aircraft import Pose, VirtualAircraft
-from sim.devices import HMR3300
-from sim.pty_device import PtyDevice
-from sim.scenario import site_at
 from tests.support.frames import pni_data, sentence, vectornav_imu
 from tests.support.virtual_time import run_virtual
 
@@ -203,28 +199,6 @@ def test_the_dialogue_is_told_of_everything_and_asked_after_it() -> None:
     run_virtual(main())
 
 
-def test_while_nothing_is_due_it_is_asked_seldom_and_in_a_conversation_often() -> None:
-    async def main() -> None:
-        sensor, _, _ = opened(device(*BOTH, dialogue=Talker))
-        talker = sensor.dialogue
-        assert isinstance(talker, Talker)
-        running = asyncio.create_task(sensor.run())
-        await asyncio.sleep(10.0)
-        assert 30 <= len(talker.asked) <= 41
-        talker.to_say = iter([b"?"])
-        await asyncio.sleep(0.3)
-        before = len(talker.asked)
-        await asyncio.sleep(0.5)
-        assert len(talker.asked) - before >= 24
-        await asyncio.sleep(2.0)
-        before = len(talker.asked)
-        await asyncio.sleep(10.0)
-        assert len(talker.asked) - before <= 41
-        running.cancel()
-
-    run_virtual(main())
-
-
 def test_not_even_a_talkative_dialogue_floods_a_device_or_the_log(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
 
@@ -348,37 +322,6 @@ def test_while_another_program_has_the_port_open_nothing_is_sent(monkeypatch: py
         other.kill()
         other.wait()
         os.close(master)
-
-
-@pytest.mark.parametrize("read_only", [False, True])
-def test_a_stopped_hmr3300_is_polled_unless_it_may_only_be_read(tmp_path: Path, *, read_only: bool) -> None:
-    async def main() -> None:
-        aircraft = VirtualAircraft(Pose(0.0, 0.0, 40.0), site_at(40.0, 116.0, 50.0))
-        aircraft.begin(asyncio.get_running_loop().time())
-        compass = HMR3300(aircraft)
-        async with PtyDevice(compass, tmp_path / "compass"):
-            compass.streaming = False
-            section = (
-                f'[compass]\nport = "{tmp_path / "compass"}"\nprotocol = "hmr3300"\nread_only = {read_only}\n'.lower()
-            )
-            (which,) = serial_devices(config(section.replace(str(tmp_path).lower(), str(tmp_path))))
-            taken: list[Sample] = []
-            sensor = SerialSensor(which, lambda role, part: taken.append(part))
-            running = asyncio.create_task(sensor.run())
-            try:
-                if read_only:
-                    await asyncio.sleep(2.8)
-                    assert not compass.streaming
-                    assert taken == []
-                    assert sensor.text == ""
-                else:
-                    await until(lambda: len(taken) >= 5)
-                    assert sensor.text == "asked 8 times a second with *Q"
-            finally:
-                running.cancel()
-                await asyncio.gather(running, return_exceptions=True)
-
-    asyncio.run(main())
 
 
 def test_what_a_device_says_against_itself_is_shown() -> None:

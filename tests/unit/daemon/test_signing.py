@@ -112,25 +112,6 @@ def test_in_1970_time_goes_on_behind_what_was_used_whatever_ends_it(
     run_virtual(main())
 
 
-def test_a_clock_that_is_right_is_believed_and_one_that_steps_back_is_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def main() -> None:
-        board = Board(tmp_path, monkeypatch, wall_s=NOW_S)
-        async with board.daemon() as first:
-            assert first.signing is not None
-            expected = (board.wall_s() - EPOCH_S) * TICKS_PER_S
-            assert first.signing.clock.next() == pytest.approx(expected, abs=10)
-            board.wall_at_boot_s -= 86400.0
-            assert first.signing.clock.next() >= expected
-        board.power_cut()
-        async with board.daemon() as second:
-            assert second.signing is not None
-            assert second.signing.clock.next() >= expected
-
-    run_virtual(main())
-
-
 @pytest.mark.parametrize("wall_at_start_s", [NOW_S, 0.0])
 def test_a_clock_once_20_years_ahead_is_not_followed_in_that_boot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wall_at_start_s: float

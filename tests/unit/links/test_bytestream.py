@@ -26,7 +26,6 @@ from companion.links.serial import bytestream
 from companion.links.serial import port as serial_port
 from companion.links.serial.bytestream import OUT_BUFFER_BYTES, QUICK_READS, ByteLink, PortSettings
 from companion.links.serial.port import SerialOpener, open_serial
-from companion.links.system.connection import Backoff, Budget
 
 NOBODY = 65534
 IS_ROOT = os.geteuid() == 0
@@ -150,10 +149,6 @@ async def collecting(port: Port, pty: Pty) -> None:
     assert reads == QUICK_READS
 
 
-def is_paused(port: Port) -> bool:
-    return port.link._paused is not None
-
-
 def test_a_fast_stream_is_collected_and_a_byte_after_it_wakes_the_loop(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,30 +171,6 @@ def test_a_fast_stream_is_collected_and_a_byte_after_it_wakes_the_loop(
     asyncio.run(main())
 
 
-def test_a_flood_ends_the_collecting_and_the_port_is_read_again_after_it(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
-
-    async def main() -> None:
-        with plugged(path) as pty:
-            async with running(path, FAST) as port:
-                port.link.budget = Budget(bytes_per_s=0.0, burst_bytes=QUICK_READS + 3)
-                await port.state(connected=True)
-                await collecting(port, pty)
-                os.write(pty.master, bytes(10))
-                await port.data(10)
-                assert is_paused(port)
-                assert port.link._collecting is None
-                port.link.budget = Budget()
-                async with asyncio.timeout(40):
-                    while is_paused(port):
-                        await asyncio.sleep(0.001)
-                await collecting(port, pty)
-
-    asyncio.run(main())
-
-
 def test_a_device_that_is_pulled_out_while_its_stream_is_collected_comes_back(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -214,20 +185,6 @@ def test_a_device_that_is_pulled_out_while_its_stream_is_collected_comes_back(
                     pty.unplug()
                     assert "the device is gone" in await port.state(connected=False)
                     assert port.link._collecting is None
-
-    asyncio.run(main())
-
-
-def test_every_byte_value_passes_unchanged(path: Path) -> None:
-    """A tty that is not raw eats ^C, ^Q, ^S and ^Z, and turns CR into LF."""
-    everything = bytes(range(256))
-
-    async def main() -> None:
-        with plugged(path) as pty:
-            async with running(path) as port:
-                await port.state(connected=True)
-                os.write(pty.master, everything)
-                assert await port.data(256) == everything
 
     asyncio.run(main())
 
@@ -598,19 +555,6 @@ def test_a_peer_that_vanishes_without_a_word_is_probed() -> None:
     asyncio.run(main())
 
 
-def test_a_server_that_is_not_there_yet() -> None:
-    async def main() -> None:
-        with server() as (listening, url):
-            address = listening.getsockname()
-            listening.close()
-            async with running(url) as port:
-                assert await port.state(connected=False) == f"{url}: Connection refused"
-                with socket.create_server(address):
-                    await port.state(connected=True)
-
-    asyncio.run(main())
-
-
 @pytest.mark.parametrize(
     ("url", "message"),
     [
@@ -631,20 +575,6 @@ def test_an_address_that_cannot_be_is_reported_and_does_not_end_the_link(url: st
 
 
 # Settings -------------------------------------------------------------------------------------------------------------
-
-
-def test_the_line_time_of_a_byte() -> None:
-    assert PortSettings("/dev/ttyUSB0", 9600).seconds_per_byte == pytest.approx(10 / 9600)
-    assert PortSettings("/dev/ttyUSB0", 9600, "even").seconds_per_byte == pytest.approx(11 / 9600)
-    assert PortSettings("tcp://127.0.0.1:4001", 9600).seconds_per_byte == 0.0
-    assert PortSettings("tcp://[::1]:4001", 9600).address() == ("::1", 4001)
-
-
-def test_pauses_double_up_to_the_cap() -> None:
-    backoff = Backoff()
-    assert [backoff.next_s() for _ in range(6)] == pytest.approx([0.2, 0.4, 0.8, 1.6, 2.0, 2.0])
-    backoff.reset()
-    assert backoff.next_s() == 0.2
 
 
 def test_explanations_name_the_mode_of_a_device() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import random
-from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -49,19 +48,6 @@ def test_garbage_never_raises_and_good_packets_after_it_are_heard(chunks: list[b
     link.receive(packet, 7.0)
     assert heard == [(0, 7.0)]
     assert link.received["handler error"] == 0
-
-
-@settings(max_examples=200)
-@given(st.data())
-def test_however_the_bytes_are_split_every_message_is_heard_once_in_order(data: st.DataObject) -> None:
-    stream = b"".join(heartbeats(10))
-    cuts = sorted(data.draw(st.sets(st.integers(0, len(stream)), max_size=30)) | {0, len(stream)})
-    link = MavlinkLink()
-    heard = listening(link)
-    for start, end in pairwise(cuts):
-        link.receive(stream[start:end], float(end))
-    assert [mode for mode, _ in heard] == list(range(10))
-    assert (link.received["HEARTBEAT"], link.received["bad"]) == (10, 0)
 
 
 @settings(max_examples=200)
@@ -164,17 +150,6 @@ def test_unsubscribing_in_the_middle_of_a_message_is_allowed() -> None:
     link.receive(b"".join(heartbeats(3)), 0.0)
     assert heard == [0]
     assert len(also) == 3
-
-
-def test_a_new_transport_begins_with_a_new_packet() -> None:
-    link = MavlinkLink()
-    heard = listening(link)
-    first, second = heartbeats(2)
-    link.receive(first[:10], 0.0)
-    link.attach(None)
-    link.receive(second, 0.0)
-    assert [mode for mode, _ in heard] == [1]
-    assert link.received["bad"] == 0
 
 
 def test_noise_that_looks_like_unknown_messages_does_not_fill_the_statistics() -> None:

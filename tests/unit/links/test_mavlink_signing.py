@@ -220,19 +220,6 @@ def test_the_senders_that_are_remembered_are_bounded() -> None:
     assert taken == MAX_STREAMS
 
 
-def test_setup_signing_changes_nothing() -> None:
-    """Signed or not, nobody gives us a key over the wire, or takes it away."""
-    link, sent = MavlinkLink(), list[bytes]()
-    link.signing = signing()
-    link.attach(sent.append)
-    for key in (KEY, None):
-        for secret, ticks in ((OTHER, NOW), (bytes(32), 0)):
-            link.receive(mavlink.MAVLink_setup_signing_message(1, 191, list(secret), ticks).pack(peer(key)), 0.0)
-    link.send(MESSAGE)
-    message = parsed(peer(KEY, NOW), sent[0])
-    assert message.get_signed()
-
-
 # --- time
 
 
@@ -249,17 +236,6 @@ def test_time_never_goes_back_with_the_clock() -> None:
         before = now
     # All within the same instant.
     assert [clock.next() - before for _ in range(3)] == [1, 2, 3]
-
-
-def test_a_clock_of_1970_goes_on_from_what_was_kept_and_learns_from_who_has_the_key() -> None:
-    clocks = Clocks(wall_s=100.0)
-    judge = Signing(required=True, key=KEY, clock=clocks.clock(start=NOW - 5))
-    assert judge.clock.next() == NOW - 5
-    later = NOW + 1000 * TICKS_PER_S
-    assert judge.admits(MESSAGE.pack(peer(KEY, later)))
-    assert judge.clock.next() >= later
-    clocks.pass_(2.0)
-    assert judge.clock.next() >= later + 2 * TICKS_PER_S
 
 
 def test_a_jump_of_the_clock_is_refused_and_true_senders_stay_believed() -> None:

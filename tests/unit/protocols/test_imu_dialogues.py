@@ -28,14 +28,6 @@ def asked(dialogue: WakeDialogue, from_s: float, to_s: float) -> list[tuple[floa
     return [(t_s, said) for t_s in times if (said := dialogue.due(t_s))]
 
 
-def test_the_registry_knows_them() -> None:
-    kinds = {name: info.dialogue for name, info in PROTOCOLS["imu"].items()}
-    assert kinds["mip"] is MipDialogue
-    assert kinds["xsens"] is XsensDialogue
-    assert kinds["vectornav"] is VectorNavDialogue
-    assert kinds["stim300"] is None
-
-
 @pytest.mark.parametrize("kind", ALL)
 def test_nothing_is_said_before_a_port_is_open_nor_while_a_device_speaks(kind: type[WakeDialogue]) -> None:
     dialogue = kind()

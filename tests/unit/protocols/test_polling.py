@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 
 from companion.protocols.compasses.pni import PniDecoder, PniDialogue
 from companion.protocols.decoding.base import Decoder
-from companion.protocols.decoding.dialogue import AGAIN_S, ANSWER_S, PATIENCE, SILENT_S, PollDialogue
+from companion.protocols.decoding.dialogue import AGAIN_S, SILENT_S, PollDialogue
 from companion.protocols.inclinometers.rion import RionDecoder, RionDialogue
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
@@ -105,45 +103,6 @@ def test_a_pni_compass_that_has_lost_its_power_is_told_again() -> None:
     talk.run(AGAIN_S + 1.5)
     assert device.components == (5, 24, 25, 8, 9, 27, 28, 29)
     assert len(talk.samples) > before
-
-
-@pytest.mark.parametrize(
-    ("dialogue", "decoder", "device"),
-    [
-        (RionDialogue, RionDecoder, lambda: RionCompass(aircraft(), automatic=True)),
-        (PniDialogue, PniDecoder, lambda: PniCompass(aircraft(), continuous=True)),
-    ],
-)
-def test_nothing_is_said_to_a_device_that_speaks(
-    dialogue: Callable[[], PollDialogue], decoder: type[Decoder], device: Callable[[], SerialDevice]
-) -> None:
-    talk = Conversation(dialogue(), decoder(), device())
-    talk.run(20.0)
-    assert talk.said == []
-    assert len(talk.samples) >= 100
-    assert talk.dialogue.words == ""
-
-
-def test_the_asking_ends_when_the_device_begins_to_speak_and_comes_back_when_it_ends() -> None:
-    device = RionCompass(aircraft(), rate_hz=20.0)
-    talk = Conversation(RionDialogue(), RionDecoder(), device)
-    talk.run(5.0)
-    asked = len(talk.said)
-    assert asked > 10
-    device.streaming = True
-    talk.run(5.0)
-    assert len(talk.said) - asked <= 2
-    asked = len(talk.said)
-    device.streaming = False
-    talk.run(5.0)
-    assert len(talk.said) - asked == pytest.approx(15, abs=2)
-
-
-def test_a_device_that_does_not_answer_is_asked_more_seldom() -> None:
-    talk = Conversation(RionDialogue(), RionDecoder(), RionCompass(aircraft()))
-    talk.unplugged = True
-    talk.run(SILENT_S + 20.0)
-    assert len(talk.said) == pytest.approx(PATIENCE + (20.0 - PATIENCE * ANSWER_S) / AGAIN_S, abs=1)
 
 
 def test_its_own_echo_is_no_answer_and_no_speech() -> None:
