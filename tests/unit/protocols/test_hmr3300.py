@@ -96,9 +96,3 @@ def test_a_lone_number_among_triples_is_debris_until_it_has_company() -> None:
     assert rejected == {"shape changed": 1}
     samples, rejected = feed(3 * LINE + 5 * b"10.5\r\n")
     assert [sample.heading_deg for sample in samples if isinstance(sample, CompassSample)] == 3 * [123.4] + 3 * [10.5]
-
-
-def test_times_are_those_of_the_line_ends() -> None:
-    decoder = Hmr3300Decoder(seconds_per_byte=0.001)
-    samples = decoder.feed(LINE + LINE + b"12", 10.0)
-    assert [sample.t_s for sample in samples] == pytest.approx([10.0 - 0.021, 10.0 - 0.002])

@@ -90,8 +90,3 @@ def test_an_interruption_drops_the_x_that_waits() -> None:
     decoder.interrupted()
     assert decoder.feed(Y, 2.0) == []
     assert decoder.rejected == {"orphan": 2}
-
-
-def test_the_time_is_that_of_the_end_of_y() -> None:
-    decoder = InclinometerXyDecoder(seconds_per_byte=0.001)
-    assert [sample.t_s for sample in decoder.feed(X + Y + X, 10.0)] == pytest.approx([10.0 - 0.011])

@@ -161,17 +161,6 @@ def test_sentences_and_binary_frames_may_alternate() -> None:
     assert not rejected
 
 
-def test_every_single_damaged_bit_is_seen() -> None:
-    for frame in (BINARY, YMR):
-        right, _ = feed(frame)
-        for at in range(len(frame) * 8):
-            damaged = bytearray(frame)
-            damaged[at // 8] ^= 1 << at % 8
-            samples, _ = feed(bytes(damaged) + b"\r\n" + bytes(VECTORNAV_BYTES))
-            # The very same samples: a hexadecimal digit of the checksum in the other case.
-            assert samples in ([], right), damaged
-
-
 def test_a_frame_held_back_by_a_false_start_keeps_its_time() -> None:
     decoder = VectorNavDecoder(seconds_per_byte=0.001)
     false_start = b"\xfa\x01\xff\x7f"  # claims all fields of group 1, 204 bytes
@@ -179,12 +168,6 @@ def test_a_frame_held_back_by_a_false_start_keeps_its_time() -> None:
     assert decoder.feed(bytes(50), 10.1) == []
     samples = decoder.feed(bytes(300), 10.5)
     assert [sample.t_s for sample in samples] == pytest.approx([10.0 - 0.001])
-
-
-def test_times_are_those_of_the_frames_ends() -> None:
-    decoder = VectorNavDecoder(seconds_per_byte=0.001)
-    samples = decoder.feed(BINARY + BINARY + BINARY[:10], 10.0)
-    assert [sample.t_s for sample in samples] == pytest.approx([10.0 - 0.001 * (len(BINARY) + 10), 10.0 - 0.01])
 
 
 @pytest.mark.parametrize("seconds_per_byte", [0.0, 1e-5])

@@ -127,16 +127,3 @@ def test_other_bits_of_the_status_are_no_reason() -> None:
 )
 def test_messages_that_give_nothing_are_counted_by_reason(data: bytes, reason: str) -> None:
     assert feed(data + MESSAGE + bytes(XSENS_BYTES)) == (feed(MESSAGE)[0], {reason: 1})
-
-
-def test_every_single_damaged_bit_is_seen() -> None:
-    for at in range(len(MESSAGE) * 8):
-        damaged = bytearray(MESSAGE)
-        damaged[at // 8] ^= 1 << at % 8
-        assert feed(bytes(damaged) + bytes(XSENS_BYTES))[0] == [], at
-
-
-def test_times_are_those_of_the_messages_ends() -> None:
-    decoder = XsensDecoder(seconds_per_byte=0.001)
-    samples = decoder.feed(MESSAGE + MESSAGE + MESSAGE[:10], 10.0)
-    assert [sample.t_s for sample in samples] == pytest.approx([10.0 - 0.001 * (len(MESSAGE) + 10), 10.0 - 0.01])
