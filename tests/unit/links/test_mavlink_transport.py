@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import pty
 import socket
-import tty
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
-from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -233,20 +229,6 @@ class TestUdpIn:
 
         asyncio.run(main())
 
-    def test_a_whole_datagram_is_taken_whoever_becomes_connected_by_it(self, peer: socket.socket) -> None:
-        async def main() -> None:
-            link = MavlinkLink()
-            texts: list[str] = []
-            link.subscribe(mavlink.MAVLink_statustext_message, lambda message, _t_s: texts.append(message.text))
-            text = mavlink.MAVLink_statustext_message(6, b"hello").pack(mavlink.MAVLink(None, srcSystem=1))
-            async with transport(link, "udpin:127.0.0.1:0") as states:
-                await until(lambda: states.connected)
-                peer.sendto(packet() + text + packet() + text, ("127.0.0.1", states.port))
-                await until(lambda: link.received["HEARTBEAT"] == 2)
-                assert texts == ["hello", "hello"]
-
-        asyncio.run(main())
-
     def test_waits_for_a_port_that_is_taken(self, peer: socket.socket) -> None:
         async def main() -> None:
             link = MavlinkLink()
@@ -413,51 +395,6 @@ class TestTcp:
                 writer.close()
 
         asyncio.run(main())
-
-
-class TestSerial:
-    def test_speaks_on_a_line_and_comes_back_after_unplugging(self, tmp_path: Path) -> None:
-        async def main() -> None:
-            link = MavlinkLink()
-            path = tmp_path / "ttyFC"
-
-            def plug() -> tuple[int, int]:
-                ours, theirs = pty.openpty()
-                tty.setraw(theirs)
-                path.unlink(missing_ok=True)
-                path.symlink_to(os.ttyname(theirs))
-                return ours, theirs
-
-            ours, theirs = plug()
-            os.set_blocking(ours, False)
-            async with transport(link, f"serial:{path}:921600"):
-                await until(lambda: link.connected)
-                link.send(HEARTBEAT(18, 8, 0, 0, 4, 3))
-                await until(lambda: readable(ours))
-                assert os.read(ours, 100)[0] == 0xFD
-                os.write(ours, packet())
-                await until(lambda: link.received["HEARTBEAT"] == 1)
-                os.close(theirs)
-                os.close(ours)
-                await until(lambda: not link.connected)
-                ours, theirs = plug()
-                await until(lambda: link.connected)
-                os.write(ours, packet())
-                await until(lambda: link.received["HEARTBEAT"] == 2)
-                os.write(ours, 100 * packet())
-                assert link.received["HEARTBEAT"] == 2
-                assert link.settled()
-                assert link.received["HEARTBEAT"] == 102
-            os.close(theirs)
-            os.close(ours)
-
-        asyncio.run(main())
-
-
-def readable(descriptor: int) -> bool:
-    import select
-
-    return bool(select.select([descriptor], [], [], 0)[0])
 
 
 @pytest.mark.parametrize(

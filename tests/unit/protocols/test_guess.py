@@ -57,21 +57,6 @@ SILENT = {"pni", "rion"}
 FAMILIES = {*families.IMUS, *families.GRADIENTERS, *families.COMPASSES} - SILENT
 
 
-@pytest.mark.parametrize("name", sorted(FAMILIES))
-def test_every_simulated_family_is_recognised(name: str) -> None:
-    scenario = demo(seed=3)
-    device = (
-        families.IMUS[name](scenario.serial_imu)
-        if name in families.IMUS
-        else {**families.GRADIENTERS, **families.COMPASSES}[name](scenario.aircraft, seed=3)
-    )
-    device.power_on(0.0)
-    data = b"".join(frame.data for frame in device.frames_until(6.0))
-    found = likeliest(data[:4096])
-    assert found is not None
-    assert found.protocol == name
-
-
 def test_every_family_of_the_registry_has_a_go(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
     for protocols in PROTOCOLS.values():
