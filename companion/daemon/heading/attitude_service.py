@@ -49,7 +49,6 @@ SHORTEST_S: Final = 0.02
 """The least time between two messages: ArduPilot drops what comes sooner (autopilots 6)."""
 SHOWN_EVERY_S: Final = 0.2
 """For people: autopilots forward these to radios that carry little."""
-RATE_SPAN_S: Final = 2.0
 _ROUNDING_S: Final = 1e-6
 
 
@@ -58,11 +57,9 @@ class Sender:
 
     def __init__(self, link: MavlinkLink, rate_hz: float, *, full: bool) -> None:
         self.sent = 0
-        self.rate_hz = 0.0
         self._link, self._full = link, full
         self._period_s = max(1.0 / rate_hz, SHORTEST_S)
         self._next_s = self._last_s = self._left_s = self._shown_s = -math.inf
-        self._counted = (-math.inf, 0)
 
     def is_due(self, t_s: float, now_s: float) -> bool:
         """Whether the attitude at `t_s` is to be sent; neither stamps nor packets may come closer than allowed."""
@@ -87,13 +84,6 @@ class Sender:
             self._shown_s = now_s
             for message in attitude_messages(attitude):
                 self._link.send(message)
-
-    def count(self, now_s: float) -> None:
-        """Work out the rate now and then."""
-        since_s, before = self._counted
-        if now_s - since_s >= RATE_SPAN_S:
-            self.rate_hz = (self.sent - before) / (now_s - since_s) if since_s > -math.inf else 0.0
-            self._counted = (now_s, self.sent)
 
 
 def is_sane(attitude: Attitude) -> bool:
@@ -222,7 +212,6 @@ class AttitudeService:
         if now_s - self._looked_s >= LOOK_S:
             self._looked_s = now_s
             await self.carrier.update(now_s)
-        self.sender.count(now_s)
         self._tell(now_s)
 
     def close(self) -> None:
@@ -293,7 +282,6 @@ class AttitudeService:
             "imu": self.carrier.imu.name,
             "pushing": self.health.pushing,
             "why_not": self.health.why_not or None,
-            "rate_hz": round(self.sender.rate_hz, 1),
             "sent": self.sender.sent,
             "alignments": self.carrier.alignments,
             "reset_counter": self.carrier.reset_counter % 256,

@@ -17,7 +17,6 @@ from companion.protocols.guess import (
     strangers,
 )
 from companion.protocols.registry import PROTOCOLS
-from sim import families
 from sim.scenario import demo
 from sim.uart import Setting, heard
 from tests.support.chatter import compass_frame, imu_frame, tilt_frame
@@ -50,11 +49,6 @@ def test_each_is_recognised_wherever_one_begins_to_listen(name: str, cut: int) -
     assert SPEAKERS[name][1] in found.kinds
     assert found.sure
     assert [one.protocol for one in candidates(stream(name)[cut:]) if one.likely] == [name]
-
-
-SILENT = {"pni", "rion"}
-"""They speak only when they are asked, and whoever guesses asks nothing."""
-FAMILIES = {*families.IMUS, *families.GRADIENTERS, *families.COMPASSES} - SILENT
 
 
 def test_every_family_of_the_registry_has_a_go(monkeypatch: pytest.MonkeyPatch) -> None:
