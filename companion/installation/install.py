@@ -67,7 +67,7 @@ def stamped(data: bytes) -> bytes:
 
 
 def is_untouched(data: bytes) -> bool:
-    """Whether a file is as some version of us has put it there."""
+    """Return whether some version of us wrote this content."""
     match = _STAMPED.match(data)
     return match is not None and hashlib.sha256(data[match.end() :]).hexdigest().encode() == match[1]
 
@@ -75,7 +75,7 @@ def is_untouched(data: bytes) -> bool:
 MODE: Final = 0o644
 COMMAND_TIMEOUT_S: Final = 120.0
 HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - named, not used
-"""What the unit hides from the service: ProtectHome and PrivateTmp."""
+"""Folders that the unit hides from the service: ProtectHome and PrivateTmp."""
 
 PACKAGED: Final = "packaged-by"
 """A file at the top of the environment that a Debian package brings: the service is then the package's."""
@@ -101,7 +101,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Where to install."""
+    """Root folder, prefix and executable of an installation."""
 
     root: Path
     prefix: Path
@@ -109,11 +109,11 @@ class Target:
 
     @property
     def is_this_machine(self) -> bool:
-        """Whether what runs here is meant."""
+        """Return whether the running machine is meant."""
         return self.root == Path("/")
 
     def path(self, shipped: Shipped) -> Path:
-        """Where a file goes."""
+        """Return the path of a shipped file."""
         base = str(self.prefix).lstrip("/") if shipped.target.startswith("lib/") else "etc/companion"
         return self.root / base / shipped.target
 
@@ -150,7 +150,7 @@ def start_service(run: Run | None = None) -> Iterator[Step]:
 
 
 def how_to_start() -> str:
-    """What to type for that."""
+    """Return the command that starts the service."""
     return _START_PACKAGED if _is_packaged() else "sudo companion install-service"
 
 
@@ -276,12 +276,12 @@ def _reload(run: Run) -> Iterator[Step]:
 
 
 def systemd_runs() -> bool:
-    """Whether there is anybody to start a service."""
+    """Return whether systemd runs here."""
     return Path("/run/systemd/system").is_dir()
 
 
 def is_service() -> bool:
-    """Whether systemd here knows the companion's unit, wherever it was put."""
+    """Return whether systemd here knows the companion's unit, wherever it was put."""
     folders = ("/etc", "/usr/local/lib", "/usr/lib", "/lib")
     return systemd_runs() and any(Path(folder, "systemd/system", SERVICE.source).exists() for folder in folders)
 

@@ -29,13 +29,13 @@ _MAVLINK_RUN: Final = 4
 
 
 class Line(NamedTuple):
-    """How a line is set: 8 data bits and one stop bit always."""
+    """Setting of a line, always with 8 data bits and one stop bit."""
 
     baud: int
     parity: Parity
 
     def __str__(self) -> str:
-        """As people write it: 9600 8E1."""
+        """Format it as people write it: 9600 8E1."""
         return f"{self.baud} 8{self.parity[0].upper()}1"
 
 
@@ -50,17 +50,17 @@ class Candidate:
 
     @property
     def likely(self) -> bool:
-        """Whether it is more than chance."""
+        """Return whether it is more than chance."""
         return self.accepted >= _LEAST_FRAMES and self.accepted >= 2 * self.rejected
 
     @property
     def sure(self) -> bool:
-        """Whether it needs no more bytes."""
+        """Return whether it needs no more bytes."""
         return self.accepted >= _SURE_FRAMES and self.accepted >= 4 * self.rejected
 
 
 def candidates(data: bytes, seconds_per_byte: float = 0.0) -> list[Candidate]:
-    """Who could have said this, the likeliest first; empty where it is nobody whom we know."""
+    """List the protocols that these bytes may be, the likeliest first."""
     kinds: dict[tuple[str, type], list[Kind]] = {}
     for kind, protocols in PROTOCOLS.items():
         for info in protocols.values():
@@ -103,7 +103,7 @@ def strangers(data: bytes) -> str | None:
 
 
 def looks_garbled(data: bytes) -> bool:
-    """Whether it looks like a line read at the wrong speed or parity: neither text nor frames of anybody we know."""
+    """Return whether a line seems read at the wrong speed or parity: neither text nor known frames."""
     return bool(data) and plain_share(data) < _MUCH_TEXT
 
 

@@ -27,7 +27,7 @@ _POLYNOMIAL: Final = 0x8408
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """Who sent one."""
+    """Sender of a HEARTBEAT."""
 
     system_id: int
     component_id: int
@@ -36,11 +36,11 @@ class Heartbeat:
 
     @property
     def is_autopilot(self) -> bool:
-        """Whether it is one, and not a ground station, a radio or another companion."""
+        """Return whether it is an autopilot, and not a ground station, a radio or another companion."""
         return self.autopilot != _NO_AUTOPILOT
 
     def __str__(self) -> str:
-        """As people say it: ArduPilot, system 1."""
+        """Format it as people say it: ArduPilot, system 1."""
         if self.is_autopilot:
             who = FIRMWARES.get(self.autopilot, f"autopilot of kind {self.autopilot}")
         else:
@@ -49,7 +49,7 @@ class Heartbeat:
 
 
 def heartbeats(data: bytes) -> list[Heartbeat]:
-    """All that are whole in it, autopilots first, each sender once."""
+    """List the senders of whole HEARTBEATs, autopilots first, each once."""
     found = [
         Heartbeat(match[2][0], match[2][1], match[3][_TYPE], match[3][_AUTOPILOT])
         for frame in _FRAMES

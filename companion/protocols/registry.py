@@ -44,10 +44,10 @@ class ProtocolInfo:
     lag_s: float = 0.0
     """Time constant with which its reading follows the truth: fluid, pendulum, filters."""
     sigma_deg: float | None = None
-    """How well such a device's tilt (gradienter) or heading (compass, level) is known where nobody says better."""
+    """Sigma of such a device's tilt (gradienter) or level heading (compass) without a configured one."""
     tilted_sigma_deg: float | None = None
     law: Law | None = None
-    """What the documents say a gradienter's two readings are; None: they do not, the user must."""
+    """Meaning of a gradienter's two readings by its documents; None: the user must say."""
 
 
 # One device may stand under several kinds: then its line, decoder and dialogue are the same under each.

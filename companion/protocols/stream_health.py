@@ -47,7 +47,7 @@ _MOST_DAMAGE_NAMED: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """What is wrong: a key to count it under, and one line for people."""
+    """A fault: a key to count it under, and one line for people."""
 
     key: str
     words: str
@@ -88,7 +88,7 @@ class StreamHealth:
         self.speaks, self._guess, self._guessed_s = None, "", -math.inf
 
     def excuse(self) -> None:
-        """What was damaged until now has a cause that is known: nobody shall look for another."""
+        """Forget the damage so far: its cause is known."""
         self._marks.clear()
 
     def took(self, data: bytes, samples: Sequence[Sample], t_s: float) -> None:
@@ -129,7 +129,7 @@ class StreamHealth:
             self._near, self.near_since_s = angles_deg, t_s
 
     def trouble(self, now_s: float) -> Trouble | None:
-        """What is wrong with what comes, or with nothing coming, at `now_s` on an open port."""
+        """Return the present fault of an open port at `now_s`."""
         lately = self._lately(now_s)
         if self.last_sample_s is None or now_s - self.last_sample_s >= SILENT_AFTER_S:
             return self._without_samples(now_s, lately)

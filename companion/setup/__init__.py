@@ -1,1 +1,1 @@
-"""From a bare board to a configuration: what is there, what its owner says, and the file that comes of both."""
+"""First-run set-up: listen, ask the owner, and write the configuration."""

@@ -73,7 +73,7 @@ class Draft:
 
     @property
     def lines(self) -> dict[str, Line]:
-        """How the ports are set, by what is said of them."""
+        """Return the line settings of the configured ports."""
         if self.is_new:
             return {}
         found = {}
@@ -103,7 +103,7 @@ class Draft:
             self._put("web", "bind", bind)
 
     def section(self, kind: Kind) -> Table | None:
-        """What there is of a device: of IMUs the first on a port of its own."""
+        """Return the section of a device; of IMUs the first on a port of its own."""
         if kind == "imu":
             return next((imu for imu in self.wanted["imu"] if imu.get("source") == "serial"), None)
         found: Table | None = self.wanted.get(kind)
@@ -136,7 +136,7 @@ class Draft:
                 self.guessed.add("gradienter.law")
 
     def other_imus(self) -> list[Table]:
-        """Those that the autopilot may have besides, as sections of the file."""
+        """List sections for further IMUs that the autopilot may have."""
         imus = self.wanted["imu"]
         taken = {
             imu.get("instance", 1) if imu["source"] == "autopilot" else imu.get("autopilot_instance") for imu in imus
@@ -149,7 +149,7 @@ class Draft:
         ]
 
     def questions(self) -> Iterator[Question]:
-        """What has to be asked, with the answer that holds at present."""
+        """Yield the questions, with the answers that hold at present."""
         yield Question(
             "vehicle.platform",
             "Where is it calibrated: on the ground, or on a deck (a boat)?",
@@ -237,7 +237,7 @@ def part_key(name: str) -> str:
 
 
 def storage_beside(path: Path) -> Path:
-    """Where the records of a new configuration go that is somebody's own file."""
+    """Return the folder of the records for a configuration that is somebody's own file."""
     return path.absolute().with_name("companion-state")
 
 
@@ -299,7 +299,7 @@ def begin(path: Path) -> Draft:
 
 
 def is_writable(path: Path) -> bool:
-    """Whether the file may be written, or made."""
+    """Return whether the file may be written, or made."""
     folder = path.parent
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
@@ -307,7 +307,7 @@ def is_writable(path: Path) -> bool:
 
 
 def holds(path: Path, text: str) -> bool:
-    """Whether the file is there and says just this."""
+    """Return whether the file exists with just this content."""
     try:
         return read_regular(path, config.MOST_BYTES) == text.encode()
     except OSError:

@@ -20,7 +20,7 @@ from companion.protocols.registry import Kind, main_kind
 AUTOPILOT_LINES: Final = tuple(Line(baud, "none") for baud in (57600, 921600, 115200))
 """ArduPilot's usual speed, PX4's TELEM 2's, and what both are set to by hand; believed first on every port."""
 Believed = Mapping[str, Line]
-"""How ports are set by what is configured: a port that takes any speed, as on USB, is then heard at that one."""
+"""Line settings of configured ports: a port that takes any speed, as on USB, is heard at that one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +51,14 @@ class FoundDevice:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What was heard on every port that was listened to."""
+    """Everything heard on every port."""
 
     serial: dict[str, Heard | str]
     udp: dict[int, HeardUdp | str]
 
     @property
     def autopilots(self) -> list[FoundAutopilot]:
-        """Those on wires of their own first."""
+        """List the autopilots, those on wires of their own first."""
         wired = [
             FoundAutopilot(f"serial:{port}:{heard.line.baud}", heard.heartbeat)
             for port, heard in self.serial.items()
@@ -71,7 +71,7 @@ class Survey:
         ]
 
     def devices(self, kind: Kind) -> list[FoundDevice]:
-        """Those that are bought as this."""
+        """List the devices that are mainly bought as this kind."""
         return [
             FoundDevice(port, heard.candidate.protocol, heard.line, kind)
             for port, heard in self.serial.items()
@@ -80,14 +80,14 @@ class Survey:
         ]
 
     def silent(self, port: str) -> bool:
-        """Whether nobody of use is at a serial port, as far as was listened to; one that somebody holds is not."""
+        """Return whether nobody of use is at a serial port; False for one that another program holds."""
         if port.startswith("/") and not os.path.exists(port):
             return True
         heard = [found for name, found in self.serial.items() if same_port(name, port)]
         return any(not isinstance(found, str) for found in heard)
 
     def silent_url(self, url: str) -> bool:
-        """Likewise of a MAVLink url at which no autopilot was heard."""
+        """Return whether no autopilot was heard at a MAVLink url."""
         kind, where, number = parse_url(url)
         if kind == "serial":
             return self.silent(where)
@@ -95,7 +95,7 @@ class Survey:
 
 
 def same_port(one: str, other: str) -> bool:
-    """Whether two names are one serial port."""
+    """Return whether two names are one serial port."""
     return resolve(ROOT, one) == resolve(ROOT, other)
 
 

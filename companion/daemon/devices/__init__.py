@@ -1,1 +1,1 @@
-"""What is read: serial devices, the autopilot, and what is wrong with them."""
+"""Serial devices, the autopilot's IMUs, and their health."""

@@ -29,7 +29,6 @@ logger = logging.getLogger(__name__)
 
 RETRY_S: Final = 3.0
 REREAD_EVERY_S: Final = 0.5
-"""What is announced again and again must not fill the line with our questions."""
 CONFIRMED_WITHIN_S: Final = 3.0
 """A reading that comes later does not tell what was in force in between."""
 
@@ -46,17 +45,17 @@ class AutopilotImu:
     def __init__(self, core: Core, imu: Imu, slots: SlotMemory, ekf_bias: EkfBias, rate_hz: float) -> None:
         self.name, self.instance = imu.name, imu.instance or 1
         self.calibration: ImuCalibration | None = None
-        """What the autopilot subtracts, as read; None while that is not known."""
+        """Calibration that the autopilot subtracts, as read; None while unknown."""
         self.problem = "not read yet"
         self.failures = 0
         self.upsets = 0
-        """How often the autopilot has restarted or other offsets have come into force, not by us."""
+        """Restarts of the autopilot and foreign changes of its offsets."""
         self.upset = ""
         self.on_sample: Listeners[ImuSample] = Listeners()
         self.on_counting: Listeners[ImuSample] = Listeners()
-        """Told of every sample that counts, before the collector: for what must not wait."""
+        """Listeners to samples that count, before the collector."""
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
-        """Told of every reading: what was read before, unless we have written since, and what is in force now."""
+        """Listeners to readings: the one before, unless we have written since, and the present one."""
         self.on_change: Listeners[[]] = Listeners()
         self.input = models.imu_input(core.profiles.imu(self.name), None)
         self._slots, self._ekf_bias, self._profiles = slots, ekf_bias, core.profiles
@@ -107,7 +106,7 @@ class AutopilotImu:
 
     @property
     def decided(self) -> bool:
-        """Whether it is known if this IMU exists: its offsets are read and samples come, or one of both has failed."""
+        """Return whether it is known if this IMU exists: offsets and samples have come, or failed."""
         if self.calibration is None:
             return self.failures > 0 or (self.stream.decided and bool(self.stream.problem))
         return self.stream.decided
@@ -241,7 +240,7 @@ def changing(imus: Iterable[AutopilotImu]) -> Iterator[None]:
 
 
 def not_ready(vehicle: Vehicle, imus: Mapping[str, AutopilotImu]) -> str | None:
-    """What of the autopilot is missing for a measurement, in one line."""
+    """Return what of the autopilot is missing for a measurement, in one line."""
     if (conflict := vehicle.conflict) is not None:
         return f"waiting: {conflict}"
     if vehicle.arm_state is ArmState.UNKNOWN:

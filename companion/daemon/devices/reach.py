@@ -40,7 +40,7 @@ class Reach:
 
     @property
     def answered(self) -> bool:
-        """Whether the autopilot has answered anything, so that it hears us."""
+        """Return whether the autopilot has answered anything, so that it hears us."""
         results = self._vehicle.commands.results
         return self._parameters.answering or any(
             count for word, count in results.items() if word not in ("no answer", "dropped")

@@ -29,7 +29,6 @@ class SensorHealth:
         self.link, self.protocol, self._decoder = link, protocol, decoder
         self.stream = StreamHealth(protocol, decoder)
         self.counts: Counter[str] = Counter()
-        """How often each trouble has begun, and the device has restarted."""
         self._breaks = 0
         self._stuck: Trouble | None = None
         self._opened_s = 0.0

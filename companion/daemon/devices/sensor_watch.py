@@ -26,18 +26,17 @@ TILTED_DEG: Final = 3.0
 """Least tilt that shows a hanging sensor: 300 steps of the coarsest gradienter, far beyond the error of a mean."""
 TILTED_SECONDS: Final = 3
 BEFORE_S: Final = 3.0
-"""How long before the first of its equal headings a compass may have begun to hang: until then it was near them."""
 QUIET_S: Final = 3.0
-"""How far an IMU may be behind the others to be a witness; the autopilot's is while its offsets are being written."""
+"""Largest lag of a witness behind the other IMUs; the autopilot's has one while its offsets are written."""
 LATE_S: Final = 1.0
-"""How much later than the others an IMU may begin to be a witness: it has not seen how the aircraft stood before."""
+"""Largest delay at which an IMU may begin to be a witness: later it has not seen the pose before."""
 TURNED_DEG: Final = 15.0
 TURNING_RAD_S: Final = math.radians(12.0)
 """The least rate that counts as turning; less may be a bias, of up to 10 deg/s."""
 
 
 NO_OFFSETS: Final = object()
-"""Of an IMU whose readings nobody changes."""
+"""Offsets of an IMU whose readings nobody changes."""
 
 
 class MotionWitness:
@@ -82,7 +81,7 @@ class MotionWitness:
         return math.degrees(math.acos(min(1.0, max(-1.0, *cosines))))
 
     def turned_deg(self, near_since_s: float, until_s: float) -> float:
-        """By how much it has turned about the vertical; the least that any IMU saw."""
+        """Return the least turn about the vertical that any IMU saw."""
         turns = [abs(sum(turned_deg for *_, turned_deg in each)) for each in self._heard(near_since_s, until_s)]
         return min(turns, default=0.0)
 
@@ -164,11 +163,10 @@ class SensorWatch:
         return next((words for plausible, words in self._troubles() if not plausible), None)
 
     def worst(self) -> str | None:
-        """Of the sensor that troubles most what is wrong, with its name; None while all do well."""
+        """Return the worst trouble of all sensors, with the sensor's name; None while all do well."""
         return next((words for _, words in self._troubles()), None)
 
     def _troubles(self) -> list[tuple[bool, str]]:
-        """Whether it looks plausible, and which sensor's it is in words; the worst first."""
         now_s = asyncio.get_running_loop().time()
         found = [(sensor.name, sensor.health.trouble(now_s)) for sensor in self._sensors]
         return sorted((not each.implausible, f"{name}: {each.words}") for name, each in found if each is not None)

@@ -28,7 +28,6 @@ TICK_S: Final = 0.02
 """Between two things that are said, and between two looks while a conversation goes on."""
 COARSE_S: Final = 0.25
 LIVELY_S: Final = 1.0
-"""How long after something was said a conversation counts as going on."""
 LOOK_AGAIN_S: Final = 60.0
 HELD_AGAIN_S: Final = 5.0
 MOST_WORDS: Final = 20
@@ -37,7 +36,7 @@ _WANTED: Final[dict[Kind, str]] = {"imu": "rates", "gradienter": "tilt", "compas
 
 
 class SensorRole:
-    """What a device is used as, as `companion status` shows it."""
+    """One use of a device, as `companion status` shows it."""
 
     def __init__(self, sensor: SerialSensor, role: Role) -> None:
         self.name, self.kind = role.name, role.kind
@@ -58,7 +57,7 @@ class SensorRole:
 
     @property
     def problem(self) -> str | None:
-        """What is wrong with it in one line, or None while samples come."""
+        """Return what is wrong in one line, or None while samples come."""
         sensor = self._sensor
         if (problem := sensor.problem) is not None:
             return problem
@@ -117,16 +116,15 @@ class SerialSensor:
         )
         self.health = SensorHealth(self.link, self.protocol, self.decoder)
         self.on_bytes: Listeners[str, bytes | None, float] = Listeners()
-        """Told (name, bytes, time) before they are decoded; without bytes: some are missing."""
+        """Listeners to name, bytes and time before decoding; without bytes: some are missing."""
         self.on_samples: Listeners[Sequence[Sample], float] = Listeners()
-        """Told all samples of a read, and its time, before anybody else gets them: for what must not wait."""
+        """Listeners to all samples of a read, and its time, before anybody else gets them."""
         self._take, self._offload = take, offload
         self._by_role = dict(zip(device.roles, self.roles, strict=True))
         self.other_north: str | None = None
         """The north of headings that were refused because another one is configured."""
         self._spoke_s = -math.inf
         self._alone = False
-        """Nobody else has the port open, as far as can be seen."""
         self._look_at_s = -math.inf
         self._held_by = ""
         self._openings = 0
@@ -217,7 +215,7 @@ class SerialSensor:
 
     @property
     def text(self) -> str:
-        """What was last said to the device, or why nothing is; empty where there was no occasion."""
+        """Return the last words sent to the device, or why nothing is sent; empty without an occasion."""
         if self._held_by:
             return f"nothing is said to it: {self._held_by} has the port open too"
         return self.dialogue.words if self.dialogue is not None else ""
@@ -226,6 +224,6 @@ class SerialSensor:
 
     @property
     def problem(self) -> str | None:
-        """What is wrong with the device in one line, or None while samples come."""
+        """Return what is wrong with the device in one line, or None while samples come."""
         found = self.health.trouble(asyncio.get_running_loop().time())
         return found.words if found is not None else None

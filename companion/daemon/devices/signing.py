@@ -159,7 +159,6 @@ class LinkSigning:
             )
 
     def _is_autopilot(self, system: int, component: int) -> bool:
-        """Whether a sender claims to be the autopilot; any autopilot while ours is not known."""
         return component == self._vehicle.component_id and self._vehicle.system_id in (None, system)
 
     def _on_verified(self, system: int, component: int) -> None:

@@ -46,7 +46,7 @@ class Devices(Subsystem):
 
     @property
     def not_heard(self) -> str:
-        """That no autopilot has been heard, and why, where that is known."""
+        """Return that no autopilot has been heard, and why."""
         why = self.signing.rejecting
         behind = f": {why}" if why else ""
         return f"not heard yet on {self._core.config.mavlink.url}{behind}"
@@ -93,7 +93,7 @@ class Devices(Subsystem):
         return misplaced(name, rotation @ batch.mean[3:], G * up, rotation, IN_CONFIGURATION.mounting)
 
     def tasks(self, *, ports: bool = True) -> Sequence[Task]:
-        """As in the base class; without ports somebody else hands their bytes to `sensors`."""
+        """List the tasks; without `ports` a test hands bytes to `sensors`."""
         return [
             ("collector", self._core.keep_ticking),
             ("signing", self.signing.run),

@@ -1,1 +1,1 @@
-"""How people and programs ask: control socket, own parameters, MQTT."""
+"""Control socket, own MAVLink parameters, and the child processes for page and MQTT."""

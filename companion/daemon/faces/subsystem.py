@@ -46,7 +46,7 @@ _NO_PAGE: Final[Object] = {"url": None, "viewers": 0, "wrong_tokens": 0}
 
 
 class Faces(Subsystem):
-    """By which the daemon is seen and asked."""
+    """The MAVLink component, the control socket's answers, and the child processes."""
 
     def __init__(
         self,
@@ -133,7 +133,7 @@ class Faces(Subsystem):
         return self.all_status()
 
     def all_status(self) -> Object:
-        """What the daemon is doing, as JSON can hold it."""
+        """Return the daemon's status for JSON."""
         # Headline, arming line and the rest then tell the same moment, not one of a quarter of a second before.
         self._readiness.update()
         return joined([subsystem.status() for subsystem in self._subsystems])

@@ -44,7 +44,6 @@ AIRSPEED_OLD_S: Final = 1.0
 INTERNAL: Final = "internal error; the log has the details"
 SAID_AGAIN_S: Final = 30.0
 LATE_S: Final = 3.0
-"""So long after a start in flight it is said why nothing is pushed."""
 SHORTEST_S: Final = 0.02
 """The least time between two messages: ArduPilot drops what comes sooner (autopilots 6)."""
 SHOWN_EVERY_S: Final = 0.2
@@ -62,7 +61,7 @@ class Sender:
         self._next_s = self._last_s = self._left_s = self._shown_s = -math.inf
 
     def is_due(self, t_s: float, now_s: float) -> bool:
-        """Whether the attitude at `t_s` is to be sent; neither stamps nor packets may come closer than allowed."""
+        """Return whether the attitude at `t_s` is due; neither stamps nor packets may come closer than allowed."""
         return (
             t_s >= self._next_s - _ROUNDING_S
             and t_s - self._last_s >= SHORTEST_S - _ROUNDING_S
@@ -170,7 +169,6 @@ class AttitudeService:
             self._vehicle.hear(mavlink.MAVLink_vfr_hud_message, self._on_vfr_hud, VFR_HUD_RATE_HZ)
 
     def _on_vfr_hud(self, message: mavlink.MAVLink_vfr_hud_message, t_s: float) -> None:
-        """Of a fixed wing only: of others ArduPilot says the speed over ground here."""
         good = (
             self.carrier.phase == "flight"
             and math.isfinite(message.airspeed)
@@ -249,7 +247,7 @@ class AttitudeService:
 
     @property
     def concern(self) -> str | None:
-        """What the pilot of an armed aircraft should know at once."""
+        """Return what the pilot of an armed aircraft should know at once."""
         if self._restarted:
             return f"attitude not pushed: {self.health.why_not}"
         if self.carrier.phase == "flight" and not self.health.pushing and self.carrier.alignments:
@@ -295,7 +293,7 @@ class AttitudeService:
         }
 
     def pose(self) -> Object | None:
-        """What is pushed, in the words of the pose; None while nothing is."""
+        """Return the pushed attitude in the keys of the pose; None while nothing is pushed."""
         attitude = self.carrier.now() if self.health.pushing else None
         if attitude is None:
             return None

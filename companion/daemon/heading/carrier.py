@@ -39,7 +39,6 @@ KEPT_S: Final = 5.0
 _NO_STAND: Final = {False: "waiting for an alignment: hold still", True: "waiting for an alignment: not on a deck"}
 STOOD_S: Final = 7.0
 CHECK_EVERY_S: Final = 10.0
-"""How often the carried attitude is compared with how the aircraft stands."""
 TILT_FLOOR_RAD: Final = 0.5 * DEG
 HEADING_FLOOR_RAD: Final = 3.0 * DEG
 DISAGREES_SIGMAS: Final = 3.0
@@ -47,7 +46,7 @@ JUMP_RAD: Final = 1.0 * DEG
 """A heading that changes by more at an alignment is told to the autopilot as a reset."""
 SLOWEST_AIRSPEED_M_S: Final = 5.0
 UNCALIBRATED_ACCEL_MG: Final = 50.0
-"""What a consumer accelerometer may be off by where only the gyros were calibrated."""
+"""Error of a consumer accelerometer where only the gyros were calibrated."""
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 
 
@@ -103,7 +102,7 @@ def _middle(value: float, step: float) -> float:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Stand:
-    """How the aircraft stood at the end of a window."""
+    """Attitude of the standing aircraft at the end of a window."""
 
     t_s: float
     body_from_ned: Matrix
@@ -127,7 +126,7 @@ def stand_of(
 
 
 def turn_between(ours: Quaternion, theirs: Quaternion) -> Triple:
-    """How theirs lies to ours, both body to NED: turns about north, east and down in rad; of large ones 2 sin(half)."""
+    """Return the turns from ours to theirs about north, east and down in rad; of large ones 2 sin(half)."""
     error = multiply(theirs, conjugate(ours))
     sign = math.copysign(2.0, error[0])
     return sign * error[1], sign * error[2], sign * error[3]
@@ -156,7 +155,7 @@ class Carrier:
         self._local: LocalEarth | None = None
         self._record: ImuRecord | None = None
         self._recent: deque[Sequence[ImuSample]] = deque()
-        """What came within `KEPT_S` on the ground, or with nothing to take it, read by read."""
+        """Reads within `KEPT_S` on the ground, or without an estimator."""
         self._wanted = False
         self._checked_s = -math.inf
         core.vehicle.on_event.add(self._on_event)
@@ -200,7 +199,7 @@ class Carrier:
         self._recent.clear()
 
     def align_anew(self) -> None:
-        """As soon as it stands still on the ground."""
+        """Align as soon as it stands still on the ground."""
         self._wanted = True
 
     def now(self) -> Attitude | None:
@@ -208,7 +207,7 @@ class Carrier:
         return None if self.estimator is None else self.estimator.attitude()
 
     def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
-        """What is remembered of the attitude then: the instant and the turn from body to NED; None: nothing."""
+        """Return instant and turn from body to NED that are remembered near then; None without any."""
         return None if self.estimator is None else self.estimator.kept_at(t_s)
 
     def _on_event(self, event: VehicleEvent) -> None:

@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 SCRIPT_STARTS_S: Final = 15.0
 """After the first heartbeat: before that nobody knows whether there is one."""
 WELL_S: Final = 10.0
-"""So long our heading must have been pushed before it is asked for again."""
+"""Time that our heading must have been pushed before its source set is asked for again."""
 AGAIN_S: Final = 1.0
 _OURS, _COMPASS, _GYROS = 1, 2, 3
 _WORDS: Final = {
@@ -49,7 +49,7 @@ class Fallback:
 
     @property
     def is_all(self) -> bool:
-        """Whether the autopilot is known to have no heading but ours: what its yaw is without it means nothing."""
+        """Return whether the autopilot has no heading but ours: its yaw means nothing without it."""
         return self._selected and self.net == "none"
 
     async def run(self) -> None:

@@ -65,17 +65,17 @@ class Difference:
         self._now, self._kept_at = now, kept_at
         self._offset_s: float | None = None
         self._forgotten_s = 0.0
-        """By how much the instants may be too late, since no message has been as quick as expected."""
+        """Possible error of the instants, as no message has been as quick as expected."""
         self.theirs: tuple[float, Quaternion] | None = None
-        """What the autopilot said last: the instant on our clock, and its turn from body to NED."""
+        """The autopilot's last attitude: instant on our clock, and turn from body to NED."""
         self.latest: tuple[float, float] | None = None
-        """As `tilt_rad` and `heading_rad`, not smoothed; None where it is too steep to tell them apart."""
+        """Unsmoothed `tilt_rad` and `heading_rad`; None where it is too steep to tell them apart."""
         self.heard_s = -math.inf
         self.forget()
         vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, ATTITUDE_RATE_HZ)
 
     def forget(self) -> None:
-        """What we carry has been set anew."""
+        """Begin anew: our attitude was aligned."""
         self._sine = self._cosine = 0.0
         self._down: Triple = (0.0, 0.0, 0.0)
         self._down_now: Triple = (0.0, 0.0, 0.0)
@@ -83,11 +83,11 @@ class Difference:
         self.straying = Straying()
 
     def is_heard(self, now_s: float) -> bool:
-        """Whether the autopilot tells its attitude."""
+        """Return whether the autopilot sends its attitude."""
         return now_s - self.heard_s < OLD_S
 
     def is_known(self, now_s: float) -> bool:
-        """Whether it has for a while."""
+        """Return whether it has done so long enough to smooth."""
         return self.is_heard(now_s) and now_s - self._since_s > SMOOTHED_S
 
     @property
@@ -174,7 +174,7 @@ class Difference:
 
 
 def disagreements(attitude: Attitude, tilt_rad: float, heading_rad: float) -> tuple[str | None, str | None]:
-    """Whether tilt and heading differ by more than both may be off by, in words."""
+    """Return in words whether tilt and heading differ by more than both errors allow."""
     roll, pitch, yaw = (sigma / DEG for sigma in attitude.sigma_rad)
     words: list[str | None] = []
     for name, found_rad, ours_deg, theirs_deg in (

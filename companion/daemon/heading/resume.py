@@ -29,13 +29,13 @@ from companion.physics.units import DEG
 from companion.samples import Vector
 
 AGREES_S: Final = 0.7
-"""So long the two must agree before the push; so long they may disagree before it begins anew."""
+"""Agreement needed before the push, and disagreement before it begins anew."""
 FRESH_S: Final = 1.0
-"""How old the autopilot's attitude may be: what has turned since is known from the gyros."""
+"""Largest age of the autopilot's attitude: the gyros tell what has turned since."""
 LATEST: Final = 10
-"""How many records are looked through for one that is in force; the others were cancelled or have failed."""
+"""Records searched for an active one; the others were cancelled or have failed."""
 DECLINATION_SIGMA_DEG: Final = 1.0
-"""Of one that was kept: the model's is 0.3 to 0.5 deg where people live, and the aircraft has flown on."""
+"""Error of a stored declination: 0.3 to 0.5 deg of the model where people live, and the way flown since."""
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 
 

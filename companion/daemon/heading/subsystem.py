@@ -132,7 +132,7 @@ class PoseNow:
             self._heading = sample
 
     async def refresh(self) -> Object | None:
-        """As `now`, with the declination of the place looked up when it is time to."""
+        """Return `now`, with the declination of the place looked up now and then."""
         if self._compass is not None and self._compass.magnetic:
             await self._look_up(asyncio.get_running_loop().time())
         return self.now()
@@ -174,7 +174,7 @@ class PoseNow:
         return pose
 
     def readings(self) -> dict[str, float | None]:
-        """What gradienter and compass themselves say at this moment, before any offset; None where nothing fresh."""
+        """Return the readings of gradienter and compass before any offset; None where nothing is fresh."""
         now_s = asyncio.get_running_loop().time()
         tilt = self._tilt if self._tilt is not None and now_s - self._tilt.t_s <= OLDEST_S else None
         heading = self._heading if self._heading is not None and now_s - self._heading.t_s <= OLDEST_S else None

@@ -65,7 +65,7 @@ def _ports(config: Config) -> dict[str, str]:
 
 
 def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> list[Finding]:
-    """What the system has against the configured ports."""
+    """List the system's faults of the configured ports."""
     ports = _ports(config)
     among = list_ports(root)
     fast = {sensor.name for sensor in serial_devices(config) if sensor.kind == "imu"}

@@ -21,7 +21,7 @@ from companion.links.system.service_manager import ServiceManager
 logger = logging.getLogger(__name__)
 
 SETTLED_AFTER_S: Final = 3.0
-"""By then what is imported only where it is used has been: MQTT, recording, the page."""
+"""Time after which lazily imported modules (MQTT, recording, the page) are there."""
 
 
 async def run(config: Config) -> None:

@@ -124,5 +124,5 @@ class Service:
             self.core.vehicle.close()
 
     def status(self) -> Object:
-        """What the daemon is doing, as JSON can hold it."""
+        """Return the daemon's status for JSON."""
         return self.faces.all_status()

@@ -30,7 +30,7 @@ AUTOMATIC_S: Final = 180.0
 
 
 class Turning(Protocol):
-    """Whose work goes on by turns."""
+    """Counts its turns."""
 
     turns: int
 
@@ -156,7 +156,7 @@ def _where(task_name: str) -> str:
 
 
 def status_line(status: Mapping[str, Any]) -> str:
-    """What a pilot wants to know, most important first; `status` is what `companion status --json` prints."""
+    """Return the status in one line for a pilot, most important first."""
     parts = [f"FAULT: {status['fault']}"] if status["fault"] is not None else []
     if status["putting_back"]:
         parts.append("an interrupted write is being put back")

@@ -76,7 +76,7 @@ class MavlinkLink:
 
     @property
     def connected(self) -> bool:
-        """Whether a transport is attached; says nothing of a peer behind it."""
+        """Return whether a transport is attached, with or without a peer."""
         return self._transmit is not None
 
     def turn(self) -> None:

@@ -21,7 +21,7 @@ listens longer."""
 
 @dataclass(frozen=True, slots=True)
 class HeardUdp:
-    """What came to a UDP port."""
+    """Messages heard on a UDP port."""
 
     port: int
     senders: tuple[Heartbeat, ...]

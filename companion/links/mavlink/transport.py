@@ -110,7 +110,7 @@ class _Udp(asyncio.DatagramProtocol):
         return self._failed.result()
 
     def _turn(self) -> None:
-        """What is due once a second."""
+        """Do the work of each second."""
 
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
         self._socket = transport.get_extra_info("socket").dup()

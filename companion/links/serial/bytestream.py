@@ -15,10 +15,10 @@ from companion.links.serial.port import SerialOpener, close_serial
 from companion.links.system.connection import Backoff, Budget, OnState, Reconnection, connect_tcp, words_of
 
 READ_BYTES = 4096
-"""As much as a tty buffers: one wake-up empties the port, so one time stamp holds for all that it brought."""
+"""Size of a tty's buffer: one read empties the port, so one time stamp holds for it all."""
 QUICK_READS = 20
 QUICK_S = 0.0015
-"""How many reads, and how close together in the mean, mark a stream whose every byte would wake the loop."""
+"""Mean interval of `QUICK_READS` reads of a stream whose every byte would wake the loop."""
 COLLECT_S = 0.0205
 """How long such a stream is collected before the next read, as behind a USB adapter: a wake-up costs far more than its
 bytes. A little more than the 20 ms within which an autopilot takes one heading (autopilots 6)."""
@@ -30,7 +30,7 @@ BEAT_S = 1.0
 BEAT_WITHIN_S = 8.0
 FLOOD_PAUSE_S = 0.05
 MOST_READS = 64
-"""So often a port is read before something may be written to it; the kernel keeps less than these bring."""
+"""Reads of a port before something may be written to it; the kernel keeps less than these bring."""
 DISCARD_BYTES = 65536
 DISCARD_READS = 16
 WORTH_S = 2.0
@@ -38,7 +38,7 @@ WORTH_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class PortSettings:
-    """Which port, and how its line is set; baud and parity mean nothing for `tcp://HOST:PORT`."""
+    """A port and its line setting; baud and parity mean nothing for `tcp://HOST:PORT`."""
 
     url: str
     baud: int
@@ -46,7 +46,7 @@ class PortSettings:
 
     @property
     def is_tcp(self) -> bool:
-        """Whether the other end is a socket (ser2net, a simulator) and not a device."""
+        """Return whether the other end is a socket (ser2net, a simulator) and not a device."""
         return self.url.startswith("tcp://")
 
     def __str__(self) -> str:
@@ -112,7 +112,7 @@ class ByteLink:
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open; says nothing of a device that keeps silent."""
+        """Return whether the port is open, with or without a device that speaks."""
         return self._descriptor is not None
 
     @property

@@ -29,7 +29,7 @@ from companion.protocols.guess import (
 from companion.protocols.heartbeat import Heartbeat, heartbeats
 
 SILENT_S: Final = 3.0
-"""How long the first setting is listened to before the port is called silent: a talker is seen at every speed."""
+"""Wait at the first setting before a port is called silent: a talker is seen at every speed."""
 LINE_S: Final = 1.0
 LINE_MOST_S: Final = 2.5
 FEW_BYTES: Final = 100
@@ -40,7 +40,7 @@ _LOOK_S: Final = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What listening has found."""
+    """Result of listening to a port."""
 
     line: Line | None
     candidate: Candidate | None
@@ -59,7 +59,7 @@ async def listen_to_all(
     first: Callable[[str], Sequence[Line]] = lambda _: (),
     tell: Callable[[str, Heard | str], None] | None = None,
 ) -> dict[str, Heard | str]:
-    """Who speaks on each port, or why that is not known, all at once; `tell` is told as soon as one is known."""
+    """Listen to all ports at once; return who speaks, or why that is not known, and `tell` each at once."""
 
     async def one(port: str) -> Heard | str:
         found: Heard | str

@@ -59,7 +59,7 @@ def list_ports(root: Path = ROOT) -> list[SerialPort]:
 
 
 def find_holders(device: str, root: Path = ROOT) -> tuple[Holder, ...]:
-    """Who has a port open, as far as we may look; `device` may be a link."""
+    """List the processes that have a port open; `device` may be a link."""
     return tuple(_holders_by_device(root).get(resolve(root, device), ()))
 
 
@@ -174,7 +174,7 @@ def _consoles(root: Path) -> set[str]:
 
 
 def entries(folder: Path) -> Iterator[Path]:
-    """What is in a folder, by name; nothing where it cannot be looked into."""
+    """Yield the entries of a folder by name; none where it cannot be read."""
     try:
         yield from sorted(folder.iterdir())
     except OSError:

@@ -1,1 +1,1 @@
-"""What every link shares: TCP, retries, budgets, the service manager."""
+"""TCP, retries, budgets, the service manager: the common parts of all links."""

@@ -34,7 +34,7 @@ OUT_OF_MEMORY: Final = 12
 STACK_BYTES: Final = 1024 * 1024
 """Stack of a thread: it counts as data, and the usual 8 MiB would use up the limit."""
 OOM_SCORE: Final = "900"
-"""Where memory runs out the kernel ends a child before anything else on the board."""
+"""Score by which the kernel, out of memory, ends a child before anything else on the board."""
 
 
 class ChildSettings(msgspec.Struct, frozen=True):

@@ -165,7 +165,7 @@ class Budget:
         self.exceeded_s: float | None = None
 
     def left(self, now_s: float) -> float:
-        """How many may be taken."""
+        """Return how many may be taken."""
         gained = max(now_s - self._t_s, 0.0) * self._bytes_per_s
         return min(self._left + gained, self._burst_bytes)
 

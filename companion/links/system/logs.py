@@ -57,7 +57,7 @@ class OneLineFormatter(logging.Formatter):
     """A message is one line, whatever has come over a wire into it; only a traceback has more."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Whoever reads the log on a terminal sees what it would obey."""
+        """Make control characters visible: a terminal would obey them."""
         said = copy.copy(record)
         said.msg, said.args = printable(record.getMessage()), None
         return "\n".join(map(printable, super().format(said).splitlines()))
@@ -83,7 +83,7 @@ def set_up(level: str) -> None:
 
 
 def goes_to_journal(stream: TextIO) -> bool:
-    """Whether a stream is the one that JOURNAL_STREAM names; the variable alone is inherited by whoever redirects."""
+    """Return whether JOURNAL_STREAM names this stream; the variable alone is inherited by any redirection."""
     named = os.environ.get("JOURNAL_STREAM")
     if named is None:
         return False

@@ -42,7 +42,7 @@ class ServiceManager:
 
     @property
     def listens(self) -> bool:
-        """Whether there is anybody to tell."""
+        """Return whether a service manager listens."""
         return self._socket is not None
 
     def ready(self) -> bool:
@@ -54,11 +54,11 @@ class ServiceManager:
         return self._send("STOPPING=1")
 
     def alive(self) -> bool:
-        """Everything that matters goes on."""
+        """Feed the watchdog."""
         return self._send("WATCHDOG=1")
 
     def status(self, words: str) -> bool:
-        """What is being done, in one line; nothing is sent while it stays the same."""
+        """Send the status line, unless it is the last one."""
         line = " ".join(words.split())
         if line == self._status:
             return True

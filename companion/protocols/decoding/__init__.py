@@ -1,1 +1,1 @@
-"""What all decoders share: framing, checks, clocks, and what is said to a device."""
+"""Framing, checks, clocks and dialogues of all decoders."""

@@ -21,7 +21,7 @@ from companion.protocols.decoding.clock import SampleTimes
 from companion.samples import Sample, Vector
 
 AHEAD_S = 0.5
-"""How far a stream may be ahead of its line; beyond, a baud rate means nothing on that port (USB without a UART)."""
+"""Largest lead of a stream over its line; beyond, the baud rate means nothing (USB without a UART)."""
 _STALL_S = 10.0
 
 
@@ -39,7 +39,7 @@ class Decoder(ABC):
     device_clock_wraps_s: ClassVar[float | None] = None
     """`ImuSample.t_device_s` starts again at 0 after so long; None where the device has no clock, or it never does."""
     clock_from_start: ClassVar[bool] = False
-    """Whether `ImuSample.t_device_s` counts from the device's start, by its documents."""
+    """True: `ImuSample.t_device_s` counts from the device's start, by its documents."""
     sequence_modulus: ClassVar[int | None] = None
     """`ImuSample.sequence` counts modulo this; None where there is none, or it never wraps."""
 
@@ -205,7 +205,7 @@ ACCEL_LIMIT_M_S2 = 2000.0
 """204 g; the widest range of a part with a gyro in it is 200 g."""
 TEMPERATURE_LIMIT_DEGC = 200.0
 ANY_TEMPERATURE = 800.0
-"""Of an IMU, in kelvin or tenths too: `estimation/temperature/thermometer.py` names what cannot be degC."""
+"""Limit for an IMU, in kelvin or tenths too: `estimation/temperature/thermometer.py` names what cannot be degC."""
 
 
 def numbers(fields: list[bytes]) -> list[float]:
@@ -231,7 +231,7 @@ def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | 
 
 
 DAMAGED: Final = re.compile(rb"[\x00\x80-\xff]")
-"""What text never holds: a byte that came with the wrong parity, or was read at the wrong speed."""
+"""Bytes that text never holds: read with the wrong parity, or at the wrong speed."""
 
 
 def out_of_range(value: float) -> RejectedError:
@@ -265,7 +265,7 @@ class FrameDecoder(Decoder):
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)
         self._buffer = b""
-        """What may be the beginning of a frame; never longer than the longest frame."""
+        """Bytes of a possible frame; never longer than the longest frame."""
         self._received = 0
         self._chunks: deque[tuple[int, float]] = deque()
         """Stream position of the end of each chunk that still has bytes in the buffer, and when it was read."""

@@ -17,7 +17,7 @@ import msgspec
 from companion.samples import ImuSample, Sample
 
 CREEP: Final = 100e-6
-"""How fast the minimum may rise: two crystals of 50 ppm. A ceramic resonator is followed in steps of `STEP_S`."""
+"""Rate at which the minimum may rise: two crystals of 50 ppm. A ceramic resonator is followed in steps of `STEP_S`."""
 
 STEP_S: Final = 0.005
 """If no sample of a whole `SPAN_S` came with less delay than this, the offset itself is another one now."""
@@ -39,7 +39,7 @@ class DeviceClock:
 
     def __init__(self, wraps_s: float | None) -> None:
         self.breaks = 0
-        """How often the samples before and after could not be told to be one device's without a pause."""
+        """Breaks: samples before and after need not be one device's without a pause."""
         self.device_s = 0.0
         """The clock as of the last sample, unwrapped."""
         self._wraps_s = wraps_s

@@ -9,9 +9,9 @@ from abc import ABC, abstractmethod
 from typing import ClassVar, Final
 
 SILENT_S: Final = 2.0
-"""How long a device that streams by itself is waited for before anything is said to it."""
+"""Silence of a streaming device before anything is sent to it."""
 ANSWER_S: Final = 1.0
-"""How long an answer is waited for before the device is asked again; none of those polled here documents a delay."""
+"""Wait for an answer before the next question; no polled device documents a delay."""
 PATIENCE: Final = 3
 AGAIN_S: Final = 5.0
 LONGEST_PAUSE_S: Final = 64.0
@@ -32,7 +32,7 @@ class Dialogue(ABC):
 
     @abstractmethod
     def due(self, t_s: float) -> bytes:
-        """What is to be sent now; empty for nothing. Asked every 20 ms or so, and after every `heard`."""
+        """Return the bytes to send now, or none; called every 20 ms or so, and after every `heard`."""
 
 
 class PollDialogue(Dialogue):

@@ -112,7 +112,7 @@ RANGE_NOT_KNOWN = "accelerometer range not known"
 OUTPUT_UNIT = "output unit"
 
 REST_TICKS: Final = 2000
-"""How many internal samples at rest (a second of them) decide the accelerometers' range."""
+"""Internal samples at rest (a second of them) that decide the accelerometers' range."""
 REST_DEG_S: Final = 3.0
 """The fastest rate that counts as "at rest"; a turn-on bias is a tenth of it."""
 

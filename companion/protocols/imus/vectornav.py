@@ -94,7 +94,7 @@ def header_bytes(groups: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What one kind of frame holds: its length and the place of each value among the unpacked ones."""
+    """Layout of one kind of frame: its length and the place of each value among the unpacked ones."""
 
     frame_bytes: int
     payload: struct.Struct
@@ -220,7 +220,7 @@ _SENTENCES: dict[bytes, tuple[int, slice, slice]] = {
     b"VNYMR": (12, slice(6, 12), slice(0, 0)),
     b"VNIMU": (11, slice(3, 9), slice(9, 10)),
 }
-"""How many numbers there are, and which are force and rate, and the temperature."""
+"""Count of numbers, and the places of force and rate, and of the temperature."""
 
 
 def _decode(sentence: bytes, t_s: float) -> list[Sample]:

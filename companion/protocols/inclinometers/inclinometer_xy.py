@@ -25,7 +25,7 @@ _SENTINEL = re.compile(rb"\+{3,}|-{3,}")
 _SINGLE_AXIS = re.compile(rb"[+-]\d\d\.\d{2,3}")
 _ECHO = re.compile(rb"[A-Za-z*]{1,8}")
 _SURE = 4
-"""How many readings in a row with fewer decimals than before make them the device's way; fewer have lost a digit."""
+"""Readings in a row with fewer decimals that make them the device's format; fewer have lost a digit."""
 
 _SPOILED: Literal["spoiled"] = "spoiled"
 
