@@ -21,13 +21,12 @@ from companion.config.sections import Config, Storage
 from companion.config.words import shown
 from companion.errors import CompanionError, ConfigError
 from companion.installation import install as installing
-from companion.links.mavlink.listening import USUAL_PORTS
 from companion.links.serial.listening import ports_to_try
 from companion.links.serial.ports import list_ports
 from companion.protocols.registry import Kind
 from companion.setup import draft as drafting
 from companion.setup.draft import Draft, Question, part_key, storage_beside
-from companion.setup.survey import Survey, same_port, same_url, survey
+from companion.setup.survey import USUAL_PORTS, Survey, same_port, same_url, survey
 
 KINDS: Final[tuple[Kind, ...]] = ("gradienter", "compass", "imu")
 WITHOUT: Final = {

@@ -9,7 +9,7 @@ import pytest
 
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.daemon.devices.reach import Reach
+from companion.daemon.devices.subsystem import Reach
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
 from tests.support.scripted_px4 import ScriptedPx4

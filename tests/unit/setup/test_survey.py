@@ -7,13 +7,12 @@ from pathlib import Path
 import pytest
 
 from companion import cli, config
-from companion.links.mavlink.listening import HeardUdp
 from companion.links.serial.listening import Heard
 from companion.protocols.guess import Candidate, Line
 from companion.protocols.heartbeat import Heartbeat
 from companion.setup import draft as drafting
 from companion.setup.draft import Draft
-from companion.setup.survey import FoundDevice, Survey, same_url
+from companion.setup.survey import FoundDevice, HeardUdp, Survey, same_url
 from tests.unit.setup.test_document import OWN
 
 PX4, STATION = Heartbeat(1, 1, 2, 12), Heartbeat(255, 190, 6, 8)
