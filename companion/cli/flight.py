@@ -35,14 +35,6 @@ def add_commands(add: AddCommand) -> None:
     """Add `flight` to the parser of the command line."""
     command = add("flight", flight, "what a log of the autopilot says of a flight")
     command.add_argument("file", type=Path, metavar="LOG", help="ArduPilot's .bin or PX4's .ulg")
-    command.add_argument(
-        "--offsets",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="compare with the offsets of a parameter file, as ground stations save it (may be repeated)",
-    )
 
 
 async def flight(options: argparse.Namespace) -> int:
@@ -65,7 +57,7 @@ async def flight(options: argparse.Namespace) -> int:
     if starts > 1:
         lines.insert(0, f"{starts} starts of the autopilot in it, each by its own clock")
     numbers = [] if store is None else _keep(store, path.name, found)
-    lines += [f"kept as flight {number}: companion report --flight {number} makes a page of it" for number in numbers]
+    lines += [f"kept as flight {number}: companion history lists it" for number in numbers]
     together = [] if store is None or not numbers else surely_moved(store.flights(), found[-1])
     lines += [one.words for one in together]
     answer = {"state": "done", "reason": "", "file": str(path), "numbers": numbers}
@@ -88,29 +80,27 @@ class _Progress:
 def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | None]:
     """Read what the companion has on disk, and give its store of flights; None: this user may not."""
     from companion.lab.flight.flight import Knowledge
-    from companion.lab.flight.in_force import parameter_file
     from companion.storage.flights import FlightStore
     from companion.storage.learned import BiasStore
     from companion.storage.records import RecordStore
 
-    others = {path.stem: parameter_file(path) for path in options.offsets}
     directory = storage_path(options)
     try:
-        known = Knowledge(records=RecordStore(directory).history(), biases=BiasStore(directory).all(), others=others)
+        known = Knowledge(records=RecordStore(directory).history(), biases=BiasStore(directory).all())
     except StorageError as error:
         words = "looked at without the companion's history, and not kept; sudo may help"
         print_lines(f"note: {error}: {words}", error=True)
-        return Knowledge(others=others), None
+        return Knowledge(), None
     return known, FlightStore(directory)
 
 
 def _keep(store: FlightStore, log: str, found: Sequence[Flight]) -> list[int]:
-    """Keep the flights that flew, for report and history; return their numbers."""
+    """Keep the flights that flew, for the history; return their numbers."""
     read_at = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="seconds")
     flown = [each for each in found if any(imu.drift for imu in each.imus)]
     if flown and not store.folder.parent.is_dir():
         where = f"this computer has no companion's storage ({store.folder.parent})"
-        print_lines(f"note: not kept: {where}; on the companion flights are kept for history and report", error=True)
+        print_lines(f"note: not kept: {where}; on the companion flights are kept for the history", error=True)
         return []
     try:
         return [store.save(KeptFlight(log=log, read_at=read_at, flight=each)) for each in flown]

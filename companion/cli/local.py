@@ -25,7 +25,6 @@ from companion.cli.terminal import (
     print_json,
     print_lines,
     storage_path,
-    within,
 )
 from companion.errors import CompanionError, StorageError
 from companion.links.system import logs
@@ -91,15 +90,10 @@ def add_commands(add: AddCommand) -> None:
         )
         if command is install:
             service.add_argument("--executable", metavar="PATH", help="the companion (default: the one that runs this)")
-    sub = add("report", report, "make a page (one HTML file) of a calibration or flight: needs no daemon, no network")
-    of = sub.add_mutually_exclusive_group()
-    of.add_argument(
+    sub = add("report", report, "make a page (one HTML file) of a calibration: needs no daemon, no network")
+    sub.add_argument(
         "record", nargs="?", metavar="RECORD", help="its number, or the beginning of its time (default: the latest)"
     )
-    of.add_argument(
-        "--flight", type=within(1, 1e9, int), nargs="?", const=0, metavar="NUMBER",
-        help="of a flight whose log was read, by its number (default: the latest)",
-    )  # fmt: skip
     sub.add_argument("-o", "--output", metavar="FILE", help="default: companion-report-….html here; - is stdout")
     sub.add_argument(
         "--storage", type=Path, metavar="DIR", help="the folder with records/ (default: as in the configuration)"
@@ -281,19 +275,12 @@ async def report(options: argparse.Namespace) -> int:
 
 def _make(options: argparse.Namespace, directory: Path) -> tuple[Path | None, list[str]]:
     from companion.lab.report.calibration_page import calibration_page
-    from companion.lab.report.flight_page import flight_page
-    from companion.lab.report.source import flight, material
+    from companion.lab.report.source import material
     from companion.storage.state import write_atomically
 
-    now = datetime.datetime.now(tz=datetime.UTC)
-    damaged: list[str] = []
-    if options.flight is not None:
-        number, kept, flights = flight(directory, options.flight)
-        content, name = flight_page(number, kept, flights, now), f"companion-flight-{number:06d}.html"
-    else:
-        one = material(directory, options.record)
-        content, damaged = calibration_page(one, now), list(one.damaged)
-        name = f"companion-report-{one.number:06d}.html"
+    found = material(directory, options.record)
+    content, damaged = calibration_page(found, datetime.datetime.now(tz=datetime.UTC)), list(found.damaged)
+    name = f"companion-report-{found.number:06d}.html"
     if options.output == "-":
         # As the file says of itself, whatever the terminal speaks.
         sys.stdout.buffer.write(content.encode("utf-8", "replace"))

@@ -25,6 +25,8 @@ COMMAND_LINE: Final[dict[str, str]] = {
     "companion install-service --dry-run": "0.2: install below a folder with --root to see the files",
     "companion uninstall-service --dry-run": "0.2: each removed file is printed",
     "companion flight --fetch": "0.2: download the log with your ground station, then companion flight LOG",
+    "companion flight --offsets": "0.2: companion flight LOG compares with the offsets before the calibration",
+    "companion report --flight": "0.2: companion flight LOG prints all of it, companion history one line a flight",
     "companion fleet demo": "0.2: run python -m sim fleet in the folder of the companion's sources",
     "companion fleet export": "0.2: use psql, sqlite3 or DuckDB, as docs/fleet.md shows (Export)",
 }

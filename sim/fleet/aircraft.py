@@ -135,7 +135,7 @@ class Aircraft:
                 axes.append({**nothing, "axis": axis, **{name: Term(terms[name], sigma) for name in terms}})
             about = {"imu": k + 1, "rate_hz": 400.0, "gyro_id": _GYRO_IDS[k], "accel_id": _ACCEL_IDS[k]}
             drift = {"flown": [Drift(30.0, 60, median := round(self._dice.uniform(1.5, 4.0), 1), 2.4 * median)]}
-            its = {"calibration": self._calibration, "axes": axes, "drift": drift, "moments": (), "notes": ()}
+            its = {"calibration": self._calibration, "axes": axes, "drift": drift, "notes": ()}
             imus.append({**nothing, **about, **its})
         flight = {"key": f"{self.epoch} {_iso(at)}", "system_id": 1, "began_at": _iso(at), "reference": "ekf"}
         flight |= {"stages": Stages(40.0, 42.0, 45.0, 610.0, 612.0), "imus": imus, "notes": ()}

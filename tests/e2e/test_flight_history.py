@@ -31,4 +31,3 @@ def test_the_daemon_tells_of_flights_that_were_read_while_it_ran(tmp_path: Path)
     assert [each["flight"]["key"] for each in latest["flights"]] == ["b"]
     (imu,) = one["flights"][0]["flight"]["imus"]
     assert imu["drift"]["flown"][1]["median_m"] == 2.1
-    assert "moments" not in imu

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 from companion.estimation.records.flight_record import (
@@ -11,7 +10,6 @@ from companion.estimation.records.flight_record import (
     Flight,
     ImuFlight,
     KeptFlight,
-    Moment,
     Split,
     Stages,
     Term,
@@ -32,24 +30,10 @@ def imu_flight(
     *,
     step: Sequence[float] = STEP,
     drifts: Mapping[str, tuple[float, ...]] = DRIFTS,
-    minutes: float = 3.0,
 ) -> ImuFlight:
     """One that stood for 30 s and then flew."""
     figures = list(zip(LEFT, step, UNITS, strict=True))
 
-    def moment(k: int) -> Moment:
-        left = [(before + by * (k >= 0) + math.sin(k)) * unit for before, by, unit in figures]
-        ekf = [0.8 * (before + by) * unit for before, by, unit in figures]
-        level = 0.1 if k < 0 else 3.0 + 0.1 * math.cos(k)
-        return Moment(
-            10.0 * k + 5.0,
-            (left[0], left[1], left[2], left[3]),
-            (ekf[0], ekf[1], ekf[2], ekf[3]),
-            36.0 + 0.2 * k,
-            level,
-        )
-
-    moments = tuple(map(moment, range(-3, round(minutes * 6.0))))
     axes = tuple(
         Split(
             axis=axis,
@@ -69,7 +53,7 @@ def imu_flight(
     }
     return ImuFlight(
         imu=number, rate_hz=400.0, calibration="2026-11-23T06:12:13.000+00:00", gyro_id=2752772, accel_id=2753028,
-        set_gyro_rad_s=(0.001,) * 3, set_accel_m_s2=(0.02,) * 3, axes=axes, drift=drift, moments=moments, notes=(),
+        set_gyro_rad_s=(0.001,) * 3, set_accel_m_s2=(0.02,) * 3, axes=axes, drift=drift, notes=(),
     )  # fmt: skip
 
 

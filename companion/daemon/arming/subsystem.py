@@ -157,7 +157,7 @@ class Arming(Subsystem):
         }
 
     def _flights(self, limit: int | None) -> list[Object]:
-        """Return the flights that `companion flight` has kept, without the data that only plots need."""
+        """Return the flights that `companion flight` has kept."""
         # Imported here, as it would slow every start.
         from companion.storage.flights import FlightStore
 
@@ -166,10 +166,7 @@ class Arming(Subsystem):
         except StorageError as error:
             logger.warning("%s", error)
             return []
-        shown: list[Object] = [msgspec.to_builtins(kept) | {"number": number} for number, kept in found.items()]
-        for imu in (imu for each in shown for imu in each["flight"]["imus"]):
-            del imu["moments"]
-        return shown
+        return [msgspec.to_builtins(kept) | {"number": number} for number, kept in found.items()]
 
 
 def shown_calibration(in_force: InForce, now_s: float) -> dict[str, object] | None:

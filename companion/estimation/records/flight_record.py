@@ -77,19 +77,6 @@ class Stages(msgspec.Struct, frozen=True):
     disarmed_s: float | None
 
 
-class Moment(msgspec.Struct, frozen=True, array_like=True):
-    """Ten seconds of a flight, or some more of a long one; by axis as in `AXES`."""
-
-    after_arming_s: float
-    """Its middle."""
-    left: tuple[float, float, float, float]
-    """The bias less what the offsets in force take off."""
-    ekf: tuple[float, float, float, float] | None
-    """The same as the EKF had it."""
-    degc: float | None
-    vibration_m_s2: float | None
-
-
 class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU in one flight."""
 
@@ -104,8 +91,7 @@ class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
     """The offsets in force, in the IMU's own axes."""
     axes: tuple[Split, ...]
     drift: dict[str, list[Drift]]
-    """Without aid, by whose offsets: `flown`, `before`, those of files."""
-    moments: tuple[Moment, ...] = ()
+    """Drift without aid, by whose offsets: `flown`, `before`."""
     notes: tuple[str, ...]
 
 

@@ -107,7 +107,7 @@ def _in_use(start: Start, name: str, lanes: Floats) -> Floats:
 def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[int]) -> FlownImu:
     rows = start.rows("IMU", instance)
     raw = _raw(start.rows("GYR", instance), start.rows("ACC", instance))
-    name, used = ("GYR", raw) if len(raw) > len(rows) else ("IMU", rows[:, :7])
+    used = raw if len(raw) > len(rows) else rows[:, :7]
     failed: NDArray[np.bool_] = np.any(rows[:, 8:10] < 1.0, axis=1)  # not so in a log that does not say
     told = np.searchsorted(rows[:, 0], used[:, 0], side="right") - 1
     used = used[np.isfinite(used).all(axis=1) & ~failed[np.maximum(told, 0)]]
@@ -117,7 +117,7 @@ def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[
     ids = [parameters.get(f"{prefix}{half}{suffix}_ID") for half in ("GYR", "ACC")]
     gyro_id, accel_id = (None if each is None else round(each) for each in ids)
     return FlownImu(
-        number=number, t_s=used[:, 0], readings=used[:, 1:7], means=start.means(name, instance),
+        number=number, t_s=used[:, 0], readings=used[:, 1:7], means=False,
         gyro_id=gyro_id, accel_id=accel_id,
         degc=rows[np.isfinite(rows[:, 7])][:, [0, 7]],
         failed_s=rows[failed, 0],

@@ -5,22 +5,25 @@ from __future__ import annotations
 import datetime
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 import msgspec
 import numpy as np
 
-from companion.autopilot.firmware.firmwares import firmware_named
-from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.firmware.firmwares import firmware_named, read_calibration
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
+from companion.autopilot.firmware.px4_slots import SlotMemory
+from companion.autopilot.parameters.change import Change
+from companion.autopilot.parameters.reading import FirmwareName
+from companion.autopilot.parameters.wire import same_float32
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.noise.allan import PROFILES, noise_profile
-from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, Moment, Stages, Term
+from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, Stages, Term
 from companion.estimation.records.record import Record
 from companion.estimation.solution.prior import curve_of
 from companion.lab.flight import ardupilot_log, inertial, px4_log
-from companion.lab.flight.in_force import calibration_in, moment, with_others, written_in
 from companion.lab.flight.inertial import Increments, Navigation, Window, World
 from companion.lab.flight.log import Boot, FlownImu
 from companion.lab.flight.split import LENGTH_S, SHORT_S, split
@@ -30,6 +33,7 @@ from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
 from companion.physics.frames import Floats
 from companion.physics.statistics import MAD_TO_SIGMA
 from companion.physics.units import DEG_H, MG
+from companion.samples import Triad
 from companion.storage.learned import KnownImu
 
 SPANS_S: Final = (10.0, 30.0, 60.0)
@@ -48,19 +52,14 @@ _SLOW_HZ: Final = 80.0
 _ENCRYPTED: Final = b"ULogEnc"
 _SYSTEM_ID: Final = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
 """ArduPilot's up to 4.6, from 4.7 on; PX4's."""
-_GROUND: Final = round(LENGTH_S / SHORT_S)
-_MOST_MOMENTS: Final = 120
-"""Most windows in a record; of a longer flight two, three ... are averaged."""
 
 
 class Knowledge(msgspec.Struct, frozen=True, kw_only=True):
-    """Records, biases and sets of offsets on the companion's disk."""
+    """Records and biases on the companion's disk."""
 
     records: Sequence[Record] = ()
     """The newest first."""
     biases: Mapping[str, KnownImu] = {}
-    others: Mapping[str, Mapping[str, float]] = {}
-    """Sets of offsets to compare with, by name."""
 
 
 def read(path: Path, progress: Progress) -> Iterator[Boot]:
@@ -98,7 +97,7 @@ async def flights(boot: Boot, known: Knowledge) -> list[Flight]:
         Flight(
             key=_key(boot, stages),
             system_id=_system_id(boot.parameters_at(stages.armed_s)),
-            began_at=moment(None if boot.unix_offset_s is None else boot.unix_offset_s + stages.armed_s),
+            began_at=_iso(None if boot.unix_offset_s is None else boot.unix_offset_s + stages.armed_s),
             stages=stages,
             reference="ekf" if boot.truth is None else "truth",
             imus=tuple(
@@ -176,10 +175,10 @@ async def _imu(
     reference, world = seen
     calibration = None
     try:
-        calibration = await calibration_in(boot.firmware, boot.parameters_at(stages.armed_s), imu)
+        calibration = await _calibration_in(boot.firmware, boot.parameters_at(stages.armed_s), imu)
     except AutopilotError as error:
         notes.append(str(error))
-    match = None if calibration is None else written_in(calibration, known.records)
+    match = None if calibration is None else _written_in(calibration, known.records)
     if match is not None and boot.unix_offset_s is not None:
         began_s = datetime.datetime.fromisoformat(match[0].started_at).timestamp()
         after_s = began_s - boot.unix_offset_s - stages.armed_s
@@ -208,7 +207,7 @@ async def _imu(
         notes.append(f"{of} left aside, far off the others: the EKF has jumped, or the IMU")
     drift: dict[str, list[Drift]] = {}
     if in_air is not None:
-        offsets = _others(calibration, match and match[1], known.others, found, in_air)
+        offsets = _offset_sets(calibration, match and match[1], found, in_air)
         drift = inertial.drift(found, reference, world, in_air, SPANS_S, offsets)
     warmth: Sequence[Term | None] = [None] * 4
     if calibration is not None and in_air is not None:
@@ -223,7 +222,6 @@ async def _imu(
         set_accel_m_s2=None if calibration is None else calibration.accel_offset_m_s2,
         axes=tuple(split(ground, flown, _means(imu.vibration, [one.t_s for one in flown]), warmth, _ekf(imu, in_air))),
         drift=drift,
-        moments=_moments(imu, stages.armed_s, ground, flown),
         notes=tuple(notes),
     )
 
@@ -260,27 +258,6 @@ def _means(table: Floats, times_s: Sequence[float]) -> Floats | None:
     return np.array([table[a : max(b, a + 1), 1].mean() for a, b in edges])
 
 
-def _moments(imu: FlownImu, armed_s: float, ground: Sequence[Window], flown: Sequence[Window]) -> tuple[Moment, ...]:
-    """Give the windows for plots, joined before the motors to the length of those in the air."""
-    rows = [[one.t_s, *one.gyro_rad_s, one.down_m_s2] for one in (*ground, *flown)]
-    per = max(1, math.ceil(len(flown) / _MOST_MOMENTS))
-    joined = [rows[k : k + _GROUND] for k in range(0, len(ground), _GROUND)]
-    joined += [rows[k : k + per] for k in range(len(ground), len(rows), per)]
-    means = [np.mean(each, axis=0) for each in joined]
-    times = [float(each[0]) for each in means]
-    degc, levels, ekf = _means(imu.degc, times), _means(imu.vibration, times), imu.estimated
-    found = []
-    for k, (at_s, x, y, z, down) in enumerate(np.round(means, 9).tolist()):
-        said = None
-        if ekf is not None and len(ekf.t_s) and ekf.t_s[0] <= at_s <= ekf.t_s[-1]:
-            columns = [*ekf.gyro_rad_s.T, ekf.accel_m_s2[:, 2]]
-            values = [round(float(np.interp(at_s, ekf.t_s, one)), 9) for one in columns]
-            said = (values[0], values[1], values[2], values[3]) if np.isfinite(values).all() else None
-        seen = (None if one is None else round(float(one[k]), 3) for one in (degc, levels))
-        found.append(Moment(round(at_s - armed_s, 1), (x, y, z, down), said, *seen))
-    return tuple(found)
-
-
 def _ekf(imu: FlownImu, in_air: tuple[float, float] | None) -> list[Term | None]:
     """Average the EKF's biases over the latter half; sigma is its own, and the rounding in the log."""
     found, nothing = imu.estimated, [None] * 4
@@ -295,20 +272,22 @@ def _ekf(imu: FlownImu, in_air: tuple[float, float] | None) -> list[Term | None]
     return [Term(*each) for each in zip(values.mean(axis=0).tolist(), sigma.tolist(), strict=True)]
 
 
-def _others(
+def _offset_sets(
     calibration: ImuCalibration | None,
     before: Mapping[str, float] | None,
-    others: Mapping[str, Mapping[str, float]],
     found: Increments,
     in_air: tuple[float, float],
 ) -> dict[str, tuple[Floats, Floats]]:
-    nothing = np.zeros(3), np.zeros(3)
-    if calibration is None:
-        return {"flown": nothing}
-    inside = (found.t_s >= in_air[0]) & (found.t_s <= in_air[1])
-    accel = found.velocity[inside].sum(axis=0) / max(float(found.dt_s[inside].sum()), 1e-9)
-    sets = {**({"before": before} if before else {}), **others}
-    return {**{name: with_others(calibration, each, accel) for name, each in sets.items()}, "flown": nothing}
+    """Return the changes of the output (SI) by the offsets before the calibration, and by those flown (none)."""
+    sets: dict[str, tuple[Floats, Floats]] = {}
+    if calibration is not None and before:
+        inside = (found.t_s >= in_air[0]) & (found.t_s <= in_air[1])
+        accel = found.velocity[inside].sum(axis=0) / max(float(found.dt_s[inside].sum()), 1e-9)
+        own = calibration.corrections
+        changes = [Change(name, own[name], value) for name, value in before.items() if name in own]
+        gyro, force = output_step(calibration, changes, tuple(accel.tolist()))
+        sets["before"] = np.array(gyro), np.array(force)
+    return {**sets, "flown": (np.zeros(3), np.zeros(3))}
 
 
 def _warmth(
@@ -337,3 +316,68 @@ def _is_same(identity: Mapping[str, str], imu: FlownImu, calibration: ImuCalibra
     if identity.get("source") != "autopilot" or identity.get("instance") != str(imu.number):
         return False
     return identity.get("gyro", "") in ("", str(calibration.gyro_id))
+
+
+# --- offsets in force
+
+
+class _LoggedParameters:
+    """Parameters of a log, with the interface of an autopilot's parameters."""
+
+    def __init__(self, firmware: FirmwareName, values: Mapping[str, float]) -> None:
+        self._values = values
+        self.vehicle = self
+        self.name: Final = "log"
+        self.firmware: Final[FirmwareName] = firmware
+        self.boots: Final = 1
+
+    async def hear_boot_time(self) -> bool:
+        """Return True: a log is of one start."""
+        return True
+
+    async def read(self, name: str) -> float:
+        if name not in self._values:
+            raise AutopilotError(f"the log has no parameter {name}")
+        return self._values[name]
+
+    async def read_optional(self, name: str) -> float | None:
+        return self._values.get(name)
+
+    async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
+        return {name: await self.read(name) for name in names if not optional or name in self._values}
+
+
+async def _calibration_in(firmware: FirmwareName, values: Mapping[str, float], imu: FlownImu) -> ImuCalibration:
+    """Read what the autopilot corrected an IMU with from the parameters in the log.
+
+    Raises:
+        AutopilotError: a parameter is missing.
+    """
+    memory = SlotMemory()
+    ids: dict[Triad, int | None] = {"gyro": imu.gyro_id, "accel": imu.accel_id}
+    for sensor, device_id in ids.items():
+        if device_id is not None:
+            memory.learn(sensor, device_id, imu.number)
+    return await read_calibration(_LoggedParameters(firmware, values), imu.number, memory)
+
+
+def _written_in(calibration: ImuCalibration, records: Sequence[Record]) -> tuple[Record, dict[str, float]] | None:
+    """Find the latest calibration that wrote the offsets in force, and the values before; records newest first.
+
+    The offsets decide and not the time: clocks of a companion and of an autopilot may be years apart.
+    """
+    in_force = calibration.offsets
+    for record in records:
+        if record.state != "done" or record.undone_at:
+            continue
+        written = {name: one for imu in record.imus for name, one in imu.written.items() if name in in_force}
+        if written and all(same_float32(one.after, in_force[name]) for name, one in written.items()):
+            return record, {name: one.before for name, one in written.items() if one.before is not None}
+    return None
+
+
+def _iso(unix_s: float | None) -> str | None:
+    """Format a time in UTC, ISO 8601; None: it is not believable."""
+    if unix_s is None or not 0.0 < unix_s < 1e11:
+        return None
+    return datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC).isoformat(timespec="seconds")

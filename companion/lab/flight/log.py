@@ -16,41 +16,9 @@ from companion.lab.flight.inertial import Navigation
 from companion.lab.logs.log import DROPOUTS, PARAMETERS, Block
 from companion.physics.frames import Floats
 
-MOST_ROWS: Final = 1 << 19
-"""Most rows of a message and instance, 20 minutes at 400 Hz; in a longer log two, four ... are averaged."""
 _MOST_PARAMETERS: Final = 1 << 16
 _INSTANCES: Final = 16
 """Most instances: a larger number is damage."""
-
-
-class Table:
-    """Rows of a message, the time in s first; its memory is bounded."""
-
-    def __init__(self) -> None:
-        self._chunks: list[Floats] = []
-        self._left: list[Floats] = []
-        self._count = 0
-        self.each = 1
-        """Number of messages in a row."""
-
-    def add(self, rows: Floats) -> None:
-        """Add rows (n, ...)."""
-        rows = np.concatenate([*self._left, rows])
-        whole = len(rows) - len(rows) % self.each
-        self._left = [rows[whole:].copy()]
-        self._take(_means(rows[:whole], self.each))
-
-    def _take(self, means: Floats) -> None:
-        self._chunks.append(means)
-        self._count += len(means)
-        if self._count > MOST_ROWS:
-            rows = np.concatenate(self._chunks)
-            self._chunks, self._count, self.each = [], 0, 2 * self.each
-            self._take(_means(rows[: len(rows) // 2 * 2], 2))
-
-    def rows(self) -> Floats:
-        """Return the rows (n, ...), ascending in time."""
-        return ascending(np.concatenate(self._chunks))
 
 
 class Start:
@@ -58,7 +26,7 @@ class Start:
 
     def __init__(self, fields: Mapping[str, int]) -> None:
         self._fields = fields
-        self._tables: dict[tuple[str, int], Table] = defaultdict(Table)
+        self._chunks: dict[tuple[str, int], list[Floats]] = defaultdict(list)
         self.parameters: list[tuple[float, str, float]] = []
         self.gaps = 0
         """Gaps in which the autopilot could not write."""
@@ -71,21 +39,17 @@ class Start:
         elif block.name == DROPOUTS:
             self.gaps += len(block.rows)
         elif 0 <= block.instance < _INSTANCES:
-            self._tables[block.name, block.instance].add(block.rows)
+            self._chunks[block.name, block.instance].append(block.rows)
 
     def rows(self, name: str, instance: int = 0) -> Floats:
         """Return the rows of a message, (n, 1 + fields), the time in s first."""
-        if (name, instance) not in self._tables:
+        if (name, instance) not in self._chunks:
             return np.zeros((0, 1 + self._fields[name]))
-        return self._tables[name, instance].rows()
-
-    def means(self, name: str, instance: int) -> bool:
-        """Return whether each row is the mean of several messages."""
-        return self._tables[name, instance].each > 1
+        return ascending(np.concatenate(self._chunks[name, instance]))
 
     def instances(self, name: str) -> list[int]:
         """List the instances that have logged a message."""
-        return sorted(instance for each, instance in self._tables if each == name)
+        return sorted(instance for each, instance in self._chunks if each == name)
 
 
 def starts(blocks: Iterable[Block | None], fields: Mapping[str, int]) -> Iterator[Start]:
@@ -111,10 +75,6 @@ def ascending(rows: Floats) -> Floats:
     ahead = (times[:-1] > times[1:]) & (times[1:] >= np.concatenate([[-np.inf], times[:-2]]))
     rows = rows[~np.append(ahead, [False])]
     return np.asarray(rows[np.concatenate([[True], rows[1:, 0] > np.maximum.accumulate(rows[:, 0])[:-1]])])
-
-
-def _means(rows: Floats, each: int) -> Floats:
-    return np.asarray(rows.reshape(-1, each, rows.shape[1]).mean(axis=1))
 
 
 class Estimated(msgspec.Struct, frozen=True):

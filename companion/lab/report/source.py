@@ -10,7 +10,7 @@ from typing import Final
 from companion.errors import StorageError
 from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.flight_evidence import moved
-from companion.estimation.records.flight_record import AXES, Flight, KeptFlight
+from companion.estimation.records.flight_record import AXES, Flight
 from companion.estimation.records.record import Arming, Record
 from companion.estimation.solution.by_temperature import ByTemperature, by_temperature
 from companion.estimation.solution.prior import curve_of
@@ -82,23 +82,6 @@ def material(directory: Path, wanted: str | None) -> Material:
         armings=[arming for arming in armings if arming.calibration == record.started_at],
         damaged=damaged,
     )
-
-
-def flight(directory: Path, wanted: int) -> tuple[int, KeptFlight, list[Flight]]:
-    """Read a flight by its number, or the latest by 0; and all flights.
-
-    Raises:
-        StorageError: there is none, none of that number, or it cannot be read.
-    """
-    store = FlightStore(directory)
-    numbers = store.numbers()
-    if not numbers:
-        raise StorageError(f"no flight yet: nothing is in {store.folder} (companion flight LOG reads one)")
-    number = wanted or numbers[-1]
-    kept = store.read(number)
-    if kept is None:
-        raise StorageError(f"no flight {wanted}; there are number {numbers[0]} to {numbers[-1]} (companion history)")
-    return number, kept, store.flights()
 
 
 def _moved_in_flight(flights: Sequence[Flight], record: Record, known: Mapping[str, KnownImu]) -> dict[str, list[str]]:
