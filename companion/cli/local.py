@@ -274,8 +274,8 @@ async def report(options: argparse.Namespace) -> int:
 
 
 def _make(options: argparse.Namespace, directory: Path) -> tuple[Path | None, list[str]]:
-    from companion.lab.report.calibration_page import calibration_page
-    from companion.lab.report.source import material
+    from companion.report.calibration import calibration_page
+    from companion.report.source import material
     from companion.storage.state import write_atomically
 
     found = material(directory, options.record)

@@ -23,8 +23,6 @@ AXES: Final = ("x", "y", "z")
 CLASSES: Final = ("sx", "sy", "sz")
 _MOST: Final = 1e4
 """The largest value in a plot (SI units): what is beyond comes from a damaged file and must not squash the rest."""
-_DOT_SHARE: Final = 0.015
-"""Width of a dot, as a share of the plot's."""
 _LATEST_S: Final = 230 * 365.25 * 86400
 MAX_WARNINGS: Final = 40
 MAX_IMUS: Final = 4
@@ -36,18 +34,12 @@ _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'
 _STYLES: Final = tuple(Path(__file__).with_name(name) for name in ("page.css", "plot.css"))
 
 
-def page(
-    title: str,
-    now: datetime.datetime,
-    *body: Child,
-    source: str = "from the records on this computer",
-    clock: str = "the companion's clock",
-) -> str:
-    """A whole file."""
+def page(title: str, now: datetime.datetime, *body: Child, source: str = "from the records on this computer") -> str:
+    """Make a whole file."""
     foot = tag(
         "p",
         f"Made {now:%Y-%m-%d %H:%M} UTC by companion {__version__} {source}. All axes:"
-        f" x forward, y right, z down. Times: UTC by {clock}.",
+        f" x forward, y right, z down. Times: UTC by the companion's clock.",
         class_="soft",
     )
     head = join(
@@ -138,33 +130,21 @@ def clock_is_sound(points: Sequence[Point]) -> bool:
     return None not in known and all(a <= b for a, b in itertools.pairwise(known) if a is not None and b is not None)
 
 
-def _too_close(places: Sequence[float]) -> bool:
-    """Return whether two of these ascending places are nearer than a dot is wide."""
-    apart = [b - a for a, b in itertools.pairwise(places)]
-    return len(apart) > 1 and min(apart) < _DOT_SHARE * (places[-1] - places[0])
-
-
-def drift(points: Sequence[Point], triad: Triad, *, name: str, this: int | None = None) -> Markup | None:
-    """Three plots, one an axis, of a bias against time; None where there is nothing to show."""
+def drift(points: Sequence[Point], triad: Triad, *, name: str, this: int | None = None) -> Markup:
+    """Draw three plots, one an axis, of a bias over calibrations in their order."""
     unit, unit_name, _ = UNITS[triad]
-    numbered = not clock_is_sound(points)
-    given = [(float(point.number) if numbered else point.unix_s, point) for point in points]
-    shown = [(x, point) for x, point in given if x is not None]
-    if not shown:
-        return None
-    places = [x for x, _ in shown]
-    across, label = svg.times(places), "time (UTC)"
-    crowded = not numbered and _too_close(places)
-    if crowded:
-        across, label = svg.in_order(places), "time (UTC), in their order"
-        shown = [(float(k), point) for k, (_, point) in enumerate(shown)]
-    if numbered:
-        across, label = svg.linear(places, least=2.0), "number of the calibration (clock not sound)"
+    times = [point.unix_s for point in points]
+    dated = [each for each in times if each is not None] if clock_is_sound(points) else []
+    if dated:
+        across, label = svg.dates(dated), "time (UTC), in their order"
+    else:
+        across = svg.in_order([str(point.number) for point in points])
+        label = "number of the calibration (clock not sound)"
     plots: list[Markup] = []
     for axis in range(3):
         ends = [
             ((point.bias[axis] - point.sigma_use[axis]) / unit, (point.bias[axis] + point.sigma_use[axis]) / unit)
-            for _, point in shown
+            for point in points
         ]
         plot = svg.Plot(
             across,
@@ -174,16 +154,14 @@ def drift(points: Sequence[Point], triad: Triad, *, name: str, this: int | None 
             x_label=label if axis == 2 else None,
             y_label=f"{AXES[axis]}, {unit_name}",
         )
-        plot.points([(x, point.bias[axis] / unit) for x, point in shown], CLASSES[axis], ends)
-        for x, point in shown:
+        plot.points([(float(k), point.bias[axis] / unit) for k, point in enumerate(points)], CLASSES[axis], ends)
+        for k, point in enumerate(points):
             if point.number == this:
-                centre = plot.at(x, point.bias[axis] / unit)
+                centre = plot.at(k, point.bias[axis] / unit)
                 plot.draw(tag("circle", cx=f"{centre[0]:.1f}", cy=f"{centre[1]:.1f}", r=8, class_="ring"))
         plots.append(plot.svg())
-    close = "Some follow each other so closely that these stand in their order, at even distances. "
-    back = "The companion's clock went back in between, so these stand in their order, not by time. "
-    why = back if numbered else close if crowded else None
-    return tag("figure", *plots, tag("figcaption", why, "Bars: one sigma for the next minutes."))
+    back = None if dated else "The companion's clock went back in between, so these stand in their order, not by time. "
+    return tag("figure", *plots, tag("figcaption", back, "Bars: one sigma for the next minutes."))
 
 
 def arming_items(armings: Iterable[tuple[str, str, str]]) -> Markup:

@@ -53,30 +53,18 @@ def linear(values: Sequence[float], *, ticks: int = 4, least: float = 0.0) -> Ax
     return Axis(low, high, tuple((place, f"{place:.{digits}f}") for place in places))
 
 
-def times(values: Sequence[float]) -> Axis:
-    """An axis of UTC times, in seconds since 1970."""
-    steps = [60, 120, 300, 600, 1800, 3600, 7200, 3 * 3600, 6 * 3600, 12 * 3600]
-    steps += [86400 * days for days in (1, 2, 4, 7, 14, 30, 61, 122, 365, 1461)]
-    plain = linear(values, least=60.0)
-    span = plain.high - plain.low
-    step = next((step for step in steps if span / step <= 4.6), math.ceil(span / 4))
-    form = "%H:%M" if step < 86400 else "%-d %b" if span < 300 * 86400 else "%b %Y"
-    first = math.ceil(plain.low / step)
-    places = [k * step for k in range(first, math.floor(plain.high / step) + 1)]
-    ticks = [(float(place), datetime.datetime.fromtimestamp(place, tz=datetime.UTC).strftime(form)) for place in places]
-    return Axis(plain.low, plain.high, tuple(ticks))
+def in_order(labels: Sequence[str]) -> Axis:
+    """Make an axis on which each label has the place of its number, counted from 0; at most four are written."""
+    every = math.ceil(len(labels) / 4)
+    ticks = tuple((float(k), labels[k]) for k in range(0, len(labels), every))
+    return Axis(-0.5, len(labels) - 0.5, ticks)
 
 
-def in_order(values: Sequence[float]) -> Axis:
-    """An axis on which each of these UTC times has the place of its number, counted from 0."""
-    every = math.ceil(len(values) / 4)
+def dates(values: Sequence[float]) -> Axis:
+    """Make an axis of UTC times, in seconds since 1970, in their order; within one day the labels are times of day."""
     moments = [datetime.datetime.fromtimestamp(value, tz=datetime.UTC) for value in values]
-    # Four labels with day and time would stand in one another.
-    days = [f"{moment:%-d %b}" for moment in moments[::every]]
-    if len(set(days)) < len(days):
-        every = math.ceil(len(values) / 3)
-        days = [f"{moment:%-d %b %H:%M}" for moment in moments[::every]]
-    return Axis(-0.5, len(values) - 0.5, tuple(zip(map(float, range(0, len(values), every)), days, strict=True)))
+    form = "%H:%M" if len({each.date() for each in moments}) == 1 else "%-d %b %y"
+    return in_order([each.strftime(form) for each in moments])
 
 
 def _nice(step: float) -> float:
@@ -114,11 +102,6 @@ class Plot:
         """Return the place of a point in the picture."""
         across = self._left + self._x.share(x) * (WIDTH - self._left - _RIGHT)
         return across, self._top + (1.0 - self._y.share(y)) * self._height
-
-    def band(self, first: float, last: float) -> None:
-        """Shade what lies between two places of the horizontal axis."""
-        left, right = self.at(first, self._y.low)[0], self.at(last, self._y.low)[0]
-        self._below.append(_rect(left, self._top, right - left, self._height, "band"))
 
     def line(self, points: Sequence[Pair], class_: str) -> None:
         """Join points."""
@@ -167,7 +150,10 @@ class Plot:
             height = self.at(self._x.low, place)[1]
             grid.append(_path(f"M{_n(self._left)} {_n(height)}H{_n(WIDTH - _RIGHT)}", "grid"))
             grid.append(tag("text", label, x=_n(self._left - 6.0), y=_n(height + 4.5), class_="end"))
-        frame = _rect(self._left, self._top, WIDTH - self._left - _RIGHT, self._height, "frame")
+        frame = tag(
+            "rect", x=_n(self._left), y=_n(self._top), width=_n(WIDTH - self._left - _RIGHT), height=_n(self._height),
+            class_="frame",
+        )  # fmt: skip
         labels: list[Markup] = []
         if self._x_label:
             middle = (self._left + WIDTH - _RIGHT) / 2.0
@@ -187,24 +173,6 @@ class Plot:
             role="img",
             class_="plot",
         )
-
-
-def strip(left: float, right: float, middle: float, height: float, class_: str) -> Markup:
-    """A block from `left` to `right`, upright around `middle`; all in the plot's units."""
-    return _rect(left, middle - height / 2.0, max(right - left, 0.6), height, class_)
-
-
-def _rect(x: float, y: float, width: float, height: float, class_: str) -> Markup:
-    return tag("rect", x=_n(x), y=_n(y), width=_n(width), height=_n(height), class_=class_)
-
-
-def legend(*entries: tuple[str, str]) -> Markup:
-    """Blocks with words, of (class, words)."""
-    parts = []
-    for class_, words in entries:
-        picture = strip(2.0, 22.0, 8.0, 4.0 if class_ == "still" else 14.0, class_)
-        parts.append(tag("span", tag("svg", picture, viewBox="0 0 24 16", class_="key"), words))
-    return tag("p", *parts, class_="legend")
 
 
 def _path(course: str, class_: str) -> Markup:

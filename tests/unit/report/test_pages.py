@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import itertools
 import json
 import re
 from html.parser import HTMLParser
@@ -16,13 +15,16 @@ from hypothesis import strategies as st
 
 from companion.cli import main
 from companion.estimation.records.record import Magnetic
-from companion.lab.report import calibration_page as calibration
-from companion.lab.report.calibration_page import calibration_page
-from companion.lab.report.source import material
 from companion.physics.units import DEG_H, MG
-from companion.report import svg
+from companion.report import calibration
+from companion.report.calibration import calibration_page, disturbances
+from companion.report.page import unix_s
+from companion.report.source import material
 from companion.samples import Vector
+from companion.storage.flights import FlightStore
+from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.records import RecordStore
+from tests.support.flights import imu_flight, kept_flight
 from tests.support.histories import a_season, arming, imu_record, record, white_trace
 
 NOW = datetime.datetime(2026, 6, 1, 12, 0, tzinfo=datetime.UTC)
@@ -76,17 +78,13 @@ class Page(HTMLParser):
             self.shown[self._key] = self.shown.get(self._key, "") + data
 
 
-def _store(folder: Path) -> RecordStore:
-    return RecordStore(folder)
-
-
 def _calibration(folder: Path, wanted: str | None = None) -> str:
     return calibration_page(material(folder, wanted), NOW)
 
 
 def test_the_figures_are_those_of_the_record(tmp_path: Path) -> None:
     one = record()
-    _store(tmp_path).save(one, white_trace(one))
+    RecordStore(tmp_path).save(one, white_trace(one))
     found = Page(_calibration(tmp_path))
     for imu in one.imus:
         for triad, unit, columns in (
@@ -131,28 +129,12 @@ def test_how_good_the_compass_heading_can_be_is_one_line(tmp_path: Path) -> None
         " inclination -59.0 deg (the Earth's -59.5), wandered 0.1 deg"
     )
     assert found.in_words() == words
-    _store(tmp_path).save(msgspec.structs.replace(record(), magnetic=found))
+    RecordStore(tmp_path).save(msgspec.structs.replace(record(), magnetic=found))
     assert f"Compass: {words}." in Page(_calibration(tmp_path)).text
     nothing = msgspec.structs.replace(found, heading_bound_deg=180.0, field_gauss=None, inclination_deg=None)
     assert nothing.in_words().startswith("shows no heading here, worked out")
     bare = msgspec.structs.replace(nothing, heading_bound_deg=None, heading_from="device", wander_deg=None)
     assert bare.in_words() == "heading error bound unknown"
-
-
-def test_the_points_of_a_plot_lie_where_their_values_are() -> None:
-    across, up = svg.linear([0.0, 10.0]), svg.linear([1.0, 100.0])
-    plot = svg.Plot(across, up, name="test", height=100.0, x_label="x")
-    plot.points([(0.0, 1.0), (5.0, 50.5), (10.0, 100.0)], "sx", spans=[(1.0, 50.5)] * 3)
-    drawn = Page(plot.svg())
-    marks = next(held["d"] or "" for tag, held in drawn.tags if tag == "path" and held["class"] == "dot sx")
-    places = [(float(x), float(y)) for x, y in re.findall(r"M(-?[\d.]+) (-?[\d.]+)", marks)]
-    # Equal steps in value are equal steps on the page, to a tenth of a unit.
-    assert places[1][0] - places[0][0] == pytest.approx(places[2][0] - places[1][0], abs=0.21)
-    assert places[1][1] - places[0][1] == pytest.approx(places[2][1] - places[1][1], abs=0.21)
-    assert places[0][1] > places[2][1]
-    bars = next(held["d"] or "" for tag, held in drawn.tags if tag == "path" and held["class"] == "bar sx")
-    low, high = re.findall(r"M[-\d.]+ ([-\d.]+)V([-\d.]+)", bars)[0]
-    assert (float(low), float(high)) == pytest.approx((places[0][1], places[1][1]), abs=0.11)
 
 
 def test_a_page_needs_nothing_else_and_stays_small(tmp_path: Path) -> None:
@@ -248,26 +230,45 @@ def test_drift_shows_the_calibrations_up_to_this_one_and_rings_it(tmp_path: Path
     assert sum(held.get("class") == "ring" for _, held in found.tags) == 3 * 4
 
 
+def test_seconds_in_a_row_that_moved_or_failed_are_one_line() -> None:
+    trace = white_trace(record(state="failed"), 20, moved=True)
+    by_name = {one.name: one for one in trace.verdicts}
+    moves = "gyro fc moves 0.31 deg/s, max 0.10"
+    fc = [(-2, -1, moves), (7, 8, moves), (16, 17, moves)]
+    assert [each for each in disturbances(trace, by_name["fc"]) if each[2] == moves] == fc
+    assert [each[:2] for each in disturbances(trace, by_name["gradienter"])][-1] == (16, 20)
+
+
+def test_a_calibration_says_where_flights_have_found_more_than_its_sigma(tmp_path: Path) -> None:
+    RecordStore(tmp_path).save(record())
+    store, biases = FlightStore(tmp_path), BiasStore(tmp_path)
+    identity = {"instance": "1", "gyro": "2752772", "accel": "2753028"}
+    biases.write({"fc": KnownImu(identity=identity)})
+    bare = Page(_calibration(tmp_path))
+    for k in range(4):
+        store.save(kept_flight(str(k), imu_flight(step=(0.0, 4.0, 45.0, 5.1))))
+    found = Page(_calibration(tmp_path))
+    ends = ", more than σ use, which is of the ground: damp the autopilot better."
+    assert found.text.count(ends) == 2
+    # Each to 12 deg/h or 0.6 mg; what all flights have wrong alike is 0.2 mg.
+    assert f"4 flights: motors move IMU 1 gyro z by +45 ± 6 deg/h{ends}" in found.text
+    assert f"4 flights: motors move IMU 1 accel z by +5.1 ± 0.4 mg{ends}" in found.text
+    # The figures of the calibration itself are what they were.
+    assert bare.exact == found.exact
+    # Flights of another sensor say nothing.
+    biases.write({"fc": KnownImu(identity=identity | {"gyro": "7", "accel": "8"})})
+    assert "motors move" not in Page(_calibration(tmp_path)).text
+
+
 def test_a_clock_that_went_back_is_said_and_order_is_used(tmp_path: Path) -> None:
     store = RecordStore(tmp_path)
     for k, year in enumerate((2026, 1970, 1970)):
         store.save(record(k, started_at=f"{year}-01-01T00:0{k}:00.000+00:00"))
     found = Page(_calibration(tmp_path))
     assert "The companion's clock went back in between" in found.text
+    assert unix_s("yesterday") is None
+    assert unix_s("2026-05-01T10:00:00+02:00") == unix_s("2026-05-01T08:00:00")
     assert "number of the calibration" in found.text
-
-
-def test_three_calibrations_of_one_hour_after_a_month_are_three_dots(tmp_path: Path) -> None:
-    store = RecordStore(tmp_path)
-    for k, when in enumerate(("04-20T09:00", "05-23T09:02", "05-23T09:31", "05-23T10:12")):
-        store.save(record(k, started_at=f"2026-{when}:00.000+00:00"))
-    found = Page(_calibration(tmp_path))
-    (course, *_) = (held["d"] or "" for tag, held in found.tags if tag == "path" and held.get("class") == "dot sx")
-    places = [float(x) for x in re.findall(r"M([\d.]+)", course)]
-    assert len(places) == 4
-    assert min(b - a for a, b in itertools.pairwise(places)) > 20.0
-    assert "stand in their order" in found.text
-    assert "23 May 09:31" in found.text
 
 
 # -------------------------------------------------------------------------------------------------------- the command
@@ -355,27 +356,15 @@ def test_a_folder_that_only_root_may_enter_is_not_taken_for_an_empty_one(
     assert "cannot be read: Permission denied; run it with sudo" in capsys.readouterr().err
 
 
-def test_damaged_armings_are_named(tmp_path: Path) -> None:
-    a_season(tmp_path, 2)
-    (tmp_path / "armings.json").write_bytes(b"[{]")
-    assert "armings.json:" in Page(_calibration(tmp_path)).text
-
-
-def test_gyros_alone_are_shown_alone(tmp_path: Path) -> None:
-    imu = msgspec.structs.replace(
-        imu_record(), accel_bias_m_s2=None, accel_sigma_stat_m_s2=None, accel_sigma_use_m_s2=None
-    )
-    RecordStore(tmp_path).save(record(imus=(imu,)))
-    found = Page(_calibration(tmp_path))
-    assert "fc.gyro.bias.z" in found.exact
-    assert "fc.accel.bias.z" not in found.exact
-    assert "Not determined: not asked for" in found.text
-
-
 def test_what_was_held_back_is_not_shown_as_in_force(tmp_path: Path) -> None:
     imu = msgspec.structs.replace(imu_record(), held_back=("accel",))
-    RecordStore(tmp_path).save(record(imus=(imu, imu_record("own", 1))))
-    assert Page(_calibration(tmp_path)).text.count("Held back: measured, not written.") == 1
+    gyros_alone = msgspec.structs.replace(
+        imu_record("own", 1), accel_bias_m_s2=None, accel_sigma_stat_m_s2=None, accel_sigma_use_m_s2=None
+    )
+    RecordStore(tmp_path).save(record(imus=(imu, gyros_alone)))
+    found = Page(_calibration(tmp_path))
+    assert found.text.count("Held back: measured, not written.") == 1
+    assert found.text.count("Not determined: not asked for") == 1
 
 
 _floats = st.floats(allow_nan=False, allow_infinity=False)

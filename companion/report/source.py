@@ -14,7 +14,7 @@ from companion.estimation.records.flight_record import AXES, Flight
 from companion.estimation.records.record import Arming, Record
 from companion.estimation.solution.by_temperature import ByTemperature, by_temperature
 from companion.estimation.solution.prior import curve_of
-from companion.lab.report.calibration_page import Material
+from companion.report.calibration import Material
 from companion.storage.flights import FlightStore
 from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.profiles import ProfileStore

@@ -17,10 +17,10 @@ from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.history import Point
 from companion.estimation.solution.by_temperature import ByTemperature, by_temperature
 from companion.estimation.solution.prior import curve_of
-from companion.lab.report.calibration_page import calibration_page
-from companion.lab.report.source import material
 from companion.physics.units import DEG_H, MG
 from companion.report.by_temperature import biases_by_temperature
+from companion.report.calibration import calibration_page
+from companion.report.source import material
 from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.records import RecordStore
 from tests.support.histories import OFFSET_DEG_H, gyro_deg_h_at, imu_record, record, windows_of_days

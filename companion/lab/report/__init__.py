@@ -1,1 +1,0 @@
-"""Reports of calibrations and flights as HTML files."""
