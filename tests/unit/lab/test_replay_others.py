@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from companion.cli import main as companion
+from companion.errors import StorageError
 from companion.lab.logs.csv_log import HEADER, read
 from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, ImuModel
@@ -163,22 +164,19 @@ def test_a_log_without_times_has_a_rate(
     assert_near(record["imus"][0], model)
 
 
-def test_equal_times_are_spread_and_repeated_lines_left_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
-) -> None:
-    """A clock of whole tenths of a second, and every tenth line twice."""
-    data, model = still
-    rows = [[f"{np.floor(row[0] * 10.0) / 10.0:.1f}", *row[1:].tolist()] for row in data]
-    doubled = [row for number, row in enumerate(rows) for _ in range(2 if number % 10 == 4 else 1)]
-    head = HEADER + "\n"
-    path = written(tmp_path, head + joined(doubled))
-    log = read(path)
-    np.testing.assert_allclose(log.t_s, data[:, 0], atol=1e-6)
-    np.testing.assert_array_equal(log.readings, data[:, 1:])
+def test_repeated_lines_are_left_out_and_equal_times_refused(tmp_path: Path, still: tuple[Floats, ImuModel]) -> None:
+    data = still[0]
+    doubled = [row for number, row in enumerate(data.tolist()) for _ in range(2 if number % 10 == 4 else 1)]
+    log = read(written(tmp_path, HEADER + "\n" + joined(doubled)))
+    np.testing.assert_array_equal(np.column_stack([log.t_s, log.readings]), data)
     assert log.left_out == {"repeated: time and readings of the line before": len(data) // 10}
-    code, record = replay(capsys, path, *WHERE)
-    assert code == 0
-    assert_near(record["imus"][0], model)
+    coarse = np.column_stack([np.floor(data[:, 0] * 10.0) / 10.0, data[:, 1:]])
+    path = written(tmp_path, HEADER + "\n" + joined(coarse.tolist()))
+    with pytest.raises(
+        StorageError, match=r"line 3: time 3\.000000 s after 3\.000000 s; allowed: growing times, or --rate"
+    ):
+        read(path)
+    assert np.diff(read(path, rate_hz=100.0).t_s) == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize(
