@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 MOST_DIFFERENCES: Final = 20
 """The most differences that are printed of a calibration; --json has them all."""
-MOST_PIECES: Final = 12
-"""The most pieces not used, and reasons, that are printed; --json has them all."""
+MOST_REASONS: Final = 12
+"""The most reasons that are printed; --json has them all."""
 
 
 def add_command(add: AddCommand) -> None:
@@ -238,7 +238,7 @@ def _windows(options: argparse.Namespace, log: StillLog, given: Given) -> int:
 def _window_lines(found: Windows) -> list[str]:
     """Say how often the error was within sigma, axis by axis."""
     lines = [f"windows of {found.length_s:g} s: {found.count}, calibrated: {found.done}"]
-    lines += [f"not calibrated: {each.count}: {each.why}" for each in found.refused[:MOST_PIECES]]
+    lines += [f"not calibrated: {each.count}: {each.why}" for each in found.refused[:MOST_REASONS]]
     for next_s, axes in itertools.groupby(found.axes, key=lambda each: each.next_s):
         rows = list(axes)
         lines.append(f"against the next {next_s:g} s, {rows[0].pairs} pairs:")
@@ -252,13 +252,10 @@ def _window_lines(found: Windows) -> list[str]:
 
 
 def _used_lines(used: Used, *, at_rest: bool = True) -> list[str]:
-    """Say which stretch was used, and why not the rest."""
+    """Say which stretch was used, and how many lines were left out."""
     lines = []
     if used.from_s is not None and used.to_s is not None:
         still = f"; {used.still_s} s of it at rest" if at_rest else ""
         lines.append(f"used: {used.from_s:.0f} to {used.to_s:.0f} s of {used.seconds:.1f} s{still}")
-    lines += [f"not used: {each.from_s:.0f} to {each.to_s:.0f} s: {each.why}" for each in used.unused[:MOST_PIECES]]
-    if len(used.unused) > MOST_PIECES:
-        lines.append(f"... and {len(used.unused) - MOST_PIECES} more (--json has them all)")
     lines += [f"left out: {count} lines {why}" for why, count in used.left_out.items()]
     return [*lines, *(f"note: {note}" for note in used.notes)]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import datetime
-import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Final
 
 import msgspec
@@ -16,8 +15,7 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.measurement import Measurement
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
-from companion.estimation.deck.deck import EVERY_S
-from companion.estimation.deck.estimate import MAX_S, MIN_S
+from companion.estimation.deck.estimate import MIN_S
 from companion.estimation.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.noise.allan import noise_profile
@@ -47,8 +45,6 @@ _LONGER: Final[dict[Platform, float]] = {"ground": 1.02, "deck": 1.1}
 """A window is chosen again when the stretch has grown by so much."""
 _AT_REST: Final[dict[Platform, str]] = {"ground": "at rest", "deck": "without a gap"}
 _AT_ONCE: Final = 4096
-_LOOK_S: Final = 300
-"""Verdicts are taken from the collector so often; it keeps twice as many."""
 
 
 class Given(msgspec.Struct, frozen=True, kw_only=True):
@@ -79,14 +75,6 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
     """True: accept biases beyond those of any part."""
 
 
-class Unused(msgspec.Struct, frozen=True):
-    """Seconds in a row that did not go into the means."""
-
-    from_s: float
-    to_s: float
-    why: str
-
-
 class Used(msgspec.Struct, frozen=True, kw_only=True):
     """Part of a log that went into the means; times from its first sample on."""
 
@@ -97,7 +85,6 @@ class Used(msgspec.Struct, frozen=True, kw_only=True):
     to_s: float | None
     still_s: int
     """Seconds between them that count."""
-    unused: tuple[Unused, ...]
     left_out: dict[str, int]
     """Lines, by reason."""
     notes: tuple[str, ...]
@@ -180,9 +167,6 @@ class _Pass:
         self._still_s = 0.0
         self._obstacle = ""
         self._longest_s = 0.0
-        self._verdicts: dict[int, tuple[str, str]] = {}
-        """Reason why a second was not still, and its kind without figures, by second; empty: it was still."""
-        self._verdicts_from_s = 0.0
 
     def run(self) -> LogEstimate:
         """Run from the first sample to the last."""
@@ -229,13 +213,6 @@ class _Pass:
             except CalibrationRefusedError:
                 return  # seconds of a deck end in tens
             self._still_s = glance.still_s
-        if last or now_s - self._verdicts_from_s >= _LOOK_S:
-            for slot, good, verdicts in collector.snapshot(self._verdicts_from_s, None).seconds:
-                said = next((each for each in verdicts.values() if each.words), None)
-                words = "beginning" if said is None else said.words
-                kind = words if said is None or said.fault else "moving"
-                self._verdicts[slot] = ("", "") if good else (words, kind)
-            self._verdicts_from_s = now_s - 5.0
 
     def _unusable(self, seconds: float) -> str:
         """Give the reason where no second could be judged."""
@@ -275,46 +252,18 @@ class _Pass:
             return record_of(None, began_at, seconds, state="failed", reason=str(error), warnings=warnings)
         return record_of(solution, began_at, seconds, warnings=warnings)
 
-    # --- what of it was used
-
     def _used(self, measurement: Measurement | None, seconds: float) -> Used:
         slots = [] if measurement is None else measurement.slots
         first = math.ceil(_FIRST_S)
-        rest = _AT_REST[self._given.platform]
-        # A deck's window ends with a round second.
-        margin = EVERY_S[MAX_S] if self._given.platform == "deck" else 0
-        elsewhere = f"{rest}, but {'another stretch is longer' if slots else 'not for long enough'}"
-        if len(slots) >= (self._max_still_s if self._given.platform == "ground" else MAX_S):
-            elsewhere = f"{rest}, but the longest window is full"
-        whys: list[tuple[int, int, str, str]] = []
-        next_slot = first
-        for slot, (words, kind) in sorted(self._verdicts.items()):
-            if not first <= slot < seconds + _FIRST_S - 1.0:
-                continue
-            if slot > next_slot:
-                whys.append((next_slot - first, slot - first, "no samples", "no samples"))
-            next_slot = slot + 1
-            if not words and not (slots and slots[0] - margin <= slot <= slots[-1] + margin):
-                words = kind = elsewhere
-            whys.append((slot - first, next_slot - first, words, kind))
         return Used(
             files=self._log.files,
             seconds=seconds,
             from_s=float(slots[0] - first) if slots else None,
             to_s=float(slots[-1] + 1 - first) if slots else None,
             still_s=len(slots),
-            unused=tuple(_in_rows(whys)),
             left_out=self._log.left_out,
             notes=(*self._log.notes, *self._streams.notes),
         )
-
-
-def _in_rows(whys: Iterable[tuple[int, int, str, str]]) -> Iterator[Unused]:
-    """Join seconds in a row with reasons of one kind, in the words of the first."""
-    for kind, group in itertools.groupby(whys, key=lambda each: each[3]):
-        some = list(group)
-        if kind:
-            yield Unused(float(some[0][0]), float(some[-1][1]), some[0][2])
 
 
 def _rows(log: StillLog, offset_s: float) -> Iterator[tuple[float, Vector, Vector, float | None]]:
