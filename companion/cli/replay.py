@@ -64,7 +64,7 @@ def _replay_recording(options: argparse.Namespace) -> int:
     different = [difference for each in result.calibrations for difference in each.differences]
     lines = _lines(result)
     reason = lines[-1]
-    good = not different and (result.estimate is None or result.estimate.state == "done")
+    good = bool(result.calibrations) and not different
     state = "different" if different else "done" if good else "failed"
     print_lines(
         f"replayed {result.seconds:.0f} s in {took_s:.1f} s"
@@ -92,10 +92,8 @@ def _lines(result: Result) -> list[str]:
         lines += [f"DIFFERENT {difference}" for difference in each.differences[:MOST_DIFFERENCES]]
         if len(each.differences) > MOST_DIFFERENCES:
             lines.append(f"... and {len(each.differences) - MOST_DIFFERENCES} more (--json has them all)")
-    if result.estimate is not None:
-        lines.append("no calibration in the recording; what one would have found at its end:")
-        lines += show.record_lines(msgspec.to_builtins(result.estimate))
-        lines.append(result.estimate.reason)
+    if not result.calibrations:
+        lines.append("no calibration in the recording: calibrate while it runs")
     elif different:
         lines.append(f"{different} of {len(result.calibrations)} calibrations came out different")
     else:
@@ -109,51 +107,36 @@ def _add_log_options(parser: argparse.ArgumentParser) -> None:
     log = parser.add_argument_group("for a log (docs/recording.md)")
     add_table_options(log)
     log.add_argument("--imu", metavar="NAME", help="which one, where there are several")
-    for name, least, most, words in (
-        ("--pitch-deg", -84.0, 84.0, "nose up"),
-        ("--roll-deg", -180.0, 180.0, "right side down"),
-        ("--heading-deg", -360.0, 360.0, "clockwise from true north"),
-        ("--latitude-deg", -90.0, 90.0, "north is positive"),
-        ("--longitude-deg", -180.0, 180.0, "east is positive; for a magnetic heading"),
-        ("--height-m", -500.0, 9000.0, "above mean sea level"),
+    for name, least, most, default, unit, words in (
+        ("pitch-deg", -84.0, 84.0, None, "DEG", "nose up"),
+        ("roll-deg", -180.0, 180.0, None, "DEG", "right side down"),
+        ("heading-deg", -360.0, 360.0, None, "DEG", "clockwise from true north"),
+        ("latitude-deg", -90.0, 90.0, None, "DEG", "north is positive"),
+        ("height-m", -500.0, 9000.0, None, "M", "above mean sea level"),
+        ("sigma-deg", 1e-4, 45.0, 0.05, "DEG", "of pitch and roll (default 0.05)"),
+        ("heading-sigma-deg", 1e-3, 180.0, 3.0, "DEG", "default 3"),
+        (
+            "powered",
+            0.0,
+            1e6,
+            0.0,
+            "S",
+            "time since switch-on when the log began (default 0): what it may still warm up",
+        ),
+        (
+            "windows",
+            10.0,
+            3600.0,
+            None,
+            "S",
+            "calibrate in every window of so many seconds, and check sigma by the next",
+        ),
     ):
-        log.add_argument(name, type=within(least, most), metavar="M" if name.endswith("-m") else "DEG", help=words)
-    log.add_argument(
-        "--sigma-deg", type=within(1e-4, 45.0), default=0.05, metavar="DEG", help="of pitch and roll (default 0.05)"
-    )
-    log.add_argument("--heading-sigma-deg", type=within(1e-3, 180.0), default=3.0, metavar="DEG", help="default 3")
-    log.add_argument(
-        "--law", choices=("axis", "slope", "euler"), default="axis", help="of columns tilt_x, tilt_y (default axis)"
-    )
-    log.add_argument(
-        "--tilt-lag",
-        type=within(0.0, 10.0),
-        default=0.0,
-        metavar="S",
-        dest="tilt_lag_s",
-        help="by which the tilt follows (default 0)",
-    )
-    log.add_argument(
-        "--platform", choices=("ground", "deck"), default="ground", help="deck: it swayed, on a boat (default ground)"
-    )
+        log.add_argument(f"--{name}", type=within(least, most), default=default, metavar=unit, help=words)
     log.add_argument("--mounting", default="ROTATION_NONE", metavar="ROTATION", help="sensor to vehicle")
     log.add_argument("--any-bias", action="store_true", help="take biases beyond what any part has (30 deg/s, 0.3 g)")
     log.add_argument(
         "--profile", metavar="PART", help="the sensor's model, such as icm42688p, or a saved profile's name or file"
-    )
-    log.add_argument(
-        "--powered",
-        type=within(0.0, 1e6),
-        default=0.0,
-        metavar="S",
-        dest="powered_s",
-        help="for so long it had been switched on when the log began (default 0): what it may still warm up",
-    )
-    log.add_argument(
-        "--windows",
-        type=within(10.0, 3600.0),
-        metavar="S",
-        help="calibrate in every window of so many seconds, and hold sigma against what comes after",
     )
 
 
@@ -175,15 +158,11 @@ def _replay_log(options: argparse.Namespace, file: Path) -> int:
 
     given = _given(options)
     log = _log(options, file)
-    if given.platform == "deck" and (
-        log.poses is None or (log.poses.tilt_deg is None and log.poses.heading_deg is None)
-    ):
-        raise StorageError(f"{file}: neither tilt nor heading in it: a deck's turn would look like a bias")
     if options.windows is not None:
         return _windows(options, log, given)
     found = estimate(log, given)
     record = msgspec.to_builtins(found.record)
-    lines = [*show.record_lines(record), *_used_lines(found.used, at_rest=given.platform == "ground")]
+    lines = [*show.record_lines(record), *_used_lines(found.used)]
     answer = {**record, "log": msgspec.to_builtins(found.used)}
     return conclude(options, answer, lines, good=found.record.state == "done")
 
@@ -210,11 +189,6 @@ def _given(options: argparse.Namespace) -> Given:
         raise ConfigError(f"--mounting: found {options.mounting}; allowed: a MAVLink rotation such as ROTATION_YAW_90")
     if (options.pitch_deg is None) != (options.roll_deg is None):
         raise ConfigError("found only one of --pitch-deg and --roll-deg; allowed: both or neither")
-    if options.platform == "deck":
-        for name in ("pitch_deg", "heading_deg", "windows"):
-            if getattr(options, name) is not None:
-                found = f"--{name.replace('_', '-')}"
-                raise ConfigError(f"{found}: found --platform deck; allowed: tilt and heading in the log, no windows")
     given = Given(**{name: getattr(options, name) for name in Given.__struct_fields__})
     if options.profile is None:
         return given
@@ -251,11 +225,11 @@ def _window_lines(found: Windows) -> list[str]:
     return lines
 
 
-def _used_lines(used: Used, *, at_rest: bool = True) -> list[str]:
+def _used_lines(used: Used) -> list[str]:
     """Say which stretch was used, and how many lines were left out."""
     lines = []
     if used.from_s is not None and used.to_s is not None:
-        still = f"; {used.still_s} s of it at rest" if at_rest else ""
-        lines.append(f"used: {used.from_s:.0f} to {used.to_s:.0f} s of {used.seconds:.1f} s{still}")
+        still = f"{used.still_s} s of it at rest"
+        lines.append(f"used: {used.from_s:.0f} to {used.to_s:.0f} s of {used.seconds:.1f} s; {still}")
     lines += [f"left out: {count} lines {why}" for why, count in used.left_out.items()]
     return [*lines, *(f"note: {note}" for note in used.notes)]

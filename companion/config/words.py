@@ -21,12 +21,17 @@ KEYS: Final[dict[str, str]] = {
 }
 """Removed configuration keys without list indexes ("imu.port"), each with its version and its remedy."""
 
+_RECORD: Final = "0.2: record where a gradienter or a boat is (companion record), and replay that"
 COMMAND_LINE: Final[dict[str, str]] = {
     "companion install-service --dry-run": "0.2: install below a folder with --root to see the files",
     "companion uninstall-service --dry-run": "0.2: each removed file is printed",
     "companion flight --fetch": "0.2: download the log with your ground station, then companion flight LOG",
     "companion flight --offsets": "0.2: companion flight LOG compares with the offsets before the calibration",
     "companion report --flight": "0.2: companion flight LOG prints all of it, companion history one line a flight",
+    "companion replay --platform": _RECORD,
+    "companion replay --law": _RECORD,
+    "companion replay --tilt-lag": _RECORD,
+    "companion replay --longitude-deg": _RECORD,
     "companion fleet demo": "0.2: run python -m sim fleet in the folder of the companion's sources",
     "companion fleet export": "0.2: use psql, sqlite3 or DuckDB, as docs/fleet.md shows (Export)",
 }

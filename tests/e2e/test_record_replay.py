@@ -31,7 +31,6 @@ from companion.lab.replay.engine import TOLERANCE_SIGMAS, Result, replay
 from companion.recording import messages
 from companion.recording import tape as tape_module
 from companion.recording.files import Ring
-from sim.imu_model import DEG_H
 from tests.e2e.test_calibration import calibrated
 from tests.e2e.test_dither import UNDITHERED, second_imu_only
 from tests.support.rig import Rig
@@ -130,29 +129,6 @@ def test_floats_of_px4_are_replayed_with_the_bias_that_its_console_told(tmp_path
     same(replay(paths), records)
 
 
-def test_a_replay_knows_who_shares_a_port(tmp_path: Path) -> None:
-    """The compass' own tilt in the gradienter's place: one device, one port, two sections."""
-
-    async def main() -> list[Record]:
-        rig = Rig(tmp_path, recordings_mb=64, min_still_s=5.0, max_s=6.0)
-        assert rig.config.gradienter is not None
-        assert rig.config.compass is not None
-        tilt = msgspec.structs.replace(
-            rig.config.gradienter, port=rig.config.compass.port, protocol="hmr3300", law="euler", sigma_deg=None
-        )
-        rig.config = msgspec.structs.replace(rig.config, gradienter=tilt)
-        rig.devices["gradienter"] = rig.devices.pop("compass")
-        async with rig.running():
-            await rig.ready()
-            result, _ = await calibrated(rig)
-            assert result.outcome == "done", result
-            await asyncio.sleep(2.5)
-        return rig.service.calibrating.store.history()
-
-    records = run_virtual(main())
-    same(replay(ring(tmp_path)), records)
-
-
 def test_moved_armed_unplugged_restarted_and_over_several_files(tmp_path: Path) -> None:
     """What began a stretch anew is not recorded: a window begins where the recorded one did all the same."""
 
@@ -237,24 +213,6 @@ def test_integers_are_replayed_as_such_but_for_a_dither_which_no_recording_holds
         same(result, [kept])
 
 
-def test_without_a_calibration_in_it_a_recording_gives_the_estimate_of_its_end(tmp_path: Path) -> None:
-    async def during(rig: Rig) -> None:
-        await asyncio.sleep(25.0)
-
-    paths, _ = record(tmp_path, during, own_imu=True)
-    result = replay(paths)
-    assert result.calibrations == []
-    assert result.estimate is not None
-    assert result.estimate.state == "done"
-    assert result.estimate.site is not None
-    assert result.estimate.site.latitude_deg == pytest.approx(40.0, abs=1e-3)
-    fc = result.estimate.imus[0]
-    assert fc.gyro_bias_rad_s is not None
-    assert fc.gyro_sigma_use_rad_s is not None
-    off = np.abs(np.subtract(fc.gyro_bias_rad_s, np.array([162.234, 169.563, -98.289]) * DEG_H))
-    assert (off / fc.gyro_sigma_use_rad_s).max() < 4.0
-
-
 @pytest.mark.parametrize(("nudge", "found"), [(0.005, 0), (0.02, 1)])
 def test_a_bias_that_is_not_recomputed_within_the_tolerance_is_named(
     usual: tuple[Path, Record], tmp_path: Path, nudge: float, found: int
@@ -299,15 +257,6 @@ def rewritten(path: Path, to: Path, change: Callable[[str, bytes], bytes | None]
 # --- cut and damaged
 
 
-def test_a_power_cut_costs_a_second(usual: tuple[Path, Record]) -> None:
-    with usual[0].open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    spans = [(chunk.message_end_time - chunk.message_start_time) / 1e9 for chunk in summary.chunk_indexes]
-    assert len(spans) > 15
-    assert max(spans) < 1.2
-
-
 def test_cut_at_any_byte_it_replays_up_to_the_cut(
     usual: tuple[Path, Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -335,7 +284,6 @@ def test_cut_at_any_byte_it_replays_up_to_the_cut(
             same(result, [kept])
         else:
             assert result.calibrations == []
-            assert result.estimate is not None
             assert result.cut_short is not None
 
 
@@ -408,22 +356,8 @@ def test_recording_on_request(tmp_path: Path) -> None:
 
     run_virtual(main())
     result = replay([path])
-    assert result.estimate is not None
-    assert result.estimate.state == "done"
+    assert result.calibrations == []
     assert result.seconds == pytest.approx(14.5, abs=1.0)
-
-
-def test_recording_on_request_ends_with_the_daemon_in_order(tmp_path: Path) -> None:
-    path = tmp_path / "mine.mcap"
-
-    async def main() -> list[Object]:
-        async with Rig(tmp_path).running() as rig:
-            running = asyncio.create_task(asked(rig, file=str(path)))
-            await asyncio.sleep(4.7)
-        return await running
-
-    assert run_virtual(main())[-1]["reason"] == "the daemon stopped"
-    assert replay([path]).cut_short is None
 
 
 def test_a_recording_without_a_length_ends_at_its_size_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -500,7 +434,7 @@ def test_a_full_disk_disturbs_nothing_is_said_once_and_ends_by_itself(
     assert len(said) == 1
     assert "No space left on device" in said[0].message
     assert any("written again" in entry.message for entry in caplog.records)
-    assert replay(ring(tmp_path)[-1:]).estimate is not None
+    assert replay(ring(tmp_path)[-1:]).seconds > 5.0
 
 
 def test_a_disk_that_hangs_holds_nothing_up_and_the_hole_is_in_the_file(
@@ -641,14 +575,3 @@ def test_without_the_extra_a_replay_says_what_to_install(
     monkeypatch.setitem(sys.modules, "zstandard", None)
     assert companion(["replay", str(usual[0])]) == 1
     assert "a recording needs more than is installed: pip install '.[recording]'" in capsys.readouterr().err
-
-
-def test_another_program_s_mcap_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "x.mcap"
-    with path.open("wb") as file:
-        writer: Any = Writer(file)
-        writer.start()
-        writer.add_message(writer.register_channel("/companion/state", "json", 0), 0, b"{}", 0)
-        writer.finish()
-    assert companion(["replay", str(path)]) == 1
-    assert "an MCAP file, but not a recording of companion" in capsys.readouterr().err

@@ -15,20 +15,19 @@ from pathlib import Path
 from typing import Final, NamedTuple, TextIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.errors import StorageError
-from companion.lab.logs.log import LAST_S, NAME, Poses, StillLog
+from companion.lab.logs.log import LAST_S, NAME, StillLog
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG, G
 
 IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
-TILT: Final = ("tilt_x", "tilt_y")
 _UNITS: Final[tuple[tuple[tuple[str, ...], dict[str, float]], ...]] = (
     (("t",), {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}),
     (IMU[:3], {"rad_s": 1.0, "deg_s": DEG, "deg_h": DEG_H, "mdeg_s": 1e-3 * DEG}),
     (IMU[3:], {"m_s2": 1.0, "g": G, "mg": MG}),
     (("temperature",), {"degc": 1.0}),
-    ((*TILT, "heading", "heading_magnetic"), {"deg": 1.0}),
 )
 COLUMNS: Final[dict[str, tuple[str, float]]] = {
     f"{what}_{unit}": (what, factor)
@@ -36,7 +35,7 @@ COLUMNS: Final[dict[str, tuple[str, float]]] = {
     for what in quantities
     for unit, factor in units.items()
 }
-"""Quantity by name of a column, and its factor to seconds, rad/s, m/s^2, degrees and degrees Celsius."""
+"""Quantity by name of a column, and its factor to seconds, rad/s, m/s^2 and degrees Celsius."""
 HEADER: Final = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2"
 GRAVITY_M_S2: Final = (7.0, 12.6)
 """Median specific force of a log at rest or nearly so: beyond, the unit or the column is another one than named."""
@@ -80,7 +79,7 @@ def read(path: Path, columns: str | None = None, rate_hz: float | None = None, n
     passed = [each for each in names if each not in COLUMNS and each != "-"]
     left_out: dict[str, int] = {}
 
-    def keep(good: Floats, why: str) -> None:
+    def keep(good: NDArray[np.bool_], why: str) -> None:
         nonlocal table, numbers
         if not good.all():
             left_out[why] = int((~good).sum())
@@ -88,14 +87,15 @@ def read(path: Path, columns: str | None = None, rate_hz: float | None = None, n
 
     places = {what: place for place, what in enumerate(used)}
     readings = [places[what] for what in IMU]
-    keep(np.isfinite(table[:, readings]).all(axis=1), "without a number in each of " + ", ".join(IMU))
+    whole = np.all(np.isfinite(table[:, readings]), axis=1)
+    keep(whole, "without a number in each of " + ", ".join(IMU))
     if rate_hz is None:
         keep(np.isfinite(table[:, places["t"]]), "without a time")
     if not len(table):
         raise StorageError(f"{path}: no line in it has a number for all of {', '.join(IMU)}")
     if rate_hz is None:
-        same = np.concatenate(([False], (np.diff(table[:, [places["t"], *readings]], axis=0) == 0.0).all(axis=1)))
-        keep(~same, "repeated: time and readings of the line before")
+        changed = np.any(np.diff(table[:, [places["t"], *readings]], axis=0) != 0.0, axis=1)
+        keep(np.append([True], changed), "repeated: time and readings of the line before")
         t_s = _times(path, table[:, places["t"]], used["t"].factor, numbers)
     else:
         t_s = numbers / rate_hz
@@ -109,7 +109,6 @@ def read(path: Path, columns: str | None = None, rate_hz: float | None = None, n
         t_s=t_s,
         readings=np.column_stack([*(values[what] for what in IMU[:3]), forces]),
         temperature_degc=values.get("temperature", np.full(len(t_s), math.nan)),
-        poses=_poses(values),
         notes=(f"columns passed over: {_some(passed)}",) if passed else (),
         left_out=left_out,
     )
@@ -130,7 +129,7 @@ def columns_of(names: Sequence[str], where: str, *, timed: bool) -> dict[str, Co
             used[what] = Column(place, factor, name)
     if not timed:
         used.pop("t", None)
-    wanted = (*(("t",) if timed else ()), *IMU, *(TILT if used.keys() & {*TILT} else ()))
+    wanted = (*(("t",) if timed else ()), *IMU)
     if missing := [what for what in wanted if what not in used]:
         rate = "; a log without time: --rate HZ" if "t" in missing else ""
         raise StorageError(
@@ -257,12 +256,3 @@ def _check_gravity(path: Path, forces: Floats, names: Sequence[str]) -> None:
             f"{path}: {', '.join(names)} read {found_m_s2:.4g} m/s^2 in all; allowed: gravity, {low:g} to {high:g}:"
             " name their right unit, or log the accelerometer itself"
         )
-
-
-def _poses(values: dict[str, Floats]) -> Poses | None:
-    tilt = np.column_stack([values[what] for what in TILT]) if TILT[0] in values else None
-    true, magnetic = values.get("heading"), values.get("heading_magnetic")
-    heading = magnetic if true is None else true
-    if tilt is None and heading is None:
-        return None
-    return Poses(tilt_deg=tilt, heading_deg=heading, magnetic=true is None and magnetic is not None)

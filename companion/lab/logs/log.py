@@ -41,16 +41,6 @@ class Block(NamedTuple):
     """Names of parameters; their values are the one field."""
 
 
-class Poses(msgspec.Struct, frozen=True, kw_only=True):
-    """Tilt and heading logged beside an IMU, line by line; NaN: not in that line."""
-
-    tilt_deg: Floats | None = None
-    """(n, 2): a gradienter's readings, in the vehicle's axes and by its own law."""
-    heading_deg: Floats | None = None
-    """(n,)."""
-    magnetic: bool = False
-
-
 class StillLog(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU in one session: a file, or several of which each goes on where the one before ends."""
 
@@ -76,7 +66,6 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
     """Assumptions and oddities, in words."""
     left_out: dict[str, int] = {}
     """Lines that do not count, by reason."""
-    poses: Poses | None = None
     clock_from_start: bool = False
     """True: times count from the switch-on of the autopilot."""
 

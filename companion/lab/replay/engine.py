@@ -22,11 +22,9 @@ from companion.configured.models import aligned, collect
 from companion.errors import CalibrationRefusedError, StorageError
 from companion.estimation.collector.measurement import Measurement
 from companion.estimation.collector.rolling import RollingCollector
-from companion.estimation.means.windows import Window
 from companion.estimation.records.record import AlignmentUsed, Record, from_json
 from companion.estimation.request import What
 from companion.estimation.solution.joint import weigh
-from companion.estimation.solution.otherwise import NOTHING, Otherwise
 from companion.estimation.solution.results import record_of
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Solution, solve
@@ -82,8 +80,6 @@ class Result(msgspec.Struct, frozen=True):
     """Result of a replay."""
 
     calibrations: list[Replayed]
-    estimate: Record | None
-    """Estimate of the last still stretch, where no calibration is in the recording."""
     seconds: float
     cut_short: str | None
     notes: list[str]
@@ -192,25 +188,21 @@ class Replay:
         if self._measured is None:
             self._not_recomputed = _BEFORE
             return
-        used = detail.alignment
+        config, used = self._config, detail.alignment
         alignment = AlignmentUsed(measured_at="", offset_deg=used[:2], sigma_deg=used[2]) if used else None
         try:
             if isinstance(self._measured, CalibrationRefusedError):
                 raise self._measured
-            solution = self._solved(self._measured.window(), What[detail.what], alignment, detail.otherwise)
+            solution = solve(
+                self._measured.window(), local_earth(self._where),
+                aligned(models.gradienter_model(config.gradienter), alignment), models.compass_model(config.compass),
+                What[detail.what], config.vehicle.platform, any_bias=config.calibration.any_bias,
+                otherwise=detail.otherwise,
+            )  # fmt: skip
             whole = {found.name: self._whole(found) for found in solution.imus}
             self._solution = weigh(solution, whole, detail.expectation).solution
         except CalibrationRefusedError as error:
             self._not_recomputed = f"refused here: {error}"
-
-    def _solved(
-        self, window: Window, what: What, alignment: AlignmentUsed | None = None, otherwise: Otherwise = NOTHING
-    ) -> Solution:
-        config = self._config
-        gradienter = aligned(models.gradienter_model(config.gradienter), alignment)
-        compass = models.compass_model(config.compass)
-        local, platform, any_bias = local_earth(self._where), config.vehicle.platform, config.calibration.any_bias
-        return solve(window, local, gradienter, compass, what, platform, any_bias=any_bias, otherwise=otherwise)
 
     def _whole(self, found: ImuSolution) -> tuple[Array | None, Array | None]:
         calibration = self._offsets.get(found.name)
@@ -244,27 +236,13 @@ class Replay:
         return (head.offset_ns, head.config) == (self._head.offset_ns, self._head.config)
 
     def result(self, cut_short: str | None) -> Result:
-        """Return the calibrations; without one, the estimate that a calibration would have made at the end."""
+        """Return the calibrations, and how far the recording went."""
         seconds = 0.0 if math.isnan(self._first_s) else self._now_s - self._first_s
-        estimate = None
-        if not self._calibrations and self._collector is not None:
-            estimate = self._estimate(self._collector, seconds)
         ours, theirs = versions(), self._head.versions
         notes = []
         if ours["companion"] != theirs.get("companion"):
             notes.append(f"recorded with companion {theirs.get('companion')}, here {ours['companion']}")
-        return Result(self._calibrations, estimate, seconds, cut_short, [*notes, *self._notes])
-
-    def _estimate(self, collector: RollingCollector, seconds: float) -> Record:
-        began_s = self._first_s + self._head.offset_ns / 1e9
-        began = datetime.datetime.fromtimestamp(began_s, tz=datetime.UTC)
-        self._offsets = self._offsets_now()
-        try:
-            solution = self._solved(collector.window(self._now_s), What.BOTH)
-        except CalibrationRefusedError as error:
-            return record_of(None, began, seconds, state="failed", reason=str(error))
-        whole = {found.name: self._whole(found) for found in solution.imus if self._offsets.get(found.name)}
-        return record_of(solution, began, seconds, whole=whole)
+        return Result(self._calibrations, seconds, cut_short, [*notes, *self._notes])
 
 
 def compared(recorded: Record, again: Record) -> Replayed:

@@ -91,7 +91,7 @@ def windows(log: StillLog, given: Given, length_s: float) -> Windows:
             continue
         part = msgspec.structs.replace(
             log, t_s=log.t_s[start:end], readings=log.readings[start:end],
-            temperature_degc=log.temperature_degc[start:end], poses=None,
+            temperature_degc=log.temperature_degc[start:end],
         )  # fmt: skip
         here = part.readings[:, 3:].mean(axis=0)
         if not here @ force >= math.cos(_SAME_RAD) * np.linalg.norm(here) * np.linalg.norm(force) > 0.0:
@@ -99,8 +99,8 @@ def windows(log: StillLog, given: Given, length_s: float) -> Windows:
             found.append(None)
         # What was switched on before the window says how far a warm-up may still go.
         at = int(np.searchsorted(starts_s, log.t_s[start], side="right")) - 1
-        powered_s = float(log.t_s[start] - starts_s[at]) + (posed.powered_s if at == 0 else 0.0)
-        record = estimate(part, msgspec.structs.replace(posed, powered_s=powered_s), max_still_s=length_s).record
+        powered_s = float(log.t_s[start] - starts_s[at]) + (posed.powered if at == 0 else 0.0)
+        record = estimate(part, msgspec.structs.replace(posed, powered=powered_s), max_still_s=length_s).record
         imu = record.imus[0] if record.imus else None
         one = None if imu is None else _figures(imu)
         found.append(one)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -243,7 +243,6 @@ def test_a_unit_that_gravity_contradicts_is_refused(
         ("nothing\nof use\n", [], "line 1: no column for t, gx, gy, gz, ax, ay, az in nothing; a log without time"),
         ("a\n" * 70, ["--columns", HEADER], "no line of numbers in it with 7 fields"),
         (HEADER + "\n", [], "no line of numbers in it with 7 fields"),
-        (f"{HEADER},tilt_x_deg\n1,0,0,0,0,0,-9.8,0\n", [], "line 1: no column for tilt_y in t_s"),
         ("0,0,0,0,0,0,-9.8\n", ["--columns", "t_s,gx"], "--columns: no column for gx, gy, gz, ax, ay, az in t_s, gx;"),
         ("x;" * 50 + "\n", [], "in x, x, x, x, x, x, x, x, x, x, x, x and 38 more; a log"),
     ],
@@ -272,67 +271,6 @@ def test_the_longest_stretch_was_used_and_is_named(
     assert companion(["replay", str(path), *WHERE, "--profile", "bmi088"]) == 0
     said = capsys.readouterr().out
     assert "used: 12 to " in said
-
-
-def with_poses(still: tuple[Floats, ImuModel], columns: Mapping[str, Sequence[str]]) -> str:
-    """The IMU's columns in SI units, and others that are filled in every tenth line."""
-    names = HEADER + "".join(f",{name}" for name in columns)
-    rows = [
-        [*row, *(values[number % len(values)] if number % 10 == 0 else "" for values in columns.values())]
-        for number, row in enumerate(still[0].tolist())
-    ]
-    return names + "\n" + joined(rows)
-
-
-# The simulated aircraft's pose as a gradienter of the law "axis" shows it: right side down and nose up.
-TILT = {"tilt_x_deg": ["-2.9885", "-2.9885", "-2.9884"], "tilt_y_deg": ["5.0001", "4.9999"]}
-
-
-PLACE = ["--latitude-deg", "40", "--longitude-deg", "116", "--height-m", "50"]
-
-
-@pytest.mark.parametrize(
-    ("columns", "more", "sigma_deg"),
-    [
-        ({"heading_deg": ["40.0", "40.1", "39.9"]}, [], 0.2),
-        ({"heading_magnetic_deg": ["47.5", "47.6", "47.4"]}, [], 1.0),
-    ],
-    ids=["true", "magnetic"],
-)
-def test_tilt_and_heading_of_the_log_take_the_place_of_the_options(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    still: tuple[Floats, ImuModel],
-    columns: Mapping[str, Sequence[str]],
-    more: list[str],
-    sigma_deg: float,
-) -> None:
-    path = written(tmp_path, with_poses(still, {**TILT, **columns}))
-    code, record = replay(capsys, path, *PLACE, *more, "--profile", "bmi088", "--heading-sigma-deg", "0.2")
-    assert (code, record["state"]) == (0, "done"), record["reason"]
-    pose = record["pose"]
-    assert pose["theta_deg"] == pytest.approx(POSE.pitch_deg, abs=0.01)
-    assert pose["gamma_deg"] == pytest.approx(POSE.roll_deg, abs=0.01)
-    assert pose["psi_deg"] == pytest.approx(POSE.heading_deg, abs=sigma_deg)
-    assert_near(record["imus"][0], still[1])
-
-
-def test_a_tilt_of_the_command_line_takes_the_place_of_the_log_s(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
-) -> None:
-    path = written(tmp_path, with_poses(still, TILT))
-    _, told = replay(capsys, path, *PLACE, "--pitch-deg", "5", "--roll-deg", "-3")
-    assert told["log"]["notes"] == ["tilt in the log left out: it is given on the command line"]
-
-
-def test_a_tilt_that_moves_is_no_rest(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
-) -> None:
-    swinging = [f"{-3.0 + np.sin(number / 50.0):.3f}" for number in range(len(still[0]))]
-    path = written(tmp_path, with_poses(still, {"tilt_x_deg": swinging, "tilt_y_deg": ["5.0"]}))
-    code, record = replay(capsys, path, *PLACE)
-    assert code == 1
-    assert "gradienter" in record["reason"]
 
 
 def test_a_file_of_office_programs_in_utf_16_is_refused_in_one_line(

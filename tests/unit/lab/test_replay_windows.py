@@ -146,7 +146,7 @@ def test_an_autopilots_log_says_how_long_its_imu_has_been_on() -> None:
     )  # fmt: skip
 
     def warm_up(log: StillLog, powered_s: float = 0.0) -> float:
-        sigma = estimate(log, Given(heading_deg=0.0, powered_s=powered_s)).record.imus[0].gyro_sigma_warm_up_rad_s
+        sigma = estimate(log, Given(heading_deg=0.0, powered=powered_s)).record.imus[0].gyro_sigma_warm_up_rad_s
         assert sigma is not None
         return max(sigma) / DEG_H
 
