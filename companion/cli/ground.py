@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import re
 import signal
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partial
+from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -19,8 +20,8 @@ from companion.errors import ConfigError, LinkError, NobodyHeardError
 if TYPE_CHECKING:
     from companion.ground.station import Outcome, Station
 
+URLS: Final = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD"
 DEFAULT_URL: Final = "udpin:0.0.0.0:14550"
-_SETTING: Final = re.compile(r"([A-Za-z0-9_]{1,16})=(.+)")
 
 
 def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
@@ -28,26 +29,14 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
     words = "from the laptop on the ground, over the telemetry link (no ground station program needed)"
     ground = commands.add_parser("ground", help=words, description=words)
     link = Parser(add_help=False, argument_default=argparse.SUPPRESS)
-    link.add_argument(
-        "--url",
-        type=_url,
-        help=f"udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD (default {DEFAULT_URL})",
-    )
-    link.add_argument(
-        "--system", type=within(1, 255, int), metavar="N", help="the vehicle's system id, where several are heard"
-    )
-    link.add_argument(
-        "--component", type=within(1, 255, int), metavar="N", help="the companion's component id (default 191)"
-    )
-    link.add_argument(
-        "--within", type=seconds, metavar="S", help="how long to look for the companion on the link (default 5)"
-    )
-    link.add_argument(
-        "--signing-key-file",
-        type=Path,
-        metavar="FILE",
-        help="sign with this key and believe nobody else (docs/security.md)",
-    )
+    link.add_argument("--url", type=_url, help=f"{URLS} (default {DEFAULT_URL})")
+    of_byte = within(1, 255, int)
+    link.add_argument("--system", type=of_byte, metavar="N", help="the vehicle's system id, where several are heard")
+    link.add_argument("--component", type=of_byte, metavar="N", help="the companion's component id (default 191)")
+    words = "how long to look for the companion on the link (default 5)"
+    link.add_argument("--within", type=seconds, metavar="S", help=words)
+    words = "sign with this key and believe nobody else (docs/security.md)"
+    link.add_argument("--signing-key-file", type=Path, metavar="FILE", help=words)
     subcommands = ground.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
     def add(name: str, command: Callable[[argparse.Namespace], Awaitable[int]], words: str) -> argparse.ArgumentParser:
@@ -57,32 +46,17 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
 
     calibrate = add("calibrate", _calibrate, "calibrate now and show how it goes; Ctrl-C cancels")
     add_fields(calibrate, Calibrate, Interface.GROUND)
-    add("status", _status, "what the companion is doing, its last result and its settings")
-    add("cancel", _cancel, "cancel what runs, whoever asked for it")
-    add("undo", _undo, "put the autopilot's values from before the last calibration back")
-    parameters = add("params", _parameters, "list the companion's own parameters, or set some until it restarts")
-    parameters.add_argument("settings", nargs="*", type=_setting, metavar="NAME=VALUE", help="such as CMP_PUSH=0")
+    for name, words in (
+        ("status", "what the companion is doing, its last result and its settings"),
+        ("cancel", "cancel what runs, whoever asked for it"),
+        ("undo", "put the autopilot's values from before the last calibration back"),
+    ):
+        add(name, partial(_on_the_link, work=methodcaller(name)), words)
 
 
 async def _calibrate(options: argparse.Namespace) -> int:
     wanted = Calibrate.read(request_of(options, Calibrate))
     return await _on_the_link(options, lambda one: one.calibrate(wanted.biases, wanted.timeout_s, reboot=wanted.reboot))
-
-
-async def _status(options: argparse.Namespace) -> int:
-    return await _on_the_link(options, lambda one: one.status())
-
-
-async def _cancel(options: argparse.Namespace) -> int:
-    return await _on_the_link(options, lambda one: one.cancel())
-
-
-async def _undo(options: argparse.Namespace) -> int:
-    return await _on_the_link(options, lambda one: one.undo())
-
-
-async def _parameters(options: argparse.Namespace) -> int:
-    return await _on_the_link(options, lambda one: one.parameters(dict(options.settings)))
 
 
 async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Awaitable[Outcome]]) -> int:
@@ -141,14 +115,3 @@ def _url(text: str) -> str:
     except LinkError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return text
-
-
-def _setting(text: str) -> tuple[str, float]:
-    match = _SETTING.fullmatch(text)
-    try:
-        value = float(match[2]) if match is not None else float("nan")
-    except ValueError:
-        value = float("nan")
-    if match is None or value != value or abs(value) == float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE with a number, such as CMP_PUSH=0")
-    return match[1].upper(), value

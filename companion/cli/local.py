@@ -7,7 +7,7 @@ import dataclasses
 import datetime
 import faulthandler
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -25,12 +25,13 @@ from companion.cli.terminal import (
     print_json,
     print_lines,
     storage_path,
+    within,
 )
 from companion.errors import CompanionError, StorageError
 from companion.links.system import logs
 
 if TYPE_CHECKING:
-    from companion.installation.install import Step, Target
+    from companion.installation.install import Step
     from companion.links.serial.listening import Heard
     from companion.links.serial.ports import SerialPort
 
@@ -38,36 +39,22 @@ if TYPE_CHECKING:
 def add_command(add: AddCommand) -> None:
     """Add `companion setup`, which comes first."""
     parser = add("setup", setup, "find autopilot and sensors, ask what cannot be found out, write the configuration")
-    parser.add_argument(
-        "ports", nargs="*", metavar="PORT", help="serial ports to listen to (default: all that nobody holds)"
-    )
-    parser.add_argument(
-        "--page", metavar="ADDRESS:PORT", help="ask on a page there, for a phone (0.0.0.0:8191) or the board itself"
-    )
-    parser.add_argument("--yes", action="store_true", help="ask nothing: take what would stand in brackets")
-    parser.add_argument("--mavlink", metavar="URL", help="where the autopilot is; otherwise it is looked for")
-    parser.add_argument(
-        "--udp", type=_udp_port, action="append", metavar="PORT",
-        help="a UDP port to listen to, instead of the usual ones; may be given again",
-    )  # fmt: skip
-    parser.add_argument("--platform", metavar="WHERE", help="ground or deck")
-    parser.add_argument("--law", metavar="LAW", help="of the gradienter: axis, slope or euler")
-    parser.add_argument(
-        "--mounting", action="append", default=[], metavar="DEVICE=HOW",
-        help="of gradienter, compass or imu: degrees clockwise from above, ROLL,PITCH,YAW, or ROTATION_...",
-    )  # fmt: skip
-    parser.add_argument(
-        "--part", action="append", default=[], metavar="IMU=PART",
-        help="of an IMU by its name: fc=icm42688p (bmi088, adis16470, adis16405, unknown)",
-    )  # fmt: skip
-    parser.add_argument("--no-check", action="store_true", help="write the file only")
-    parser.add_argument("--no-service", action="store_true", help="do not offer to start it at every boot")
-
-
-def _udp_port(text: str) -> int:
-    if not text.isdigit() or not 1 <= int(text) <= 65535:
-        raise argparse.ArgumentTypeError(f"found {text!r}; allowed: a port from 1 to 65535")
-    return int(text)
+    option = parser.add_argument
+    option("ports", nargs="*", metavar="PORT", help="serial ports to listen to (default: all that nobody holds)")
+    words = "ask on a page there, for a phone (0.0.0.0:8191) or the board itself"
+    option("--page", metavar="ADDRESS:PORT", help=words)
+    option("--yes", action="store_true", help="ask nothing: take what would stand in brackets")
+    option("--mavlink", metavar="URL", help="where the autopilot is; otherwise it is looked for")
+    words = "a UDP port to listen to, instead of the usual ones; may be given again"
+    option("--udp", type=within(1, 65535, int), action="append", metavar="PORT", help=words)
+    option("--platform", metavar="WHERE", help="ground or deck")
+    option("--law", metavar="LAW", help="of the gradienter: axis, slope or euler")
+    words = "of gradienter, compass or imu: degrees clockwise from above, ROLL,PITCH,YAW, or ROTATION_..."
+    option("--mounting", action="append", default=[], metavar="DEVICE=HOW", help=words)
+    words = "of an IMU by its name: fc=icm42688p (bmi088, adis16470, adis16405, unknown)"
+    option("--part", action="append", default=[], metavar="IMU=PART", help=words)
+    option("--no-check", action="store_true", help="write the file only")
+    option("--no-service", action="store_true", help="do not offer to start it at every boot")
 
 
 async def setup(options: argparse.Namespace) -> int:
@@ -79,17 +66,19 @@ async def setup(options: argparse.Namespace) -> int:
 
 def add_commands(add: AddCommand) -> None:
     """Add those that have options of their own: to install, to uninstall, and to report."""
-    for name, command, words in (
-        ("install-service", install, "start the companion at every boot: unit, udev rules, configuration"),
-        ("uninstall-service", uninstall, "take that away again; configuration and records stay"),
+    for name, words in (
+        ("install-service", "start the companion at every boot: unit, udev rules, configuration"),
+        ("uninstall-service", "take that away again; configuration and records stay"),
     ):
-        service = add(name, command, words)
-        service.add_argument("--root", default="/", metavar="DIR", help="below this folder, for packages (default /)")
-        service.add_argument(
-            "--prefix", type=Path, default=Path("/usr/local"), help="whose lib takes the unit (default /usr/local)"
-        )
-        if command is install:
-            service.add_argument("--executable", metavar="PATH", help="the companion (default: the one that runs this)")
+        service = add(name, install, words)
+        service.set_defaults(installs=name == "install-service")
+        words = "below this folder, for packages (default /)"
+        service.add_argument("--root", type=_absolute, default=Path("/"), metavar="DIR", help=words)
+        words = "whose lib takes the unit (default /usr/local)"
+        service.add_argument("--prefix", type=Path, default=Path("/usr/local"), help=words)
+        if name == "install-service":
+            words = "the companion (default: the one that runs this)"
+            service.add_argument("--executable", metavar="PATH", help=words)
     sub = add("report", report, "make a page (one HTML file) of a calibration: needs no daemon, no network")
     sub.add_argument(
         "record", nargs="?", metavar="RECORD", help="its number, or the beginning of its time (default: the latest)"
@@ -98,6 +87,10 @@ def add_commands(add: AddCommand) -> None:
     sub.add_argument(
         "--storage", type=Path, metavar="DIR", help="the folder with records/ (default: as in the configuration)"
     )
+
+
+def _absolute(text: str) -> Path:
+    return Path(text).absolute()
 
 
 FIRST_RUN: Final = ("--page", "0.0.0.0:8191")
@@ -225,28 +218,13 @@ async def check(options: argparse.Namespace) -> int:
 
 
 async def install(options: argparse.Namespace) -> int:
-    """`companion install-service`."""
+    """`companion install-service` and `companion uninstall-service`."""
     from companion.installation import install as installing
 
-    return _tell(options, installing.install(_target(options, options.executable or installing.own_executable())))
-
-
-async def uninstall(options: argparse.Namespace) -> int:
-    """`companion uninstall-service`."""
-    from companion.installation import install as installing
-
-    return _tell(options, installing.uninstall(_target(options, installing.own_executable())))
-
-
-def _target(options: argparse.Namespace, executable: str) -> Target:
-    from companion.installation.install import Target
-
-    return Target(Path(options.root).absolute(), options.prefix, executable)
-
-
-def _tell(options: argparse.Namespace, steps: Iterable[Step]) -> int:
+    executable = getattr(options, "executable", None) or installing.own_executable()
+    target = installing.Target(options.root, options.prefix, executable)
     done: list[Step] = []
-    for step in steps:
+    for step in (installing.install if options.installs else installing.uninstall)(target):
         done.append(step)
         print_lines(step.line(), error=options.json)
     failed = [step for step in done if step.outcome == "failed"]
@@ -259,37 +237,38 @@ def _tell(options: argparse.Namespace, steps: Iterable[Step]) -> int:
 
 async def report(options: argparse.Namespace) -> int:
     """`companion report`."""
+    from companion.report.calibration import calibration_page
+    from companion.report.source import material
+
     if options.output == "-" and options.json:
         print_lines("companion report: -o - and --json both want stdout", error=True)
         return USAGE
-    path, damaged = _make(options, options.storage or storage_path(options))
-    skipped = f"skipped: {'; '.join(damaged)}" if damaged else ""
+    found = material(options.storage or storage_path(options), options.record)
+    content = calibration_page(found, datetime.datetime.now(tz=datetime.UTC)).encode("utf-8", "replace")
+    skipped = f"skipped: {'; '.join(found.damaged)}" if found.damaged else ""
+    if options.output == "-":
+        # As the file says of itself, whatever the terminal speaks.
+        sys.stdout.buffer.write(content)
+        sys.stdout.flush()
+    else:
+        path = _save(options.output or "", f"companion-report-{found.number:06d}.html", content)
     if skipped:
         print_lines(f"companion: {skipped}", error=True)
     if options.json:
         print_json({"state": "done", "reason": skipped, "file": str(path)})
-    elif path is not None:
+    elif options.output != "-":
         print_lines(path)
     return DONE
 
 
-def _make(options: argparse.Namespace, directory: Path) -> tuple[Path | None, list[str]]:
-    from companion.report.calibration import calibration_page
-    from companion.report.source import material
+def _save(output: str, name: str, content: bytes) -> Path:
+    """Write a page to the file or into the folder that is named, or here."""
     from companion.storage.state import write_atomically
 
-    found = material(directory, options.record)
-    content, damaged = calibration_page(found, datetime.datetime.now(tz=datetime.UTC)), list(found.damaged)
-    name = f"companion-report-{found.number:06d}.html"
-    if options.output == "-":
-        # As the file says of itself, whatever the terminal speaks.
-        sys.stdout.buffer.write(content.encode("utf-8", "replace"))
-        sys.stdout.flush()
-        return None, damaged
-    path = Path(options.output or name).absolute()
+    path = _absolute(output or name)
     if not path.parent.is_dir():
         raise StorageError(f"{path}: there is no folder {path.parent}")
     if path.is_dir():
-        path = path / name
-    write_atomically(path, content.encode("utf-8", "replace"), mode=0o644)
-    return path, damaged
+        path /= name
+    write_atomically(path, content, mode=0o644)
+    return path

@@ -16,6 +16,7 @@ import textwrap
 import time
 from typing import Final
 
+from companion import summary
 from companion.cli import show
 from companion.cli.terminal import DONE, load_config, print_json, print_lines
 from companion.errors import DaemonUnreachableError
@@ -72,11 +73,9 @@ class _Json:
 
     def show(self, status: Object) -> None:
         print_json(status)
-        sys.stdout.flush()
 
     def gone(self, why: str) -> None:
         print_json({"state": "unreachable", "reason": why})
-        sys.stdout.flush()
 
     def close(self) -> None:
         pass
@@ -97,10 +96,11 @@ class _Lines:
         if stand != self._stand or (headline["reason"] != self._reason and now_s - self._reason_s >= REASON_S):
             self._stand, self._reason, self._reason_s = stand, headline["reason"], now_s
         # What each line is about, by which it is known again when it says the same in other figures.
-        lines: dict[tuple[object, ...], str] = {(self._reason_s,): show.headline_line(status)}
-        lines |= {(name, good): f"{name}: {words}" for good, name, words in show.link_rows(status)}
-        warnings = [f"warning: {words}" for words in status["warnings"]]
-        lines |= {(line,): line for line in [*warnings, *show.end_lines(status)]}
+        lines: dict[tuple[object, ...], str] = {(self._reason_s,): summary.headline(status)}
+        for row in summary.rows(status):
+            line = f"{row.name}: {row.words}"
+            lines[(line,) if row.name == "warning" else row[:2]] = line
+        lines |= {(line,): line for line in show.end_lines(status)}
         self._print([line for about, line in lines.items() if about not in self._before])
         self._before = set(lines)
 

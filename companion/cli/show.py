@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from companion import summary
 from companion.estimation.records.flight_record import Flight, figure
 from companion.estimation.records.record import Magnetic, outcome_word
 from companion.formats import Object
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 
 _BAR = 40
-_HEARTBEAT_S = 2.0
 _VERDICTS = {"accept": "ready", "wait": "not yet", "refuse": "NOT ready"}
 
 
@@ -93,49 +93,32 @@ def _number(value: float | None, form: str) -> str:
 
 
 def status_lines(status: Object) -> list[str]:
-    """The daemon's state as a person reads it."""
-    lines = [headline_line(status)]
-    said = () if status["last"] is None else status["last"]["reason"]
+    """Show the daemon's state."""
+    lines, last, recording = [summary.headline(status)], status["last"], status["recording"]
+    said = () if last is None else last["reason"]
     if status["progress"] is None and status["reason"] and status["reason"] != said:
         lines.append(f"last: {status['reason']}")
     if status["fault"] is not None:
         lines.append(f"FAULT: {status['fault']}")
     if status["putting_back"]:
         lines.append("an interrupted write is being put back (needs the autopilot, disarmed)")
-    recording = status["recording"]
-    if recording["fault"] is not None:
-        lines.append(f"recordings: none at present: {recording['fault']}")
     if recording["lost"]:
         lines.append(f"recordings: {recording['lost']} messages lost so far, the disk is too slow")
-    if recording["file"] is not None:
-        file = recording["file"]
+    if (file := recording["file"]) is not None:
         lines.append(f"recording to {file['path']}: {file['seconds']:.0f} s, {file['bytes'] / 1e6:.1f} MB")
-    vehicle = status["vehicle"]
-    lines.append(f"autopilot: {vehicle['summary']}")
-    if vehicle["signing"] is not None:
-        lines.append(f"signing ({vehicle['signing']['mode']}): {vehicle['signing']['summary']}")
-    lines += [f"not allowed to ask: {sender} ({count} times)" for sender, count in vehicle["refused"].items()]
-    lines += [f"{device['name']}: {device['summary']}{_counts(device)}" for device in status["devices"]]
+    lines += [f"{row.name}: {row.words}" for row in summary.rows(status)]
+    refused = status["vehicle"]["refused"].items()
+    lines += [f"not allowed to ask: {sender} ({count} times)" for sender, count in refused]
     lines += _reading_lines(status)
-    lines += [f"warning: {warning}" for warning in status["warnings"]]
-    if not status["ground_stations"]["good"]:
-        lines.append(f"ground stations: {status['ground_stations']['summary']}")
-    lines += [f"{name}: {status[name]['summary']}" for name in ("mqtt", "fleet") if status[name] is not None]
     arming = status["arming"]
-    lines.append(
-        f"at arming ({arming['at_arm']}): {_VERDICTS[arming['verdict']]}"
-        + (f", {arming['words']}" if arming["verdict"] != "accept" else "")
-    )
-    lines.append(f"in force: {arming['in_force']}")
+    verdict = _VERDICTS[arming["verdict"]] + (f", {arming['words']}" if arming["verdict"] != "accept" else "")
+    lines += [f"at arming ({arming['at_arm']}): {verdict}", f"in force: {arming['in_force']}"]
     lines += [f"by hand, {_minute(one['measured_at'])} UTC: {by_hand_words(one)}" for one in status["by_hand"]]
     lines += [f"profile {each['imu']}: {each['summary']}" for each in status["profiles"]]
     lines += end_lines(status)
     if status["undoable"]:
         lines.append(undo_line(status["undoable"]))
-    if status["last"] is not None:
-        lines += _magnetic_lines(status["last"].get("magnetic"))
-        lines += status["last"].get("when_warm", [])
-    return lines
+    return lines if last is None else [*lines, *_magnetic_lines(last.get("magnetic")), *last.get("when_warm", [])]
 
 
 def undo_line(steps: Sequence[Object]) -> str:
@@ -153,17 +136,6 @@ def undo_line(steps: Sequence[Object]) -> str:
 
 def _minute(iso: str) -> str:
     return iso[:16].replace("T", " ")
-
-
-def _counts(device: Object) -> str:
-    """What has happened to a device's samples so far; empty while all is well."""
-    words = {
-        "lost": device.get("lost"),
-        "repeated": (device.get("dropped") or {}).get("repeated"),
-        "too late": device.get("too_late"),
-        "restarts": device.get("restarts"),
-    }
-    return "".join(f"; {number} {what}" for what, number in words.items() if number)
 
 
 def _reading_lines(status: Object) -> list[str]:
@@ -186,18 +158,13 @@ def _reading_lines(status: Object) -> list[str]:
     return lines
 
 
-def headline_line(status: Object) -> str:
-    """The big word and its reason."""
-    headline = status["headline"]
-    return f"{headline['word']}: {headline['reason']}"
-
-
 def end_lines(status: Object) -> list[str]:
     """Where the page is, and how the last calibration ended."""
     page, last = status["page"], status["last"]
     lines = [] if page is None else [f"page: {'' if page['good'] else 'none: '}{page['summary']}"]
-    when = "" if last is None else last["started_at"][:16].replace("T", " ") + " UTC"
-    found = "none yet" if last is None else f"{last['state']} at {when}: {last['reason']}"
+    found = "none yet"
+    if last is not None:
+        found = f"{last['state']} at {_minute(last['started_at'])} UTC: {last['reason']}"
     return [*lines, f"last calibration: {found}"]
 
 
@@ -210,26 +177,11 @@ def monitor_lines(status: Object) -> list[str]:
     if pose is not None:
         heading = f"{_number(pose['heading_deg'], '.1f')} {pose['north'] or ''}"
         lines.append(f"pitch {pose['pitch_deg']:+.2f}  roll {pose['roll_deg']:+.2f}  heading {heading}")
-    links = [("ok" if good else "wrong", name, words) for good, name, words in link_rows(status)]
-    lines += ["", *_judged([*links, *(("warning", "", words) for words in status["warnings"])]), ""]
+    lines += ["", *_judged(summary.rows(status)), ""]
     lines += _bias_lines(status["calibration"])
     lines.append(f"in force: {status['arming']['in_force']}")
     lines += end_lines(status)
     return lines
-
-
-def link_rows(status: Object) -> list[tuple[bool, str, str]]:
-    """What the companion is connected to: whether all is well with it, its name, how it stands."""
-    vehicle = status["vehicle"]
-    heartbeat_s = vehicle["heartbeat_age_s"]
-    links = [(heartbeat_s is not None and heartbeat_s < _HEARTBEAT_S, "autopilot", vehicle["summary"])]
-    links += [(device["good"], device["name"], device["summary"]) for device in status["devices"]]
-    if not status["ground_stations"]["good"]:
-        links.append((False, "ground stations", status["ground_stations"]["summary"]))
-    links += [(one["good"], name, one["summary"]) for name in ("mqtt", "fleet") if (one := status[name]) is not None]
-    if status["recording"]["fault"] is not None:
-        links.append((False, "recordings", status["recording"]["fault"]))
-    return links
 
 
 def _bias_lines(calibration: Object | None) -> list[str]:

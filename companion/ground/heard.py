@@ -153,18 +153,6 @@ def _whole(fields: Fields, name: str) -> int:
     return value if isinstance(value, int) else 0
 
 
-MEANINGS: Final = {
-    "CMP_GYR_TGT": "deg/h: gyro sigma that is good enough",
-    "CMP_ACC_TGT": "mg: accelerometer sigma that is good enough",
-    "CMP_PUSH": "1: results are written to the autopilot, 0: only measured",
-    "CMP_AT_ARM": "0: silent at arming, 1: warns, 2: holds the arming back",
-    "CMP_TUNES": "1: tunes on the autopilot's buzzer, 0: none",
-    "CMP_STATE": "last calibration: 0 none, 1 done, 2 failed, 3 cancelled (read only)",
-    "CMP_GYR_SIG": "deg/h: gyro sigma of the last result, worst axis (read only)",
-    "CMP_ACC_SIG": "mg: accelerometer sigma of the last result, worst axis (read only)",
-}
-
-
 def figures(gyro_deg_h: float | None, accel_mg: float | None) -> str:
     """What a result is worth, in one unit each."""
     gyro = f"sigma {gyro_deg_h:.3g} deg/h" if gyro_deg_h is not None else ""

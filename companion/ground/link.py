@@ -141,16 +141,6 @@ class GroundLink:
             logger.debug("%s not read: %s", name, error)
             return None
 
-    async def set_parameter(self, target: Target, name: str, value: float) -> str | None:
-        """Set one parameter; returns why that did not work, in MAVSDK's words, or None."""
-        from mavsdk.plugins.param import ParamError
-
-        try:
-            await asyncio.to_thread(self._client(target).set_param_float, name, value)
-        except ParamError as error:
-            return str(error.result.name)
-        return None
-
     def _client(self, target: Target) -> Any:
         from mavsdk.plugins.param import Param, ParamError, ParamResult, ProtocolVersion
 

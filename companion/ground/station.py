@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import difflib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -44,6 +43,12 @@ _STATES: Final[dict[int, State]] = {
     mavlink.MAV_RESULT_DENIED: "refused",
     mavlink.MAV_RESULT_TEMPORARILY_REJECTED: "refused",
     mavlink.MAV_RESULT_UNSUPPORTED: "refused",
+}
+_DOING: Final[dict[int, tuple[State, str]]] = {
+    mavlink.MAV_STATE_CALIBRATING: ("busy", "calibrating or writing"),
+    mavlink.MAV_STATE_STANDBY: ("idle", "nothing is running"),
+    mavlink.MAV_STATE_ACTIVE: ("idle", "nothing is running"),
+    mavlink.MAV_STATE_CRITICAL: ("fault", "something needs attention: `companion status` on the aircraft says what"),
 }
 _SAID_AS: Final = {"failed": Severity.ERROR, "refused": Severity.WARNING}
 """How the companion says why."""
@@ -128,28 +133,23 @@ class Station:
         more: dict[str, Any] = {"duration_s": round(loop.time() - begun_s, 1)}
         reason = outcome.reason
         if outcome.state == "done":
-            gyro = await self._sigma("CMP_GYR_SIG") if what.gyros else None
-            accel = await self._sigma("CMP_ACC_SIG") if what.accelerometers else None
+            asked = {"CMP_GYR_SIG": what.gyros, "CMP_ACC_SIG": what.accelerometers}
+            gyro, accel = [
+                (await self._link.get_parameter(self._target, name) or None) if wanted else None
+                for name, wanted in asked.items()
+            ]
             more |= {"gyro_sigma_deg_h": gyro, "accel_sigma_mg": accel}
             reason = heard.figures(gyro, accel) or reason
         lines = [f"{outcome.state.upper()} after {more['duration_s']:.0f} s: {reason}", *outcome.lines[1:]]
         return dataclasses.replace(outcome, reason=reason, lines=lines, more={**outcome.more, **more})
 
     async def undo(self) -> Outcome:
-        """Put the old values back; raises as `calibrate`.
-
-        Raises:
-            NobodyHeardError: the companion beats, but does not answer.
-        """
+        """Put the old values back; raises as `calibrate`."""
         begun_s = asyncio.get_running_loop().time()
         return await self._judge(await self._cancellable(self._exchange(UNDO), None), begun_s)
 
     async def cancel(self) -> Outcome:
-        """Cancel what runs, whoever asked for it, and wait until it has ended; raises as `calibrate`.
-
-        Raises:
-            NobodyHeardError: the companion beats, but does not answer.
-        """
+        """Cancel what runs, whoever asked for it, and wait until it has ended; raises as `calibrate`."""
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
         answer = await self._exchange(CANCEL).run()
@@ -166,21 +166,10 @@ class Station:
 
     async def status(self) -> Outcome:
         """What the companion is doing, its settings and its last result."""
-        beat = self._heard.heartbeats[self._target]
-        state: State = {
-            mavlink.MAV_STATE_CALIBRATING: "busy",
-            mavlink.MAV_STATE_STANDBY: "idle",
-            mavlink.MAV_STATE_ACTIVE: "idle",
-            mavlink.MAV_STATE_CRITICAL: "fault",
-        }.get(beat.system_status, "unknown")  # type: ignore[assignment] # mypy widens the literals
-        found = await self._own_parameters()
-        vehicle = self.vehicle
+        doing = self._heard.heartbeats[self._target].system_status
+        state, reason = _DOING.get(doing, ("unknown", "it does not say what it is doing"))
+        found, vehicle = await self._own_parameters(), self.vehicle
         last = _result(found.get("CMP_STATE"))
-        reason = {
-            "busy": "calibrating or writing",
-            "idle": "nothing is running",
-            "fault": "something needs attention: `companion status` on the aircraft says what",
-        }.get(state, "it does not say what it is doing")
         sigma = {
             "gyro_sigma_deg_h": found.get("CMP_GYR_SIG") or None,
             "accel_sigma_mg": found.get("CMP_ACC_SIG") or None,
@@ -189,45 +178,17 @@ class Station:
             f"companion: system {self._target.system_id}, component {self._target.component_id}: {state} - {reason}",
             f"autopilot: {vehicle.firmware}, {vehicle.armed}" if vehicle.firmware else "autopilot: not heard",
         ]
-        if not found:
-            lines.append("settings: no answer to the question for its parameters (a bad link?)")
+        if found:
+            known = heard.figures(*sigma.values()) if last == "done" else ""
+            ended = ", ".join(filter(None, (last, known))) or "none since the companion started"
+            at_arm, pushes = found.get("CMP_AT_ARM"), found.get("CMP_PUSH")
+            at_arming = AT_ARM[int(at_arm)] if at_arm in (0.0, 1.0, 2.0) else "unknown"
+            results = "written to the autopilot" if pushes else "NOT written (CMP_PUSH = 0)"
+            lines += [f"last calibration: {ended}", f"at arming: {at_arming}; results are {results}"]
         else:
-            known = heard.figures(sigma["gyro_sigma_deg_h"], sigma["accel_sigma_mg"])
-            lines.append(f"last calibration: {last}{', ' + known if known and last == 'done' else ''}"
-                         if last else "last calibration: none since the companion started")  # fmt: skip
-            at_arm = found.get("CMP_AT_ARM", -1.0)
-            lines.append(
-                f"at arming: {AT_ARM[int(at_arm)] if at_arm in (0.0, 1.0, 2.0) else 'unknown'};"
-                f" results are {'written to the autopilot' if found.get('CMP_PUSH') else 'NOT written (CMP_PUSH = 0)'}"
-            )
+            lines.append("settings: no answer to the question for its parameters (a bad link?)")
         more = {**self._more(0.0), "last": last, **sigma, "parameters": found}
         return Outcome(state, reason, good=True, lines=lines, more=more)
-
-    async def parameters(self, wanted: dict[str, float]) -> Outcome:
-        """Show the companion's own parameters, after setting some.
-
-        Raises:
-            ConfigError: it has no parameter of such a name; nothing was set.
-            NobodyHeardError: it does not answer.
-        """
-        begun_s = asyncio.get_running_loop().time()
-        found = await self._own_parameters()
-        if not found:
-            raise NobodyHeardError(f"{self._name()} beats, but does not answer for its parameters: a bad link?")
-        for name in wanted:
-            if name not in found:
-                near = difflib.get_close_matches(name, found, n=1)
-                hint = f"; nearest: {near[0]}" if near else ""
-                raise ConfigError(f"{name}: the companion has no such parameter (it has {', '.join(found)}{hint})")
-        problems = [(name, await self._link.set_parameter(self._target, name, value)) for name, value in wanted.items()]
-        refusals = [f"{name} not set: {problem}" for name, problem in problems if problem is not None]
-        if wanted:
-            found = await self._own_parameters() or found
-        lines = [f"{name:12} {value:12g}  {heard.MEANINGS.get(name, '')}".rstrip() for name, value in found.items()]
-        reason = "; ".join(refusals) or ("set; holds until the companion restarts" if wanted else "")
-        state: State = "refused" if refusals else "done"
-        return Outcome(state, reason, good=not refusals, lines=[*lines, *([reason] if reason else [])],
-                       more={**self._more(begun_s), "parameters": found})  # fmt: skip
 
     # --- asking
 
@@ -324,9 +285,6 @@ class Station:
             return {}
         found = await self._link.parameters(self._target)
         return {name: value for name, value in sorted(found.items()) if name.startswith("CMP_")}
-
-    async def _sigma(self, name: str) -> float | None:
-        return await self._link.get_parameter(self._target, name) or None
 
     # --- words
 

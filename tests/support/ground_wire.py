@@ -51,7 +51,3 @@ class StationOnTheWire(Ground):
 
     async def get_parameter(self, target: Target, name: str) -> float | None:
         return self.values.get(name)
-
-    async def set_parameter(self, target: Target, name: str, value: float) -> str | None:
-        self.values[name] = value
-        return None

@@ -9,15 +9,12 @@ from typing import cast
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.service import Refusal
 from companion.ground.exchange import Answer, Exchange
 from companion.ground.heard import Ack
 from companion.ground.link import GroundLink
 from tests.support.component import (
     ACCEPTED,
     CALIBRATE,
-    CANCELLED,
-    DENIED,
     FAILED,
     UNDO,
     Bench,
@@ -63,16 +60,6 @@ def test_progress_is_shown_and_the_end_is_the_companions() -> None:
             assert station.confirmations == [0], "nothing was lost: nothing is to be repeated"
             assert not station.on_ack
             assert b.service.started[0].what.name == "GYROS"  # type: ignore[union-attr]
-
-    run_virtual(main())
-
-
-def test_a_refusal_is_an_answer() -> None:
-    async def main() -> None:
-        station = StationOnTheWire()
-        async with bench(ground=station) as b:
-            b.service.refusal = Refusal("armed", "armed: disarm first")
-            assert await exchange(station).run() == Answer(DENIED, begun=True)
 
     run_virtual(main())
 
@@ -147,22 +134,6 @@ async def _cut_for(b: Bench, seconds: float) -> None:
     b.wire.cut = True
     await asyncio.sleep(seconds)
     b.wire.cut = False
-
-
-def test_a_link_that_comes_back_goes_on_where_it_was() -> None:
-    async def main() -> None:
-        station = StationOnTheWire()
-        async with bench(ground=station) as b:
-            b.service.mav_state = mavlink.MAV_STATE_CALIBRATING
-            asking = asyncio.create_task(exchange(station).run())
-            await asyncio.sleep(1.0)
-            await _cut_for(b, 15.0)
-            await asyncio.sleep(2.0)
-            b.service.jobs[0].finish("cancelled")
-            assert await asking == Answer(CANCELLED, begun=True)
-            assert len(b.service.started) == 1
-
-    run_virtual(main())
 
 
 def test_a_link_that_stays_away_is_given_up() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -65,14 +64,6 @@ def test_what_a_terminal_would_obey_is_not_passed_on() -> None:
     assert said(heard) == ["calm ?[31mred? ? 5 deg"]
 
 
-def test_what_never_ends_is_forgotten() -> None:
-    heard = Heard(191)
-    for number in range(1000):
-        say(heard, f"text {number}")
-    assert len(heard.texts) <= 200
-    assert said(heard)[-1] == "text 999"
-
-
 anything = st.sampled_from([None, True, -1, 0, 2**70, 1.5, float("nan"), "", "x" * 50, "\0", [1], {"a": 1}])
 
 
@@ -108,12 +99,3 @@ def test_nobody_there_is_one_line_with_what_was_heard_and_what_to_try() -> None:
     assert "forwarded" in ardupilot
     for line in (nothing, px4, ardupilot):
         assert "\n" not in line
-
-
-@pytest.mark.parametrize(
-    ("gyro", "accel", "expected"),
-    [(33.45, 0.178, "sigma 33.5 deg/h, 0.178 mg"), (None, 0.2, "sigma 0.2 mg"), (4.0, None, "sigma 4 deg/h"),
-     (None, None, "")],
-)  # fmt: skip
-def test_figures(gyro: float | None, accel: float | None, expected: str) -> None:
-    assert ground_heard.figures(gyro, accel) == expected

@@ -1,0 +1,63 @@
+"""The daemon's status in one summary: the rows that every interface shows of it."""
+
+from __future__ import annotations
+
+from typing import Final, Literal, NamedTuple
+
+from companion.formats import Object
+
+_HEARTBEAT_S: Final = 2.0
+"""An older heartbeat is a lost link."""
+
+
+class Row(NamedTuple):
+    """One part that the companion is connected to, or one warning."""
+
+    verdict: Literal["ok", "warning", "wrong"]
+    name: str
+    words: str
+
+
+def headline(status: Object) -> str:
+    """Give the big word and its reason."""
+    return f"{status['headline']['word']}: {status['headline']['reason']}"
+
+
+def rows(status: Object) -> list[Row]:
+    """List what the companion is connected to, then what needs attention; a reply of `status` or `monitor`."""
+    vehicle, recording, gate = status["vehicle"], status["recording"], status["arming"]["setup"]
+    heartbeat_s, signing = vehicle["heartbeat_age_s"], vehicle["signing"]
+    found = [_row(heartbeat_s is not None and heartbeat_s < _HEARTBEAT_S, "autopilot", vehicle["summary"])]
+    if signing is not None:
+        found.append(_row(signing["good"], f"signing ({signing['mode']})", signing["summary"]))
+    found += [_row(device["good"], device["name"], device["summary"] + _counts(device)) for device in status["devices"]]
+    if not status["ground_stations"]["good"]:
+        found.append(Row("wrong", "ground stations", status["ground_stations"]["summary"]))
+    found += [
+        _row(one["good"], name, one["summary"]) for name in ("mqtt", "fleet") if (one := status[name]) is not None
+    ]
+    if recording["fault"] is not None:
+        found.append(Row("wrong", "recordings", f"none at present: {recording['fault']}"))
+    if gate is not None and gate["problem"]:
+        found.append(Row("wrong", "arming", gate["problem"]))
+    if status["automatic"]["stopped"]:
+        found.append(Row("wrong", "by itself", f"no calibration until asked: {status['automatic']['stopped']}"))
+    return [*found, *(Row("warning", "warning", words) for words in status["warnings"])]
+
+
+def _row(good: bool, name: str, words: str) -> Row:  # noqa: FBT001 - the first column
+    return Row("ok" if good else "wrong", name, words)
+
+
+def _counts(device: Object) -> str:
+    """Say what has happened to a device's samples so far; empty while all is well."""
+    words = {
+        "bad frames": sum((device.get("rejected") or {}).values()),
+        "lost": device.get("lost"),
+        "repeated": (device.get("dropped") or {}).get("repeated"),
+        "too late": device.get("too_late"),
+        "restarts": device.get("restarts"),
+        "reconnected": device.get("reconnects"),
+        "clock jumps": device.get("clock_jumps"),
+    }
+    return "".join(f"; {what}: {number}" for what, number in words.items() if number)
