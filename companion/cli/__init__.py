@@ -36,8 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(logs.OneLineFormatter())
     try:
-        options = _options(arguments)
-        return asyncio.run(_dispatch(options))
+        options = _parser().parse_args(arguments, argparse.Namespace(json=False))
+        return asyncio.run(_run(options))
     except ConfigError as error:
         print_lines(error, error=True)
         return USAGE
@@ -57,12 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return FAILED
 
 
-def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """What the command line says; --json where no part of it does."""
-    return _parser().parse_args(arguments, argparse.Namespace(json=False))
-
-
-async def _dispatch(options: argparse.Namespace) -> int:
+async def _run(options: argparse.Namespace) -> int:
     command: Command = options.command
     return await command(options)
 
@@ -98,19 +93,11 @@ def _parser() -> Parser:
     check = add("check", local.check, "check configuration, ports, sensors and autopilot; say what is wrong")
     check.add_argument("--seconds", type=seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
     ports = add("ports", local.ports, "list serial ports with their stable names")
-    ports.add_argument(
-        "--listen",
-        nargs="*",
-        metavar="PORT",
-        help="tell who speaks on these ports (default: all that nobody holds and no console uses) by listening at the"
-        " usual speeds, up to half a minute; not a byte is sent, but opening a port raises DTR, which starts an Arduino"
-        " anew",
-    )
-    add(
-        "lua",
-        local.lua,
-        "print the arming script for ArduPilot (> APM/scripts/companion_arming.lua), and how to install it",
-    )
+    words = "tell who speaks on these ports (default: all that nobody holds and no console uses) by listening at the"
+    words += " usual speeds, up to half a minute; not a byte is sent, but opening a port raises DTR, which starts an"
+    ports.add_argument("--listen", nargs="*", metavar="PORT", help=f"{words} Arduino anew")
+    words = "print the arming script for ArduPilot (> APM/scripts/companion_arming.lua), and how to install it"
+    add("lua", local.lua, words)
     local.add_commands(add)
     for kind, command in (
         (commands.Status, client.status),

@@ -35,21 +35,12 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
         sub.set_defaults(command=command)
         return sub
 
-    run = add(
-        "run", _run, "collect, until Ctrl-C; -c names a file whose [mqtt] names the broker (default: this machine's)"
-    )
-    run.add_argument(
-        "--database",
-        default="fleet.sqlite",
-        metavar="URL",
-        help="postgresql://USER@HOST/NAME, or the path of an SQLite file (default fleet.sqlite, here)",
-    )
-    run.add_argument(
-        "--page",
-        default=DEFAULT_PAGE,
-        metavar="HOST:PORT",
-        help=f"address of the page (default {DEFAULT_PAGE}, for this computer alone; off: no page)",
-    )
+    words = "collect, until Ctrl-C; -c names a file whose [mqtt] names the broker (default: this machine's)"
+    run = add("run", _run, words)
+    words = "postgresql://USER@HOST/NAME, or the path of an SQLite file (default fleet.sqlite, here)"
+    run.add_argument("--database", default="fleet.sqlite", metavar="URL", help=words)
+    words = f"address of the page (default {DEFAULT_PAGE}, for this computer alone; off: no page)"
+    run.add_argument("--page", default=DEFAULT_PAGE, metavar="HOST:PORT", help=words)
     run.add_argument("--password-file", type=Path, metavar="FILE", help="file with the password of the page")
     run.add_argument("--cert", type=Path, metavar="FILE", help="certificate of the page with its chain (PEM)")
     run.add_argument("--key", type=Path, metavar="FILE", help="key of the certificate; both together turn on https")

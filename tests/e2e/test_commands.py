@@ -295,11 +295,3 @@ def test_check_says_that_the_autopilot_has_fallen_silent(tmp_path: Path) -> None
             assert finding["words"].endswith(" s: power? cable?")
 
     asyncio.run(main())
-
-
-@pytest.mark.parametrize("words", [["calibrate", "--timeout", "-1"], []])
-def test_usage_errors_end_with_2(words: list[str]) -> None:
-    said = asyncio.run(companion(*words))
-    assert said.code == USAGE
-    assert said.err.startswith("companion")
-    assert said.err.count("\n") == 1

@@ -6,6 +6,7 @@ socket between the two is left out (tests/e2e/test_commands.py has it).
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import json
 import re
@@ -63,7 +64,8 @@ def test_the_session_happens_as_shown(
             for command, expected in session(path):
                 words = shlex.split(command)
                 assert words[0] == "companion", f"{path.name}: {command}: only the companion's commands can be run"
-                code = await cli._dispatch(cli._options(words[1:]))
+                options = cli._parser().parse_args(words[1:], argparse.Namespace(json=False))
+                code = await cli._run(options)
                 output = capsys.readouterr()
                 said = output.err + output.out
                 assert code == DONE, f"{command}: {said}"

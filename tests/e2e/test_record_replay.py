@@ -504,19 +504,6 @@ def test_without_the_means_the_daemon_runs_and_says_so_only_where_recordings_wer
     assert not (tmp_path / "recordings").exists()
 
 
-def test_the_ring_is_on_unless_switched_off(tmp_path: Path) -> None:
-    async def main() -> None:
-        rig = Rig(tmp_path)
-        storage = msgspec.structs.replace(rig.config.storage, recordings_mb=None)
-        rig.config = msgspec.structs.replace(rig.config, storage=storage)
-        async with rig.running():
-            await asyncio.sleep(3.0)
-            assert rig.service.status()["recording"]["ring"]["most_bytes"] == 64 << 20
-
-    run_virtual(main())
-    assert len(ring(tmp_path)) == 1
-
-
 def test_a_fault_of_the_recorder_s_own_does_not_take_the_daemon_along(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

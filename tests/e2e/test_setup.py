@@ -17,10 +17,8 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion import cli, config
-from companion.daemon.process.check import answering_imus
 from companion.installation import install as installing
 from sim.firmware.double import AutopilotDouble
 from sim.pty_device import PtyDevice, reader_setting
@@ -213,22 +211,6 @@ def test_a_script_has_gyros_of_an_autopilot_on_a_wire_alone(tmp_path: Path, firm
     asyncio.run(main())
 
 
-@pytest.mark.parametrize(("firmware", "answers_after_s"), [("ardupilot", 0.0), ("ardupilot", 0.5), ("px4", 0.0)])
-def test_an_autopilot_that_answers_slowly_has_all_its_imus(
-    tmp_path: Path, firmware: Firmware, answers_after_s: float
-) -> None:
-    """PX4 is slow by itself: on the ground its console is asked for the EKF's bias before the samples are."""
-
-    async def main() -> None:
-        async with bench(tmp_path, firmware=firmware, answers_after_s=answers_after_s) as made:
-            imus = "".join(f'[[imu]]\nname = "fc{n}"\nsource = "autopilot"\ninstance = {n}\n' for n in (1, 2, 3))
-            files = f'[storage]\ndirectory = "{tmp_path}/state"\n[control]\nsocket = "{tmp_path}/socket"\n'
-            asked = config.parse(f'[mavlink]\nurl = "udpin:127.0.0.1:{made.udp}"\n{imus}{files}', "asked.toml")
-            assert await answering_imus(asked, asked.imu) == {"fc1": None, "fc2": None}
-
-    asyncio.run(main())
-
-
 def test_a_part_that_device_ids_tell_is_not_asked_for(tmp_path: Path) -> None:
     async def main() -> None:
         parameters = {f"INS_{half}_ID": 0x340102 for half in ("GYR", "ACC")}
@@ -246,21 +228,6 @@ def test_a_part_that_device_ids_tell_is_not_asked_for(tmp_path: Path) -> None:
             # Whoever knows better says so.
             assert (await by_script(made, *made.words("nobody"), "--part", "fc=bmi088", "--no-check"))[0] == 0
             assert made.configuration()["imu"] == [{"name": "fc", "source": "autopilot", "profile": "bmi088"}]
-
-    asyncio.run(main())
-
-
-def test_nothing_but_heartbeats_at_the_last_speed_is_enough(tmp_path: Path) -> None:
-    codec = mavlink.MAVLink(None, srcSystem=3, srcComponent=1)
-    frame = bytes(codec.heartbeat_encode(2, 3, 0, 0, 3).pack(codec))
-
-    async def main() -> None:
-        made = Bench(tmp_path)
-        line = Setting(460800, "none")
-        async with Chatter(tmp_path / "telem", lambda _: frame, rate_hz=1.0, line=line):
-            code, answer, told = await by_script(made, *made.words("telem"), "--no-check")
-            assert code == 0, told
-            assert answer["configuration"]["mavlink"]["url"] == f"serial:{tmp_path}/telem:460800"
 
     asyncio.run(main())
 
@@ -434,21 +401,6 @@ def test_the_service_is_started_with_it(
             f"systemctl {verb} companion.service: no such unit" for verb in ("enable", "restart")
         )
         assert answer["next"][0].startswith("sudo systemctl enable --now companion ")
-
-
-def test_where_no_systemd_runs_it_is_started_by_hand(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(installing, "systemd_runs", lambda: False)
-    monkeypatch.setattr(config, "DEFAULT_PATH", tmp_path / "companion.toml")
-    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    words = ["setup", str(tmp_path / "nobody"), "--mavlink", "udpin:127.0.0.1:14550", "--udp", str(free_udp())]
-    assert cli.main([*words, "--yes", "--json", "--no-check"]) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["steps"] is None
-    assert [step.split("   ")[0] for step in answer["next"]] == [
-        "companion run", "companion check", "companion calibrate --wait", "companion align faces --write",
-    ]  # fmt: skip
 
 
 def test_a_damaged_file_is_not_replaced_unasked(tmp_path: Path) -> None:

@@ -103,16 +103,6 @@ def test_a_log_with_cells_that_nobody_expects(tmp_path: Path, command: list[str]
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 @SETTINGS
-@given(names=st.lists(CELLS | st.sampled_from(HEAD.split(",")), max_size=14), rows=st.integers(0, 3))
-def test_columns_of_any_name(tmp_path: Path, command: list[str], names: list[str], rows: int) -> None:
-    text = ",".join(names) + "\n" + "1,2,3,4,5,6,7,8,9,10,11,12,13,14\n" * rows
-    path = tmp_path / "log.csv"
-    path.write_bytes(text.encode("utf-8", "surrogatepass"))
-    assert_one_line_or_a_result(path, command)
-
-
-@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-@SETTINGS
 @given(
     head=st.sampled_from([b"", b"\xff\xfe", b"\xfe\xff", b"\xef\xbb\xbf", HEAD.encode() + b"\n", b"ULog\x01\x12\x35"]),
     body=st.binary(max_size=400),

@@ -60,15 +60,6 @@ def test_one_flood_hides_nothing_else() -> None:
     assert text.count("armed") == 10
 
 
-def test_what_comes_now_and_then_is_written_as_it_comes() -> None:
-    clock = Clock()
-    with log_on(clock) as (logger, stream):
-        for k in range(1000):
-            logger.info("calibration %d done", k)
-            clock.now_s += 10.1
-    assert stream.getvalue() == "".join(f"calibration {k} done\n" for k in range(1000))
-
-
 WITHOUT_DESCRIPTORS = """
 import logging, os, resource
 from companion.links.system import logs

@@ -352,20 +352,6 @@ def test_another_file_is_one_line(
     assert capsys.readouterr().err == f"companion: {path}: {words}\n"
 
 
-def test_gps_time_that_comes_late_or_leaps_dates_the_flight(
-    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    told = []
-    for name, values in messages(flown, parameters()):
-        if name == "GPS" and values[0] < 140e6:
-            values = (*values[:2], 1, 0, 0, *values[5:])  # no fix: no time
-        elif name == "GPS" and 180e6 < values[0] < 190e6:
-            values = (*values[:4], values[4] + 1024, *values[5:])  # a receiver that has lost count of the weeks
-        told.append((name, values))
-    _, answer = said(capsys, dataflash(tmp_path / "x.bin", told), *storage(tmp_path))
-    assert answer["flights"][0]["began_at"] == "2026-10-11T00:00:46+00:00"
-
-
 def test_readings_at_the_sensors_own_rate_tell_the_same(
     flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,7 +20,7 @@ from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.scenario import site_at
 from tests.support.autopilot_files import ulog_message, write_dataflash, write_ulog
-from tests.support.made_noise import Floats, adis16405
+from tests.support.made_noise import Floats
 from tests.support.recordings import shared
 
 SECONDS, RATE_HZ = 30, 100
@@ -122,14 +122,6 @@ def test_every_imu_of_ardupilot_is_one(tmp_path: Path, capsys: pytest.CaptureFix
         assert record["log"]["notes"][0].startswith("the autopilot's offsets are taken off in it")
 
 
-def test_a_profile_is_learned_from_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_dataflash(tmp_path / "night.bin", {0: adis16405(300, 20, seed=4)})
-    assert companion(["profile", str(path), "--json"]) == 0
-    (imu,) = json.loads(capsys.readouterr().out)["imus"]
-    assert imu["name"] == "imu0"
-    assert imu["profile"]["gyro"]["white"] / DEG_H == pytest.approx(150.0, rel=0.2)
-
-
 def test_numbers_that_are_none_and_late_ones_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = readings(1)
     rows[1000:1010, 2] = np.nan
@@ -166,17 +158,6 @@ def test_a_damaged_log_is_one_line_or_what_is_left_of_it(
         if not said.out:
             assert code
             assert 1 <= said.err.count("\n") <= 2, said.err
-
-
-@pytest.mark.parametrize("head", [b"ULog\x01\x12\x35", b"ULog\x01\x12\x35\x01" + bytes(8), b"\xa3\x95\x80"])
-def test_nothing_but_a_beginning_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], head: bytes) -> None:
-    path = tmp_path / "log"
-    path.write_bytes(head)
-    assert companion(["replay", str(path)]) == 1
-    said = capsys.readouterr()
-    assert said.err.count("\n") == 1
-    assert str(path) in said.err
-    assert said.out == ""
 
 
 @pytest.fixture

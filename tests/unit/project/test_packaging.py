@@ -7,7 +7,6 @@ Dockerfile is read by a parser of others, and its labels are held against what B
 from __future__ import annotations
 
 import fnmatch
-import json
 import re
 import shutil
 import subprocess
@@ -134,42 +133,6 @@ def test_the_container_has_the_units_settings_of_the_c_library() -> None:
     ours = {name: value for name, value in dockerfile().envs.items() if name.startswith("MALLOC_")}
     assert ours == {name: value for name, value in unit_environment().items() if name.startswith("MALLOC_")}
     assert ours
-
-
-def test_the_labels_are_what_blueos_expects() -> None:
-    found = labels()
-    kinds = {"authors": list, "company": dict, "tags": list, "links": dict, "permissions": dict}
-    parsed = {name: json.loads(found[name]) for name in kinds}
-    assert {name: type(value) for name, value in parsed.items()} == kinds
-    assert found["type"] in {"device-integration", "example", "theme", "tool", "other"}
-    assert re.fullmatch(r"core >= \d+(\.\d+)*", found["requirements"])
-    assert len(parsed["tags"]) <= 10
-    assert all(re.fullmatch(r"[a-z0-9-]+", tag) for tag in parsed["tags"])
-    assert set(parsed["company"]) == {"name", "about", "email"}
-
-
-def test_whoever_publishes_the_extension_can_say_who_he_is() -> None:
-    authors = [{"name": "Somebody", "email": "somebody@example.invalid"}]
-    links = {"website": "https://example.invalid/companion"}
-    found = labels(AUTHORS=json.dumps(authors), LINKS=json.dumps(links), README="https://example.invalid/README.md")
-    assert json.loads(found["authors"]) == authors
-    assert json.loads(found["links"]) == links
-    assert found["readme"] == "https://example.invalid/README.md"
-
-
-def test_the_extension_may_open_serial_ports_and_nothing_more() -> None:
-    permissions = json.loads(labels()["permissions"])
-    assert set(permissions) == {"StopTimeout", "HostConfig"}
-    host = permissions["HostConfig"]
-    assert not host.get("Privileged")
-    # Documentation/admin-guide/devices.txt of the kernel: ttyS, ttyACM, ttyUSB, ttyAMA.
-    assert host["DeviceCgroupRules"] == [f"c {major}:* rw" for major in (4, 166, 188, 204)]
-    unit = (PROJECT / "systemd/companion.service").read_text()
-    assert f"TimeoutStopSec={permissions['StopTimeout']}\n" in unit
-    assert f"MemoryMax={host['Memory'] // 2**20}M\n" in unit
-    kept = {bind.split(":")[1] for bind in host["Binds"]} - {"/dev"}
-    environment = dockerfile().envs
-    assert kept == {"/etc/companion", environment["STATE_DIRECTORY"]}
 
 
 def test_the_paths_of_the_dockerfile_are_there_and_let_into_the_build() -> None:

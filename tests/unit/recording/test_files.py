@@ -78,15 +78,6 @@ def numbers_of(paths: Iterable[Path]) -> list[int]:
     return [int(path.stem) for path in paths]
 
 
-def test_a_ring_found_too_large_at_start_is_made_smaller(tmp_path: Path) -> None:
-    for number in range(1, 9):
-        (tmp_path / f"{number:06d}.mcap").write_bytes(bytes(MB))
-    ring = Ring(tmp_path, 4 * MB)
-    ring.write(raw(1, 10), beginning())
-    ring.close()
-    assert numbers(tmp_path) == [6, 7, 8, 9]
-
-
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "mine.mcap"
     path.write_bytes(b"precious")
@@ -176,16 +167,6 @@ def test_what_finds_no_room_is_lost_in_one_piece_and_said_in_the_file(
     assert [message.t_s for message in found] == [1000.0 + k for k in wanted]
 
 
-def test_bytes_in_waiting_are_bounded_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tape_module, "MOST_BYTES", 1000)
-    tape = Tape()
-    tape.begin(0.0)
-    for k in range(3):
-        tape.put("/mavlink/in", float(k), bytes(400))
-    assert tape.lost == 4  # its beginning too
-    assert len(tape) == 0
-
-
 def test_a_file_begins_with_the_states_in_force_and_says_whether_it_follows_on_another(tmp_path: Path) -> None:
     tape, ring = Tape(), Ring(tmp_path, 8 * MB)
     tape.put_state(PLACE, 990.0, encode(Whereabouts(height_m=1.0)))
@@ -200,12 +181,3 @@ def test_a_file_begins_with_the_states_in_force_and_says_whether_it_follows_on_a
     assert heights == [[1.0], [1.0, 2.0]]
     (_, _), (follows,) = ([decode(START, each.data) for each in on_topic(path, START)] for path in (first, second))
     assert follows.continues
-
-
-@pytest.mark.parametrize("content", [b"", b"hello, world, this is no recording", bytes(100)])
-def test_an_empty_or_foreign_file_is_one_line(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "x.mcap"
-    path.write_bytes(content)
-    with pytest.raises(StorageError, match=r"the file is empty|not a recording \(MCAP\)") as caught:
-        list(Recording(path).items())
-    assert "\n" not in str(caught.value)
