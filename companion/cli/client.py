@@ -63,7 +63,6 @@ def finish(options: argparse.Namespace, reply: Object, answer: Object, lines: li
 
 
 async def status(options: argparse.Namespace) -> int:
-    """`companion status`."""
     reply = await request(options, {"command": "status"})
     answer = reply.get("status", {})
     return finish(options, reply, answer, show.status_lines(answer) if answer else [], good=True)
@@ -85,7 +84,6 @@ def _finish_briefly(options: argparse.Namespace, reply: Object, *, good: bool = 
 
 
 async def cancel(options: argparse.Namespace) -> int:
-    """`companion cancel`."""
     return _finish_briefly(options, await request(options, {"command": "cancel"}))
 
 
@@ -98,7 +96,6 @@ async def undo(options: argparse.Namespace, wanted: Object | None = None) -> int
 
 
 async def history(options: argparse.Namespace) -> int:
-    """`companion history`."""
     reply = await request(options, request_of(options, commands.History))
     keys = ("numbers", "records", "armings", "by_hand", "interrupted", "flights")
     answer = {key: reply.get(key, []) for key in keys}
@@ -122,7 +119,6 @@ async def temperature(options: argparse.Namespace) -> int:
 
 
 async def setup(options: argparse.Namespace) -> int:
-    """`companion autopilot-setup`."""
     reply = await request(options, {"command": "autopilot-setup"})
     answer = {key: value for key, value in reply.items() if key != "kind"}
     good = reply["kind"] != "error"
@@ -172,7 +168,6 @@ async def align(options: argparse.Namespace) -> int:
 
 
 async def record(options: argparse.Namespace) -> int:
-    """`companion record`."""
     wanted, stop = request_of(options, commands.Record), {"command": "record", "stop": True}
     if "file" in wanted:
         wanted["file"] = str(Path.cwd() / wanted["file"])

@@ -51,7 +51,6 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
 
 
 async def _run(options: argparse.Namespace) -> int:
-    """`companion fleet run`."""
     _check_installed()
     from companion.config.sections import Mqtt
     from companion.fleet.collector import Collector, load_broker
@@ -66,7 +65,6 @@ async def _run(options: argparse.Namespace) -> int:
 
 
 async def _acl(options: argparse.Namespace) -> int:
-    """`companion fleet acl`."""
     from companion.fleet.acl import access_list
 
     print_lines(*access_list(options.broker, options.aircraft))

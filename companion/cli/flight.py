@@ -38,7 +38,6 @@ def add_commands(add: AddCommand) -> None:
 
 
 async def flight(options: argparse.Namespace) -> int:
-    """`companion flight`."""
     from companion.estimation.records.flight_evidence import surely_moved
     from companion.lab.flight.flight import flights, read
 

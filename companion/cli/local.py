@@ -205,7 +205,6 @@ async def web_token(options: argparse.Namespace) -> int:
 
 
 async def check(options: argparse.Namespace) -> int:
-    """`companion check`."""
     from companion.daemon.process.check import run_check
 
     config = load_config(options, profiles=True)
@@ -218,7 +217,6 @@ async def check(options: argparse.Namespace) -> int:
 
 
 async def install(options: argparse.Namespace) -> int:
-    """`companion install-service` and `companion uninstall-service`."""
     from companion.installation import install as installing
 
     executable = getattr(options, "executable", None) or installing.own_executable()
@@ -236,7 +234,6 @@ async def install(options: argparse.Namespace) -> int:
 
 
 async def report(options: argparse.Namespace) -> int:
-    """`companion report`."""
     from companion.report.calibration import calibration_page
     from companion.report.source import material
 

@@ -38,7 +38,6 @@ def add_command(add: AddCommand) -> None:
 
 
 async def replay(options: argparse.Namespace) -> int:
-    """`companion replay`."""
     from companion.lab.logs.log_files import reader_of
     from companion.lab.logs.recording import is_text
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from companion import config
 from companion.cli.asking import Asking, PageAsking
-from companion.cli.setup_imus import ask_autopilot, daemon_status, parts_given, parts_of
+from companion.cli.setup_imus import ask_autopilot, daemon_status, parts_given
 from companion.cli.show import finding_lines
 from companion.cli.terminal import DONE, FAILED, config_path, load_config, own_name, print_json
 from companion.config.rules import bind_problem
@@ -33,7 +33,7 @@ WITHOUT: Final = {
     "gradienter": "no gradienter: gyros only, accelerometers by hand (connected later: companion setup again)",
     "compass": "no compass: the gyros' sigmas are a little wider",
 }
-CHECK_S: Final = 5.0
+CHECK_S: Final = 10.0
 
 
 async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
@@ -57,8 +57,7 @@ def _bind(options: argparse.Namespace) -> str:
         raise ConfigError("--page asks a person: it goes neither with --yes nor with --json")
     if (wrong := bind_problem(options.page, "--page")) is not None:
         raise ConfigError(wrong)
-    page: str = options.page
-    return page
+    return str(options.page)
 
 
 def _storage(options: argparse.Namespace) -> Path:
@@ -119,11 +118,10 @@ class _Session:
             await self._take_device(draft, found, kind)
         await self._ask(draft, list(draft.questions()), given)
         daemon = await daemon_status(draft.parsed())
+        told: dict[str, str | None] = {}
         if daemon is not None:
-            told = parts_of(daemon)
-        elif self._options.no_check:
-            told = {}
-        else:
+            told = {one["imu"]: one["name"] for one in daemon.get("profiles", ()) if one["by_device_id"]}
+        elif not self._options.no_check:
             told = await ask_autopilot(self.asking, draft, by_default=is_new)
         names = [imu["name"] for imu in draft.wanted["imu"]]
         to_ask = [name for name in names if told.get(name) is None or part_key(name) in parts]
@@ -299,9 +297,6 @@ class _Session:
 
         self.asking.say("", "Checking (it speaks with all of them now, and changes nothing):")
         findings = await run_check(parsed, CHECK_S)
-        if not all(finding.good for finding in findings):
-            self.asking.say("Something is missing: once more, and longer.")
-            findings = await run_check(parsed, 2.0 * CHECK_S)
         self.asking.say(*finding_lines(findings))
         bad = [f"{finding.name}: {finding.words}" for finding in findings if not finding.good]
         self.answer["findings"] = [dataclasses.asdict(finding) for finding in findings]

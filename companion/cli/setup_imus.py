@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
@@ -17,9 +17,6 @@ from companion.setup.draft import Draft, part_key
 
 COARSE: Final = "It sends whole steps of 206 deg/h and 1 mg: a gyro bias below one step may stay unknown."
 """1 mrad/s and 1 mg: the steps of SCALED_IMU2 and SCALED_IMU3."""
-
-Parts = Mapping[str, str | None]
-"""Part of each IMU by name, from its device ids; None: not in the catalogue."""
 
 
 def parts_given(options: Sequence[str]) -> dict[str, str]:
@@ -50,13 +47,8 @@ async def daemon_status(config: Config) -> Object | None:
     return found
 
 
-def parts_of(status: Object) -> Parts:
-    """Read from a daemon's status the parts that device ids tell."""
-    return {one["imu"]: one["name"] for one in status.get("profiles", ()) if one["by_device_id"]}
-
-
-async def ask_autopilot(asking: Asking, draft: Draft, *, by_default: bool) -> Parts:
-    """Offer the IMUs that the autopilot has besides the configured ones, and return the parts of all that answer.
+async def ask_autopilot(asking: Asking, draft: Draft, *, by_default: bool) -> dict[str, str | None]:
+    """Offer the IMUs that the autopilot has besides the configured ones; return the parts of all that answer, by name.
 
     Nothing is written to the autopilot. `by_default`: the answer to the offer where nobody gives one.
     """

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any, Final
 
+from companion import __version__
 from companion.errors import StorageError
 from companion.recording import messages
 from companion.recording.messages import Message, Start
@@ -161,8 +162,9 @@ class RecordingFile:
 
     def _begin(self, beginning: Beginning, start: Start) -> None:
         self._begun = beginning
-        table = {**versions(), "offset_ns": str(beginning.offset_ns)}
-        self._writer.start(profile="", library=f"companion {table['companion']}")
+        offset = str(beginning.offset_ns)
+        table = {"format": messages.FORMAT_VERSION, "companion": __version__, "offset_ns": offset}
+        self._writer.start(profile="", library=f"companion {__version__}")
         started_ns = self._ns(beginning.t_s)
         self._writer.add_metadata(messages.METADATA, table)
         self._writer.add_attachment(started_ns, started_ns, messages.CONFIG, "application/json", beginning.config)
@@ -312,21 +314,3 @@ class Ring:
             path.unlink(missing_ok=True)
             in_all -= size
         self.bytes_in_all = in_all
-
-
-def versions() -> dict[str, str]:
-    """Return the version of the format, and what else may make a replay differ in the last digits."""
-    import platform
-    import sys
-
-    import numpy
-
-    from companion import __version__
-
-    return {
-        "format": messages.FORMAT_VERSION,
-        "companion": __version__,
-        "python": ".".join(map(str, sys.version_info[:3])),
-        "numpy": numpy.__version__,
-        "machine": platform.machine(),
-    }

@@ -62,7 +62,6 @@ def _figure(imu: ByTemperature, triad: Triad, when: str) -> Markup | None:
             across,
             svg.linear([*ends, *([now.gyro_deg_h[axis]] if now else [])], ticks=3),
             name=f"IMU {imu.imu}, {NAMES[triad].lower()} {AXES[axis]}: bias by temperature",
-            told=_told(imu, triad, axis, dots, when),
             height=110.0,
             x_label="temperature of the IMU, degC" if axis == 2 else "",
             y_label=_label(imu, triad, axis, when),
@@ -108,21 +107,6 @@ def _label(imu: ByTemperature, triad: Triad, axis: int, when: str) -> str:
 
 def _value(found: Expected, axis: int) -> str:
     return f"{found.gyro_deg_h[axis]:+.0f} ± {found.sigma_deg_h[axis]:.0f}"
-
-
-def _told(imu: ByTemperature, triad: Triad, axis: int, dots: Sequence[tuple[float, float, float]], when: str) -> str:
-    """Describe the plot for a screen reader."""
-    unit, digits = UNITS[triad].name, 0 if triad == "gyro" else 2
-    low, high = (f"{pick(value for _, value, _ in dots):+.{digits}f}" for pick in (min, max))
-    words = [f"{len(dots)} points, {low} to {high} {unit}."]
-    if triad == "gyro" and imu.curve:
-        words += [
-            f"Expected at power-up: {_value(row, axis)} {unit} at {row.degc:.0f} degC."
-            for row in (imu.curve[0], imu.curve[-1])
-        ]
-    if triad == "gyro" and imu.now is not None:
-        words.append(f"{when.capitalize()} {_value(imu.now, axis)} {unit} at {imu.now.degc:.1f} degC.")
-    return " ".join(words)
 
 
 def _caption(imu: ByTemperature, triad: Triad, when: str) -> str:

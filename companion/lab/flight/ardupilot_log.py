@@ -20,8 +20,6 @@ from companion.physics.units import DEG
 
 _ROWS: Final[dict[str, tuple[str, tuple[str, ...]]]] = {
     "IMU": ("I", ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ", "T", "GH", "AH")),
-    "GYR": ("I", ("GyrX", "GyrY", "GyrZ")),
-    "ACC": ("I", ("AccX", "AccY", "AccZ")),
     "VIBE": ("IMU", ("VibeX", "VibeY", "VibeZ")),
     "XKF1": ("C", ("VN", "VE", "VD", "PN", "PE", "PD", "GX", "GY", "GZ")),
     "XKF2": ("C", ("AX", "AY", "AZ")),
@@ -106,11 +104,8 @@ def _in_use(start: Start, name: str, lanes: Floats) -> Floats:
 
 def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[int]) -> FlownImu:
     rows = start.rows("IMU", instance)
-    raw = _raw(start.rows("GYR", instance), start.rows("ACC", instance))
-    used = raw if len(raw) > len(rows) else rows[:, :7]
     failed: NDArray[np.bool_] = np.any(rows[:, 8:10] < 1.0, axis=1)  # not so in a log that does not say
-    told = np.searchsorted(rows[:, 0], used[:, 0], side="right") - 1
-    used = used[np.isfinite(used).all(axis=1) & ~failed[np.maximum(told, 0)]]
+    used = rows[np.isfinite(rows[:, :7]).all(axis=1) & ~failed]
     vibration = start.rows("VIBE", instance)
     number = instance + 1
     prefix, suffix = (f"INS{number}_", "") if number > 3 else ("INS_", "" if number == 1 else str(number))
@@ -124,14 +119,6 @@ def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[
         vibration=np.column_stack([vibration[:, 0], np.linalg.norm(vibration[:, 1:4], axis=1)]),
         estimated=_estimated(start, cores.index(instance)) if instance in cores else None,
     )  # fmt: skip
-
-
-def _raw(gyro: Floats, accel: Floats) -> Floats:
-    """Join GYR and ACC, corrected, at the sensor's own rate; forces at the gyro's times."""
-    if len(gyro) < 2 or len(accel) < 2:
-        return np.zeros((0, 7))
-    forces = [np.interp(gyro[:, 0], accel[:, 0], column) for column in accel[:, 1:4].T]
-    return np.column_stack([gyro, *forces])
 
 
 def _estimated(start: Start, core: int) -> Estimated | None:

@@ -24,10 +24,6 @@ _MOVING: Final = ("timestamp_sample", "vx", "vy", "vz", "x", "y", "z", "ref_lat"
 _TOPICS: Final[dict[str, tuple[str, ...]]] = {
     "sensor_combined": (*_elements("gyro_rad"), *_elements("accelerometer_m_s2")),
     "sensor_selection": ("gyro_device_id",),
-    "vehicle_imu": (
-        "timestamp_sample", *_elements("delta_angle"), *_elements("delta_velocity"), "delta_angle_dt",
-        "delta_velocity_dt",
-    ),
     "vehicle_imu_status": ("gyro_device_id", "accel_device_id", "temperature_gyro", "accel_vibration_metric"),
     "estimator_sensor_bias": (
         "gyro_device_id", *_elements("gyro_bias"), *_elements("accel_bias"), *_elements("gyro_bias_variance"),
@@ -42,8 +38,6 @@ _TOPICS: Final[dict[str, tuple[str, ...]]] = {
     "vehicle_land_detected": ("landed",),
     "vehicle_gps_position": ("time_utc_usec",),
 }  # fmt: skip
-_FAST_HZ: Final = 20.0
-"""vehicle_imu is usually logged twice a second: each is then one of a hundred."""
 _TURNING: Final = 0.02
 
 
@@ -93,7 +87,7 @@ def _navigation(start: Start, suffix: str) -> Navigation | None:
 
 
 def _imus(start: Start) -> tuple[FlownImu, ...]:
-    """List the IMUs logged fast enough: the one that PX4 flies by, and others if the logger was set so."""
+    """List the IMUs that PX4 has flown by: sensor_combined is of the one in use."""
     found: dict[int, FlownImu] = {}
     status = {k: start.rows("vehicle_imu_status", k) for k in start.instances("vehicle_imu_status")}
     ids = {rows[-1, 1]: k for k, rows in status.items() if len(rows)}
@@ -103,12 +97,6 @@ def _imus(start: Start) -> tuple[FlownImu, ...]:
     for gyro_id in np.unique(selected):
         number = ids.get(gyro_id, 0)
         found[number] = _imu(start, number, combined[selected == gyro_id])
-    for k in start.instances("vehicle_imu"):
-        rows = _sampled(start.rows("vehicle_imu", k))
-        rows = rows[(rows[:, 7:] > 0.0).all(axis=1)]
-        imu = _imu(start, k, np.hstack([rows[:, :1], rows[:, 1:7] / (np.repeat(rows[:, 7:], 3, axis=1) * US)]))
-        if k not in found and imu.rate_hz >= _FAST_HZ:
-            found[k] = imu
     return tuple(found[k] for k in sorted(found))
 
 

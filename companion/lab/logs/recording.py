@@ -18,8 +18,6 @@ from companion.recording import messages
 MAGIC: Final = b"\x89MCAP0\r\n"
 MOST_BYTES: Final = 4 * 1024 * 1024
 """The most bytes of a record, and of a chunk unpacked; ours have less than one MiB, and 2.3 in a flood of bytes."""
-MOST_TIMES: Final = 100
-"""The most that all chunks together may unpack to, in sizes of the file, beside one chunk; ours reach four."""
 _NEEDS_MORE: Final = (
     "a recording needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
 )
@@ -96,7 +94,7 @@ class Recording:
         topics: dict[int, str] = {}
         try:
             with self.path.open("rb") as file:
-                for record in _records(file, self.path.stat().st_size):
+                for record in _records(file):
                     if isinstance(record, records.Metadata) and record.name == messages.METADATA:
                         table = record.metadata
                         self._check_format(table)
@@ -146,18 +144,15 @@ class _Bounded:
         return self._file.read(length)
 
 
-def _records(file: IO[bytes], size: int) -> Iterator[Any]:
+def _records(file: IO[bytes]) -> Iterator[Any]:
     """Give all records but chunks, whose records are given in their place."""
     from mcap.records import Chunk, DataEnd
     from mcap.stream_reader import StreamReader, breakup_chunk
 
-    room = MOST_BYTES + MOST_TIMES * size
     source: Any = _Bounded(file)
     for record in StreamReader(source, emit_chunks=True, record_size_limit=MOST_BYTES).records:
         if isinstance(record, Chunk):
-            room -= _checked_size(record)
-            if room < 0:
-                raise _DamagedError(f"unpacks to more than {MOST_TIMES} times its size")
+            _check_size(record)
             yield from breakup_chunk(record, validate_crc=True)
         elif isinstance(record, DataEnd):
             return
@@ -165,8 +160,8 @@ def _records(file: IO[bytes], size: int) -> Iterator[Any]:
             yield record
 
 
-def _checked_size(chunk: Any) -> int:
-    """Return how much a chunk unpacks to; the zstd frame reserves what it says of itself, whatever the chunk says."""
+def _check_size(chunk: Any) -> None:
+    """Check how much a chunk unpacks to; the zstd frame reserves what it says of itself, whatever the chunk says."""
     import zstandard
 
     size: int = chunk.uncompressed_size
@@ -175,4 +170,3 @@ def _checked_size(chunk: Any) -> int:
     inside = zstandard.frame_content_size(chunk.data) if chunk.compression else len(chunk.data)
     if size > MOST_BYTES or inside > size:
         raise _DamagedError(f"found {max(size, inside)} bytes in one piece; allowed: {MOST_BYTES}")
-    return size

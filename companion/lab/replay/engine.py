@@ -16,6 +16,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from companion import __version__
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
 from companion.configured import models
 from companion.configured.models import aligned, collect
@@ -32,7 +33,6 @@ from companion.lab.logs.playback import UNUSABLE, Playback, config_of
 from companion.lab.logs.recording import Head, Message, Recording
 from companion.physics.frames import Array
 from companion.recording import messages
-from companion.recording.files import versions
 from companion.recording.messages import ImuState, Measured, Solved, Start, decode
 
 FOLLOWS_S: Final = 3.0
@@ -96,7 +96,8 @@ class Replay:
         self._collector: RollingCollector | None = None
         self._calibrations: list[Replayed] = []
         self._notes: list[str] = []
-        self._is_cut = False
+        self.is_cut = False
+        """True: the end of a file is missing, so that the next one begins anew."""
         self._first_s = self._now_s = self._begun_s = math.nan
         self._where = Whereabouts()
         self._measured: Measurement | CalibrationRefusedError | None = None
@@ -137,7 +138,8 @@ class Replay:
         elif topic == messages.PLACE:
             self._where = decode(topic, data)
         elif topic == messages.MEASURED:
-            self._offsets = self._offsets_now()
+            states = {imu.name: self._playback.state(imu.name) for imu in self._config.imu}
+            self._offsets = {name: state.calibration for name, state in states.items() if state is not None}
             self._measured = self._measure(collector, decode(topic, data), t_s)
         elif topic == messages.SOLVED:
             self._solve(decode(topic, data))
@@ -145,22 +147,18 @@ class Replay:
             self._calibrations.append(self._compare(from_json(data)))
 
     def _start(self, start: Start, t_s: float) -> None:
-        follows = start.continues and self._collector is not None and not self._is_cut
+        follows = start.continues and self._collector is not None and not self.is_cut
         if follows and t_s - self._now_s < FOLLOWS_S:
             return
         if start.lost:
             self._notes.append(f"{start.lost} messages were lost in recording; replayed from behind the gap")
         if math.isnan(self._first_s):
             self._first_s = t_s
-        self._is_cut, self._begun_s = False, t_s
+        self.is_cut, self._begun_s = False, t_s
         self._collector = models.collector(self._config)
         self._playback.begin()
         self._measured = self._solution = None
         self._not_recomputed = _BEFORE
-
-    def _offsets_now(self) -> dict[str, ImuCalibration | None]:
-        states = {imu.name: self._playback.state(imu.name) for imu in self._config.imu}
-        return {name: state.calibration for name, state in states.items() if state is not None}
 
     def _measure(
         self, collector: RollingCollector, measured: Measured, now_s: float
@@ -227,10 +225,6 @@ class Replay:
         again = msgspec.structs.replace(again, imus=imus, system_id=recorded.system_id, alignment=recorded.alignment)
         return compared(recorded, again)
 
-    def cut(self) -> None:
-        """Note that the end of a file is missing: the next one begins anew."""
-        self._is_cut = True
-
     def goes_on(self, head: Head) -> bool:
         """Return whether a file with this head is of the same run of the daemon."""
         return (head.offset_ns, head.config) == (self._head.offset_ns, self._head.config)
@@ -238,11 +232,9 @@ class Replay:
     def result(self, cut_short: str | None) -> Result:
         """Return the calibrations, and how far the recording went."""
         seconds = 0.0 if math.isnan(self._first_s) else self._now_s - self._first_s
-        ours, theirs = versions(), self._head.versions
-        notes = []
-        if ours["companion"] != theirs.get("companion"):
-            notes.append(f"recorded with companion {theirs.get('companion')}, here {ours['companion']}")
-        return Result(self._calibrations, seconds, cut_short, [*notes, *self._notes])
+        if (theirs := self._head.versions.get("companion")) != __version__:
+            self._notes.insert(0, f"recorded with companion {theirs}, here {__version__}")
+        return Result(self._calibrations, seconds, cut_short, self._notes)
 
 
 def compared(recorded: Record, again: Record) -> Replayed:
@@ -296,6 +288,6 @@ def replay(paths: Iterable[Path]) -> Result:
                 raise StorageError(f"{path}: not of the same run of the daemon as the file before; replay it alone")
         if recording.cut_short is not None and found is not None:
             cut_short = cut_short or recording.cut_short
-            found.cut()
+            found.is_cut = True
     assert found is not None
     return found.result(cut_short)

@@ -258,7 +258,7 @@ def test_what_is_heard_on_the_ground(
     main(["ground", "status", *form])
     out, said = capsys.readouterr()
     clean(out + said)
-    assert "owned" in out + said
+    assert not form or "owned" in out
 
 
 def test_the_bar_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -279,7 +279,7 @@ def test_the_bar_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
         ["status", EVIL],
         [EVIL],
         ["history", "-n", EVIL],
-        ["ground", "params", EVIL],
+        ["ground", "status", "--url", EVIL],
         ["ground", "status", "--url", EVIL],
     ],
 )
