@@ -17,7 +17,7 @@ from companion.formats import Object
 from companion.links.system.control_client import ask
 
 SILENT_S: Final = 2.0
-"""After so long without an answer it is said that one is waited for."""
+"""Silence after which the command says that it waits for an answer."""
 
 
 async def request(
@@ -126,7 +126,7 @@ async def setup(options: argparse.Namespace) -> int:
 
 
 def setup_lines(answer: Object) -> list[str]:
-    """The set-up as a person reads it."""
+    """Show the set-up of the autopilot."""
     net = answer["net"]
     heading = answer["reason"] if net is None else f"{answer['state']}: {answer['reason']}"
     lines = [f"heading: {heading}", *map(_row, answer["parameters"])]
@@ -182,7 +182,7 @@ async def record(options: argparse.Namespace) -> int:
 
 
 def sides_lines(imus: Sequence[Object]) -> list[str]:
-    """What accelerometers that were held on all sides have left now."""
+    """Show the errors left in accelerometers that were held on all sides."""
     lines = []
     for imu in imus:
         lines.append(f"{imu['name']}: known from all sides, {imu['measured_at'][:19]} UTC; its output has left")
@@ -200,11 +200,11 @@ _FIGURES: Final = {
     "gyro_bias_deg_h": ("gyro bias", "deg/h", "+.1f", 1.0),
 }
 _SHOWN: Final = {"faces": ("accel_bias_mg", "accel_scale", "accel_shear"), "turn": ()}
-"""Of other kinds all but the shear, as far as the stands tell."""
+"""Figures by kind of alignment; other kinds show all that are known but the shear."""
 
 
 def _bias_lines(words: str, whole: Sequence[float] | None, left: Sequence[float], sigma: Sequence[float]) -> list[str]:
-    """The whole bias, and where it is known what of it the output still shows: the change of a write."""
+    """Show the whole bias, and the part left in the output, if known: the change by a write."""
     if words == "slant when level" or whole is None:
         return [f"  {words:16} {'mg':6} {show.axes(left, sigma, '+.3f')}"]
     return [
@@ -214,7 +214,7 @@ def _bias_lines(words: str, whole: Sequence[float] | None, left: Sequence[float]
 
 
 def stands_lines(record: Object) -> list[str]:
-    """What stands have told, as a person reads it: the spot, the zero, each IMU, the board, then what to copy."""
+    """Show an alignment: spot, zero, each IMU, board, lines for the configuration."""
     slope = f"; the spot slopes by {record['slope_deg']:.2f} deg" if "slope_deg" in record else ""
     lines = [f"measured {record['measured_at'][:19]} UTC in {len(record['stands'])} stands{slope}"]
     zero: list[str] = []

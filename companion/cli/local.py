@@ -80,9 +80,7 @@ def add_commands(add: AddCommand) -> None:
             words = "the companion (default: the one that runs this)"
             service.add_argument("--executable", metavar="PATH", help=words)
     sub = add("report", report, "make a page (one HTML file) of a calibration: needs no daemon, no network")
-    sub.add_argument(
-        "record", nargs="?", metavar="RECORD", help="its number, or the beginning of its time (default: the latest)"
-    )
+    sub.add_argument("record", nargs="?", type=within(1, 1e9, int), metavar="NUMBER", help="default: the latest")
     sub.add_argument("-o", "--output", metavar="FILE", help="default: companion-report-….html here; - is stdout")
     sub.add_argument(
         "--storage", type=Path, metavar="DIR", help="the folder with records/ (default: as in the configuration)"
@@ -94,7 +92,7 @@ def _absolute(text: str) -> Path:
 
 
 FIRST_RUN: Final = ("--page", "0.0.0.0:8191")
-"""How `run` calls `setup` where there is no configuration: whoever reads its output gets the token from it."""
+"""Options of the `setup` that `run` starts without a configuration; its output has the token of the page."""
 
 
 async def run(options: argparse.Namespace) -> int:
@@ -115,7 +113,7 @@ async def run(options: argparse.Namespace) -> int:
 
 
 async def _first_run(path: Path) -> None:
-    """Have it asked for, by whoever may write it; others are told by the daemon's own start that it is missing."""
+    """Ask for the configuration on a page, if this user may write it; else the daemon names the missing file."""
     from companion.cli import setup as session
     from companion.setup.draft import is_writable
 
@@ -148,7 +146,7 @@ async def ports(options: argparse.Namespace) -> int:
 
 
 async def _listen(wanted: Sequence[str], found: Sequence[SerialPort]) -> dict[str, Heard | str]:
-    """Who speaks on each port, or why that is not known."""
+    """Find out who speaks on each port, or why that is not known."""
     from companion.links.serial.listening import listen_to_all, ports_to_try
 
     names = list(wanted) or ports_to_try(found)

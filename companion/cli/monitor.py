@@ -29,7 +29,7 @@ SILENT_S: Final = 5.0
 AGAIN_S: Final = 1.0
 
 REASON_S: Final = 10.0
-"""How often another reason for the same state is worth a line: many count seconds, or carry a reading."""
+"""Shortest time between lines for the same state with another reason: many reasons count seconds."""
 _COLOURS: Final = {"good": "1;97;42", "wait": "1;30;103", "busy": "1;97;44", "bad": "1;97;41"}
 _SIGNS: Final = {"good": "OK ", "wait": "...", "busy": ">>>", "bad": "!!!"}
 

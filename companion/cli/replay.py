@@ -211,7 +211,7 @@ def _windows(options: argparse.Namespace, log: StillLog, given: Given) -> int:
 def _window_lines(found: Windows) -> list[str]:
     """Say how often the error was within sigma, axis by axis."""
     lines = [f"windows of {found.length_s:g} s: {found.count}, calibrated: {found.done}"]
-    lines += [f"not calibrated: {each.count}: {each.why}" for each in found.refused[:MOST_REASONS]]
+    lines += [f"not calibrated: {count}: {why}" for why, count in [*found.refused.items()][:MOST_REASONS]]
     for next_s, axes in itertools.groupby(found.axes, key=lambda each: each.next_s):
         rows = list(axes)
         lines.append(f"against the next {next_s:g} s, {rows[0].pairs} pairs:")

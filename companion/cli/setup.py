@@ -94,7 +94,7 @@ class _Session:
         }  # fmt: skip
 
     async def run(self) -> None:
-        """The whole of it.
+        """Run the whole session.
 
         Raises:
             CompanionError: it cannot go on; `so_far` says what has become of the file.
@@ -156,7 +156,7 @@ class _Session:
         return draft
 
     def _given(self) -> dict[str, str]:
-        """Answers from the command line, by question."""
+        """Read the answers on the command line, by question."""
         options = self._options
         given = {"vehicle.platform": options.platform, "gradienter.law": options.law}
         for words in options.mounting:
@@ -167,7 +167,7 @@ class _Session:
         return {key: words for key, words in given.items() if words is not None}
 
     async def _listen(self, draft: Draft) -> Survey:
-        """Everything that can be listened to; not a byte is sent."""
+        """Listen to all serial ports and UDP; send nothing."""
         options = self._options
         ports = [*map(os.path.abspath, options.ports)] or ports_to_try(list_ports())
         udp = tuple(options.udp or USUAL_PORTS)
@@ -188,7 +188,7 @@ class _Session:
         return found
 
     async def _take_autopilot(self, draft: Draft, found: Survey) -> None:
-        """Its url: as it was where it is heard there or held by somebody, else where one is heard, else as typed."""
+        """Choose the url: the configured one if it is heard or held, else one that is heard, else a typed one."""
         say, was = self.asking.say, draft.url
         heard = [one.url for one in found.autopilots]
         if self._options.mavlink is not None:
@@ -212,7 +212,7 @@ class _Session:
             await self.asking.ask("Autopilot", "", draft.take_url)
 
     async def _take_device(self, draft: Draft, found: Survey, kind: Kind) -> None:
-        """One that is heard, in the place of one that is not; one that is held by somebody stays."""
+        """Choose a device that is heard; keep a configured one whose port somebody holds."""
         section, heard = draft.section(kind), found.devices(kind)
         if section is not None:
             port = section["port"]
@@ -234,7 +234,7 @@ class _Session:
             draft.take(draft_from)
 
     async def _choose(self, what: str, names: Sequence[str]) -> str:
-        """One of several; of one nobody is asked."""
+        """Ask for one of several names; a single one is taken."""
         if len(names) == 1:
             self.asking.say(f"{what}: {names[0]}")
             return names[0]
@@ -276,7 +276,7 @@ class _Session:
             self.answer["kept"] = str(kept)
 
     async def _finish(self, *, runs: bool) -> None:
-        """Check it, offer the service, tell the next step."""
+        """Check the configuration, offer the service, list the next steps."""
         parsed = load_config(self._options, profiles=True)
         good, checks = True, not runs and not self._options.no_check
         if checks:
@@ -292,7 +292,7 @@ class _Session:
         self.asking.say("", "Next:", *(f"  {number}. {step}" for number, step in enumerate(steps, 1)))
 
     async def _check(self, parsed: Config) -> bool:
-        """As `companion check` does: it speaks with autopilot and sensors as the daemon will, and writes nothing."""
+        """Check as `companion check` does; write nothing."""
         from companion.daemon.process.check import run_check
 
         self.asking.say("", "Checking (it speaks with all of them now, and changes nothing):")
@@ -305,7 +305,7 @@ class _Session:
         return not bad
 
     async def _service(self, *, runs: bool) -> bool:
-        """Whether it now runs as a service with this file."""
+        """Offer the service; return whether it now runs with this file."""
         if self._path != config.DEFAULT_PATH or self._options.no_service or not installing.systemd_runs():
             return False
         what = "Restart the companion with it?" if runs else "Start the companion now, and at every boot?"
@@ -327,7 +327,7 @@ class _Session:
 
 
 def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: bool, checks: bool) -> Iterator[str]:
-    """What to do, in this order; `is_old`: what runs has another configuration; `checks`: `good` was looked at."""
+    """List the next steps; `is_old`: the running daemon has another configuration; `checks`: `good` was checked."""
     is_service = command == "companion"
     if not good:
         yield f"mend what is wrong above, then: {command} check"

@@ -23,7 +23,7 @@ _VERDICTS = {"accept": "ready", "wait": "not yet", "refuse": "NOT ready"}
 
 
 def record_lines(record: Object) -> list[str]:
-    """A record as a person reads it: outcome first, then pose, then one block an IMU."""
+    """Show a record: outcome, pose, one block for each IMU."""
     lines = [f"{record['state'].upper()} after {record['duration_s']:.0f} s: {record['reason']}"]
     pose = record.get("pose")
     if pose is not None:
@@ -68,7 +68,7 @@ def _imu_lines(imu: Object) -> list[str]:
 
 
 def written_lines(written: Object) -> list[str]:
-    """What became of each parameter."""
+    """Show each written parameter with its outcome."""
     return [
         f"  {name:16} {_number(one['before'], '+.6f')} -> {one['after']:+.6f}  {outcome_word(one['outcome'])}"
         for name, one in written.items()
@@ -76,7 +76,7 @@ def written_lines(written: Object) -> list[str]:
 
 
 def axes(values: Sequence[float], sigmas: Sequence[float], form: str, scale: float = 1.0) -> str:
-    """Three figures with their sigmas, in a unit that is so many of theirs; `form` such as "+9.1f"."""
+    """Format three values with their sigmas, divided by `scale`; `form` such as "+9.1f"."""
     return "  ".join(
         f"{axis} {value / scale:{form}} +- {sigma / scale:.{form[-2]}f}"
         for axis, value, sigma in zip("xyz", values, sigmas, strict=True)
@@ -84,7 +84,7 @@ def axes(values: Sequence[float], sigmas: Sequence[float], form: str, scale: flo
 
 
 def changes(values: Sequence[float], form: str, scale: float = 1.0) -> str:
-    """Three figures without their sigmas, as `axes`: what a write has changed, or would."""
+    """Format three values without sigmas: the change by a write."""
     return "  ".join(f"{axis} {value / scale:{form}}" for axis, value in zip("xyz", values, strict=True))
 
 
@@ -122,7 +122,7 @@ def status_lines(status: Object) -> list[str]:
 
 
 def undo_line(steps: Sequence[Object]) -> str:
-    """What the next undo takes back, and how many more could follow."""
+    """Name the step that the next undo restores, and the number of steps after it."""
     if not steps:
         return "undo: nothing is left to take back"
     step, more = steps[0], len(steps) - 1
@@ -139,7 +139,7 @@ def _minute(iso: str) -> str:
 
 
 def _reading_lines(status: Object) -> list[str]:
-    """What gradienter and compass say at this moment, and whose zero the gradienter's is."""
+    """Show the readings of gradienter and compass, and the gradienter's zero."""
     lines, readings, alignment = [], status["readings"], status["alignment"]
     if readings["gradienter_x_deg"] is not None:
         lines.append(
@@ -159,7 +159,7 @@ def _reading_lines(status: Object) -> list[str]:
 
 
 def end_lines(status: Object) -> list[str]:
-    """Where the page is, and how the last calibration ended."""
+    """Show the address of the page, and the end of the last calibration."""
     page, last = status["page"], status["last"]
     lines = [] if page is None else [f"page: {'' if page['good'] else 'none: '}{page['summary']}"]
     found = "none yet"
@@ -169,7 +169,7 @@ def end_lines(status: Object) -> list[str]:
 
 
 def monitor_lines(status: Object) -> list[str]:
-    """What stands below the big word and its reason on a terminal that is drawn anew every half second."""
+    """Show what stands below the headline on the monitor's screen."""
     lines = []
     if (percent := status["progress"]) is not None:
         lines += [f"[{'#' * (percent * _BAR // 100):.<{_BAR}}] {percent} %", ""]
@@ -203,12 +203,12 @@ def _held_back(imu: Object, triad: str) -> str:
 
 
 def finding_lines(findings: Sequence[Finding]) -> list[str]:
-    """What a check has found, one line each."""
+    """Show the findings of a check, one line each."""
     return _judged([(finding.verdict, finding.name, finding.words) for finding in findings])
 
 
 def _judged(rows: Sequence[tuple[str, str, str]]) -> list[str]:
-    """In columns: ok, warning or wrong; whose; how it stands."""
+    """Align rows of verdict, name and words."""
     width = max(len(name) for _, name, _ in rows)
     return [f"{verdict:7}  {name if name != verdict else '':{width}}  {words}" for verdict, name, words in rows]
 
@@ -221,7 +221,7 @@ def history_lines(
     flights: Sequence[Object] = (),
     interrupted: Sequence[Object] = (),
 ) -> list[str]:
-    """History, newest first in each section; `numbers`: of the records, as `companion report` takes them."""
+    """Show the history, newest first in each section; `numbers` of the records, for `companion report`."""
     lines = ["no calibrations yet"]
     if records:
         lines = [f"{'no.':>4} {'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]
@@ -250,7 +250,7 @@ def history_lines(
 
 
 def _interrupted(one: Object) -> str:
-    """An interrupted write, with the minute of the restore."""
+    """Show an interrupted write, with the minute of the restore."""
     ended = f", {_minute(one['ended_at'])}" if one["ended_at"] else ""
     what, number = one["what"] or "write", len(one["parameters"])
     began_at = (one["began_at"] or one["ended_at"] or "time unknown")[:19]
@@ -273,7 +273,7 @@ def by_hand_words(done: Object) -> str:
 
 
 def _what_became(record: Object) -> str:
-    """What a calibration has written, and whether that was taken back."""
+    """Say how many parameters a calibration wrote, and whether they were undone."""
     written = sum(len(imu["written"]) for imu in record.get("imus", ()))
     if not written or record["state"] != "done":
         return ""
@@ -282,7 +282,7 @@ def _what_became(record: Object) -> str:
 
 
 def temperature_lines(imus: Sequence[Object]) -> list[str]:
-    """By IMU, what was seen of its biases over temperature, and the gyros' now and at a power-up."""
+    """Show by IMU the known biases over temperature, and the gyros' now and at a power-up."""
     lines: list[str] = []
     for imu in imus:
         lines.append(f"{imu['imu']}: {imu['summary']}")
@@ -316,7 +316,7 @@ def _accelerometers(imu: Object) -> str | None:
 
 
 def curves_written_lines(written: Object | None) -> list[str]:
-    """What was written of curves over temperature."""
+    """Show the temperature curves that were written."""
     if written is None:
         return []
     lines = [f"{name}: {len(each)} parameters" for name, each in written["imus"].items()]

@@ -1,4 +1,4 @@
-"""What all commands share: exit codes, the door to the terminal, the configuration, arguments."""
+"""Parts that all commands share: exit codes, printing, the configuration, arguments."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ AddCommand = Callable[[str, Command, str], argparse.ArgumentParser]
 
 
 def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
-    """Print lines for people, or JSON: the one door to the terminal, by which nothing goes that it would obey."""
+    """Print lines without characters that a terminal obeys; everything on the terminal is printed here."""
     stream = sys.stderr if error else sys.stdout
     for line in lines:
         stream.write(printable(str(line)) + end)
@@ -41,7 +41,7 @@ def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
 
 
 def print_address(url: str, token: str | None) -> None:
-    """Where a page is, with the token that its buttons need: as words, and as a picture for a phone's camera."""
+    """Print the address of a page with the token of its buttons, in words and as a QR code."""
     if token is None:
         print_lines(f"{url} needs no token: only this board can reach it")
         return
@@ -99,19 +99,19 @@ def storage_path(options: argparse.Namespace) -> Path:
 
 
 def config_path(options: argparse.Namespace) -> Path:
-    """The file that -c names, or the default one."""
+    """Give the path that -c names, or the default one."""
     path: Path = getattr(options, "config", config.DEFAULT_PATH)
     return path
 
 
 def own_name(options: argparse.Namespace) -> str:
-    """How the companion is called with this configuration."""
+    """Give the command that uses this configuration."""
     path = config_path(options)
     return "companion" if path == config.DEFAULT_PATH else f"companion -c {shlex.quote(str(path))}"
 
 
 def how_to_start(options: argparse.Namespace) -> str:
-    """What is to be typed where no daemon answers."""
+    """Say what to type when no daemon answers."""
     from companion.installation.install import is_service
 
     serves = is_service() and config_path(options) == config.DEFAULT_PATH

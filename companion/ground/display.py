@@ -38,7 +38,7 @@ class Display:
             self._bar.stop()
 
     def progress(self, percent: int, text: str) -> None:
-        """How far it is."""
+        """Show the progress."""
         text = printable(text)
         if self._console.is_terminal:
             if self._task is None:
@@ -50,5 +50,5 @@ class Display:
             self._console.print(f"[{percent:3d} %] {text}")
 
     def text(self, text: str, *, urgent: bool) -> None:
-        """What the companion says."""
+        """Show a text of the companion."""
         self._console.print(printable(text), style="bold yellow" if urgent else "")

@@ -22,27 +22,27 @@ if TYPE_CHECKING:
     from companion.ground.link import GroundLink
 
 ANSWER_WITHIN_S: Final = (0.6, 0.6, 0.6, 0.6, 1.6)
-"""Of each attempt. The companion answers within 0.3 s, the rest is for the radio; all attempts are made while it would
-remember the end of the first, or else the last could start the same once more."""
+"""Timeout of each attempt: 0.3 s for the companion, the rest for the radio. All attempts end while the companion
+remembers the end of the first; else the last could start another calibration."""
 REPEAT_AFTER_S: Final = (1.2, 1.5, 1.8, 2.1, 2.4)
 """Seconds without an answer after which progress is asked for again: two ACKs may be lost in a row before. The last
 leaves the radio the rest of the time for which the companion remembers its final answer."""
 assert max(REPEAT_AFTER_S[-1], sum(ANSWER_WITHIN_S[:-1])) < REMEMBER_FINAL_S - 0.5
 ENDED_AFTER_S: Final = 5.0
-"""How long without an answer, while the heartbeat shows no work, until the end counts as missed."""
+"""Silence, while heartbeats show no work, after which the end counts as missed."""
 LOST_AFTER_S: Final = 20.0
 _TICK_S: Final = 0.25
 
 
 class Answer(NamedTuple):
-    """How an exchange ended."""
+    """End of an exchange."""
 
     result: int | None
     """MAV_RESULT_*; None: no final answer came."""
     begun: bool
-    """Whether the companion has answered at all."""
+    """True: the companion has answered at least once."""
     detail: int = 0
-    """What the final answer says beside its result (`result_param2`)."""
+    """`result_param2` of the final answer."""
 
 
 class Exchange:

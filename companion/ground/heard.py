@@ -1,4 +1,4 @@
-"""What has been heard on the link: who beats, whether the vehicle is armed, and what the companion has said."""
+"""Heartbeats and texts heard on the link: who is there, whether the vehicle is armed, the companion's words."""
 
 from __future__ import annotations
 
@@ -70,12 +70,12 @@ class Heard:
     def __init__(self, component_id: int) -> None:
         self.component_id = component_id
         self.first_s: float | None = None
-        """When anything was heard first."""
+        """Time of the first heartbeat."""
         self.heartbeats: dict[Target, Heartbeat] = {}
         self.texts: list[tuple[int, Text]] = []
-        """By the companions of all vehicles, with their system ids, oldest first; the oldest beyond 200 are gone."""
+        """Texts of the companions of all vehicles with their system ids, oldest first, at most 200."""
         self.on_text: Listeners[[int, Text]] = Listeners()
-        """Told of every text, with its system id."""
+        """Listeners for every text, with its system id."""
 
     def update(self, name: str, source: Target, fields: Fields, now_s: float) -> None:
         """Take a HEARTBEAT or STATUSTEXT; others are not looked at."""
@@ -85,11 +85,11 @@ class Heard:
             self._text(source.system_id, fields, now_s)
 
     def companions(self) -> list[int]:
-        """The system ids of the vehicles whose companion was heard."""
+        """List the system ids of the vehicles whose companion was heard."""
         return sorted(target.system_id for target in self.heartbeats if target.component_id == self.component_id)
 
     def vehicle(self, system_id: int, now_s: float) -> Vehicle:
-        """What is known of a vehicle's autopilot."""
+        """Describe a vehicle's autopilot."""
         beat = self.heartbeats.get(Target(system_id, mavlink.MAV_COMP_ID_AUTOPILOT1))
         if beat is None:
             return Vehicle(system_id, None, "unknown")
@@ -99,14 +99,14 @@ class Heard:
         return Vehicle(system_id, FIRMWARES.get(beat.autopilot, f"autopilot type {beat.autopilot}"), armed)
 
     def busy(self, system_id: int, since_s: float) -> bool | None:
-        """Whether the companion is at work, by a heartbeat later than `since_s`; None: there was none."""
+        """Return whether the companion is at work by a heartbeat later than `since_s`; None: there was none."""
         beat = self.heartbeats.get(Target(system_id, self.component_id))
         if beat is None or beat.at_s <= since_s:
             return None
         return beat.system_status == mavlink.MAV_STATE_CALIBRATING
 
     def texts_of(self, system_id: int, since_s: float) -> list[Text]:
-        """What the vehicle's companion has said since then; a line that goes on is part of the one before it."""
+        """List the texts of a vehicle's companion since then; continuation lines are joined."""
         found: list[Text] = []
         for source, text in self.texts:
             if source != system_id or text.at_s < since_s:
@@ -119,7 +119,7 @@ class Heard:
         return found
 
     def summary(self) -> str:
-        """Who was heard, in a few words; empty when nobody was."""
+        """Name who was heard; empty: nobody."""
         vehicles, others = [], []
         for (system, component), beat in sorted(self.heartbeats.items()):
             if component == mavlink.MAV_COMP_ID_AUTOPILOT1 and beat.kind not in _NO_VEHICLES:
@@ -154,14 +154,14 @@ def _whole(fields: Fields, name: str) -> int:
 
 
 def figures(gyro_deg_h: float | None, accel_mg: float | None) -> str:
-    """What a result is worth, in one unit each."""
+    """Format the sigmas of a result."""
     gyro = f"sigma {gyro_deg_h:.3g} deg/h" if gyro_deg_h is not None else ""
     accel = f"{'' if gyro else 'sigma '}{accel_mg:.3g} mg" if accel_mg is not None else ""
     return ", ".join(filter(None, (gyro, accel)))
 
 
 def nobody_heard(heard: Heard, url: str, system_id: int | None, within_s: float) -> str:
-    """Why there is nobody to ask, in one line: what was heard, and what to try."""
+    """Say in one line why no companion was found: what was heard, and what to try."""
     others, component = heard.summary(), heard.component_id
     if not others:
         return (

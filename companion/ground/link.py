@@ -49,7 +49,7 @@ class SignedLink:
         sdk.subscribe_raw_bytes_to_be_sent(self._in_a_thread)
 
     def text(self) -> str:
-        """What was dropped, for people; empty when nothing was."""
+        """Name the dropped messages; empty: none."""
         if not self.signing.doubted:
             return ""
         counts = ", ".join(f"{count} {reason}" for reason, count in self.signing.doubted.most_common())
@@ -103,7 +103,7 @@ class GroundLink:
         self.own, self.heard, self.unbelieved = own, heard, unbelieved
         self._sdk, self._direct = sdk, direct
         self.on_ack: Listeners[[Ack]] = Listeners()
-        """Told of every COMMAND_ACK to us."""
+        """Listeners for every COMMAND_ACK to us."""
         self._loop = asyncio.get_running_loop()
         for name in _HEARD:
             direct.subscribe_message(name, self._in_a_thread)

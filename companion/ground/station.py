@@ -1,4 +1,4 @@
-"""What can be done from the ground: find the companion on the link, ask it for something, say what came of it."""
+"""Requests from the ground: find the companion on the link, send a request, describe its outcome."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 CALIBRATE, CANCEL, UNDO = mavlink.MAV_CMD_USER_1, mavlink.MAV_CMD_USER_2, mavlink.MAV_CMD_USER_3
 EVERYBODY_WITHIN_S: Final = 1.3
-"""How long after the first heartbeat everybody in reach has been heard: heartbeats come once a second."""
+"""Time after the first heartbeat within which everybody in reach is heard: heartbeats come once a second."""
 WORDS_WITHIN_S: Final = 3.0
-"""For how long the words that belong to an end may follow it."""
+"""Longest time by which the texts of an end may follow it."""
 QUIET_S: Final = 1.0
 """Silence after which a sender has said everything: two lines a second pass."""
 CANCELLED_WITHIN_S: Final = 30.0
@@ -51,12 +51,12 @@ _DOING: Final[dict[int, tuple[State, str]]] = {
     mavlink.MAV_STATE_CRITICAL: ("fault", "something needs attention: `companion status` on the aircraft says what"),
 }
 _SAID_AS: Final = {"failed": Severity.ERROR, "refused": Severity.WARNING}
-"""How the companion says why."""
+"""Severity of the text that has the reason."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What came of it: for programs (`answer`, with `state` and `reason` first) and for people (`lines`)."""
+    """Outcome of a request: for programs (`answer`, with `state` and `reason` first) and for people (`lines`)."""
 
     state: State
     reason: str
@@ -83,7 +83,7 @@ class Station:
 
     @property
     def vehicle(self) -> Vehicle:
-        """The autopilot beside the companion."""
+        """Autopilot beside the companion."""
         return self._heard.vehicle(self._target.system_id, asyncio.get_running_loop().time())
 
     def interrupt(self) -> None:
@@ -165,7 +165,7 @@ class Station:
         return self._ended("cancelled", reason, begun_s, good=True)
 
     async def status(self) -> Outcome:
-        """What the companion is doing, its settings and its last result."""
+        """Describe what the companion is doing, its settings and its last result."""
         doing = self._heard.heartbeats[self._target].system_status
         state, reason = _DOING.get(doing, ("unknown", "it does not say what it is doing"))
         found, vehicle = await self._own_parameters(), self.vehicle
@@ -196,7 +196,7 @@ class Station:
         return Exchange(self._link, self._target, command, busy=self._is_busy)
 
     async def _cancellable(self, exchange: Exchange, timeout_s: float | None) -> Answer:
-        """Run it; Ctrl-C or the end of the time given cancel it, and its end is waited for all the same."""
+        """Run an exchange; Ctrl-C or the timeout cancel it, and its end is waited for all the same."""
         running = asyncio.create_task(exchange.run())
         try:
             if not await self._ends(running, timeout_s):
@@ -214,7 +214,7 @@ class Station:
             await asyncio.gather(running, return_exceptions=True)
 
     async def _ends(self, running: asyncio.Task[Answer], within_s: float | None) -> bool:
-        """Whether it comes to its end before the time has, or the next Ctrl-C."""
+        """Wait for the end, the timeout or the next Ctrl-C; return whether it ended."""
         interrupted = asyncio.create_task(self._interrupted.wait())
         try:
             await asyncio.wait({running, interrupted}, timeout=within_s, return_when=asyncio.FIRST_COMPLETED)
@@ -224,7 +224,7 @@ class Station:
         return running.done()
 
     async def _judge(self, answer: Answer, begun_s: float) -> Outcome:
-        """What an answer means, with what the companion says against it."""
+        """Translate an answer into an outcome, with the companion's reason."""
         if not answer.begun:
             raise NobodyHeardError(
                 f"{self._name()} beats, but does not answer: nothing that is sent from here arrives"
@@ -244,7 +244,7 @@ class Station:
         return self._ended(state, reason, begun_s, said, good=state == "done")
 
     async def _judge_unheard_end(self, begun_s: float) -> Outcome:
-        """The link was gone when it ended, or it was not waited for."""
+        """Describe an end that was not heard, or not waited for."""
         busy = self._is_busy(asyncio.get_running_loop().time() - FRESH_S)
         if busy is False:
             ended = await self._last_result()
@@ -309,7 +309,7 @@ class Station:
     def _ended(
         self, state: State, reason: str, begun_s: float, said: Text | None = None, *, good: bool = False
     ) -> Outcome:
-        """How it ended, and what else the companion has warned of meanwhile."""
+        """Make an outcome, with the warnings of the companion meanwhile."""
         warned = [text for text in self._texts(begun_s) if text.severity <= Severity.WARNING and text != said]
         lines = [f"{state.upper()}: {reason}", *(f"warning: {text.words}" for text in warned)]
         return Outcome(state, reason, good=good, lines=lines, more=self._more(begun_s))
@@ -323,5 +323,5 @@ class Station:
 
 
 def _result(state: float | None) -> str | None:
-    """How the last calibration has ended, by CMP_STATE; None: there was none, or it is not told."""
+    """Name the end of the last calibration by CMP_STATE; None: there was none, or it is not known."""
     return RESULTS[int(state)] if state in (1.0, 2.0, 3.0) else None

@@ -11,9 +11,7 @@ import msgspec
 
 from companion.estimation.collector.trace import Trace, VerdictTrace
 from companion.estimation.records.record import Arming, ImuRecord, Outcome, Record, outcome_word
-from companion.estimation.solution.by_temperature import ByTemperature
 from companion.physics.units import UNITS
-from companion.report.by_temperature import biases_by_temperature
 from companion.report.markup import Child, Markup, cell, join, number, row, tag
 from companion.report.page import (
     AXES,
@@ -54,8 +52,6 @@ class Material(msgspec.Struct, frozen=True, kw_only=True):
     armings: Sequence[Arming]
     """While it was in force, oldest first."""
     damaged: Sequence[str]
-    by_temperature: Sequence[ByTemperature] = ()
-    """Curves of its IMUs, as known when the page is made."""
     flown: Mapping[str, Sequence[str]] = {}
     """Changes by motors beyond sigma, in words, by IMU."""
 
@@ -63,7 +59,7 @@ class Material(msgspec.Struct, frozen=True, kw_only=True):
 def calibration_page(material: Material, now: datetime.datetime) -> str:
     """Make the page."""
     record = material.record
-    imus, warmth = record.imus[:MAX_IMUS], material.by_temperature[:MAX_IMUS]
+    imus = record.imus[:MAX_IMUS]
     return page(
         f"Calibration {material.number}, {moment(record.started_at)}",
         now,
@@ -79,9 +75,6 @@ def calibration_page(material: Material, now: datetime.datetime) -> str:
         _pose(record),
         tag("section", tag("h2", "Was it still?"), *_stillness(material.trace, material.no_trace)),
         _drift(material),
-        tag("section", tag("h2", "Biases by temperature"), biases_by_temperature(warmth, looking_back=True))
-        if warmth
-        else None,
     )
 
 

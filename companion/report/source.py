@@ -8,16 +8,12 @@ from pathlib import Path
 from typing import Final
 
 from companion.errors import StorageError
-from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.flight_evidence import moved
 from companion.estimation.records.flight_record import AXES, Flight
 from companion.estimation.records.record import Arming, Record
-from companion.estimation.solution.by_temperature import ByTemperature, by_temperature
-from companion.estimation.solution.prior import curve_of
 from companion.report.calibration import Material
 from companion.storage.flights import FlightStore
 from companion.storage.learned import BiasStore, KnownImu
-from companion.storage.profiles import ProfileStore
 from companion.storage.records import Entry, RecordStore
 from companion.storage.state import BoundedList
 
@@ -25,11 +21,11 @@ MAX_EARLIER: Final = 60
 _NO_SIGMA: Final = (math.inf,) * 3
 
 
-def material(directory: Path, wanted: str | None) -> Material:
-    """Read the content of a page by a calibration's number or the beginning of its time; None: the latest.
+def material(directory: Path, wanted: int | None) -> Material:
+    """Read the content of a page by a calibration's number; None: the latest.
 
     Raises:
-        StorageError: there is nothing to make a page of, none of that number or time, or it cannot be read.
+        StorageError: there is nothing to make a page of, none of that number, or it cannot be read.
     """
     store, records = RecordStore(directory), directory / "records"
     try:
@@ -58,11 +54,9 @@ def material(directory: Path, wanted: str | None) -> Material:
     except StorageError as error:
         why = f"{error}."
         damaged.append(str(error))
-    warmth: Sequence[ByTemperature] = ()
     flown: dict[str, list[str]] = {}
     try:
         known = BiasStore(directory).all()
-        warmth = _by_temperature(directory, record, known)
         flown = _moved_in_flight(FlightStore(directory).flights(), record, known)
     except StorageError as error:
         damaged.append(str(error))
@@ -77,7 +71,6 @@ def material(directory: Path, wanted: str | None) -> Material:
         trace=trace,
         no_trace="" if trace is not None else why,
         earlier=earlier[-MAX_EARLIER:],
-        by_temperature=warmth,
         flown=flown,
         armings=[arming for arming in armings if arming.calibration == record.started_at],
         damaged=damaged,
@@ -101,46 +94,13 @@ def _moved_in_flight(flights: Sequence[Flight], record: Record, known: Mapping[s
     return found
 
 
-def _by_temperature(directory: Path, record: Record, every: Mapping[str, KnownImu]) -> list[ByTemperature]:
-    """List the curves known today of this calibration's IMUs on the same vehicle."""
-    found = []
-    for name, known in every.items():
-        identity, points = known.identity, known.points
-        if name not in {imu.name for imu in record.imus} or identity.get("system", "") not in (
-            "",
-            str(record.system_id),
-        ):
-            continue
-        this = next((point for point in points if point.started_at == record.started_at), None)
-        part = identity.get("profile", "unknown")
-        noise = PROFILES[part] if part in PROFILES else ProfileStore(directory).read(part).profile
-        found.append(
-            by_temperature(
-                name,
-                points,
-                curve_of(points, "gyro", noise.gyro),
-                curve_of(points, "accel", noise.accel),
-                power_up=this.power_up if this is not None else None,
-                started_at=record.started_at,
-            )
-        )
-    return found
-
-
-def _find(entries: Sequence[Entry], wanted: str | None) -> tuple[Entry, Record]:
+def _find(entries: Sequence[Entry], wanted: int | None) -> tuple[Entry, Record]:
     if wanted is None:
         return next((entry, entry.record) for entry in reversed(entries) if entry.record is not None)
-    if wanted.isdecimal():
-        found = [entry for entry in entries if entry.number == int(wanted)]
-        if found and found[0].record is None:
-            raise StorageError(f"{found[0].path}: {found[0].problem}")
-    else:
-        begins = wanted.strip().replace(" ", "T", 1)
-        found = [entry for entry in entries if entry.record and entry.record.started_at.startswith(begins)]
-    if len(found) > 1:
-        numbers = ", ".join(str(entry.number) for entry in found[-5:])
-        raise StorageError(f"{len(found)} calibrations begin with {wanted!r}; the latest are number {numbers}")
-    if not found or found[0].record is None:
+    found = next((entry for entry in entries if entry.number == wanted), None)
+    if found is None:
         first, last = entries[0].number, entries[-1].number
-        raise StorageError(f"no calibration {wanted!r}; there are number {first} to {last} (companion history)")
-    return found[0], found[0].record
+        raise StorageError(f"no calibration {wanted}; there are number {first} to {last} (companion history)")
+    if found.record is None:
+        raise StorageError(f"{found.path}: {found.problem}")
+    return found, found.record

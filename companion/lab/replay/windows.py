@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+from collections import Counter
 from collections.abc import Sequence
 from typing import Final
 
@@ -36,14 +37,6 @@ _LATITUDE_DEG: Final = 45.0
 """Any: the Earth's rate cancels, too."""
 
 
-class Refused(msgspec.Struct, frozen=True):
-    """Windows without a result, for reasons that differ in figures only."""
-
-    count: int
-    why: str
-    """Reason of the first."""
-
-
 class AxisKept(msgspec.Struct, frozen=True, kw_only=True):
     """Predictions of one axis against the windows after them, rad/s or m/s^2."""
 
@@ -67,7 +60,8 @@ class Windows(msgspec.Struct, frozen=True, kw_only=True):
     length_s: float
     count: int
     done: int
-    refused: tuple[Refused, ...]
+    refused: dict[str, int]
+    """Number of windows without a result by reason, the commonest first; reasons that differ in figures are one."""
     axes: tuple[AxisKept, ...]
     """None where fewer than two windows in a row gave a result."""
 
@@ -138,12 +132,11 @@ def _figures(imu: ImuRecord) -> Floats | None:
     return None if None in gyro or None in accel else np.hstack([np.array(gyro), np.array(accel)])
 
 
-def _counted(whys: Sequence[str]) -> tuple[Refused, ...]:
-    """Count reasons without their figures, the commonest first."""
-    kinds: dict[str, list[str]] = {}
-    for why in whys:
-        kinds.setdefault(re.sub(r"\d+(\.\d+)?", "", why), []).append(why)
-    return tuple(sorted((Refused(len(each), each[0]) for each in kinds.values()), key=lambda each: -each.count))
+def _counted(whys: Sequence[str]) -> dict[str, int]:
+    """Count reasons without their figures, the commonest first; the key is the first of a kind."""
+    kinds = Counter(re.sub(r"\d+(\.\d+)?", "", why) for why in whys)
+    first = {re.sub(r"\d+(\.\d+)?", "", why): why for why in reversed(whys)}
+    return {first[kind]: count for kind, count in kinds.most_common()}
 
 
 def _kept(found: Sequence[Floats | None], span: int, next_s: float) -> list[AxisKept]:

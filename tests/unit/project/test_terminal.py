@@ -280,7 +280,6 @@ def test_the_bar_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
         [EVIL],
         ["history", "-n", EVIL],
         ["ground", "status", "--url", EVIL],
-        ["ground", "status", "--url", EVIL],
     ],
 )
 def test_what_a_file_or_an_argument_is_called(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import re
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from xml.etree import ElementTree
 
 import msgspec
@@ -19,11 +18,7 @@ from companion.estimation.solution.by_temperature import ByTemperature, by_tempe
 from companion.estimation.solution.prior import curve_of
 from companion.physics.units import DEG_H, MG
 from companion.report.by_temperature import biases_by_temperature
-from companion.report.calibration import calibration_page
-from companion.report.source import material
-from companion.storage.learned import BiasStore, KnownImu
-from companion.storage.records import RecordStore
-from tests.support.histories import OFFSET_DEG_H, gyro_deg_h_at, imu_record, record, windows_of_days
+from tests.support.histories import OFFSET_DEG_H, gyro_deg_h_at, windows_of_days
 
 NOW = datetime.datetime(2026, 6, 1, 12, 0, tzinfo=datetime.UTC)
 MODEL, ACCEL_MODEL = PROFILES["icm42688p"].gyro, PROFILES["icm42688p"].accel
@@ -172,29 +167,3 @@ def test_where_little_was_learned_a_line_says_what_is_needed(points: list[Point]
     assert imu.needs == words
     assert words in biases_by_temperature([imu])
     assert temperature_lines([msgspec.to_builtins(imu)])[-1] == f"    {words}"
-
-
-def test_a_report_shows_them_of_its_own_vehicle_and_leaves_the_file_alone(tmp_path: Path) -> None:
-    one = record(imus=(imu_record("fc"), imu_record("other")), system_id=1)
-    RecordStore(tmp_path).save(one)
-    points = windows_of_days(7)
-    points[-2] = msgspec.structs.replace(points[-2], started_at=one.started_at)
-    identity = {"profile": "icm42688p", "system": "1"}
-    BiasStore(tmp_path).write(
-        {
-            "fc": KnownImu(identity=identity, points=tuple(points)),
-            "other": KnownImu(identity={**identity, "system": "2"}, points=tuple(points)),
-        }
-    )
-    (seen,) = material(tmp_path, None).by_temperature
-    assert seen.imu == "fc"
-    assert seen.now is not None
-    assert seen.now.degc == points[-2].temperature_degc
-    page = calibration_page(material(tmp_path, None), NOW)
-    assert "Biases by temperature" in page
-    assert "Ring and dashes: this calibration" in page
-    (tmp_path / "biases.json").write_bytes(b"nonsense")
-    broken = material(tmp_path, None)
-    assert broken.by_temperature == ()
-    assert "biases.json" in broken.damaged[0]
-    assert (tmp_path / "biases.json").read_bytes() == b"nonsense"
