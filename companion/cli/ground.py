@@ -61,18 +61,17 @@ async def _calibrate(options: argparse.Namespace) -> int:
 
 async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Awaitable[Outcome]]) -> int:
     """Find the companion, do the work, print what came of it."""
-    from companion.ground.display import Display
     from companion.ground.heard import Heard
     from companion.ground.link import open_link
-    from companion.ground.station import Station
+    from companion.ground.station import Display, Station
 
     url, key_file = getattr(options, "url", DEFAULT_URL), getattr(options, "signing_key_file", None)
     key = None if key_file is None else _key(key_file)
     heard = Heard(getattr(options, "component", 191))
     # MAVSDK prints some of its own troubles on stdout, which is for the answer alone.
-    with contextlib.redirect_stdout(sys.stderr), Display() as display:
+    with contextlib.redirect_stdout(sys.stderr):
         async with open_link(url, heard, key) as link:
-            station = Station(link, url, display)
+            station = Station(link, url, Display())
             try:
                 await station.find(getattr(options, "system", None), getattr(options, "within", 5.0))
             except NobodyHeardError as error:

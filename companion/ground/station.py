@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -19,9 +20,7 @@ from companion.ground import heard
 from companion.ground.exchange import Answer, Exchange
 from companion.ground.heard import FRESH_S, Heard, Target, Text, Vehicle
 from companion.ground.link import GroundLink
-
-if TYPE_CHECKING:
-    from companion.ground.display import Display
+from companion.printable import printable
 
 CALIBRATE, CANCEL, UNDO = mavlink.MAV_CMD_USER_1, mavlink.MAV_CMD_USER_2, mavlink.MAV_CMD_USER_3
 EVERYBODY_WITHIN_S: Final = 1.3
@@ -68,6 +67,24 @@ class Outcome:
     def answer(self) -> dict[str, Any]:
         """One JSON object."""
         return {"state": self.state, "reason": self.reason, **self.more}
+
+
+class Display:
+    """Progress and texts on stderr."""
+
+    def __init__(self) -> None:
+        self._shown: tuple[str, int] | None = None
+
+    def progress(self, percent: int, stage: str) -> None:
+        """Print a line for each stage, and for every tenth of the way."""
+        if (shown := (stage, percent // 10)) != self._shown:
+            self._shown = shown
+            self.text(f"[{percent:3d} %] {stage}")
+
+    def text(self, words: str) -> None:
+        """Print a text of the companion, without characters that a terminal obeys."""
+        sys.stderr.write(printable(words) + "\n")
+        sys.stderr.flush()
 
 
 class Station:
@@ -201,7 +218,7 @@ class Station:
         try:
             if not await self._ends(running, timeout_s):
                 self._why_cancelled = self._why_cancelled or f"not finished within {timeout_s:g} s"
-                self._display.text(f"{self._why_cancelled}: cancelling (Ctrl-C: do not wait)", urgent=True)
+                self._display.text(f"{self._why_cancelled}: cancelling (Ctrl-C: do not wait)")
                 cancelling = asyncio.create_task(self._exchange(CANCEL).run())
                 try:
                     await self._ends(running, CANCELLED_WITHIN_S)
@@ -290,7 +307,7 @@ class Station:
 
     def _on_text(self, system_id: int, text: Text) -> None:
         if system_id == self._target.system_id:
-            self._display.text(text.words, urgent=text.severity <= Severity.WARNING)
+            self._display.text(text.words)
 
     def _show_progress(self, percent: int, silent_s: float) -> None:
         if silent_s >= SILENCE_WORTH_A_WORD_S:

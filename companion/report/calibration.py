@@ -208,8 +208,8 @@ def _setting(value: float | None) -> Markup:
 
 
 def _pose(record: Record) -> Markup:
-    parts: list[Child] = [tag("h2", "Pose and place")]
-    pose, site = record.pose, record.site
+    parts: list[Child] = [tag("h2", "Pose")]
+    pose = record.pose
     if pose is None:
         parts.append(card("", "Not determined."))
     else:
@@ -224,19 +224,6 @@ def _pose(record: Record) -> Markup:
         parts.append(tag("table", *rows))
     if record.magnetic is not None:
         parts.append(tag("p", f"Compass: {record.magnetic.in_words()}."))
-    if site is not None:
-        facts = (
-            ("latitude", site.latitude_deg, ".4f", "deg"),
-            ("height", site.height_m, ".0f", "m"),
-            ("gravity", site.gravity_m_s2, ".5f", "m/s²"),
-            ("declination", site.declination_deg, "+.2f", "deg"),
-        )
-        rows_of_site = (
-            row(what, cell(f"site.{what}", *(["unknown"] if value is None else [number(value, form), f" {unit}"])))
-            for what, value, form, unit in facts
-        )
-        parts.append(tag("table", *rows_of_site))
-        parts.append(tag("p", f"Place from: {site.source or 'nobody'}.", class_="soft"))
     return tag("section", *parts)
 
 

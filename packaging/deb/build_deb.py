@@ -235,7 +235,7 @@ def try_out(stage: Path) -> None:
     """Import all that the package has of ours, with nothing but what it has: nothing that is needed was left out."""
     code = (
         "import importlib, pkgutil, companion\n"
-        "left_out = {'mavsdk', 'rich', 'sqlalchemy', 'psycopg'}\n"
+        "left_out = {'mavsdk', 'sqlalchemy', 'psycopg'}\n"
         "for module in pkgutil.walk_packages(companion.__path__, 'companion.'):\n"
         "    if module.name.endswith('__main__'):\n"
         "        continue\n"

@@ -281,17 +281,3 @@ def test_check_without_a_daemon_says_what_is_wrong(tmp_path: Path) -> None:
             assert bad.err.startswith("checking: 1.5 s")
 
     asyncio.run(main())
-
-
-def test_check_says_that_the_autopilot_has_fallen_silent(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flight_line(tmp_path) as line:
-            line.scenario.autopilot.faults.heartbeat_off = True
-            await _until_status(line.config, "that it is gone", lambda said: said["vehicle"]["heartbeat_age_s"] > 5.0)
-            check = await companion("-c", str(line.config), "check", "--json")
-            (finding,) = [each for each in check.json["findings"] if each["name"] == "autopilot"]
-            assert not finding["good"]
-            assert finding["words"].startswith("no heartbeat for ")
-            assert finding["words"].endswith(" s: power? cable?")
-
-    asyncio.run(main())

@@ -78,7 +78,7 @@ def usual(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
 def same(result: Result, records: list[Record]) -> None:
     """Every calibration was recomputed and agrees within the tolerance, biases and sigmas."""
     assert [each.not_recomputed for each in result.calibrations] == [None] * len(records)
-    assert [str(difference) for each in result.calibrations for difference in each.differences] == []
+    assert [difference for each in result.calibrations for difference in each.differences] == []
     for each, kept in zip(result.calibrations, records, strict=True):
         assert each.worst_sigmas is not None
         assert each.worst_sigmas <= TOLERANCE_SIGMAS
@@ -179,18 +179,6 @@ def test_a_window_begins_where_the_recorded_one_began_though_arming_is_not_recor
     same(replay(paths), records)
 
 
-def test_a_calibration_that_fails_before_anything_is_known_replays_as_it_was(tmp_path: Path) -> None:
-    async def during(rig: Rig) -> None:
-        rig.unplugged.add("gradienter")
-        result, _ = await calibrated(rig, timeout_s=8.0)
-        assert result.outcome == "failed"
-
-    paths, records = record(tmp_path, during)
-    (again,) = replay(paths).calibrations
-    assert again.record == records[0]
-    assert again.not_recomputed == "it ended before anything was worked out"
-
-
 @pytest.mark.parametrize("dither", [False, True])
 def test_integers_are_replayed_as_such_but_for_a_dither_which_no_recording_holds(tmp_path: Path, dither: bool) -> None:
     async def main() -> list[Record]:
@@ -227,7 +215,7 @@ def test_a_bias_that_is_not_recomputed_within_the_tolerance_is_named(
     (again,) = replay(
         [rewritten(path, tmp_path / "o.mcap", lambda topic, data: other if topic == messages.RECORD else data)]
     ).calibrations
-    assert [difference.field for difference in again.differences] == ["imus[fc].gyro_bias_rad_s[1]"] * found
+    assert [words.partition(":")[0] for words in again.differences] == ["imus[fc].gyro_bias_rad_s[1]"] * found
     assert again.worst_sigmas == pytest.approx(nudge, rel=0.05)
 
 

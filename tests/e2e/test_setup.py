@@ -305,19 +305,6 @@ def test_again_it_reads_what_is_there_and_keeps_the_old_file(tmp_path: Path) -> 
     asyncio.run(main())
 
 
-def test_what_is_configured_and_silent_today_stays(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path) as made:
-            assert (await by_script(made, *made.words(*LINES), "--no-check"))[0] == 0
-            before = made.file.read_bytes()
-        # The bench is switched off: no port, no autopilot.
-        code, answer, told = await by_script(made, *made.words(*LINES), "--no-check")
-        assert (code, answer["state"]) == (0, "unchanged"), told
-        assert made.file.read_bytes() == before
-
-    asyncio.run(main())
-
-
 def test_a_port_that_somebody_holds_is_not_opened(tmp_path: Path) -> None:
     async def main() -> None:
         async with bench(tmp_path) as made:

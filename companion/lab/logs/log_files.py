@@ -38,9 +38,6 @@ _IMUS: Final = 5
 """Most IMUs of a board: a larger number is damage."""
 
 _FIELDS: Final = ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ", "T")
-_KINDS: Final = {"IMU": ("I", _FIELDS), "IMU2": ("", _FIELDS), "IMU3": ("", _FIELDS)}
-_INSTANCES: Final = {"IMU2": 1, "IMU3": 2}
-"""Messages and their instances; newer firmware has one kind, with the instance in it."""
 _TOPICS: Final = {
     "sensor_combined": tuple(f"{name}[{k}]" for name in ("gyro_rad", "accelerometer_m_s2") for k in range(3)),
     "sensor_gyro": ("x", "y", "z", "temperature"),
@@ -220,13 +217,9 @@ def read_dataflash(path: Path) -> list[StillLog]:
     Raises:
         StorageError: one line: it cannot be read.
     """
-    data = {
-        (_INSTANCES.get(name, k), name): rows
-        for (name, k), rows in _joined_blocks(dataflash.dataflash(path, _KINDS)).items()
-        if name in _KINDS
-    }
+    data = _joined_blocks(dataflash.dataflash(path, {"IMU": ("I", _FIELDS)}))
     logs: list[StillLog] = []
-    for (instance, _), rows in sorted(data.items()):
+    for (_, instance), rows in sorted((key, rows) for key, rows in data.items() if key[0] == "IMU"):
         logs += _log(path, f"imu{instance}", rows[:, 0], rows[:, 1:7], rows[:, 7], (_CORRECTED,))
     return _some(path, logs)
 

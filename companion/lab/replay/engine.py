@@ -49,27 +49,12 @@ _SIGMAS: Final = {
 _BEFORE: Final = "it was measured before the recording began"
 
 
-class Difference(msgspec.Struct, frozen=True):
-    """One bias that came out different."""
-
-    field: str
-    """Such as imus[fc].gyro_bias_rad_s[0]."""
-    recorded: float | None
-    replayed: float | None
-    sigmas: float | None
-    """Difference in sigma_use; None where one of them is missing."""
-
-    def __str__(self) -> str:
-        size = "" if self.sigmas is None else f" ({self.sigmas:.2g} sigma)"
-        return f"{self.field}: recorded {self.recorded!r}, replayed {self.replayed!r}{size}"
-
-
 class Replayed(msgspec.Struct, frozen=True):
     """One calibration again."""
 
     record: Record
-    differences: list[Difference]
-    """Biases that differ by more than the tolerance."""
+    differences: list[str]
+    """Biases that differ by more than the tolerance, such as `imus[fc].gyro_bias_rad_s[0]: recorded ...`."""
     worst_sigmas: float | None
     """Largest difference of all biases, in sigma_use; None where nothing was recomputed."""
     not_recomputed: str | None
@@ -239,7 +224,7 @@ class Replay:
 
 def compared(recorded: Record, again: Record) -> Replayed:
     """Compare the biases of a record with those of a replay."""
-    differences: list[Difference] = []
+    differences: list[str] = []
     worst = 0.0
     ours = {imu.name: imu for imu in again.imus}
     for imu in recorded.imus:
@@ -253,7 +238,9 @@ def compared(recorded: Record, again: Record) -> Replayed:
                 off = None if one is None or other is None else float(np.abs(other - one) / sigmas[axis])
                 worst = worst if off is None else max(worst, off)
                 if off is None or not off <= TOLERANCE_SIGMAS:
-                    differences.append(Difference(f"imus[{imu.name}].{field}[{axis}]", one, other, off))
+                    size = "" if off is None else f" ({off:.2g} sigma)"
+                    where = f"imus[{imu.name}].{field}[{axis}]"
+                    differences.append(f"{where}: recorded {one!r}, replayed {other!r}{size}")
     return Replayed(again, differences, worst, None)
 
 

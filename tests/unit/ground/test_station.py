@@ -8,14 +8,12 @@ from typing import cast
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.service import Refusal
 from companion.component.statustext import Severity, Weight
 from companion.errors import ConfigError, NobodyHeardError
 from companion.estimation.request import What
-from companion.ground.display import Display
 from companion.ground.heard import Target
 from companion.ground.link import GroundLink
-from companion.ground.station import Station
+from companion.ground.station import Display, Station
 from tests.support.component import Bench, bench
 from tests.support.ground_wire import StationOnTheWire, is_final
 from tests.support.virtual_time import run_virtual
@@ -32,7 +30,7 @@ class Notes:
         if self.stages[-1:] != [text]:
             self.stages.append(text)
 
-    def text(self, text: str, *, urgent: bool) -> None:
+    def text(self, text: str) -> None:
         self.texts.append(text)
 
 
@@ -225,27 +223,6 @@ def test_a_one_way_link_is_named() -> None:
             b.wire.cut = True
             with pytest.raises(NobodyHeardError, match="component 191 of system 1 beats, but does not answer"):
                 await station.undo()
-
-    run_virtual(main())
-
-
-def test_something_else_as_component_191_is_named() -> None:
-    async def main() -> None:
-        wire = StationOnTheWire()
-        async with bench(ground=wire) as b:
-            b.service.refusal = Refusal("other", "never")
-            station = station_on(wire)
-            await station.find(1, 5.0)
-
-            def answer(target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
-                b.link.send(
-                    mavlink.MAVLink_command_ack_message(command, mavlink.MAV_RESULT_UNSUPPORTED, 0, 0, 245, 190)
-                )
-
-            wire.send_command = answer  # type: ignore[method-assign]
-            outcome = await station.calibrate(What.BOTH, None, reboot=False)
-            assert outcome.state == "refused"
-            assert "is it a companion?" in outcome.reason
 
     run_virtual(main())
 

@@ -54,22 +54,6 @@ def replay(capsys: pytest.CaptureFixture[str], path: Path, *more: str) -> tuple[
     return code, json.loads(capsys.readouterr().out)
 
 
-def test_columns_may_be_named_by_hand_and_others_are_passed_over(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    data, _ = rows(20.0)
-    path = written(tmp_path / "imu.csv", data, "common", head="")
-    more = ["--columns", UNITS["common"][0]]
-    _, plain = replay(capsys, path, *WHERE, *more)
-    # A header of other names, a remark, a column more, a log that was cut in the middle of a line.
-    lines = path.read_text(encoding="utf-8").splitlines()
-    text = "time,a,b,c,d,e,f,lamp\n# remark\n" + "\n".join(f"{line},1" for line in lines) + "\n23.1,0.0"
-    path.write_text(text, encoding="utf-8")
-    code, record = replay(capsys, path, *WHERE, "--columns", UNITS["common"][0] + ",lamp")
-    assert code == 0
-    assert record["imus"] == plain["imus"]
-
-
 def test_what_is_not_said_widens_sigma_and_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data, model = rows(30.0)
     path = written(tmp_path / "imu.csv", data)
@@ -191,14 +175,3 @@ def test_every_line_is_read_however_it_is_written(tmp_path: Path, separator: str
         log = read(path)
         found = np.column_stack([log.t_s, log.readings, log.temperature_degc])
         np.testing.assert_array_equal(found, np.array(by_hand(text, 8), dtype=np.float64))
-
-
-@pytest.mark.parametrize("line", ["30.5,0,0,0,0,0", "30.5,0,0,0,0,0,-9.8,1", "30.5,0,0,x,0,0,-9.8", "1,0,0,0,0,0,-9.8"])
-def test_a_mistake_far_behind_is_named_with_its_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str
-) -> None:
-    good = [f"{0.001 * number!r},0.0,0.0,0.0,0.0,0.0,-9.8" for number in range(30000)]
-    path = tmp_path / "imu.csv"
-    path.write_text(GOOD + "\n".join([*good, line, *good]) + "\n", encoding="utf-8")
-    assert companion(["replay", str(path)]) == 1
-    assert f"{path}, line 30002: " in capsys.readouterr().err

@@ -183,11 +183,3 @@ def test_the_extension_starts_with_a_configuration_and_keeps_an_edited_one(tmp_p
     configuration.write_text("# mine\n")
     assert start() == (out, "")
     assert configuration.read_text() == "# mine\n"
-
-
-def test_the_router_of_blueos_takes_the_place_of_the_serial_line() -> None:
-    edit = re.search(r"RUN sed '([^']+)' (\S+) > \S+", (BLUEOS / "Dockerfile").read_text())
-    assert edit is not None
-    source = PROJECT / edit[2].removeprefix("/src/")
-    edited = subprocess.run(["sed", edit[1], str(source)], capture_output=True, text=True, check=True).stdout
-    assert tomllib.loads(edited)["mavlink"]["url"] == "tcp:127.0.0.1:5777"

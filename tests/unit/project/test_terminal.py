@@ -25,8 +25,8 @@ from companion.cli import main, monitor
 from companion.cli.show import finding_lines
 from companion.daemon.process.check import Finding
 from companion.errors import LinkError
-from companion.ground.display import Display
 from companion.ground.heard import Heard, Target
+from companion.ground.station import Display
 from companion.links.serial.ports import Holder, SerialPort
 from companion.links.system import logs
 from companion.links.system.logs import JournalFormatter, OneLineFormatter
@@ -263,9 +263,9 @@ def test_what_is_heard_on_the_ground(
 
 def test_the_bar_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", to := io.StringIO())
-    with Display() as display:
-        display.text(EVIL, urgent=True)
-        display.progress(20, EVIL)
+    display = Display()
+    display.text(EVIL)
+    display.progress(20, EVIL)
     assert clean(to.getvalue()) == f"{SHOWN}\n[ 20 %] {SHOWN}\n"
 
 
