@@ -60,7 +60,6 @@ async def _calibrate(options: argparse.Namespace) -> int:
 
 
 async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Awaitable[Outcome]]) -> int:
-    """Find the companion, do the work, print what came of it."""
     from companion.ground.heard import Heard
     from companion.ground.link import open_link
     from companion.ground.station import Display, Station

@@ -257,7 +257,6 @@ async def report(options: argparse.Namespace) -> int:
 
 
 def _save(output: str, name: str, content: bytes) -> Path:
-    """Write a page to the file or into the folder that is named, or here."""
     from companion.storage.state import write_atomically
 
     path = _absolute(output or name)

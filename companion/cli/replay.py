@@ -102,7 +102,6 @@ def _lines(result: Result) -> list[str]:
 
 
 def _add_log_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a log that is no recording of ours."""
     log = parser.add_argument_group("for a log (docs/recording.md)")
     add_table_options(log)
     log.add_argument("--imu", metavar="NAME", help="which one, where there are several")

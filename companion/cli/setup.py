@@ -94,11 +94,7 @@ class _Session:
         }  # fmt: skip
 
     async def run(self) -> None:
-        """Run the whole session.
-
-        Raises:
-            CompanionError: it cannot go on; `so_far` says what has become of the file.
-        """
+        """Run the whole session."""
         say = self.asking.say
         if not drafting.is_writable(self._path):
             raise CompanionError(
@@ -156,7 +152,6 @@ class _Session:
         return draft
 
     def _given(self) -> dict[str, str]:
-        """Read the answers on the command line, by question."""
         options = self._options
         given = {"vehicle.platform": options.platform, "gradienter.law": options.law}
         for words in options.mounting:
@@ -276,7 +271,6 @@ class _Session:
             self.answer["kept"] = str(kept)
 
     async def _finish(self, *, runs: bool) -> None:
-        """Check the configuration, offer the service, list the next steps."""
         parsed = load_config(self._options, profiles=True)
         good, checks = True, not runs and not self._options.no_check
         if checks:

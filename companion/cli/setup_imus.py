@@ -20,11 +20,7 @@ COARSE: Final = "It sends whole steps of 206 deg/h and 1 mg: a gyro bias below o
 
 
 def parts_given(options: Sequence[str]) -> dict[str, str]:
-    """Read the --part options: answers by the keys of their questions.
-
-    Raises:
-        ConfigError: an option names no part.
-    """
+    """Read the --part options: answers by the keys of their questions."""
     given = {}
     for words in options:
         name, _, part = words.partition("=")

@@ -85,11 +85,7 @@ def load_config(options: argparse.Namespace, *, profiles: bool = False, forgivin
 
 
 def storage_path(options: argparse.Namespace) -> Path:
-    """The storage directory of the configuration; where none is named and the default one is not there, the usual one.
-
-    Raises:
-        ConfigError: the configuration that -c names cannot be read.
-    """
+    """Give the storage directory of the configuration; without -c and a default configuration, the usual one."""
     try:
         return load_config(options).storage.path
     except ConfigError:

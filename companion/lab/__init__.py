@@ -1,1 +1,1 @@
-"""Desk tools: replay of recordings and logs, noise profiles, reports and flights. The daemon imports none of them."""
+"""Desk tools: replay, noise profiles, flights. Readers raise StorageError, in one line, for an unusable file."""

@@ -68,11 +68,7 @@ def disk_shortage(folder: Path) -> str | None:
 
 
 def open_new(path: Path) -> IO[bytes]:
-    """Create a file that does not exist yet, for its owner alone: positions and signatures are in it.
-
-    Raises:
-        OSError: it does, or it cannot be created.
-    """
+    """Create a file that does not exist yet, for its owner alone: positions and signatures are in it."""
     return open(path, "xb", opener=lambda name, flags: os.open(name, flags, 0o600))
 
 
@@ -84,11 +80,7 @@ def is_available() -> bool:
 
 
 class RecordingFile:
-    """One MCAP file in the making.
-
-    Raises:
-        StorageError: it cannot be created.
-    """
+    """One MCAP file in the making."""
 
     def __init__(self, path: Path, opener: Opener = open_new, free_bytes: FreeBytes = _free_bytes) -> None:
         from mcap.writer import CompressionType, IndexType, Writer
@@ -121,11 +113,7 @@ class RecordingFile:
         return 0 if self._file is None else int(self._file.tell())
 
     def write(self, batch: Sequence[Message], beginning: Beginning, *, continues: bool = False) -> None:
-        """Add messages, finish the chunk and sync it; the beginning comes before the first.
-
-        Raises:
-            StorageError: the disk refuses; the file ends here, and what it has can be replayed.
-        """
+        """Add messages, finish the chunk and sync it; the beginning comes before the first."""
         if self._file is None:
             return
         try:
@@ -145,11 +133,7 @@ class RecordingFile:
             raise
 
     def close(self) -> None:
-        """Finish the file.
-
-        Raises:
-            StorageError: the disk refuses; all but the index is there.
-        """
+        """Finish the file."""
         if self._file is None:
             return
         try:
@@ -202,11 +186,7 @@ class RecordingFile:
 
 
 def unused_path(folder: Path) -> Path:
-    """Path of a recording on request that was given no name; creates the folder.
-
-    Raises:
-        StorageError: the folder cannot be used.
-    """
+    """Path of a recording on request that was given no name; creates the folder."""
     try:
         folder.mkdir(FOLDER_MODE, exist_ok=True)
         numbers = [int(path.stem[5:]) for path in folder.glob("kept-*.mcap") if path.stem[5:].isdecimal()]
@@ -216,11 +196,7 @@ def unused_path(folder: Path) -> Path:
 
 
 def create_on_request(path: Path) -> RecordingFile:
-    """Create the file of a recording on request.
-
-    Raises:
-        StorageError: the disk has too little room for one, or the file cannot be created.
-    """
+    """Create the file of a recording on request."""
     if (shortage := disk_shortage(path.parent)) is not None:
         raise StorageError(f"{path}: not recorded, with {shortage}; make room")
     return RecordingFile(path)
@@ -250,11 +226,7 @@ class Ring:
         return self._current is not None and self._current.bytes_written >= self.most_bytes // PARTS
 
     def write(self, batch: Sequence[Message], beginning: Beginning) -> None:
-        """Add messages to the present file; after `close` to the next one.
-
-        Raises:
-            StorageError: the disk refuses; the file ends here.
-        """
+        """Add messages to the present file; after `close` to the next one."""
         try:
             if self._current is None:
                 self._next()
@@ -274,11 +246,7 @@ class Ring:
             raise StorageError(f"{self.folder}: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """Finish the present file.
-
-        Raises:
-            StorageError: the disk refuses.
-        """
+        """Finish the present file."""
         current, self._current = self._current, None
         if current is not None:
             current.close()

@@ -114,11 +114,7 @@ def encode(message: Any) -> bytes:
 
 
 def decode(topic: str, data: bytes) -> Any:
-    """Decode the struct of a topic.
-
-    Raises:
-        ValueError: it is nothing that this version could have written.
-    """
+    """Decode the struct of a topic."""
     if len(data) > MOST_BYTES:
         raise ValueError(f"found {len(data)} bytes; allowed: {MOST_BYTES}")
     kind = ImuState if topic.startswith(IMU) else _TYPES[topic]

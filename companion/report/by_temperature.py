@@ -90,7 +90,6 @@ def _power_up(plot: svg.Plot, dots: Sequence[_Dot], axis: int, class_: str) -> N
 
 
 def _mark(plot: svg.Plot, degc: float, bias: float) -> None:
-    """Mark the temperature now, and the bias."""
     plot.upright(degc, "now")
     x, y = plot.at(degc, bias)
     plot.draw(tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=8, class_="ring"))

@@ -22,11 +22,7 @@ _NO_SIGMA: Final = (math.inf,) * 3
 
 
 def material(directory: Path, wanted: int | None) -> Material:
-    """Read the content of a page by a calibration's number; None: the latest.
-
-    Raises:
-        StorageError: there is nothing to make a page of, none of that number, or it cannot be read.
-    """
+    """Read the content of a page by a calibration's number; None: the latest."""
     store, records = RecordStore(directory), directory / "records"
     try:
         # Else a folder that only root may enter looks like one that is not there.

@@ -48,11 +48,7 @@ _TURNING_US: Final = 30.0
 
 
 def read(path: Path, progress: Progress) -> Iterator[Boot]:
-    """Each start of the autopilot in it, one after another: memory is that of one.
-
-    Raises:
-        StorageError: one line: it cannot be read.
-    """
+    """Each start of the autopilot in it, one after another: memory is that of one."""
     fields = {name: len(columns) for name, (_, columns) in _ROWS.items()}
     return map(_boot, starts(dataflash(path, _ROWS, progress), fields))
 

@@ -63,11 +63,7 @@ class Knowledge(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def read(path: Path, progress: Progress) -> Iterator[Boot]:
-    """Read each start of the autopilot in a log.
-
-    Raises:
-        StorageError: one line: it cannot be read, or is another file.
-    """
+    """Read each start of the autopilot in a log."""
     try:
         reader = reader_of(path)
     except OSError as error:
@@ -128,7 +124,6 @@ def _system_id(values: Mapping[str, float]) -> int | None:
 
 
 def _during(found: Increments, stages: Stages) -> Increments:
-    """Select the increments of one flight."""
     start_s, end_s = stages.armed_s - _STOOD_S, stages.disarmed_s or math.inf
     inside = (found.t_s > start_s) & (found.t_s < end_s)
     return Increments(*(each[inside] for each in found))
@@ -348,11 +343,7 @@ class _LoggedParameters:
 
 
 async def _calibration_in(firmware: FirmwareName, values: Mapping[str, float], imu: FlownImu) -> ImuCalibration:
-    """Read what the autopilot corrected an IMU with from the parameters in the log.
-
-    Raises:
-        AutopilotError: a parameter is missing.
-    """
+    """Read what the autopilot corrected an IMU with from the parameters in the log."""
     memory = SlotMemory()
     ids: dict[Triad, int | None] = {"gyro": imu.gyro_id, "accel": imu.accel_id}
     for sensor, device_id in ids.items():

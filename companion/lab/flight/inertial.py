@@ -159,7 +159,7 @@ class _Carried(NamedTuple):
 
 
 def _carry(found: Increments) -> _Carried:
-    """(n + 1, ...) before the first increment and after each."""
+    """Integrate from the beginning: (n + 1, ...), before the first increment and after each."""
     turn = np.concatenate([np.eye(3)[None], running_products(rotations(found.angle))])
     added = np.einsum("nij,nj->ni", turn[:-1], found.velocity)
     velocity = np.concatenate([np.zeros((1, 3)), np.cumsum(added, axis=0)])

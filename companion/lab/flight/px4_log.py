@@ -42,11 +42,7 @@ _TURNING: Final = 0.02
 
 
 def read(path: Path, progress: Progress) -> Iterator[Boot]:
-    """Each start of the autopilot in it: of PX4 there is one in a file, unless somebody has put several together.
-
-    Raises:
-        StorageError: one line: it cannot be read.
-    """
+    """Each start of the autopilot in it: of PX4 there is one in a file, unless somebody has put several together."""
     fields = {name: len(columns) for name, columns in _TOPICS.items()}
     return map(_boot, starts(ulog(path, _TOPICS, progress), fields))
 

@@ -63,9 +63,6 @@ def read(path: Path, columns: str | None = None, rate_hz: float | None = None, n
     """Read a CSV file: semicolons, tabs, commas or blanks; "#" begins a remark.
 
     `columns`, separated by commas, take the place of the file's header, and a rate that of its times.
-
-    Raises:
-        StorageError: one line with the number of the line, what was found and what is allowed.
     """
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
@@ -115,11 +112,7 @@ def read(path: Path, columns: str | None = None, rate_hz: float | None = None, n
 
 
 def columns_of(names: Sequence[str], where: str, *, timed: bool) -> dict[str, Column]:
-    """Map quantities to columns; one is time, if `timed`.
-
-    Raises:
-        StorageError: a quantity is missing, or is there twice.
-    """
+    """Map quantities to columns; one is time, if `timed`."""
     used: dict[str, Column] = {}
     for place, name in enumerate(names):
         if (known := COLUMNS.get(name)) is not None:

@@ -63,11 +63,7 @@ class _Kind:
 
 
 def dataflash(path: Path, fields: Fields, progress: Progress = nobody) -> Iterator[Block | None]:
-    """Give these messages and the parameters; None where another log begins in the same file.
-
-    Raises:
-        StorageError: one line: it cannot be read.
-    """
+    """Give these messages and the parameters; None where another log begins in the same file."""
     kinds: dict[bytes, _Kind] = {MAGIC: _Kind(_FMT.itemsize + 3)}
     left = b""
     for piece in _pieces(path, progress):

@@ -48,11 +48,7 @@ _TOPICS: Final = {
 def read_logs(
     paths: Sequence[Path], columns: str | None = None, rate_hz: float | None = None, csv_name: str = NAME
 ) -> list[StillLog]:
-    """All IMUs in all files of any kind, one entry for each IMU and session; the rest as for `csv_log.read`.
-
-    Raises:
-        StorageError: a file cannot be read, in one line.
-    """
+    """All IMUs in all files of any kind, one entry for each IMU and session; the rest as for `csv_log.read`."""
     found: list[StillLog] = []
     for path in paths:
         try:
@@ -176,11 +172,7 @@ def _goes_on(before: StillLog, log: StillLog) -> bool:
 
 
 def reader_of(path: Path) -> Callable[[Path], list[StillLog]] | None:
-    """Return the reader of an autopilot's log; None: the file is none.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Return the reader of an autopilot's log; None: the file is none."""
     with path.open("rb") as file:
         head = file.read(len(ulog.MAGIC))
     if head.startswith(ulog.MAGIC):
@@ -189,11 +181,7 @@ def reader_of(path: Path) -> Callable[[Path], list[StillLog]] | None:
 
 
 def read_ulog(path: Path) -> list[StillLog]:
-    """Read the IMUs of a PX4 log: sensor_combined, by which PX4 flies, and each pair of sensor_gyro and sensor_accel.
-
-    Raises:
-        StorageError: one line: it cannot be read.
-    """
+    """Read the IMUs of a PX4 log: sensor_combined, which PX4 flies by, and pairs of sensor_gyro and sensor_accel."""
     data = _joined_blocks(ulog.ulog(path, _TOPICS))
     dropouts = len(data.get((DROPOUTS, 0), ()))
     notes = (f"gaps in it, in which PX4 could not write: {dropouts}",) if dropouts else ()
@@ -212,11 +200,7 @@ def read_ulog(path: Path) -> list[StillLog]:
 
 
 def read_dataflash(path: Path) -> list[StillLog]:
-    """Read the IMUs of an ArduPilot log, from its IMU messages.
-
-    Raises:
-        StorageError: one line: it cannot be read.
-    """
+    """Read the IMUs of an ArduPilot log, from its IMU messages."""
     data = _joined_blocks(dataflash.dataflash(path, {"IMU": ("I", _FIELDS)}))
     logs: list[StillLog] = []
     for (_, instance), rows in sorted((key, rows) for key, rows in data.items() if key[0] == "IMU"):
@@ -225,7 +209,6 @@ def read_dataflash(path: Path) -> list[StillLog]:
 
 
 def _joined_blocks(blocks: Iterable[Block | None]) -> dict[tuple[str, int], Floats]:
-    """Join the rows of each message and instance."""
     found: dict[tuple[str, int], list[Floats]] = defaultdict(list)
     for block in blocks:
         if block is not None and block.instance < _IMUS:

@@ -28,11 +28,7 @@ _KINDS: Final = {
 
 
 def config_of(found: recording.Head, where: object) -> Config:
-    """Decode the configuration in force.
-
-    Raises:
-        StorageError: another version wrote it.
-    """
+    """Decode the configuration in force."""
     try:
         return msgspec.json.decode(found.config, type=Config)
     except ValueError as error:

@@ -47,22 +47,14 @@ class _DamagedError(Exception):
 
 
 def is_text(path: Path) -> bool:
-    """Return whether a file is no recording but looks like a log in text.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Return whether a file is no recording but looks like a log in text."""
     with path.open("rb") as file:
         head = file.read(len(MAGIC))
     return bool(head) and not MAGIC.startswith(head) and b"\0" not in head
 
 
 class Recording:
-    """An MCAP file of ours.
-
-    Raises:
-        StorageError: one line: it cannot be read, is empty, or is no MCAP file.
-    """
+    """An MCAP file of ours."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -79,11 +71,7 @@ class Recording:
             raise StorageError(f"{path}: not a recording (MCAP), nor any log that is known")
 
     def items(self, wanted: Callable[[str], bool] = lambda topic: True) -> Iterator[Head | Message]:
-        """Give the head, then the messages on wanted topics in the order of writing, until the end or a cut.
-
-        Raises:
-            StorageError: one line: another program or another version wrote it.
-        """
+        """Give the head, then the messages on wanted topics in the order of writing, until the end or a cut."""
         try:
             import zstandard
             from mcap import exceptions, records, stream_reader

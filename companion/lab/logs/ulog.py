@@ -32,11 +32,7 @@ class _Counted(io.BufferedReader):
         self._size, self._read, self._progress = max(path.stat().st_size, 1), 0, progress
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read so many bytes.
-
-        Raises:
-            StorageError: the file has been read several times over.
-        """
+        """Read so many bytes."""
         data = super().read(size)
         before, self._read = self._read, self._read + len(data)
         if before >> 20 != self._read >> 20:
@@ -47,11 +43,7 @@ class _Counted(io.BufferedReader):
 
 
 def ulog(path: Path, topics: Topics, progress: Progress = nobody) -> Iterator[Block]:
-    """Give these topics, the parameters and the dropouts.
-
-    Raises:
-        StorageError: one line: it cannot be read.
-    """
+    """Give these topics, the parameters and the dropouts."""
     try:
         from pyulog import ULog
     except ImportError:

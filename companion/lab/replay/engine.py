@@ -92,11 +92,7 @@ class Replay:
         self._not_recomputed = _BEFORE
 
     def take(self, message: Message) -> None:
-        """Replay the next message.
-
-        Raises:
-            StorageError: this version cannot have written it.
-        """
+        """Replay the next message."""
         try:
             self._take(message.topic, message.data, message.t_s)
         except UNUSABLE as error:
@@ -256,11 +252,7 @@ def _change(collector: RollingCollector, before: ImuState | None, state: ImuStat
 
 
 def replay(paths: Iterable[Path]) -> Result:
-    """Replay recordings in this order, each to its end or to where it is cut.
-
-    Raises:
-        StorageError: one line: a file is none of ours, or was made by another version.
-    """
+    """Replay recordings in this order, each to its end or to where it is cut."""
     found: Replay | None = None
     cut_short: str | None = None
     for path in paths:

@@ -201,7 +201,6 @@ class _Pass:
 
 
 def _rows(log: StillLog, offset_s: float) -> Iterator[tuple[float, Vector, Vector, float | None]]:
-    """Give time, rates, forces and temperature of each sample."""
     for at in range(0, len(log.t_s), _AT_ONCE):
         part = slice(at, at + _AT_ONCE)
         times = (log.t_s[part] + offset_s).tolist()
