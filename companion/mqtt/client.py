@@ -11,7 +11,6 @@ import asyncio
 import contextlib
 import datetime
 import importlib
-import importlib.util
 import logging
 import math
 import ssl
@@ -318,15 +317,13 @@ def _left_out_words(size: float) -> str:
 
 
 def _load_library() -> str | None:
-    """Import aiomqtt, in a thread as it takes a while; returns what is wrong with it, in words."""
+    """Import aiomqtt, in a thread as it takes a while; return why it cannot be used, in words."""
     try:
-        if importlib.util.find_spec("aiomqtt") is None:
-            return f"MQTT needs aiomqtt, which is not installed ({INSTALL}); the companion goes on without MQTT"
-        importlib.import_module("aiomqtt")
         # Imported here: it takes as long as all of the links.
         from importlib.metadata import version
 
         found = version("aiomqtt")
+        importlib.import_module("aiomqtt")
     except Exception as error:  # noqa: BLE001 - whatever a broken installation raises
         return f"aiomqtt cannot be loaded: {error} ({INSTALL}); the companion goes on without MQTT"
     if not found.startswith("2."):

@@ -1,53 +1,104 @@
-"""What there is to tell, out of the storage directory: whoever has written it there, and whenever, each thing once.
+"""Finds in the storage directory what the fleet has not been told yet, and tells each thing once.
 
-Not told as it happens: what the disk has is what has happened, after a crash too, and before the fleet was switched on.
+The files are read as plain JSON: the collector checks the bodies, and the types of the records would load numpy. The
+disk is the source, not the daemon's events: it has what happened before a crash, and before the fleet was configured.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
 from companion.errors import StorageError
-from companion.estimation.records.record import Record
-from companion.storage.changes import PREDICTION
+from companion.formats import Object
 from companion.storage.fleet_items import Clock, Entry, FleetItems, Item, Mark
-from companion.storage.flights import FlightStore
-from companion.storage.learned import alignment_in, alignments_in, armings_in, faces_in
-from companion.storage.profiles import ProfileStore
-from companion.storage.records import RecordStore
+from companion.storage.state import BoundedList, StateFile, named_in
 
 RECORD, ARMING, BY_HAND, PROFILE, FLIGHT, IMU = "record/", "arming/", "by-hand/", "profile/", "flight/", "imu/"
-"""What marks begin with."""
+"""Prefixes of marks."""
 TOLD: Final = "told"
 _WATCHED: Final = ("records", "armings.json", "by-hand.json", "profiles", "flights")
+_NAME: Final = re.compile(r"([a-z0-9][a-z0-9._-]*)\.json")
+_LISTED: Final = 200
+"""Most entries of a list; the daemon keeps no more."""
+FORMAT_VERSION: Final = 1
+"""Newest format of the files."""
 
 Told = tuple[str, list[Item]]
 """The value of the mark, and the items."""
 
 
+class _Imu(msgspec.Struct, frozen=True):
+    name: str = ""
+    gyro_id: int | None = None
+    accel_id: int | None = None
+
+
+class _Keys(msgspec.Struct, frozen=True):
+    """Keys that are needed here, of a file or an entry of any kind."""
+
+    system_id: int | None = None
+    undone_at: str | None = None
+    started_at: str = ""
+    imus: list[_Imu] = []
+    what: str = ""
+    state: str = ""
+    measured_at: str = ""
+    armed_at: str = ""
+    saved_at: str = ""
+    read_at: str = ""
+    key: str = ""
+    began_at: str | None = None
+    flight: _Keys | None = None
+
+
+_Found = tuple[_Keys, Object]
+"""The keys, and the whole."""
+
+
 def utc(at: str) -> str:
-    """A time of ours as it is told."""
+    """Return a time of a record in the contract's form."""
     return f"{at.removesuffix('+00:00')}Z" if at.endswith("+00:00") else at
 
 
+class Look(msgspec.Struct, frozen=True):
+    """Aircraft that the items found now belong to."""
+
+    aircraft: str
+    system_id: int | None
+    """MAVLink system; records of another one do not belong to the aircraft. None: all do."""
+    clock: Callable[[str], Clock]
+    """Returns how good the clock was at a time."""
+
+    def owns(self, system_id: int | None) -> bool:
+        """Whether a record of that MAVLink system belongs to the aircraft."""
+        return self.system_id is None or system_id in (None, self.system_id)
+
+    def item(self, kind: str, at: str, body: object) -> Item:
+        """Make an item."""
+        return Item(kind, utc(at), self.clock(at), msgspec.json.encode(body))
+
+    def undo(self, what: str, of: str, undone_at: str) -> Item:
+        """Make the item of an undo of what was written by `what` at `of`."""
+        return self.item("undo", undone_at, {"what": what, "of": of, "undone_at": undone_at})
+
+
 class Sources:
-    """Of one storage directory, with the marks of what was taken in `items`; reading is blocking."""
+    """Files of one storage directory; marks of what was told are in `items`. Reading blocks."""
 
     def __init__(self, directory: Path, items: FleetItems) -> None:
         self._directory, self._items = directory, items
-        self._records, self._profiles = RecordStore(directory), ProfileStore(directory)
-        self._flights = FlightStore(directory)
         self._seen: tuple[str, ...] | None = None
         self._settled = False
 
     def has_news(self) -> bool:
         """Whether something may have been written since the last call.
 
-        Once more after each change: what is written in the same tick of the file system's clock changes no time.
+        Once more after each change: a second write in the same tick of the file system's clock changes no time.
         """
         seen = tuple(_stamp(self._directory / name) for name in _WATCHED)
         settled, self._settled = self._settled, seen == self._seen
@@ -55,22 +106,22 @@ class Sources:
         return not (settled and self._settled)
 
     def entries(self, look: Look) -> Iterator[Entry]:
-        """What was not taken yet.
+        """Yield what was not told yet.
 
         Raises:
-            StorageError: something cannot be read.
+            StorageError: a list or a folder cannot be read.
         """
-        yield from self._of_records(look)
-        yield from self._of_stands(look)
-        at = {one.armed_at: one for one in armings_in(self._directory).all()}
+        yield from self._records(look)
+        yield from self._alignments(look)
+        armings = {one.armed_at: body for one, body in self._listed("armings.json")}
         yield from self._told(
-            ARMING, dict.fromkeys(at, TOLD), lambda key, _: (TOLD, [look.item("arming", key, at[key])])
+            ARMING, dict.fromkeys(armings, TOLD), lambda key, _: (TOLD, [look.item("arming", key, armings[key])])
         )
-        yield from self._of_profiles(look)
-        yield from self._of_flights(look)
+        yield from self._profiles(look)
+        yield from self._flights(look)
 
     def _told(self, prefix: str, stamps: Mapping[str, str], tell: Callable[[str, str], Told]) -> Iterator[Entry]:
-        """Of each whose stamp is another one than before, what `tell` makes of it and of the value before."""
+        """Yield an entry for each key whose stamp differs from its mark; `tell` makes it from the mark's value."""
         marks = self._items.marks(prefix)
         for key, stamp in stamps.items():
             before = marks.pop(prefix + key, Mark("", ""))
@@ -80,121 +131,103 @@ class Sources:
         if marks:
             self._items.forget(marks)
 
-    def _of_records(self, look: Look) -> Iterator[Entry]:
-        imus = {key: mark.value for key, mark in self._items.marks(f"{IMU}{look.aircraft}/").items()}
-        exchanged: dict[str, Mark] = {}
+    def _stamps(self, folder: str) -> dict[str, str]:
+        """Return the stamp of each JSON file of a folder by its name, in order."""
+        path = self._directory / folder
+        return {name: _stamp(path / f"{name}.json") for name in named_in(path, _NAME)}
+
+    def _read(self, name: str) -> _Found | None:
+        """Return the content of a file; None: there is none that can be read."""
+        try:
+            body = StateFile[Object](self._directory / name, dict[str, Any], newest=FORMAT_VERSION).read()
+            return None if body is None else (msgspec.convert(body, _Keys), body)
+        except (StorageError, msgspec.ValidationError):
+            return None
+
+    def _listed(self, name: str) -> list[_Found]:
+        bodies = BoundedList(self._directory / name, dict, _LISTED).all()
+        try:
+            return [(msgspec.convert(body, _Keys), body) for body in bodies]
+        except msgspec.ValidationError as error:
+            raise StorageError(f"{self._directory / name}: cannot be used: {error}") from error
+
+    def _records(self, look: Look) -> Iterator[Entry]:
+        parts = {key: mark.value for key, mark in self._items.marks(f"{IMU}{look.aircraft}/").items()}
+        changed: dict[str, Mark] = {}
 
         def tell(number: str, before: str) -> Told:
-            record = self._records.entry(int(number)).record
-            if record is None or not look.is_its(record.system_id):
+            found = self._read(f"records/{number}.json")
+            if found is None or not look.owns(found[0].system_id):
                 return before, []
+            record, body = found
             began, _, undone_at = before.partition(" ")
             items = []
             if began != record.started_at:
-                exchanged.update(_parts(look.aircraft, record))
-                items += [look.exchanged(record, key, imus.get(key), mark.value) for key, mark in exchanged.items()]
-                imus.update({key: mark.value for key, mark in exchanged.items()})
-                items.append(look.item("calibration", record.started_at, record))
+                for imu in record.imus:
+                    ids = {"gyro_id": imu.gyro_id, "accel_id": imu.accel_id}
+                    if (imu.gyro_id, imu.accel_id) == (None, None):
+                        continue
+                    key, now = f"{IMU}{look.aircraft}/{imu.name}", msgspec.json.encode(ids).decode()
+                    if parts.get(key, now) != now:
+                        earlier = msgspec.json.decode(parts[key])
+                        event = {"what": "imu exchanged", "imu": imu.name, "before": earlier, "now": ids}
+                        items.append(look.item("event", record.started_at, event))
+                    parts[key], changed[key] = now, Mark("", now)
+                items.append(look.item("calibration", record.started_at, body))
             if record.undone_at is not None and undone_at != record.undone_at:
                 items.append(look.undo("calibration", record.started_at, record.undone_at))
-            return f"{record.started_at} {record.undone_at or ''}", [item for item in items if item is not None]
+            return f"{record.started_at} {record.undone_at or ''}", items
 
-        stamps = {f"{number:06d}": stamp for number, stamp in self._records.stamps().items()}
-        for entry in self._told(RECORD, stamps, tell):
-            yield Entry({**entry.marks, **exchanged}, entry.items)
-            exchanged.clear()
+        for entry in self._told(RECORD, self._stamps("records"), tell):
+            yield Entry({**entry.marks, **changed}, entry.items)
+            changed.clear()
 
-    def _of_stands(self, look: Look) -> Iterator[Entry]:
-        file = alignments_in(self._directory)
-        done = {f"{each.what} {each.measured_at}": each for each in file.all() if each.what != PREDICTION}
+    def _alignments(self, look: Look) -> Iterator[Entry]:
+        listed = self._listed("by-hand.json")
+        # "predicted": gyro offsets that version 0.1 wrote.
+        done = {f"{one.what} {one.measured_at}": (one, body) for one, body in listed if one.state != "predicted"}
 
         def tell(key: str, before: str) -> Told:
-            each, items = done[key], []
-            if not look.is_its(each.system_id):
-                return before, []
+            one, body = done[key]
+            items: list[Item] = []
+            if not look.owns(one.system_id):
+                return before, items
             if before != TOLD:
-                body = {**msgspec.to_builtins(each), "record": self._figures(each.measured_at)}
-                items.append(look.item("alignment", each.measured_at, body))
-            if each.undone_at is not None:
-                items.append(look.undo(each.what, each.measured_at, each.undone_at))
+                told = {"undone_at": None, **body, "record": self._figures(one.measured_at)}
+                items.append(look.item("alignment", one.measured_at, told))
+            if one.undone_at is not None:
+                items.append(look.undo(one.what, one.measured_at, one.undone_at))
             return TOLD, items
 
-        return self._told(BY_HAND, {key: each.undone_at or TOLD for key, each in done.items()}, tell)
+        return self._told(BY_HAND, {key: one.undone_at or TOLD for key, (one, _) in done.items()}, tell)
 
-    def _figures(self, measured_at: str) -> object:
-        """The record of an alignment, while it is the latest of its kind."""
-        for file in (alignment_in(self._directory), faces_in(self._directory)):
-            record = file.read()
-            if record is not None and record.measured_at == measured_at:
-                return record
+    def _figures(self, measured_at: str) -> Object | None:
+        """Return the record of an alignment, while it is the latest of its kind."""
+        for name in ("alignment.json", "faces.json"):
+            found = self._read(name)
+            if found is not None and found[0].measured_at == measured_at:
+                return found[1]
         return None
 
-    def _of_profiles(self, look: Look) -> Iterator[Entry]:
+    def _profiles(self, look: Look) -> Iterator[Entry]:
         def tell(name: str, before: str) -> Told:
-            try:
-                profile = self._profiles.read(name)
-            except StorageError:
+            found = self._read(f"profiles/{name}.json")
+            if found is None or found[0].saved_at == before:
                 return before, []
-            is_new = profile.saved_at != before
-            return profile.saved_at, [look.item("profile", profile.saved_at, profile)] if is_new else []
+            return found[0].saved_at, [look.item("profile", found[0].saved_at, found[1])]
 
-        return self._told(PROFILE, {name: _stamp(self._profiles.path(name)) for name in self._profiles.names()}, tell)
+        return self._told(PROFILE, self._stamps("profiles"), tell)
 
-    def _of_flights(self, look: Look) -> Iterator[Entry]:
+    def _flights(self, look: Look) -> Iterator[Entry]:
         def tell(number: str, before: str) -> Told:
-            try:
-                kept = self._flights.read(int(number))
-            except StorageError:
+            found = self._read(f"flights/{number}.json")
+            flight = None if found is None else found[0].flight
+            # A flight whose log was read again is the same flight.
+            if found is None or flight is None or before == flight.key or not look.owns(flight.system_id):
                 return before, []
-            # Read again from its log, it is the same flight.
-            if kept is None or before == kept.flight.key or not look.is_its(kept.flight.system_id):
-                return before, []
-            return kept.flight.key, [look.item("flight", kept.flight.began_at or kept.read_at, kept)]
+            return flight.key, [look.item("flight", flight.began_at or found[0].read_at, found[1])]
 
-        numbers = [f"{number:06d}" for number in self._flights.numbers()]
-        folder = self._flights.folder
-        return self._told(FLIGHT, {number: _stamp(folder / f"{number}.json") for number in numbers}, tell)
-
-
-class Look(msgspec.Struct, frozen=True):
-    """Whose all is that is found now."""
-
-    aircraft: str
-    system_id: int | None
-    """What was recorded of another MAVLink system is not its; None: all is."""
-    clock: Callable[[str], Clock]
-    """How good the clock was at a time."""
-
-    def is_its(self, system_id: int | None) -> bool:
-        """Whether what was recorded of that system is."""
-        return self.system_id is None or system_id in (None, self.system_id)
-
-    def item(self, kind: str, at: str, body: object) -> Item:
-        """Something to be told."""
-        return Item(kind, utc(at), self.clock(at), msgspec.json.encode(body))
-
-    def undo(self, what: str, of: str, undone_at: str) -> Item:
-        """What was written by `what` at `of` was put back."""
-        return self.item("undo", undone_at, {"what": what, "of": of, "undone_at": undone_at})
-
-    def exchanged(self, record: Record, key: str, before: str | None, now: str) -> Item | None:
-        """That an IMU is another part than before, if so."""
-        if before in (None, now):
-            return None
-        before_ids, now_ids = (msgspec.json.decode(ids) for ids in (before or "", now))
-        body = {"what": "imu exchanged", "imu": key.rpartition("/")[2], "before": before_ids, "now": now_ids}
-        return self.item("event", record.started_at, body)
-
-
-def _parts(aircraft: str, record: Record) -> dict[str, Mark]:
-    """Which part each IMU is, where it is known."""
-    return {
-        f"{IMU}{aircraft}/{imu.name}": Mark(
-            "", msgspec.json.encode({"gyro_id": imu.gyro_id, "accel_id": imu.accel_id}).decode()
-        )
-        for imu in record.imus
-        if (imu.gyro_id, imu.accel_id) != (None, None)
-    }
+        return self._told(FLIGHT, self._stamps("flights"), tell)
 
 
 def _stamp(path: Path) -> str:

@@ -18,7 +18,7 @@ import logging
 import re
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Final
 
 import msgspec
 
@@ -43,41 +43,41 @@ KNOWN: Final = asked_by(Interface.MQTT)
 _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 
-class Request(msgspec.Struct, frozen=True):
-    """A request that can be asked of the daemon."""
+class Request(msgspec.Struct):
+    """A request, and how it was answered last."""
 
     command: str
-    transaction: Transaction
-    content: Object
+    transaction: Transaction = None
+    content: Object = {}
     """Everything but the transaction."""
+    problem: str = ""
+    """Why it cannot be asked of the daemon, in one line; empty: it can."""
+    at_s: float = 0.0
+    response: Object | None = None
 
 
-class Misfit(msgspec.Struct, frozen=True):
-    """A request that is none, and why, in one line."""
-
-    transaction: Transaction
-    reason: str
-
-
-def parse(command: str, payload: bytes) -> Request | Misfit:
+def parse(command: str, payload: bytes) -> Request:
     """Judge a request's payload: a JSON object with known keys, or nothing. Never raises."""
+
+    def refused(reason: str, transaction: Transaction = None) -> Request:
+        return Request(command, transaction, problem=reason)
+
     if command not in KNOWN:
-        return Misfit(None, f"unknown request {command!r}; known: {', '.join(KNOWN)}")
+        return refused(f"unknown request {command!r}; known: {', '.join(KNOWN)}")
     if len(payload) > MAX_PAYLOAD_BYTES:
-        return Misfit(None, f"a payload of {len(payload)} bytes; allowed: at most {MAX_PAYLOAD_BYTES}")
+        return refused(f"a payload of {len(payload)} bytes; allowed: at most {MAX_PAYLOAD_BYTES}")
     try:
         content = msgspec.json.decode(payload) if payload.strip() else {}
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         why = "nested too deeply" if isinstance(error, RecursionError) else str(error)
-        return Misfit(None, f"the payload is not JSON: {why}; allowed: a JSON object, or nothing")
+        return refused(f"the payload is not JSON: {why}; allowed: a JSON object, or nothing")
     if not isinstance(content, dict):
-        return Misfit(None, f"the payload is {shown(content)}; allowed: a JSON object, or nothing")
+        return refused(f"the payload is {shown(content)}; allowed: a JSON object, or nothing")
     transaction = content.pop("transaction", None)
     if not _is_transaction(transaction):
-        return Misfit(
-            None,
+        return refused(
             f"'transaction': found {shown(transaction)}; allowed: a text of at most {MAX_TRANSACTION} characters, or a"
-            " whole number",
+            " whole number"
         )
     kind = KNOWN[command]
     known = kind.fields(Interface.MQTT)
@@ -85,13 +85,13 @@ def parse(command: str, payload: bytes) -> Request | Misfit:
         if key not in known:
             near = difflib.get_close_matches(key[:MAX_SHOWN], known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(('transaction', *known))}"
-            return Misfit(transaction, f"unknown key {shown(key)}; {hint}")
+            return refused(f"unknown key {shown(key)}; {hint}", transaction)
         if value is None:
-            return Misfit(transaction, f"{key!r}: found null; allowed: {known[key].allowed}")
+            return refused(f"{key!r}: found null; allowed: {known[key].allowed}", transaction)
     try:
         kind.read(content)
     except CalibrationRefusedError as error:
-        return Misfit(transaction, str(error))
+        return refused(str(error), transaction)
     return Request(command, transaction, content)
 
 
@@ -101,30 +101,20 @@ def _is_transaction(value: object) -> bool:
     return value is None or (isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER)
 
 
-class Respond(Protocol):
-    """Somewhere to put responses."""
-
-    def __call__(self, command: str, response: Object, *, droppable: bool) -> None:
-        """Send one."""
-
-
-class _Known:
-    def __init__(self, request: Request, at_s: float) -> None:
-        self.request, self.at_s = request, at_s
-        self.response: Object | None = None
-        """What was answered last; None: nothing yet."""
+Respond = Callable[[str, Object], None]
+"""Sends the response to a command."""
 
 
 class Requests:
-    """Takes requests and answers them; responses that may be dropped are refusals.
+    """Accepts requests and answers them.
 
-    `on_retained` is told once of each command of which a retained request lies at the broker.
+    `on_retained` is called once for each command with a retained request at the broker.
     """
 
     def __init__(self, ask: Ask, respond: Respond, on_retained: Callable[[str], None]) -> None:
         self._ask, self._respond, self._on_retained = ask, respond, on_retained
         self._tasks: set[asyncio.Task[None]] = set()
-        self._known: OrderedDict[tuple[str, Transaction], _Known] = OrderedDict()
+        self._known: OrderedDict[tuple[str, Transaction], Request] = OrderedDict()
         self._retained: set[str] = set()
 
     def accept(self, command: str, payload: bytes, *, retained: bool) -> None:
@@ -135,11 +125,9 @@ class Requests:
         if self._is_leftover(command, payload, retained=retained):
             return
         request = parse(command, payload)
-        if retained:
-            reason = "a retained request is never obeyed; send it again without retain"
-            self._refuse(command, request.transaction, "request", reason)
-        elif isinstance(request, Misfit):
-            self._refuse(command, request.transaction, "request", request.reason)
+        reason = "a retained request is never obeyed; send it again without retain" if retained else request.problem
+        if reason:
+            self._refuse(request, "request", reason)
         elif not self._is_repeat(request):
             self._start(request)
 
@@ -173,21 +161,21 @@ class Requests:
         known = self._known.get((request.command, request.transaction))
         if known is None:
             return False
-        if known.request.content != request.content:
+        if known.content != request.content:
             reason = f"transaction {request.transaction!r} was another {request.command}; give each one of its own"
-            self._refuse(request.command, request.transaction, "request", reason)
+            self._refuse(request, "request", reason)
         elif known.response is not None:
-            self._respond(request.command, {**known.response, "repeated": True}, droppable=True)
+            self._respond(request.command, {**known.response, "repeated": True})
         return True
 
     def _start(self, request: Request) -> None:
         if len(self._tasks) >= MAX_PENDING:
             reason = f"{MAX_PENDING} requests are waiting for their end already"
-            self._refuse(request.command, request.transaction, "busy", reason)
+            self._refuse(request, "busy", reason)
             return
-        key = (request.command, request.transaction)
         if request.transaction is not None:
-            self._known[key] = _Known(request, asyncio.get_running_loop().time())
+            request.at_s = asyncio.get_running_loop().time()
+            self._known[request.command, request.transaction] = request
             if len(self._known) > REMEMBERED:
                 self._known.popitem(last=False)
         task = asyncio.get_running_loop().create_task(self._run(request), name=f"mqtt {request.command}")
@@ -218,20 +206,17 @@ class Requests:
             )
 
     def _answer(self, request: Request, answer: Object) -> None:
-        response = {"transaction": request.transaction, **answer}
-        known = self._known.get((request.command, request.transaction))
-        if known is not None:
-            known.response = response
-        self._respond(request.command, response, droppable=False)
+        request.response = {"transaction": request.transaction, **answer}
+        self._respond(request.command, request.response)
 
     def _reject(self, request: Request, refusal: str, reason: str) -> None:
         # A refused request is not remembered: the daemon may accept the same one a moment later.
         self._known.pop((request.command, request.transaction), None)
-        self._refuse(request.command, request.transaction, refusal, reason)
+        self._refuse(request, refusal, reason)
 
-    def _refuse(self, command: str, transaction: Transaction, refusal: str, reason: str) -> None:
-        response = {"transaction": transaction, "state": "refused", "refusal": refusal, "reason": reason}
-        self._respond(command, response, droppable=True)
+    def _refuse(self, request: Request, refusal: str, reason: str) -> None:
+        response = {"transaction": request.transaction, "state": "refused", "refusal": refusal, "reason": reason}
+        self._respond(request.command, response)
 
 
 def _final(reply: Object) -> Object:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import importlib.util
 import json
 import logging
 import sys
@@ -211,8 +210,7 @@ def test_a_flood_of_requests_is_answered_and_disturbs_nothing(tmp_path: Path) ->
 def test_without_aiomqtt_the_daemon_goes_on_and_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "aiomqtt" else find(name))
+    monkeypatch.setitem(sys.modules, "aiomqtt", None)
 
     async def main() -> None:
         async with alone(tmp_path, '[mqtt]\nhost = "127.0.0.1"\n') as service:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.commands import Interface
-from companion.mqtt.requests import KNOWN, MAX_PAYLOAD_BYTES, Misfit, parse
+from companion.mqtt.requests import KNOWN, MAX_PAYLOAD_BYTES, parse
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -23,10 +23,10 @@ objects = st.dictionaries(keys, values, max_size=4).map(lambda found: json.dumps
 @given(command=st.sampled_from([*KNOWN, "other"]), payload=st.binary(max_size=200) | objects)
 def test_no_payload_raises_and_every_verdict_is_one_short_line(command: str, payload: bytes) -> None:
     verdict = parse(command, payload)
-    if isinstance(verdict, Misfit):
-        assert verdict.reason.isprintable()
-        assert len(verdict.reason) < 400
-        msgspec.json.encode({"transaction": verdict.transaction, "reason": verdict.reason})
+    if verdict.problem:
+        assert verdict.problem.isprintable()
+        assert len(verdict.problem) < 400
+        msgspec.json.encode({"transaction": verdict.transaction, "reason": verdict.problem})
     else:
         assert len(payload) <= MAX_PAYLOAD_BYTES
         assert set(verdict.content) <= set(KNOWN[command].fields(Interface.MQTT))

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from companion.mqtt.requests import MAX_PENDING, REMEMBER_S, REMEMBERED, Misfit, Request, Requests, parse
+from companion.mqtt.requests import MAX_PENDING, REMEMBER_S, REMEMBERED, Request, Requests, parse
 from tests.support.virtual_time import run_virtual
 
 Object = dict[str, Any]
@@ -19,7 +19,7 @@ class Daemon:
 
     def __init__(self) -> None:
         self.asked: list[Object] = []
-        self.responses: list[tuple[str, Object, bool]] = []
+        self.responses: list[tuple[str, Object]] = []
         self.end = asyncio.Event()
         self.running = False
         self.fault: Exception | None = None
@@ -46,11 +46,11 @@ class Daemon:
         self.running = False
         yield {"kind": "result", "record": {"state": "done", "reason": "sigma 3 deg/h"}}
 
-    def respond(self, command: str, response: Object, *, droppable: bool) -> None:
-        self.responses.append((command, response, droppable))
+    def respond(self, command: str, response: Object) -> None:
+        self.responses.append((command, response))
 
     def states(self) -> list[str]:
-        return [response["state"] for _, response, _ in self.responses]
+        return [response["state"] for _, response in self.responses]
 
     async def take(self, payload: bytes, command: str = "calibrate", *, retained: bool = False) -> None:
         self.requests.accept(command, payload, retained=retained)
@@ -67,7 +67,7 @@ def test_a_calibration_is_answered_twice_with_its_transaction() -> None:
         daemon.end.set()
         await asyncio.sleep(1.0)
         assert daemon.responses == [
-            ("calibrate", {"transaction": "a b", "state": "accepted", "reason": "calibration started"}, False),
+            ("calibrate", {"transaction": "a b", "state": "accepted", "reason": "calibration started"}),
             (
                 "calibrate",
                 {
@@ -76,7 +76,6 @@ def test_a_calibration_is_answered_twice_with_its_transaction() -> None:
                     "reason": "sigma 3 deg/h",
                     "record": {"state": "done", "reason": "sigma 3 deg/h"},
                 },
-                False,
             ),
         ]
 
@@ -114,7 +113,6 @@ def test_what_was_refused_may_be_asked_again_under_its_transaction() -> None:
         assert daemon.responses[0] == (
             "calibrate",
             {"transaction": "x", "state": "refused", "refusal": "armed", "reason": "armed: disarm first"},
-            True,
         )
         assert daemon.states() == ["refused", "accepted"]
         await daemon.requests.close(0.0)
@@ -129,8 +127,7 @@ def test_a_flood_is_refused_as_busy_and_leaves_nothing_behind() -> None:
             daemon.requests.accept("cancel", b'{"transaction": %d}' % number, retained=False)
         assert len(asyncio.all_tasks()) == MAX_PENDING + 1
         assert daemon.states() == ["refused"] * (5000 - MAX_PENDING)
-        assert {response["refusal"] for _, response, _ in daemon.responses} == {"busy"}
-        assert all(droppable for _, _, droppable in daemon.responses)
+        assert {response["refusal"] for _, response in daemon.responses} == {"busy"}
         daemon.end.set()
         await asyncio.sleep(1.0)
         for number in range(5000):
@@ -214,18 +211,16 @@ def test_the_end_answers_who_still_waits() -> None:
     ],
 )
 def test_a_request_that_is_none_gets_one_clear_reason(command: str, payload: bytes, words: list[str]) -> None:
-    found = parse(command, payload)
-    assert isinstance(found, Misfit)
+    problem = parse(command, payload).problem
     for word in words:
-        assert word in found.reason
-    assert "\n" not in found.reason
-    assert len(found.reason) < 300
+        assert word in problem
+    assert "\n" not in problem
+    assert len(problem) < 300
 
 
-def test_a_misfit_is_answered_under_its_transaction() -> None:
-    assert parse("calibrate", b'{"transaction": "t", "wat": 1}') == Misfit(
-        "t", "unknown key \"wat\"; did you mean 'what'?"
-    )
+def test_a_refusal_repeats_the_transaction() -> None:
+    found = parse("calibrate", b'{"transaction": "t", "wat": 1}')
+    assert found == Request("calibrate", "t", problem="unknown key \"wat\"; did you mean 'what'?")
 
 
 @pytest.mark.parametrize("payload", [b"", b"  \n", b"{}", b'{"transaction": null}'])
