@@ -17,7 +17,6 @@ import sqlalchemy as sa
 
 from companion.fleet import schema
 from companion.fleet.database import engine_of
-from companion.fleet.imu_pages import models
 from companion.fleet.store import Message, Store
 from sim.fleet.aircraft import Aircraft
 from tests.support.broker import broker, free_port
@@ -108,14 +107,6 @@ def judging(url: str) -> None:
         )
 
 
-def _models(url: str) -> dict[str, int]:
-    engine = engine_of(url, reads_only=True)
-    with engine.connect() as connection:
-        found = models(connection)
-    engine.dispose()
-    return found
-
-
 def _get(port: int, path: str) -> tuple[float, int]:
     """How long a page takes, in ms, and its bytes."""
     begun_s = time.perf_counter()
@@ -137,7 +128,6 @@ async def page_latency(place: Place, url: str, aircraft: int) -> None:
         await one.at_work()
         of_one = [f"/aircraft/{Aircraft(dice.randrange(aircraft // COPIES)).id}" for _ in range(200)]
         kinds = [("the fleet", ["/"] * 50), ("an aircraft", of_one)]
-        kinds += [(f"a model of {parts} parts", [f"/model/{name}"] * 50) for name, parts in _models(url).items()]
         for words, paths in kinds:
             await asyncio.to_thread(_get, port, paths[0])
             meter = Meter(lambda: processor_s(one.process_id), lambda: processor_s(place.postgres.process_id))

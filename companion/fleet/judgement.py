@@ -63,9 +63,6 @@ _TOGETHER: Final = 10
 REPLACE: Final = {"scatter": 3.0, "noise": 2.0, "drift": 8.0, "bias": 8.0}
 """Least sizes of findings, by kind, for the word "replace"."""
 
-Part = tuple[str, str]
-"""Aircraft and name of the IMU there."""
-
 
 class History(NamedTuple):
     """One IMU over its power-ups, in their order; NaN: not known."""
@@ -256,7 +253,7 @@ def judged(connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Ro
         ids = calibrations[-1].axes[0]
         model = model_of(firmware, ids.gyro_id, ids.accel_id)
         parts += _part(aircraft, imu, model, scatter_of_part(history.biases, history.temperature_degc))
-        others = None if model is None else scatter_of_model([*parts_of(connection, model, but=aircraft).values()])
+        others = None if model is None else _others(connection, model, aircraft)
         found += [(imu, history.at, each) for each in judge(history, others)]
     found = _of_the_gradienter(found, len(imus))
     rows = list(done.values())
@@ -270,16 +267,16 @@ def judged(connection: sa.Connection, aircraft: str) -> tuple[list[Row], list[Ro
     return parts, [_row(aircraft, place, *each) for place, each in enumerate(worst)]
 
 
-def parts_of(connection: sa.Connection, model: str, *, but: str = "") -> dict[Part, Scatter]:
-    """Read the scatter of each part of a model that is in an aircraft now, except in the aircraft `but`."""
-    query = sa.select(schema.parts).where(schema.parts.c.model == model, schema.parts.c.aircraft != but)
-    found: dict[Part, Scatter] = {}
+def _others(connection: sa.Connection, model: str, aircraft: str) -> Scatter | None:
+    """Read the scatter of a model, by the parts that are in other aircraft now."""
+    query = sa.select(schema.parts).where(schema.parts.c.model == model, schema.parts.c.aircraft != aircraft)
+    found: dict[tuple[str, str], Scatter] = {}
     for row in connection.execute(query.order_by("aircraft", "imu").limit(6 * MOST_PARTS)):
         one = found.setdefault((row.aircraft, row.imu), Scatter(row.power_ups, *np.full((3, 6), np.nan)))
         place = _AXES.index(f"{row.triad} {row.axis}")
         for name in ("turn_on", "wander", "per_k"):
             getattr(one, name)[place] = np.nan if (value := getattr(row, name)) is None else value
-    return found
+    return scatter_of_model(list(found.values()))
 
 
 def _done(connection: sa.Connection, aircraft: str) -> dict[tuple[str, int], Any]:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
+from itertools import groupby
+from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
+import msgspec
 import sqlalchemy as sa
 
-from companion.estimation.solution.by_temperature import Seen
-from companion.fleet.imu_pages import by_temperature, curves, model_links
+from companion.estimation.solution.by_temperature import ByTemperature, Expected, ExpectedForces, Seen
 from companion.fleet.schema import Moment, findings, rejected
 from companion.fleet.schema import aircraft as known
 from companion.physics.units import UNITS
+from companion.report.by_temperature import biases_by_temperature
 from companion.report.markup import Child, Markup, join, row, tag
 from companion.report.page import NAMES, Point, arming_items, card, drift, page, seconds_of, with_sigma
 from companion.samples import TRIADS, Triad, Vector
@@ -104,7 +107,6 @@ def glance(connection: sa.Connection, now: datetime.datetime, number: int = 1) -
         _other_pages(number, known_in_all),
         tag("table", head, *(_line(one, now) for one in found), class_="fleet") if found else None,
         _other_pages(number, known_in_all),
-        model_links(connection),
         _refused(connection, now),
         source=SOURCE,
     )
@@ -190,7 +192,7 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
     for each in _rows(connection, query, which=which, most=MOST_CALIBRATIONS * 3 * 4):
         by_imu.setdefault(each.imu, {}).setdefault((each.epoch, each.sequence), {})[each.axis] = each
     parts: list[Child] = []
-    told = curves(connection, which)
+    told = _curves(connection, which)
     for imu, found in sorted(by_imu.items()):
         latest = [axes for axes in found.values() if len(axes) == 3][:MOST_CALIBRATIONS][::-1]
         newest = next(iter(next(iter(found.values())).values()))
@@ -230,8 +232,35 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
             and (gyro := _triad(axes, "gyro", "bias"))
             and (sigma := _triad(axes, "gyro", "sigma_use"))
         ]
-        parts.append(by_temperature(told.get(imu), seen))
+        if imu in told:
+            curve = msgspec.structs.replace(told[imu], points=tuple(seen))
+            parts.append(biases_by_temperature([curve], looking_back=True))
     return parts
+
+
+def _curves(connection: sa.Connection, which: str) -> dict[str, ByTemperature]:
+    """Read the latest curve over temperature of each IMU of an aircraft."""
+    query = """
+        SELECT imu, triad, degc, power_ups, at,
+               COALESCE(gyro_bias_deg_h, accel_bias_mg) AS bias, COALESCE(gyro_sigma_deg_h, accel_sigma_mg) AS sigma
+        FROM temperature_curves WHERE aircraft = :which ORDER BY imu, degc, triad, axis"""
+    found: dict[str, ByTemperature] = {}
+    told = connection.execute(sa.text(query).columns(at=Moment()), {"which": which})
+    for imu, rows in groupby(told, key=attrgetter("imu")):
+        gyro, accel = list[Expected](), list[ExpectedForces]()
+        for (degc, triad), (x, y, z) in groupby(rows, key=attrgetter("degc", "triad")):
+            bias, sigma = (x.bias, y.bias, z.bias), (x.sigma, y.sigma, z.sigma)
+            if triad == "gyro":
+                gyro.append(Expected(degc=degc, gyro_deg_h=bias, sigma_deg_h=sigma))
+            else:
+                accel.append(ExpectedForces(degc=degc, accel_mg=bias, sigma_mg=sigma))
+        found[imu] = ByTemperature(
+            imu=f"{imu} by temperature",
+            summary=f"The curve of {x.power_ups} power-ups, as told {x.at:%Y-%m-%d}",
+            curve=tuple(gyro),
+            accel_curve=tuple(accel),
+        )
+    return found
 
 
 def _triad(axes: dict[str, Any], triad: Triad, what: str) -> Vector | None:

@@ -29,8 +29,6 @@ WANDER_LAG: Final = 30
 """Power-ups between the two levels that tell the wander."""
 _FOR_A_TERM: Final = 24
 """Power-ups for each further power of the temperature."""
-_LEAST_SPREAD: Final = 0.05
-"""Least difference between the scatters of parts, as a share of the typical scatter."""
 _OUTLIER: Final = 3.0
 """Sigmas beyond which a step is left out of the slope over temperature."""
 _GROUPS: Final = (slice(0, 3), slice(3, 5), slice(5, 6))
@@ -94,36 +92,10 @@ def scatter_of_model(parts: Sequence[Scatter]) -> Scatter | None:
     return Scatter(sum(part.power_ups for part in telling), *middle)
 
 
-class Typical(NamedTuple):
-    """Typical part of a model, and how much parts differ from it, one sigma; (6,) each, NaN where not known."""
-
-    turn_on: Floats
-    turn_on_spread: Floats
-    per_k: Floats
-    per_k_spread: Floats
-
-
-def typical_part(parts: Sequence[Scatter]) -> Typical | None:
-    """Describe the typical part of a model; None: fewer than `LEAST_PARTS` have a known scatter."""
-    telling = [part for part in parts if np.isfinite(part.turn_on).any()]
-    usual = scatter_of_model(telling)
-    if usual is None:
-        return None
-    turn_on, per_k = (np.array([getattr(part, name) for part in telling]) for name in ("turn_on", "per_k"))
-    slope = np.array([middle_of(column, LEAST_PARTS) for column in per_k.T])
-    spread = np.maximum(_spread(turn_on, usual.turn_on), _LEAST_SPREAD * usual.turn_on)
-    return Typical(usual.turn_on, spread, slope, _spread(per_k, slope))
-
-
-def _spread(values: Floats, about: Floats) -> Floats:
-    """Estimate one sigma of each column from the median deviation."""
-    return MAD_TO_SIGMA * np.array([middle_of(off, LEAST_PARTS) for off in np.abs(values - about).T])
-
-
-def middle_of(values: Floats, least: int = 1) -> float:
-    """Give the median of the known values; NaN: fewer than `least` are known."""
+def middle_of(values: Floats) -> float:
+    """Give the median of the known values; NaN: none is known."""
     there = values[np.isfinite(values)]
-    return float(np.median(there)) if len(there) >= least else np.nan
+    return float(np.median(there)) if len(there) else np.nan
 
 
 def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float, float]:

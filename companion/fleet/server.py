@@ -25,7 +25,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from companion.config.rules import bind_problem
 from companion.errors import ConfigError
-from companion.fleet import imu_pages, page
+from companion.fleet import page
 from companion.fleet.database import engine_of, why
 from companion.links.system.connection import Backoff, Reconnection
 from companion.mqtt.broker import load_pair, unusable
@@ -47,7 +47,6 @@ FRESH_S: Final = 2.0
 """Time for which a rendered page is given to further clients."""
 _GLANCE: Final = re.compile(r"/(?:page/([1-9][0-9]{0,6}))?")
 _AIRCRAFT: Final = re.compile(r"/aircraft/([0-9a-f]{16,36})")
-_MODEL: Final = re.compile(r"/model/([0-9a-z-]{1,40})")
 _HEADERS: Final = (
     ("X-Content-Type-Options", "nosniff"),
     ("X-Frame-Options", "DENY"),
@@ -104,34 +103,16 @@ class Certificate:
             return None
 
     def _load(self) -> None:
-        client, trial = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         self._stamps = self._read_stamps()
         where = self._cert
         try:
-            client.load_verify_locations(where)
+            # An unusable pair must not reach the context in use.
+            ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_verify_locations(where)
             where = self._key
-            for context in (trial, self.context):
+            for context in (ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), self.context):
                 load_pair(context, self._cert, self._key)
         except OSError as error:
             raise ConfigError(str(unusable(error, where))) from None
-        if (refused := _refused_by(client, trial)) is not None:
-            logger.warning("page: %s: browsers will refuse it: %s", self._cert, refused)
-
-
-def _refused_by(client: ssl.SSLContext, server: ssl.SSLContext) -> str | None:
-    """Return why a client that trusts this very certificate refuses it (dates, purpose), by a handshake in memory."""
-    client.check_hostname = False
-    client.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
-    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
-    sides = client.wrap_bio(back, there), server.wrap_bio(there, back, server_side=True)
-    for side in sides * 2:
-        try:
-            side.do_handshake()
-        except ssl.SSLWantReadError:
-            continue
-        except ssl.SSLCertVerificationError as error:
-            return error.verify_message
-    return None
 
 
 class Renderer:
@@ -177,8 +158,6 @@ def _page_at(connection: sa.Connection, path: str, now: datetime.datetime) -> st
         return page.glance(connection, now, int(match[1] or 1))
     if (match := _AIRCRAFT.fullmatch(path)) is not None:
         return page.aircraft(connection, match[1], now)
-    if (match := _MODEL.fullmatch(path)) is not None:
-        return imu_pages.model_page(connection, match[1], now, page.SOURCE)
     return None
 
 

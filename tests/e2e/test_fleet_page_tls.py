@@ -116,20 +116,6 @@ def test_what_cannot_be_used_is_one_line(tmp_path: Path, capsys: pytest.CaptureF
         assert words in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("days", "words"),
-    [((-10, -1), "certificate has expired"), ((1, 10), "certificate is not yet valid"), ((-10, 10), None)],
-)
-def test_a_certificate_of_another_time_is_warned_of_and_stops_nothing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, days: tuple[int, int], words: str | None
-) -> None:
-    cert, key = issue(tmp_path, days=days)
-    Certificate(cert, key)
-    assert [record.getMessage() for record in caplog.records] == (
-        [f"page: {cert}: browsers will refuse it: {words}"] if words else []
-    )
-
-
 def test_a_password_in_plain_text_on_a_network_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     cert, key = issue(tmp_path)
     database = str(tmp_path / "fleet.sqlite")
