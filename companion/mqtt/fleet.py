@@ -214,7 +214,7 @@ class AircraftFleet:
             message = self._inbox.popleft()
             said = wire.parse(message.payload)
             for kept in self._kept:
-                if said is not None and message.topic in wire.Topics(kept.aircraft).heard:
+                if said is not None and message.topic in _heard(kept.aircraft):
                     await self._heed(kept.aircraft, said, confirmed=message.topic.endswith("/confirmed"))
         if heard:
             await self._count()
@@ -250,12 +250,12 @@ class AircraftFleet:
         if now_s - self._hello_s < HELLO_AGAIN_S and all(kept.aircraft in self._greeted for kept in news):
             return
         for kept in news:
-            topics = wire.Topics(kept.aircraft)
-            for topic in topics.heard:
+            for topic in _heard(kept.aircraft):
                 await link.hear(topic)
+            hello = f"fleet/{kept.aircraft}/hello"
             name = self._settings.name if kept.aircraft == self._of else None
-            link.outbox.keep(topics.hello, wire.hello(kept, name, utc(utc_now())))
-            link.outbox.send_again(topics.hello)  # though it be the same as before
+            link.outbox.keep(hello, wire.hello(kept, name, utc(utc_now())))
+            link.outbox.send_again(hello)  # though it be the same as before
             self._greeted[kept.aircraft], self._hello_s = kept.last, now_s
 
     def _begin_again(self) -> None:
@@ -281,8 +281,13 @@ class AircraftFleet:
         if not batch and self._sent:
             batch = await self._offload(self._items.waiting, 0, WINDOW)
         for waiting in batch:
-            topic = wire.Topics(waiting.aircraft).item
+            topic = f"fleet/{waiting.aircraft}/item"
             link.outbox.answer(topic, wire.item(waiting, self._settings.location), droppable=True)
         self._under_way = {(waiting.aircraft, waiting.sequence) for waiting in batch}
         self._sent = batch[-1].number if batch else 0
         self._expires_s = now_s + self._wait_s
+
+
+def _heard(aircraft: str) -> tuple[str, str]:
+    """Return the topics on which a collector answers an aircraft."""
+    return f"fleet/{aircraft}/confirmed", f"fleet/{aircraft}/wanted"

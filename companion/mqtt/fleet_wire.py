@@ -1,9 +1,9 @@
-"""What an aircraft and a collector say to one another: docs/fleet/asyncapi.yaml."""
+"""Payloads between an aircraft and a collector: docs/fleet/asyncapi.yaml."""
 
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final
 
 import msgspec
 
@@ -29,46 +29,25 @@ _ROUNDED: Final[dict[str, int]] = {
     "inclination_deg": 1,
     "inclination_expected_deg": 1,
 }
-"""Whatever tells a place (gravity and the field do, too), and to how many decimals it is no closer than a kilometre."""
+"""Figures that give away a place (gravity and the field do, too), and the decimals that leave it a kilometre."""
 _WORKED_OUT: Final[dict[str, object]] = {"covariance": None, "cross_covariance": [], "effective": None}
-"""Whose digits give away the gravity and the latitude that they were worked out with, and what is told instead."""
+"""Figures whose digits give away the gravity and the latitude behind them, and their substitutes."""
 _EARTHS: Final = re.compile(r"(the Earth's) [\d.]+")
 
 
-class Topics(NamedTuple):
-    """Of one aircraft."""
-
-    aircraft: str
-
-    @property
-    def hello(self) -> str:
-        """What it keeps."""
-        return f"fleet/{self.aircraft}/hello"
-
-    @property
-    def item(self) -> str:
-        """What it tells."""
-        return f"fleet/{self.aircraft}/item"
-
-    @property
-    def heard(self) -> tuple[str, str]:
-        """What a collector has, and what it lacks."""
-        return f"fleet/{self.aircraft}/confirmed", f"fleet/{self.aircraft}/wanted"
-
-
 class Said(msgspec.Struct, frozen=True):
-    """What a collector says of sequences: it has them, or wants them."""
+    """Sequences that a collector has, or wants."""
 
     epoch: str
     sequences: Annotated[list[tuple[_Sequence, _Sequence]], msgspec.Meta(max_length=MOST_RANGES)]
 
     def names(self, sequence: int) -> bool:
-        """Whether this one is among them."""
+        """Whether a sequence is among them."""
         return any(first <= sequence <= last for first, last in self.sequences)
 
 
 def parse(payload: bytes) -> Said | None:
-    """None: it is nothing of the kind, or of a newer version. Never raises."""
+    """Read what a collector says; None: it is something else, or of a newer version. Never raises."""
     try:
         said: Said = decode(payload, Said, FORMAT_VERSION)
     except UNREADABLE:
@@ -77,7 +56,7 @@ def parse(payload: bytes) -> Said | None:
 
 
 def hello(kept: Kept, name: str | None, at: str) -> bytes:
-    """The payload of a hello."""
+    """Encode the payload of a hello."""
     return msgspec.json.encode(
         {
             "format_version": FORMAT_VERSION,
@@ -92,7 +71,7 @@ def hello(kept: Kept, name: str | None, at: str) -> bytes:
 
 
 def item(waiting: Waiting, location: Location) -> bytes:
-    """The payload of an item, with as much of the place as is wanted."""
+    """Encode the payload of an item, with the place as exact as configured."""
     told = waiting.item
     try:
         body = msgspec.json.decode(told.body)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import re
 import zlib
@@ -106,18 +105,6 @@ class RecordStore:
             return Entry(number, path, None, error.strerror or str(error))
         except UNREADABLE as error:
             return Entry(number, path, None, f"not a readable record: {error}")
-
-    def stamps(self) -> dict[int, str]:
-        """By number, oldest first, what another content has another of.
-
-        Raises:
-            StorageError: the folder cannot be listed.
-        """
-        found: dict[int, str] = {}
-        for number in numbers_in(self._folder, _NAME):
-            with contextlib.suppress(OSError):
-                found[number] = str(self._path(number).stat().st_mtime_ns)
-        return found
 
     def history(self, limit: int | None = None) -> list[Record]:
         """The latest records, newest first; a file that cannot be read is logged and passed over."""

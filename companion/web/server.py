@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import re
 from pathlib import Path
 from typing import Final
 
@@ -10,12 +13,14 @@ from companion.formats import Object
 from companion.links.system.connection import Backoff, Reconnection
 from companion.web.access import Access, is_loopback, kept_token, new_token, page_url, split_address
 from companion.web.app import Site
-from companion.web.document import assembled, security_headers
 from companion.web.listener import listening
 from companion.web.viewers import Ask, Viewers
 
 WORTH_S: Final = 10.0
 """A page that was open for this long is opened again at once."""
+_PARTS: Final = Path(__file__).with_name("page")
+_STYLE: Final = re.compile(rb'<link rel="stylesheet" href="([\w./]+)">')
+_SCRIPT: Final = re.compile(rb'<script src="([\w.]+)"></script>')
 
 
 class Page:
@@ -31,7 +36,7 @@ class Page:
         self.access = Access(new_token(), handed_out=self.local)
         self.problem: str | None = "not open yet"
         """Why nobody can look, in one line; None while the page is there."""
-        self._html = assembled()
+        self._html = _assembled()
         self._viewers = Viewers(ask, local=self.local)
         self._site: Site | None = None
         self._reconnection = Reconnection(
@@ -47,7 +52,7 @@ class Page:
             if not self.local:
                 self.access = Access(kept_token(self._directory), handed_out=False)
             self._site = Site(self.access, self._ask, self._viewers, self._html)
-            headers = security_headers(self._html)
+            headers = _security_headers(self._html)
             async with listening(self._site.app, self._host, self._port, headers) as self._port:
                 self._reconnection.up(self.url)
                 await self._viewers.run()
@@ -73,3 +78,35 @@ class Page:
             "viewers": len(self._viewers),
             "wrong_tokens": 0 if self._site is None else self._site.wrong_tokens,
         }
+
+
+def _assembled() -> bytes:
+    """Return the page as one document: a phone at the edge of the hotspot has all of it or nothing."""
+    html = (_PARTS / "page.html").read_bytes()
+    html = _STYLE.sub(lambda found: b"<style>\n" + (_PARTS / found[1].decode("ascii")).read_bytes() + b"</style>", html)
+    return _SCRIPT.sub(
+        lambda found: b"<script>\n" + (_PARTS / found[1].decode("ascii")).read_bytes() + b"</script>", html
+    )
+
+
+def _security_headers(html: bytes) -> tuple[tuple[str, str], ...]:
+    """Return headers that let nothing but the page's own style and script run, and speak to nobody but us."""
+
+    def hashes(tag: bytes) -> str:
+        found = re.findall(b"<" + tag + b">(.*?)</" + tag + b">", html, re.DOTALL)
+        digests = (base64.b64encode(hashlib.sha256(text).digest()).decode() for text in found)
+        return " ".join(f"'sha256-{digest}'" for digest in digests)
+
+    policy = (
+        f"default-src 'none'; script-src {hashes(b'script')}; style-src {hashes(b'style')}; connect-src 'self'; "
+        "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+    return (
+        ("Content-Security-Policy", policy),
+        ("X-Content-Type-Options", "nosniff"),
+        ("X-Frame-Options", "DENY"),
+        ("Referrer-Policy", "no-referrer"),
+        ("Cross-Origin-Resource-Policy", "same-origin"),
+        ("Cross-Origin-Opener-Policy", "same-origin"),
+        ("Cache-Control", "no-store"),
+    )

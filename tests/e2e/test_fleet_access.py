@@ -109,22 +109,6 @@ def test_each_says_and_hears_what_is_its_own_and_nothing_else(tmp_path: Path, ai
     assert f"'fleet/{HERON}/item'" in denied
 
 
-@mosquitto_only
-def test_nobody_who_has_no_name_is_let_in(tmp_path: Path) -> None:
-    one = start(tmp_path, [], ("witness",))
-
-    async def main() -> None:
-        await one.start()
-        try:
-            with pytest.raises(aiomqtt.MqttError, match=r"[Nn]ot authori"):
-                async with aiomqtt.Client("127.0.0.1", one.port):
-                    pass
-        finally:
-            one.kill()
-
-    asyncio.run(main())
-
-
 # --- EMQX: grammar and order by "Use ACL File" of its documentation: the first rule that fits decides
 
 _RULE = re.compile(r'\{allow, (all|\{username, "([^"]+)"\}), (publish|subscribe), \[(("[^"]+"(, )?)+)\]\}\.')

@@ -11,9 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from companion.estimation.machine import State
 from tests.support.broker import BEST, Heard, broker, hurry, peer
-from tests.support.children import mqtt_of
 from tests.support.mqtt_daemon import (
     ALONE,
     BASE,
@@ -171,35 +169,6 @@ def test_a_request_published_to_be_retained_is_not_obeyed_either(tmp_path: Path)
             await watcher.publish(f"{BASE}/request/cancel", {"transaction": "end"})
             await watcher.response(BASE, "cancel", "end")
             assert watcher.responses(BASE, "calibrate") == []
-
-    asyncio.run(main())
-
-
-def test_a_flood_of_requests_is_answered_and_disturbs_nothing(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with broker(tmp_path) as one:
-            rig = Rig(tmp_path, min_still_s=60.0, max_s=60.0, more=one.section())
-            rig.offload = asyncio.to_thread
-            async with rig.running(), peer(one) as watcher:
-                await until_connected(rig.service)
-                await rig.ready()
-                heartbeats = rig.service.core.vehicle.heartbeat_age_s
-                assert heartbeats is not None
-                for number in range(2000):
-                    await watcher.publish("companion/1/request/calibrate", {"transaction": number}, qos=0)
-                await watcher.publish("companion/1/request/calibrate", {"transaction": "last"})
-                await watcher.response("companion/1", "calibrate", "last", within_s=30.0)
-                answers = watcher.responses("companion/1", "calibrate")
-                assert [one["state"] for one in answers].count("accepted") == 1
-                assert {one["refusal"] for one in answers if one["state"] == "refused"} == {"busy"}
-                assert rig.service.calibrating.manager.cancel("test")
-                await rig.until(lambda: rig.service.calibrating.manager.state is State.CANCELLED, 10.0)
-                assert rig.service.calibrating.store.history() == []  # nothing had been measured
-                link = mqtt_of(rig.service).link
-                assert link is not None
-                assert len(link.outbox) < 100
-                dropped = rig.service.status()["mqtt"]["dropped"]
-                assert len([one for one in answers if one["transaction"] != "last"]) >= 2000 - dropped
 
     asyncio.run(main())
 

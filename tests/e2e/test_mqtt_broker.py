@@ -13,7 +13,6 @@ import pytest
 
 from companion.config import parse
 from companion.daemon.process.service import Service
-from companion.estimation.machine import State
 from companion.mqtt import client as link
 from companion.mqtt import process
 from tests.support.broker import BEST, KINDS, Broker, Kind, broker, hurry, peer
@@ -28,7 +27,6 @@ from tests.support.mqtt_daemon import (
     until_connected,
     until_problem,
 )
-from tests.support.rig import Rig
 
 
 @pytest.fixture(autouse=True)
@@ -105,21 +103,6 @@ def test_a_broker_that_is_killed_and_comes_back_gets_everything_anew(
     asyncio.run(main())
 
 
-def test_a_broker_that_is_absent_at_start(tmp_path: Path) -> None:
-    async def main() -> None:
-        one = Broker(tmp_path)
-        try:
-            async with alone(tmp_path, one.section()) as service:
-                summary = await until_problem(service, "nobody listens there")
-                assert f"127.0.0.1:{one.port}" in summary
-                await one.start()
-                await until_connected(service)
-        finally:
-            one.kill()
-
-    asyncio.run(main())
-
-
 def test_something_that_listens_and_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link, "GREETING_DEADLINE_S", 0.3)
 
@@ -140,30 +123,6 @@ def test_something_that_listens_and_says_nothing(tmp_path: Path, monkeypatch: py
         for writer in connected:
             writer.close()
         server.close()
-
-    asyncio.run(main())
-
-
-def test_what_ended_while_the_broker_was_away_is_not_lost(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with broker(tmp_path) as one:
-            rig = Rig(tmp_path, min_still_s=60.0, max_s=60.0, more=one.section())
-            rig.offload = asyncio.to_thread
-            async with rig.running():
-                await until_connected(rig.service)
-                await rig.ready()
-                async with peer(one) as watcher:
-                    await watcher.publish("companion/1/request/calibrate", {"transaction": "lost"})
-                    await watcher.response("companion/1", "calibrate", "lost", "accepted")
-                one.kill()
-                await until_connected(rig.service, connected=False)
-                assert rig.service.calibrating.manager.cancel("somebody")
-                await rig.until(lambda: rig.service.calibrating.manager.state is State.CANCELLED, 10.0)
-                await one.start()
-                async with peer(one) as watcher:
-                    record = (await watcher.until("companion/1/calibration/state")).json
-                    assert record["reason"] == "cancelled by somebody"
-                    await watcher.response("companion/1", "calibrate", "lost", "cancelled")
 
     asyncio.run(main())
 
@@ -231,17 +190,6 @@ def test_a_wrong_password_is_said_and_mended_without_a_restart(tmp_path: Path, k
                 assert "password" in summary
                 password.write_text(right)
                 await until_connected(service)
-
-    asyncio.run(main())
-
-
-def test_a_password_file_that_is_missing_is_one_line(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with broker(tmp_path, users=True) as one:
-            section = one.section()
-            (one.folder / "password").unlink()
-            async with alone(tmp_path, section) as service:
-                assert f"{one.folder}/password: no such file" in await until_problem(service, "password file")
 
     asyncio.run(main())
 
