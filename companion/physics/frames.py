@@ -71,10 +71,11 @@ def skew(vectors: Floats) -> Floats:
     return found
 
 
-def symmetric(beside: Array) -> Matrix:
-    """The 3x3 matrix with xy, xz and yz beside a diagonal of zeros."""
-    xy, xz, yz = beside
-    return np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
+def symmetric(beside: Floats) -> Floats:
+    """Return the matrices (..., 3, 3) with xy, xz and yz, (..., 3), beside a diagonal of zeros."""
+    xy, xz, yz = np.moveaxis(beside, -1, 0)
+    zero = np.zeros_like(xy)
+    return np.stack([zero, xy, xz, xy, zero, yz, xz, yz, zero], axis=-1).reshape(*beside.shape, 3)
 
 
 def symmetric_by(vector: Array) -> Matrix:

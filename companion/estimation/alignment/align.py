@@ -27,26 +27,28 @@ from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align_model import (
-    DOWN,
+    ACCEL_BIAS,
+    GYRO_BIAS,
+    LEVEL,
+    MISALIGNMENT,
+    PART_SCALE,
+    PART_SHEAR,
     PRIOR_BIAS_M_S2,
     PRIOR_SCALE,
     PRIOR_SHEAR,
+    Fit,
     Ground,
     Model,
-    Part,
     Priors,
     Row,
     Stand,
-    Unknowns,
+    fit,
 )
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
 from companion.physics.gradienter import Law, up_in_sensor
 from companion.physics.statistics import chi_square_ratio
 from companion.physics.units import DEG, MG
 
-MAX_ROUNDS: Final = 30
-_CONVERGED: Final = 1e-4
-"""Share of the prior sigma of each unknown."""
 W_LIMIT: Final = 4.5
 """Threshold for |w| of one residual: exceeded by chance once in some thousand alignments of a hundred readings."""
 SPOT_W_LIMIT: Final = 3.9
@@ -58,7 +60,6 @@ _NINETY_NINE: Final = 2.326
 """Sigmas that a normal variable exceeds in one case of a hundred."""
 MOST_TURNED_DEG: Final = 30.0
 """Largest turn of an IMU against the base: more is another orientation than the one configured."""
-LEVEL: Final = -DOWN
 ALONE: Final = Priors(scale=PRIOR_SCALE, shear=PRIOR_SHEAR, misalignment_deg=3.0, accel_bias_m_s2=PRIOR_BIAS_M_S2)
 """Priors of uncalibrated accelerometers on a board put in by eye."""
 
@@ -130,37 +131,37 @@ def align(
     Raises:
         CalibrationRefusedError: the equations cannot be solved: readings that cannot belong together.
     """
-    model = Model(law, vehicle_from_sensor, stands, ground, priors or Priors())
+    mounting = law, vehicle_from_sensor
     try:
-        at = model.begin([_first_attitude(law, vehicle_from_sensor, stand) for stand in stands])
-        residual, scaled, row_sigma, labels = _solve(model, at)
-        for name, imu in zip(model.names, at.imus, strict=True):
-            turned_deg = abs(math.remainder(float(np.linalg.norm(imu[Part.MISALIGNMENT])) / DEG, 360.0))
+        first_guess = [_first_attitude(law, vehicle_from_sensor, stand) for stand in stands]
+        model = Model(mounting, stands, ground, priors or Priors(), first_guess)
+        found = fit(model.residuals, model.start, model.sigma, model.damped)
+        for k, name in enumerate(model.names):
+            turned_rad = float(np.linalg.norm(found.values[model.imu(k, MISALIGNMENT)]))
+            turned_deg = abs(math.remainder(turned_rad / DEG, 360.0))
             if turned_deg > MOST_TURNED_DEG:
                 raise ValueError(f"imu {name} would sit turned by {turned_deg:.0f} deg")
     except (ValueError, np.linalg.LinAlgError) as error:
         raise CalibrationRefusedError(
             f"the readings do not belong together ({error}): check the gradienter's law and mounting"
         ) from None
-    sought = model.sigma > 0.0
-    inverse = np.linalg.inv(scaled.T @ scaled)
-    chi_square, freedom = float(residual @ residual), len(residual) - int(sought.sum()) - model.damped
-    redundancy = 1.0 - np.einsum("ij,ij->i", scaled @ inverse, scaled)
+    chi_square = float(found.residual @ found.residual)
+    freedom = int((found.residual.size - np.count_nonzero(model.sigma)) - sum(model.sigma[model.damped] > 0.0))
     # A stand's placement is checked where the other stands predict it: the rest is its redundancy.
-    checked = any(row.group == "spot" and share > 0.1 for row, share in zip(labels, redundancy, strict=True))
-    covariance = np.zeros((model.size, model.size))
-    sigma = model.sigma[sought]
-    covariance[np.ix_(sought, sought)] = widened_by(chi_square, freedom) * inverse * np.outer(sigma, sigma)
+    checked = any(
+        row.group == "spot" and share > 0.1 for row, share in zip(model.labels, found.redundancy, strict=True)
+    )
+    covariance = widened_by(chi_square, freedom) * found.covariance
     return Alignment(
-        offset_deg=at.values[model.offset] / DEG,
+        offset_deg=found.values[model.offset] / DEG,
         offset_covariance_deg2=covariance[model.offset, model.offset] / DEG**2,
-        imus=tuple(_imu(model, at, covariance, k) for k in range(len(model.names))),
-        slope_deg=float(np.hypot(*at.values[model.spot])) / DEG if any(stand.on_spot for stand in stands) else 0.0,
-        attitudes=tuple(at.attitudes),
+        imus=tuple(_imu(model, found.values, covariance, ground, k) for k in range(len(model.names))),
+        slope_deg=float(np.hypot(*found.values[model.spot])) / DEG if any(stand.on_spot for stand in stands) else 0.0,
+        attitudes=tuple(model.attitudes(found.values)),
         chi_square=chi_square,
         freedom=freedom,
         checked=checked,
-        complaint=_worst(residual, redundancy, row_sigma, labels),
+        complaint=_worst(found, model),
     )
 
 
@@ -220,32 +221,9 @@ def _first_attitude(law: Law, mounting: Matrix, stand: Stand) -> Matrix:
     return body_from_ned(roll, pitch, stand.heading_rad)
 
 
-def _solve(model: Model, at: Unknowns) -> tuple[Array, Matrix, Array, list[Row]]:
-    """Iterate `at` to the solution (Gauss-Newton).
-
-    Returns the residuals over their sigmas, their derivatives in units of the prior sigmas, the sigmas, the labels.
-    """
-    sought = model.sigma > 0.0
-    sigma = model.sigma[sought]
-    converged = False
-    for _ in range(MAX_ROUNDS + 1):
-        rows = model.linearise(at)
-        residual, derivative, row_sigma = rows.stacked()
-        scaled = derivative[:, sought] * sigma
-        if converged:
-            return residual, scaled, row_sigma, rows.labels
-        step = np.linalg.lstsq(scaled, residual, rcond=None)[0]
-        whole = np.zeros(model.size)
-        whole[sought] = step * sigma
-        model.step(at, whole)
-        if not np.isfinite(step).all():
-            break
-        converged = bool(np.abs(step).max() < _CONVERGED)
-    raise ValueError("no solution was found")
-
-
-def _worst(residual: Array, redundancy: Array, row_sigma: Array, labels: Sequence[Row]) -> Complaint | None:
+def _worst(found: Fit, model: Model) -> Complaint | None:
     """Return the residual that is worst against its own sigma, if it is beyond its threshold."""
+    residual, redundancy, labels = found.residual, found.redundancy, model.labels
     usable = redundancy > _LEAST_REDUNDANCY
     w = np.where(usable, residual / np.sqrt(np.where(usable, redundancy, 1.0)), 0.0)
     beyond = np.abs(w) / np.array([SPOT_W_LIMIT if row.group == "spot" else W_LIMIT for row in labels])
@@ -255,26 +233,28 @@ def _worst(residual: Array, redundancy: Array, row_sigma: Array, labels: Sequenc
     # All axes of that reading together: one axis alone depends on how the aircraft is turned.
     alone = labels[k].group in ("zero", "prior")
     axes = [k] if alone else [j for j, row in enumerate(labels) if row == labels[k] and usable[j]]
-    size = float(np.linalg.norm(residual[axes] * row_sigma[axes] / redundancy[axes]))
+    size = float(np.linalg.norm(residual[axes] * model.row_sigma[axes] / redundancy[axes]))
     return Complaint(labels[k], abs(float(w[k])), size)
 
 
-def _imu(model: Model, at: Unknowns, covariance: Matrix, k: int) -> ImuAlignment:
-    def figures(part: Part) -> Figures:
+def _imu(model: Model, at: Array, covariance: Matrix, ground: Ground, k: int) -> ImuAlignment:
+    def figures(part: int) -> Figures:
         place = model.imu(k, part)
         sigma = np.sqrt(np.diag(covariance)[place])
         before = model.sigma[place]
-        return Figures(at.imus[k, part].copy(), sigma, (before > 0.0) & (sigma < DETERMINED * before))
+        return Figures(at[place].copy(), sigma, (before > 0.0) & (sigma < DETERMINED * before))
 
-    by = model.reading_by(at, k, LEVEL)
+    step = 1e-6 * np.maximum(model.sigma, 1e-9)
+    level = model.reading(at + np.vstack([np.zeros(len(at)), np.diag(step)]), LEVEL[None])[:, 0, k]
+    by = (level[1:] - level[0]).T / step
     return ImuAlignment(
         name=model.names[k],
         # With the place's gravity, as in a calibration.
-        level_bias_m_s2=model.reading(at, k, LEVEL) - model.ground.gravity_m_s2 * LEVEL,
+        level_bias_m_s2=level[0] - ground.gravity_m_s2 * LEVEL,
         level_covariance_m2_s4=by @ covariance @ by.T,
-        accel_bias_m_s2=figures(Part.ACCEL_BIAS),
-        scale=figures(Part.SCALE),
-        shear=figures(Part.SHEAR),
-        misalignment_rad=figures(Part.MISALIGNMENT),
-        gyro_bias_rad_s=figures(Part.GYRO_BIAS),
+        accel_bias_m_s2=figures(ACCEL_BIAS),
+        scale=figures(PART_SCALE),
+        shear=figures(PART_SHEAR),
+        misalignment_rad=figures(MISALIGNMENT),
+        gyro_bias_rad_s=figures(GYRO_BIAS),
     )

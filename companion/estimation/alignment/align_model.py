@@ -1,4 +1,4 @@
-"""The model behind `align`: the predicted reading of every sensor in every stand, and its derivatives.
+"""The model behind `align`, and the least-squares fit of every alignment.
 
 A *stand* is one still window. Estimated for all stands together: the gradienter's zero; for every IMU its
 misalignment against the base, accelerometer scale, shear and bias, and gyro bias; gravity and the Earth's rate
@@ -15,34 +15,86 @@ turned about the vertical):
     spot           down of the vehicle, seen from the ground, is the normal of the spot: C_k^T z = n + placement
 
 The last line is the level reversal (method 3.4): the spot's true tilt is the same in the ground's frame, however the
-aircraft is turned on it. "Level" is parallel to the plane on which it is turned. All derivatives are analytic; an
-attitude error eps is C = (I - [eps x]) C_0.
+aircraft is turned on it. "Level" is parallel to the plane on which it is turned. An attitude error eps is
+C = exp(-[eps x]) C_0, with C_0 the first guess.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import enum
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, Literal
 
 import numpy as np
 
-from companion.physics.frames import Array, Matrix, rotations, skew, symmetric, symmetric_by
-from companion.physics.gradienter import Law, readings_from_up, up_jacobian
+from companion.physics.frames import Array, Floats, Matrix, rotations, symmetric
+from companion.physics.gradienter import Law, readings_from_up
 from companion.physics.units import DEG, MG
 
-DOWN: Final = np.array([0.0, 0.0, 1.0])
+LEVEL: Final = np.array([0.0, 0.0, -1.0])
 Group = Literal["gradienter", "accelerometer", "gyro", "compass", "turn", "spot", "zero", "prior", "nothing"]
 
-_AXES: Final = skew(np.eye(3))
 _ANYHOW_RAD: Final = 1.0
-"""Weak prior, about the first guess, of unknowns that only the readings determine: keeps the equations solvable."""
+"""Damping of unknowns that only the readings determine: keeps the equations solvable."""
 PRIOR_BIAS_M_S2: Final = 100.0 * MG
 PRIOR_SCALE: Final = 0.03
 PRIOR_SHEAR: Final = 0.01
 """One sigma of an uncalibrated part (ICM-42688-P: 0.5 %, cross axis 1 %; mounted parts are worse)."""
+_MAX_ROUNDS: Final = 30
+_CONVERGED: Final = 1e-5
+_STEP: Final = 1e-5
+"""Step of the numerical derivatives. Both are shares of the prior sigma of each unknown."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """Result of `fit`."""
+
+    values: Array
+    covariance: Matrix
+    """Covariance by the sigmas of readings and priors; zero where an unknown is not estimated."""
+    residual: Array
+    """Residuals over their sigmas: readings, then the prior of every unknown that is estimated."""
+    redundancy: Array
+    """Share of each residual's variance that the other rows leave in it."""
+
+
+def fit(residuals: Callable[[Floats], Floats], start: Array, sigma: Array, damped: Sequence[int] | slice = ()) -> Fit:
+    """Estimate unknowns by Gauss-Newton with priors.
+
+    Args:
+        residuals: maps unknowns (m, size) to (m, readings), measured minus predicted, over sigma.
+        start: first guess, and mean of the priors, (size,).
+        sigma: sigma of each prior, (size,); 0: known, not estimated.
+        damped: unknowns that have no prior; `sigma` limits their step.
+
+    Raises:
+        ValueError: the iteration does not converge.
+        numpy.linalg.LinAlgError: the equations cannot be solved.
+    """
+    sought = np.flatnonzero(sigma)
+    scale = sigma[sought]
+    steps = np.zeros((len(sought) + 1, len(start)))
+    steps[range(1, len(steps)), sought] = _STEP * scale
+    has_prior = np.ones(len(start), dtype=np.bool_)
+    has_prior[damped if isinstance(damped, slice) else list(damped)] = False
+    at, converged = start.copy(), False
+    for _ in range(_MAX_ROUNDS + 1):
+        found = residuals(at + steps)
+        residual = np.concatenate([found[0], (has_prior * (start - at))[sought] / scale])
+        scaled = np.vstack([(found[0] - found[1:]).T / _STEP, np.eye(len(sought))])
+        if not np.isfinite(scaled).all():
+            break
+        if converged:
+            inverse = np.linalg.inv(scaled.T @ scaled)
+            covariance = np.zeros((len(start), len(start)))
+            covariance[np.ix_(sought, sought)] = inverse * np.outer(scale, scale)
+            return Fit(at, covariance, residual, 1.0 - np.einsum("ij,ij->i", scaled @ inverse, scaled))
+        step = np.linalg.lstsq(scaled, residual, rcond=None)[0]
+        at[sought] += step * scale
+        converged = bool(np.abs(step).max() < _CONVERGED)
+    raise ValueError("no solution was found")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -110,230 +162,134 @@ class Row:
     name: str = ""
 
 
-class Part(enum.IntEnum):
-    """Unknowns of an IMU, three figures each: x, y, z, and of the shear xy, xz, yz."""
-
-    MISALIGNMENT = 0
-    SCALE = 1
-    SHEAR = 2
-    ACCEL_BIAS = 3
-    GYRO_BIAS = 4
-
-
-@dataclasses.dataclass(slots=True, eq=False)
-class Unknowns:
-    """All unknowns at their present values."""
-
-    values: Array
-    """(size,) in SI units, in the order of `Model`; attitude errors are zero."""
-    attitudes: list[Matrix]
-    """C_k, body from ground."""
-
-    @property
-    def gravity_m_s2(self) -> float:
-        """Strength of gravity."""
-        return float(self.values[Model.gravity.start])
-
-    @property
-    def imus(self) -> Array:
-        """(imus, parts, 3)."""
-        return self.values[Model.turn.stop + 3 * len(self.attitudes) :].reshape(-1, len(Part), 3)
+MISALIGNMENT, PART_SCALE, PART_SHEAR, ACCEL_BIAS, GYRO_BIAS = range(5)
+"""Unknowns of an IMU, three figures each: x, y, z, and of the shear xy, xz, yz."""
 
 
 class Model:
-    """Residuals and their derivatives, each divided by its sigma."""
+    """Unknowns and residuals of all stands.
+
+    Unknowns, SI units: zero of the gradienter (2), spot (2), gravity (1), Earth's rate (3), scale of counted turns (1),
+    attitude error of each stand (3), and five parts of each IMU (3).
+    """
 
     offset, spot, gravity, rate, turn = slice(0, 2), slice(2, 4), slice(4, 5), slice(5, 8), slice(8, 9)
 
     def __init__(
-        self, law: Law, vehicle_from_sensor: Matrix, stands: Sequence[Stand], ground: Ground, priors: Priors
+        self,
+        mounting: tuple[Law, Matrix],
+        stands: Sequence[Stand],
+        ground: Ground,
+        priors: Priors,
+        attitudes: Sequence[Matrix],
     ) -> None:
-        self._law, self._mounting = law, vehicle_from_sensor
-        self.stands, self.ground, self.priors = stands, ground, priors
-        self.names = [imu.name for imu in stands[0].imus]
-        count = len(self.names)
-        self._poses = self.turn.stop
-        self._first_imu = self._poses + 3 * len(stands)
-        self.size = self._first_imu + 15 * count
-        sigma = np.full(self.size, _ANYHOW_RAD)
-        sigma[self.offset] = priors.offset_deg * DEG if any(stand.tilt_deg is not None for stand in stands) else 0.0
-        if not any(stand.on_spot for stand in stands):
-            sigma[self.spot] = 0.0
-        sigma[self.gravity] = ground.gravity_sigma_m_s2
-        sigma[self.rate] = np.sqrt(np.diag(ground.rate_covariance))
-        sigma[self.turn] = priors.turn_scale
-        self.damped = 3 * len(stands) + (2 if sigma[2] > 0.0 else 0)
-        """Number of unknowns that only the readings determine."""
+        self._law, self._vehicle_from_sensor = mounting
+        self.names = names = [imu.name for imu in stands[0].imus]
+        self._stands, self._first_guess = stands, np.array(attitudes)
+        self._first_imu = self.turn.stop + 3 * len(stands)
+        numbers = range(len(stands))
+        self._tilted = [k for k in numbers if stands[k].tilt_deg is not None]
+        self._on_spot = [k for k in numbers if stands[k].on_spot]
+        self._turned = [k for k in numbers if stands[k].counted]
+        self._headed = [k for k in numbers if not stands[k].counted]
+        self._accel = np.array([[imu.accel_m_s2 for imu in stand.imus] for stand in stands])
+        self._gyro = np.array([[imu.gyro_rad_s for imu in stand.imus] for stand in stands])
+        self._tilt_deg = np.array([stands[k].tilt_deg for k in self._tilted]).reshape(-1, 2)
+        self._heading = np.array([stand.heading_rad for stand in stands])
+
         angle, bias = priors.misalignment_deg * DEG, (priors.accel_bias_m_s2, priors.gyro_bias_rad_s)
-        each = [angle, priors.scale, priors.shear, *bias]
-        sigma[self._first_imu :] = np.tile(np.repeat(each, 3), count)
-        self.sigma = sigma
+        self.sigma = np.full(self._first_imu + 15 * len(names), _ANYHOW_RAD)
         """Sigma of every unknown before any reading; 0: not estimated."""
-        self._known = np.zeros(self.size)
-        self._known[self.gravity], self._known[self.rate] = ground.gravity_m_s2, ground.rate_rad_s
+        self.sigma[self.offset] = priors.offset_deg * DEG if self._tilted else 0.0
+        self.sigma[self.spot] = _ANYHOW_RAD if self._on_spot else 0.0
+        self.sigma[self.gravity] = ground.gravity_sigma_m_s2
+        self.sigma[self.rate] = np.sqrt(np.diag(ground.rate_covariance))
+        self.sigma[self.turn] = priors.turn_scale
+        self.sigma[self._first_imu :] = np.tile(np.repeat([angle, priors.scale, priors.shear, *bias], 3), len(names))
+        self.start = np.zeros(len(self.sigma))
+        self.start[self.gravity], self.start[self.rate] = ground.gravity_m_s2, ground.rate_rad_s
+        if self._on_spot:
+            self.start[self.spot] = self._first_guess[self._on_spot, 2, :2].mean(axis=0)
+        self.damped = [*range(2, 4), *range(self.turn.stop, self._first_imu)]
+        """Unknowns that only the readings determine."""
 
-    def pose(self, stand: int) -> slice:
-        """Place of the attitude error of a stand, counted from 0."""
-        return slice(self._poses + 3 * stand, self._poses + 3 * stand + 3)
+        each = [(k, name) for k in numbers for name in names]
+        self.labels = [
+            *(Row("gradienter", k + 1) for k in self._tilted for _ in range(2)),
+            *(Row("accelerometer", k + 1, name) for k, name in each for _ in range(3)),
+            *(Row("gyro", k + 1, name) for k, name in each for _ in range(3)),
+            *(Row("compass", k + 1) for k in self._headed),
+            *(Row("turn", k + 1) for k in self._turned),
+            *(Row("spot", k + 1) for k in self._on_spot for _ in range(2)),
+            *(Row(self._prior_group(int(part))) for part in np.flatnonzero(self.sigma)),
+        ]
+        """Labels of the residuals and of the priors."""
+        heading_sigma = np.array([stand.heading_sigma_rad for stand in stands])
+        self.row_sigma = np.concatenate(
+            [
+                np.array([stands[k].tilt_sigma_deg for k in self._tilted]).ravel() * DEG,
+                np.array([[imu.accel_sigma_m_s2 for imu in stand.imus] for stand in stands]).ravel(),
+                np.array([[imu.gyro_sigma_rad_s for imu in stand.imus] for stand in stands]).ravel(),
+                heading_sigma[self._headed],
+                heading_sigma[self._turned],
+                np.full(2 * len(self._on_spot), priors.placement_deg * DEG),
+                self.sigma[self.sigma > 0.0],
+            ]
+        )
+        """Sigma of every row of `labels`, SI units."""
 
-    def imu(self, imu: int, part: Part) -> slice:
+    def _prior_group(self, part: int) -> Group:
+        return "zero" if part < self.offset.stop else "nothing" if part in self.damped else "prior"
+
+    def imu(self, imu: int, part: int) -> slice:
         """Place of one part of an IMU, counted from 0."""
         start = self._first_imu + 15 * imu + 3 * part
         return slice(start, start + 3)
 
-    def begin(self, attitudes: list[Matrix]) -> Unknowns:
-        """Return the first guess that attitudes alone give."""
-        spots = [a.T @ DOWN for a, stand in zip(attitudes, self.stands, strict=True) if stand.on_spot]
-        at = Unknowns(self._known.copy(), list(attitudes))
-        at.values[self.spot] = np.mean(spots, axis=0)[:2] if spots else 0.0
-        return at
+    def attitudes(self, at: Floats) -> Floats:
+        """Return body from ground in every stand, (..., stands, 3, 3)."""
+        errors = at[..., self.turn.stop : self._first_imu]
+        return np.asarray(rotations(-errors.reshape(*at.shape[:-1], -1, 3)) @ self._first_guess)
 
-    def step(self, at: Unknowns, by: Array) -> None:
-        """Change all unknowns by one step."""
-        at.values = at.values + by
-        at.values[self._poses : self._first_imu] = 0.0
-        for k in range(len(self.stands)):
-            at.attitudes[k] = rotations(-by[self.pose(k)]) @ at.attitudes[k]
+    def reading(self, at: Floats, up: Floats) -> Floats:
+        """Predict every IMU's accelerometers, (..., stands, imus, 3), from up in the vehicle, (..., stands, 3)."""
+        imus = self._imus(at)
+        turned = rotations(-imus[..., MISALIGNMENT, :])
+        matrices = response(imus[..., PART_SCALE, :], imus[..., PART_SHEAR, :]) @ turned
+        felt = np.einsum("...iab,...kb->...kia", matrices, up) * at[..., self.gravity, None, None]
+        return np.asarray(felt + imus[..., None, :, ACCEL_BIAS, :])
 
-    def linearise(self, at: Unknowns) -> Rows:
-        """Return all residuals at these values.
+    def residuals(self, at: Floats) -> Floats:
+        """Return measured minus predicted over sigma, (m, readings), for unknowns (m, size)."""
+        attitudes = self.attitudes(at)
+        up, forward = -attitudes[..., 2], attitudes[..., 0, :]
+        sensed = readings_from_up(self._law, up[:, self._tilted] @ self._vehicle_from_sensor)
+        tilt = np.remainder(self._tilt_deg - sensed + 180.0, 360.0) - 180.0
+        gyro = (attitudes @ at[:, None, self.rate, None])[..., 0]
+        compass = self._heading - np.arctan2(forward[..., 1], forward[..., 0])
+        turned = attitudes[:, self._turned] @ np.swapaxes(attitudes[:, [k - 1 for k in self._turned]], -1, -2)
+        counted = np.array([self._heading[k] - self._heading[k - 1] for k in self._turned])
+        by_gyros = np.arctan2(turned[..., 0, 1] - turned[..., 1, 0], turned[..., 0, 0] + turned[..., 1, 1])
+        parts = [
+            tilt * DEG - at[:, None, self.offset],
+            self._accel - self.reading(at, up),
+            self._gyro - gyro[..., None, :] - self._imus(at)[:, None, :, GYRO_BIAS],
+            _wrapped(compass[:, self._headed]),
+            _wrapped(counted * (1.0 - at[:, self.turn]) - by_gyros),
+            at[:, None, self.spot] - attitudes[:, self._on_spot, 2, :2],
+        ]
+        found = np.concatenate([part.reshape(len(at), -1) for part in parts], axis=1)
+        return np.asarray(found / self.row_sigma[: found.shape[1]])
 
-        Raises:
-            ValueError: the readings cannot belong together.
-        """
-        rows = Rows(self.size)
-        for k, stand in enumerate(self.stands):
-            attitude = at.attitudes[k]
-            up = -attitude @ DOWN
-            self._gradienter(rows, at, k, up)
-            for i, imu in enumerate(stand.imus):
-                self._accelerometer(rows, at, (k, i), imu, up)
-                self._gyro(rows, at, (k, i), imu)
-            if stand.counted:
-                self._turn(rows, at, k)
-            else:
-                self._heading(rows, at, k)
-            if stand.on_spot:
-                placement = np.full(2, self.priors.placement_deg * DEG)
-                by = rows.add(Row("spot", k + 1), at.values[self.spot] - (attitude.T @ DOWN)[:2], placement)
-                by[:, self.pose(k)] = (attitude.T @ -skew(DOWN))[:2]
-                by[:, self.spot] = -np.eye(2)
-        off = at.values - self._known
-        off[self.spot] = 0.0  # the readings alone tell it
-        for part in np.flatnonzero(self.sigma > 0.0):
-            weak = self.spot.start <= part < self.spot.stop or self._poses <= part < self._first_imu
-            group: Group = "zero" if part < self.offset.stop else "nothing" if weak else "prior"
-            rows.add(Row(group), -off[[part]], self.sigma[[part]])[0, part] = 1.0
-        return rows
-
-    def _heading(self, rows: Rows, at: Unknowns, k: int) -> None:
-        stand, attitude = self.stands[k], at.attitudes[k]
-        forward = attitude.T[:, 0]
-        turn = attitude.T @ -skew(np.array([1.0, 0.0, 0.0]))
-        across = forward[0] ** 2 + forward[1] ** 2
-        off = math.remainder(stand.heading_rad - math.atan2(forward[1], forward[0]), 2.0 * math.pi)
-        by = rows.add(Row("compass", k + 1), np.array([off]), np.array([stand.heading_sigma_rad]))
-        by[:, self.pose(k)] = (forward[0] * turn[1] - forward[1] * turn[0]) / max(across, 1e-6)
-
-    def _turn(self, rows: Rows, at: Unknowns, k: int) -> None:
-        counted = self.stands[k].heading_rad - self.stands[k - 1].heading_rad
-        turned = at.attitudes[k] @ at.attitudes[k - 1].T
-        sine, cosine = turned[0, 1] - turned[1, 0], turned[0, 0] + turned[1, 1]
-        off = math.remainder(
-            counted * (1.0 - float(at.values[self.turn.start])) - math.atan2(sine, cosine), 2.0 * math.pi
-        )
-        by = rows.add(Row("turn", k + 1), np.array([off]), np.array([self.stands[k].heading_sigma_rad]))
-        for stand, changes in ((k, -_AXES @ turned), (k - 1, turned @ _AXES)):
-            across = cosine * (changes[:, 0, 1] - changes[:, 1, 0]) - sine * (changes[:, 0, 0] + changes[:, 1, 1])
-            by[:, self.pose(stand)] = across / max(sine**2 + cosine**2, 1e-6)
-        by[:, self.turn] = counted
-
-    def _gradienter(self, rows: Rows, at: Unknowns, k: int, up: Array) -> None:
-        stand = self.stands[k]
-        if stand.tilt_deg is None:
-            return
-        x_deg, y_deg = readings_from_up(self._law, self._mounting.T @ up).tolist()
-        read = np.array([math.remainder(a - b, 360.0) for a, b in zip(stand.tilt_deg, (x_deg, y_deg), strict=True)])
-        # On the sphere of directions the readings' Jacobian is the left inverse of that of the direction.
-        by_up = np.linalg.pinv(up_jacobian(self._law, x_deg, y_deg)) @ self._mounting.T
-        sigma = np.array(stand.tilt_sigma_deg) * DEG
-        by = rows.add(Row("gradienter", k + 1), read * DEG - at.values[self.offset], sigma)
-        by[:, self.offset] = np.eye(2)
-        by[:, self.pose(k)] = by_up @ skew(up)
-
-    def _accelerometer(self, rows: Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand, up: Array) -> None:
-        k, i = where
-        read = imu.accel_m_s2 - self.reading(at, i, up)
-        by = rows.add(Row("accelerometer", k + 1, imu.name), read, imu.accel_sigma_m_s2)
-        by += self.reading_by(at, i, up)
-        by[:, self.pose(k)] = at.gravity_m_s2 * _response(at, i) @ skew(up)
-
-    def reading(self, at: Unknowns, imu: int, up: Array) -> Array:
-        """Predict the reading of an IMU's accelerometers, counted from 0, with `up` up in the vehicle; (3,)."""
-        return np.asarray(_response(at, imu) @ up * at.gravity_m_s2 + at.imus[imu, Part.ACCEL_BIAS])
-
-    def reading_by(self, at: Unknowns, imu: int, up: Array) -> Matrix:
-        """Return the derivative of `reading` by all unknowns but the attitude, (3, size)."""
-        misalignment, gravity = at.imus[imu, Part.MISALIGNMENT], at.gravity_m_s2
-        stretch, aligned = _stretch(at, imu), rotations(-misalignment) @ up
-        by = np.zeros((3, self.size))
-        by[:, self.imu(imu, Part.MISALIGNMENT)] = gravity * stretch @ skew(aligned) @ _jacobian(-misalignment)
-        by[:, self.imu(imu, Part.SCALE)] = gravity * np.diag(aligned)
-        by[:, self.imu(imu, Part.SHEAR)] = gravity * symmetric_by(aligned)
-        by[:, self.imu(imu, Part.ACCEL_BIAS)] = np.eye(3)
-        by[:, self.gravity] = (stretch @ aligned)[:, None]
-        return by
-
-    def _gyro(self, rows: Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand) -> None:
-        k, i = where
-        rate = at.attitudes[k] @ at.values[self.rate]
-        read = imu.gyro_rad_s - rate - at.imus[i, Part.GYRO_BIAS]
-        by = rows.add(Row("gyro", k + 1, imu.name), read, imu.gyro_sigma_rad_s)
-        by[:, self.pose(k)] = skew(rate)
-        by[:, self.rate] = at.attitudes[k]
-        by[:, self.imu(i, Part.GYRO_BIAS)] = np.eye(3)
+    def _imus(self, at: Floats) -> Floats:
+        """Return the parts of every IMU, (..., imus, 5, 3)."""
+        return at[..., self._first_imu :].reshape(*at.shape[:-1], -1, 5, 3)
 
 
-class Rows:
-    """Residuals and their derivatives by all unknowns."""
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-        self._parts: list[tuple[Array, Matrix, Array]] = []
-        self.labels: list[Row] = []
-
-    def add(self, row: Row, residual: Array, sigma: Array) -> Matrix:
-        """Add rows; returns their derivatives, to be filled in."""
-        derivative = np.zeros((len(residual), self._size))
-        self.labels += [row] * len(residual)
-        self._parts.append((residual, derivative, sigma))
-        return derivative
-
-    def stacked(self) -> tuple[Array, Matrix, Array]:
-        """Residuals (n,) and derivatives (n, size), both over sigma, and the sigmas (n,)."""
-        residual, derivative, sigma = (np.concatenate(part) for part in zip(*self._parts, strict=True))
-        return residual / sigma, derivative / sigma[:, None], sigma
+def response(scale: Floats, shear: Floats) -> Floats:
+    """Return I + S, (..., 3, 3), of scale x y z and shear xy, xz, yz."""
+    return np.asarray((1.0 + scale)[..., None] * np.eye(3) + symmetric(shear))
 
 
-def response(scale: Array, shear: Array) -> Matrix:
-    """Return I + S, (3, 3), of scale x y z and shear xy, xz, yz."""
-    return np.diag(1.0 + scale) + symmetric(shear)
-
-
-def _stretch(at: Unknowns, imu: int) -> Matrix:
-    return response(at.imus[imu, Part.SCALE], at.imus[imu, Part.SHEAR])
-
-
-def _response(at: Unknowns, imu: int) -> Matrix:
-    return _stretch(at, imu) @ rotations(-at.imus[imu, Part.MISALIGNMENT])
-
-
-def _jacobian(vector_rad: Array) -> Matrix:
-    """Return J of exp([(v + d) x]) = exp([(J d) x]) exp([v x]), to first order in d."""
-    angle = float(np.linalg.norm(vector_rad))
-    cross = skew(vector_rad)
-    if angle < 1e-6:
-        return np.eye(3) + cross / 2.0
-    return np.asarray(
-        np.eye(3) + (1.0 - math.cos(angle)) / angle**2 * cross + (angle - math.sin(angle)) / angle**3 * cross @ cross
-    )
+def _wrapped(angle_rad: Floats) -> Floats:
+    return np.asarray(np.remainder(angle_rad + math.pi, 2.0 * math.pi) - math.pi)

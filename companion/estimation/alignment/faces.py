@@ -18,16 +18,16 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.alignment.align import LEVEL, ImuAlignment, widened_by
-from companion.estimation.alignment.align_model import PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, response
+from companion.estimation.alignment.align import ImuAlignment, widened_by
+from companion.estimation.alignment.align_model import LEVEL, PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, fit, response
 from companion.estimation.alignment.poses import Hold, Wish
-from companion.physics.frames import Array, Matrix, roll_pitch_from_up, symmetric_by, vector
+from companion.physics.frames import Array, Floats, Matrix, roll_pitch_from_up, vector
 from companion.physics.units import MG
 
 FIGURES: Final = 9
@@ -38,8 +38,6 @@ W_LIMIT: Final = 3.9
 """Threshold for |w| of a stand (Baarda): exceeded by chance once in ten thousand."""
 LEAST_SPARE: Final = 2
 """Stands beyond the number of figures that it takes to name a wrong one."""
-_MAX_ROUNDS: Final = 30
-_CONVERGED: Final = 1e-8
 _LEAST_REDUNDANCY: Final = 1e-3
 
 ENOUGH_BIAS_M_S2: Final = 0.15 * MG
@@ -158,8 +156,7 @@ def faces(
     )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
+class _Fit(NamedTuple):
     figures: Array
     covariance: Matrix
     chi_square: float
@@ -167,54 +164,35 @@ class _Fit:
 
 
 def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, float]) -> _Fit:
-    """Estimate the figures and gravity by Gauss-Newton with priors, in units of the prior sigmas."""
+    """Estimate the figures and gravity."""
     force = np.array([stands[k].accel_m_s2 for k in which])
     variance = np.array([stands[k].sigma_m_s2 for k in which]) ** 2
     prior = np.append(np.repeat([PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR], 3), max(gravity[1], 1e-9))
-    at = np.zeros(FIGURES + 1)
-    for _ in range(_MAX_ROUNDS):
-        residual, scaled = _linearised(force, variance, at, gravity[0], prior)
-        step, *_ = np.linalg.lstsq(scaled, residual, rcond=None)
-        at = at + step * prior
-        if not (np.isfinite(step).all() and np.abs(at[SCALE]).max() < 0.5):
-            break
-        if np.abs(step).max() < _CONVERGED:
-            return _judged(*_linearised(force, variance, at, gravity[0], prior), at, prior, len(which))
-    raise CalibrationRefusedError("the accelerometers' readings are no gravity: is every stand still?")
 
+    def residuals(at: Floats) -> Floats:
+        inverse = np.linalg.inv(response(at[:, SCALE], at[:, SHEAR]))
+        inside = (force - at[:, None, BIAS]) @ inverse
+        lengths = np.linalg.norm(inside, axis=-1)
+        across = inside / lengths[..., None] @ inverse
+        """Derivative of each length by its reading."""
+        sigma = np.sqrt(np.einsum("mki,ki->mk", across**2, variance))
+        return np.asarray((lengths - gravity[0] - at[:, FIGURES:]) / sigma)
 
-def _linearised(force: Matrix, variance: Matrix, at: Array, gravity_m_s2: float, prior: Array) -> tuple[Array, Matrix]:
-    """Return residuals over sigma, measured minus predicted, and derivatives of the prediction times prior sigmas."""
-    inverse = np.linalg.inv(response(at[SCALE], at[SHEAR]))
-    inside = (force - at[BIAS]) @ inverse
-    lengths = np.linalg.norm(inside, axis=1)
-    across = inside / lengths[:, None] @ inverse
-    """Derivative of each length by its reading, (stands, 3)."""
-    sigma = np.sqrt(np.einsum("ki,ki->k", across**2, variance))
-    derivative = np.empty((len(force), FIGURES + 1))
-    derivative[:, BIAS] = across
-    derivative[:, SCALE] = across * inside
-    derivative[:, SHEAR] = [one @ symmetric_by(other) for one, other in zip(across, inside, strict=True)]
-    derivative[:, FIGURES] = 1.0
-    residual = lengths - gravity_m_s2 - at[FIGURES]
-    return (
-        np.concatenate([residual / sigma, -at / prior]),
-        np.vstack([derivative / sigma[:, None] * prior, np.eye(FIGURES + 1)]),
-    )
-
-
-def _judged(residual: Array, scaled: Matrix, at: Array, prior: Array, count: int) -> _Fit:
-    inverse = np.linalg.inv(scaled.T @ scaled)
-    residual, freedom = residual[:count], count - FIGURES
+    try:
+        found = fit(residuals, np.zeros(FIGURES + 1), prior)
+    except (ValueError, np.linalg.LinAlgError):
+        found = None
+    if found is None or np.abs(found.values[SCALE]).max() > 0.5:
+        raise CalibrationRefusedError("the accelerometers' readings are no gravity: is every stand still?")
+    count = len(which)
+    residual, freedom = found.residual[:count], count - FIGURES
     chi_square = float(residual @ residual)
-    redundancy = 1.0 - np.einsum("ij,jk,ik->i", scaled[:count], inverse, scaled[:count])
-    w = residual / np.sqrt(np.maximum(redundancy, _LEAST_REDUNDANCY))
+    w = residual / np.sqrt(np.maximum(found.redundancy[:count], _LEAST_REDUNDANCY))
     # Compared with the scatter of the other stands, where that exceeds their sigmas.
     others = np.maximum((chi_square - w**2) / (freedom - 1), 1.0) if freedom > 1 else np.ones(count)
-    covariance = widened_by(chi_square, freedom) * inverse * np.outer(prior, prior)
     return _Fit(
-        figures=at[:FIGURES],
-        covariance=covariance[:FIGURES, :FIGURES],
+        figures=found.values[:FIGURES],
+        covariance=widened_by(chi_square, freedom) * found.covariance[:FIGURES, :FIGURES],
         chi_square=chi_square,
         fits=bool((np.abs(w) <= W_LIMIT * np.sqrt(others)).all()),
     )
@@ -286,7 +264,7 @@ def _all_sides(vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
 
 def _told(found: FacesEstimate, up: Array) -> Array:
     """Return the share of each figure's variance, (9,), that a stand with `up` upwards would take away."""
-    by = np.concatenate([up, found.gravity_m_s2 * up**2, found.gravity_m_s2 * up @ symmetric_by(up)])
+    by = np.concatenate([up, found.gravity_m_s2 * up**2, found.gravity_m_s2 * 2.0 * up[[0, 0, 1]] * up[[1, 2, 2]]])
     gain = found.by_stands @ by
     return np.asarray(gain**2 / (by @ gain + _STAND_SIGMA_M_S2**2) / np.diag(found.by_stands))
 
