@@ -12,7 +12,7 @@ from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
-from companion.estimation.deck.deck import KEPT_S
+from companion.estimation.deck.deck import KEPT_S, Deck
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.noise.allan import noise_profile
@@ -123,13 +123,9 @@ def imu_input(imu: Imu, kind: StreamKind | None, grid: tuple[float, float] = (0.
 
 def collector(config: Config) -> RollingCollector:
     """Return the collector of a configuration, before anything has been heard of the autopilot's IMUs."""
-    return RollingCollector(
-        settings(config),
-        [imu_input(imu, None) for imu in config.imu],
-        gradienter_model(config.gradienter),
-        compass_model(config.compass),
-        on_deck=config.vehicle.platform == "deck",
-    )
+    wanted, pose = settings(config), (gradienter_model(config.gradienter), compass_model(config.compass))
+    windows = Deck(*pose, wanted.horizon_s) if config.vehicle.platform == "deck" else None
+    return RollingCollector(wanted, [imu_input(imu, None) for imu in config.imu], *pose, windows)
 
 
 def gradienter_model(gradienter: Gradienter | None) -> GradienterModel | None:

@@ -107,7 +107,7 @@ def sail(
     feed(deck, imu, spans_s[-1] + 1, random, voyage.compass_sigma_deg)
     errors, sigmas = [], []
     for span in spans_s:
-        found = deck.work(range(1, 1 + span), NEXT_S).run()
+        found = deck.work(range(1, 1 + span)).run()
         if isinstance(found, CalibrationRefusedError):
             raise found
         error, sigma = _against_the_truth(found.window, imu, tilt, compass)

@@ -9,8 +9,7 @@ from typing import Final
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.attitude.corrections import REFUSED_S
-from companion.attitude.estimator import Attitude, AttitudeEstimator
+from companion.attitude.estimator import REFUSED_S, Attitude, AttitudeEstimator
 from companion.attitude.quaternion import (
     Quaternion,
     Triple,

@@ -78,7 +78,7 @@ class SpotTask(PoseTask):
             return HeldPose(up, 0.0, first_sigma_deg)
         before, imu = state.windows[-1], now.imus[0]
         bias = (np.array(before.imus[0].gyro_rad_s) + np.array(imu.gyro_rad_s)) / 2.0
-        counted = self._core.collector.counted(imu.name, before.end_s, now.start_s, bias)
+        counted = self._core.collector.imus[imu.name].counted(before.end_s, now.start_s, bias)
         turn_deg, sigma_deg = asked_turn_deg(self._request, state.poses), BY_EYE_SIGMA_DEG
         if counted is not None:
             turn_deg, sigma_deg = counted.angle_rad / DEG, counted.sigma_rad / DEG

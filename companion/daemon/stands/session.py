@@ -292,7 +292,7 @@ class PoseSession:
         """Take the stand if it is the pose that is wanted; else object."""
         window = await self._core.window(since_s=state.since_s + SETTLE_S)
         pose, objection = task.examine(state, window)
-        forces = self._collector.forces_m_s2(window.imus[0].name, window.start_s, window.end_s)
+        forces = self._collector.imus[window.imus[0].name].forces_m_s2(window.start_s, window.end_s)
         # A hand that is taken off too slowly for a movement, or soft ground.
         if (leaned := leaned_deg(np.array(forces))) >= LEANED_DEG:
             state.since_s = now_s
@@ -321,7 +321,7 @@ class PoseSession:
         if now_s - state.turn_read_s >= 1.0:
             last, before_deg = state.windows[-1], state.turned_deg
             imu = last.imus[0]
-            counted = self._collector.counted(imu.name, last.end_s, now_s, np.array(imu.gyro_rad_s))
+            counted = self._collector.imus[imu.name].counted(last.end_s, now_s, np.array(imu.gyro_rad_s))
             state.turn_read_s, state.turned_deg = now_s, math.nan if counted is None else abs(counted.angle_rad) / DEG
             step_deg = state.turned_deg - before_deg
             is_near = state.turned_deg + step_deg > wanted_deg - STOP_WITHIN_DEG

@@ -199,36 +199,31 @@ def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, flo
 
 
 def missing(found: FacesEstimate, vehicle_from_sensor: Matrix) -> Wish | None:
-    """Return the pose that tells most; None where bias and scale of all axes are known well enough, and checked.
+    """Return the next pose; None where bias and scale of all axes are known well enough, and checked.
 
     `vehicle_from_sensor`: 3x3, the mounting of the accelerometers in `found`.
     """
     wander, gravity = ENOUGH_WANDER * found.wander_m_s2, found.gravity_m_s2
     # No stand tells an error of the place's gravity: that much of the scale stays open.
     scale = np.hypot(np.maximum(ENOUGH_SCALE, wander / gravity), found.gravity_sigma_m_s2 / gravity)
-    wanted = np.concatenate([np.maximum(ENOUGH_BIAS_M_S2, wander), scale, np.full(3, np.inf)])
-    sigma = np.sqrt(np.diag(found.by_stands))
-    share = sigma / wanted
-    open_figures = share > 1.0
+    sigma = np.sqrt(np.diag(found.by_stands))[: SCALE.stop]
+    share = sigma / np.concatenate([np.maximum(ENOUGH_BIAS_M_S2, wander), scale])
+    worst_first = [int(which) for which in np.argsort(-share) if share[which] > 1.0]
     unchecked = len(found.up) - len(found.left_out) < FIGURES + LEAST_SPARE
-    if not open_figures.any() and not unchecked and not found.in_doubt:
+    if not worst_first and not unchecked and not found.in_doubt:
         return None
     # Where all have been seen, the one that tells most is held once more.
     sides = _not_seen(found, vehicle_from_sensor) or _all_sides(vehicle_from_sensor)
-    told = {side: _told(found, up) for side, up in sides}
-    if not open_figures.any():
-        words = "a stand does not fit, one more tells which" if found.in_doubt else "nothing checks the others yet"
-        return _wish(max(told, key=lambda side: float(told[side].sum())), words)
-    side = max(told, key=lambda side: float(told[side][open_figures].sum()))
-    worst_first = tuple(_figure(sigma, int(which)) for which in np.argsort(-share) if open_figures[which])
-    told_most = int(np.argmax(np.where(open_figures, told[side] * share, 0.0)))
-    return _wish(side, _figure(sigma, told_most), worst_first)
-
-
-def _wish(side: str, why: str, unknown: tuple[str, ...] = ()) -> Wish:
-    names = side.removeprefix("between ").split(" and ")
-    up = np.sum([_SIDES[name] for name in names], axis=0)
-    return Wish(f"{side}: {why}", Hold(vector(up / np.linalg.norm(up))), unknown)
+    weight = np.where(share > 1.0, share, 0.0) if worst_first else np.ones(SCALE.stop)
+    told = [_told(found, up)[: SCALE.stop] * weight for _, up in sides]
+    best = int(np.argmax([each.sum() for each in told]))
+    if worst_first:
+        why = _figure(sigma, int(np.argmax(told[best])))
+    else:
+        why = "a stand does not fit, one more tells which" if found.in_doubt else "nothing checks the others yet"
+    side, up = sides[best]
+    hold = Hold(vector(vehicle_from_sensor @ up))
+    return Wish(f"{side}: {why}", hold, tuple(_figure(sigma, which) for which in worst_first))
 
 
 def seen_before(found: FacesEstimate, up: Array, vehicle_from_sensor: Matrix) -> int | None:

@@ -1,50 +1,44 @@
-"""What comes into the rolling collector: its streams, each with batches, gate and verdict, and where samples go."""
+"""One stream into the collector: its seconds, its gate and its verdict."""
 
 from __future__ import annotations
 
-import functools
 import math
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import msgspec
 
-from companion.estimation.deck.deck import Deck
-from companion.estimation.means.pose import CompassModel, FieldHeading, GradienterModel
+from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import ImuInput, integer_steps
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.estimation.seconds.counting import Counted, TurnCounter
 from companion.estimation.stillness.gates import STILL, ImuGate, PoseGate, Verdict
 from companion.estimation.stillness.stretch import Settling
-from companion.estimation.turning.watch import Turn, TurnWatch
 from companion.physics.frames import Array
-from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
-
-if TYPE_CHECKING:
-    from companion.estimation.temperature.thermometer import Thermometers
+from companion.samples import ImuSample
 
 Kind = Literal["imu", "gradienter", "compass"]
+PoseKind = Literal["gradienter", "compass"]
 
 _SILENT_S: Final = 2.5
-_LONGEST_UP_S: Final = 3e8
-"""A clock that says more counts from somewhere else: UTC, say."""
 _CARRY: Final = 2
 """Seconds for which a slow gradienter's or compass' last reading stands."""
+_LONGEST_UP_S: Final = 3e8
+"""A longer time since power-up counts from somewhere else, such as UTC."""
 LIMITS_IMU: Final = (1e3,) * 3 + (1e4,) * 3
 _LIMITS_TILT: Final = (180.0,) * 2
 _LIMITS_HEADING: Final = (1e3,)
 
 
 class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """One source now."""
+    """State of one source."""
 
     kind: Kind
     name: str
     still: bool
     words: str
-    """Why not still; empty when still."""
+    """Reason for not being still; empty when still."""
     rate_hz: int
     """Samples in its last whole second."""
     dropped: dict[str, int]
@@ -56,7 +50,7 @@ class Source:
     """One stream: its batches, its gate, its last verdict."""
 
     hint = ""
-    """Why nothing comes, where somebody knows better than "no data"."""
+    """Reason for silence, where it is known."""
 
     def __init__(
         self,
@@ -64,24 +58,29 @@ class Source:
         name: str,
         batches: BatchSource,
         gate: ImuGate | PoseGate,
-        settling: Settling | None = None,
-        keep: int = 0,
+        *,
+        may_move: bool,
     ) -> None:
-        self.kind, self.name, self.batches, self.gate, self.settling = kind, name, batches, gate, settling
-        self.may_move = False
-        """Whether only faults count: on a deck."""
+        self.kind, self.name, self.batches, self.gate = kind, name, batches, gate
+        self._may_move = may_move
         self.verdict = Verdict(still=False)
-        self.unsettled: deque[int] = deque(maxlen=keep)
+        self.settling: Settling | None = None
+        self.unsettled: deque[int] = deque(maxlen=0)
         """Seconds in which its readings still followed a movement; good for the others, not for a mean of its own."""
 
     @property
     def label(self) -> str:
-        """As a pilot calls it."""
+        """Name for a pilot."""
         return f"imu {self.name}" if self.kind == "imu" else self.name
 
+    @property
+    def newest(self) -> Batch | None:
+        """The last whole second."""
+        return next(reversed(self.batches.batches.values()), None)
+
     def judge(self, slot: int, *, moved: bool = False) -> bool:
-        """Whether this source was still in that second, in which by the IMUs the aircraft `moved`; remembers it."""
-        # Of a slow pose sensor the last one, for a short while.
+        """Return whether this source was still in a second in which, by the IMUs, the aircraft `moved`."""
+        # A slow pose sensor's last batch counts for a short while.
         first, batches = slot if self.kind == "imu" else slot - _CARRY, self.batches.batches
         batch = next((batches[at] for at in range(slot, first - 1, -1) if at in batches), None)
         if self.settling is not None:
@@ -94,16 +93,29 @@ class Source:
             self.verdict = Verdict(still=False, words=words, fault=True)
         elif batch.slot == slot:
             verdict = self.gate.judge(batch)
-            self.verdict = STILL if self.may_move and not verdict.fault else verdict
+            self.verdict = STILL if self._may_move and not verdict.fault else verdict
         return self.verdict.still
 
+    def accept(self, slot: int) -> None:
+        """Let the gate learn from a second in which every source was still."""
+        batch = self.batches.batches.get(slot)
+        if batch is not None and (self.kind == "imu" or slot not in self.unsettled):
+            self.gate.accept(batch)
+
+    def forget(self) -> None:
+        """Drop the seconds so far."""
+        self.batches.forget()
+        self.verdict = Verdict(still=False)
+        if isinstance(self.gate, ImuGate):
+            self.gate.forget_level()
+
     def settled(self, slots: Sequence[int]) -> list[Batch]:
-        """Its batches of these seconds that do not follow a movement any more."""
+        """Return the batches of these seconds that no longer follow a movement."""
         batches, unsettled = self.batches.batches, frozenset(self.unsettled)
         return [batches[slot] for slot in slots if slot in batches and slot not in unsettled]
 
     def lacks(self, slots: Sequence[int], needed: int, left_s: int) -> str | None:
-        """What its mean over these seconds and the next `left_s` has to wait for, after a movement; else None."""
+        """Say how long its mean over these seconds and the next `left_s` has to wait after a movement, if at all."""
         unsettled = sum(slot in self.unsettled for slot in slots) if self.unsettled else 0
         needed -= len(slots) - unsettled
         if self.settling is None or unsettled == 0 or needed <= 0 or self.settling.left_s + needed <= left_s:
@@ -111,7 +123,7 @@ class Source:
         return f"{self.label} settles: {self.settling.left_s + needed} s more"
 
     def silence(self, now_s: float) -> str | None:
-        """One line when nothing comes; None when data flows."""
+        """Return one line when nothing comes; None when data flows."""
         last = self.batches.last_s
         if last is None:
             return self.hint or f"no data from {self.label} yet"
@@ -120,9 +132,8 @@ class Source:
         return None
 
     def status(self, now_s: float) -> SourceStatus:
-        """What can be shown of it."""
-        silence = self.silence(now_s)
-        newest = next(reversed(self.batches.batches.values()), None)
+        """Return the state to show."""
+        silence, newest = self.silence(now_s), self.newest
         return SourceStatus(
             kind=self.kind,
             name=self.name,
@@ -134,207 +145,82 @@ class Source:
         )
 
 
-class Intake(ABC):
-    """The streams, and what is known of each. Nothing that a sample holds makes it raise."""
+class ImuSource(Source):
+    """The stream of one IMU, with what is known of its device."""
 
-    def __init__(
-        self, keep: int, gradienter: GradienterModel | None, compass: CompassModel | None, deck: Deck | None, span: int
-    ) -> None:
-        self._keep, self._gradienter, self._compass, self._deck = keep, gradienter, compass, deck
-        self._inputs: dict[str, ImuInput] = {}
-        self._imus: dict[str, Source] = {}
-        self._tilt = None if gradienter is None else self._pose_source("gradienter")
-        self._heading = None if compass is None else self._pose_source("compass")
-        self._breaks: dict[str, int] = {}
-        self._restarted_s: dict[str, float] = {}
-        self._up: dict[str, tuple[float, float]] = {}
-        """By IMU whose device tells: a time, and for how long it had been on by then."""
-        self._field = None if compass is None else FieldHeading(compass, gradienter, keep)
-        self._turns = TurnWatch(span)
-        self._counters: dict[str, TurnCounter] = {}
-        """By IMU, while turns on a spot are counted."""
+    def __init__(self, imu: ImuInput, keep: int, *, may_move: bool) -> None:
+        batches = BatchSource(LIMITS_IMU, keep, steps=integer_steps(imu))
+        super().__init__("imu", imu.name, batches, _gate(imu, sways=may_move), may_move=may_move)
+        self.imu = imu
+        self.counter: TurnCounter | None = None
+        """Set while turns on a spot are counted."""
+        self._breaks = 0
+        self._restarted_s = -math.inf
+        self._up: tuple[float, float] | None = None
+        """A time, and the time since power-up by then, where the device tells."""
 
-    @functools.cached_property
-    def thermometers(self) -> Thermometers:
-        """Of the IMUs; not wanted before the first second."""
-        from companion.estimation.temperature.thermometer import Thermometers
+    def replace(self, imu: ImuInput) -> None:
+        """Set the new kind of the stream."""
+        self.imu, self.gate = imu, _gate(imu, sways=self._may_move)
+        self.batches.steps = integer_steps(imu)
 
-        return Thermometers()
+    def has_restarted(self, sample: ImuSample) -> bool:
+        """Return whether the stream was interrupted just before a sample."""
+        if sample.breaks == self._breaks:
+            return False
+        self._breaks, self._restarted_s = sample.breaks, sample.t_s
+        return True
 
-    @abstractmethod
-    def _evaluate(self) -> None:
-        """A second of some stream has ended: judge what can be judged."""
-
-    @abstractmethod
-    def reset(self, why: str, imu: str | None = None) -> None:
-        """Forget what was measured, of one IMU or of everything."""
-
-    @abstractmethod
-    def _break(self) -> None:
-        """The still stretch is over."""
-
-    # ------------------------------------------------------------------------------------------------- samples in
-
-    def add_imu(self, name: str, sample: ImuSample) -> None:
-        """Take one sample of the IMU of that name; of an unknown name it is dropped."""
-        source = self._imus.get(name)
-        if source is None:
-            return
-        if sample.breaks != self._breaks.get(name, 0):
-            self._breaks[name] = sample.breaks
-            self._restarted_s[name] = sample.t_s
-            self._forget(name)
-        if name in self._counters:
-            self._counters[name].add(sample)
+    def add(self, sample: ImuSample) -> bool:
+        """Add a sample; return whether a second may have ended."""
+        if self.counter is not None:
+            self.counter.add(sample)
         stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
         row = sample.gyro_rad_s + sample.accel_m_s2
-        if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp, sample.shared_variance):
-            up_s = sample.t_device_s
-            if self._inputs[name].clock_from_start and up_s is not None and 0.0 <= up_s < _LONGEST_UP_S:
-                self._up[name] = (sample.t_s, up_s)
-            self._evaluate()
-
-    def add_tilt(self, sample: TiltSample) -> None:
-        """Take one reading of the gradienter; dropped when none is expected."""
-        if self._field is not None:
-            self._field.take_tilt(sample)
-        if self._tilt is not None and self._tilt.batches.add(
-            sample.t_s, (sample.x_deg, sample.y_deg), sample.temperature_degc
-        ):
-            self._evaluate()
-
-    def add_compass(self, sample: CompassSample) -> bool:
-        """Take one heading of the device's own; whether it is the one that counts (else that from its field does)."""
-        counts = self._field is None or self._field.takes_own(sample)
-        if counts:
-            self._take_heading(sample)
-        return counts
-
-    def add_field(self, sample: MagSample) -> CompassSample | None:
-        """Take the compass' field; the heading that came of it, where that is the one that counts."""
-        if self._heading is None or self._field is None:
-            return None
-        heading = self._field.add(sample)
-        self._heading.hint = self._field.hint
-        if heading is not None:
-            self._take_heading(heading)
-        return heading
-
-    def _take_heading(self, sample: CompassSample) -> None:
-        if self._heading is not None and self._heading.batches.add(sample.t_s, (sample.heading_deg,)):
-            self._evaluate()
-
-    def set_imu(self, imu: ImuInput) -> None:
-        """Add an IMU, or say that its stream is another kind now: all that was learned of it is forgotten."""
-        self._inputs[imu.name] = imu
-        steps = (imu.gyro_step_rad_s, imu.accel_step_m_s2)
-        gate = ImuGate(imu.name, imu.profile, steps, sways=self._deck is not None)
-        self._turns.set_imu(imu.name, imu.rotation, imu.profile, steps)
-        known = self._imus.get(imu.name)
-        if self._deck is not None:
-            self._deck.set_imu(imu)
-        if known is None:
-            batches = BatchSource(LIMITS_IMU, self._keep, steps=integer_steps(imu))
-            name = imu.name
-            batches.believed = lambda slot, degc: self.thermometers.believed(name, slot, degc)
-            self._imus[imu.name] = source = Source("imu", imu.name, batches, gate)
-            if self._deck is not None:
-                source.may_move, batches.on_second = True, functools.partial(self._deck.take_imu, imu.name)
-            # It has no share in the seconds so far.
-            self._break()
-        else:
-            known.gate = gate
-            known.batches.steps = integer_steps(imu)
-            self.reset("another stream", imu.name)
-
-    def expect(self, *, gradienter: bool, compass: bool) -> None:
-        """Change which pose sensors are waited for, for example when one is found dead; the IMUs' history stays."""
-        added = (gradienter and self._tilt is None) or (compass and self._heading is None)
-        if gradienter != (self._tilt is not None):
-            self._tilt = self._pose_source("gradienter") if gradienter else None
-        if compass != (self._heading is not None):
-            self._heading = self._pose_source("compass") if compass else None
-        if added:
-            self._break()
-
-    def _pose_source(self, name: Literal["gradienter", "compass"]) -> Source:
-        """A gradienter's two channels, or a compass' heading, in degrees."""
-        circle = name == "compass"
-        model = self._compass if circle else self._gradienter
-        settling = None if model is None else Settling(model.lag_s, model.sigma_deg, circle=circle)
-        batches = BatchSource(_LIMITS_HEADING if circle else _LIMITS_TILT, self._keep, circle=circle)
-        source = Source(name, name, batches, PoseGate(name), settling, self._keep)
-        if self._deck is not None:
-            source.may_move = True
-            batches.on_second = self._deck.take_heading if circle else self._deck.take_tilt
-        return source
+        if not self.batches.add(sample.t_s, row, sample.temperature_degc, stamp, sample.shared_variance):
+            return False
+        up_s = sample.t_device_s
+        if self.imu.clock_from_start and up_s is not None and 0.0 <= up_s < _LONGEST_UP_S:
+            self._up = sample.t_s, up_s
+        return True
 
     @property
-    def begun_s(self) -> dict[str, float]:
-        """By IMU, since when it has been switched on: by its device's clock, else as long as its stream has come."""
-        heard = {
-            name: max(float(source.batches.begun), self._restarted_s.get(name, -math.inf))
-            for name, source in self._imus.items()
-            if source.batches.begun is not None
-        }
-        return heard | {name: t_s - up_s for name, (t_s, up_s) in self._up.items() if name in heard}
+    def begun_s(self) -> float | None:
+        """Time of power-up by the device's clock, else of the first sample; None before it."""
+        if self.batches.begun is None:
+            return None
+        if self._up is not None:
+            return self._up[0] - self._up[1]
+        return max(float(self.batches.begun), self._restarted_s)
 
-    def up_s(self, name: str) -> float | None:
-        """For how long the device of an IMU had been on when that was heard last; None where it does not tell."""
-        return self._up[name][1] if name in self._up else None
+    @property
+    def up_s(self) -> float | None:
+        """Time since power-up by the latest sample; None where the device does not tell."""
+        return None if self._up is None else self._up[1]
 
-    def forces_m_s2(self, imu: str, start_s: float, end_s: float) -> list[Array]:
-        """The mean specific force of each second between two times, (3,) in the IMU's own axes."""
-        batches = self._imus[imu].batches.batches
+    def forces_m_s2(self, start_s: float, end_s: float) -> list[Array]:
+        """Return the mean specific force of each second between two times, (3,) in the IMU's own axes."""
+        batches = self.batches.batches
         return [batches[slot].mean[3:] for slot in sorted(batches) if start_s <= slot < end_s]
 
-    def count_turns(self, *, wanted: bool) -> None:
-        """Begin to keep what turns on a spot are counted by, or stop it."""
-        self._counters = {name: TurnCounter() for name in self._imus} if wanted else {}
+    def counted(self, start_s: float, end_s: float, bias_rad_s: Array) -> Counted | None:
+        """Return `TurnCounter.counted`; None where nothing was kept."""
+        cut_rad_s = self.imu.gyro_step_rad_s if self.imu.truncates else 0.0
+        if self.counter is None:
+            return None
+        return self.counter.counted(start_s, end_s, bias_rad_s, self.imu.rotation, cut_rad_s)
 
-    def counted(self, imu: str, start_s: float, end_s: float, bias_rad_s: Array) -> Counted | None:
-        """`TurnCounter.counted` of an IMU; None where nothing was kept of it."""
-        counter, kind = self._counters.get(imu), self._inputs[imu]
-        cut_rad_s = kind.gyro_step_rad_s if kind.truncates else 0.0
-        return None if counter is None else counter.counted(start_s, end_s, bias_rad_s, kind.rotation, cut_rad_s)
 
-    @property
-    def turn(self) -> Turn:
-        """What is known of the platform's own rate."""
-        return self._turns.turn
+def _gate(imu: ImuInput, *, sways: bool) -> ImuGate:
+    return ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2), sways=sways)
 
-    def _watch_turn(self, slot: int, *, good: bool) -> bool:
-        """Look for a turn in a second that has been judged; False where the still stretch ends with it."""
-        others = [source.verdict for source in self._sources() if source is not self._heading]
-        if self._deck is not None or any(verdict.fault for verdict in others):
-            return True
-        if not all(verdict.still for verdict in others):
-            self._turns.moved(slot)
-            return True
-        heading = None if self._heading is None else next(iter(self._heading.settled([slot])), None)
-        imus = {name: source.batches.batches[slot] for name, source in self._imus.items()}
-        return self._turns.add_second(slot, imus, heading, good=good)
 
-    def imu_seconds(self) -> dict[str, Batch]:
-        """The last whole second of each IMU that has one, still or not."""
-        newest = {name: next(reversed(source.batches.batches.values()), None) for name, source in self._imus.items()}
-        return {name: batch for name, batch in newest.items() if batch is not None}
+class PoseSource(Source):
+    """The two channels of a gradienter, or the heading of a compass, in degrees."""
 
-    def tilt_second(self) -> Batch | None:
-        """The same of the gradienter."""
-        return None if self._tilt is None else next(reversed(self._tilt.batches.batches.values()), None)
-
-    def _forget(self, imu: str | None) -> None:
-        if self._deck is not None:
-            self._deck.forget(imu)
-        for source in self._sources():
-            if imu is None or (source.kind == "imu" and source.name == imu):
-                source.batches.forget()
-                source.verdict = Verdict(still=False)
-                if isinstance(source.gate, ImuGate):
-                    source.gate.forget_level()
-        self._turns.forget(imu)
-        self._break()
-
-    def _sources(self) -> list[Source]:
-        return [*self._imus.values(), *(source for source in (self._tilt, self._heading) if source is not None)]
+    def __init__(self, model: GradienterModel | CompassModel | None, kind: PoseKind, keep: int, *, may_move: bool):
+        circle = kind == "compass"
+        batches = BatchSource(_LIMITS_HEADING if circle else _LIMITS_TILT, keep, circle=circle)
+        super().__init__(kind, kind, batches, PoseGate(kind), may_move=may_move)
+        self.settling = None if model is None else Settling(model.lag_s, model.sigma_deg, circle=circle)
+        self.unsettled = deque(maxlen=keep)

@@ -1,88 +1,62 @@
-"""A window whose seconds are chosen and whose figures are not worked out yet: choosing costs a small part of it.
+"""Seconds from which windows are made, and the newest estimates of them: the interface, and that of the ground.
 
-Estimates are kept while they are of use, and packed up so that they can be worked out elsewhere.
+Choosing the seconds of a window costs a small part of working it out. Estimates are kept while they are of use; one
+that is due can be packed up and worked out in another thread.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
 
 import msgspec
 
 from companion.errors import CalibrationRefusedError
+from companion.estimation.collector.outlook import Progress, Settings, expected_s, is_enough
 from companion.estimation.means.pose import FieldWindow, heading_window, tilt_window
 from companion.estimation.means.windows import ImuEstimate, ImuInput, Window, imu_estimates
-from companion.estimation.seconds.batch import Batch
+from companion.estimation.seconds.batch import Batch, BatchSource
+from companion.estimation.stillness.stretch import Stretch
 from companion.estimation.turning.watch import Turn
 
-Found = list[ImuEstimate] | CalibrationRefusedError
+MIN_BATCHES: Final = 5
+"""Seconds of a window that was asked for with `since_s`: fewer say nothing about their own scatter."""
 
 
 class Work(msgspec.Struct, frozen=True, kw_only=True):
     """An estimate that is due; `run` touches nothing that changes, and may be called in another thread."""
 
-    imus: list[ImuInput]
-    batches: list[list[Batch]]
-    slots: list[int]
-    """The good seconds, the same of every IMU."""
-    horizon_s: float
+    slots: Sequence[int]
+    """The seconds of the window, ascending."""
     since_s: float | None
-    """The window's own beginning, where it is not the whole stretch."""
+    """The window's own beginning, where it is not that of all seconds."""
     generation: int
 
-    def run(self) -> Found:
-        """Work it out."""
-        first, last = self.slots[0], self.slots[-1]
-        rejected = last - first + 1 - len(self.slots)
-        try:
-            return imu_estimates(self.imus, self.batches, end_s=last + 1.0, horizon_s=self.horizon_s, rejected=rejected)
-        except CalibrationRefusedError as error:
-            return error
-
-
-class Estimates:
-    """The newest estimate of the whole stretch, and of one other window beside it."""
-
-    def __init__(self) -> None:
-        self._kept: dict[float | None, tuple[int, Found]] = {}
-        self.generation = 0
-        """Of the stretch that is under way."""
-
-    def clear(self) -> None:
-        """The stretch is over: what was worked out over it, or still is, is of no use."""
-        self._kept.clear()
-        self.generation += 1
-
-    def known(self, last: int, since_s: float | None) -> Found | None:
-        """The estimate of a window that ends with that second or a later one; None where there is none yet."""
-        kept = self._kept.get(since_s)
-        return kept[1] if kept is not None and kept[0] >= last else None
-
-    def keep(self, work: Work, found: Found) -> None:
-        """Remember what it has found, unless it comes too late."""
-        if work.generation != self.generation:
-            return
-        self._kept = {key: one for key, one in self._kept.items() if key is None or key == work.since_s}
-        self._kept[work.since_s] = (work.slots[-1], found)
+    def run(self) -> Any:
+        """Return the estimate, or the `CalibrationRefusedError` that says why there is none."""
+        raise NotImplementedError
 
 
 class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     """Everything that a window is made of; holds nothing that changes later."""
 
-    slots: list[int]
+    slots: Sequence[int]
     """Its good seconds, ascending, at least one."""
-    estimate: Callable[[], Found]
+    estimate: Callable[[], Any]
     settling: str | None = None
-    """What a pose sensor's mean has to wait for."""
+    """Reason why a pose sensor's mean has to wait."""
     tilt: list[Batch] | None = None
-    """The seconds of the gradienter that count; None: there is none. Likewise the next."""
+    """Seconds of the gradienter that count; None: no gradienter."""
     heading: list[Batch] | None = None
+    """Seconds of the compass that count; None: no compass."""
     from_field: bool = False
     wander_deg: float | None = None
-    """Of the heading, both as in its window."""
+    """Both as in `HeadingWindow`."""
     field: FieldWindow | None = None
     begun_s: dict[str, float] = {}
-    """By IMU, since when it has been switched on, as far as that is known."""
+    """Time of power-up by IMU, where it is known."""
     turn: Turn = Turn()
 
     def window(self) -> Window:
@@ -111,3 +85,215 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
             powered_s={name: self.slots[-1] + 1.0 - since_s for name, since_s in self.begun_s.items()},
             turn=self.turn,
         )
+
+
+class Stillness(NamedTuple):
+    """How still it has been."""
+
+    still_s: int
+    """Seconds that count so far."""
+    steady_s: int
+    """Seconds that count without a bad one until now."""
+    good_now: bool
+    """Whether the latest second counts."""
+    hold_still_s: int = 0
+    """Seconds to stand still yet before a window is possible."""
+
+
+class WindowSource(ABC):
+    """The seconds that count, and the newest estimates: of all of them, and of one other window."""
+
+    may_move = False
+    """True: only faults of a source count against a second, no movement."""
+
+    def __init__(self) -> None:
+        self._kept: dict[float | None, tuple[int, Any]] = {}
+        self.generation = 0
+        """Number of the stretch that is under way."""
+
+    @abstractmethod
+    def set_imu(self, imu: ImuInput, batches: BatchSource) -> None:
+        """Add an IMU with its seconds, or begin anew with one whose stream is another now."""
+
+    @abstractmethod
+    def set_pose(self, kind: str, batches: BatchSource) -> None:
+        """Add the seconds of the gradienter or the compass."""
+
+    def forget(self, imu: str | None) -> None:
+        """Drop what was measured, of one IMU or of everything."""
+        self.clear()
+
+    @abstractmethod
+    def new_stretch(self) -> None:
+        """End a still stretch."""
+
+    @abstractmethod
+    def add(self, slot: int, *, good: bool) -> bool:
+        """Add a judged second; return False if the still stretch ended with it."""
+
+    @property
+    @abstractmethod
+    def stillness(self) -> Stillness:
+        """Return how still it has been."""
+
+    def good_slots(self, since_s: float | None) -> list[int]:
+        """Return the seconds that count of those that wait for a pose sensor to settle."""
+        return []
+
+    @abstractmethod
+    def slots(self, since_s: float | None) -> Sequence[int]:
+        """Return the seconds of a window.
+
+        Raises:
+            CalibrationRefusedError: too few.
+        """
+
+    @abstractmethod
+    def work(self, slots: Sequence[int], since_s: float | None) -> Work:
+        """Pack up the estimate of these seconds."""
+
+    @abstractmethod
+    def progress(self, settings: Settings, *, waits: bool) -> Progress:
+        """Return how far the newest estimate is from good enough; `waits`: something is in the way."""
+
+    def clear(self) -> None:
+        """Drop all estimates, also those that are being worked out."""
+        self._kept.clear()
+        self.generation += 1
+
+    def known(self, last: int, since_s: float | None) -> Any:
+        """Return the estimate of a window that ends with that second or a later one; None if there is none yet."""
+        kept = self._kept.get(since_s)
+        return kept[1] if kept is not None and kept[0] >= last else None
+
+    def pending(self, since_s: float | None) -> Work | None:
+        """Return what has to be worked out now; None when there is nothing."""
+        try:
+            slots = self.slots(since_s)
+        except CalibrationRefusedError:
+            return None
+        return None if self.known(slots[-1], since_s) is not None else self.work(slots, since_s)
+
+    def accept(self, work: Work, found: Any) -> bool:
+        """Keep what the work has found; return False if it comes too late."""
+        if work.generation != self.generation:
+            return False
+        self._kept = {key: one for key, one in self._kept.items() if key is None or key == work.since_s}
+        self._kept[work.since_s] = (work.slots[-1], found)
+        return True
+
+    def measurement(self, since_s: float | None) -> Measurement:
+        """Return what a window is made of, without the pose.
+
+        Raises:
+            CalibrationRefusedError: too few seconds.
+        """
+        slots = self.slots(since_s)
+        return Measurement(slots=slots, estimate=self.estimate_later(slots, since_s))
+
+    def estimate_later(self, slots: Sequence[int], since_s: float | None, late: int = 0) -> Callable[[], Any]:
+        """Return a call that works out the estimate of what is known now, unless one at most `late` s old is known."""
+        found = self.known(slots[-1] - late, since_s)
+        if found is not None:
+            return lambda: found
+        work = self.work(slots, since_s)
+
+        def estimate() -> Any:
+            found = work.run()
+            self.accept(work, found)
+            return found
+
+        return estimate
+
+
+class GroundWork(Work, frozen=True, kw_only=True):
+    """Estimate of a still window."""
+
+    imus: list[ImuInput]
+    batches: list[list[Batch]]
+    horizon_s: float
+
+    def run(self) -> list[ImuEstimate] | CalibrationRefusedError:
+        """Work it out."""
+        first, last = self.slots[0], self.slots[-1]
+        rejected = last - first + 1 - len(self.slots)
+        try:
+            return imu_estimates(self.imus, self.batches, end_s=last + 1.0, horizon_s=self.horizon_s, rejected=rejected)
+        except CalibrationRefusedError as error:
+            return error
+
+
+class Ground(WindowSource):
+    """The still stretch of an aircraft on the ground."""
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__()
+        self._horizon_s, self._min_good, self._max_slots = settings.horizon_s, settings.min_slots, settings.max_slots
+        self._least = min(MIN_BATCHES, self._min_good)
+        self._stretch = Stretch(self._min_good, self._max_slots)
+        self._imus: dict[str, tuple[ImuInput, BatchSource]] = {}
+        self._next = 0
+
+    def set_imu(self, imu: ImuInput, batches: BatchSource) -> None:
+        """Add an IMU or replace it."""
+        self._imus[imu.name] = imu, batches
+
+    def set_pose(self, kind: str, batches: BatchSource) -> None:
+        """Do nothing: the seconds of the pose are asked for with the window."""
+
+    def new_stretch(self) -> None:
+        """Begin to count anew."""
+        self._stretch.clear()
+        self.clear()
+
+    def add(self, slot: int, *, good: bool) -> bool:
+        """Count the next second."""
+        self._next = slot + 1
+        return self._stretch.add(slot, good=good)
+
+    @property
+    def stillness(self) -> Stillness:
+        """The stretch under way."""
+        stretch = self._stretch
+        left_s = 0 if stretch.begun else self._min_good - stretch.good
+        return Stillness(stretch.good, stretch.steady, stretch.good_now, left_s)
+
+    def good_slots(self, since_s: float | None) -> list[int]:
+        """Return the good seconds of the stretch under way that lie wholly after `since_s`."""
+        first = -math.inf if since_s is None else since_s
+        flags = self._stretch.flags
+        return [slot for slot, good in enumerate(flags, self._next - len(flags)) if good and slot >= first]
+
+    def slots(self, since_s: float | None) -> list[int]:
+        """Return the seconds of a window."""
+        slots = self.good_slots(since_s)
+        # A stretch that has begun may have had up to a fifth rejected since.
+        needed = self._least if since_s is not None else 1 if self._stretch.begun else self._min_good
+        if len(slots) < needed:
+            needed = self._min_good if since_s is None else self._least
+            raise CalibrationRefusedError(f"still for {len(slots)} s only, needs {needed} s")
+        return slots
+
+    def work(self, slots: Sequence[int], since_s: float | None) -> GroundWork:
+        """Pack up the estimate of these seconds."""
+        return GroundWork(
+            imus=[imu for imu, _ in self._imus.values()],
+            batches=[[source.batches[slot] for slot in slots] for _, source in self._imus.values()],
+            slots=slots,
+            horizon_s=self._horizon_s,
+            since_s=since_s,
+            generation=self.generation,
+        )
+
+    def progress(self, settings: Settings, *, waits: bool) -> Progress:
+        """Return how far the stretch is, by an estimate that may be a second old."""
+        stretch, words = self._stretch, f"still for {self._stretch.good} s"
+        if not stretch.begun or waits:
+            share = 0.0 if stretch.start is None else stretch.good / self._max_slots
+            return Progress(enough=False, share=share, words=words)
+        estimates = self.estimate_later(self.slots(None), None, late=1)()
+        if isinstance(estimates, CalibrationRefusedError):
+            return Progress(enough=False, share=0.0, words=words, refused=str(estimates))
+        enough = stretch.full or is_enough(settings, estimates)
+        needed = max(expected_s(settings, estimates), stretch.good + 1)
+        return Progress(enough=enough, share=1.0 if enough else stretch.good / needed, words=words)

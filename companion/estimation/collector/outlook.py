@@ -1,9 +1,10 @@
-"""What is in the way of a measurement, and when more seconds buy nothing (method 3.2)."""
+"""Settings and state of the collector, and the rules by which it is done (method 3.2) or on a boat."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -12,21 +13,35 @@ from numpy.typing import NDArray
 from companion.estimation.collector.intake import SourceStatus
 from companion.estimation.means.windows import WHITE_SHARE, Estimate, ImuEstimate
 from companion.estimation.noise.allan import floor_variance
+from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import Floats
+from companion.physics.units import DEG
 
 
 class Obstacle(msgspec.Struct, frozen=True):
-    """What is in the way of a measurement."""
+    """Reason why nothing can be measured now."""
 
     words: str
     moving: bool = False
-    """Nothing but a movement, which a hand can end; no fault."""
+    """True for a movement, which a hand can end; False for a fault."""
     hold_still_s: int | None = None
-    """Nothing but time: how long it has to stand still yet."""
+    """Seconds to stand still yet, where nothing else is missing."""
+
+
+class Progress(msgspec.Struct, frozen=True):
+    """How far an estimate is from good enough."""
+
+    enough: bool
+    share: float
+    words: str
+    left: str = ""
+    """Part of the words that says how much longer it takes."""
+    refused: str = ""
+    """Reason why the readings give no estimate."""
 
 
 class Status(msgspec.Struct, frozen=True, kw_only=True):
-    """Where the collector stands."""
+    """State of the collector."""
 
     still_s: float
     """Good seconds, common to all sources, of the stretch under way."""
@@ -38,9 +53,9 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     """0..1 towards `enough`; falls to 0 when the stretch breaks."""
     sources: tuple[SourceStatus, ...]
     measuring: str
-    """What is under way where nothing is waited for, in words."""
+    """Words for a measurement under way."""
     left: str = ""
-    """For how long yet, where that is minutes; part of `measuring`."""
+    """Part of `measuring` that says how much longer it takes, where that is minutes."""
 
     @property
     def waiting_for(self) -> str | None:
@@ -49,10 +64,10 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Glance(msgspec.Struct, frozen=True, kw_only=True):
-    """What can be said of the stillness at once, without looking at the readings themselves."""
+    """State of the stillness, without any estimate."""
 
     obstacle: Obstacle | None
-    """What is in the way at this moment, however long it has been still: it moves, or a source is silent or stuck."""
+    """A movement now, or a source that is silent or stuck."""
     still_s: float
     steady_s: float
     """Good seconds without a bad one until now."""
@@ -64,7 +79,7 @@ class Glance(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def moves(self) -> str | None:
-        """What moves at this moment; None where nothing does, however short a time it has been still."""
+        """Words for a movement at this moment; None where nothing moves."""
         found = self.obstacle
         return found.words if found is not None and found.moving and found.hold_still_s is None else None
 
@@ -78,9 +93,9 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     target_accel_sigma_m_s2: float
     horizon_s: float = 180.0
     on_a_boat: str = 'set vehicle.platform = "deck"'
-    """What to do where it sways with a regular wave, in words."""
+    """Remedy to name where it sways with a regular wave."""
     dither: bool = False
-    """Integers that do not tell are measured in another way afterwards: more seconds of them are not waited for."""
+    """True: undecided integers are measured by a dither afterwards, and are not waited for."""
 
     @property
     def min_slots(self) -> int:
@@ -131,3 +146,35 @@ def _waited_for(settings: Settings, own: Estimate) -> NDArray[np.bool_]:
 def _done(white: Floats, use: Floats, target: Floats, undecided: NDArray[np.bool_]) -> NDArray[np.bool_]:
     enough = (white < WHITE_SHARE * (use - white)) & ~undecided
     return np.asarray(np.where(undecided, np.isinf(target), use <= np.square(target)) | enough)
+
+
+WATCHED_S: Final = 40
+_LEAST_RAD_S: Final = 0.1 * DEG
+_WAVES_HZ: Final = (0.05, 1.0 / 3.0)
+_NARROW: Final = 0.25
+"""Half the width of a wave's band, over its frequency; never below `_RESOLVED_HZ`."""
+_RESOLVED_HZ: Final = 0.03
+_FINER: Final = 4
+"""Points of the spectrum to every one that is independent."""
+_REGULAR: Final = 0.75
+"""Share of the rates' power, of all axes, in one band. Waves of 3 to 14 s have it in nine of ten seconds; hands have
+many frequencies, different on each axis (BROAD's slow rotation: at most 0.72)."""
+
+
+def is_wave(batches: Mapping[int, Batch]) -> bool:
+    """Tell whether the latest `WATCHED_S` seconds without a gap in one IMU are a regular wave, as on a boat."""
+    slots = list(batches)
+    ends = [k for k in range(len(slots), WATCHED_S - 1, -1) if slots[k - 1] - slots[k - WATCHED_S] == WATCHED_S - 1]
+    if not ends:
+        return False
+    rates = np.array([batches[slot].mean[:3] for slot in slots[ends[0] - WATCHED_S : ends[0]]])
+    rates = rates - rates.mean(axis=0)
+    if float(np.square(rates).sum()) / len(rates) < _LEAST_RAD_S**2:
+        return False
+    tapered, size = rates * np.hanning(len(rates))[:, None], _FINER * len(rates)
+    power = np.square(np.abs(np.fft.rfft(tapered, size, axis=0))).sum(axis=1)
+    frequencies = np.fft.rfftfreq(size)
+    waves = np.where((frequencies >= _WAVES_HZ[0]) & (frequencies <= _WAVES_HZ[1]), power, 0.0)
+    middle = frequencies[waves.argmax()]
+    band = np.abs(frequencies - middle) <= max(_NARROW * middle, _RESOLVED_HZ)
+    return bool(power[band].sum() > _REGULAR * power.sum())

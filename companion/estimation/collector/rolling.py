@@ -1,4 +1,4 @@
-"""The rolling collector: every stream in, one still stretch out.
+"""The rolling collector: every stream in, one window out.
 
 It knows no clock: time comes in with the samples and with `now_s`. All sources share one 1 s grid; a second counts
 when every source was still in it. Method 2.4, 3.1 and 3.2.
@@ -6,39 +6,41 @@ when every source was still in it. Method 2.4, 3.1 and 3.2.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.collector.afloat import Afloat
-from companion.estimation.collector.intake import Intake, Source
-from companion.estimation.collector.measurement import Estimates, Found, Measurement, Work
-from companion.estimation.collector.outlook import Glance, Obstacle, Settings, Status, expected_s, is_enough
-from companion.estimation.collector.swell import Swell
+from companion.estimation.collector.intake import ImuSource, PoseKind, PoseSource, Source
+from companion.estimation.collector.measurement import MIN_BATCHES, Ground, Measurement, WindowSource, Work
+from companion.estimation.collector.outlook import Glance, Obstacle, Settings, Status, is_wave
 from companion.estimation.collector.trace import Snapshot, TraceLog
-from companion.estimation.deck.deck import Deck
-from companion.estimation.deck.estimate import DeckWork
-from companion.estimation.means.pose import CompassModel, GradienterModel
+from companion.estimation.means.pose import CompassModel, FieldHeading, GradienterModel
 from companion.estimation.means.windows import ImuInput, Window
-from companion.estimation.stillness.stretch import HeadingWatch, Stretch
+from companion.estimation.seconds.batch import Batch
+from companion.estimation.seconds.counting import TurnCounter
+from companion.estimation.stillness.stretch import HeadingWatch
+from companion.estimation.turning.watch import Turn, TurnWatch
+from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
-MIN_BATCHES: Final = 5
-"""Of a window that was asked for with `since_s`: fewer say nothing about their own scatter."""
+if TYPE_CHECKING:
+    from companion.estimation.temperature.thermometer import Thermometers
 
 _GRACE_S: Final = 1.0
-"""How long after its end a second waits for a silent source: the latency of a busy telemetry link."""
+"""Time for which a second waits after its end for a silent source: the latency of a busy telemetry link."""
 _CLOSE_S: Final = 0.25
 _MARGIN: Final = 8
 
 
-class RollingCollector(Intake):
-    """Collects batches of all sources, judges stillness, and gives means of the still stretch.
+class RollingCollector:
+    """Collects batches of all sources, judges stillness, and gives means of the seconds that count.
 
-    Pure: no clock and no I/O. Nothing that a sample holds makes it raise; what is dropped is counted by reason.
-    Memory is bounded: `max_s` and a margin of one-second batches a source. None: there is no gradienter, no compass.
+    Pure: no clock and no I/O. Nothing that a sample holds makes it raise; samples that are dropped are counted by
+    reason. Memory is bounded: `max_s` and a margin of one-second batches a source. A model that is None: no such
+    sensor. `windows`: which seconds count; those of the still stretch, unless told otherwise.
 
     Raises:
         ValueError: two IMUs of one name.
@@ -50,35 +52,125 @@ class RollingCollector(Intake):
         imus: Sequence[ImuInput],
         gradienter: GradienterModel | None = None,
         compass: CompassModel | None = None,
-        *,
-        on_deck: bool = False,
+        windows: WindowSource | None = None,
     ) -> None:
         if len({imu.name for imu in imus}) != len(imus):
             raise ValueError("two IMUs have one name")
         self._settings = settings
-        self._min_good, self._max_slots = settings.min_slots, settings.max_slots
-        self._least = min(MIN_BATCHES, self._min_good)
-        deck = Deck(gradienter, compass) if on_deck else None
-        super().__init__(self._max_slots + _MARGIN, gradienter, compass, deck, span=self._max_slots)
-        self._afloat = None if deck is None else Afloat(deck, settings.horizon_s)
+        self._keep = settings.max_slots + _MARGIN
+        self._gradienter, self._compass = gradienter, compass
+        self._windows = Ground(settings) if windows is None else windows
+        self.imus: dict[str, ImuSource] = {}
+        self._tilt = None if gradienter is None else self._pose_source("gradienter")
+        self._heading = None if compass is None else self._pose_source("compass")
+        self._field = None if compass is None else FieldHeading(compass, gradienter, self._keep)
+        self._turns = TurnWatch(settings.max_slots)
         self._watch = HeadingWatch()
-        self._stretch = Stretch(self._min_good, self._max_slots)
         self._next: int | None = None
         self._now_s = -math.inf
-        self._good: dict[int, bool] = {}
-        self._estimates = Estimates()
         self._trace = TraceLog()
         self._restarts = 0
-        self._swell = Swell()
         self.on_second: list[Callable[[], object]] = []
         """Called when every source has closed a second, from within the call that closed it: they only take note."""
         for imu in imus:
             self.set_imu(imu)
 
+    @functools.cached_property
+    def thermometers(self) -> Thermometers:
+        """Thermometers of the IMUs; not wanted before the first second."""
+        from companion.estimation.temperature.thermometer import Thermometers
+
+        return Thermometers()
+
+    # ------------------------------------------------------------------------------------------------- samples in
+
+    def add_imu(self, name: str, sample: ImuSample) -> None:
+        """Add one sample of the IMU of that name; of an unknown name it is dropped."""
+        source = self.imus.get(name)
+        if source is None:
+            return
+        if source.has_restarted(sample):
+            self._forget(name)
+        if source.add(sample):
+            self._evaluate()
+
+    def add_tilt(self, sample: TiltSample) -> None:
+        """Add one reading of the gradienter; dropped when none is expected."""
+        if self._field is not None:
+            self._field.take_tilt(sample)
+        row = (sample.x_deg, sample.y_deg)
+        if self._tilt is not None and self._tilt.batches.add(sample.t_s, row, sample.temperature_degc):
+            self._evaluate()
+
+    def add_compass(self, sample: CompassSample) -> bool:
+        """Add one heading of the device's own; return whether it counts (else that from its field does)."""
+        counts = self._field is None or self._field.takes_own(sample)
+        if counts:
+            self._add_heading(sample)
+        return counts
+
+    def add_field(self, sample: MagSample) -> CompassSample | None:
+        """Add the compass' field; return the heading from it, where that is the one that counts."""
+        if self._heading is None or self._field is None:
+            return None
+        heading = self._field.add(sample)
+        self._heading.hint = self._field.hint
+        if heading is not None:
+            self._add_heading(heading)
+        return heading
+
+    def _add_heading(self, sample: CompassSample) -> None:
+        if self._heading is not None and self._heading.batches.add(sample.t_s, (sample.heading_deg,)):
+            self._evaluate()
+
+    def tick(self, now_s: float) -> None:
+        """End the seconds that are over at `now_s` (the samples' clock), also of silent sources.
+
+        The feeder calls it a few times a second.
+        """
+        if math.isfinite(now_s):
+            self._now_s = now_s
+            for source in self._sources():
+                source.batches.close_before(now_s - _CLOSE_S)
+            if self._field is not None:
+                self._field.batches.close_before(now_s - _CLOSE_S)
+        self._evaluate()
+
     # ------------------------------------------------------------------------------------------------- what changes
 
+    def set_imu(self, imu: ImuInput) -> None:
+        """Add an IMU, or replace it when its stream changes kind: all that was learned of it is forgotten."""
+        name, known = imu.name, self.imus.get(imu.name)
+        self._turns.set_imu(name, imu.rotation, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2))
+        if known is None:
+            self.imus[name] = source = ImuSource(imu, self._keep, may_move=self._windows.may_move)
+            source.batches.believed = lambda slot, degc: self.thermometers.believed(name, slot, degc)
+            self._windows.set_imu(imu, source.batches)
+            # It has no share in the seconds so far.
+            self._break()
+        else:
+            known.replace(imu)
+            self._windows.set_imu(imu, known.batches)
+            self.reset("another stream", name)
+
+    def expect(self, *, gradienter: bool, compass: bool) -> None:
+        """Change which pose sensors are waited for, for example when one is found dead; the IMUs' history stays."""
+        added = (gradienter and self._tilt is None) or (compass and self._heading is None)
+        if gradienter != (self._tilt is not None):
+            self._tilt = self._pose_source("gradienter") if gradienter else None
+        if compass != (self._heading is not None):
+            self._heading = self._pose_source("compass") if compass else None
+        if added:
+            self._break()
+
+    def _pose_source(self, kind: PoseKind) -> PoseSource:
+        model = self._compass if kind == "compass" else self._gradienter
+        source = PoseSource(model, kind, self._keep, may_move=self._windows.may_move)
+        self._windows.set_pose(kind, source.batches)
+        return source
+
     def retarget(self, settings: Settings) -> None:
-        """Other targets from the next look on; the lengths (`min_still_s`, `max_s`) stay as they were."""
+        """Use other targets from the next status on; the lengths (`min_still_s`, `max_s`) stay."""
         self._settings = msgspec.structs.replace(
             self._settings,
             target_gyro_sigma_rad_s=settings.target_gyro_sigma_rad_s,
@@ -91,90 +183,81 @@ class RollingCollector(Intake):
         The second under way is forgotten too. The stretch begins again; learned noise stays.
         """
         self._forget(imu)
-        if self._afloat is not None:
-            self._afloat.clear()
 
-    def tick(self, now_s: float) -> None:
-        """Let the seconds end that are over at `now_s` (the samples' clock), also of sources that say nothing.
-
-        Whoever feeds it does this, a few times a second; everything below only looks.
-        """
-        if math.isfinite(now_s):
-            self._now_s = now_s
-            for source in self._sources():
-                source.batches.close_before(now_s - _CLOSE_S)
-            if self._field is not None:
-                self._field.batches.close_before(now_s - _CLOSE_S)
-        self._evaluate()
+    def count_turns(self, *, wanted: bool) -> None:
+        """Start or stop to keep what turns on a spot are counted by."""
+        for source in self.imus.values():
+            source.counter = TurnCounter() if wanted else None
 
     # ------------------------------------------------------------------------------------------------- what is known
 
-    def glance(self, now_s: float) -> Glance:
-        """How still it is at `now_s`; costs a small part of what `status` does."""
-        afloat, stretch = self._afloat, self._stretch
-        still, steady = (stretch.good, stretch.steady) if afloat is None else (afloat.seconds, afloat.seconds)
-        return Glance(obstacle=self._obstacle(now_s), still_s=float(still), steady_s=float(steady))
+    @property
+    def begun_s(self) -> dict[str, float]:
+        """Time of power-up by IMU: by its device's clock, else the first sample of its stream."""
+        return {name: source.begun_s for name, source in self.imus.items() if source.begun_s is not None}
 
-    def pending(self, now_s: float, *, since_s: float | None = None) -> Work | DeckWork | None:
-        """What `window` would have to work out now, for somebody who does it elsewhere; None when there is nothing.
+    def up_s(self, name: str) -> float | None:
+        """Return the time since power-up by the latest sample of an IMU; None where its device does not tell."""
+        return self.imus[name].up_s if name in self.imus else None
+
+    @property
+    def turn(self) -> Turn:
+        """The platform's own rate, as far as it is known."""
+        return self._turns.turn
+
+    @property
+    def wander_deg(self) -> float | None:
+        """Wander of the heading since the aircraft last moved; None until that is known."""
+        return self._watch.wander_deg
+
+    def imu_seconds(self) -> dict[str, Batch]:
+        """Return the last whole second of each IMU that has one, still or not."""
+        return {name: source.newest for name, source in self.imus.items() if source.newest is not None}
+
+    def tilt_second(self) -> Batch | None:
+        """Return the last whole second of the gradienter."""
+        return None if self._tilt is None else self._tilt.newest
+
+    def glance(self, now_s: float) -> Glance:
+        """Return how still it is at `now_s`; costs a small part of what `status` does."""
+        stillness = self._windows.stillness
+        return Glance(
+            obstacle=self._obstacle(now_s), still_s=float(stillness.still_s), steady_s=float(stillness.steady_s)
+        )
+
+    def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:
+        """Return what `window` would have to work out now, for another thread; None when there is nothing.
 
         It takes milliseconds, more on small boards, and what must be answered at once shall not wait for it.
         """
-        if self._obstacle(now_s) is not None:
-            return None
-        if self._afloat is not None:
-            return self._afloat.pending(since_s)
-        slots = self._slots(since_s)
-        if not self._are_enough(slots, since_s) or self._estimates.known(slots[-1], since_s) is not None:
-            return None
-        return self._work(slots, since_s)
+        return None if self._obstacle(now_s) is not None else self._windows.pending(since_s)
 
-    def accept(self, work: Work | DeckWork, found: Any) -> None:
-        """Take what such work has found; too late, it is left."""
-        if isinstance(work, Work):
-            self._estimates.keep(work, found)
-        elif self._afloat is not None:
-            self._afloat.accept(work, found)
+    def accept(self, work: Work, found: Any) -> None:
+        """Keep the result of such work, unless it comes too late."""
+        self._windows.accept(work, found)
 
     def status(self, now_s: float) -> Status:
-        """Where it stands at `now_s` (the samples' clock). Its figures may be those of the second before."""
-        sources = tuple(source.status(now_s) for source in self._sources())
-        if self._afloat is not None:
-            obstacle, found = self._obstacle(now_s), self._afloat.progress(self._settings)
-            return Status(
-                still_s=float(self._afloat.seconds),
-                obstacle=obstacle,
-                enough=found.enough and obstacle is None,
-                progress=min(found.share, 1.0 if found.enough else 0.99),
-                sources=sources,
-                measuring=found.words,
-                left=found.left,
-            )
-        waiting, enough, progress = self._waiting_for(now_s), False, 0.0
-        if self._stretch.begun and waiting is None:
-            estimates = self._estimate_later(self._slots(None), None, late=1)()
-            if isinstance(estimates, CalibrationRefusedError):
-                waiting = Obstacle(str(estimates))
-            else:
-                enough = self._stretch.full or is_enough(self._settings, estimates)
-                needed = max(expected_s(self._settings, estimates), self._stretch.good + 1)
-                progress = 1.0 if enough else self._stretch.good / needed
-        elif self._stretch.start is not None:
-            progress = min(self._stretch.good / self._max_slots, 0.99)
+        """Return the state at `now_s` (the samples' clock). Its figures may be those of the second before."""
+        obstacle = self._waiting_for(now_s)
+        found = self._windows.progress(self._settings, waits=obstacle is not None)
+        if obstacle is None and found.refused:
+            obstacle = Obstacle(found.refused)
+        enough = found.enough and obstacle is None
         return Status(
-            still_s=float(self._stretch.good),
-            obstacle=waiting,
+            still_s=float(self._windows.stillness.still_s),
+            obstacle=obstacle,
             enough=enough,
-            progress=min(progress, 1.0 if enough else 0.99),
-            sources=sources,
-            measuring=f"still for {self._stretch.good} s",
+            progress=min(found.share, 1.0 if enough else 0.99),
+            sources=tuple(source.status(now_s) for source in self._sources()),
+            measuring=found.words,
+            left=found.left,
         )
 
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:
-        """Means over the still stretch that ends with the latest complete second, at most `max_s` long.
+        """Return means over the seconds that count up to the latest complete one, at most `max_s` long.
 
-        Of seconds that lie wholly after `since_s`, for a look at what a write has done, 5 good ones are enough;
-        `duration_s` says how many there were.
+        Of seconds that lie wholly after `since_s`, for the effect of a write, 5 good ones are enough; `duration_s`
+        says how many there were.
 
         Raises:
             CalibrationRefusedError: not still, not still for long enough, or a source fails its checks.
@@ -182,47 +265,47 @@ class RollingCollector(Intake):
         return self.measurement(now_s, since_s=since_s).window()
 
     def measurement(self, now_s: float, *, since_s: float | None = None) -> Measurement:
-        """What `window` would give, not worked out yet; costs a small part of it.
+        """Return what `window` is made of, not worked out yet; costs a small part of it.
 
         Raises:
             CalibrationRefusedError: not still, or not still for long enough.
         """
         if (reason := self._obstacle(now_s)) is not None:
             raise CalibrationRefusedError(reason.words)
-        if self._afloat is not None:
-            return self._afloat.measurement(since_s)
-        slots = self._slots(since_s)
-        if not self._are_enough(slots, since_s):
-            needed = self._min_good if since_s is None else self._least
-            raise CalibrationRefusedError(f"still for {len(slots)} s only, needs {needed} s")
-        return Measurement(
-            slots=slots,
-            estimate=self._estimate_later(slots, since_s),
-            settling=self._settles(slots, 0),
-            tilt=None if self._tilt is None else self._tilt.settled(slots),
-            heading=None if self._heading is None else self._heading.settled(slots),
+        found = self._windows.measurement(since_s)
+        if self._windows.may_move:
+            return found
+        return msgspec.structs.replace(
+            found,
+            settling=self._settles(list(found.slots), 0),
+            tilt=None if self._tilt is None else self._tilt.settled(found.slots),
+            heading=None if self._heading is None else self._heading.settled(found.slots),
             from_field=self._field is not None and self._field.from_field,
             wander_deg=self.wander_deg,
-            field=self._field.window(slots) if self._field and self._heading else None,
+            field=self._field.window(found.slots) if self._field and self._heading else None,
             begun_s=self.begun_s,
             turn=self.turn,
         )
 
-    @property
-    def wander_deg(self) -> float | None:
-        """How far the heading has wandered since the aircraft last moved; None until that is known."""
-        return self._watch.wander_deg
-
     def snapshot(self, started_s: float, measured_s: tuple[float, float] | None) -> Snapshot:
-        """What was seen since `started_s`, or since the window `measured_s` (start, end) began; cheap."""
+        """Return the verdicts since `started_s`, or since the window `measured_s` (start, end) began; cheap."""
         return self._trace.snapshot(started_s, measured_s)
 
     # ------------------------------------------------------------------------------------------------- inside
 
+    def _sources(self) -> list[Source]:
+        return [*self.imus.values(), *(source for source in (self._tilt, self._heading) if source is not None)]
+
+    def _forget(self, imu: str | None) -> None:
+        self._windows.forget(imu)
+        for source in self._sources():
+            if imu is None or (source.kind == "imu" and source.name == imu):
+                source.forget()
+        self._turns.forget(imu)
+        self._break()
+
     def _break(self) -> None:
-        self._stretch.clear()
-        self._good.clear()
-        self._estimates.clear()
+        self._windows.new_stretch()
         self._turns.new_stretch()
         for source in self._sources():
             source.gate.new_stretch()
@@ -270,96 +353,58 @@ class RollingCollector(Intake):
             others = [source.verdict for source in sources if source is not self._heading]
             self._watch.add_second(self._heading.batches.batches.get(slot), others)
         self._trace.add(slot, sources, good=good)
-        self._swell.add(next((each.batches.batches.get(slot) for each in self._imus.values()), None))
-        if not self._stretch.add(slot, good=good):
+        if not self._windows.add(slot, good=good):
             self._break()
         if not self._watch_turn(slot, good=good):
             self._break()
-        if not good and self._stretch.start is None:
-            return
-        self._good[slot] = good
-        while len(self._good) > self._keep:
-            del self._good[next(iter(self._good))]
-        if not good:
-            return
-        for source in sources:
-            batch = source.batches.batches.get(slot)
-            if batch is None:
-                continue
-            if source.kind == "imu" or slot not in source.unsettled:
-                source.gate.accept(batch)
+        if good:
+            for source in sources:
+                source.accept(slot)
+
+    def _watch_turn(self, slot: int, *, good: bool) -> bool:
+        """Look for a turn in a second that has been judged; False where the still stretch ends with it."""
+        others = [source.verdict for source in self._sources() if source is not self._heading]
+        if self._windows.may_move or any(verdict.fault for verdict in others):
+            return True
+        if not all(verdict.still for verdict in others):
+            self._turns.moved(slot)
+            return True
+        heading = None if self._heading is None else next(iter(self._heading.settled([slot])), None)
+        imus = {name: source.batches.batches[slot] for name, source in self.imus.items()}
+        return self._turns.add_second(slot, imus, heading, good=good)
 
     def _obstacle(self, now_s: float) -> Obstacle | None:
-        """A silent source, or the latest second was not still; None when nothing is in the way."""
+        """Return a silent source or the reason why the latest second was not still; None when nothing is in the way."""
         sources = self._sources()
         if (silence := next(filter(None, (source.silence(now_s) for source in sources)), None)) is not None:
             return Obstacle(silence)
         others = any(source.verdict.words for source in sources if source is not self._heading)
         if self._turns.words and not others:
             return Obstacle(self._turns.words, moving=True)
-        if self._stretch.good_now:
+        if self._windows.stillness.good_now:
             return None
-        said = [source.verdict for source in sources if source.verdict.words]
-        moving = not any(verdict.fault for verdict in said)
-        if self._afloat is not None and moving:
-            return None
-        if not said:
-            return Obstacle(f"hold still {self._min_good} s", moving, self._min_good)
-        words = said[0].words
-        if said[0].fault:
-            return Obstacle(words, moving)
-        boat = f"; on a boat? {self._settings.on_a_boat}" if self._swell.is_regular else ""
-        return Obstacle(f"hold still: {words}{boat}", moving)
+        said = next((source.verdict for source in sources if source.verdict.words), None)
+        if said is None:
+            least_s = self._settings.min_slots
+            return Obstacle(f"hold still {least_s} s", moving=True, hold_still_s=least_s)
+        moving = not any(source.verdict.fault for source in sources if source.verdict.words)
+        if said.fault:
+            return Obstacle(said.words, moving)
+        first = next(iter(self.imus.values()), None)
+        is_boat = first is not None and is_wave(first.batches.batches)
+        boat = f"; on a boat? {self._settings.on_a_boat}" if is_boat else ""
+        return Obstacle(f"hold still: {said.words}{boat}", moving)
 
     def _waiting_for(self, now_s: float) -> Obstacle | None:
         if (moves := self._obstacle(now_s)) is not None:
             return moves
-        left_s = 0 if self._stretch.begun else self._min_good - self._stretch.good
-        settles = self._settles(self._slots(None), left_s)
+        left_s = self._windows.stillness.hold_still_s
+        settles = self._settles(self._windows.good_slots(None), left_s)
         if settles is not None:
             return Obstacle(settles)
         return Obstacle(f"hold still {left_s} s more", hold_still_s=left_s) if left_s else None
 
     def _settles(self, slots: list[int], left_s: int) -> str | None:
-        """What the mean of a pose sensor over these seconds and the next `left_s` has to wait for; None for nothing."""
-        sources = filter(None, (self._tilt, self._heading))
-        return next(filter(None, (source.lacks(slots, self._least, left_s) for source in sources)), None)
-
-    def _slots(self, since_s: float | None) -> list[int]:
-        start = self._stretch.start
-        if start is None or self._next is None:
-            return []
-        start = max(start, self._next - self._max_slots)
-        if since_s is not None:
-            start = max(start, math.ceil(since_s))
-        return [slot for slot in range(start, self._next) if self._good.get(slot, False)]
-
-    def _are_enough(self, slots: list[int], since_s: float | None) -> bool:
-        if since_s is not None:
-            return len(slots) >= self._least
-        # A stretch that has begun may have had up to a fifth rejected since.
-        return len(slots) >= self._min_good or (self._stretch.begun and bool(slots))
-
-    def _work(self, slots: list[int], since_s: float | None) -> Work:
-        return Work(
-            imus=[self._inputs[name] for name in self._imus],
-            batches=[[source.batches.batches[slot] for slot in slots] for source in self._imus.values()],
-            slots=slots,
-            horizon_s=self._settings.horizon_s,
-            since_s=since_s,
-            generation=self._estimates.generation,
-        )
-
-    def _estimate_later(self, slots: list[int], since_s: float | None, late: int = 0) -> Callable[[], Found]:
-        """Worked out when it is asked for, of what is known now; once a second, however often that is."""
-        found = self._estimates.known(slots[-1] - late, since_s)
-        if found is not None:
-            return lambda: found
-        work = self._work(slots, since_s)
-
-        def estimate() -> Found:
-            found = work.run()
-            self._estimates.keep(work, found)
-            return found
-
-        return estimate
+        """Say how long the mean of a pose sensor over these seconds and the next `left_s` has to wait, if at all."""
+        sources, least = filter(None, (self._tilt, self._heading)), min(MIN_BATCHES, self._settings.min_slots)
+        return next(filter(None, (source.lacks(slots, least, left_s) for source in sources)), None)

@@ -80,11 +80,11 @@ def from_json(data: bytes) -> Trace:
 
 
 Second = tuple[int, bool, dict[tuple[Kind, str], Verdict]]
-"""Its number, whether it was good, and what the gate of each source said."""
+"""Slot, whether it was good, and the verdict on each source."""
 
 
 class Snapshot(msgspec.Struct, frozen=True):
-    """The seconds of one calibration, not packed yet; `trace` may run in another thread."""
+    """Seconds of one calibration; `trace` may run in another thread."""
 
     seconds: tuple[Second, ...]
     started_s: float
@@ -92,7 +92,7 @@ class Snapshot(msgspec.Struct, frozen=True):
     cut: bool
 
     def trace(self, started_at: str) -> Trace:
-        """Pack it; takes milliseconds."""
+        """Return the seconds as columns; takes milliseconds."""
         origin = math.floor(self.started_s)
         names = dict.fromkeys(name for _, _, said in self.seconds for name in said)
         columns = {name: [said.get(name) for _, _, said in self.seconds] for name in names}
@@ -116,23 +116,21 @@ class Snapshot(msgspec.Struct, frozen=True):
 
 
 class TraceLog:
-    """The latest seconds as they were judged, whatever became of them."""
+    """The latest seconds as they were judged."""
 
     def __init__(self) -> None:
         self._seconds: deque[Second] = deque(maxlen=MAX_SECONDS)
 
     def add(self, slot: int, sources: Sequence[Source], *, good: bool) -> None:
-        """Take one second that has just been judged."""
+        """Add a second that has just been judged."""
         if self._seconds and slot <= self._seconds[-1][0]:
-            # The clock went back: what was before cannot be set against what comes.
+            # The clock went back: old and new seconds cannot be compared.
             self._seconds.clear()
         self._seconds.append((slot, good, {(each.kind, each.name): each.verdict for each in sources}))
 
     def snapshot(self, started_s: float, measured_s: tuple[float, float] | None) -> Snapshot:
-        """Everything since a calibration was asked for, or since its window began where that was earlier."""
-        since_s = min(started_s, measured_s[0]) if measured_s is not None else started_s
-        first = math.floor(since_s)
-        full = len(self._seconds) == self._seconds.maxlen
-        cut = full and self._seconds[0][0] > first
+        """Return the seconds since the start of a calibration, or of its window where that was earlier."""
+        first = math.floor(started_s if measured_s is None else min(started_s, measured_s[0]))
+        cut = len(self._seconds) == MAX_SECONDS and self._seconds[0][0] > first
         kept = tuple(second for second in self._seconds if second[0] >= first)
         return Snapshot(kept, started_s, measured_s, cut)

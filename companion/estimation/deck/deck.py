@@ -1,69 +1,215 @@
-"""A deck: every stream in, second by second; what is known of them together can be worked out elsewhere."""
+"""The seconds of an aircraft on a deck, which sways and turns, beside those of the ground.
+
+The seconds of an IMU must follow one another without a gap: a gyro that was silent for a while has turned by an unknown
+angle.
+"""
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import Final
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
 
-from companion.estimation.deck.estimate import MAX_S, DeckWork
-from companion.estimation.deck.stream import KEPT_SHOWN, Stream
+import numpy as np
+
+from companion.errors import CalibrationRefusedError
+from companion.estimation.collector.measurement import Measurement, Stillness, WindowSource
+from companion.estimation.collector.outlook import Progress, Settings
+from companion.estimation.deck.estimate import MAX_S, MIN_LOOK_S, MIN_S, DeckFound, DeckWork, ImuSecond, Known
+from companion.estimation.deck.fluid import Fluid, Level, level
+from companion.estimation.deck.smoother import passage
 from companion.estimation.means.pose import CompassModel, GradienterModel
-from companion.estimation.means.windows import ImuInput
-from companion.estimation.seconds.batch import Batch
+from companion.estimation.means.windows import WHITE_SHARE, ImuInput, Window
+from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.physics.frames import Floats
-from companion.physics.units import DEG
+from companion.physics.units import DEG, UNITS
+from companion.samples import TRIADS
 
 EVERY_S: Final = {180: 10, 600: 30, MAX_S: 60}
-"""By how many seconds there are at most, how often a window ends: an estimate of more costs more, and tells less that
-is new."""
+"""Interval at which windows end, by their length up to which it holds: long estimates cost more and change less."""
 KEPT_S: Final = MAX_S + 2 * max(EVERY_S.values())
-"""What a window that is the latest until the next one may begin with."""
+"""Seconds kept: a window that is the latest until the next one may begin with the first of them."""
+LONGEST_GAP_S: Final = 0.5
+_SETTLED_LAGS: Final = 10.0
+_KEPT_SHOWN: Final = 4
+"""Seconds that wait for the gradienter's readings."""
+_FALLS: Final = 2.0
+"""Power of the time with which the white part of a variance falls, until estimates show it: that of a slope through
+waves or white noise falls with the third, a sensor's own white noise with the first."""
+_FALLS_LEAST: Final = 1.0
+_FALLS_MOST: Final = 3.0
+_APART: Final = 1.15
+"""Ratio of the lengths of two windows that show the power."""
+_LONG: Final = 4.0
+"""Ratio of the lengths of two windows that show a power below `_FALLS`."""
+_IN_MINUTES_S: Final = 90.0
 
 
-class Deck:
+class Stream:
+    """One IMU's seconds without a gap, beside the gradienter."""
+
+    def __init__(self, imu: ImuInput, gradienter: GradienterModel | None) -> None:
+        self.imu, self._gradienter = imu, gradienter
+        self.seconds: deque[ImuSecond] = deque(maxlen=KEPT_S)
+        self.levels: dict[int, Level] = {}
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self.seconds.clear()
+        self.levels.clear()
+        self._last: Floats | None = None
+        self._shown: dict[int, tuple[Floats, Floats]] = {}
+        self._fluid = None if self._gradienter is None else Fluid(self._gradienter)
+        self._settled_s = math.inf
+
+    def add(self, batch: Batch, times: Floats, rows: Floats) -> bool:
+        """Add one second of samples (n, 6): rates, forces, in the sensor's axes; return False after a gap."""
+        own = np.column_stack([times, self._in_vehicle(rows)])
+        last = self._last
+        gap_s = max(float(np.diff(times).max(initial=0.0)), 0.0 if last is None else float(own[0, 0] - last[0]))
+        if gap_s > LONGEST_GAP_S:
+            self.clear()
+            last = None
+        self._last = own[-1]
+        if self._fluid is not None:
+            if last is None:
+                self._settled_s = float(times[0]) + _SETTLED_LAGS * self._fluid.lag_s
+            self._shown[batch.slot] = times, self._fluid.follow(times, own[:, 4:])
+            _trim(self._shown, _KEPT_SHOWN)
+        if last is None:
+            return gap_s <= LONGEST_GAP_S
+        whole = np.vstack([last, own])
+        rates = whole[:, 1:4]
+        step_s = float(np.median(np.diff(whole[:, 0]).tolist()))
+        second = rates[2:] - 2.0 * rates[1:-1] + rates[:-2]
+        white2 = float(np.square(second).mean()) / 6.0 * step_s if len(second) else 0.0
+        self.seconds.append(ImuSecond(batch, passage(whole[:, 0], rates, whole[:, 4:]), white2))
+        while self.levels and next(iter(self.levels)) < self.seconds[0].slot:
+            del self.levels[next(iter(self.levels))]
+        return True
+
+    def compare(self, slot: int, times: Floats, tilts: Floats) -> None:
+        """Add the gradienter's readings of a second."""
+        shown = self._shown.get(slot)
+        if shown is None or shown[0][0] < self._settled_s:
+            return
+        found = level(*shown, times, tilts)
+        if found is not None:
+            self.levels[slot] = found
+
+    def _in_vehicle(self, rows: Floats) -> Floats:
+        imu = self.imu
+        if imu.truncates:
+            # Toward zero: on a platform that moves by more than a step, half a step was cut off.
+            steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
+            rows = rows + np.sign(rows) * steps / 2.0
+        return np.hstack([rows[:, :3] @ imu.rotation.T, rows[:, 3:] @ imu.rotation.T])
+
+
+class DeckMeasurement(Measurement, frozen=True, kw_only=True):
+    """Everything that a deck's window is made of: the estimate holds the pose too."""
+
+    def window(self) -> Window:
+        """Work it out, unless that is done.
+
+        Raises:
+            CalibrationRefusedError: the readings give no estimate.
+        """
+        found = self.estimate()
+        if isinstance(found, CalibrationRefusedError):
+            raise found
+        window: Window = found.window
+        return window
+
+
+class Deck(WindowSource):
     """Collects what `DeckWork` needs. Pure: time comes in with the samples."""
 
-    def __init__(self, gradienter: GradienterModel | None, compass: CompassModel | None) -> None:
-        self._gradienter, self._compass = gradienter, compass
+    may_move = True
+
+    def __init__(
+        self, gradienter: GradienterModel | None, compass: CompassModel | None, horizon_s: float = 180.0
+    ) -> None:
+        super().__init__()
+        self._gradienter, self._compass, self._horizon_s = gradienter, compass, horizon_s
         self._streams: dict[str, Stream] = {}
         self._headings: dict[int, float] = {}
         self._tilts: dict[int, tuple[Floats, Floats]] = {}
+        self._first: tuple[int, DeckFound] | None = None
+        """First estimate of all seconds, and of how many, to see how fast sigma falls."""
+        self._reference_deg: tuple[float, float] | None = None
+        """Tilt at which the last accelerometer means were given, to compare those after a write with."""
+        self._newest_s = 0
+        self._is_good = True
 
-    def set_imu(self, imu: ImuInput) -> None:
+    def set_imu(self, imu: ImuInput, batches: BatchSource | None = None) -> None:
         """Add an IMU, or begin anew with one whose stream is another now."""
-        self._streams[imu.name] = Stream(imu, self._gradienter, KEPT_S)
+        self._streams[imu.name] = Stream(imu, self._gradienter)
+        if batches is not None:
+            batches.on_second = functools.partial(self.take_imu, imu.name)
+
+    def set_pose(self, kind: str, batches: BatchSource) -> None:
+        """Add the seconds of the gradienter or the compass."""
+        batches.on_second = self.take_heading if kind == "compass" else self.take_tilt
 
     def forget(self, imu: str | None) -> None:
-        """Drop what was measured, of one IMU or of all."""
+        """Drop what was measured, of one IMU or of everything."""
         for name, stream in self._streams.items():
             if imu is None or name == imu:
                 stream.clear()
         if imu is None:
             self._headings.clear()
+        self._is_good = True
+        self.clear()
+
+    def clear(self) -> None:
+        """Drop all estimates."""
+        super().clear()
+        self._first = None
+
+    def new_stretch(self) -> None:
+        """Do nothing: a movement ends nothing here."""
+
+    def add(self, slot: int, *, good: bool) -> bool:
+        """Note whether a source was faulty."""
+        self._is_good = good
+        return True
 
     def take_imu(self, name: str, batch: Batch, times: Floats, rows: Floats) -> None:
-        """The samples (n, 6) of one second of an IMU, in its own axes."""
+        """Add the samples (n, 6) of one second of an IMU, in its own axes."""
         stream = self._streams[name]
-        stream.take(batch, times, rows)
+        if not stream.add(batch, times, rows):
+            self.clear()
         if batch.slot in self._tilts:
             stream.compare(batch.slot, *self._tilts[batch.slot])
 
     def take_tilt(self, batch: Batch, times: Floats, rows: Floats) -> None:
-        """The readings (n, 2) of one second of the gradienter."""
+        """Add the readings (n, 2) of one second of the gradienter."""
         self._tilts[batch.slot] = times, rows
-        while len(self._tilts) > KEPT_SHOWN:
-            del self._tilts[next(iter(self._tilts))]
+        _trim(self._tilts, _KEPT_SHOWN)
         for stream in self._streams.values():
             stream.compare(batch.slot, times, rows)
 
     def take_heading(self, batch: Batch, times: Floats, rows: Floats) -> None:
-        """The headings (n, 1) of one second, degrees."""
+        """Add the headings (n, 1) of one second, degrees."""
         self._headings[batch.slot] = float(batch.mean[0]) * DEG
-        while len(self._headings) > KEPT_S:
-            del self._headings[next(iter(self._headings))]
+        _trim(self._headings, KEPT_S)
 
-    def slots(self, since_s: float | None = None) -> range:
-        """The seconds that all IMUs have in common and that begin after `since_s`, up to the last end by `EVERY_S`."""
+    @property
+    def seconds(self) -> int:
+        """Number of seconds that the IMUs have in common, to the last."""
+        return min((len(stream.seconds) for stream in self._streams.values()), default=0)
+
+    @property
+    def stillness(self) -> Stillness:
+        """Every second counts."""
+        return Stillness(self.seconds, self.seconds, self._is_good)
+
+    def common(self, since_s: float | None = None) -> range:
+        """Return the seconds of all IMUs that begin after `since_s`, up to the last end by `EVERY_S`."""
         ends = [(one.seconds[0].slot, one.seconds[-1].slot) for one in self._streams.values() if one.seconds]
         if not ends or len(ends) < len(self._streams):
             return range(0)
@@ -75,20 +221,15 @@ class Deck:
         first = max(end - MAX_S, begin)
         return range(first, max(end, first))
 
-    @property
-    def seconds(self) -> int:
-        """How many there are in common, to the last."""
-        counts = [len(stream.seconds) for stream in self._streams.values()]
-        return min(counts, default=0)
+    def slots(self, since_s: float | None) -> range:
+        """Return the seconds of a window."""
+        slots, needed = self.common(since_s), MIN_S if since_s is None else MIN_LOOK_S
+        if len(slots) < needed:
+            raise CalibrationRefusedError(self._at_least(needed))
+        return slots
 
-    def work(
-        self,
-        slots: range,
-        horizon_s: float,
-        reference_deg: tuple[float, float] | None = None,
-        since_s: float | None = None,
-    ) -> DeckWork:
-        """What is to be worked out of these seconds; holds nothing that changes later."""
+    def work(self, slots: Sequence[int], since_s: float | None = None) -> DeckWork:
+        """Pack up the estimate of these seconds."""
         streams = self._streams.values()
         return DeckWork(
             imus=[stream.imu for stream in streams],
@@ -98,7 +239,98 @@ class Deck:
             slots=slots,
             gradienter=self._gradienter,
             compass=self._compass,
-            horizon_s=horizon_s,
-            reference_deg=reference_deg,
+            horizon_s=self._horizon_s,
+            reference_deg=None if since_s is None else self._reference_deg,
             since_s=since_s,
+            generation=self.generation,
         )
+
+    def accept(self, work: Any, found: Any) -> bool:
+        """Keep what the work has found; return False if it comes too late."""
+        if not super().accept(work, found):
+            return False
+        if work.since_s is None and isinstance(found, DeckFound):
+            if (tilt := found.window.tilt) is not None:
+                self._reference_deg = tilt.x_deg, tilt.y_deg
+            self._newest_s = len(work.slots)
+            self._first = self._first or (self._newest_s, found)
+        return True
+
+    def measurement(self, since_s: float | None) -> DeckMeasurement:
+        """Return what a window is made of."""
+        slots = self.slots(since_s)
+        return DeckMeasurement(slots=slots, estimate=self.estimate_later(slots, since_s))
+
+    def progress(self, settings: Settings, *, waits: bool) -> Progress:
+        """Return how far the newest estimate is from good enough."""
+        found = self.known(0, None)
+        if found is None or self.seconds < MIN_S:
+            left = self._at_least(MIN_S)
+            return Progress(enough=False, share=min(self.seconds / MIN_S, 1.0) / 4.0, words=left, left=left)
+        if isinstance(found, CalibrationRefusedError):
+            return Progress(enough=False, share=0.0, words=str(found))
+        first_s, first = self._first or (self._newest_s, found)
+        targets = settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2
+        aims = [
+            aim((first_s, first.known[at]), (self._newest_s, known), targets[at % 2])
+            for at, known in enumerate(found.known)
+        ]
+        if all(each.sigma <= each.goal for each in aims):
+            return Progress(enough=True, share=1.0, words="sigma is good enough")
+        if self.seconds >= MAX_S:
+            return Progress(enough=True, share=1.0, words=f"measured for {MAX_S // 60} min")
+        at, last = max(enumerate(aims), key=lambda each: each[1].whole_s)
+        left_s = max(last.whole_s - self.seconds, 1)
+        left, unit = more(left_s), UNITS[TRIADS[at % 2]]
+        share = self.seconds / (self.seconds + left_s)
+        return Progress(enough=False, share=share, words=f"{left}: {last.in_words(unit.si, unit.name)}", left=left)
+
+    def _at_least(self, needed: int) -> str:
+        return f"at least {max(needed - self.seconds, 1)} s more"
+
+
+class Aim(NamedTuple):
+    """The sigma that a triad is measured to: the target, or all that more time can give."""
+
+    sigma: float
+    goal: float
+    whole_s: float
+    """Predicted length of the window that reaches the goal."""
+
+    def in_words(self, unit: float, name: str) -> str:
+        """Give '12 deg/h, goal 6.1'."""
+        return f"{_figure(self.sigma / unit)} {name}, goal {_figure(self.goal / unit)}"
+
+
+def aim(first: tuple[int, Known], newest: tuple[int, Known], target: float) -> Aim:
+    """Return the aim of a triad by the first and the newest estimate, each with its number of seconds."""
+    (first_s, was), (newest_s, known) = first, newest
+    floor = known.use - known.white
+    goal = max(target**2, floor * (1.0 + WHITE_SHARE))
+    whole_s = float(newest_s)
+    if known.use > goal:
+        falls = _FALLS
+        if newest_s > first_s * _APART and known.white > 0.0:
+            fell = math.log(max(was.white, known.white) / known.white) / math.log(newest_s / first_s)
+            # While a turn is short, a bias hides behind the compass' error: that fall is slower at first than later.
+            falls = min(max(fell, _FALLS_LEAST if newest_s > _LONG * first_s else _FALLS), _FALLS_MOST)
+        wanted = (goal - floor) / known.white
+        whole_s = min(newest_s * wanted ** (-1.0 / falls), MAX_S) if wanted > 0.0 else MAX_S
+    return Aim(math.sqrt(known.use), math.sqrt(goal), whole_s)
+
+
+def more(left_s: float) -> str:
+    """Give a time for a pilot."""
+    if left_s < _IN_MINUTES_S:
+        return f"some {math.ceil(left_s / 10.0) * 10} s more"
+    return f"some {left_s / 60.0:.0f} min more"
+
+
+def _figure(value: float) -> str:
+    return f"{value:.{0 if value >= 9.95 else 1 if value >= 0.995 else 2}f}"
+
+
+def _trim(kept: dict[int, Any], most: int) -> None:
+    """Drop the oldest."""
+    while len(kept) > most:
+        del kept[next(iter(kept))]

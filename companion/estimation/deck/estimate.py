@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
-import msgspec
 import numpy as np
 
 from companion.errors import CalibrationRefusedError
+from companion.estimation.collector.measurement import Work
 from companion.estimation.deck.fluid import Compared, Level, compare
-from companion.estimation.deck.smoother import Believed, Found, smooth
-from companion.estimation.deck.stream import ImuSecond
+from companion.estimation.deck.smoother import Believed, Found, Passage, smooth
 from companion.estimation.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.estimation.means.warming import drifting
 from companion.estimation.means.windows import ImuInput, ImuWindow, Window
 from companion.estimation.noise.allan import AllanModel, floor_variance, slope_variance
+from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import Array, Floats, Matrix, body_from_ned, vector
 from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG, MG
@@ -45,37 +45,22 @@ _UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
 _LEAST_ACCEL_M_S2: Final = 0.1 * MG
 """Of the comparison with the gradienter; what its zero is wrong by turns everything alike and comes in `solve`."""
 _MIDDLE: Final = 0.37
-"""Of K^2 T: what a slope, weighed most in its middle, misses of a bias that walks; no averaging takes it away."""
+"""Share of K^2 T."""
 _FLICKER_TO_COME: Final = 0.75
 """Of B^2: what flicker does in the next minutes that its past does not tell. With what it did in the window, as a
 random walk of B / sqrt(T), it is the flicker's part of V(T, H)."""
-_UPRIGHT: Final = 0.5
-"""Square of an axis' part along the vertical."""
 _GRAVITY_M_S2: Final = 9.8
 
 
-class ByHeading(msgspec.Struct, frozen=True, kw_only=True):
-    """What headings will go on telling of a bias about the vertical."""
-
-    turn_rad_s: float
-    iron_rad: float
-    """Compass error that changes with the heading, one sigma of its sine and cosine."""
-    heading_white: float
-    """N of the headings, rad * sqrt(s)."""
-    gyro: AllanModel
-
-
-class Known(msgspec.Struct, frozen=True):
+class Known(NamedTuple):
     """How well a triad is known: largest variances of the axes."""
 
     use: float
     white: float
-    """What more seconds take away."""
-    by_heading: ByHeading | None = None
-    """Where the worst axis is one that the compass tells of."""
+    """The part that more seconds take away."""
 
 
-class DeckFound(msgspec.Struct, frozen=True):
+class DeckFound(NamedTuple):
     """A window, and how far it is."""
 
     window: Window
@@ -83,21 +68,32 @@ class DeckFound(msgspec.Struct, frozen=True):
     """Gyros and accelerometers of one IMU after another."""
 
 
-class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
-    """An estimate that is due; `run` touches nothing that changes, and may be called in another thread."""
+class ImuSecond(NamedTuple):
+    """One second of one IMU."""
+
+    batch: Batch
+    passage: Passage
+    white2: float
+    """N^2 of the gyros, from second differences of neighbouring samples; the mean of the axes."""
+
+    @property
+    def slot(self) -> int:
+        """Number of the second."""
+        return self.batch.slot
+
+
+class DeckWork(Work, frozen=True, kw_only=True):
+    """Estimate of a window on a deck."""
 
     imus: Sequence[ImuInput]
     seconds: Sequence[Sequence[ImuSecond]]
     levels: Sequence[Mapping[int, Level]]
     headings: Mapping[int, float]
-    slots: range
     gradienter: GradienterModel | None
     compass: CompassModel | None
     horizon_s: float
     reference_deg: tuple[float, float] | None
     """The tilt to give the accelerometers' means at, as the gradienter reads it; None: the mean of the window."""
-    since_s: float | None
-    """The window's own beginning, where it is not that of all seconds."""
 
     def run(self) -> DeckFound | CalibrationRefusedError:
         """Work it out: a third of a second for ten minutes of one IMU on a desktop."""
@@ -146,7 +142,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         """
         if not self.imus:
             return set()
-        rates = {one.slot: one.mean[:3] @ self.imus[0].rotation.T for one in self.seconds[0]}
+        rates = {one.slot: one.batch.mean[:3] @ self.imus[0].rotation.T for one in self.seconds[0]}
         found: set[int] = set()
         for run in _runs(readings):
             swayed = [rates[slot][:2] for slot in run if slot in rates]
@@ -188,10 +184,10 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         covariance[3:, 3:] = own + np.diag(accel_floor)
         use = np.sqrt(np.diag(covariance))
         heading_rad = math.atan2(found.body_to_ned[-1, 1, 0], found.body_to_ned[-1, 0, 0])
-        temperatures = [one.temperature_degc for one in seconds if one.temperature_degc is not None]
+        temperatures = [one.batch.temperature_degc for one in seconds if one.batch.temperature_degc is not None]
         window = ImuWindow(
             name=imu.name,
-            samples=sum(one.samples for one in seconds),
+            samples=sum(one.batch.n for one in seconds),
             duration_s=span_s,
             gyro_rad_s=vector(found.gyro_rad_s),
             accel_m_s2=vector(direction),
@@ -207,25 +203,10 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             # Of its level axes: along the heading, to the right of it, and down.
             by_earth=found.by_earth @ body_from_ned(0.0, 0.0, heading_rad).T,
         )
-        worst = int(np.argmax(use[:3]))
-        gyros = Known(
-            float(use[worst] ** 2),
-            max(float(np.diag(gyro_own).max()) - wandered(gyro, span_s), 0.0),
-            self._by_heading(found, worst, believed, gyro),
-        )
+        # A slope, weighed most in its middle, misses some of a bias that walks: no averaging takes that away.
+        walked = _MIDDLE * followed_walk(gyro, span_s) ** 2 * span_s
+        gyros = Known(float(use[:3].max() ** 2), max(float(np.diag(gyro_own).max()) - walked, 0.0))
         return window, (gyros, Known(float(use[3:].max() ** 2), float(np.diag(own).max()))), found
-
-    def _by_heading(self, found: Found, worst: int, believed: Believed, gyro: AllanModel) -> ByHeading | None:
-        down = found.body_to_ned[-1][2]
-        if self.compass is None or down[worst] ** 2 < _UPRIGHT:
-            return None
-        headings = np.unwrap(np.arctan2(found.body_to_ned[:, 1, 0], found.body_to_ned[:, 0, 0]))
-        return ByHeading(
-            turn_rad_s=float(np.polyfit(np.arange(len(headings)), headings, 1)[0]),
-            iron_rad=believed.compass_sigma_rad,
-            heading_white=found.heading_sigma_rad * math.sqrt(len(self.slots)),
-            gyro=msgspec.structs.replace(gyro, white=believed.gyro_white),
-        )
 
     def _believed(
         self,
@@ -270,11 +251,6 @@ def followed_walk(gyro: AllanModel, span_s: float) -> float:
     return math.hypot(gyro.walk, gyro.flicker / math.sqrt(span_s))
 
 
-def wandered(gyro: AllanModel, span_s: float) -> float:
-    """Variance that no averaging takes away."""
-    return _MIDDLE * followed_walk(gyro, span_s) ** 2 * span_s
-
-
 def _runs(readings: Mapping[int, Floats]) -> list[list[int]]:
     """Seconds one after another with the same reading."""
     found: list[list[int]] = []
@@ -306,9 +282,9 @@ def _felt(
 def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:
     """(6,) variance of what integers hide that the swaying does not spread, and of what is off in all; vehicle axes."""
     steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
-    means = np.array([one.mean for one in seconds])
-    spread = np.sqrt(means.var(axis=0) + np.mean([one.variance for one in seconds], axis=0))
+    means = np.array([one.batch.mean for one in seconds])
+    spread = np.sqrt(means.var(axis=0) + np.mean([one.batch.variance for one in seconds], axis=0))
     hidden = np.where(spread < _DITHERED * steps, np.square(steps / 2.0), 0.0)
-    hidden = hidden + np.mean([one.shared_variance for one in seconds], axis=0)
+    hidden = hidden + np.mean([one.batch.shared_variance for one in seconds], axis=0)
     turn = np.square(imu.rotation)
     return np.concatenate([turn @ hidden[:3], turn @ hidden[3:]])

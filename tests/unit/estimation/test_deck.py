@@ -18,7 +18,7 @@ from companion.estimation.deck.waves import Wander, Waves, fit_waves, whitened
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.noise.allan import PROFILES
-from companion.estimation.seconds.batch import Batch, summary
+from companion.estimation.seconds.batch import Batch, BatchSource, summary
 from companion.physics.frames import rotations, running_products
 from sim.accuracy.deck import Voyage, feed, sail
 from sim.aircraft import Pose, Site, VirtualAircraft
@@ -150,7 +150,7 @@ def test_a_sensor_that_repeats_itself_on_a_swaying_deck_is_named(stuck: str) -> 
     aircraft = VirtualAircraft(Pose(), Site(latitude_deg=45.0), motions=Voyage().motions(8))
     imu = ImuModel(aircraft, "icm42688p", seed=8)
     feed(deck, imu, 91, np.random.default_rng(8), 1.0)
-    assert isinstance(deck.work(range(1, 91), 180.0).run(), DeckFound)
+    assert isinstance(deck.work(range(1, 91)).run(), DeckFound)
     for slot in range(65, 91):
         if stuck == "compass":
             deck._headings[slot] = deck._headings[65]
@@ -159,7 +159,7 @@ def test_a_sensor_that_repeats_itself_on_a_swaying_deck_is_named(stuck: str) -> 
             first = deck._streams["imu"].levels[65].reading
             off = level.difference + first - level.reading
             deck._streams["imu"].levels[slot] = Level(first, off, level.slope)
-    found = deck.work(range(1, 91), 180.0).run()
+    found = deck.work(range(1, 91)).run()
     assert isinstance(found, CalibrationRefusedError)
     assert str(found) == f"{stuck} is stuck: the same for 26 s while it sways"
 
@@ -172,7 +172,7 @@ def test_windows_end_the_more_rarely_the_longer_they_are() -> None:
         times = slot + np.arange(4) / 4.0
         rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.8], (4, 1))
         deck.take_imu("imu", summary(slot, times, rows), times, rows)
-        slots = deck.slots()
+        slots = deck.common()
         assert len(slots) <= 1200
         ends.append(slots.stop)
     assert sorted(ends[20:]) == ends[20:]
@@ -193,14 +193,14 @@ def test_a_gap_begins_the_seconds_anew() -> None:
     for slot in range(25):
         times, rows = quiet_second(slot)
         deck.take_imu("imu", summary(slot, times, rows), times, rows)
-    assert deck.slots() == range(1, 20)
+    assert deck.common() == range(1, 20)
     times, rows = quiet_second(25, begin=0.7)
     deck.take_imu("imu", summary(25, times, rows), times, rows)
     assert deck.seconds == 0
     for slot in range(26, 41):
         times, rows = quiet_second(slot)
         deck.take_imu("imu", summary(slot, times, rows), times, rows)
-    assert deck.slots() == range(26, 40)
+    assert deck.common() == range(26, 40)
 
 
 def test_half_a_circle_leaves_no_part_of_the_earths_rate() -> None:
@@ -239,7 +239,7 @@ class OfPairs(Deck):
         super().__init__(gradienter, compass)
         self.off = self.sigma * np.random.default_rng([seed, 8]).standard_normal(6)
 
-    def set_imu(self, imu: ImuInput) -> None:
+    def set_imu(self, imu: ImuInput, batches: BatchSource | None = None) -> None:
         super().set_imu(msgspec.structs.replace(imu, rotation=self.rotation))
 
     def take_imu(self, name: str, batch: Batch, times: Array, rows: Array) -> None:

@@ -62,7 +62,7 @@ class Fed:
 
     @property
     def batches(self) -> list[Batch]:
-        return list(self.collector._imus["own"].batches.batches.values())
+        return list(self.collector.imus["own"].batches.batches.values())
 
 
 def still(stream: Reads) -> list[tuple[float, ...]]:

@@ -39,9 +39,9 @@ class Played:
             status = self.collector.status(sample.t_s)
             self.still_s[second - 1] = status.still_s
             self.words[second - 1] = status.waiting_for or ""
-            start = self.collector._stretch.start
+            start = self.collector._windows._stretch.start
             if start is not None:
-                stretches[start] = self.collector._slots(None)[-1]
+                stretches[start] = self.collector._windows.good_slots(None)[-1]
         self.end_s = float(recording.t_s[-1])
         self.stretches = [(start, float(last + 1)) for start, last in stretches.items()]
 

@@ -208,7 +208,6 @@ def test_the_window_is_at_most_max_s_long_and_memory_is_bounded() -> None:
     assert status.still_s > 250.0
     for source in feed.collector._sources():
         assert len(source.batches.batches) <= 30
-    assert len(feed.collector._good) <= 30
 
 
 def test_a_warm_up_is_taken_where_the_last_second_ends() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.estimation.collector.swell import WATCHED_S, Swell
+from companion.estimation.collector.outlook import WATCHED_S, is_wave
 from companion.estimation.seconds.batch import summary
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array
@@ -18,16 +18,15 @@ RATE_HZ = 20
 
 def hints(times: Array, rates: Array, lost: int | None = None) -> list[bool]:
     """Of every second from `WATCHED_S` on but the lost one, whether it hints."""
-    swell, found = Swell(), []
+    batches, found = {}, []
     slots = np.floor(times).astype(int)
     for slot in range(int(slots[-1])):
         here = slots == slot
         if not here.any() or slot == lost:
-            swell.add(None)
             continue
-        swell.add(summary(slot, times[here], np.hstack([rates[here], np.zeros((here.sum(), 3))])))
+        batches[slot] = summary(slot, times[here], np.hstack([rates[here], np.zeros((here.sum(), 3))]))
         if slot >= WATCHED_S:
-            found.append(swell.is_regular)
+            found.append(is_wave(batches))
     return found
 
 

@@ -50,16 +50,16 @@ def test_a_turn_is_counted_in_the_vehicles_axes_and_not_through_a_hole() -> None
     feed.collector.count_turns(wanted=True)
     feed.run(8.3)
     x, y, z = BIAS
-    counted = feed.collector.counted("own", 1005.0, 1010.0, np.array([-y, x, z - 0.2]))
+    counted = feed.collector.imus["own"].counted(1005.0, 1010.0, np.array([-y, x, z - 0.2]))
     assert counted is not None
     assert counted.angle_rad == pytest.approx(1.0, abs=0.4 / RATE_HZ + 6.0 * GYRO_NOISE * math.sqrt(5.0 / RATE_HZ))
-    assert feed.collector.counted("own", 1002.0, 1010.0, np.zeros(3)) is None, "nothing was kept before"
+    assert feed.collector.imus["own"].counted(1002.0, 1010.0, np.zeros(3)) is None, "nothing was kept before"
     feed.now_s += 0.15  # of 1011, though its other 85 samples are there
     feed.run(6.0)
-    assert feed.collector.counted("own", 1012.0, 1016.0, np.zeros(3)) is not None
-    assert feed.collector.counted("own", 1010.0, 1016.0, np.zeros(3)) is None
+    assert feed.collector.imus["own"].counted(1012.0, 1016.0, np.zeros(3)) is not None
+    assert feed.collector.imus["own"].counted(1010.0, 1016.0, np.zeros(3)) is None
     feed.collector.count_turns(wanted=False)
-    assert feed.collector.counted("own", 1012.0, 1016.0, np.zeros(3)) is None
+    assert feed.collector.imus["own"].counted(1012.0, 1016.0, np.zeros(3)) is None
 
 
 def test_a_movement_is_kept_in_the_words_of_its_gate_although_the_stretch_is_forgotten() -> None:
