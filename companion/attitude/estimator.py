@@ -49,20 +49,20 @@ Phase = Literal["ground", "flight"]
 
 LEVEL_TAU_S: Final[dict[Phase, float]] = {"ground": 3.0, "flight": 30.0}
 STEADY_SHARE: Final = 0.03
-"""How far the length of specific force may be from g, as a share, for a compass that levels itself to be read."""
+"""Deviation of specific force from g, as a share, up to which a compass that levels itself is read."""
 STEADY_RAD_S: Final = math.radians(20.0)
-"""How fast it may turn then."""
+"""Rate up to which it is read."""
 COVARIANCE_STEP_S: Final = 0.2
 REST_S: Final = 1.0
 REST_SIGMAS: Final = 5.0
-"""A second of rest that tells more than this of bias was none: nobody knows at once that a movement has begun."""
+"""Rest that shows a larger bias was a movement that had begun unnoticed."""
 KEPT_S: Final = 2.0
-"""How long orientations are remembered, for compass readings that come late."""
+"""Orientations kept for compass readings that come late."""
 FORCE_SMOOTHED_S: Final = 1.0
-"""The time over which the length of specific force is judged: vibration and gusts are shorter."""
+"""Averaging time of the length of specific force: vibration and gusts are shorter."""
 DOUBTED_SHARE: Final = 0.03
-"""At so much of g off, half is believed: three times what an uncalibrated accelerometer's scale may be off by, and
-the 15 degrees of bank from which on a turn tilts more than a calibrated gyro drifts in its time."""
+"""Deviation from g, as a share, at which half is believed: three times the scale error of accelerometers.
+Above it (15 degrees of bank) a turn tilts more than a calibrated gyro drifts in its time."""
 _UP: Final = (0.0, 0.0, -1.0)
 
 TAU_S: Final = 9.0
@@ -71,16 +71,16 @@ GATE_SIGMAS: Final = 4.0
 GATE_LEAST_RAD: Final = math.radians(10.0)
 STEEP_RAD: Final = math.radians(60.0)
 FIRST_S: Final = 0.1
-"""What the first reading stands for."""
+"""Time for which the first reading stands."""
 BADLY: Final = 1.5
-"""A heading is known badly from so many sigmas of the compass on."""
+"""Sigma of a badly known heading, in sigmas of the compass."""
 REFUSED_S: Final = 20.0
-"""A compass that has been outside the gate for so long is worth a word to the pilot."""
+"""Time outside the gate after which the pilot is warned."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class AttitudeSettings:
-    """What the calibration and the site know. Vectors in vehicle FRD.
+    """Results of a calibration and data of the site. Vectors in vehicle FRD.
 
     `latitude_deg` None: the Earth's rotation is not taken out, and may be an error of 15 deg/h.
     """
@@ -107,7 +107,7 @@ class Attitude(msgspec.Struct, frozen=True, gc=False):
     yaw_rad: float
     """In [-pi, pi], from true north."""
     rate_rad_s: Triple
-    """Of the body against the Earth in FRD, bias and the Earth's rotation removed."""
+    """Rate of the body against the Earth in FRD, without bias."""
     sigma_rad: Triple
     """One sigma of roll, pitch and yaw."""
 
@@ -118,9 +118,9 @@ class Leveller:
     def __init__(self, gravity_m_s2: float) -> None:
         self.gravity_m_s2 = gravity_m_s2
         self.ned_from_e: Quaternion = IDENTITY
-        """Of tilt and heading together; the heading aid turns it about the vertical."""
+        """Tilt and heading together; the heading aid turns it about the vertical."""
         self.doubt = 0.0
-        """How far the force's length has been from gravity, over `FORCE_SMOOTHED_S`, as a share of g."""
+        """Deviation of the force from gravity, over `FORCE_SMOOTHED_S`, as a share of g."""
         self._force: Triple = (0.0, 0.0, -gravity_m_s2)
         self._slope: Triple = (0.0, 0.0, 0.0)
         self._length = gravity_m_s2
@@ -182,7 +182,7 @@ class HeadingAid:
         return max(trust, min(1.0, since_s / TAU_S))
 
     def refused_for_s(self, t_s: float) -> float:
-        """How long it has been refused without a break."""
+        """Return the time for which readings have been refused without a break."""
         return 0.0 if self._refused_since_s is None else t_s - self._refused_since_s
 
 
@@ -192,7 +192,6 @@ class AttitudeEstimator:
     def __init__(self, settings: AttitudeSettings) -> None:
         self._strapdown = Strapdown()
         self.compass = HeadingAid()
-        """What became of the compass readings."""
         self._history: deque[tuple[float, Quaternion]] = deque()
         self._aligned = False
         self._still_s = 0.0
@@ -203,7 +202,7 @@ class AttitudeEstimator:
         self._leveller = Leveller(settings.gravity_m_s2)
 
     def settle(self, settings: AttitudeSettings) -> None:
-        """Take the result of a newer calibration; the attitude goes on, its bias sigma begins anew."""
+        """Use the result of a newer calibration; the attitude goes on, its bias sigma begins anew."""
         kept = self._uncertainty.attitude
         self._settle(settings)
         self._leveller.gravity_m_s2 = settings.gravity_m_s2
@@ -241,17 +240,17 @@ class AttitudeEstimator:
 
     @property
     def aligned(self) -> bool:
-        """Whether there is an attitude at all."""
+        """True if there is an attitude."""
         return self._aligned and not self._strapdown.lost
 
     @property
     def heading_known(self) -> bool:
-        """Whether the heading is more than a guess."""
+        """True if the heading is more than a guess."""
         return self.aligned and self._uncertainty.heading_sigma_rad < 0.5 * HEADING_UNKNOWN_RAD
 
     @property
     def gyro_bias_rad_s(self) -> Triple:
-        """What is subtracted now, vehicle FRD: the calibration's bias with what rest has added to it."""
+        """Bias in use, vehicle FRD: that of the calibration, refined at rest."""
         return rotate(conjugate(self._sensor_from_vehicle), self._strapdown.bias_rad_s)
 
     # ------------------------------------------------------------------------------------------------- samples
@@ -355,9 +354,9 @@ class AttitudeEstimator:
         return True
 
     def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
-        """What is remembered of the attitude then, body to NED, by the present opinion of level and north.
+        """Return a time at most a stretch before `t_s` and the attitude then, body to NED, by the present level.
 
-        With the instant, up to a stretch before, of which it is; None when nothing of then is.
+        None when nothing is kept of it.
         """
         for then_s, orientation in reversed(self._history if self.aligned else ()):
             if then_s <= t_s:

@@ -164,7 +164,8 @@ class Job:
             CalibrationRefusedError: it is over.
         """
         if self.deadline_s is not None and asyncio.get_running_loop().time() >= self.deadline_s:
-            raise CalibrationRefusedError(f"not finished in the time given: {self.words}")
+            boat = '; on a boat? set vehicle.platform = "deck"' if self.words.startswith("hold still: ") else ""
+            raise CalibrationRefusedError(f"not finished in the time given: {self.words}{boat}")
 
     async def pause(self, seconds: float) -> None:
         """Wait, but not past a cancel or a `look_again`.

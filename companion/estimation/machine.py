@@ -1,8 +1,4 @@
-"""The life of one calibration, as one table.
-
-No clock, no I/O, no device is known here: whoever conducts a calibration reports events and obeys the state.
-The diagram in docs/calibration.md is this table.
-"""
+"""The states of one calibration, as one table: the diagram in docs/calibration.md is this table."""
 
 from __future__ import annotations
 
@@ -11,7 +7,7 @@ from typing import Final
 
 
 class State(enum.Enum):
-    """Where a calibration stands."""
+    """State of a calibration."""
 
     IDLE = "idle"
     WAITING = "waiting"
@@ -29,12 +25,12 @@ class State(enum.Enum):
 
     @property
     def busy(self) -> bool:
-        """Whether work is under way."""
+        """True while work is under way."""
         return self not in RESTING
 
     @property
     def is_writing(self) -> bool:
-        """Whether offsets are being changed and not yet known to be right."""
+        """True while offsets are being changed and not yet known to be right."""
         return self in _WRITING
 
     @property
@@ -44,12 +40,12 @@ class State(enum.Enum):
 
     @property
     def word(self) -> str:
-        """What people read, wherever they look."""
+        """Word shown to people."""
         return _WORDS.get(self, self.value)
 
 
 class Event(enum.Enum):
-    """What can happen to it."""
+    """Event in a calibration."""
 
     REQUEST = "request"
     UNDO = "undo"

@@ -14,8 +14,6 @@ from companion.estimation.collector.outlook import Status
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.noise.robust import huber_line, huber_mean
 from companion.estimation.seconds.batch import BatchSource
-from companion.physics.frames import rotation_matrix
-from companion.rotations import ROTATION_NAMES
 from companion.samples import CompassSample, ImuSample, TiltSample
 from tests.support import still_aircraft as still
 
@@ -122,37 +120,3 @@ def test_a_line_gains_the_slope_that_is_added(values: list[float], slope: float)
     assert tilted.slope[0] == pytest.approx(float(flat.slope[0]) + slope, abs=0.02 * size)
     assert np.isfinite(tilted.end).all()
     assert np.isfinite(tilted.end_leverage).all()
-
-
-@settings(max_examples=15)
-@given(st.tuples(*[st.floats(-0.1, 0.1)] * 3), st.tuples(*[st.floats(-1.0, 1.0)] * 3))
-def test_what_is_added_to_the_readings_is_added_to_the_means(
-    rate: tuple[float, float, float], force: tuple[float, float, float]
-) -> None:
-    shift = np.array(rate + force)
-    plain, shifted = (
-        run(np.zeros(6)),
-        run(shift),
-    )
-    assert np.array(shifted.gyro_rad_s) - plain.gyro_rad_s == pytest.approx(np.array(rate), abs=1e-6)
-    assert np.array(shifted.accel_m_s2) - plain.accel_m_s2 == pytest.approx(np.array(force), abs=1e-5)
-    assert shifted.gyro_sigma_use_rad_s == pytest.approx(plain.gyro_sigma_use_rad_s, rel=1e-3)
-
-
-@settings(max_examples=15)
-@given(st.sampled_from(ROTATION_NAMES))
-def test_the_mounting_turns_the_means_and_keeps_the_total_variance(name: str) -> None:
-    rotation = rotation_matrix(name)
-    plain, turned = run(np.zeros(6)), run(np.zeros(6), rotation=rotation)
-    assert np.array(turned.gyro_rad_s) == pytest.approx(rotation @ plain.gyro_rad_s)
-    assert np.array(turned.accel_m_s2) == pytest.approx(rotation @ plain.accel_m_s2)
-    for field in ("gyro_sigma_stat_rad_s", "accel_sigma_use_m_s2"):
-        assert np.linalg.norm(getattr(turned, field)) == pytest.approx(float(np.linalg.norm(getattr(plain, field))))
-
-
-def run(shift: still.Floats, **more: object):  # type: ignore[no-untyped-def]
-    collector = RollingCollector(still.settings(), [still.imu(**more)])  # type: ignore[arg-type]
-    feed = still.Feeder(collector, seed=4)
-    feed.change = lambda _name, _t, rows: rows + shift
-    feed.run(14.0)
-    return collector.window(feed.now_s).imus[0]

@@ -23,7 +23,7 @@ from companion.daemon.core import Core
 from companion.daemon.offsets.plan import Plan, Target
 from companion.daemon.offsets.px4_writes import FarMean, Px4Writes, step_from_far
 from companion.errors import CalibrationRefusedError
-from companion.estimation.collector.rolling import MIN_BATCHES
+from companion.estimation.collector.measurement import MIN_BATCHES
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.noise.allan import floor_variance, noise_profile
 from companion.physics.frames import Array, vector

@@ -36,8 +36,8 @@ from companion.estimation.alignment.align_model import (
     PRIOR_BIAS_M_S2,
     PRIOR_SCALE,
     PRIOR_SHEAR,
-    Fit,
     Ground,
+    LeastSquares,
     Model,
     Priors,
     Row,
@@ -221,7 +221,7 @@ def _first_attitude(law: Law, mounting: Matrix, stand: Stand) -> Matrix:
     return body_from_ned(roll, pitch, stand.heading_rad)
 
 
-def _worst(found: Fit, model: Model) -> Complaint | None:
+def _worst(found: LeastSquares, model: Model) -> Complaint | None:
     """Return the residual that is worst against its own sigma, if it is beyond its threshold."""
     residual, redundancy, labels = found.residual, found.redundancy, model.labels
     usable = redundancy > _LEAST_REDUNDANCY

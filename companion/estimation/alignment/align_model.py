@@ -48,7 +48,7 @@ _STEP: Final = 1e-5
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class LeastSquares:
     """Result of `fit`."""
 
     values: Array
@@ -60,7 +60,9 @@ class Fit:
     """Share of each residual's variance that the other rows leave in it."""
 
 
-def fit(residuals: Callable[[Floats], Floats], start: Array, sigma: Array, damped: Sequence[int] | slice = ()) -> Fit:
+def fit(
+    residuals: Callable[[Floats], Floats], start: Array, sigma: Array, damped: Sequence[int] | slice = ()
+) -> LeastSquares:
     """Estimate unknowns by Gauss-Newton with priors.
 
     Args:
@@ -90,7 +92,7 @@ def fit(residuals: Callable[[Floats], Floats], start: Array, sigma: Array, dampe
             inverse = np.linalg.inv(scaled.T @ scaled)
             covariance = np.zeros((len(start), len(start)))
             covariance[np.ix_(sought, sought)] = inverse * np.outer(scale, scale)
-            return Fit(at, covariance, residual, 1.0 - np.einsum("ij,ij->i", scaled @ inverse, scaled))
+            return LeastSquares(at, covariance, residual, 1.0 - np.einsum("ij,ij->i", scaled @ inverse, scaled))
         step = np.linalg.lstsq(scaled, residual, rcond=None)[0]
         at[sought] += step * scale
         converged = bool(np.abs(step).max() < _CONVERGED)

@@ -40,10 +40,10 @@ class Work(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Measurement(msgspec.Struct, frozen=True, kw_only=True):
-    """Everything that a window is made of; holds nothing that changes later."""
+    """Parts of a window; nothing in it changes later."""
 
     slots: Sequence[int]
-    """Its good seconds, ascending, at least one."""
+    """Good seconds, ascending, at least one."""
     estimate: Callable[[], Any]
     settling: str | None = None
     """Reason why a pose sensor's mean has to wait."""
@@ -88,14 +88,14 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Stillness(NamedTuple):
-    """How still it has been."""
+    """Stillness until now."""
 
     still_s: int
     """Seconds that count so far."""
     steady_s: int
     """Seconds that count without a bad one until now."""
     good_now: bool
-    """Whether the latest second counts."""
+    """True if the latest second counts."""
     hold_still_s: int = 0
     """Seconds to stand still yet before a window is possible."""
 
@@ -223,7 +223,7 @@ class GroundWork(Work, frozen=True, kw_only=True):
             return error
 
 
-class Ground(WindowSource):
+class GroundWindows(WindowSource):
     """The still stretch of an aircraft on the ground."""
 
     def __init__(self, settings: Settings) -> None:

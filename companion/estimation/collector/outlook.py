@@ -1,10 +1,9 @@
-"""Settings and state of the collector, and the rules by which it is done (method 3.2) or on a boat."""
+"""Settings and state of the collector, and the rule by which it is done (method 3.2)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Final
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -13,9 +12,7 @@ from numpy.typing import NDArray
 from companion.estimation.collector.intake import SourceStatus
 from companion.estimation.means.windows import WHITE_SHARE, Estimate, ImuEstimate
 from companion.estimation.noise.allan import floor_variance
-from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import Floats
-from companion.physics.units import DEG
 
 
 class Obstacle(msgspec.Struct, frozen=True):
@@ -29,7 +26,7 @@ class Obstacle(msgspec.Struct, frozen=True):
 
 
 class Progress(msgspec.Struct, frozen=True):
-    """How far an estimate is from good enough."""
+    """Progress of an estimate towards good enough."""
 
     enough: bool
     share: float
@@ -74,7 +71,7 @@ class Glance(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def moving(self) -> bool:
-        """Whether a movement is in the way."""
+        """True for a movement now."""
         return self.obstacle is not None and self.obstacle.moving
 
     @property
@@ -85,15 +82,13 @@ class Glance(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True):
-    """How long and how good. A target that nobody asked for is `math.inf`."""
+    """Lengths and targets of a calibration; a target that is not wanted is `math.inf`."""
 
     min_still_s: float
     max_s: float
     target_gyro_sigma_rad_s: float
     target_accel_sigma_m_s2: float
     horizon_s: float = 180.0
-    on_a_boat: str = 'set vehicle.platform = "deck"'
-    """Remedy to name where it sways with a regular wave."""
     dither: bool = False
     """True: undecided integers are measured by a dither afterwards, and are not waited for."""
 
@@ -109,7 +104,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def is_enough(settings: Settings, found: Sequence[ImuEstimate]) -> bool:
-    """Whether every axis meets its target, or its white part is below 30 % of what averaging cannot remove."""
+    """Tell whether every axis meets its target, or its white part is below 30 % of the part that stays."""
     target = _targets(settings)
     return all(
         bool(_done(one.white_variance, one.use_variance, target, _waited_for(settings, one)).all())
@@ -146,35 +141,3 @@ def _waited_for(settings: Settings, own: Estimate) -> NDArray[np.bool_]:
 def _done(white: Floats, use: Floats, target: Floats, undecided: NDArray[np.bool_]) -> NDArray[np.bool_]:
     enough = (white < WHITE_SHARE * (use - white)) & ~undecided
     return np.asarray(np.where(undecided, np.isinf(target), use <= np.square(target)) | enough)
-
-
-WATCHED_S: Final = 40
-_LEAST_RAD_S: Final = 0.1 * DEG
-_WAVES_HZ: Final = (0.05, 1.0 / 3.0)
-_NARROW: Final = 0.25
-"""Half the width of a wave's band, over its frequency; never below `_RESOLVED_HZ`."""
-_RESOLVED_HZ: Final = 0.03
-_FINER: Final = 4
-"""Points of the spectrum to every one that is independent."""
-_REGULAR: Final = 0.75
-"""Share of the rates' power, of all axes, in one band. Waves of 3 to 14 s have it in nine of ten seconds; hands have
-many frequencies, different on each axis (BROAD's slow rotation: at most 0.72)."""
-
-
-def is_wave(batches: Mapping[int, Batch]) -> bool:
-    """Tell whether the latest `WATCHED_S` seconds without a gap in one IMU are a regular wave, as on a boat."""
-    slots = list(batches)
-    ends = [k for k in range(len(slots), WATCHED_S - 1, -1) if slots[k - 1] - slots[k - WATCHED_S] == WATCHED_S - 1]
-    if not ends:
-        return False
-    rates = np.array([batches[slot].mean[:3] for slot in slots[ends[0] - WATCHED_S : ends[0]]])
-    rates = rates - rates.mean(axis=0)
-    if float(np.square(rates).sum()) / len(rates) < _LEAST_RAD_S**2:
-        return False
-    tapered, size = rates * np.hanning(len(rates))[:, None], _FINER * len(rates)
-    power = np.square(np.abs(np.fft.rfft(tapered, size, axis=0))).sum(axis=1)
-    frequencies = np.fft.rfftfreq(size)
-    waves = np.where((frequencies >= _WAVES_HZ[0]) & (frequencies <= _WAVES_HZ[1]), power, 0.0)
-    middle = frequencies[waves.argmax()]
-    band = np.abs(frequencies - middle) <= max(_NARROW * middle, _RESOLVED_HZ)
-    return bool(power[band].sum() > _REGULAR * power.sum())

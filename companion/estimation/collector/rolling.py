@@ -15,13 +15,14 @@ import msgspec
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.intake import ImuSource, PoseKind, PoseSource, Source
-from companion.estimation.collector.measurement import MIN_BATCHES, Ground, Measurement, WindowSource, Work
-from companion.estimation.collector.outlook import Glance, Obstacle, Settings, Status, is_wave
+from companion.estimation.collector.measurement import MIN_BATCHES, GroundWindows, Measurement, WindowSource, Work
+from companion.estimation.collector.outlook import Glance, Obstacle, Settings, Status
 from companion.estimation.collector.trace import Snapshot, TraceLog
 from companion.estimation.means.pose import CompassModel, FieldHeading, GradienterModel
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.seconds.batch import Batch
 from companion.estimation.seconds.counting import TurnCounter
+from companion.estimation.stillness.gates import Verdict
 from companion.estimation.stillness.stretch import HeadingWatch
 from companion.estimation.turning.watch import Turn, TurnWatch
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
@@ -59,7 +60,7 @@ class RollingCollector:
         self._settings = settings
         self._keep = settings.max_slots + _MARGIN
         self._gradienter, self._compass = gradienter, compass
-        self._windows = Ground(settings) if windows is None else windows
+        self._windows = GroundWindows(settings) if windows is None else windows
         self.imus: dict[str, ImuSource] = {}
         self._tilt = None if gradienter is None else self._pose_source("gradienter")
         self._heading = None if compass is None else self._pose_source("compass")
@@ -220,10 +221,8 @@ class RollingCollector:
 
     def glance(self, now_s: float) -> Glance:
         """Return how still it is at `now_s`; costs a small part of what `status` does."""
-        stillness = self._windows.stillness
-        return Glance(
-            obstacle=self._obstacle(now_s), still_s=float(stillness.still_s), steady_s=float(stillness.steady_s)
-        )
+        still = self._windows.stillness
+        return Glance(obstacle=self._obstacle(now_s), still_s=float(still.still_s), steady_s=float(still.steady_s))
 
     def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:
         """Return what `window` would have to work out now, for another thread; None when there is nothing.
@@ -296,6 +295,10 @@ class RollingCollector:
     def _sources(self) -> list[Source]:
         return [*self.imus.values(), *(source for source in (self._tilt, self._heading) if source is not None)]
 
+    def _others(self) -> list[Verdict]:
+        """Return the verdicts on all sources but the compass."""
+        return [source.verdict for source in self._sources() if source is not self._heading]
+
     def _forget(self, imu: str | None) -> None:
         self._windows.forget(imu)
         for source in self._sources():
@@ -350,8 +353,7 @@ class RollingCollector:
             good = source.judge(slot, moved=moved) and good
             moved = moved or (source.kind == "imu" and not source.verdict.still and not source.verdict.fault)
         if self._heading is not None:
-            others = [source.verdict for source in sources if source is not self._heading]
-            self._watch.add_second(self._heading.batches.batches.get(slot), others)
+            self._watch.add_second(self._heading.batches.batches.get(slot), self._others())
         self._trace.add(slot, sources, good=good)
         if not self._windows.add(slot, good=good):
             self._break()
@@ -363,7 +365,7 @@ class RollingCollector:
 
     def _watch_turn(self, slot: int, *, good: bool) -> bool:
         """Look for a turn in a second that has been judged; False where the still stretch ends with it."""
-        others = [source.verdict for source in self._sources() if source is not self._heading]
+        others = self._others()
         if self._windows.may_move or any(verdict.fault for verdict in others):
             return True
         if not all(verdict.still for verdict in others):
@@ -378,8 +380,7 @@ class RollingCollector:
         sources = self._sources()
         if (silence := next(filter(None, (source.silence(now_s) for source in sources)), None)) is not None:
             return Obstacle(silence)
-        others = any(source.verdict.words for source in sources if source is not self._heading)
-        if self._turns.words and not others:
+        if self._turns.words and not any(verdict.words for verdict in self._others()):
             return Obstacle(self._turns.words, moving=True)
         if self._windows.stillness.good_now:
             return None
@@ -390,10 +391,7 @@ class RollingCollector:
         moving = not any(source.verdict.fault for source in sources if source.verdict.words)
         if said.fault:
             return Obstacle(said.words, moving)
-        first = next(iter(self.imus.values()), None)
-        is_boat = first is not None and is_wave(first.batches.batches)
-        boat = f"; on a boat? {self._settings.on_a_boat}" if is_boat else ""
-        return Obstacle(f"hold still: {said.words}{boat}", moving)
+        return Obstacle(f"hold still: {said.words}", moving)
 
     def _waiting_for(self, now_s: float) -> Obstacle | None:
         if (moves := self._obstacle(now_s)) is not None:

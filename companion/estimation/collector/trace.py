@@ -1,8 +1,4 @@
-"""What was seen second by second during a calibration: kept beside its record, for whoever asks later.
-
-The record holds results only. Whether the aircraft really stood still can be looked at afterwards only if the verdicts
-of its seconds are kept.
-"""
+"""Verdicts of the seconds of a calibration, kept beside its record to show later how still it was."""
 
 from __future__ import annotations
 
@@ -18,25 +14,24 @@ from companion.estimation.collector.intake import Kind, Source
 from companion.estimation.stillness.gates import Verdict
 
 FORMAT_VERSION: Final = 2
-"""Of 1 it leaves out the noise of each IMU."""
+"""Version 1 held the noise of each IMU too."""
 
 MAX_SECONDS: Final = 600
-"""Kept; the oldest go first. Ten times the longest usual window;
-some 1 MB in memory, 100 kB on disk with three IMUs."""
+"""Ten times the longest usual window; 1 MB in memory, 100 kB on disk with three IMUs."""
 
 MAX_WORDS: Final = 100
 _Second = Annotated[int, msgspec.Meta(ge=-100_000_000, le=100_000_000)]
 
 
 class VerdictTrace(msgspec.Struct, frozen=True, kw_only=True):
-    """What the gate of one source said, second by second."""
+    """Verdicts on one source."""
 
     kind: Kind
     name: str
     words: tuple[str | None, ...]
     """None: still. Else why not; empty while nothing was known yet."""
     fault: tuple[bool, ...]
-    """Whether it was the device, not the aircraft."""
+    """True: the device is at fault, not the aircraft."""
 
 
 class Trace(msgspec.Struct, frozen=True, kw_only=True):
@@ -44,9 +39,9 @@ class Trace(msgspec.Struct, frozen=True, kw_only=True):
 
     format_version: int = FORMAT_VERSION
     started_at: str
-    """Of the record that it belongs to."""
+    """Start of the record that it belongs to."""
     second: Annotated[tuple[_Second, ...], msgspec.Meta(max_length=MAX_SECONDS)]
-    """Since the calibration was asked for; negative before it. Ascending, with gaps where nothing was judged."""
+    """Seconds since the request; negative before it. Ascending, with gaps where nothing was judged."""
     good: tuple[bool, ...]
     """Still for all sources."""
     measured: tuple[_Second, _Second] | None

@@ -86,7 +86,18 @@ class Stream:
         step_s = float(np.median(np.diff(whole[:, 0]).tolist()))
         second = rates[2:] - 2.0 * rates[1:-1] + rates[:-2]
         white2 = float(np.square(second).mean()) / 6.0 * step_s if len(second) else 0.0
-        self.seconds.append(ImuSecond(batch, passage(whole[:, 0], rates, whole[:, 4:]), white2))
+        self.seconds.append(
+            ImuSecond(
+                slot=batch.slot,
+                passage=passage(whole[:, 0], rates, whole[:, 4:]),
+                samples=batch.n,
+                mean=batch.mean,
+                variance=batch.variance,
+                temperature_degc=batch.temperature_degc,
+                white2=white2,
+                shared_variance=batch.shared_variance,
+            )
+        )
         while self.levels and next(iter(self.levels)) < self.seconds[0].slot:
             del self.levels[next(iter(self.levels))]
         return True
@@ -110,7 +121,7 @@ class Stream:
 
 
 class DeckMeasurement(Measurement, frozen=True, kw_only=True):
-    """Everything that a deck's window is made of: the estimate holds the pose too."""
+    """Parts of a deck's window: the estimate holds the pose too."""
 
     def window(self) -> Window:
         """Work it out, unless that is done.

@@ -1,7 +1,6 @@
-"""From the seconds of a deck to the same window as of a still stretch, so that everything after it is one path.
+"""Estimate of a window on a deck: the same `Window` as on the ground, so that everything after it is one path.
 
-An IMU's means in it are those that it would have at rest: at the gradienter's mean tilt, and under the Earth's rate
-alone.
+An IMU's means are those it would have at rest: at the gradienter's mean tilt, under the Earth's rate alone.
 """
 
 from __future__ import annotations
@@ -20,40 +19,39 @@ from companion.estimation.means.pose import CompassModel, GradienterModel, Headi
 from companion.estimation.means.warming import drifting
 from companion.estimation.means.windows import ImuInput, ImuWindow, Window
 from companion.estimation.noise.allan import AllanModel, floor_variance, slope_variance
-from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import Array, Floats, Matrix, body_from_ned, vector
 from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG, MG
 
 MIN_S: Final = 60
-"""Some waves: before it nothing is said to be enough."""
+"""Some waves: a shorter window is never enough."""
 MIN_LOOK_S: Final = 40
-"""A look at what a write has done; its sigma says how little that is."""
+"""Shortest window after a write; its sigma says how little that tells."""
 MAX_S: Final = 1200
 SCALE_SIGMA: Final = 0.003
 """Scale and cross-axis errors of common gyros (0.5 % at the most): so much of a steady turn may pass for a bias."""
 COMPASS_SHARE: Final = math.sqrt(0.5)
-"""Of a compass' sigma, the part that changes with the heading; the other part is the same on all headings."""
+"""Part of a compass' sigma that changes with the heading; the rest is the same on all headings."""
 FROZEN_S: Final = 20
-"""No sensor that is swayed says exactly the same for so long."""
+"""A sensor that is swayed does not repeat one reading for so long."""
 _SWAYS_RAD_S: Final = 0.3 * DEG
-"""Of roll and pitch, over such a while."""
+"""Least scatter of the rates of roll and pitch in that time."""
 _SAME: Final = 1e-9
 _DITHERED: Final = 1.5
 """Integers spread over so many steps by the swaying hide nothing."""
 _UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
 _LEAST_ACCEL_M_S2: Final = 0.1 * MG
-"""Of the comparison with the gradienter; what its zero is wrong by turns everything alike and comes in `solve`."""
+"""Sigma of the comparison with the gradienter; the error of its zero turns everything alike and comes in `solve`."""
 _MIDDLE: Final = 0.37
 """Share of K^2 T."""
 _FLICKER_TO_COME: Final = 0.75
-"""Of B^2: what flicker does in the next minutes that its past does not tell. With what it did in the window, as a
+"""Share of B^2: flicker of the next minutes that its past does not tell. Together with the flicker in the window, a
 random walk of B / sqrt(T), it is the flicker's part of V(T, H)."""
 _GRAVITY_M_S2: Final = 9.8
 
 
 class Known(NamedTuple):
-    """How well a triad is known: largest variances of the axes."""
+    """Largest variances of the axes of a triad."""
 
     use: float
     white: float
@@ -69,17 +67,17 @@ class DeckFound(NamedTuple):
 
 
 class ImuSecond(NamedTuple):
-    """One second of one IMU."""
+    """Summary of one second of one IMU; arrays as in `Batch`, in the sensor's axes."""
 
-    batch: Batch
+    slot: int
     passage: Passage
+    samples: int
+    mean: Floats
+    variance: Floats
+    temperature_degc: float | None
     white2: float
     """N^2 of the gyros, from second differences of neighbouring samples; the mean of the axes."""
-
-    @property
-    def slot(self) -> int:
-        """Number of the second."""
-        return self.batch.slot
+    shared_variance: Floats
 
 
 class DeckWork(Work, frozen=True, kw_only=True):
@@ -135,22 +133,24 @@ class DeckWork(Work, frozen=True, kw_only=True):
         return DeckFound(window, tuple(known for _, triads, _ in found for known in triads))
 
     def _frozen(self, name: str, readings: Mapping[int, Floats]) -> set[int]:
-        """Seconds in which a sensor said the same over and over while it was swayed.
+        """Return the seconds in which a sensor repeated one reading while it was swayed.
 
         Raises:
-            CalibrationRefusedError: so it does still.
+            CalibrationRefusedError: it still does.
         """
-        if not self.imus:
+        if not self.imus or not readings:
             return set()
-        rates = {one.slot: one.batch.mean[:3] @ self.imus[0].rotation.T for one in self.seconds[0]}
+        slots, values = np.array(list(readings)), np.array(list(readings.values()))
+        changes = np.abs(np.diff(values, axis=0)).max(axis=1) > _SAME
+        rates = {one.slot: one.mean[:3] @ self.imus[0].rotation.T for one in self.seconds[0]}
         found: set[int] = set()
-        for run in _runs(readings):
+        for run in np.split(slots, np.flatnonzero(changes) + 1):
             swayed = [rates[slot][:2] for slot in run if slot in rates]
             if len(run) < FROZEN_S or not swayed or np.std(swayed, axis=0).max() < _SWAYS_RAD_S:
                 continue
             if run[-1] >= self.slots[-1] - 1:
                 raise CalibrationRefusedError(f"{name} is stuck: the same for {len(run)} s while it sways")
-            found.update(run)
+            found.update(run.tolist())
         return found
 
     def _imu(
@@ -184,10 +184,10 @@ class DeckWork(Work, frozen=True, kw_only=True):
         covariance[3:, 3:] = own + np.diag(accel_floor)
         use = np.sqrt(np.diag(covariance))
         heading_rad = math.atan2(found.body_to_ned[-1, 1, 0], found.body_to_ned[-1, 0, 0])
-        temperatures = [one.batch.temperature_degc for one in seconds if one.batch.temperature_degc is not None]
+        temperatures = [one.temperature_degc for one in seconds if one.temperature_degc is not None]
         window = ImuWindow(
             name=imu.name,
-            samples=sum(one.batch.n for one in seconds),
+            samples=sum(one.samples for one in seconds),
             duration_s=span_s,
             gyro_rad_s=vector(found.gyro_rad_s),
             accel_m_s2=vector(direction),
@@ -251,22 +251,10 @@ def followed_walk(gyro: AllanModel, span_s: float) -> float:
     return math.hypot(gyro.walk, gyro.flicker / math.sqrt(span_s))
 
 
-def _runs(readings: Mapping[int, Floats]) -> list[list[int]]:
-    """Seconds one after another with the same reading."""
-    found: list[list[int]] = []
-    last: Floats | None = None
-    for slot, reading in readings.items():
-        if last is None or np.abs(reading - last).max() > _SAME:
-            found.append([])
-        found[-1].append(slot)
-        last = reading
-    return found
-
-
 def _felt(
     found: Found, gradienter: GradienterModel | None, reference: tuple[float, float] | None, compared: Compared | None
 ) -> tuple[Array, Matrix]:
-    """The accelerometers' mean as it would be at rest at the reference's tilt, (3,), and its covariance (3, 3)."""
+    """Return the accelerometers' mean at rest at the reference's tilt, (3,), and its covariance (3, 3)."""
     size = found.force_m_s2
     if gradienter is None or reference is None or compared is None:
         up = -found.body_to_ned[:, 2].mean(axis=0)
@@ -280,11 +268,11 @@ def _felt(
 
 
 def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:
-    """(6,) variance of what integers hide that the swaying does not spread, and of what is off in all; vehicle axes."""
+    """Return the variance (6,) that integers hide where the swaying does not spread them, and that of shared errors."""
     steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
-    means = np.array([one.batch.mean for one in seconds])
-    spread = np.sqrt(means.var(axis=0) + np.mean([one.batch.variance for one in seconds], axis=0))
+    means = np.array([one.mean for one in seconds])
+    spread = np.sqrt(means.var(axis=0) + np.mean([one.variance for one in seconds], axis=0))
     hidden = np.where(spread < _DITHERED * steps, np.square(steps / 2.0), 0.0)
-    hidden = hidden + np.mean([one.batch.shared_variance for one in seconds], axis=0)
+    hidden = hidden + np.mean([one.shared_variance for one in seconds], axis=0)
     turn = np.square(imu.rotation)
     return np.concatenate([turn @ hidden[:3], turn @ hidden[3:]])

@@ -110,7 +110,6 @@ class _Pass:
             max_s=max_still_s,
             target_gyro_sigma_rad_s=0.0,
             target_accel_sigma_m_s2=0.0,
-            on_a_boat="companion record on the boat",
         )
         profile = noise_profile(given.profile or log.profile)
         imu = ImuInput(name=log.imu, rotation=rotation_matrix(given.mounting), profile=profile)

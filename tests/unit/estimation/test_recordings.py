@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.faces import Face, faces
+from companion.estimation.collector.measurement import GroundWindows
 from companion.estimation.collector.rolling import RollingCollector
 from companion.physics.units import MG
 from tests.support.recordings import Recording, px4, xio, xsens_counts
@@ -39,9 +40,11 @@ class Played:
             status = self.collector.status(sample.t_s)
             self.still_s[second - 1] = status.still_s
             self.words[second - 1] = status.waiting_for or ""
-            start = self.collector._windows._stretch.start
+            windows = self.collector._windows
+            assert isinstance(windows, GroundWindows)
+            start = windows._stretch.start
             if start is not None:
-                stretches[start] = self.collector._windows.good_slots(None)[-1]
+                stretches[start] = windows.good_slots(None)[-1]
         self.end_s = float(recording.t_s[-1])
         self.stretches = [(start, float(last + 1)) for start, last in stretches.items()]
 

@@ -13,15 +13,13 @@ from companion.estimation.collector import measurement
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.noise.allan import AllanModel, NoiseProfile
-from companion.physics.units import DEG, DEG_H, MG
+from companion.physics.units import DEG, DEG_H
 from companion.recording.messages import encode
 from companion.samples import ImuSample, TiltSample
 from tests.support.still_aircraft import (
     BIAS,
-    FORCE,
     GYRO_NOISE,
     HEADING,
-    QUIET,
     RATE_HZ,
     TILT,
     Feeder,
@@ -103,22 +101,6 @@ def test_motion_is_said_with_figures_and_starts_the_count_again() -> None:
         feed.collector.window(feed.now_s)
 
 
-def test_each_source_has_its_own_verdict() -> None:
-    feed = feeder(None, "fc", "nose", gradienter=True)
-    feed.change = lambda name, t, rows: (
-        rows + np.sin(12.0 * t)[:, None] * np.array([DEG, 0, 0, 0, 0, 0]) if name == "nose" else rows
-    )
-    feed.run(5.0)
-    sources = {source.name: source for source in feed.collector.status(feed.now_s).sources}
-    assert sources["fc"].still
-    assert sources["fc"].rate_hz == RATE_HZ
-    assert sources["fc"].words == ""
-    assert not sources["nose"].still
-    assert sources["nose"].words.startswith("gyro nose moves 0.")
-    assert sources["gradienter"].still
-    assert sources["gradienter"].kind == "gradienter"
-
-
 def test_a_window_too_soon_says_how_long_is_needed() -> None:
     feed = feeder()
     feed.run(6.0)
@@ -171,17 +153,6 @@ def test_more_than_a_fifth_rejected_ends_the_stretch() -> None:
     assert feed.collector.status(feed.now_s).still_s < 5.0
 
 
-def test_a_new_pose_is_a_new_stretch_though_each_second_is_still() -> None:
-    feed = feeder(SILENT)
-    feed.run(20.0)
-    lean = np.array([0.0, 0.0, 0.0, 0.3, 0.0, 0.0])
-    feed.change = lambda _name, _t, rows: rows + lean
-    feed.run(20.0)
-    window = feed.collector.window(feed.now_s)
-    assert window.start_s > 1020.0
-    assert window.imus[0].accel_m_s2 == pytest.approx((FORCE + lean[3:]).tolist(), abs=0.005)
-
-
 def test_a_steady_turn_after_a_rest_is_not_a_new_stretch() -> None:
     feed = feeder(SILENT)
     feed.run(20.0)
@@ -208,21 +179,6 @@ def test_the_window_is_at_most_max_s_long_and_memory_is_bounded() -> None:
     assert status.still_s > 250.0
     for source in feed.collector._sources():
         assert len(source.batches.batches) <= 30
-
-
-def test_a_warm_up_is_taken_where_the_last_second_ends() -> None:
-    feed = feeder()
-    slope = 2e-5
-    quiet = np.random.default_rng(2)
-
-    def warming(_name: str, times: Floats, rows: Floats) -> Floats:
-        rows[:, :3] = BIAS + slope * times[:, None] + quiet.normal(0.0, 1e-6, (len(times), 3))
-        return rows
-
-    feed.change = warming
-    feed.run(25.0)
-    window = feed.collector.window(feed.now_s)
-    assert window.imus[0].gyro_rad_s == pytest.approx(BIAS + slope * window.end_s, abs=0.1 * slope)
 
 
 def test_since_takes_only_whole_seconds_after_it() -> None:
@@ -411,31 +367,6 @@ def test_one_dead_axis_of_a_float_stream_is_refused(part: str, axis: int) -> Non
     assert feed.waiting_for() == line
     with pytest.raises(CalibrationRefusedError, match=line):
         feed.collector.window(feed.now_s)
-
-
-def test_a_frozen_imu_never_becomes_still() -> None:
-    feed = feeder()
-    feed.change = lambda _name, _t, rows: np.tile(rows[0], (len(rows), 1))
-    for _ in range(15):
-        feed.run(1.0)
-    feed.change = lambda _name, _t, rows: np.tile([0, 0, 0, 0, 0, -9.8], (len(rows), 1))
-    feed.run(15.0)
-    assert feed.waiting_for() == f"gyro fc is stuck: {RATE_HZ} equal readings"
-
-
-def test_fewer_than_three_distinct_readings_cost_half_a_step() -> None:
-    step = 1e-3
-    feed = feeder()
-    feed.collector.set_imu(imu("fc", QUIET, gyro_step_rad_s=step, accel_step_m_s2=1e-4))
-    # Noise of a fifth of a step around the middle of two readings: rounding shows just these two.
-    feed.change = lambda _name, _t, rows: np.concatenate(
-        [np.round(0.5 + np.clip(rows[:, :3] - BIAS, -0.4 * step, 0.4 * step) / step) * step, rows[:, 3:]], axis=1
-    )
-    feed.run(20.0)
-    window = feed.collector.window(feed.now_s).imus[0]
-    assert "gyro fc xyz: fewer than 3 distinct readings, half a step may be hidden" in window.warnings
-    assert min(window.gyro_sigma_stat_rad_s) >= step / 2.0
-    assert max(window.accel_sigma_stat_m_s2) < 0.2 * MG
 
 
 # --------------------------------------------------------------------------------------------------- stop, progress

@@ -130,15 +130,6 @@ def test_a_turn_that_the_stands_contradict_is_named() -> None:
     assert said.startswith("stand 3: it was not turned as the gyros say, off by 12 deg")
 
 
-@pytest.mark.parametrize("headings", [HALF, QUARTERS], ids=["half", "quarters"])
-def test_a_spot_that_moved_is_named_in_words_that_know_no_gradienter(headings: tuple[float, ...]) -> None:
-    found = solved(on_spot((0.5, 0.5), headings, bumped=2))
-    assert found.complaint is not None
-    words = in_words(found.complaint, gradienter=False)
-    assert "the spot moved" in words
-    assert "gradienter" not in words
-
-
 def held(board_deg: tuple[float, float, float], orientation: str = "ROTATION_NONE") -> Sides:
     stands = []
     for k, (pitch, roll) in enumerate(TWELVE):
@@ -187,15 +178,6 @@ def test_the_covariance_of_the_tilt_is_that_of_what_it_is_made_of() -> None:
         )
         drawn.append([one.roll_rad, one.pitch_rad])
     np.testing.assert_allclose(np.std(drawn, axis=0), said, rtol=0.15)
-
-
-def test_a_hand_that_stays_on_it_trembles_and_leaves_it_as_it_was() -> None:
-    aircraft = VirtualAircraft(Pose(1.0, 2.0, 40.0), SITE)
-    hands = Hands(aircraft)
-    assert hands.obey("grip 20", 1.0).startswith("a hand stays")
-    tilts = [aircraft.pose_at(float(t)).pitch_deg for t in np.linspace(5.0, 15.0, 50)]
-    assert 0.02 < np.std(tilts) < 0.5
-    assert aircraft.pose_at(30.0).pitch_deg == pytest.approx(1.0)
 
 
 def test_without_a_gradienter_none_is_blamed() -> None:

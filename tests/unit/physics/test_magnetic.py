@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from companion.physics import earth
-from companion.physics.frames import roll_pitch_from_up, wrap_deg
+from companion.physics.frames import wrap_deg
 from companion.physics.magnetic import (
     BOUND_OF_ONE,
     BOUND_OF_TWO,
@@ -41,19 +41,6 @@ def test_heading_and_inclination_of_every_pose(inclination_deg: float) -> None:
         assert inclination_rad(field, up) / DEG == pytest.approx(inclination_deg, abs=1e-9)
 
 
-def test_heading_is_the_tilt_compensation_of_the_textbooks() -> None:
-    # Method 3.5: Xh = mx ct + my sr st + mz cr st, Yh = my cr - mz sr, heading = atan2(-Yh, Xh).
-    random = np.random.default_rng(1)
-    for _ in range(200):
-        up, (mx, my, mz) = random.standard_normal(3), random.standard_normal(3)
-        up /= np.linalg.norm(up)
-        gamma, theta = roll_pitch_from_up(up)
-        sr, cr, st, ct = math.sin(gamma), math.cos(gamma), math.sin(theta), math.cos(theta)
-        xh, yh = mx * ct + my * sr * st + mz * cr * st, my * cr - mz * sr
-        found = heading_rad(np.array([mx, my, mz]), up)
-        assert math.cos(found - math.atan2(-yh, xh)) == pytest.approx(1.0, abs=1e-12)
-
-
 def test_sensitivities_are_those_of_finite_differences() -> None:
     for pose in POSES:
         for inclination_deg in (-65.0, 20.0, 68.0):
@@ -68,12 +55,6 @@ def test_sensitivities_are_those_of_finite_differences() -> None:
                 assert turned / 2e-6 == pytest.approx(by_heading @ step / 1e-6, abs=1e-6)
                 dipped = inclination_rad(field, ahead) - inclination_rad(field, behind)
                 assert dipped / 2e-6 == pytest.approx(by_inclination @ step / 1e-6, abs=1e-6)
-
-
-def test_a_tilt_error_costs_two_and_a_half_times_itself_at_68_degrees() -> None:
-    # Method 3.5: dpsi = tan I * tilt error (2.5 x at 68 deg).
-    size = np.linalg.norm(heading_by_up(field_ned(68.0), UP_NED))
-    assert size == pytest.approx(2.5, abs=0.05)
 
 
 def test_no_heading_where_field_or_nose_is_vertical() -> None:
