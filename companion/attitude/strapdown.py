@@ -24,20 +24,19 @@ from companion.samples import ImuSample
 STEP_S: Final = 0.02
 """Length of the stretches over which specific force is averaged for levelling."""
 TURN_S: Final = 0.004
-"""Specific force is turned into E after so long at the latest: at 1000 deg/s that is 4 degrees, of which the mean
-direction keeps half, for as long as the turn lasts."""
+"""Longest time between turns of the specific force into E: 4 degrees at 1000 deg/s."""
 GAP_S: Final = 0.1
-"""A longer silence is bridged with the last rate, which then is a guess; it is told as `missing_s`."""
+"""A longer silence is bridged with the last rate, a guess, and counted as `missing_s`."""
 _ROUNDING_S: Final = 1e-6
 _ANGLE_SQUARE: Final = 1e6
 _FORCE_SQUARE: Final = 1e8
-"""Limits of one sample, squared: ten times what decoders let through, so that nothing overflows here."""
+"""Limits of one sample, squared: ten times those of the decoders, so that nothing overflows."""
 LOST_S: Final = 1.0
-"""After a longer one the attitude is not known any more."""
+"""After a longer silence the attitude is lost."""
 
 
 class Stretch(NamedTuple):
-    """What happened in about `STEP_S` seconds."""
+    """Motion in about `STEP_S` seconds."""
 
     t_s: float
     span_s: float
@@ -46,7 +45,7 @@ class Stretch(NamedTuple):
     rate_rad_s: Triple
     """Mean rate in the sensor's axes, bias removed."""
     missing_s: float
-    """How much of it had no samples."""
+    """Time in it without samples."""
     orientation: Quaternion
     """Sensor axes to E at its end."""
 
@@ -62,11 +61,11 @@ class Strapdown:
         self.bias_rad_s: Triple = (0.0, 0.0, 0.0)
         self.force_bias_m_s2: Triple = (0.0, 0.0, 0.0)
         self.frame_rate_rad_s: Triple = (0.0, 0.0, 0.0)
-        """How E turns against inertial space, in E: the Earth's rotation."""
+        """Rate of E against inertial space, in E: the Earth's rotation."""
         self.last_s: float | None = None
         self.last_rate_rad_s: Triple = (0.0, 0.0, 0.0)
         self.lost = False
-        """Nothing came for longer than `LOST_S`: `orientation` means nothing until it is set again."""
+        """True after a silence longer than `LOST_S`, until a restart."""
         self._previous: Triple = (0.0, 0.0, 0.0)
         self._clear()
 
@@ -85,10 +84,7 @@ class Strapdown:
         self._turn_s = 0.0
 
     def integrate(self, samples: Sequence[ImuSample]) -> list[Stretch]:
-        """Take samples in the order of time; return the stretches that they complete.
-
-        How the samples are cut into calls changes nothing.
-        """
+        """Integrate samples in the order of time, cut into calls in any way; return the stretches they complete."""
         done: list[Stretch] = []
         for sample in samples:
             if (dt := self._since_last(sample)) is None:
@@ -119,7 +115,7 @@ class Strapdown:
         return done
 
     def _since_last(self, sample: ImuSample) -> float | None:
-        """Seconds since the sample before; None where this one tells nothing."""
+        """Return the seconds since the last sample; None where this one tells nothing."""
         if self.last_s is None:
             self.last_s = sample.t_s
             return None
@@ -141,7 +137,7 @@ class Strapdown:
         self._unturned, self._turn_s = (0.0, 0.0, 0.0), 0.0
 
     def _finished(self, t_s: float) -> Stretch:
-        """The stretch that is complete; the next one begins."""
+        """Return the complete stretch and begin the next."""
         (ex, ey, ez), half = self.frame_rate_rad_s, -0.5 * self._span_s
         self.orientation = normalised(multiply((1.0, half * ex, half * ey, half * ez), self.orientation))
         (vx, vy, vz), (ux, uy, uz), mean = self._velocity, self._angle, 1.0 / self._span_s

@@ -1,4 +1,4 @@
-"""Whether a heading turns by what other gyros do not: the same rule as that of the script on the flight controller."""
+"""Watch for a heading that turns while other gyros do not, by the rule of the script on the flight controller."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from typing import Final
 
 STRAYS_RAD: Final = math.radians(5.0)
 WITHIN_S: Final = 4.0
-"""What is older counts less and less: 1.25 deg/s go unnoticed, and are what the compass holds."""
+"""Time in which the sum fades: 1.25 deg/s go unnoticed, and are what the compass holds."""
 SIGMAS: Final = 3.0
 """A heading that was not well known may be set right by its compass."""
 SCALES: Final = 0.01
 """Share of a turn by which two gyros may differ."""
 LATE_S: Final = 0.03
-"""By so much the times of the two may lie apart while they turn."""
+"""Usual difference of the times of both while they turn."""
 LONGEST_STEP_S: Final = 0.25
-"""What turns to and fro between two of them is not seen; on a line that brings fewer nothing is compared."""
+"""Longest step that is compared: a turn to and fro within it is not seen."""
 
 
 class Straying:
@@ -23,20 +23,19 @@ class Straying:
 
     def __init__(self) -> None:
         self.strayed_rad = 0.0
-        """By how much the heading has turned and the gyros have not, lately."""
+        """Recent turn of the heading less that of the gyros."""
         self.is_too_far = False
         self._last: tuple[float, float, float] | None = None
         self._turned_rad = self._sigma_rad = self._apart_rad = 0.0
 
     def skip(self) -> None:
-        """Leave the step to the next instant out: its two ends were not told equally late."""
+        """Leave out the step to the next instant: the delays of its two ends differ."""
         self._last = None
 
     def add(self, t_s: float, heading_rad: float, sigma_rad: float, rate_rad_s: float, late_s: float = 0.0) -> None:
-        """Heading with its sigma, and how fast the other gyros turn about the vertical.
+        """Add a heading with its sigma, and the rate of the other gyros about the vertical.
 
-        What happens in a gap is not counted; after one of `WITHIN_S` it begins anew.
-        `late_s`: by how much more than usual the times of the two may lie apart.
+        A gap is not counted; after one of `WITHIN_S` it begins anew. `late_s`: delay beyond the usual.
         """
         before, self._last = self._last, (t_s, heading_rad, rate_rad_s)
         if before is None:

@@ -1,7 +1,6 @@
-"""How well the attitude is known: a covariance beside the filter, fed by what the calibration left.
+"""Covariance of the attitude, for the gains in use, which are not a Kalman filter's (Joseph's form).
 
-The filter's gains are not a Kalman filter's, so its covariance is that of the gains in use (Joseph's form). Six states:
-attitude error in NED (rad) and gyro bias error in the sensor's axes (rad/s). Method 2.2 and 3.7.
+Six states: attitude error in NED (rad) and gyro bias error in the sensor's axes (rad/s). Method 2.2 and 3.7.
 """
 
 from __future__ import annotations
@@ -16,24 +15,24 @@ from companion.estimation.noise.allan import AllanModel
 from companion.physics.frames import Array, Matrix
 
 SCALE_SHARE: Final = 0.003
-"""Scale error and misalignment of a consumer gyro after its factory's trim. Turning to and fro takes it back, turning
-on in circles piles it up: it is counted by the net turn since the last correction."""
+"""Scale error and misalignment of a consumer gyro after its factory's trim, counted by the net turn since the last
+correction: turning back undoes it."""
 GAP_RATE_RAD_S: Final = math.radians(20.0)
-"""What the rate may have been off by while samples were missing."""
+"""Error of the rate while samples were missing."""
 MANOEUVRE_M_S2: Final = {"ground": 0.05, "flight": 0.6}
-"""What of the horizontal acceleration is left after averaging where it is not seen by the length of the force."""
+"""Horizontal acceleration left after averaging that does not show in the length of the force."""
 MANOEUVRE_LASTS_S: Final = 2.0
 HEADING_UNKNOWN_RAD: Final = math.pi / math.sqrt(3.0)
 """One sigma of an unknown heading."""
 _BIAS_WANDERS_S: Final = 300.0
-"""In so long a bias moves by the floor of its Allan deviation, the middle of the flat part of consumer gyros."""
+"""Time in which a bias moves by the floor of its Allan deviation: the middle of the flat part of consumer gyros."""
 
 
 class Uncertainty:
     """The covariance.
 
-    Of the gyro bias that is subtracted: (3, 3), sensor axes, (rad/s)^2, of sigma_use, not sigma_stat. The sigma (3,) of
-    the accelerometer bias levels the aircraft wrongly for ever.
+    `bias_covariance`: of the gyro bias, (3, 3), sensor axes, by sigma_use. The sigma (3,) of the accelerometer bias
+    levels the aircraft wrongly for ever.
     """
 
     def __init__(
@@ -46,7 +45,7 @@ class Uncertainty:
         self.restart(np.eye(3) * HEADING_UNKNOWN_RAD**2)
 
     def restart(self, attitude_covariance: Matrix) -> None:
-        """A new alignment with this covariance, (3, 3) in NED, rad^2."""
+        """Begin with the covariance of an alignment, (3, 3) in NED, rad^2."""
         self._covariance = np.zeros((6, 6))
         self._covariance[:3, :3] = attitude_covariance
         self._covariance[3:, 3:] = self._bias_start
@@ -54,7 +53,7 @@ class Uncertainty:
         self._turned = np.zeros(3)
 
     def propagate(self, span_s: float, ned_from_sensor: Matrix, turned_rad: Array, missing_s: float) -> None:
-        """Let `span_s` pass at this attitude, having turned by `turned_rad` (3,) about the sensor's axes."""
+        """Add the errors of `span_s` with a turn by `turned_rad` (3,) about the sensor's axes."""
         step = np.eye(6)
         step[:3, 3:] = -span_s * ned_from_sensor
         self._covariance = step @ self._covariance @ step.T
@@ -66,7 +65,7 @@ class Uncertainty:
         self._covariance[range(6), range(6)] += [white + guessed] * 3 + [wander] * 3
 
     def level(self, span_s: float, tau_s: float, believed: float, doubt: float, phase: str) -> None:
-        """The leveller has worked for `span_s`, believing so much."""
+        """Add a correction by the leveller over `span_s`."""
         gain = min(1.0, span_s * believed / tau_s)
         keep = np.eye(6)
         keep[0, 0] = keep[1, 1] = 1.0 - gain
@@ -78,7 +77,7 @@ class Uncertainty:
         self._levelled += (1.0 - self._levelled) * gain
 
     def head(self, gain: float, sigma_rad: float) -> None:
-        """The heading was turned towards a reading with this sigma."""
+        """Add a correction by a heading with this sigma."""
         keep = np.eye(6)
         keep[2, 2] = 1.0 - gain
         self._turned[2] *= 1.0 - gain
@@ -91,11 +90,11 @@ class Uncertainty:
         return self._noise.white**2 / seconds + self._noise.floor**2
 
     def rest_sigma(self, seconds: float) -> Array:
-        """(3,) of the mean rate that is left after so long at rest, sensor axes."""
+        """Return the sigma of the mean rate that is left after a rest, (3,), sensor axes."""
         return np.sqrt(np.maximum(np.diag(self._covariance)[3:], 0.0) + self._rest_variance(seconds))
 
     def rest(self, seconds: float) -> Matrix:
-        """The aircraft has stood still for so long: gain (6, 3) for the mean rate that was left, sensor axes."""
+        """Add a rest; return the gain (6, 3) for the mean rate that was left, sensor axes."""
         variance = self._rest_variance(seconds)
         part = self._covariance[:, 3:]
         gain = np.linalg.solve(self._covariance[3:, 3:] + np.eye(3) * variance, part.T).T
@@ -113,6 +112,6 @@ class Uncertainty:
 
     @property
     def heading_sigma_rad(self) -> float:
-        """Of the heading alone; at most that of an unknown one."""
+        """One sigma of the heading, at most that of an unknown one."""
         variance = float(self._covariance[2, 2]) + (SCALE_SHARE * float(self._turned[2])) ** 2
         return min(math.sqrt(max(variance, 0.0)), HEADING_UNKNOWN_RAD)

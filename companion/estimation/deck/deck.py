@@ -18,8 +18,8 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.measurement import Measurement, Stillness, WindowSource
 from companion.estimation.collector.outlook import Progress, Settings
 from companion.estimation.deck.estimate import MAX_S, MIN_LOOK_S, MIN_S, DeckFound, DeckWork, ImuSecond, Known
-from companion.estimation.deck.fluid import Fluid, Level, level
 from companion.estimation.deck.smoother import passage
+from companion.estimation.deck.waves import Fluid, Level, level
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import WHITE_SHARE, ImuInput, Window
 from companion.estimation.seconds.batch import Batch, BatchSource

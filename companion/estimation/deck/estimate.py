@@ -13,8 +13,8 @@ import numpy as np
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.measurement import Work
-from companion.estimation.deck.fluid import Compared, Level, compare
 from companion.estimation.deck.smoother import Believed, Found, Passage, smooth
+from companion.estimation.deck.waves import Compared, Level, compare
 from companion.estimation.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.estimation.means.warming import drifting
 from companion.estimation.means.windows import ImuInput, ImuWindow, Window

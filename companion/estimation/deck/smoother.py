@@ -33,12 +33,12 @@ from companion.physics.frames import (
 )
 
 EARTH_RATE_NORTH_RAD_S: Final = 5.2e-5
-"""W cos L halfway between the equator and 65 degrees: what is left of it, once the latitude is known, is linear."""
+"""W cos L halfway between the equator and 65 degrees: the rest, once the latitude is known, is linear."""
 RAMP_T: Final = 5.0
-"""A ramp is believed from so many of its sigmas on, as at rest (`noise.robust`)."""
+"""Sigmas from which on a ramp is believed, as at rest (`noise.robust`)."""
 _ROUNDS: Final = 7
 _NEAR: Final = 0.1
-"""A round that moves the biases by less, in sigmas, is the last."""
+"""Change of the biases in the last round, in sigmas."""
 _START, _GYRO, _ACCEL, _COMPASS, _RAMP = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11), slice(11, 14)
 _UNKNOWNS: Final = 14
 _NO_RAMP: Final = 11
@@ -46,13 +46,13 @@ _NO_RAMP: Final = 11
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Believed:
-    """What is known beforehand; one sigma each."""
+    """Priors; one sigma each."""
 
     accel_m_s2: Array
     """(3,) of the accelerometers' bias, from the comparison with the gradienter."""
     accel_sigma_m_s2: float
     compass_sigma_rad: float
-    """Of the part of the compass' error that changes with the heading."""
+    """Part of the compass' error that changes with the heading."""
     gyro_white: float
     """N of the gyros, rad/s * sqrt(s): the largest of the axes."""
     gyro_walk: float
@@ -84,7 +84,7 @@ class Found:
     body_to_ned: Floats
     """(n + 1, 3, 3) at the knots; north is the compass'."""
     heading_sigma_rad: float
-    """Of the heading at the end, as far as averaging goes."""
+    """Sigma of the heading at the end, by averaging alone."""
 
 
 class _Stretch:
@@ -251,7 +251,7 @@ class _System:
         return _Answer(values, covariance_found, covariance @ (regressors.T @ earth))
 
     def noise(self, answer: _Answer) -> tuple[Waves, Waves]:
-        """What is left over, as waves: the two levels together, the heading."""
+        """Fit the residuals as waves: the two levels together, the heading."""
         left = [
             readings - columns[:, :_UNKNOWNS] @ answer.values
             for columns, readings in zip(self.columns, self.readings, strict=True)

@@ -1,23 +1,30 @@
-"""Noise that comes in waves: its autoregressive model, and how a series is whitened by it.
+"""Noise of waves: its autoregressive model, whitening of a series by it, and the comparison with the gradienter.
 
-What waves do to a reading is no white noise: it is narrow in frequency, and over some waves it averages out far faster
-than one over the root of time. A line through it is judged by what is left when everything that the past foretells is
-taken away. Burg's method as in Kay, Modern Spectral Estimation, 1988, section 7.3; whitening by a Kalman filter, which
-takes gaps and the gyros' random walk of angle in its stride.
+Waves are narrow in frequency and average out far faster than white noise. A line through them is judged by what remains
+after prediction from the past. Burg's method as in Kay, Modern Spectral Estimation, 1988, section 7.3; whitening by a
+Kalman filter, which allows for gaps and the gyros' random walk of angle.
+
+The comparison of accelerometer and gradienter is by the gradienter's law and with the lag of its fluid. Both feel the
+same specific force, surge included: to first order their difference is the accelerometers' bias and the gradienter's
+zero. A wrong lag shows as a difference that goes with the slope of the tilt: one unknown more.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
+import msgspec
 import numpy as np
 
-from companion.physics.frames import Floats, Matrix
+from companion.estimation.means.pose import GradienterModel
+from companion.physics.frames import Array, Floats, Matrix
+from companion.physics.gradienter import readings_from_up
 
 MOST_TERMS: Final = 12
 _LEAST_LEFT: Final = 1e-6
-"""Of the variance: what foretells itself better than that is a line of the spectrum, and numbers do not bear it."""
+"""Share of the variance below which a series is a line of the spectrum, beyond numerical precision."""
 _DOUBLINGS: Final = 24
 
 
@@ -29,7 +36,7 @@ class Waves(NamedTuple):
 
 
 def fit_waves(series: list[Floats]) -> Waves:
-    """The model of one or more series of one spectrum (means taken off), its order by Akaike's corrected criterion."""
+    """Fit one or more series of one spectrum (without means), the order by Akaike's corrected criterion."""
     forward, backward = [s.copy() for s in series], [s.copy() for s in series]
     points = sum(len(s) for s in series)
     variance = sum(float(s @ s) for s in series) / max(points, 1)
@@ -58,19 +65,16 @@ def fit_waves(series: list[Floats]) -> Waves:
 
 
 class Wander(NamedTuple):
-    """What is not stationary, from one row to the next; both are zero at the last row."""
+    """Non-stationary part, from one row to the next; both are zero at the last row."""
 
     angle: float = 0.0
     """Variance of the step of a random walk: the gyros' white noise."""
     rate: float = 0.0
-    """Variance of the step of a random walk whose sum this is: their bias, which is asked for as it is at last."""
+    """Variance of the step of a random walk whose sum this is: their bias, sought at its last value."""
 
 
 def whitened(columns: Floats, waves: Waves, wander: Wander = Wander()) -> Floats:  # noqa: B008 - it never changes
-    """Columns (n, c) as series of unit white noise, were they made of such waves and of what has wandered.
-
-    Readings and regressors alike; a row of NaN is a gap.
-    """
+    """Whiten columns (n, c), readings and regressors, of waves and wander to unit variance; a row of NaN is a gap."""
     order = max(len(waves.terms), 1)
     angle, rate, size = order, order + 1, order + 2
     move = np.zeros((size, size))
@@ -86,7 +90,7 @@ def whitened(columns: Floats, waves: Waves, wander: Wander = Wander()) -> Floats
     found = np.full_like(columns, math.nan)
     turned = np.ascontiguousarray(move.T)
     gaps = np.asarray(np.isnan(columns).any(axis=1)).tolist()
-    # Backwards: what has wandered is nothing at the end.
+    # Backwards: the wander is zero at the end.
     for row in range(len(columns) - 1, -1, -1):
         if not gaps[row]:
             spread = covariance[:, 0] + covariance[:, angle]
@@ -98,15 +102,104 @@ def whitened(columns: Floats, waves: Waves, wander: Wander = Wander()) -> Floats
             covariance -= gain * spread
         state = move @ state
         covariance = move @ covariance @ turned
-        # Narrow waves have covariances that numbers hardly bear: what is not symmetric grows without end.
+        # Covariances of narrow waves are near the numerical limit: an asymmetry would grow.
         covariance = (covariance + covariance.T) / 2.0 + kick
     return found
 
 
 def _stationary(move: Matrix, kick: Matrix) -> Matrix:
-    """The covariance that stays as it is (Lyapunov's equation, by doubling)."""
+    """Return the stationary covariance (Lyapunov's equation, by doubling)."""
     covariance, power = kick.copy(), move.copy()
     for _ in range(_DOUBLINGS):
         covariance = covariance + power @ covariance @ power.T
         power = power @ power
     return covariance
+
+
+class Level(msgspec.Struct, frozen=True):
+    """One second of gradienter and accelerometer; (2,) x and y in degrees, in the gradienter's axes."""
+
+    reading: Floats
+    difference: Floats
+    """Gradienter minus what it would show by the accelerometer."""
+    slope: Floats
+    """Slope of what it would show, degrees a second."""
+
+
+class Compared(NamedTuple):
+    """Gradienter minus what it would show by the accelerometers, over many seconds."""
+
+    difference_deg: Array
+    covariance_deg2: Matrix
+
+
+class Fluid:
+    """The gradienter's reading of one IMU's specific force."""
+
+    def __init__(self, model: GradienterModel) -> None:
+        self._law, self._turn, self.lag_s = model.law, model.vehicle_from_sensor, model.lag_s
+        self._last: tuple[float, float, float] | None = None
+        self._shown = (0.0, 0.0)
+
+    def follow(self, times_s: Floats, forces_m_s2: Floats) -> Floats:
+        """Return readings (n, 2) after the lag, for forces (n, 3) in the vehicle's axes; exact for an even change."""
+        felt = readings_from_up(self._law, forces_m_s2 @ self._turn)
+        if self.lag_s <= 0.0:
+            return felt
+        found = np.empty_like(felt)
+        lag_s = self.lag_s
+        if self._last is None:
+            self._last = float(times_s[0]), float(felt[0, 0]), float(felt[0, 1])
+            self._shown = self._last[1], self._last[2]
+        then, x_before, y_before = self._last
+        x_shown, y_shown = self._shown
+        for row, (now, (x, y)) in enumerate(zip(times_s.tolist(), felt.tolist(), strict=True)):
+            span = now - then
+            if span > 0.0:
+                keep, behind = math.exp(-span / lag_s), lag_s / span
+                x_late, y_late = (x - x_before) * behind, (y - y_before) * behind
+                x_shown = x - x_late + (x_shown - x_before + x_late) * keep
+                y_shown = y - y_late + (y_shown - y_before + y_late) * keep
+            found[row] = x_shown, y_shown
+            then, x_before, y_before = now, x, y
+        self._last, self._shown = (then, x_before, y_before), (x_shown, y_shown)
+        return found
+
+
+def level(times_s: Floats, shown_deg: Floats, tilt_times_s: Floats, tilts_deg: Floats) -> Level | None:
+    """Compare a second of what it would show (n, 2) and shows (m, 2); None where they do not overlap."""
+    inside = (tilt_times_s >= times_s[0]) & (tilt_times_s <= times_s[-1])
+    if not inside.any():
+        return None
+    at, tilts = tilt_times_s[inside], tilts_deg[inside]
+    would = np.column_stack([np.interp(at, times_s, shown_deg[:, axis]) for axis in range(2)])
+    return Level(
+        tilts.mean(axis=0),
+        (tilts - would).mean(axis=0),
+        (shown_deg[-1] - shown_deg[0]) / max(float(times_s[-1] - times_s[0]), 1e-6),
+    )
+
+
+def compare(levels: Sequence[Level]) -> Compared:
+    """Return the difference over a window, weighted by the waves that are left in it."""
+    difference = np.array([one.difference for one in levels])
+    slope = np.array([one.slope for one in levels])
+    one, nothing = np.ones(len(levels)), np.zeros(len(levels))
+    waves: Waves = fit_waves([column - column.mean() for column in difference.T])
+    for _ in range(2):
+        rows = np.vstack(
+            [
+                whitened(np.column_stack([one, nothing, -slope[:, 0], difference[:, 0]]), waves),
+                whitened(np.column_stack([nothing, one, -slope[:, 1], difference[:, 1]]), waves),
+            ]
+        )
+        regressors = rows[:, :3]
+        # A lag may be off by a second, not by more: that keeps it out of what stands still.
+        information = regressors.T @ regressors + np.diag([0.0, 0.0, 1.0])
+        covariance = np.linalg.inv(information)
+        x, y, lag = covariance @ (regressors.T @ rows[:, 3])
+        left = difference - np.array([x, y]) + slope * lag
+        waves = fit_waves([column - column.mean() for column in left.T])
+    spent = 3 + len(waves.terms)
+    widened = len(rows) / max(len(rows) - spent, len(rows) / 4.0)
+    return Compared(np.array([x, y]), np.asarray(covariance[:2, :2] * widened))

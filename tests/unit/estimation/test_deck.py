@@ -14,9 +14,8 @@ from companion.component.statustext import LINE_BYTES
 from companion.errors import CalibrationRefusedError
 from companion.estimation.deck.deck import Aim, Deck, aim, more
 from companion.estimation.deck.estimate import DeckFound, Known
-from companion.estimation.deck.fluid import Fluid, Level
 from companion.estimation.deck.smoother import passage
-from companion.estimation.deck.waves import Wander, Waves, fit_waves, whitened
+from companion.estimation.deck.waves import Fluid, Level, Wander, Waves, fit_waves, whitened
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.noise.allan import PROFILES
@@ -188,9 +187,12 @@ def test_a_gap_begins_the_seconds_anew() -> None:
         times, rows = quiet_second(slot)
         deck.take_imu("imu", summary(slot, times, rows), times, rows)
     assert deck.common() == range(1, 20)
+    work, nothing = deck.work(range(1, 20)), CalibrationRefusedError("nothing")
+    assert deck.accept(work, nothing)
     times, rows = quiet_second(25, begin=0.7)
     deck.take_imu("imu", summary(25, times, rows), times, rows)
     assert deck.seconds == 0
+    assert not deck.accept(work, nothing), "of seconds that are forgotten"
     for slot in range(26, 41):
         times, rows = quiet_second(slot)
         deck.take_imu("imu", summary(slot, times, rows), times, rows)

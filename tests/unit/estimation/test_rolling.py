@@ -153,20 +153,6 @@ def test_more_than_a_fifth_rejected_ends_the_stretch() -> None:
     assert feed.collector.status(feed.now_s).still_s < 5.0
 
 
-def test_a_steady_turn_after_a_rest_is_not_a_new_stretch() -> None:
-    feed = feeder(SILENT)
-    feed.run(20.0)
-    feed.change = lambda _name, _t, rows: rows + np.array([0.0, 0.0, 2.0 * DEG, 0.0, 0.0, 0.0])
-    feed.run(8.0)
-    for _ in range(90):  # the turn lasts, and nobody takes it for a bias after a while
-        feed.run(1.0)
-        line = feed.waiting_for()
-        assert line is not None
-        assert line.startswith("the aircraft turns 2.0 deg/s to the right")
-    with pytest.raises(CalibrationRefusedError, match="the aircraft turns"):
-        feed.collector.window(feed.now_s)
-
-
 def test_the_window_is_at_most_max_s_long_and_memory_is_bounded() -> None:
     feed = feeder(settings(max_s=20.0), gradienter=True)
     feed.run(300.0)
