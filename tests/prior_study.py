@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.estimation.noise.allan import AllanModel
+from companion.config.sections import AllanModel
 from companion.estimation.records.history import Measured, Point, PowerUp
 from companion.estimation.records.record import Pose, PoseSigma, Site
 from companion.estimation.solution.joint import Weighed, weigh

@@ -40,7 +40,7 @@ from companion.attitude.quaternion import (
 )
 from companion.attitude.strapdown import Strapdown, Stretch
 from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD, Uncertainty
-from companion.estimation.noise.allan import AllanModel
+from companion.config.sections import AllanModel
 from companion.physics.earth import earth_rate_ned_rad_s
 from companion.physics.frames import Matrix
 from companion.samples import ImuSample

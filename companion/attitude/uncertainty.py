@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from companion.attitude.quaternion import Triple
-from companion.estimation.noise.allan import AllanModel
+from companion.config.sections import AllanModel
 from companion.physics.frames import Array, Matrix
 
 SCALE_SHARE: Final = 0.003

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import datetime
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,21 +11,16 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import msgspec
 
 from companion.cli.replay import add_table_options
-from companion.cli.terminal import (
-    AddCommand,
-    conclude,
-    load_config,
-    print_lines,
-    seconds,
-    storage_path,
-)
+from companion.cli.terminal import AddCommand, conclude, load_config, print_lines, seconds, storage_path
 from companion.errors import CalibrationRefusedError, ConfigError, StorageError
+from companion.formats import utc_now
 from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
-    from companion.estimation.noise.allan import NoiseProfile
+    from companion.config.sections import NoiseProfile
+    from companion.estimation.noise.allan_fit import AxisFit
     from companion.lab.logs.log import StillLog
-    from companion.lab.profile import AxisFinding, Finding, Rests
+    from companion.lab.profile import Finding, Rests
 
 SHORT_S: Final = 1200
 MOST_STRETCHES: Final = 6
@@ -53,8 +47,6 @@ def add_command(add: AddCommand) -> None:
     add_table_options(sub)
     words = "to compare with, and for what the recordings do not tell (default: as used)"
     sub.add_argument("--profile", metavar="PART", help=words)
-    words = "recordings that begin when it was switched on, cold: by how much its biases move"
-    sub.add_argument("--warm-up", nargs="+", type=Path, default=(), metavar="FILE", help=words)
     sub.add_argument("--skip", type=seconds, default=0.0, metavar="S", help="leave out so much at each beginning")
     sub.add_argument("--save", metavar="NAME", help='keep it: profile = "NAME" in [[imu]] then takes it')
     sub.add_argument("--storage", type=Path, metavar="DIR", help="where to (default: as in the configuration)")
@@ -74,14 +66,14 @@ async def profile(options: argparse.Namespace) -> int:
     if options.profile is not None:
         given = given_profile(options.profile, lambda: options.storage or storage_path(options))
         compared = noise_profile(given)
-    logs, cold = (
-        read_logs(files, options.columns, options.rate, options.imu or NAME) if files else []
-        for files in (options.files, options.warm_up)
-    )
+    logs = read_logs(options.files, options.columns, options.rate, options.imu or NAME)
+    names = dict.fromkeys(log.imu for log in logs)
+    if options.imu is not None and options.imu not in names:
+        raise StorageError(f"no IMU {options.imu!r} in these files; there are: {', '.join(names)}")
     results, refused = [], []
-    for imu, own in _by_imu(logs, options.imu).items():
+    for imu in names if options.imu is None else [options.imu]:
         try:
-            results.append(_learn(imu, own, compared, options.skip, [log for log in cold if log.imu == imu]))
+            results.append(_learn(imu, [log for log in logs if log.imu == imu], compared, options.skip))
         except CalibrationRefusedError as error:
             refused.append(f"imu {imu}: {error}")
     for words in refused:
@@ -91,8 +83,8 @@ async def profile(options: argparse.Namespace) -> int:
     saved = None
     if store is not None and good:
         if len(results) > 1:
-            names = ", ".join(result.imu for result in results)
-            raise ConfigError(f"--save: found IMUs {names}; allowed: one; say which with --imu")
+            found = ", ".join(result.imu for result in results)
+            raise ConfigError(f"--save: found IMUs {found}; allowed: one; say which with --imu")
         saved = store.write(_to_save(results[0], options.save))
         lines.append(f'saved: {saved}; profile = "{options.save}" in [[imu]] takes it, after a restart')
         lines.append(f"check it: companion replay LOG --windows 60 --profile {saved}")
@@ -101,23 +93,14 @@ async def profile(options: argparse.Namespace) -> int:
     return conclude(options, {**answer, "imus": [_object(result) for result in results]}, lines, good=good)
 
 
-def _by_imu(logs: Sequence[StillLog], wanted: str | None) -> dict[str, list[StillLog]]:
-    names = dict.fromkeys(log.imu for log in logs)
-    if wanted is not None and wanted not in names:
-        raise StorageError(f"no IMU {wanted!r} in these files; there are: {', '.join(names)}")
-    return {name: [log for log in logs if log.imu == name] for name in names if wanted in (None, name)}
-
-
-def _learn(
-    imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float, cold: Sequence[StillLog]
-) -> Result:
+def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float) -> Result:
     """Estimate the noise of one IMU.
 
     Raises:
         CalibrationRefusedError: the recordings do not show it.
     """
     from companion.estimation.noise.allan import noise_profile
-    from companion.lab.profile import Rests, fit_profile, learn_warm_up, rests
+    from companion.lab.profile import Rests, fit_profile, rests
 
     whole = [log for log in logs if not log.truncated]
     if not whole:
@@ -127,69 +110,39 @@ def _learn(
     against = compared or noise_profile(whole[-1].profile)
     found = []
     for log in whole:
-        pieces = log.pieces(skip_s)
-        parts = [rests(log.t_s[at], log.readings[at], log.temperature_degc[at], imu, against) for at in pieces]
+        parts = [rests(log.t_s[at], log.readings[at], imu, against) for at in log.pieces(skip_s)]
         stretches = tuple(rest for part in parts for rest in part.stretches)
         obstacle = next((part.obstacle for part in parts if part.obstacle), "")
         found.append(Rests(stretches, sum(part.seconds for part in parts), obstacle))
     obstacle = next((each.obstacle for each in found if each.obstacle), "")
-    in_the_way = f" (in the way: {obstacle})" if obstacle else ""
     try:
         finding = fit_profile(imu, [stretch for each in found for stretch in each.stretches], against)
     except CalibrationRefusedError as error:
+        in_the_way = f" (in the way: {obstacle})" if obstacle else ""
         raise CalibrationRefusedError(f"{error}{in_the_way}") from None
-    warm_up = None
-    if cold:
-        stretches_of = [rests(log.t_s, log.readings, log.temperature_degc, imu, against).stretches for log in cold]
-        warm_up = learn_warm_up(stretches_of)
-        own = msgspec.structs.replace(finding.profile, warm_up=warm_up)
-        finding = msgspec.structs.replace(finding, profile=own)
-    notes = _notes(finding, against, found, obstacle)
-    if warm_up is not None:
-        gyro, accel = warm_up[0] / DEG_H, warm_up[1] / MG
-        notes.append(
-            f"warming up moves gyros by {gyro:.3g} deg/h, accelerometers by {accel:.3g} mg: sigma allows for it"
-        )
-    return Result(imu, whole, found, finding, against, notes)
-
-
-def _notes(finding: Finding, against: NoiseProfile, found: Sequence[Rests], obstacle: str) -> list[str]:
-    import numpy as np
-
     notes = []
-    unseen = not any(np.isfinite(rest.temperature_degc).any() for each in found for rest in each.stretches)
     if finding.kept:
         notes.append(
             f"too short to tell {', '.join(finding.kept)}: as in {against.name!r}, as far as the recordings allow"
         )
     if finding.still_s < SHORT_S:
         notes.append("less than 20 min at rest: an hour tells N and B, a night K too")
-    if unseen and not any(axis.drift_per_s for axis in finding.axes):
-        walking = [name for name, axis, *_ in _named(finding) if axis.fit.known[2]]
-        if walking:
-            notes.append(f"K of {', '.join(walking)}: may be warm-up, or the room's temperature, which is not recorded")
-    moved_s = sum(each.seconds - each.still_s for each in found)
-    if moved_s:
+    if moved_s := sum(each.seconds - each.still_s for each in found):
         notes.append(f"{moved_s} s were not at rest and are left out{f' ({obstacle})' if obstacle else ''}")
-    for name, axis, unit, unit_name, _ in _named(finding):
-        if axis.drift_per_s:
-            drift = axis.drift_per_s * 3600.0 / unit
-            notes.append(
-                f"{name} drifts by {drift:.3g} {unit_name} in an hour: K allows for it; --skip leaves warm-up out"
-            )
-        if axis.fit.excess is not None:
-            span, ratio = axis.fit.excess
+    for name, fit, *_ in _named(finding):
+        if fit.excess is not None:
+            span, ratio = fit.excess
             notes.append(
                 f"{name}: {ratio:.1f} times the noise that N, B and K make of {span} s: something periodic, or steps;"
                 " B allows for it"
             )
-    return notes
+    return Result(imu, whole, found, finding, against, notes)
 
 
-def _named(finding: Finding) -> Iterator[tuple[str, AxisFinding, float, str, int]]:
-    for column, axis in enumerate(finding.axes):
+def _named(finding: Finding) -> Iterator[tuple[str, AxisFit, float, str, int]]:
+    for column, fit in enumerate(finding.axes):
         triad = "gyro" if column < 3 else "accel"
-        yield (f"{triad} {'xyz'[column % 3]}", axis, *_UNITS[triad])
+        yield (f"{triad} {'xyz'[column % 3]}", fit, *_UNITS[triad])
 
 
 def _used(result: Result) -> Iterator[tuple[StillLog, list[tuple[float, float]], float]]:
@@ -208,8 +161,8 @@ def _lines(result: Result) -> list[str]:
     degc = "" if span is None else f", {span[0]:.1f} to {span[1]:.1f} degC"
     lines = [f"imu {result.imu}: {finding.still_s / 3600.0:.2f} h at rest in {recordings}{degc}"]
     table = [("", ["N, x sqrt(s)", "floor A", "K, / sqrt(s)"])]
-    for name, axis, unit, unit_name, digits in _named(finding):
-        table.append((f"{name}, {unit_name}", [_cell(axis, which, unit, digits) for which in range(3)]))
+    for name, fit, unit, unit_name, digits in _named(finding):
+        table.append((f"{name}, {unit_name}", [_cell(fit, which, unit, digits) for which in range(3)]))
     for triad, (unit, _, digits) in _UNITS.items():
         for name, noise in (("this profile", finding.profile), (result.compared.name, result.compared)):
             model = noise.gyro if triad == "gyro" else noise.accel
@@ -225,16 +178,16 @@ def _lines(result: Result) -> list[str]:
     return lines + [f"note: {note}" for note in result.notes]
 
 
-def _cell(axis: AxisFinding, which: int, unit: float, digits: int) -> str:
+def _cell(fit: AxisFit, which: int, unit: float, digits: int) -> str:
     """Write a figure with its standard error, or its upper limit where the recordings do not show it."""
     from companion.estimation.noise.allan import FLOOR_OF_FLICKER
 
     factor = (1.0, FLOOR_OF_FLICKER, 1.0)[which] / unit
     digits += 2 * (which == 2)
-    value, square = axis.fit.figures[which], axis.fit.sigmas[which]
-    if axis.fit.known[which]:
+    value, square = fit.figures[which], fit.sigmas[which]
+    if fit.known[which]:
         return f"{value * factor:.{digits}f} +-{square / (2.0 * value) * factor:.{digits}f}"
-    upper = axis.fit.upper[which] * factor
+    upper = fit.upper[which] * factor
     return f"< {upper:.{digits}f}" if math.isfinite(upper) else "not told"
 
 
@@ -247,10 +200,9 @@ def _temperatures(logs: Sequence[StillLog]) -> tuple[float, float] | None:
 
 
 def _to_save(result: Result, name: str) -> Any:
-    from companion.estimation.noise.allan import WARM_UP
     from companion.storage.profiles import FORMAT_VERSION, SavedProfile, Source
 
-    finding = result.finding
+    learned = result.finding.profile
     sources = [
         Source(
             file=", ".join(log.files),
@@ -263,15 +215,15 @@ def _to_save(result: Result, name: str) -> Any:
     return SavedProfile(
         format_version=FORMAT_VERSION,
         name=name,
-        saved_at=datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="seconds"),
+        saved_at=utc_now(),
         imu=result.imu,
-        gyro=finding.profile.gyro,
-        accel=finding.profile.accel,
+        gyro=learned.gyro._asdict(),
+        accel=learned.accel._asdict(),
         kept_from=result.compared.name,
-        kept=finding.kept,
+        kept=result.finding.kept,
         sources=tuple(sources),
         notes=tuple(result.notes),
-        warm_up=finding.profile.warm_up if finding.profile.warm_up != WARM_UP else None,
+        warm_up=learned.warm_up,
     )
 
 
@@ -293,10 +245,14 @@ def _object(result: Result) -> dict[str, Any]:
             for log, spans, seconds_s in _used(result)
         ],
         "temperature_degc": _temperatures(result.logs),
-        "profile": msgspec.to_builtins(finding.profile),
-        "compared": msgspec.to_builtins(result.compared),
+        "profile": _figures(finding.profile),
+        "compared": _figures(result.compared),
         "kept": list(finding.kept),
         # An upper limit that nobody knows is infinite; msgspec writes null for it.
-        "axes": msgspec.json.decode(msgspec.json.encode(finding.axes)),
+        "axes": [{"fit": msgspec.json.decode(msgspec.json.encode(fit))} for fit in finding.axes],
         "notes": result.notes,
     }
+
+
+def _figures(noise: NoiseProfile) -> dict[str, Any]:
+    return {"name": noise.name, "gyro": noise.gyro._asdict(), "accel": noise.accel._asdict(), "warm_up": noise.warm_up}

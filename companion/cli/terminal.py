@@ -16,7 +16,7 @@ from typing import Any, Final, NoReturn
 from urllib.parse import quote
 
 from companion import commands, config
-from companion.config.sections import Config, Noise, Storage
+from companion.config.sections import Config, NoiseProfile, Storage
 from companion.config.words import COMMAND_LINE, refusal_of_words
 from companion.errors import ConfigError
 from companion.formats import Object
@@ -76,7 +76,7 @@ def load_config(options: argparse.Namespace, *, profiles: bool = False, forgivin
     Who only asks the daemon may not be allowed to read those. `forgiving`: a damaged one is no reason to refuse.
     """
 
-    def saved(directory: Path, name: str) -> Noise | str:
+    def saved(directory: Path, name: str) -> NoiseProfile | str:
         from companion.storage.profiles import saved_profile
 
         return saved_profile(directory, name, forgiving=forgiving) if profiles else name

@@ -16,7 +16,7 @@ from typing import Final
 import msgspec
 
 from companion.config.rules import check_together
-from companion.config.sections import Config, Noise, Profile
+from companion.config.sections import Config, NoiseProfile, Profile
 from companion.config.words import brief, explain, refuse_unknown_keys, shown
 from companion.errors import ConfigError, StorageError
 
@@ -28,7 +28,7 @@ MOST_LINE: Final = 4096
 CATALOGUE: Final[tuple[str, ...]] = typing.get_args(Profile)
 _Kind = typing.TypeVar("_Kind", bound=msgspec.Struct)
 
-Saved = Callable[[Path, str], Noise | str]
+Saved = Callable[[Path, str], NoiseProfile | str]
 """What a profile of that name is which a storage directory has; a name stays one where nobody looks there.
 
 Raises:
@@ -43,7 +43,7 @@ def no_profile(wanted: str, names: Sequence[str] = ()) -> ConfigError:
     return ConfigError(f"{shown(wanted)}; allowed: {_allowed(names)}{hint}")
 
 
-def _none(_directory: Path, wanted: str) -> Noise:
+def _none(_directory: Path, wanted: str) -> NoiseProfile:
     raise no_profile(wanted)
 
 
@@ -112,7 +112,7 @@ def _with_saved_profiles(config: Config, name: str, saved: Saved) -> Config:
     imus = []
     for index, imu in enumerate(config.imu):
         key = f"{name}: 'imu[{index}].profile': found"
-        if isinstance(imu.profile, Noise):
+        if isinstance(imu.profile, NoiseProfile):
             raise ConfigError(f"{key} a table; allowed: {_allowed(())}")
         if imu.profile is not None and imu.profile not in CATALOGUE:
             try:

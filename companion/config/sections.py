@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
+
+from companion.samples import Triad
 
 EVERYBODY: Final = ("*",)
 ALLOWED: Final = '"SYSTEM" or "SYSTEM:COMPONENT", each a number from 0 to 255, a range such as 250-255, or *'
@@ -124,17 +127,41 @@ class Mavlink(Section, frozen=True):
         return None if self.signing_key_file is None else secret_path(self.signing_key_file)
 
 
-class Noise(Section, frozen=True):
-    """A saved profile, in the place of its name as soon as the file has been read: a recording takes it along."""
+class AllanModel(NamedTuple):
+    """Noise of one axis: rad/s or m/s^2 (times sqrt(s), 1, over sqrt(s))."""
+
+    white: float
+    """N."""
+    flicker: float
+    """B; the floor of the Allan deviation is 0.664 B."""
+    walk: float
+    """K."""
+
+    @property
+    def floor(self) -> float:
+        """The floor of the Allan deviation by flicker alone, in the axis' unit."""
+        return math.sqrt(2.0 * math.log(2.0) / math.pi) * self.flicker
+
+
+class NoiseProfile(msgspec.Struct, frozen=True):
+    """Noise of one make of IMU: of the catalogue, or saved. A recording keeps the saved one of each IMU."""
 
     name: NonEmpty
-    gyro: tuple[float, float, float]
-    """White noise N, flicker B and random walk K in rad/s (times sqrt(s), 1, over sqrt(s))."""
-    accel: tuple[float, float, float]
-    """Likewise in m/s^2."""
+    gyro: AllanModel
+    accel: AllanModel
     origin: str = ""
+    """How a saved profile was learned, in words."""
     warm_up: tuple[float, float] | None = None
-    """By how much a warm-up moves the biases, rad/s and m/s^2; None: nobody has watched one."""
+    """Two sigma of the bias change from cold to warm, rad/s and m/s^2; None: not known."""
+
+    def of(self, triad: Triad) -> AllanModel:
+        """Return the noise of gyro or accelerometer."""
+        return self.gyro if triad == "gyro" else self.accel
+
+    @property
+    def is_named(self) -> bool:
+        """Whether the profile is of a known part."""
+        return self.name != UNKNOWN
 
 
 class Imu(Section, frozen=True):
@@ -151,7 +178,7 @@ class Imu(Section, frozen=True):
     autopilot_instance: Annotated[int, Meta(ge=1, le=3)] | None = None
     read_only: bool = False
     """Whether nothing may ever be sent to the device on that port."""
-    profile: str | Noise | None = None
+    profile: str | NoiseProfile | None = None
     """One of the catalogue (`Profile`), or a saved one."""
 
 

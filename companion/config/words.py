@@ -33,6 +33,7 @@ COMMAND_LINE: Final[dict[str, str]] = {
     "companion replay --tilt-lag": _RECORD,
     "companion replay --longitude-deg": _RECORD,
     "companion ground params": "0.2: set CMP_ parameters in the parameter list of a ground station program",
+    "companion profile --warm-up": "0.2: leave it out (each IMU's temperature curve is learned in service)",
     "companion fleet demo": "0.2: run python -m sim fleet in the folder of the companion's sources",
     "companion fleet export": "0.2: use psql, sqlite3 or DuckDB, as docs/fleet.md shows (Export)",
 }

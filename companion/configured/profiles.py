@@ -6,7 +6,7 @@ import functools
 
 import msgspec
 
-from companion.config.sections import UNKNOWN, Config, Imu, Noise, Profile
+from companion.config.sections import UNKNOWN, Config, Imu, NoiseProfile, Profile
 from companion.configured.models import longest_window_s, settings
 from companion.estimation.noise.allan import PROFILES, predicted_sigma
 from companion.physics.units import DEG_H
@@ -39,7 +39,7 @@ class Profiles:
             self._parts[name] = part
         return self.of(name) != before
 
-    def of(self, name: str) -> str | Noise | None:
+    def of(self, name: str) -> str | NoiseProfile | None:
         """The profile of an IMU; None: nobody has named its part."""
         return self._imus[name].profile or self._parts.get(name)
 
@@ -53,7 +53,7 @@ class Profiles:
         found: list[dict[str, object]] = []
         for name in self._imus:
             profile = self.of(name)
-            fitted = profile.name if isinstance(profile, Noise) else None
+            fitted = profile.name if isinstance(profile, NoiseProfile) else None
             found.append(
                 {
                     "imu": name,
@@ -74,7 +74,7 @@ class Profiles:
 
     def _in_words(self, name: str) -> str:
         profile = self.of(name)
-        if isinstance(profile, Noise):
+        if isinstance(profile, NoiseProfile):
             return f"{profile.name}, {profile.origin}"
         if profile in (None, UNKNOWN):
             return f"part unknown: {self._price_of_unknown}"

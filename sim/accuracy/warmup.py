@@ -9,9 +9,10 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from companion.config.sections import NoiseProfile
 from companion.errors import CalibrationRefusedError
 from companion.estimation.means.windows import ImuInput, Window
-from companion.estimation.noise.allan import NoiseProfile, allan_model, noise_profile
+from companion.estimation.noise.allan import allan_model, noise_profile
 from sim.accuracy.experiments import FIELD_HEADING_DEG, FIELD_TILT_DEG, SPANS_S
 from sim.accuracy.stand import (
     GRAVITY_ANOMALY_M_S2,

@@ -11,7 +11,7 @@ import pytest
 
 from companion.autopilot.firmware.firmwares import part_of
 from companion.config import parse
-from companion.config.sections import Noise
+from companion.config.sections import NoiseProfile
 from companion.daemon.process.check import run_check
 from companion.estimation.means.windows import Hidden, ImuWindow
 from companion.estimation.noise.allan import noise_profile
@@ -79,7 +79,7 @@ def ids(firmware: str, gyro: int, accel: int) -> dict[str, float]:
     return dict(zip(names, (device_id(gyro), device_id(accel, 2)), strict=True))
 
 
-def gyros(folder: Path, profile: str | Noise | None, *, compass: bool = True, **rig: Any) -> Found:
+def gyros(folder: Path, profile: str | NoiseProfile | None, *, compass: bool = True, **rig: Any) -> Found:
     """One calibration of a BMI088's gyros, with this in the configuration."""
     found: list[Found] = []
 
@@ -130,10 +130,10 @@ def test_what_is_configured_holds_whatever_the_ids_say(tmp_path: Path) -> None:
     worst = gyros(tmp_path / "a", "unknown", parameters=parameters)
     assert worst.summary.startswith("part unknown: gyros known to 49 deg/h at best")
     learned = noise_profile("adis16405")
-    saved = Noise(
+    saved = NoiseProfile(
         name="mine",
-        gyro=msgspec.structs.astuple(learned.gyro),
-        accel=msgspec.structs.astuple(learned.accel),
+        gyro=learned.gyro,
+        accel=learned.accel,
         origin="learned from 9.0 h at rest",
     )
     mine = gyros(tmp_path / "b", saved, parameters=parameters)

@@ -21,7 +21,7 @@ from mcap.writer import Writer
 
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.cli import main as companion
-from companion.config.sections import Config, Noise
+from companion.config.sections import AllanModel, Config, NoiseProfile
 from companion.daemon.recorder import recorder as recorder_module
 from companion.errors import StorageError
 from companion.estimation.records.record import Record, to_json
@@ -48,7 +48,7 @@ def record(folder: Path, during: Callable[[Rig], Any] | None = None, **options: 
         rig = Rig(folder, recordings_mb=64, **options)
         (fc, *others) = rig.config.imu
         # Where the replay runs nobody has this profile: a flicker of 2 mrad/s is far above every other's.
-        learned = Noise(name="mine", gyro=(3.5e-5, 2e-3, 1e-6), accel=(5e-4, 0.05, 1e-5))
+        learned = NoiseProfile("mine", AllanModel(3.5e-5, 2e-3, 1e-6), AllanModel(5e-4, 0.05, 1e-5))
         if options.get("seed") == 3:
             rig.config = msgspec.structs.replace(
                 rig.config, imu=[msgspec.structs.replace(fc, profile=learned), *others]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from companion.estimation.noise.allan import AllanModel, predicted_sigma
+from companion.config.sections import AllanModel
+from companion.estimation.noise.allan import predicted_sigma
 
 
 def use_variance(model: AllanModel, mean_s: float, horizon_s: float) -> float:

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.config.sections import AllanModel, NoiseProfile
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import ImuInput
-from companion.estimation.noise.allan import AllanModel, NoiseProfile, noise_profile
+from companion.estimation.noise.allan import noise_profile
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import CompassSample, ImuSample, TiltSample
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.config.sections import Noise
+from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensors import SerialSensor
@@ -74,7 +74,7 @@ class ImuIdentities:
     def identity(self, name: str, before: Mapping[str, str]) -> dict[str, str]:
         """Give what makes it another sensor, or its biases others, if it changes; `before` fills gaps."""
         source = self._sources[name]
-        profile = source.profile.name if isinstance(source.profile, Noise) else source.profile
+        profile = source.profile.name if isinstance(source.profile, NoiseProfile) else source.profile
         found: dict[str, str] = {"source": source.source, "profile": profile or "unknown"}
         if source.source == "serial":
             return {**found, "protocol": source.protocol or "", "mounting": _plain(source.mounting)}

@@ -18,7 +18,7 @@ from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.verify import Observation, Verdict, judge
 from companion.autopilot.vehicle.vehicle import ArmState, Moment
-from companion.config.sections import Noise
+from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
 from companion.daemon.offsets.plan import Plan, Target
 from companion.daemon.offsets.px4_writes import FarMean, Px4Writes, step_from_far
@@ -163,7 +163,7 @@ def judge_vectors(
     calibration: ImuCalibration,
     changes: list[Change],
     kind: StreamKind | None,
-    profile: str | Noise | None,
+    profile: str | NoiseProfile | None,
     on_the_way: OnTheWay,
 ) -> list[Verdict]:
     """Judge the written vectors: accelerometers, gyros, or both.

@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from companion.config.sections import AllanModel
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.measurement import Work
 from companion.estimation.deck.smoother import Believed, Found, Passage, smooth
@@ -18,7 +19,7 @@ from companion.estimation.deck.waves import Compared, Level, compare
 from companion.estimation.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.estimation.means.warming import drifting
 from companion.estimation.means.windows import ImuInput, ImuWindow, Window
-from companion.estimation.noise.allan import AllanModel, floor_variance, slope_variance
+from companion.estimation.noise.allan import floor_variance, slope_variance
 from companion.physics.frames import Array, Floats, Matrix, body_from_ned, vector
 from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG, MG

@@ -17,8 +17,9 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from companion.config.sections import NoiseProfile
 from companion.errors import CalibrationRefusedError
-from companion.estimation.noise.allan import NoiseProfile, floor_variance
+from companion.estimation.noise.allan import floor_variance
 from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import Floats
 

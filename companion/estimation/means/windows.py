@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.config.sections import NoiseProfile
 from companion.estimation.means.integers import IntegerColumns, integer_columns
 from companion.estimation.means.losses import lost, refuse_broken
 from companion.estimation.means.pose import FieldWindow, HeadingWindow, TiltWindow
@@ -21,7 +22,7 @@ from companion.estimation.means.quantised import EDGE_RMS
 from companion.estimation.means.warming import Lines, Warming, drifting, warming
 from companion.estimation.noise.allan import (
     FLOOR_OF_FLICKER,
-    NoiseProfile,
+    WARM_UP,
     allan_variance,
     floor_variance,
     slope_variance,
@@ -336,7 +337,7 @@ def _imu_window(imu: ImuInput, batches: Sequence[Batch], found: Estimate, reject
         hidden=_hidden(imu, found),
         named=imu.profile.is_named,
         mounting=(vector(rotation[0]), vector(rotation[1]), vector(rotation[2])),
-        warming=warming(rotation, found.lines, imu.profile.warm_up, batches),
+        warming=warming(rotation, found.lines, imu.profile.warm_up or WARM_UP, batches),
         drifting=drifting(imu.name, found.lines.ramp, temperatures),
     )
 

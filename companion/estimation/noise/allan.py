@@ -9,18 +9,16 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.config.sections import Noise
+from companion.config.sections import AllanModel, NoiseProfile
 from companion.errors import ConfigError
 from companion.physics.frames import Floats
 from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG_H, MG
-from companion.samples import Triad
 
-FLOOR_OF_FLICKER: Final = math.sqrt(2.0 * math.log(2.0) / math.pi)
+FLOOR_OF_FLICKER: Final = AllanModel(0.0, 1.0, 0.0).floor
 """Allan deviation of pure flicker noise over B: 0.664."""
 
 _FLOOR_REACHED_S: Final = 1000.0
@@ -34,38 +32,6 @@ WARM_UP: Final = (WARM_UP_K * 54.0 * DEG_H, WARM_UP_K * 0.4 * MG)
 BMI160's accelerometer (the table named there)."""
 
 
-class AllanModel(msgspec.Struct, frozen=True):
-    """White noise, flicker and random walk of one axis; rad/s or m/s^2 (times sqrt(s), 1, over sqrt(s))."""
-
-    white: float
-    flicker: float
-    walk: float
-
-    @property
-    def floor(self) -> float:
-        """The floor of the Allan deviation that the flicker alone makes, in the axis' unit."""
-        return FLOOR_OF_FLICKER * self.flicker
-
-
-class NoiseProfile(msgspec.Struct, frozen=True):
-    """The noise of one make of IMU: gyro in rad/s, accelerometer in m/s^2."""
-
-    name: str
-    gyro: AllanModel
-    accel: AllanModel
-    warm_up: tuple[float, float] = WARM_UP
-    """By how much the biases of gyro and accelerometer may move from cold to warm, two sigma."""
-
-    def of(self, triad: Triad) -> AllanModel:
-        """Of one of the two."""
-        return self.gyro if triad == "gyro" else self.accel
-
-    @property
-    def is_named(self) -> bool:
-        """Whether it is that of some part, and not of the worst common ones."""
-        return self != PROFILES["unknown"]
-
-
 def allan_model(white: float, floor: float) -> AllanModel:
     """A model from a data sheet's two figures: white noise N and the Allan floor A (0.664 B)."""
     return AllanModel(white, floor / FLOOR_OF_FLICKER, floor * math.sqrt(3.0 / _FLOOR_REACHED_S))
@@ -77,12 +43,12 @@ def _profile(
     accel_ug: tuple[float, float],
     per_kelvin: tuple[float, float] | None = None,
 ) -> NoiseProfile:
-    """Figures of a data sheet; `per_kelvin` in deg/h and mg, None where it has none."""
+    """Make a profile from a data sheet's figures; `per_kelvin` in deg/h and mg, None where it has none."""
     return NoiseProfile(
         name,
         allan_model(gyro_deg_h[0] * DEG_H, gyro_deg_h[1] * DEG_H),
         allan_model(accel_ug[0] * 1e-3 * MG, accel_ug[1] * 1e-3 * MG),
-        WARM_UP if per_kelvin is None else (WARM_UP_K * per_kelvin[0] * DEG_H, WARM_UP_K * per_kelvin[1] * MG),
+        warm_up=None if per_kelvin is None else (WARM_UP_K * per_kelvin[0] * DEG_H, WARM_UP_K * per_kelvin[1] * MG),
     )
 
 
@@ -105,15 +71,14 @@ PROFILES: Final[dict[str, NoiseProfile]] = {
 }
 
 
-def noise_profile(profile: str | Noise | None) -> NoiseProfile:
-    """The catalogue's of that name, or that of these figures; None: the cautious one for an unknown part.
+def noise_profile(profile: str | NoiseProfile | None) -> NoiseProfile:
+    """Return a given profile, or that of a part of the catalogue; None: the cautious one for an unknown part.
 
     Raises:
         ConfigError: no such profile.
     """
-    if isinstance(profile, Noise):
-        models = AllanModel(*profile.gyro), AllanModel(*profile.accel)
-        return NoiseProfile(profile.name, *models, warm_up=profile.warm_up or WARM_UP)
+    if isinstance(profile, NoiseProfile):
+        return profile
     if profile is not None and profile not in PROFILES:
         raise ConfigError(f"no noise profile {profile!r} (known: {', '.join(PROFILES)})")
     return PROFILES[profile or "unknown"]

@@ -22,7 +22,8 @@ from typing import Final
 
 import msgspec
 
-from companion.estimation.noise.allan import AllanModel, floor_variance
+from companion.config.sections import AllanModel
+from companion.estimation.noise.allan import floor_variance
 from companion.estimation.records.record import ImuRecord
 from companion.physics.units import UNITS
 from companion.samples import Triad, Vector

@@ -14,10 +14,11 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
+from companion.config.sections import AllanModel
 from companion.estimation.alignment.align_model import response
 from companion.estimation.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Sides
 from companion.estimation.means.windows import ImuWindow
-from companion.estimation.noise.allan import AllanModel, floor_variance
+from companion.estimation.noise.allan import floor_variance
 from companion.estimation.solution.site import LocalEarth
 from companion.estimation.temperature.curve import CATALOGUE_PER_K, CATALOGUE_SCATTER
 from companion.physics.frames import Array, Matrix, symmetric_by

@@ -23,9 +23,10 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
+from companion.config.sections import AllanModel
 from companion.estimation.alignment.align_model import Priors
 from companion.estimation.means.warming import Path
-from companion.estimation.noise.allan import AllanModel, floor_variance
+from companion.estimation.noise.allan import floor_variance
 from companion.estimation.records.align_record import Determined, ImuAlignmentRecord
 from companion.estimation.records.history import GUARDS_FROM, WEIGHS_FROM, Measured, Point, PowerUp, believed
 from companion.estimation.records.record import Effective

@@ -25,7 +25,7 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
-from companion.estimation.noise.allan import NoiseProfile
+from companion.config.sections import NoiseProfile
 from companion.estimation.seconds.batch import Batch
 from companion.estimation.seconds.recent import Recent
 from companion.estimation.stillness.coarse import Steps

@@ -13,7 +13,8 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from companion.estimation.noise.allan import AllanModel, NoiseProfile, floor_variance
+from companion.config.sections import AllanModel, NoiseProfile
+from companion.estimation.noise.allan import floor_variance
 from companion.estimation.noise.slope import FEWEST, Slope, fit_slope, hidden_by_steps
 from companion.estimation.seconds.batch import Batch
 from companion.estimation.seconds.recent import Recent

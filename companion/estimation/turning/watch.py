@@ -19,7 +19,7 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
-from companion.estimation.noise.allan import NoiseProfile
+from companion.config.sections import NoiseProfile
 from companion.estimation.noise.slope import FEWEST, fit_slope, hidden_by_steps, plain_slope
 from companion.estimation.seconds.batch import Batch
 from companion.estimation.seconds.recent import Recent

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from companion.config.sections import Noise
+from companion.config.sections import NoiseProfile
 from companion.physics.frames import Floats
 
 NAME: Final = "imu"
@@ -53,7 +53,7 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
     """(n, 6): gyro in rad/s, accelerometer in m/s^2; axes as recorded."""
     temperature_degc: Floats
     """(n,); NaN where unknown."""
-    profile: str | Noise | None = None
+    profile: str | NoiseProfile | None = None
     """Noise profile in the configuration in force then."""
     truncated: bool = False
     """It came as integers only, which are left out."""

@@ -10,7 +10,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.config.sections import Mounting, Noise
+from companion.config.sections import Mounting, NoiseProfile
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.measurement import Measurement
 from companion.estimation.collector.outlook import Settings
@@ -59,7 +59,7 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
     """Time in s for which the IMU had been switched on when the log began, at least."""
     mounting: Mounting = "ROTATION_NONE"
     """IMU to vehicle FRD."""
-    profile: str | Noise | None = None
+    profile: str | NoiseProfile | None = None
     """The IMU's model, or figures learned, for its Allan figures."""
     any_bias: bool = False
     """True: accept biases beyond those of any part."""

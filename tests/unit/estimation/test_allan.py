@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from companion.config.sections import AllanModel
 from companion.errors import ConfigError
 from companion.estimation.noise.allan import (
     FLOOR_OF_FLICKER,
     PROFILES,
-    AllanModel,
     allan_model,
     allan_variance,
     noise_profile,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.estimation.noise.allan_fit import AxisFit, Curve, _scatter, curve, fit_axis
+from companion.estimation.noise.allan_fit import AxisFit, Curve, curve, fit_axis
 from tests.support.made_noise import FLICKER_OF_FLOOR, slow
 
 Floats = NDArray[np.float64]
@@ -27,35 +27,8 @@ def test_the_deviations_are_those_of_allantools() -> None:
     found = curve_of(values)
     taus, deviations, _, _ = allantools.oadev(values, rate=1.0, data_type="freq", taus=list(found.spans))
     assert list(taus) == list(found.spans)
-    assert found.spans[-1] > 900 / 2
+    assert found.spans[-1] == 256
     np.testing.assert_allclose(np.sqrt(found.variance[:, 0]), deviations, rtol=1e-9)
-
-
-def by_matrices(covariance: Floats, a: int, b: int) -> float:
-    """Covariance of two overlapping Allan variances of Gaussian seconds: 2 tr(A S B S), with nothing left out."""
-
-    def form(span: int) -> Floats:
-        rows = len(covariance) - 2 * span + 1
-        differences = np.zeros((rows, len(covariance)))
-        for row in range(rows):
-            differences[row, row : row + span] = -1.0 / span
-            differences[row, row + span : row + 2 * span] = 1.0 / span
-        return differences.T @ differences / (2.0 * rows)
-
-    return float(2.0 * np.trace(form(a) @ covariance @ form(b) @ covariance))
-
-
-@pytest.mark.parametrize("squares", [(1.0, 0.0), (0.0, 1.0), (1.0, 0.3)], ids=["white", "walk", "both"])
-def test_how_variances_scatter_is_the_algebra_of_gaussian_squares(squares: tuple[float, float]) -> None:
-    length, spans = 40, (1, 2, 4, 8)
-    index = np.arange(length)
-    # A random walk averaged over whole seconds: min(i, j) + 1/2 between two of them, i + 1/3 of one.
-    walk = np.minimum(index[:, None], index[None, :]) + 0.5 - np.eye(length) / 6.0
-    white2, walk2 = squares
-    expected = [[by_matrices(white2 * np.eye(length) + walk2 * walk, a, b) for b in spans] for a in spans]
-    # By products of N^2, B^2, K^2: (N N, N B, N K, B B, B K, K K).
-    found = np.tensordot([white2**2, 0.0, white2 * walk2, 0.0, 0.0, walk2**2], _scatter(length, spans), axes=1)
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def fits(seed: int, runs: int, seconds: int, white: float, floor: float, walk: float) -> list[AxisFit]:

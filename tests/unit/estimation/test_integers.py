@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from companion.config.sections import NoiseProfile
 from companion.estimation.collector.outlook import is_enough
 from companion.estimation.means.windows import ImuEstimate, ImuInput, imu_estimates, integer_steps
-from companion.estimation.noise.allan import NoiseProfile
 from companion.estimation.seconds.batch import MAX_LEVELS, Batch, BatchSource
 from companion.physics.units import DEG_H, MG
 from companion.recording.messages import encode

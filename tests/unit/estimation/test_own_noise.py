@@ -69,7 +69,7 @@ def test_a_still_sensor_behind_a_filter_is_still(
         later = verdicts(t_s, readings)[80:]
         assert np.mean(later) >= 0.95
         # A profile's recordings are looked at as a whole: nothing is lost at their beginning.
-        assert rests(t_s, readings, None, "own", UNKNOWN).still_s >= 165
+        assert rests(t_s, readings, "own", UNKNOWN).still_s >= 165
 
 
 def test_what_is_learned_is_the_density_of_the_noise() -> None:
@@ -221,7 +221,7 @@ def test_more_than_any_part_has_is_never_learned_but_by_whoever_says_that_it_is_
     assert words[-1].endswith(" (steady as noise: name its part, or companion profile)")
     assert "" not in words
     # Its recording tells a profile, and with it, it is still.
-    found = rests(t_s, readings, None, "own", UNKNOWN)
+    found = rests(t_s, readings, "own", UNKNOWN)
     assert found.still_s >= 110
     profile = fit_profile("own", found.stretches, UNKNOWN).profile
     assert profile.gyro.white == pytest.approx(noisy[0], rel=0.15)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from companion.config.sections import AllanModel, NoiseProfile
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector import measurement
 from companion.estimation.collector.outlook import Settings

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.estimation.noise.allan import PROFILES, AllanModel
+from companion.config.sections import AllanModel
+from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.validity import (
     DRIFT_SIGMAS,
     Held,

@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.config.sections import Imu
+from companion.config.sections import AllanModel, Imu, NoiseProfile
 from companion.configured.models import imu_input
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.means.warming import Warming, likely_k_s, temperature_rate
-from companion.estimation.noise.allan import WARM_UP, WARM_UP_K, AllanModel, NoiseProfile, noise_profile
+from companion.estimation.noise.allan import WARM_UP, WARM_UP_K, noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.physics.units import DEG_H, MG
 from companion.protocols.registry import PROTOCOLS

@@ -9,10 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.config import parse
+from companion.config.sections import AllanModel, NoiseProfile
 from companion.configured.profiles import gyro_sigmas_deg_h
 from companion.estimation.means.pose import heading_window, tilt_window
 from companion.estimation.means.windows import ImuInput, estimates, imu_estimates
-from companion.estimation.noise.allan import AllanModel, NoiseProfile, noise_profile, slope_variance
+from companion.estimation.noise.allan import noise_profile, slope_variance
 from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H

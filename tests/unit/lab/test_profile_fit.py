@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from companion.config.sections import AllanModel, NoiseProfile
 from companion.errors import CalibrationRefusedError
 from companion.estimation.means.windows import ImuInput, estimates
-from companion.estimation.noise.allan import AllanModel, NoiseProfile, noise_profile
+from companion.estimation.noise.allan import noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.lab.profile import Finding, Rest, fit_profile, rests, seconds_of
 from tests.support.made_noise import DEG, DEG_H, FLICKER_OF_FLOOR, MG, adis16405, slow
@@ -34,17 +35,15 @@ def test_seconds_are_those_of_the_daemon() -> None:
     readings[:, 1] = np.rint(readings[:, 1] / (0.1 * DEG)) * (0.1 * DEG)
     kept = np.random.default_rng(2).random(len(t_s)) < 0.8
     t_s, readings = t_s[kept], readings[kept]
-    degc = 20.0 + t_s
     source = BatchSource((1e9,) * 6, keep=100)
-    for t, row, temperature in zip(t_s.tolist(), readings.tolist(), degc.tolist(), strict=True):
-        source.add(t, tuple(row), temperature)
-    ours = {batch.slot: batch for batch in seconds_of(t_s, readings, degc)}
+    for t, row in zip(t_s.tolist(), readings.tolist(), strict=True):
+        source.add(t, tuple(row))
+    ours = {batch.slot: batch for batch in seconds_of(t_s, readings)}
     assert sorted(ours) == sorted(source.batches) == list(range(1, 19))
     for slot, batch in source.batches.items():
         found = ours[slot]
         assert found.n == batch.n
         assert found.largest_gap_s == pytest.approx(batch.largest_gap_s)
-        assert found.temperature_degc == pytest.approx(batch.temperature_degc)
         for name in ("mean", "variance", "white", "low", "high"):
             np.testing.assert_allclose(getattr(found, name), getattr(batch, name), rtol=1e-6, atol=1e-15)
         np.testing.assert_array_equal(found.distinct, batch.distinct)
@@ -68,7 +67,7 @@ def test_movement_ends_a_stretch_and_a_new_pose_is_another_one() -> None:
     t_s, readings = at_rest(200)
     readings[100 * 50 : 110 * 50, :3] += np.random.default_rng(3).normal(0.0, 0.2, (500, 3))
     readings[110 * 50 :, 3] += 0.5  # it lies tilted now
-    found = rests(t_s, readings, None, "own", UNKNOWN)
+    found = rests(t_s, readings, "own", UNKNOWN)
     assert [(rest.slots[0], rest.slots[-1]) for rest in found.stretches] == [(1, 99), (110, 198)]
     assert found.seconds == 198
     assert found.obstacle.startswith("gyro own")
@@ -78,7 +77,7 @@ def test_a_knock_and_a_lost_second_are_holes() -> None:
     t_s, readings = at_rest(100)
     readings[50 * 50 : 50 * 50 + 20, 0] += 0.2
     there = (t_s < 70.0) | (t_s >= 71.0)
-    found = rests(t_s[there], readings[there], None, "own", UNKNOWN)
+    found = rests(t_s[there], readings[there], "own", UNKNOWN)
     (rest,) = found.stretches
     assert sorted(set(range(1, 99)) - set(rest.slots.tolist())) == [50, 70]
     assert found.still_s == 96
@@ -87,12 +86,11 @@ def test_a_knock_and_a_lost_second_are_holes() -> None:
 # --- the profile
 
 
-def rest_of(seconds: int, models: tuple[AllanModel, AllanModel], seed: int, degc: Floats | None = None) -> Rest:
+def rest_of(seconds: int, models: tuple[AllanModel, AllanModel], seed: int) -> Rest:
     """Made second by second, without samples."""
     rng = np.random.default_rng(seed)
     columns = [slow(rng, seconds, m.flicker, m.walk, m.white) for m in (models[0],) * 3 + (models[1],) * 3]
-    temperature = np.full(seconds, np.nan) if degc is None else degc
-    return Rest(np.arange(seconds), np.stack(columns, axis=1), temperature)
+    return Rest(np.arange(seconds), np.stack(columns, axis=1))
 
 
 GYRO = AllanModel(7.1 * DEG_H, 3.0 * FLICKER_OF_FLOOR * DEG_H, 0.16 * DEG_H)
@@ -107,11 +105,11 @@ def test_one_choice_promises_too_much_for_no_axis() -> None:
     rest = rest_of(7200, (GYRO, ACCEL), 4)
     noisy = rest.means.copy()
     noisy[:, 1] = slow(np.random.default_rng(5), 7200, 2.0 * GYRO.flicker, GYRO.walk, 2.0 * GYRO.white)
-    finding = fitted(Rest(rest.slots, noisy, rest.temperature_degc))
+    finding = fitted(Rest(rest.slots, noisy))
     assert finding.profile.gyro.white == pytest.approx(2.0 * GYRO.white, rel=0.05)
     assert finding.profile.gyro.floor == pytest.approx(2.0 * GYRO.floor, rel=0.2)
     assert finding.profile.accel.white == pytest.approx(ACCEL.white, rel=0.05)
-    assert finding.axes[0].fit.figures[0] == pytest.approx(GYRO.white, rel=0.05)
+    assert finding.axes[0].figures[0] == pytest.approx(GYRO.white, rel=0.05)
 
 
 def test_what_is_not_told_is_borrowed_and_named() -> None:
@@ -128,18 +126,14 @@ def test_what_is_not_told_is_borrowed_and_named() -> None:
     assert hour.profile.gyro.floor == pytest.approx(GYRO.floor, rel=0.25)
 
 
-def test_a_drift_is_no_random_walk() -> None:
-    """200 deg/h in an hour: as a walk K would be several deg/h over sqrt(s)."""
+def test_a_drift_costs_what_it_does_over_a_calibration_and_the_minutes_after_it() -> None:
+    """200 deg/h in an hour: over the longest averages of the hour K would be several deg/h over sqrt(s)."""
     still = rest_of(3600, (GYRO, ACCEL), 8)
     ramp = 200.0 * DEG_H / 3600.0
-    drifting = Rest(still.slots, still.means + ramp * still.slots[:, None], still.temperature_degc)
-    plain, finding = fitted(still), fitted(drifting)
-    assert all(axis.drift_per_s == 0.0 for axis in plain.axes)
-    for axis in finding.axes[:3]:
-        assert axis.drift_per_s == pytest.approx(ramp, rel=0.15)
+    finding = fitted(Rest(still.slots, still.means + ramp * still.slots[:, None]))
     assert finding.profile.gyro.floor == pytest.approx(GYRO.floor, rel=0.3)
     assert finding.profile.gyro.walk < 1.2 * DEG_H
-    # What it costs over a minute and the three after it is in K: d (T + H) / 2.
+    # A minute and the three after it: d (T + H) / 2.
     more = (finding.profile.gyro.walk**2) * 240.0 / 3.0
     assert more >= (ramp * 120.0) ** 2
 
@@ -192,13 +186,13 @@ class Misses:
 def test_a_night_s_profile_keeps_its_word_in_the_other_half() -> None:
     """2.8 h, as the recordings of the ADIS16405 were, at a tenth of their rate: noise does not care."""
     t_s, readings = adis16405(10080, 10, seed=12)
-    found = rests(t_s, readings, None, "adis", UNKNOWN)
+    found = rests(t_s, readings, "adis", UNKNOWN)
     assert found.still_s > 10070
     profile = fit_profile("adis", found.stretches, UNKNOWN).profile
     assert profile.gyro.white / DEG_H == pytest.approx(152.0, rel=0.04)
     assert 23.0 < profile.gyro.floor / DEG_H < 34.0
     assert 0.17 < profile.accel.floor / MG < 0.23
-    half = rests(t_s[: len(t_s) // 2], readings[: len(t_s) // 2], None, "adis", UNKNOWN)
+    half = rests(t_s[: len(t_s) // 2], readings[: len(t_s) // 2], "adis", UNKNOWN)
     learned = fit_profile("adis", half.stretches, UNKNOWN).profile
     later = seconds_of(t_s[len(t_s) // 2 :], readings[len(t_s) // 2 :])
     for mean_s in (10, 30, 60):
@@ -233,7 +227,7 @@ def made_session(
         )
         for slot, mean in enumerate(means)
     ]  # fmt: skip
-    return Rest(np.arange(seconds), means, np.full(seconds, np.nan)), batches
+    return Rest(np.arange(seconds), means), batches
 
 
 @pytest.mark.parametrize(
@@ -251,7 +245,10 @@ def made_session(
 def test_a_wander_costs_what_it_does_in_the_next_minutes(
     figures: tuple[float, float, float], bounded: tuple[float, float]
 ) -> None:
-    """Learned from three nights, tested on the fourth: neither too little nor, as of a walk, too much."""
+    """Learned from three nights, tested on the fourth. Never too little; of a wander that is bounded at most 1.4 times.
+
+    N, B and K cannot follow a bound within the longest average.
+    """
     nights = [made_session(figures, bounded, 7200, seed) for seed in range(40, 44)]
     rests_of = [rest for rest, _ in nights]
     profiles = [
@@ -262,8 +259,9 @@ def test_a_wander_costs_what_it_does_in_the_next_minutes(
         for (_, batches), profile in zip(nights, profiles, strict=True):
             misses.add(batches, profile, mean_s, next_s)
         # 120 windows of 60 and 180 s side by side in six axes of the same noise: the share is good to a percent.
-        assert 0.93 <= misses.share() <= 0.985
-        assert 0.82 <= misses.ratio() <= 1.08
+        assert misses.share() >= 0.93
+        assert 0.70 <= misses.ratio() <= 1.08
+        assert bounded[0] != 0.0 or (misses.share() <= 0.985 and misses.ratio() >= 0.82)
 
 
 # --- real recordings: short ones, so that they tell white noise, and test the cautious profile
@@ -290,7 +288,7 @@ def test_of_real_recordings_the_next_seconds_are_where_they_were_promised_to_be(
     misses = Misses()
     for played, next_s in ((imu_tk(), 10), (px4(), 10), (xio("fusion_sensor_data.csv.gz"), 5), (broad(), 10)):
         readings = np.hstack([played.gyro, played.accel])
-        slots = {slot for rest in rests(played.t_s, readings, None, "own", UNKNOWN).stretches for slot in rest.slots}
+        slots = {slot for rest in rests(played.t_s, readings, "own", UNKNOWN).stretches for slot in rest.slots}
         still = [batch for batch in seconds_of(played.t_s, readings) if batch.slot in slots]
         misses.add(still, UNKNOWN, 10, next_s)
     assert len(misses.miss) >= 12
@@ -300,7 +298,7 @@ def test_of_real_recordings_the_next_seconds_are_where_they_were_promised_to_be(
 
 def test_px4_s_minute_tells_its_white_noise_and_says_what_it_does_not() -> None:
     played = px4()
-    found = rests(played.t_s, np.hstack([played.gyro, played.accel]), None, "fc", UNKNOWN)
+    found = rests(played.t_s, np.hstack([played.gyro, played.accel]), "fc", UNKNOWN)
     finding = fit_profile("fc", found.stretches, UNKNOWN)
     assert {"gyro B", "gyro K"} <= set(finding.kept)
     assert 5.0 < finding.profile.gyro.white / DEG_H < 30.0
