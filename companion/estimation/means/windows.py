@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.config.sections import NoiseProfile
-from companion.estimation.means.integers import IntegerColumns, integer_columns
-from companion.estimation.means.losses import lost, refuse_broken
+from companion.errors import CalibrationRefusedError
+from companion.estimation.means.integers import EDGE_RMS, IntegerColumns, integer_columns
 from companion.estimation.means.pose import FieldWindow, HeadingWindow, TiltWindow
-from companion.estimation.means.quantised import EDGE_RMS
 from companion.estimation.means.warming import Lines, Warming, drifting, warming
 from companion.estimation.noise.allan import (
     FLOOR_OF_FLICKER,
@@ -33,7 +32,7 @@ from companion.estimation.seconds.batch import Batch
 from companion.estimation.turning.watch import Turn
 from companion.physics.frames import Floats, vector
 from companion.physics.units import DEG_H, MG
-from companion.samples import Triad, Vector
+from companion.samples import TRIADS, Triad, Vector, rows_of
 
 WHITE_SHARE: Final = 0.09
 """White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
@@ -42,6 +41,9 @@ _FLICKER_OF_SLOPE: Final = 0.5
 """Share of the slope's variance by flicker and walk that counts as a hidden warm-up: V(T, H) has them already. With
 none of it 2 sigma cover 82 % of an ADIS16405's accelerometers in the steepest simulated ramp, with half 89 %."""
 _LOST_WARNING: Final = 0.01
+_LOST_REFUSAL: Final = 0.5
+_USUAL_SHARE: Final = 0.95
+"""Share of the usual samples below which a second lost some; above, it is the phase of the grid."""
 _ALLAN_SIGNIFICANT: Final = 3.0
 """ADEV^2 at T/5 over what white noise explains: the upper 5 % point with its about four degrees of freedom."""
 
@@ -163,8 +165,6 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     """Integers whose mean is unknown yet: more seconds may bring the rare reading that tells."""
     useless: NDArray[np.bool_]
     """Integers around zero whose mean is unknown: it says no more than that it is less than a step."""
-    edge_rms: Floats
-    """Of integers: displacement of their edges, in steps, for which sigma allows (`quantised.shape_variance`)."""
 
 
 class ImuEstimate(msgspec.Struct, frozen=True):
@@ -224,21 +224,20 @@ def estimates(
         variance=np.where(no_line, np.inf, np.square(white) / spread + wander + by_steps),
         level_variance=np.square(white) / seconds + rest,
     )
-    figures = {
-        "mean": mean,
-        "stat_variance": stat,
-        "use_variance": use,
-        "white_variance": white_part,
-        "white": white,
-        "flicker": flicker,
-        "walk": walk,
-        "half_step": half_step,
-        "undecided": whole.unknown,
-        "useless": whole.useless,
-        "edge_rms": whole.edge_rms,
-    }
     return [
-        Estimate(lines=Lines(*(each[part] for each in lines)), **{name: each[part] for name, each in figures.items()})
+        Estimate(
+            mean=mean[part],
+            stat_variance=stat[part],
+            use_variance=use[part],
+            white_variance=white_part[part],
+            white=white[part],
+            flicker=flicker[part],
+            walk=walk[part],
+            lines=Lines(*(each[part] for each in lines)),
+            half_step=half_step[part],
+            undecided=whole.unknown[part],
+            useless=whole.useless[part],
+        )
         for part in (slice(at, at + 6) for at in range(0, 6 * len(imus), 6))
     ]
 
@@ -310,7 +309,7 @@ def imu_estimates(
     if not imus:
         return []
     for imu, own in zip(imus, batches, strict=True):
-        refuse_broken(imu.name, (imu.gyro_step_rad_s, imu.accel_step_m_s2), own)
+        _refuse_broken(imu, own)
     found = estimates(imus, batches, end_s=end_s, horizon_s=horizon_s)
     return [
         ImuEstimate(own, _imu_window(imu, seconds, own, rejected))
@@ -349,12 +348,10 @@ def _turned(rotation: Floats, variance: Floats) -> Vector:
 
 def _hidden(imu: ImuInput, own: Estimate) -> dict[Triad, Hidden]:
     found: dict[Triad, Hidden] = {}
-    part: Triad
-    for part, triad, step, grid, unit in (
-        ("gyro", slice(0, 3), f"{imu.gyro_step_rad_s / DEG_H:.0f} deg/h", imu.gyro_grid_rad_s / DEG_H, "deg/h"),
-        ("accel", slice(3, 6), f"{imu.accel_step_m_s2 / MG:.1f} mg", imu.accel_grid_m_s2 / MG, "mg"),
-    ):
-        undecided, useless_axes = own.undecided[triad], own.useless[triad]
+    steps = f"{imu.gyro_step_rad_s / DEG_H:.0f} deg/h", f"{imu.accel_step_m_s2 / MG:.1f} mg"
+    grids = f"{imu.gyro_grid_rad_s / DEG_H:.3g} deg/h", f"{imu.accel_grid_m_s2 / MG:.3g} mg"
+    for part, step, grid, edge_rms in zip(TRIADS, steps, grids, _edges(imu), strict=True):
+        undecided, useless_axes = own.undecided[rows_of(part)], own.useless[rows_of(part)]
         if undecided.any():
             useless = bool(useless_axes.any())
             axes = _axes(useless_axes if useless else undecided)
@@ -364,9 +361,9 @@ def _hidden(imu: ImuInput, own: Estimate) -> dict[Triad, Hidden]:
                 " true measures it",
                 useless,
             )
-        elif grid > 0.0 and (own.edge_rms[triad] > EDGE_RMS).any():
+        elif edge_rms > EDGE_RMS:
             found[part] = Hidden(
-                f"{part} {imu.name}: the sensor has coarse steps of its own ({grid:.3g} {unit}) below"
+                f"{part} {imu.name}: the sensor has coarse steps of its own ({grid}) below"
                 " the integers, sigma widened; push.dither = true takes them away",
                 useless=False,
             )
@@ -379,16 +376,35 @@ def _axes(which: NDArray[np.bool_]) -> str:
 
 def _warnings(imu: ImuInput, batches: Sequence[Batch], own: Estimate, rejected: int) -> list[str]:
     found: list[str] = []
-    few, uneven = own.half_step & ~own.undecided, own.edge_rms > EDGE_RMS
-    parts = (("gyro", slice(0, 3), imu.gyro_grid_rad_s), ("accel", slice(3, 6), imu.accel_grid_m_s2))
-    for part, triad, grid in parts:
-        if axes := _axes(few[triad]):
+    for part in TRIADS:
+        if axes := _axes((own.half_step & ~own.undecided)[rows_of(part)]):
             found.append(f"{part} {imu.name} {axes}: fewer than 3 distinct readings, half a step may be hidden")
-        if not grid and (axes := _axes(uneven[triad])):
-            why = "a coarser step inside the sensor?"
-            found.append(f"{part} {imu.name} {axes}: integers not spread like noise ({why}), sigma widened")
     if (share := lost(batches)) > _LOST_WARNING:
         found.append(f"imu {imu.name} lost {share:.0%} of its samples")
     if rejected:
         found.append(f"{rejected} of {rejected + len(batches)} s were not still and are left out")
     return found
+
+
+def _refuse_broken(imu: ImuInput, batches: Sequence[Batch]) -> None:
+    low = np.min([batch.low for batch in batches], axis=0)
+    high = np.max([batch.high for batch in batches], axis=0)
+    floats = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3) == 0.0
+    for column in np.flatnonzero((low == high) & floats).tolist():
+        part = f"{TRIADS[column // 3]} {imu.name}"
+        raise CalibrationRefusedError(f"{part} is stuck: axis {'xyz'[column % 3]} did not change in {len(batches)} s")
+    if (share := lost(batches)) > _LOST_REFUSAL:
+        raise CalibrationRefusedError(f"imu {imu.name} lost {share:.0%} of its samples, more than {_LOST_REFUSAL:.0%}")
+
+
+def lost(batches: Sequence[Batch]) -> float:
+    """Return the share of lost samples: by the device's counter, else against the usual number in a second."""
+    usual = float(np.median([batch.n for batch in batches]))
+    missing = came = 0.0
+    for batch in batches:
+        came += batch.n
+        if batch.missing is not None:
+            missing += batch.missing
+        elif batch.n < _USUAL_SHARE * usual:
+            missing += usual - batch.n
+    return missing / (missing + came)

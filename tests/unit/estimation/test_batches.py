@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.estimation.means.losses import lost
+from companion.estimation.means.windows import lost
 from companion.estimation.seconds.batch import MAX_SAMPLES, Batch, BatchSource
 
 

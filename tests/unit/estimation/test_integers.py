@@ -1,16 +1,20 @@
-"""Windows of truncated streams against the truth they were cut from: means, sigmas, ramps, knocks, refusals."""
+"""Truncated streams against the truth that they were cut from: windows, then the fit against sums by hand."""
 
 from __future__ import annotations
 
 import math
 
+import hypothesis
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from companion.config.sections import NoiseProfile
 from companion.estimation.collector.outlook import is_enough
+from companion.estimation.means.integers import MIN_BEYOND_TWO, fit, shape_variance, truncation_edges
 from companion.estimation.means.windows import ImuEstimate, ImuInput, imu_estimates, integer_steps
 from companion.estimation.seconds.batch import MAX_LEVELS, Batch, BatchSource
 from companion.physics.units import DEG_H, MG
@@ -256,3 +260,130 @@ def test_steps_of_the_sensors_own_below_the_integers_are_in_sigma_where_they_are
     for pulls in (known[:, :3], known[:, 3:]):
         assert 0.3 < np.sqrt(np.nanmean(np.square(pulls))) < 1.0
         assert np.nanmax(np.abs(pulls)) < 2.0
+
+
+# --- the fit
+
+Cells = tuple[Floats, Floats]
+
+
+def counted(integers: Floats) -> Cells:
+    """Edges and counts of (n, c) integers."""
+    lowest = integers.min(axis=0).astype(np.int64)
+    place = integers.astype(np.int64) - lowest
+    levels = int(place.max()) + 1
+    counts = np.stack([np.bincount(column, minlength=levels) for column in place.T], axis=1)
+    return truncation_edges(lowest, levels), counts.astype(np.float64)
+
+
+def drawn(seed: int, mean: Floats | float, sigma: Floats | float, n: int, columns: int) -> Cells:
+    rng = np.random.default_rng(seed)
+    # int() of C and Python and trunc() of numpy all cut toward zero; this one is by hand.
+    exact = rng.normal(mean, sigma, (n, columns))
+    return counted(np.where(exact < 0.0, -np.floor(-exact), np.floor(exact)))
+
+
+def by_hand(cells: Cells, mean: float, sigma: float) -> float:
+    """Log-likelihood of the first column, from the error function."""
+    total = 0.0
+    edges, counts = cells
+    for low, high, count in zip(edges[:-1, 0], edges[1:, 0], counts[:, 0], strict=True):
+        if count:
+            below, above = ((edge - mean) / (sigma * math.sqrt(2.0)) for edge in (low, high))
+            total += count * math.log(0.5 * (math.erfc(below) - math.erfc(above)))
+    return total
+
+
+def test_the_edges_are_those_of_a_cut_toward_zero() -> None:
+    edges = truncation_edges(np.array([-3]), 7)[:, 0]
+    for value in np.linspace(-3.995, 3.995, 800).tolist():
+        cell = int(np.searchsorted(edges, value)) - 1
+        assert cell - 3 == int(value)
+
+
+@pytest.mark.parametrize(("mean", "sigma"), [(0.6, 0.6), (-1.1, 0.35), (0.05, 0.6), (2.5, 1.3), (-40.3, 0.5)])
+def test_no_other_mean_and_sigma_are_likelier(mean: float, sigma: float) -> None:
+    cells = drawn(1, mean, sigma, 3000, 1)
+    found = fit(*cells)
+    best = by_hand(cells, float(found.mean[0]), float(found.sigma[0]))
+    for off_mean in np.linspace(-0.2, 0.2, 21):
+        for off_sigma in np.linspace(-0.15, 0.15, 21):
+            other = by_hand(cells, float(found.mean[0]) + off_mean, float(found.sigma[0]) + off_sigma)
+            assert other <= best + 1e-6
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.386, 0.5, 0.75, 1.0, 2.0])
+@pytest.mark.parametrize("n", [2000, 6000])
+def test_the_standard_error_is_the_error_over_the_whole_range_of_means(sigma: float, n: int) -> None:
+    """400 draws with means all over -3..3 LSB, the dead band in the middle of them."""
+    means = np.random.default_rng(n).uniform(-3.0, 3.0, 400)
+    found = fit(*drawn(int(1000 * sigma), means, sigma, n, 400))
+    pulls = ((found.mean - means) / np.sqrt(found.variance))[found.identified]
+    assert len(pulls) > 100
+    # The standard error of an rms of 100 is 7 %.
+    assert 0.85 < math.sqrt(float(np.mean(np.square(pulls)))) < 1.15
+    assert abs(float(np.mean(pulls))) < 4.0 / math.sqrt(len(pulls))
+    assert float(np.abs(pulls).max()) < 4.5
+
+
+def test_a_barely_occupied_third_value_has_an_honest_error_from_the_least_share_on() -> None:
+    """Just above the limit, where the luck of a dozen readings decides; twice as noisy as asked for would be 2."""
+    rng = np.random.default_rng(5)
+    pulls: list[float] = []
+    for seed in range(12):
+        means = rng.uniform(-2.0, 2.0, 400)
+        edges, counts = drawn(seed, means, rng.uniform(0.25, 0.4), 6000, 400)
+        found = fit(edges, counts)
+        rare = found.identified & (np.sort(counts, axis=0)[:-2].sum(axis=0) < 2.0 * MIN_BEYOND_TWO)
+        pulls += ((found.mean - means) / np.sqrt(found.variance))[rare].tolist()
+    assert len(pulls) > 150
+    assert 0.85 < math.sqrt(float(np.mean(np.square(pulls)))) < 1.15
+
+
+def test_the_mean_in_the_case_that_was_measured_on_a_real_autopilot() -> None:
+    """Autopilots 9.3.1, case A: accelerometer by likelihood 6 ug."""
+    accel = np.tile([88.1, 51.4, -994.3], 100)
+    found = fit(*drawn(7, accel, 0.33, 6000, 300))
+    off = (found.mean - accel)[found.identified] * 1000.0
+    assert math.sqrt(float(np.mean(np.square(off)))) < 9.0
+
+
+def test_two_integers_are_not_enough_without_a_sigma_and_are_with_one() -> None:
+    cells = truncation_edges(np.array([5, 5]), 2), np.array([[700.0, 700.0], [300.0, 300.0]])
+    assert not fit(*cells).identified.any()
+    found = fit(*cells, np.array([0.1, math.nan]))
+    assert found.identified.tolist() == [True, False]
+    # 30 % lie above 6: the mean is 0.5244 sigma below it.
+    assert found.mean[0] == pytest.approx(6.0 - 0.524401 * 0.1, abs=1e-5)
+    # One integer alone: no mean, whatever the sigma.
+    assert not fit(truncation_edges(np.array([5]), 1), np.array([[1000.0]]), np.array([0.3])).identified.any()
+
+
+@hypothesis.example(lowest=0, counts=[1, 1, *[0] * 17], sigma=1.0000000000000002e-06)
+@hypothesis.settings(max_examples=200)
+@given(
+    lowest=st.integers(-40000, 40000),
+    counts=st.lists(st.integers(0, 5000), min_size=1, max_size=40),
+    sigma=st.none() | st.floats(1e-6, 1e6),
+)
+def test_nothing_is_ever_nan(lowest: int, counts: list[int], sigma: float | None) -> None:
+    edges = truncation_edges(np.array([lowest]), len(counts))
+    with np.errstate(all="raise", under="ignore"):
+        found = fit(edges, np.array(counts, dtype=np.float64)[:, None], None if sigma is None else np.array([sigma]))
+        shape = shape_variance(found, np.zeros(1))
+    for figure in (found.mean, found.sigma, found.variance, found.influence, shape):
+        assert np.isfinite(figure).all()
+    if found.identified[0] and sigma is None:
+        values = np.flatnonzero(counts) + lowest
+        assert values[0] - 1.0 <= found.mean[0] <= values[-1] + 1.0
+
+
+@hypothesis.settings(max_examples=50)
+@given(mean=st.floats(-3.0, 3.0), sigma=st.floats(0.3, 2.0), seed=st.integers(0, 10**6))
+def test_the_mirror_image_has_the_mirrored_mean(mean: float, sigma: float, seed: int) -> None:
+    exact = np.random.default_rng(seed).normal(mean, sigma, (4000, 1))
+    one, other = fit(*counted(np.trunc(exact))), fit(*counted(np.trunc(-exact)))
+    assert one.identified[0] == other.identified[0]
+    if one.identified[0]:
+        assert other.mean[0] == pytest.approx(-one.mean[0], abs=1e-6)
+        assert other.variance[0] == pytest.approx(one.variance[0], rel=1e-4)
