@@ -129,13 +129,6 @@ def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s
         notes.append("less than 20 min at rest: an hour tells N and B, a night K too")
     if moved_s := sum(each.seconds - each.still_s for each in found):
         notes.append(f"{moved_s} s were not at rest and are left out{f' ({obstacle})' if obstacle else ''}")
-    for name, fit, *_ in _named(finding):
-        if fit.excess is not None:
-            span, ratio = fit.excess
-            notes.append(
-                f"{name}: {ratio:.1f} times the noise that N, B and K make of {span} s: something periodic, or steps;"
-                " B allows for it"
-            )
     return Result(imu, whole, found, finding, against, notes)
 
 

@@ -6,7 +6,6 @@ A figure that the recordings are too short for is borrowed from another profile,
 from __future__ import annotations
 
 import itertools
-import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import Final
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 
 from companion.config.sections import AllanModel, NoiseProfile
 from companion.errors import CalibrationRefusedError
-from companion.estimation.noise.allan import FLOOR_OF_FLICKER
 from companion.estimation.noise.allan_fit import AxisFit, curve, fit_axis
 from companion.estimation.seconds.batch import Batch, summary
 from companion.estimation.stillness.gates import ImuGate
@@ -162,15 +160,4 @@ def _triad(axes: Sequence[AxisFit], fallback: AllanModel) -> tuple[AllanModel, l
             chosen[which] = max(chosen[which], figure)
         if not shown:
             unknown.append(which)
-    white, flicker, walk = chosen
-    return AllanModel(white, max(flicker, *(_flicker_over(axis) for axis in axes)), walk), unknown
-
-
-def _flicker_over(fit: AxisFit) -> float:
-    """Raise B until the Allan deviation lies nowhere above the model: noise of another kind counts as flicker."""
-    white, flicker, walk = fit.figures
-    if fit.excess is None:
-        return flicker
-    span, ratio = fit.excess
-    model = white**2 / span + (FLOOR_OF_FLICKER * flicker) ** 2 + walk**2 * span / 3.0
-    return math.sqrt(flicker**2 + (ratio**2 - 1.0) * model / FLOOR_OF_FLICKER**2)
+    return AllanModel(*chosen), unknown

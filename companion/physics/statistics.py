@@ -34,9 +34,3 @@ def chi_square_ratio(freedom: Floats | float, sigmas: float) -> Floats:
     """
     spread = 2.0 / (9.0 * np.asarray(freedom))
     return np.asarray((1.0 - spread + sigmas * np.sqrt(spread)) ** 3)
-
-
-def chi_square_sigmas(ratio: float, freedom: float) -> float:
-    """Give how many sigmas a variance estimate over its variance is from the usual one; inverts `chi_square_ratio`."""
-    spread = 2.0 / (9.0 * freedom)
-    return (math.cbrt(ratio) - 1.0 + spread) / math.sqrt(spread)

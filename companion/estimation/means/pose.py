@@ -41,7 +41,7 @@ class GradienterModel:
     """By which it follows the truth."""
 
     def up(self, x_deg: float, y_deg: float) -> Array:
-        """Up in the vehicle's axes, (3,), by readings without an offset: which zero is in force may be known later.
+        """Return up in the vehicle's axes, (3,), from readings without an offset.
 
         Raises:
             ValueError: the readings cannot belong together.
@@ -67,7 +67,7 @@ class CompassModel:
     """By which it follows the truth."""
 
     def sigma_at(self, up: Array) -> float:
-        """Its sigma in degrees where `up`, shape (3,), is up in the vehicle's axes."""
+        """Return sigma in degrees where `up`, shape (3,), is up in the vehicle's axes."""
         upright = float(-(self.vehicle_from_sensor.T @ up)[2])
         if self.tilted_sigma_deg is None or upright >= LEVEL_COSINE:
             return self.sigma_deg
@@ -75,15 +75,15 @@ class CompassModel:
 
 
 def up_in_vehicle(model: GradienterModel, x_deg: float, y_deg: float) -> Array:
-    """Up in the vehicle's axes, shape (3,), from the gradienter's two readings; raises as `GradienterModel.up`."""
+    """Return up in the vehicle's axes, (3,), from the gradienter's two readings; raises as `GradienterModel.up`."""
     return model.up(x_deg - model.offset_deg[0], y_deg - model.offset_deg[1])
 
 
 def vehicle_heading_rad(compass: CompassModel, heading_deg: float, up: Array) -> float:
-    """Heading of the vehicle, from the compass' own north (magnetic or true), not wrapped.
+    """Return the heading of the vehicle from the compass' own north (magnetic or true), not wrapped.
 
-    A compass gives the azimuth of its own forward axis. The azimuth that this axis has when the vehicle heads
-    north, at the tilt it has, is what the mounting adds.
+    A compass gives the azimuth of its own forward axis. The mounting adds the azimuth that this axis has, at the
+    present tilt, when the vehicle heads north.
     """
     gamma, theta = roll_pitch_from_up(up)
     forward_ned = body_from_ned(gamma, theta, 0.0).T @ compass.vehicle_from_sensor[:, 0]
@@ -124,20 +124,20 @@ class FieldWindow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def tilt_window(batches: Sequence[Batch]) -> TiltWindow:
-    """The gradienter's window from its good batches, at least one."""
-    mean, sigma = _pose_mean(batches, np.array([batch.mean for batch in batches]))
+    """Average the gradienter's good batches, at least one."""
+    (x_deg, y_deg), (x_sigma_deg, y_sigma_deg) = _pose_mean(batches, np.array([batch.mean for batch in batches]))
     temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
     return TiltWindow(
-        x_deg=float(mean[0]),
-        y_deg=float(mean[1]),
-        x_sigma_deg=float(sigma[0]),
-        y_sigma_deg=float(sigma[1]),
+        x_deg=float(x_deg),
+        y_deg=float(y_deg),
+        x_sigma_deg=float(x_sigma_deg),
+        y_sigma_deg=float(y_sigma_deg),
         temperature_degc=float(np.mean(temperatures)) if temperatures else None,
     )
 
 
 def heading_window(batches: Sequence[Batch], *, from_field: bool, wander_deg: float | None) -> HeadingWindow:
-    """The compass' window from its good batches, at least one."""
+    """Average the compass' good batches, at least one."""
     first = batches[0].mean
     turned = np.array([np.mod(batch.mean - first + 180.0, 360.0) - 180.0 for batch in batches])
     mean, sigma = _pose_mean(batches, turned)
@@ -171,12 +171,12 @@ _LIMITS: Final = (1e6,) * 3
 
 
 class FieldHeading:
-    """Takes tilts and fields, gives headings of the compass' own forward axis from magnetic north."""
+    """Headings of the compass' own forward axis from magnetic north, worked out from tilts and fields."""
 
     def __init__(self, compass: CompassModel, gradienter: GradienterModel | None, keep: int) -> None:
         self._compass, self._gradienter = compass, gradienter
         self._keep = keep
-        self._tilt: tuple[float, float, float] | None = None
+        self._tilt: TiltSample | None = None
         self._own_s: float | None = None
         self._begun_s: float | None = None
         self.unit: FieldUnit = "gauss"
@@ -187,22 +187,22 @@ class FieldHeading:
         """Why there is none from the field although one is needed; empty while there is."""
 
     def take_tilt(self, sample: TiltSample) -> None:
-        """Take a reading of the gradienter."""
-        self._tilt = (sample.t_s, sample.x_deg, sample.y_deg)
+        """Add a reading of the gradienter."""
+        self._tilt = sample
 
     def takes_own(self, sample: CompassSample) -> bool:
-        """Take a heading of the device's own; whether it is the one that counts."""
+        """Add a heading of the device's own; return whether it is the one that counts."""
         if self._compass.prefers_field:
             return False
         self._own_s, self.from_field, self.hint = sample.t_s, False, ""
         return True
 
     def add(self, sample: MagSample) -> CompassSample | None:
-        """Take a field; the heading that it gives, where that is the one that counts."""
+        """Add a field; return the heading that it gives, where that is the one that counts."""
         field = self._in_unit(sample)
         if field is None:
             return None
-        self.batches.add(sample.t_s, (float(field[0]), float(field[1]), float(field[2])))
+        self.batches.add(sample.t_s, vector(field))
         if self._begun_s is None:
             self._begun_s = sample.t_s
         since_s = self._begun_s if self._own_s is None else self._own_s
@@ -220,7 +220,7 @@ class FieldHeading:
         return CompassSample(sample.t_s, heading / DEG % 360.0)
 
     def window(self, slots: Sequence[int]) -> FieldWindow | None:
-        """The mean field of these seconds; None where nothing came in them."""
+        """Return the mean field of these seconds; None where nothing came in them."""
         found = [self.batches.batches[slot] for slot in slots if slot in self.batches.batches]
         if not found:
             return None
@@ -228,15 +228,13 @@ class FieldHeading:
         return FieldWindow(field=vector(mean), sigma=vector(sigma), unit=self.unit)
 
     def _in_unit(self, sample: MagSample) -> Array | None:
-        unit: FieldUnit = "gauss"
-        if sample.field_gauss is not None:
-            field = np.array(sample.field_gauss, dtype=np.float64)
-        elif sample.counts is None:
+        scale, read = self._compass.counts_per_gauss, sample.field_gauss
+        unit: FieldUnit = "gauss" if read is not None or scale is not None else "counts"
+        if read is None and sample.counts is None:
             return None
-        elif self._compass.counts_per_gauss is not None:
-            field = np.array(sample.counts, dtype=np.float64) / self._compass.counts_per_gauss
-        else:
-            field, unit = np.array(sample.counts, dtype=np.float64), "counts"
+        field = np.array(sample.counts if read is None else read, dtype=np.float64)
+        if read is None:
+            field /= scale or 1.0
         if not np.isfinite(field).all():
             return None
         if unit != self.unit:
@@ -245,16 +243,16 @@ class FieldHeading:
         return field
 
     def _up(self, t_s: float) -> Array | None:
-        """Up in the vehicle's axes now; without one, `hint` says why."""
+        """Return up in the vehicle's axes now; without one, `hint` says why."""
         if not self._compass.magnetic:
             self.hint = 'compass sends its field only, and that shows magnetic north, not reference = "true"'
         elif self._gradienter is None:
             self.hint = "compass sends its field only: a heading from it needs a gradienter"
-        elif self._tilt is None or not abs(t_s - self._tilt[0]) <= OLDEST_TILT_S:
+        elif self._tilt is None or not abs(t_s - self._tilt.t_s) <= OLDEST_TILT_S:
             self.hint = "compass sends its field only: no tilt from the gradienter to work out the heading"
         else:
             try:
-                up = up_in_vehicle(self._gradienter, self._tilt[1], self._tilt[2])
+                up = up_in_vehicle(self._gradienter, self._tilt.x_deg, self._tilt.y_deg)
                 if np.isfinite(up).all():
                     return up
             except ValueError as error:

@@ -26,7 +26,6 @@ QUICKEST_S: Final = 60.0
 NEXT_S: Final = 60.0
 """Time for which an unseen slope is believed to continue."""
 _LATER_S: Final = (120.0, 600.0, 3600.0)
-"""Ages for which the warning predicts sigma."""
 _WORTH_WAITING: Final = 2.0 / 3.0
 """Share of the present sigma below which a later one is worth waiting for."""
 _TEMPERATURE_WARNING_K: Final = 3.0
@@ -88,23 +87,18 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
     """Variances are at most `_UNKNOWN`."""
     warm_up: tuple[float, float]
     """Bias change of gyro and accelerometer in a warm-up of `WARM_UP_K`, rad/s and m/s^2."""
-    lever_s: float
-    """Time from the middle of the window to the middle of the next minute."""
-    k_s: float | None
-    """Rate of the thermometer; None: no thermometer."""
-    k_s_variance: float = 0.0
+    half_s: float
+    """Half of the window's length."""
+    rate: tuple[float, float] | None
+    """Rate of the thermometer, K/s, and its variance; None: no thermometer."""
     path: Path | None = None
     """Temperature through the window; None: no change is known."""
 
     @property
-    def half_s(self) -> float:
-        """Half of the window's length."""
-        return self.lever_s - NEXT_S / 2.0
-
-    @property
     def rate_k_s(self) -> float:
         """Significant rate of the temperature; zero where it may be chance or there is no thermometer."""
-        return self.k_s if self.k_s is not None and abs(self.k_s) > 2.0 * math.sqrt(self.k_s_variance) else 0.0
+        k_s, variance = self.rate or (0.0, 0.0)
+        return k_s if abs(k_s) > 2.0 * math.sqrt(variance) else 0.0
 
     def of(self, triad: Triad) -> Lines:
         """Select one triad."""
@@ -126,25 +120,13 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
 
         `powered_s`: least age of the sensor at the end of the window.
         """
-        prior = self._rate_variance(powered_s) * np.repeat(np.square(self.warm_up), 3) / WARM_UP_K**2
-        share = prior / np.maximum(prior + self.lines.hidden_variance, np.finfo(float).tiny)
-        slope_squared = np.square(share * self.lines.hidden) + share * self.lines.hidden_variance
-        return np.asarray(slope_squared * self.lever_s**2)
-
-    def _rate_variance(self, powered_s: float) -> float:
-        """Mean square of the rate by age and thermometer, (K/s)^2."""
-        prior = likely_k_s(powered_s) ** 2
-        if self.k_s is None:
-            return prior
-        share = prior / (prior + self.k_s_variance)
-        return (share * self.k_s) ** 2 + share * self.k_s_variance
+        by_age = np.asarray(likely_k_s(powered_s) ** 2)
+        rate2 = by_age if self.rate is None else _bounded(by_age, np.asarray(self.rate[0]), np.asarray(self.rate[1]))
+        prior = rate2 * np.repeat(np.square(self.warm_up), 3) / WARM_UP_K**2
+        return _bounded(prior, self.lines.hidden, self.lines.hidden_variance) * (self.half_s + NEXT_S / 2.0) ** 2
 
     def in_words(self, name: str, powered_s: float, other_variance: Floats) -> str:
         """Explain a gyro sigma that is mostly warm-up; empty where it is not. `other_variance`: (6,), the rest."""
-
-        def sigma(age_s: float) -> float:
-            return math.sqrt((self.unseen(age_s)[:3] + other_variance[:3]).max())
-
         if self.unseen(powered_s)[:3].max() <= other_variance[:3].max():
             return ""
         if self.rate_k_s:
@@ -152,9 +134,17 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
             return f"gyro {name}: its temperature moves by {k_min:.1f} K a minute, sigma allows for that"
         age = f"{powered_s:.0f} s" if powered_s < 120.0 else f"{powered_s / 60.0:.0f} min"
         words = f"gyro {name}: on for {age}, may still be warming, sigma allows for that"
-        enough = _WORTH_WAITING * sigma(powered_s)
-        at_s = next((at_s for at_s in _LATER_S if sigma(at_s) <= enough), None)
-        return words if at_s is None else f"{words}; after {at_s / 60.0:.0f} min about {sigma(at_s) / DEG_H:.0f} deg/h"
+        now, *later = (math.sqrt((self.unseen(at_s) + other_variance)[:3].max()) for at_s in (powered_s, *_LATER_S))
+        for at_s, sigma in zip(_LATER_S, later, strict=True):
+            if sigma <= _WORTH_WAITING * now:
+                return f"{words}; after {at_s / 60.0:.0f} min about {sigma / DEG_H:.0f} deg/h"
+        return words
+
+
+def _bounded(prior: Floats, measured: Floats, variance: Floats) -> Floats:
+    """Return the mean square of a slope that was measured with this variance and is likely as large as the prior."""
+    share = prior / np.maximum(prior + variance, np.finfo(float).tiny)
+    return np.asarray(np.square(share * measured) + share * variance)
 
 
 def likely_k_s(powered_s: float) -> float:
@@ -162,12 +152,6 @@ def likely_k_s(powered_s: float) -> float:
     age_s = max(powered_s, 0.0)
     steepest = math.exp(-age_s / QUICKEST_S) / QUICKEST_S if age_s < QUICKEST_S else 1.0 / (math.e * age_s)
     return WARM_UP_K / 2.0 * steepest
-
-
-def temperature_rate(batches: Sequence[Batch]) -> tuple[float, float] | None:
-    """Rate of a thermometer, K/s, and its variance; None without one, or with too few readings."""
-    found = _fitted(batches, 1)
-    return None if found is None else (float(found[0][1]), float(found[1][1]))
 
 
 def temperature_path(batches: Sequence[Batch]) -> Path | None:
@@ -222,15 +206,14 @@ def warming(rotation: Matrix, lines: Lines, warm_up: tuple[float, float], batche
     both, square = np.kron(np.eye(2), rotation), np.kron(np.eye(2), np.square(rotation))
     most = [np.minimum(each, _UNKNOWN) for each in (lines.hidden_variance, lines.variance)]
     hidden_variance, variance = (np.minimum(square @ each, _UNKNOWN) for each in most)
-    rate = temperature_rate(batches)
+    line = _fitted(batches, 1)
     return Warming(
         lines=Lines(
             both @ lines.hidden, hidden_variance, both @ lines.ramp, variance, np.asarray(square @ lines.level_variance)
         ),
         warm_up=warm_up,
-        lever_s=(batches[-1].slot + 1.0 - batches[0].slot + NEXT_S) / 2.0,
-        k_s=None if rate is None else rate[0],
-        k_s_variance=0.0 if rate is None else rate[1],
+        half_s=(batches[-1].slot + 1.0 - batches[0].slot) / 2.0,
+        rate=None if line is None else (float(line[0][1]), float(line[1][1])),
         path=temperature_path(batches),
     )
 

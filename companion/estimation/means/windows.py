@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from companion.config.sections import NoiseProfile
 from companion.errors import CalibrationRefusedError
-from companion.estimation.means.integers import EDGE_RMS, IntegerColumns, integer_columns
+from companion.estimation.means.integers import EDGE_RMS, integer_columns
 from companion.estimation.means.pose import FieldWindow, HeadingWindow, TiltWindow
 from companion.estimation.means.warming import Lines, Warming, drifting, warming
 from companion.estimation.noise.allan import (
@@ -68,7 +68,7 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def integer_steps(imu: ImuInput) -> Floats | None:
-    """(6,) steps of a stream of truncated integers, whose seconds must keep their counts; None for others."""
+    """Return the steps (6,) of a stream of truncated integers, whose seconds keep their counts; None for others."""
     if not imu.truncates or imu.gyro_step_rad_s == imu.accel_step_m_s2 == 0.0:
         return None
     steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
@@ -76,18 +76,18 @@ def integer_steps(imu: ImuInput) -> Floats | None:
 
 
 def _edges(imu: ImuInput) -> tuple[float, float]:
-    """Rms displacement of the integers' edges, in steps, by a grid below; each lies anywhere between two lines."""
+    """Return the rms displacement of the integers' edges, in steps, by a grid below: anywhere between two lines."""
     pairs = ((imu.gyro_grid_rad_s, imu.gyro_step_rad_s), (imu.accel_grid_m_s2, imu.accel_step_m_s2))
     gyro, accel = (grid / step / math.sqrt(12.0) if step > 0.0 else 0.0 for grid, step in pairs)
     return gyro, accel
 
 
 class Hidden(msgspec.Struct, frozen=True):
-    """What the integer readings of one triad do not tell."""
+    """Doubt in the means of one triad of integers."""
 
     words: str
     useless: bool
-    """It is no measurement; else good to half a step."""
+    """The means are no measurement; else good to half a step."""
 
 
 class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
@@ -106,24 +106,24 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     temperature_degc: float | None
     warnings: tuple[str, ...]
     drifting: tuple[str, ...] = ()
-    """What is to be said of its drift, unless it is known where that leads."""
+    """Warnings of a drift, unless a curve of the temperature explains it."""
     hidden: dict[Triad, Hidden] = {}
-    """By triad, where the noise spreads the integers too little for a mean."""
+    """Triads whose noise spreads the integers too little for a mean."""
     dithered: bool = False
-    """Its means come from a dither, in which the telemetry followed every step of the offsets."""
+    """The means come from a dither, in which the telemetry followed every step of the offsets."""
     named: bool = True
-    """Its part is known."""
+    """The part is known."""
     covariance: NDArray[np.float64] | None = None
-    """Of a deck: 6x6 of all axes. Likewise the next."""
+    """6x6 of all axes, on a deck."""
     by_earth: NDArray[np.float64] | None = None
-    """3x3, what the gyro means hold of the Earth's rate (ahead, right, down)."""
+    """3x3, on a deck: share of the Earth's rate (ahead, right, down) in the gyro means."""
     mounting: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     """Rows of the rotation from the sensor's axes."""
     warming: Warming | None = None
-    """What may be hidden of a warm-up; None: nothing."""
+    """Slopes by a warm-up; None: none is allowed for."""
 
     def refused(self, part: Triad) -> str | None:
-        """Why a triad's means are no measurement although they have a figure; None when they are one."""
+        """Return why the means of a triad are no measurement; None when they are one."""
         found = self.hidden.get(part)
         return found.words if found is not None and found.useless else None
 
@@ -137,13 +137,13 @@ class Window(msgspec.Struct, frozen=True, kw_only=True):
     tilt: TiltWindow | None
     heading: HeadingWindow | None
     field: FieldWindow | None = None
-    """Of a compass that gives the field too; its seconds are those of the others, as far as it sent in them."""
+    """Mean field of a compass that sends it, over those of the good seconds in which it came."""
     turn_rad_s: Vector | None = None
-    """Of a deck's mean turn, its axis levelled by the gradienter's readings without an offset."""
+    """Mean turn of a deck, its axis levelled by the gradienter's readings without an offset."""
     powered_s: dict[str, float] = {}
-    """By IMU, for how long it has been switched on at least, at the end."""
+    """Least age of each IMU since its switch-on, at the end."""
     turn: Turn = Turn()
-    """What else was known of the platform's own rate, where it stands still."""
+    """Rate of the platform itself where it stands still."""
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
@@ -153,7 +153,7 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     stat_variance: Floats
     use_variance: Floats
     white_variance: Floats
-    """The part of `use_variance` that more seconds take away."""
+    """Part of `use_variance` that more seconds reduce."""
     white: Floats
     """N in force: measured, or the profile's where that is larger."""
     flicker: Floats
@@ -168,7 +168,7 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ImuEstimate(msgspec.Struct, frozen=True):
-    """Of one IMU, and its window."""
+    """Estimate of one IMU in its own axes and in the vehicle's."""
 
     own: Estimate
     window: ImuWindow
@@ -177,7 +177,7 @@ class ImuEstimate(msgspec.Struct, frozen=True):
 def estimates(
     imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float
 ) -> list[Estimate]:
-    """Every IMU over the same good seconds, at least 2.
+    """Estimate every IMU over the same good seconds, at least 2.
 
     All columns of all IMUs go through each step at once: numpy's cost is by the call, not by the column. A ramp is
     evaluated at the end of the window, `end_s`, and never later; `horizon_s` is H of V(T, H).
@@ -195,7 +195,15 @@ def estimates(
     # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
     named = np.repeat([imu.profile.is_named for imu in imus], 6)
     wander = np.where(named, slope_variance(flicker, walk, end_s - slots[0]), 0.0)
-    mean, leverage, slope, level, hidden = _levelled(slots, values, end_s, whole, wander)
+    mean, leverage = robust_mean(values, whole.huber_c, whole.least), np.full(len(steps), 1.0 / seconds)
+    slope, hidden, level = np.zeros(len(steps)), np.full(len(steps), np.nan), values
+    if len(slots) >= RAMP_BATCHES:
+        times = slots + 0.5
+        line = huber_line(times, values, end_s, whole.huber_c, whole.least)
+        ramps = is_ramp(line, len(slots), wander)
+        slope, hidden = np.where(ramps, line.slope, 0.0), np.where(ramps, 0.0, line.slope)
+        level = values - slope * (times - times.mean())[:, None]
+        mean, leverage = np.where(ramps, line.end, mean), np.where(ramps, line.end_leverage, leverage)
     measured = np.maximum(white_noise(slots, level), whole.least)
     white = np.maximum(measured, np.repeat([model.white for model in models], 3))
     flicker = _flicker(slots, level, measured, flicker)
@@ -242,34 +250,14 @@ def estimates(
     ]
 
 
-def _levelled(
-    slots: NDArray[np.int64], values: Floats, end_s: float, whole: IntegerColumns, wander: Floats
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Means, or the ends of ramps; their leverages; slopes, zero but of ramps; the values without those; other slopes.
-
-    The others are zero of ramps, and NaN where the window is too short for a line.
-    """
-    mean = robust_mean(values, whole.huber_c, whole.least)
-    leverage = np.full(values.shape[1], 1.0 / len(values))
-    if len(values) < RAMP_BATCHES:
-        return mean, leverage, np.zeros(values.shape[1]), values, np.full(values.shape[1], np.nan)
-    times = slots.astype(np.float64) + 0.5
-    line = huber_line(times, values, end_s, whole.huber_c, whole.least)
-    ramps = is_ramp(line, len(values), wander)
-    slope = np.where(ramps, line.slope, 0.0)
-    level = values - slope * (times - times.mean())[:, None]
-    leverage = np.where(ramps, line.end_leverage, leverage)
-    return np.where(ramps, line.end, mean), leverage, slope, level, np.asarray(line.slope - slope)
-
-
 def _columns(values: list[list[Floats]]) -> Floats:
-    """(imus, seconds, 6) as (seconds, 6 * imus)."""
+    """Reshape (imus, seconds, 6) to (seconds, 6 * imus)."""
     stacked = np.array(values)
     return np.asarray(stacked.transpose(1, 0, 2).reshape(stacked.shape[1], -1))
 
 
 def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: Floats) -> Floats:
-    """B of every column: the profile's, or what the Allan deviation at T/5 says more than it and white noise."""
+    """Return B of every column: the profile's, or the excess of the Allan deviation at T/5 over white noise."""
     span = int(slots[-1] - slots[0] + 1) // _ALLAN_SPANS
     if span < 2:
         return profile
@@ -280,7 +268,7 @@ def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: F
 
 
 def _quantisation(batches: Sequence[Sequence[Batch]], steps: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """What a rounded reading's steps may hide, as one sigma a column, and where there are fewer than 3 distinct values.
+    """Return one sigma a column that rounding may hide, and where there are fewer than 3 distinct values.
 
     Half a step for fewer than 3 distinct values; else the bound that noise of sigma leaves, (q / pi) exp(-2 pi^2
     sigma^2 / q^2) (method 2.2 and 2.5).
@@ -301,7 +289,7 @@ def _quantisation(batches: Sequence[Sequence[Batch]], steps: Floats) -> tuple[Fl
 def imu_estimates(
     imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float, rejected: int
 ) -> list[ImuEstimate]:
-    """The windows of all IMUs from their good batches, which are of the same seconds.
+    """Estimate all IMUs from their good batches, which are of the same seconds.
 
     Raises:
         CalibrationRefusedError: an axis never changes, or most samples were lost.
@@ -310,11 +298,8 @@ def imu_estimates(
         return []
     for imu, own in zip(imus, batches, strict=True):
         _refuse_broken(imu, own)
-    found = estimates(imus, batches, end_s=end_s, horizon_s=horizon_s)
-    return [
-        ImuEstimate(own, _imu_window(imu, seconds, own, rejected))
-        for imu, seconds, own in zip(imus, batches, found, strict=True)
-    ]
+    found = zip(imus, batches, estimates(imus, batches, end_s=end_s, horizon_s=horizon_s), strict=True)
+    return [ImuEstimate(own, _imu_window(imu, seconds, own, rejected)) for imu, seconds, own in found]
 
 
 def _imu_window(imu: ImuInput, batches: Sequence[Batch], found: Estimate, rejected: int) -> ImuWindow:
@@ -342,7 +327,7 @@ def _imu_window(imu: ImuInput, batches: Sequence[Batch], found: Estimate, reject
 
 
 def _turned(rotation: Floats, variance: Floats) -> Vector:
-    """Sigmas of independent axes after a rotation."""
+    """Return the sigmas of independent axes after a rotation."""
     return vector(np.sqrt(np.square(rotation) @ variance))
 
 

@@ -9,7 +9,7 @@ wavelets, which together are all that a recording tells.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from companion.estimation.noise.allan import FLOOR_OF_FLICKER, allan_variance
 from companion.physics.frames import Floats, vector
-from companion.physics.statistics import chi_square_sigmas
 
 KNOWN_SIGMAS: Final = 2.0
 """N^2, B^2 or K^2 over its standard error from which the recordings show it: within 25 % of N, B or K."""
@@ -29,9 +28,6 @@ LEAST_SLOTS: Final = 8
 LONGEST_S: Final = 256
 _LONGEST_SHARE: Final = 3
 """The longest average is a third of the stretch: beyond, one difference is all there is."""
-EXCESS_SIGMAS: Final = 4.0
-EXCESS_RATIO: Final = 1.2
-"""An Allan variance so far above the model, in sigmas and by this factor, is noise of another kind."""
 _ROUNDS: Final = 1000
 _UPPER_ROUNDS: Final = 40
 _UNBOUNDED: Final = 1e6
@@ -61,9 +57,6 @@ class AxisFit(msgspec.Struct, frozen=True):
     """One-sided 95 % limits of N, B, K; infinite where the recordings are too short for one."""
     known: tuple[bool, bool, bool]
     """Whether the recordings show each of them."""
-    excess: tuple[int, float] | None = None
-    """Noise of another kind: the averaging time, s, at which the Allan deviation exceeds the model most, and the
-    ratio."""
 
 
 def curve(slots: NDArray[np.int64], values: Floats) -> Curve | None:
@@ -110,41 +103,28 @@ def fit_axis(curves: Sequence[Curve], column: int) -> AxisFit:
         # One stretch with two averaging times tells no three figures: the error of the third comes out large.
         return np.asarray(np.sqrt(np.diag(np.linalg.inv(information + np.diag(1e-12 * np.diag(information))))))
 
+    def upper(which: int) -> float:
+        """Find the square from which an estimate as low as this one is a matter of 5 %; a large one scatters more."""
+        limit = theta.copy()
+        for _ in range(_UPPER_ROUNDS):
+            before = limit[which]
+            limit[which] = theta[which] + UPPER_SIGMAS * errors(limit)[which]
+            if limit[which] <= before * 1.001:
+                return float(limit[which])
+            if limit[which] > _UNBOUNDED:
+                break
+        return math.inf
+
     theta = np.array([1.0, 0.05, 1e-3])
     for _ in range(_ROUNDS):
         # The likelihood of chi-squares rises with every such step, and no figure becomes negative.
         model = design @ theta
         theta = theta * (design.T @ (freedom * variance / np.square(model))) / (design.T @ (freedom / model))
     sigmas = errors(theta)
-    upper = [_upper(errors, theta, which) for which in range(3)]
     n, b, k = (theta > KNOWN_SIGMAS * sigmas).tolist()
     return AxisFit(
         figures=vector(np.sqrt(theta * unit2)),
         sigmas=vector(sigmas * unit2),
-        upper=vector(np.sqrt(np.array(upper) * unit2)),
+        upper=vector(np.sqrt(np.array([upper(which) for which in range(3)]) * unit2)),
         known=(n, b, k),
-        excess=_excess(spans, freedom, variance, design @ theta),
     )
-
-
-def _upper(errors: Callable[[Floats], Floats], theta: Floats, which: int) -> float:
-    limit = theta.copy()
-    for _ in range(_UPPER_ROUNDS):
-        before = limit[which]
-        limit[which] = theta[which] + UPPER_SIGMAS * errors(limit)[which]
-        if limit[which] > _UNBOUNDED:
-            return math.inf
-        if limit[which] <= before * 1.001:
-            return float(limit[which])
-    return math.inf
-
-
-def _excess(spans: Floats, freedom: Floats, variance: Floats, model: Floats) -> tuple[int, float] | None:
-    """Find the averaging time at which all stretches together exceed the model most, if by more than by chance."""
-    found: list[tuple[int, float]] = []
-    for span in np.unique(spans):
-        at = spans == span
-        ratio = float((freedom * variance / model)[at].sum() / freedom[at].sum())
-        if ratio > EXCESS_RATIO and chi_square_sigmas(ratio, float(freedom[at].sum())) > EXCESS_SIGMAS:
-            found.append((int(span), math.sqrt(ratio)))
-    return max(found, key=lambda each: each[1], default=None)

@@ -11,7 +11,7 @@ import pytest
 from companion.config.sections import AllanModel, Imu, NoiseProfile
 from companion.configured.models import imu_input
 from companion.estimation.collector.rolling import RollingCollector
-from companion.estimation.means.warming import Warming, likely_k_s, temperature_rate
+from companion.estimation.means.warming import Warming, likely_k_s
 from companion.estimation.noise.allan import WARM_UP, WARM_UP_K, noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.physics.units import DEG_H, MG
@@ -29,7 +29,13 @@ def with_temperatures(batches: list[Batch], degc: list[float]) -> list[Batch]:
 
 
 def seconds(degc: list[float]) -> list[Batch]:
-    return with_temperatures(batches_of(np.zeros((len(degc), 6))), degc)
+    return with_temperatures(batches_of(np.random.default_rng(1).normal(size=(len(degc), 6))), degc)
+
+
+def rate_of(batches: list[Batch]) -> tuple[float, float] | None:
+    found = window_of(imu(), batches).warming
+    assert isinstance(found, Warming)
+    return found.rate
 
 
 def test_no_warm_up_is_steeper_than_a_curve_of_its_age_can_be() -> None:
@@ -44,23 +50,23 @@ def test_a_thermometers_rate_is_found_and_holds_what_it_says() -> None:
     inside = 0
     for _ in range(200):
         degc = 31.0 + 0.02 * np.arange(30.0) + rng.normal(0.0, 0.05, 30)
-        found = temperature_rate(seconds(degc.tolist()))
+        found = rate_of(seconds(degc.tolist()))
         assert found is not None
         inside += abs(found[0] - 0.02) < 2.0 * math.sqrt(found[1])
     assert 0.90 < inside / 200 < 0.99
-    assert temperature_rate(batches_of(np.zeros((30, 6)))) is None
-    assert temperature_rate(seconds([25.0, 25.0])) is None
+    assert rate_of(batches_of(np.random.default_rng(1).normal(size=(30, 6)))) is None
+    assert rate_of(seconds([25.0, 25.0])) is None
 
 
 @pytest.mark.parametrize("step", [1.0, 0.25, 0.01])
 def test_a_coarse_thermometer_that_stands_still_tells_no_more_than_its_step_allows(step: float) -> None:
     """The fastest that a reading can go through T seconds without showing it is a step in T."""
-    found = temperature_rate(seconds([24.0 + step] * 20))
+    found = rate_of(seconds([24.0 + step] * 20))
     assert found is not None
     assert found[0] == 0.0
     assert step / 20.0 < 2.0 * math.sqrt(found[1]) < 3.0 * step / 20.0
     rounded = np.rint((24.0 + 0.4 * step * np.arange(20.0) / 20.0) / step) * step
-    seen = temperature_rate(seconds(rounded.tolist()))
+    seen = rate_of(seconds(rounded.tolist()))
     assert seen is not None
     assert abs(seen[0] - 0.4 * step / 20.0) < 2.0 * math.sqrt(seen[1])
 
