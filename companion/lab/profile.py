@@ -29,7 +29,6 @@ MIN_SECONDS: Final = 16
 LEAST_STILL_S: Final = 60
 """Least seconds at rest: a calibration measures as much itself."""
 _MIN_GOOD: Final = 10
-_AXES: Final = tuple(f"{triad} {axis}" for triad in TRIADS for axis in "xyz")
 _NAMES: Final = ("N", "B", "K")
 
 
@@ -131,12 +130,11 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Fin
     still_s = sum(len(rest.slots) for rest in rests)
     if still_s < LEAST_STILL_S:
         raise CalibrationRefusedError(f"only {still_s} s at rest; a profile needs {LEAST_STILL_S} s, better an hour")
-    curves = [found for rest in rests if (found := curve(rest.slots, rest.means)) is not None]
-    axes: list[AxisFit] = []
-    for column, axis in enumerate(_AXES):
-        if not any(each.variance[0, column] > 0.0 for each in curves):
-            raise CalibrationRefusedError(f"{axis} never changes: its noise is below its last digit")
-        axes.append(fit_axis(curves, column))
+    found = curve((rest.slots, rest.means) for rest in rests)
+    for column in np.flatnonzero((found.variance == 0.0).all(axis=0)).tolist():
+        axis = f"{TRIADS[column // 3]} {'xyz'[column % 3]}"
+        raise CalibrationRefusedError(f"{axis} never changes: its noise is below its last digit")
+    axes = [fit_axis(found, column) for column in range(6)]
     models, kept = [], []
     for triad in TRIADS:
         model, unknown = _triad(axes[rows_of(triad)], fallback.of(triad))

@@ -9,8 +9,8 @@ wavelets, which together are all that a recording tells.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Iterable
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -33,17 +33,17 @@ _UPPER_ROUNDS: Final = 40
 _UNBOUNDED: Final = 1e6
 
 
-class Curve(msgspec.Struct, frozen=True):
-    """Allan variances of one stretch."""
+class Curve(NamedTuple):
+    """Allan variances of all stretches of a recording at rest; a row for each averaging time of each stretch."""
 
     spans: Floats
     """(k,) averaging times, s."""
     counts: Floats
     """(k,) seconds in an average; fewer where the stretch has holes."""
-    variance: Floats
-    """(k, c)."""
     freedom: Floats
     """(k,) independent squares."""
+    variance: Floats
+    """(k, c)."""
 
 
 class AxisFit(msgspec.Struct, frozen=True):
@@ -59,42 +59,40 @@ class AxisFit(msgspec.Struct, frozen=True):
     """Whether the recordings show each of them."""
 
 
-def curve(slots: NDArray[np.int64], values: Floats) -> Curve | None:
-    """Compute the Allan variances of one stretch from means (m, c) of ascending seconds; None where it is too short."""
-    if len(slots) < LEAST_SLOTS:
-        return None
-    length = int(slots[-1] - slots[0]) + 1
-    spans, rows = [], []
-    span = 1
-    while span <= min(length // _LONGEST_SHARE, LONGEST_S):
-        variance, freedom = allan_variance(slots, values, span)
-        if freedom > 0.0:
-            spans.append(span)
-            rows.append(variance)
-        span *= 2
-    if not spans:
-        return None
-    times = np.array(spans, dtype=np.float64)
-    filled = len(slots) / length
-    # One second has no hole; of a longer average only the seconds that are there average white noise away.
-    return Curve(times, np.where(times > 1.0, filled * times, 1.0), np.array(rows), len(slots) / (2.0 * times))
-
-
-def fit_axis(curves: Sequence[Curve], column: int) -> AxisFit:
-    """Estimate N, B and K of one column over all stretches.
+def curve(stretches: Iterable[tuple[NDArray[np.int64], Floats]]) -> Curve:
+    """Compute the Allan variances from the means (m, c) of ascending seconds (m,) of each stretch.
 
     Raises:
-        ValueError: no curve, or a column that never changes.
+        ValueError: every stretch is too short.
     """
-    spans, counts, freedom = (
-        np.concatenate([getattr(each, name) for each in curves] or [np.zeros(0)])
-        for name in ("spans", "counts", "freedom")
-    )
-    variance = np.concatenate([each.variance[:, column] for each in curves] or [np.zeros(0)])
+    rows = []
+    for slots, values in stretches:
+        length = int(slots[-1] - slots[0]) + 1
+        filled = len(slots) / length
+        span = 1
+        while span <= min(length // _LONGEST_SHARE, LONGEST_S) and len(slots) >= LEAST_SLOTS:
+            variance, freedom = allan_variance(slots, values, span)
+            if freedom > 0.0:
+                # One second has no hole; of a longer average only the seconds that are there average noise away.
+                rows.append((span, max(filled * span, 1.0), len(slots) / (2.0 * span), variance))
+            span *= 2
+    if not rows:
+        raise ValueError("nothing to fit: no stretch is long enough")
+    return Curve(*(np.array(column, dtype=np.float64) for column in zip(*rows, strict=True)))
+
+
+def fit_axis(found: Curve, column: int) -> AxisFit:
+    """Estimate N, B and K of one column.
+
+    Raises:
+        ValueError: the column never changes.
+    """
+    spans, counts, freedom, every = found
+    variance = every[:, column]
     # In units of the scatter from second to second, so that no square is small.
-    unit2 = float(variance[spans == 1.0].mean()) if (variance > 0.0).any() else 0.0
+    unit2 = float(variance[spans == 1.0].mean())
     if not unit2 > 0.0:
-        raise ValueError("nothing to fit: no stretch, or readings that never change")
+        raise ValueError("nothing to fit: readings that never change")
     variance = variance / unit2
     design = np.stack([1.0 / counts, np.full(len(spans), FLOOR_OF_FLICKER**2), spans / 3.0], axis=1)
 
