@@ -210,8 +210,8 @@ def _to_save(result: Result, name: str) -> Any:
         name=name,
         saved_at=utc_now(),
         imu=result.imu,
-        gyro=learned.gyro._asdict(),
-        accel=learned.accel._asdict(),
+        gyro=learned.gyro,
+        accel=learned.accel,
         kept_from=result.compared.name,
         kept=result.finding.kept,
         sources=tuple(sources),
@@ -238,14 +238,10 @@ def _object(result: Result) -> dict[str, Any]:
             for log, spans, seconds_s in _used(result)
         ],
         "temperature_degc": _temperatures(result.logs),
-        "profile": _figures(finding.profile),
-        "compared": _figures(result.compared),
+        "profile": msgspec.to_builtins(finding.profile),
+        "compared": msgspec.to_builtins(result.compared),
         "kept": list(finding.kept),
         # An upper limit that nobody knows is infinite; msgspec writes null for it.
         "axes": [{"fit": msgspec.json.decode(msgspec.json.encode(fit))} for fit in finding.axes],
         "notes": result.notes,
     }
-
-
-def _figures(noise: NoiseProfile) -> dict[str, Any]:
-    return {"name": noise.name, "gyro": noise.gyro._asdict(), "accel": noise.accel._asdict(), "warm_up": noise.warm_up}

@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta
@@ -127,7 +127,7 @@ class Mavlink(Section, frozen=True):
         return None if self.signing_key_file is None else secret_path(self.signing_key_file)
 
 
-class AllanModel(NamedTuple):
+class AllanModel(msgspec.Struct, frozen=True):
     """Noise of one axis: rad/s or m/s^2 (times sqrt(s), 1, over sqrt(s))."""
 
     white: float

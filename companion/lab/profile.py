@@ -146,11 +146,12 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Fin
 
 def _triad(axes: Sequence[AxisFit], fallback: AllanModel) -> tuple[AllanModel, list[int]]:
     """Choose one model that promises too much for none of three axes; return it and the figures that no axis shows."""
+    other = fallback.white, fallback.flicker, fallback.walk
     chosen, unknown = [0.0, 0.0, 0.0], []
     for which in range(3):
         shown = [axis.figures[which] for axis in axes if axis.known[which]]
         # The axes of one part are alike: the figure of one is a better guess for the others than another profile.
-        guess = max(shown) if shown else fallback[which]
+        guess = max(shown) if shown else other[which]
         for axis in axes:
             figure = axis.figures[which]
             if not axis.known[which]:

@@ -43,10 +43,8 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     saved_at: str
     imu: str
-    gyro: dict[str, float]
-    """Fields of an `AllanModel`, rad/s."""
-    accel: dict[str, float]
-    """Fields of an `AllanModel`, m/s^2."""
+    gyro: AllanModel
+    accel: AllanModel
     kept_from: str
     """The profile whose figures stand for those in `kept`."""
     kept: tuple[str, ...]
@@ -62,7 +60,7 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
         seconds, many = sum(source.still_s for source in self.sources), len(self.sources)
         recordings = f"{many} recording{'s' if many != 1 else ''}"
         origin = f"learned from {seconds / 3600.0:.1f} h at rest in {recordings}, saved {self.saved_at[:10]}"
-        return NoiseProfile(self.name, AllanModel(**self.gyro), AllanModel(**self.accel), origin, self.warm_up)
+        return NoiseProfile(self.name, self.gyro, self.accel, origin, self.warm_up)
 
 
 def check_name(name: str) -> None:
@@ -137,9 +135,9 @@ def read_profile(path: Path) -> SavedProfile:
     try:
         found: SavedProfile = formats.decode(unsealed(read_regular(path)), SavedProfile, FORMAT_VERSION)
         for model in (found.gyro, found.accel):
-            usable = model.keys() == set(AllanModel._fields) and all(0.0 <= each < math.inf for each in model.values())
-            if not usable or model["white"] == 0.0:
-                raise ValueError(f"found N, B, K of {model}; allowed: N above 0, none negative")
+            figures = msgspec.structs.astuple(model)
+            if not all(0.0 <= each < math.inf for each in figures) or model.white == 0.0:
+                raise ValueError(f"found N, B, K of {figures}; allowed: N above 0, none negative")
         if found.warm_up is not None and not all(0.0 < each < math.inf for each in found.warm_up):
             raise ValueError(f"found warm_up of {found.warm_up}; allowed: above 0")
     except OSError as error:

@@ -198,7 +198,7 @@ def estimates(
     mean, leverage = robust_mean(values, whole.huber_c, whole.least), np.full(len(steps), 1.0 / seconds)
     slope, hidden, level = np.zeros(len(steps)), np.full(len(steps), np.nan), values
     if len(slots) >= RAMP_BATCHES:
-        times = slots + 0.5
+        times = slots.astype(np.float64) + 0.5
         line = huber_line(times, values, end_s, whole.huber_c, whole.least)
         ramps = is_ramp(line, len(slots), wander)
         slope, hidden = np.where(ramps, line.slope, 0.0), np.where(ramps, 0.0, line.slope)

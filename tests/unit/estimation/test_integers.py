@@ -18,7 +18,6 @@ from companion.estimation.means.integers import MIN_BEYOND_TWO, fit, shape_varia
 from companion.estimation.means.windows import ImuEstimate, ImuInput, imu_estimates, integer_steps
 from companion.estimation.seconds.batch import MAX_LEVELS, Batch, BatchSource
 from companion.physics.units import DEG_H, MG
-from companion.recording.messages import encode
 from tests.support.still_aircraft import QUIET, imu, settings
 
 Floats = NDArray[np.float64]
@@ -33,16 +32,14 @@ def stream(profile: NoiseProfile = QUIET) -> ImuInput:
     return imu("fc2", profile, gyro_step_rad_s=MRAD, accel_step_m_s2=MG, truncates=True)
 
 
-def batches_of(exact_lsb: Floats, rate_hz: int = 100, *, split: int | None = None) -> list[Batch]:
+def batches_of(exact_lsb: Floats, rate_hz: int = 100) -> list[Batch]:
     """(n, 6) exact readings in LSB, cut and collected second by second; the first second is not whole and is lost."""
     source = BatchSource((1e3,) * 3 + (1e4,) * 3, 4000)
     source.steps = integer_steps(stream())
     cut = np.where(exact_lsb < 0.0, -np.floor(-exact_lsb), np.floor(exact_lsb)) * STEPS
     times = 99.5 + (np.arange(len(cut)) + 0.5) / rate_hz
-    for index, (t_s, row) in enumerate(zip(times.tolist(), cut.tolist(), strict=True)):
+    for t_s, row in zip(times.tolist(), cut.tolist(), strict=True):
         source.add(t_s, tuple(row))
-        if split is not None and index % split == 0:
-            source.close_before(t_s - 0.25)
     source.close_before(1e9)
     return list(source.batches.values())
 
@@ -122,13 +119,6 @@ def test_noise_behind_a_filter_widens_sigma_by_what_it_scatters_from_second_to_s
         pulls += (errors(found, mean) / whites)[~unknown(found)].tolist()
     assert len(pulls) > 50
     assert 0.75 < math.sqrt(np.mean(np.square(pulls))) < 1.2
-
-
-def test_chunking_does_not_matter() -> None:
-    rng = np.random.default_rng(3)
-    exact = white(rng, 0.7 + GRAVITY_LSB, 0.45, 30)
-    one, other = estimate(batches_of(exact)), estimate(batches_of(exact, split=7))
-    assert encode(one.window) == encode(other.window)
 
 
 def test_a_ramp_is_followed_to_its_end() -> None:
@@ -340,14 +330,6 @@ def test_a_barely_occupied_third_value_has_an_honest_error_from_the_least_share_
     assert 0.85 < math.sqrt(float(np.mean(np.square(pulls)))) < 1.15
 
 
-def test_the_mean_in_the_case_that_was_measured_on_a_real_autopilot() -> None:
-    """Autopilots 9.3.1, case A: accelerometer by likelihood 6 ug."""
-    accel = np.tile([88.1, 51.4, -994.3], 100)
-    found = fit(*drawn(7, accel, 0.33, 6000, 300))
-    off = (found.mean - accel)[found.identified] * 1000.0
-    assert math.sqrt(float(np.mean(np.square(off)))) < 9.0
-
-
 def test_two_integers_are_not_enough_without_a_sigma_and_are_with_one() -> None:
     cells = truncation_edges(np.array([5, 5]), 2), np.array([[700.0, 700.0], [300.0, 300.0]])
     assert not fit(*cells).identified.any()
@@ -376,14 +358,3 @@ def test_nothing_is_ever_nan(lowest: int, counts: list[int], sigma: float | None
     if found.identified[0] and sigma is None:
         values = np.flatnonzero(counts) + lowest
         assert values[0] - 1.0 <= found.mean[0] <= values[-1] + 1.0
-
-
-@hypothesis.settings(max_examples=50)
-@given(mean=st.floats(-3.0, 3.0), sigma=st.floats(0.3, 2.0), seed=st.integers(0, 10**6))
-def test_the_mirror_image_has_the_mirrored_mean(mean: float, sigma: float, seed: int) -> None:
-    exact = np.random.default_rng(seed).normal(mean, sigma, (4000, 1))
-    one, other = fit(*counted(np.trunc(exact))), fit(*counted(np.trunc(-exact)))
-    assert one.identified[0] == other.identified[0]
-    if one.identified[0]:
-        assert other.mean[0] == pytest.approx(-one.mean[0], abs=1e-6)
-        assert other.variance[0] == pytest.approx(one.variance[0], rel=1e-4)

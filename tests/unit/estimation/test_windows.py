@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -61,16 +62,6 @@ def test_sigma_stat_covers_the_truth_in_white_noise(seconds: int) -> None:
         inside += int((miss < 1.96 * sigma).sum())
         total += 6
     assert 0.93 < inside / total < 0.975
-
-
-def test_sigma_stat_is_root_n_squared_over_t() -> None:
-    rng = np.random.default_rng(1)
-    found = []
-    for _ in range(200):
-        window = window_of(imu("fc", QUIET), batches_of(rng.normal(0.0, 3.0, (50, 6))))
-        found.append(np.square(window.gyro_sigma_stat_rad_s))
-    # A few per cent more, for N is known with some 32 degrees of freedom.
-    assert math.sqrt(float(np.mean(found))) == pytest.approx(3.0 / math.sqrt(50.0), rel=0.07)
 
 
 @pytest.mark.parametrize(
@@ -148,12 +139,6 @@ def test_a_ramp_is_neither_white_noise_nor_flicker() -> None:
     assert steep.flicker == pytest.approx(calm.flicker, abs=0.2)
 
 
-def test_no_ramp_is_flagged_in_white_noise() -> None:
-    rng = np.random.default_rng(7)
-    flagged = sum(bool(window_of(imu(), batches_of(rng.normal(size=(20, 6)))).warnings) for _ in range(200))
-    assert flagged <= 2
-
-
 def test_rounding_with_enough_noise_costs_nothing_and_seconds_without_counts_cost_half_a_step() -> None:
     rng = np.random.default_rng(8)
     batches = batches_of(rng.normal(30.0, 0.01, (30, 6)), spread=2.0)
@@ -177,16 +162,7 @@ def test_the_bound_for_rounding_covers_its_bias() -> None:
     for sigma in (0.25, 0.35, 0.5):
         worst = max(abs(mean_of_rounded(true, sigma) - true) for true in np.linspace(0.0, 1.0, 41).tolist())
         batches = batches_of(np.zeros((30, 6)), spread=sigma)
-        for index in range(len(batches)):
-            batches[index] = Batch(
-                **{
-                    name: getattr(batches[index], name)
-                    for name in Batch.__struct_fields__
-                    if name not in {"low", "high"}
-                },
-                low=np.full(6, -1.0),
-                high=np.full(6, 1.0),
-            )
+        batches = [msgspec.structs.replace(batch, low=np.full(6, -1.0), high=np.full(6, 1.0)) for batch in batches]
         window = window_of(imu("fc", QUIET, gyro_step_rad_s=1.0), batches)
         assert worst <= 1.02 * window.gyro_sigma_stat_rad_s[0]
         assert window.gyro_sigma_stat_rad_s[0] < 1.1 * worst
@@ -226,10 +202,8 @@ def test_gradienter_mean_and_sigma() -> None:
 
 
 def test_a_gradienter_that_shows_one_value_has_the_sigma_of_its_last_decimal() -> None:
-    batches = [
-        Batch(**{**{name: getattr(batch, name) for name in Batch.__struct_fields__}, "distinct": np.array([1, 1])})
-        for batch in batches_of(np.tile([1.25, -0.5], (20, 1)), spread=0.0)
-    ]
+    still = batches_of(np.tile([1.25, -0.5], (20, 1)), spread=0.0)
+    batches = [msgspec.structs.replace(batch, distinct=np.array([1, 1])) for batch in still]
     window = tilt_window(batches)
     assert window.x_sigma_deg == pytest.approx(0.01 / math.sqrt(12.0))
     assert window.y_sigma_deg == pytest.approx(0.1 / math.sqrt(12.0))
