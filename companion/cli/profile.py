@@ -20,21 +20,19 @@ if TYPE_CHECKING:
     from companion.config.sections import NoiseProfile
     from companion.estimation.noise.allan_fit import AxisFit
     from companion.lab.logs.log import StillLog
-    from companion.lab.profile import Finding, Rests
+    from companion.lab.profile import LearnedNoise, Rests
 
 SHORT_S: Final = 1200
-MOST_STRETCHES: Final = 6
-"""Most stretches of a recording that are shown; --json has them all."""
 _UNITS: Final = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
 
 
-class Result(NamedTuple):
+class Learned(NamedTuple):
     """Noise of one IMU, and the recordings that it comes from."""
 
     imu: str
     logs: list[StillLog]
     rests: list[Rests]
-    finding: Finding
+    finding: LearnedNoise
     compared: NoiseProfile
     notes: list[str]
 
@@ -93,7 +91,7 @@ async def profile(options: argparse.Namespace) -> int:
     return conclude(options, {**answer, "imus": [_object(result) for result in results]}, lines, good=good)
 
 
-def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float) -> Result:
+def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float) -> Learned:
     """Estimate the noise of one IMU.
 
     Raises:
@@ -129,24 +127,16 @@ def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s
         notes.append("less than 20 min at rest: an hour tells N and B, a night K too")
     if moved_s := sum(each.seconds - each.still_s for each in found):
         notes.append(f"{moved_s} s were not at rest and are left out{f' ({obstacle})' if obstacle else ''}")
-    return Result(imu, whole, found, finding, against, notes)
+    return Learned(imu, whole, found, finding, against, notes)
 
 
-def _named(finding: Finding) -> Iterator[tuple[str, AxisFit, float, str, int]]:
+def _named(finding: LearnedNoise) -> Iterator[tuple[str, AxisFit, float, str, int]]:
     for column, fit in enumerate(finding.axes):
         triad = "gyro" if column < 3 else "accel"
         yield (f"{triad} {'xyz'[column % 3]}", fit, *_UNITS[triad])
 
 
-def _used(result: Result) -> Iterator[tuple[StillLog, list[tuple[float, float]], float]]:
-    """Give each recording with its stretches, in seconds from its beginning, and its length in seconds."""
-    for log, found in zip(result.logs, result.rests, strict=True):
-        begin_s = float(log.t_s[0])
-        spans = [(float(rest.slots[0]) - begin_s, float(rest.slots[-1]) + 1.0 - begin_s) for rest in found.stretches]
-        yield log, spans, float(log.t_s[-1]) - begin_s
-
-
-def _lines(result: Result) -> list[str]:
+def _lines(result: Learned) -> list[str]:
     """Make the lines for people."""
     finding = result.finding
     recordings = f"{len(result.logs)} recording{'s' if len(result.logs) > 1 else ''}"
@@ -162,10 +152,8 @@ def _lines(result: Result) -> list[str]:
             figures = ((model.white, digits), (model.floor, digits), (model.walk, digits + 2))
             table.append((f"{triad}: {name}", [f"{value / unit:.{places}f}" for value, places in figures]))
     lines += [f"{first:24} " + " ".join(f"{cell:>16}" for cell in cells) for first, cells in table]
-    for log, spans, seconds_s in _used(result):
-        shown = ", ".join(f"{from_s:.0f} to {to_s:.0f} s" for from_s, to_s in spans[:MOST_STRETCHES])
-        more = f" and {len(spans) - MOST_STRETCHES} more" if len(spans) > MOST_STRETCHES else ""
-        lines.append(f"used of {', '.join(log.files)}: {shown}{more}, of {seconds_s:.0f} s")
+    for log, found in zip(result.logs, result.rests, strict=True):
+        lines.append(f"used of {', '.join(log.files)}: {found.still_s} of {found.seconds} s")
         lines += [f"left out: {count} lines {why}" for why, count in log.left_out.items()]
         lines += [f"note: {note}" for note in log.notes]
     return lines + [f"note: {note}" for note in result.notes]
@@ -192,12 +180,12 @@ def _temperatures(logs: Sequence[StillLog]) -> tuple[float, float] | None:
     return (float(known.min()), float(known.max())) if len(known) else None
 
 
-def _to_save(result: Result, name: str) -> Any:
-    from companion.storage.profiles import FORMAT_VERSION, SavedProfile, Source
+def _to_save(result: Learned, name: str) -> Any:
+    from companion.storage.profiles import FORMAT_VERSION, ProfileSource, SavedProfile
 
     learned = result.finding.profile
     sources = [
-        Source(
+        ProfileSource(
             file=", ".join(log.files),
             began_at=log.began_at,
             still_s=float(rests.still_s),
@@ -220,7 +208,7 @@ def _to_save(result: Result, name: str) -> Any:
     )
 
 
-def _object(result: Result) -> dict[str, Any]:
+def _object(result: Learned) -> dict[str, Any]:
     """Make the object for --json."""
     finding = result.finding
     return {
@@ -229,13 +217,8 @@ def _object(result: Result) -> dict[str, Any]:
         "seconds": sum(each.seconds for each in result.rests),
         "recordings": [", ".join(log.files) for log in result.logs],
         "used": [
-            {
-                "seconds": seconds_s,
-                "stretches": [{"from_s": from_s, "to_s": to_s} for from_s, to_s in spans],
-                "left_out": log.left_out,
-                "notes": log.notes,
-            }
-            for log, spans, seconds_s in _used(result)
+            {"seconds": found.seconds, "still_s": found.still_s, "left_out": log.left_out, "notes": log.notes}
+            for log, found in zip(result.logs, result.rests, strict=True)
         ],
         "temperature_degc": _temperatures(result.logs),
         "profile": msgspec.to_builtins(finding.profile),

@@ -150,7 +150,7 @@ class NoiseProfile(msgspec.Struct, frozen=True):
     gyro: AllanModel
     accel: AllanModel
     origin: str = ""
-    """How a saved profile was learned, in words."""
+    """Words: the recordings that a saved profile was learned from."""
     warm_up: tuple[float, float] | None = None
     """Two sigma of the bias change from cold to warm, rad/s and m/s^2; None: not known."""
 
@@ -160,7 +160,7 @@ class NoiseProfile(msgspec.Struct, frozen=True):
 
     @property
     def is_named(self) -> bool:
-        """Whether the profile is of a known part."""
+        """True: the profile is of a known part."""
         return self.name != UNKNOWN
 
 

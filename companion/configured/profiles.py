@@ -28,40 +28,44 @@ class Profiles:
     def __init__(self, config: Config) -> None:
         self._config = config
         self._imus = {imu.name: imu for imu in config.imu}
-        self._parts: dict[str, Profile] = {}
+        self._parts: dict[str, Profile | None] = {}
 
     def found(self, name: str, part: Profile | None) -> bool:
-        """The autopilot says which part an IMU is, or that it does not know; whether that changes its profile."""
+        """Set the part that the autopilot names for an IMU, None where it knows none; return whether that matters."""
         before = self.of(name)
-        if part is None:
-            self._parts.pop(name, None)
-        else:
-            self._parts[name] = part
+        self._parts[name] = part
         return self.of(name) != before
 
     def of(self, name: str) -> str | NoiseProfile | None:
-        """The profile of an IMU; None: nobody has named its part."""
+        """Return the profile of an IMU; None: nobody has named its part."""
         return self._imus[name].profile or self._parts.get(name)
 
     def imu(self, name: str) -> Imu:
-        """The configuration of an IMU, with its profile in it."""
+        """Return the configuration of an IMU with its profile."""
         return msgspec.structs.replace(self._imus[name], profile=self.of(name))
 
     def status(self) -> list[dict[str, object]]:
-        """For `companion status`."""
-        store = ProfileStore(self._config.storage.path)
+        """Describe each IMU's profile for `companion status`."""
         found: list[dict[str, object]] = []
-        for name in self._imus:
-            profile = self.of(name)
-            fitted = profile.name if isinstance(profile, NoiseProfile) else None
+        for name, imu in self._imus.items():
+            profile, file = self.of(name), None
+            by_device_id = imu.profile is None and profile is not None
+            if isinstance(profile, NoiseProfile):
+                file, summary = ProfileStore(self._config.storage.path).path(profile.name), profile.origin
+                profile = profile.name
+            elif profile in (None, UNKNOWN):
+                summary = self._price_of_unknown
+            else:
+                summary = f"of the catalogue{', by its device id' if by_device_id else ''}"
+            label = "part unknown: " if profile in (None, UNKNOWN) else f"{profile}, "
             found.append(
                 {
                     "imu": name,
-                    "name": fitted or profile,
-                    "fitted": fitted is not None,
-                    "by_device_id": self._imus[name].profile is None and profile is not None,
-                    "file": None if fitted is None else str(store.path(fitted)),
-                    "summary": self._in_words(name),
+                    "name": profile,
+                    "fitted": file is not None,
+                    "by_device_id": by_device_id,
+                    "file": None if file is None else str(file),
+                    "summary": label + summary,
                 }
             )
         return found
@@ -71,12 +75,3 @@ class Profiles:
         *known, (_, unknown) = gyro_sigmas_deg_h(self._config).items()
         others = ", ".join(f"{part} {sigma:.0f}" for part, sigma in known)
         return f"gyros known to {unknown:.0f} deg/h at best ({others})"
-
-    def _in_words(self, name: str) -> str:
-        profile = self.of(name)
-        if isinstance(profile, NoiseProfile):
-            return f"{profile.name}, {profile.origin}"
-        if profile in (None, UNKNOWN):
-            return f"part unknown: {self._price_of_unknown}"
-        by = "" if self._imus[name].profile is not None else ", by its device id"
-        return f"{profile}, of the catalogue{by}"

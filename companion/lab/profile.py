@@ -56,7 +56,7 @@ class Rests(msgspec.Struct, frozen=True):
         return sum(len(rest.slots) for rest in self.stretches)
 
 
-class Finding(msgspec.Struct, frozen=True, kw_only=True):
+class LearnedNoise(msgspec.Struct, frozen=True, kw_only=True):
     """Noise of one IMU by its recordings."""
 
     profile: NoiseProfile
@@ -121,7 +121,7 @@ def rests(t_s: Floats, readings: Floats, name: str, profile: NoiseProfile) -> Re
     return Rests(tuple(stretches), len(batches), obstacle)
 
 
-def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Finding:
+def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> LearnedNoise:
     """Estimate the noise of one IMU from all its stretches at rest.
 
     Raises:
@@ -141,7 +141,7 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Fin
         models.append(model)
         kept += [f"{triad} {_NAMES[which]}" for which in unknown]
     profile = NoiseProfile(name, models[0], models[1], warm_up=fallback.warm_up)
-    return Finding(profile=profile, axes=tuple(axes), kept=tuple(kept), still_s=still_s)
+    return LearnedNoise(profile=profile, axes=tuple(axes), kept=tuple(kept), still_s=still_s)
 
 
 def _triad(axes: Sequence[AxisFit], fallback: AllanModel) -> tuple[AllanModel, list[int]]:

@@ -25,7 +25,7 @@ _NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]{0,39}")
 _FILE: Final = re.compile(rf"({_NAME.pattern})\.json")
 
 
-class Source(msgspec.Struct, frozen=True, kw_only=True):
+class ProfileSource(msgspec.Struct, frozen=True, kw_only=True):
     """One recording that a profile was learned from."""
 
     file: str
@@ -49,10 +49,10 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
     """The profile whose figures stand for those in `kept`."""
     kept: tuple[str, ...]
     """Figures that the recordings were too short to tell."""
-    sources: tuple[Source, ...]
+    sources: tuple[ProfileSource, ...]
     notes: tuple[str, ...] = ()
     warm_up: tuple[float, float] | None = None
-    """As in `NoiseProfile`."""
+    """Two sigma of the bias change from cold to warm, rad/s and m/s^2; null: not known."""
 
     @property
     def profile(self) -> NoiseProfile:

@@ -26,7 +26,7 @@ from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.record import ImuRecord, Record
 from companion.estimation.request import What
 from companion.protocols.registry import PROTOCOLS
-from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, saved_profile
+from companion.storage.profiles import FORMAT_VERSION, ProfileSource, ProfileStore, SavedProfile, saved_profile
 from sim.aircraft import Pose, VirtualAircraft
 from sim.ardupilot.double import ArduPilotDouble
 from sim.devices import SerialDevice
@@ -138,7 +138,7 @@ def calm() -> SavedProfile:
         accel=part.accel,
         kept_from=part.name,
         kept=(),
-        sources=(Source(file="a.csv", began_at=None, still_s=5400.0, temperature_degc=None),),
+        sources=(ProfileSource(file="a.csv", began_at=None, still_s=5400.0, temperature_degc=None),),
         warm_up=(10.0 * DEG_H, 0.1 * MG),
     )
 

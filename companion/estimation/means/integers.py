@@ -172,7 +172,7 @@ class IntegerColumns(msgspec.Struct, frozen=True):
     """Figures of the truncated columns among those of all streams; (c,) or (m, c), SI units."""
 
     of: NDArray[np.bool_]
-    """Whether a column is truncated; the other figures of the rest are neutral."""
+    """True: the column is truncated; the other figures of the rest are neutral."""
     values: Floats
     """(m, c) mean of every second."""
     huber_c: Floats

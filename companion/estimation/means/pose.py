@@ -31,14 +31,14 @@ LEVEL_COSINE: Final = math.cos(2.0 * DEG)
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class GradienterModel:
-    """How a gradienter's readings become the direction of up in the vehicle: law, zero offset, mounting, sigma."""
+    """Gradienter model for up in the vehicle: law, zero offset, mounting, sigma."""
 
     law: Law
     vehicle_from_sensor: Matrix
     offset_deg: tuple[float, float]
     sigma_deg: float
     lag_s: float = 0.0
-    """By which it follows the truth."""
+    """Time constant of the device."""
 
     def up(self, x_deg: float, y_deg: float) -> Array:
         """Return up in the vehicle's axes, (3,), from readings without an offset.
@@ -51,20 +51,20 @@ class GradienterModel:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class CompassModel:
-    """How a compass reading becomes a true heading: reference, offset, mounting, sigma."""
+    """Compass model for a true heading: reference, offset, mounting, sigma."""
 
     magnetic: bool
     vehicle_from_sensor: Matrix
     offset_deg: float
     sigma_deg: float
     counts_per_gauss: float | None = None
-    """Of a device that gives its field in counts; None: only their direction means something."""
+    """Scale of a field in counts; None: only its direction is known."""
     prefers_field: bool = False
     """The heading is worked out from the field even where the device gives one of its own."""
     tilted_sigma_deg: float | None = None
-    """Where it does not stand level; None: as `sigma_deg`."""
+    """Sigma where the compass is not level; None: `sigma_deg`."""
     lag_s: float = 0.0
-    """By which it follows the truth."""
+    """Time constant of the device."""
 
     def sigma_at(self, up: Array) -> float:
         """Return sigma in degrees where `up`, shape (3,), is up in the vehicle's axes."""
@@ -109,7 +109,7 @@ class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
     from_field: bool = False
     """Worked out from the device's field and the gradienter's tilt; else the device's own."""
     wander_deg: float | None = None
-    """By how much it has changed while nothing else said that the aircraft turned; None: not watched long enough."""
+    """Change while no other sensor showed a turn; None: not watched long enough."""
 
 
 FieldUnit = Literal["gauss", "counts"]
@@ -182,7 +182,7 @@ class FieldHeading:
         self.unit: FieldUnit = "gauss"
         self.batches = BatchSource(_LIMITS, keep)
         self.from_field = False
-        """Whether the latest heading that counts was worked out here."""
+        """True: the latest heading that counts was worked out here."""
         self.hint = ""
         """Why there is none from the field although one is needed; empty while there is."""
 

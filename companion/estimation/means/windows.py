@@ -1,4 +1,4 @@
-"""From the batches of a still stretch to means with honest sigmas.
+"""Means of a still stretch with honest sigmas, from its batches.
 
 Two sigmas a reading: `sigma_stat` is what averaging left, `sigma_use` what the next H seconds can expect of the
 sensor. Method 2.2, 2.4, 2.5 and 3.2.
@@ -59,12 +59,12 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
     """Quantisation of the stream; 0 for floats."""
     accel_step_m_s2: float = 0.0
     truncates: bool = False
-    """Whether the stream truncates toward zero instead of rounding."""
+    """True: the stream truncates toward zero instead of rounding."""
     gyro_grid_rad_s: float = 0.0
     """Steps of its own that the sensor's readings had before they became integers of the stream; 0: much finer."""
     accel_grid_m_s2: float = 0.0
     clock_from_start: bool = False
-    """Whether the time in its samples (`t_device_s`) counts from when its device was switched on."""
+    """True: the time in its samples (`t_device_s`) counts from the switch-on of the device."""
 
 
 def integer_steps(imu: ImuInput) -> Floats | None:

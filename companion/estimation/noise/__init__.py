@@ -1,1 +1,1 @@
-"""How a sensor scatters and wanders: Allan models, robust means."""
+"""Noise of sensors: Allan models, robust means."""

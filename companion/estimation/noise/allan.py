@@ -23,17 +23,14 @@ FLOOR_OF_FLICKER: Final = AllanModel(0.0, 1.0, 0.0).floor
 
 _FLOOR_REACHED_S: Final = 1000.0
 """Catalogues give no random walk; K is taken such that it reaches the flicker floor here (method 2.2)."""
-
-
 WARM_UP_K: Final = 20.0
 """A board with its processor and radio, from cold to warm; two sigma."""
 WARM_UP: Final = (WARM_UP_K * 54.0 * DEG_H, WARM_UP_K * 0.4 * MG)
-"""Of a part that nobody has watched warming up and no data sheet is known of: a BMI088's gyro (method 2.1), a
-BMI160's accelerometer (the table named there)."""
+"""Bias change of a part without a data sheet: a BMI088's gyro (method 2.1), a BMI160's accelerometer (table there)."""
 
 
 def allan_model(white: float, floor: float) -> AllanModel:
-    """A model from a data sheet's two figures: white noise N and the Allan floor A (0.664 B)."""
+    """Make a model of a data sheet's two figures: white noise N and the Allan floor A (0.664 B)."""
     return AllanModel(white, floor / FLOOR_OF_FLICKER, floor * math.sqrt(3.0 / _FLOOR_REACHED_S))
 
 
@@ -85,7 +82,7 @@ def noise_profile(profile: str | NoiseProfile | None) -> NoiseProfile:
 
 
 def phi(ratio: Floats | float) -> Floats:
-    """PHI(H/T), the flicker's part of V(T, H), times pi / B^2; PHI(1) = 4 ln 2 (method 2.2).
+    """Return PHI(H/T), the flicker's part of V(T, H), times pi / B^2; PHI(1) = 4 ln 2 (method 2.2).
 
     Written with log1p so that it neither cancels for H much longer than T nor for H much shorter.
     """
@@ -94,7 +91,7 @@ def phi(ratio: Floats | float) -> Floats:
 
 
 def floor_variance(flicker: Floats | float, walk: Floats | float, mean_s: Floats | float, horizon_s: float) -> Floats:
-    """V(T, H) without its white part: what no averaging takes away."""
+    """Return V(T, H) without its white part, which alone averaging reduces."""
     mean_s = np.asarray(mean_s, dtype=np.float64)
     return np.asarray(
         np.square(flicker) / math.pi * phi(horizon_s / mean_s) + np.square(walk) * (mean_s + horizon_s) / 3.0
@@ -108,7 +105,7 @@ def predicted_sigma(model: AllanModel, mean_s: float, horizon_s: float) -> float
 
 
 def slope_variance(flicker: Floats | float, walk: Floats | float, mean_s: float) -> Floats:
-    """Variance of a straight line's slope over `mean_s` seconds that flicker and random walk make where there is none.
+    """Return the variance of the slope that flicker and walk give a straight line over `mean_s` seconds.
 
     The line's weights on the generalised covariance -(B^2 / pi) ln|t| - (K^2 / 2)|t| of method 2.2: the double
     integrals are 1/16 and 1/60 of T^4 and T^5, times 144 / T^6.
@@ -117,7 +114,7 @@ def slope_variance(flicker: Floats | float, walk: Floats | float, mean_s: float)
 
 
 def allan_variance(slots: NDArray[np.int64], values: Floats, span: int) -> tuple[Floats, float]:
-    """Overlapping Allan variance of values (m, c) at ascending slots (m,) of a 1 s grid with holes.
+    """Compute the overlapping Allan variance of values (m, c) at ascending slots (m,) of a 1 s grid with holes.
 
     An average over `span` slots needs at least half of them.
 
@@ -152,7 +149,7 @@ def student_ratio(freedom: float) -> float:
 
 
 def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
-    """N of every column from the Allan deviation between neighbouring seconds, widened for few degrees of freedom.
+    """Return N of every column by the Allan deviation between neighbouring seconds, widened for few of them.
 
     Falls back on the scatter of the means where no two seconds are neighbours (a gradienter slower than 1 Hz).
     """

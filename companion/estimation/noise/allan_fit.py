@@ -33,7 +33,7 @@ _UPPER_ROUNDS: Final = 40
 _UNBOUNDED: Final = 1e6
 
 
-class Curve(NamedTuple):
+class AllanCurve(NamedTuple):
     """Allan variances of all stretches of a recording at rest; a row for each averaging time of each stretch."""
 
     spans: Floats
@@ -56,10 +56,10 @@ class AxisFit(msgspec.Struct, frozen=True):
     upper: tuple[float, float, float]
     """One-sided 95 % limits of N, B, K; infinite where the recordings are too short for one."""
     known: tuple[bool, bool, bool]
-    """Whether the recordings show each of them."""
+    """True: the recordings show the figure."""
 
 
-def curve(stretches: Iterable[tuple[NDArray[np.int64], Floats]]) -> Curve:
+def curve(stretches: Iterable[tuple[NDArray[np.int64], Floats]]) -> AllanCurve:
     """Compute the Allan variances from the means (m, c) of ascending seconds (m,) of each stretch.
 
     Raises:
@@ -78,10 +78,10 @@ def curve(stretches: Iterable[tuple[NDArray[np.int64], Floats]]) -> Curve:
             span *= 2
     if not rows:
         raise ValueError("nothing to fit: no stretch is long enough")
-    return Curve(*(np.array(column, dtype=np.float64) for column in zip(*rows, strict=True)))
+    return AllanCurve(*(np.array(column, dtype=np.float64) for column in zip(*rows, strict=True)))
 
 
-def fit_axis(found: Curve, column: int) -> AxisFit:
+def fit_axis(found: AllanCurve, column: int) -> AxisFit:
     """Estimate N, B and K of one column.
 
     Raises:

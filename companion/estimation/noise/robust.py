@@ -29,7 +29,7 @@ _MEAN_ABS_TO_SIGMA: Final = 1.2533
 _EQUAL: Final = 1e-6
 _ROUNDS: Final = 30
 _CONVERGED: Final = 1e-4
-"""Of the scatter of one value: 0.1 % of the standard error of a mean of a hundred."""
+"""Share of the scatter of one value: 0.1 % of the standard error of a mean of a hundred."""
 
 
 def _scale(residual: Floats) -> Floats:
@@ -79,7 +79,7 @@ def robust_mean(values: Floats, c: Floats | float = HUBER_C, least: Floats | flo
     return np.asarray(centre + (weight * residual).sum(axis=0) / weight.sum(axis=0))
 
 
-class Line(msgspec.Struct, frozen=True):
+class RobustLine(msgspec.Struct, frozen=True):
     """A robust straight line through every column, (c,) each: its end, slope per second, and that over its error."""
 
     end: Floats
@@ -91,7 +91,7 @@ class Line(msgspec.Struct, frozen=True):
 
 def huber_line(
     times_s: Floats, values: Floats, end_s: float, c: Floats | float = HUBER_C, least: Floats | float = 0.0
-) -> Line:
+) -> RobustLine:
     """Huber's line through every column of (m, c), m >= 3, evaluated at the window's end and not a second later.
 
     `c` and `least` as for `huber_mean`.
@@ -121,7 +121,7 @@ def huber_line(
     # A perfect line has no standard error; this keeps 0/0 out and is below anything that is measured.
     error = np.sqrt(variance / spread) + 1e-100
     at_end = end_s - times_s.mean()
-    return Line(
+    return RobustLine(
         end=np.asarray(level + slope * at_end),
         slope=np.asarray(slope),
         t_statistic=np.asarray(slope / error),
@@ -141,7 +141,7 @@ _ONE_IN_10000: Final = 3.8906
 """Sigmas that a normal number exceeds with this probability, on either side."""
 
 
-def is_ramp(line: Line, count: int, wander: Floats) -> NDArray[np.bool_]:
+def is_ramp(line: RobustLine, count: int, wander: Floats) -> NDArray[np.bool_]:
     """(c,) which columns' slopes, of `count` values, are ramps; `wander`: variance of a slope by the part's own."""
     chance = np.abs(line.t_statistic) > slope_limit(count)
     return np.asarray(chance & (np.abs(line.slope) > RAMP_FLOORS * np.sqrt(wander)))

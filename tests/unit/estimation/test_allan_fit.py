@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.estimation.noise.allan_fit import AxisFit, Curve, curve, fit_axis
+from companion.estimation.noise.allan_fit import AllanCurve, AxisFit, curve, fit_axis
 from tests.support.made_noise import FLICKER_OF_FLOOR, slow
 
 Floats = NDArray[np.float64]
 
 
-def curve_of(*stretches: Floats) -> Curve:
+def curve_of(*stretches: Floats) -> AllanCurve:
     return curve((np.arange(len(values)), values[:, None]) for values in stretches)
 
 

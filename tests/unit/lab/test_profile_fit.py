@@ -13,7 +13,7 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.means.windows import ImuInput, estimates
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
-from companion.lab.profile import Finding, Rest, fit_profile, rests, seconds_of
+from companion.lab.profile import LearnedNoise, Rest, fit_profile, rests, seconds_of
 from tests.support.made_noise import DEG, DEG_H, FLICKER_OF_FLOOR, MG, adis16405, slow
 from tests.support.recordings import Recording, px4, shared, xio, xsens_counts
 
@@ -97,7 +97,7 @@ GYRO = AllanModel(7.1 * DEG_H, 3.0 * FLICKER_OF_FLOOR * DEG_H, 0.16 * DEG_H)
 ACCEL = AllanModel(0.05 * MG, 0.01 * FLICKER_OF_FLOOR * MG, 0.0005 * MG)
 
 
-def fitted(rest: Rest, fallback: NoiseProfile = UNKNOWN) -> Finding:
+def fitted(rest: Rest, fallback: NoiseProfile = UNKNOWN) -> LearnedNoise:
     return fit_profile("made", [rest], fallback)
 
 

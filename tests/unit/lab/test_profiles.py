@@ -23,7 +23,7 @@ from companion.estimation.noise.allan import PROFILES, noise_profile
 from companion.lab.logs.log_files import read_logs
 from companion.recording.files import Beginning, RecordingFile
 from companion.recording.messages import IMU, MAVLINK, ImuState, Message, encode
-from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, saved_profile
+from companion.storage.profiles import FORMAT_VERSION, ProfileSource, ProfileStore, SavedProfile, saved_profile
 from companion.storage.state import MOST_BYTES, sealed, unsealed
 from tests.support.made_noise import DEG_H, adis16405, write_csv
 from tests.unit.daemon.test_plan import CALIBRATION
@@ -34,7 +34,7 @@ SMALLEST = '[mavlink]\nurl = "udpin:127.0.0.1:1"\n[[imu]]\nname = "fc"\nsource =
 
 
 def saved(name: str = "mine", **changes: Any) -> SavedProfile:
-    source = Source(file="a.csv", began_at=None, still_s=5400.0, temperature_degc=(20.0, 21.5))
+    source = ProfileSource(file="a.csv", began_at=None, still_s=5400.0, temperature_degc=(20.0, 21.5))
     profile = SavedProfile(
         format_version=FORMAT_VERSION, name=name, saved_at="2026-11-21T10:00:00+00:00", imu="fc", gyro=GYRO,
         accel=ACCEL, kept_from="unknown", kept=("gyro K",), sources=(source,),
@@ -177,8 +177,7 @@ def test_learned_saved_and_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[
     (imu,) = answer["imus"]
     assert imu["still_s"] == pytest.approx(1798, abs=8)
     (used,) = imu["used"]
-    assert used["seconds"] == pytest.approx(1800, abs=1)
-    assert sum(each["to_s"] - each["from_s"] for each in used["stretches"]) == pytest.approx(1798, abs=8)
+    assert used["seconds"] == pytest.approx(1798, abs=1)
     profile = ProfileStore(tmp_path).read("mine")
     assert profile.gyro.white / DEG_H == pytest.approx(150.0, rel=0.08)
     assert (profile.sources[0].file, profile.imu) == ("half_hour.csv", "imu")
@@ -259,7 +258,7 @@ def test_the_table_says_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixt
         assert words in said
 
 
-def test_the_part_at_rest_is_named_and_lines_left_out_are_counted(
+def test_the_seconds_at_rest_and_the_lines_left_out_are_counted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Two minutes at rest, half a minute in the hand, a line without a number; the clock began at 500 s."""
@@ -270,14 +269,12 @@ def test_the_part_at_rest_is_named_and_lines_left_out_are_counted(
     code, answer, _ = run(capsys, path)
     assert code == 0
     (used,) = answer["imus"][0]["used"]
-    (stretch,) = used["stretches"]
-    assert 0.0 <= stretch["from_s"] <= 2.0
-    assert 118.0 <= stretch["to_s"] <= 121.0
+    assert 116 <= used["still_s"] <= 120
     assert used["left_out"] == {"without a number in each of gx, gy, gz, ax, ay, az": 1}
     assert any("were not at rest and are left out (gyro" in note for note in answer["imus"][0]["notes"])
     assert companion(["profile", str(path)]) == 0
     said = capsys.readouterr().out
-    assert f"used of a.csv: {stretch['from_s']:.0f} to {stretch['to_s']:.0f} s, of 150 s" in said
+    assert f"used of a.csv: {used['still_s']} of 148 s" in said
     assert "left out: 1 lines without a number in each of" in said
 
 
