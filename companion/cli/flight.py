@@ -38,7 +38,6 @@ def add_commands(add: AddCommand) -> None:
 
 
 async def flight(options: argparse.Namespace) -> int:
-    from companion.estimation.records.flight_evidence import surely_moved
     from companion.lab.flight.flight import flights, read
 
     path = options.file
@@ -57,10 +56,8 @@ async def flight(options: argparse.Namespace) -> int:
         lines.insert(0, f"{starts} starts of the autopilot in it, each by its own clock")
     numbers = [] if store is None else _keep(store, path.name, found)
     lines += [f"kept as flight {number}: companion history lists it" for number in numbers]
-    together = [] if store is None or not numbers else surely_moved(store.flights(), found[-1])
-    lines += [one.words for one in together]
     answer = {"state": "done", "reason": "", "file": str(path), "numbers": numbers}
-    answer |= {"flights": msgspec.to_builtins(found), "moved": msgspec.to_builtins(together)}
+    answer["flights"] = msgspec.to_builtins(found)
     return conclude(options, answer, lines, good=True)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from operator import attrgetter
 from typing import Final
 
@@ -52,8 +52,6 @@ class Material(msgspec.Struct, frozen=True, kw_only=True):
     armings: Sequence[Arming]
     """While it was in force, oldest first."""
     damaged: Sequence[str]
-    flown: Mapping[str, Sequence[str]] = {}
-    """Changes by motors beyond sigma, in words, by IMU."""
 
 
 def calibration_page(material: Material, now: datetime.datetime) -> str:
@@ -66,7 +64,7 @@ def calibration_page(material: Material, now: datetime.datetime) -> str:
         _headline(material),
         damaged(material.damaged),
         _warnings(record),
-        *(_imu(imu, material.flown.get(imu.name, ())) for imu in imus),
+        *(_imu(imu) for imu in imus),
         card("caution", f"{len(record.imus) - MAX_IMUS} more IMUs are not shown.")
         if len(record.imus) > MAX_IMUS
         else None,
@@ -119,7 +117,7 @@ def _warnings(record: Record) -> Markup | None:
     )
 
 
-def _imu(imu: ImuRecord, flown: Sequence[str]) -> Markup:
+def _imu(imu: ImuRecord) -> Markup:
     temperature = "temperature unknown" if imu.temperature_degc is None else f"{imu.temperature_degc:.1f} degC"
     return join(
         tag("h2", f"IMU {imu.name}"),
@@ -131,10 +129,6 @@ def _imu(imu: ImuRecord, flown: Sequence[str]) -> Markup:
             if imu.residual_gyro_rad_s or imu.residual_accel_m_s2
             else None,
             class_="soft",
-        ),
-        *(
-            card("caution", tag("p", f"{words}, more than σ use, which is of the ground: damp the autopilot better."))
-            for words in flown
         ),
         tag("div", *(_triad(imu, triad) for triad in TRIADS), class_="pairs"),
     )

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from companion.errors import StorageError
-from companion.estimation.records.flight_evidence import moved
-from companion.estimation.records.flight_record import AXES, Flight
 from companion.estimation.records.record import Arming, Record
 from companion.report.calibration import Material
-from companion.storage.flights import FlightStore
-from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.records import Entry, RecordStore
 from companion.storage.state import BoundedList
 
 MAX_EARLIER: Final = 60
-_NO_SIGMA: Final = (math.inf,) * 3
 
 
 def material(directory: Path, wanted: int | None) -> Material:
@@ -50,12 +44,6 @@ def material(directory: Path, wanted: int | None) -> Material:
     except StorageError as error:
         why = f"{error}."
         damaged.append(str(error))
-    flown: dict[str, list[str]] = {}
-    try:
-        known = BiasStore(directory).all()
-        flown = _moved_in_flight(FlightStore(directory).flights(), record, known)
-    except StorageError as error:
-        damaged.append(str(error))
     earlier = [
         (one.number, one.record)
         for one in entries
@@ -67,27 +55,9 @@ def material(directory: Path, wanted: int | None) -> Material:
         trace=trace,
         no_trace="" if trace is not None else why,
         earlier=earlier[-MAX_EARLIER:],
-        flown=flown,
         armings=[arming for arming in armings if arming.calibration == record.started_at],
         damaged=damaged,
     )
-
-
-def _moved_in_flight(flights: Sequence[Flight], record: Record, known: Mapping[str, KnownImu]) -> dict[str, list[str]]:
-    """List by IMU what motors surely add to its biases, where that exceeds the calibration's sigma."""
-    found: dict[str, list[str]] = {}
-    for imu in record.imus:
-        identity = known[imu.name].identity if imu.name in known else {}
-        number, gyro, accel = (identity.get(key, "") for key in ("instance", "gyro", "accel"))
-        if not (number.isdecimal() and gyro.isdecimal() and accel.isdecimal()):
-            continue
-        gyro_use, accel_use = imu.gyro_sigma_use_rad_s or _NO_SIGMA, imu.accel_sigma_use_m_s2 or _NO_SIGMA
-        found[imu.name] = [
-            one.words
-            for one in moved(flights, record.system_id, int(number), int(gyro), int(accel))
-            if one.is_sure and abs(one.moves.value) > (*gyro_use, accel_use[2])[AXES.index(one.axis)]
-        ]
-    return found
 
 
 def _find(entries: Sequence[Entry], wanted: int | None) -> tuple[Entry, Record]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from companion.errors import StorageError
-from companion.estimation.records.flight_record import FORMAT_VERSION, Flight, KeptFlight
+from companion.estimation.records.flight_record import FORMAT_VERSION, KeptFlight
 from companion.storage.state import StateFile, numbers_in, remove_durably
 
 logger = logging.getLogger(__name__)
@@ -63,14 +63,6 @@ class FlightStore:
             else:
                 found |= {} if kept is None else {number: kept}
         return found
-
-    def flights(self) -> list[Flight]:
-        """All that can be read, the newest first.
-
-        Raises:
-            StorageError: the folder cannot be listed.
-        """
-        return [kept.flight for kept in self.newest().values()]
 
     def read(self, number: int) -> KeptFlight | None:
         """One of them, if there is one of that number.
