@@ -15,9 +15,9 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.imu_messages import EkfBiasReading
 from companion.autopilot.parameters.reading import FirmwareName
 from companion.estimation.means.windows import ImuInput
-from companion.estimation.solution.otherwise import Otherwise
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.site import Whereabouts
+from companion.estimation.solution.truth import Otherwise
 from companion.estimation.turning.watch import Turn
 
 FORMAT_VERSION: Final = "4"

@@ -136,12 +136,7 @@ def _imu(imu: ImuRecord) -> Markup:
 
 def _triad(imu: ImuRecord, triad: Triad) -> Markup:
     unit, unit_name, _ = UNITS[triad]
-    if triad == "gyro":
-        bias, stat, use = imu.gyro_bias_rad_s, imu.gyro_sigma_stat_rad_s, imu.gyro_sigma_use_rad_s
-        left = imu.residual_gyro_rad_s
-    else:
-        bias, stat, use = imu.accel_bias_m_s2, imu.accel_sigma_stat_m_s2, imu.accel_sigma_use_m_s2
-        left = imu.residual_accel_m_s2
+    bias, stat, use, _, left, _ = imu.of(triad)
     title = tag("h3", f"{NAMES[triad]}, {unit_name}")
     if bias is None or stat is None or use is None:
         return tag("div", title, card("caution", "Not determined: not asked for, or a warning above says why."))

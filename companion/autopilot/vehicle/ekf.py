@@ -23,8 +23,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.firmwares import FIRMWARES
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.estimation.solution.otherwise import OwnHeading
 from companion.estimation.solution.site import UNKNOWN_DECLINATION_SIGMA_DEG
+from companion.estimation.solution.truth import OwnHeading
 from companion.links.mavlink.link import Message
 from companion.links.system.waiting import comes
 from companion.physics.frames import Array, body_from_ned

@@ -26,7 +26,7 @@ from companion.errors import AutopilotError, StorageError
 from companion.estimation.means.warming import Warming
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import Point, by_power_up, kept
-from companion.estimation.solution.doubt import Doubt
+from companion.estimation.solution.doubt import Doubt, points
 from companion.estimation.solution.joint import Weighed, Whole, weigh
 from companion.estimation.solution.prior import (
     Expectation,
@@ -37,7 +37,6 @@ from companion.estimation.solution.prior import (
     expect,
     expect_today,
     follow,
-    points,
     pose_effect,
 )
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution, moved

@@ -11,9 +11,9 @@ from companion.daemon.stands.alignment import AlignmentInForce, FacesInForce
 from companion.errors import AutopilotError
 from companion.estimation.means.windows import Window
 from companion.estimation.request import What
-from companion.estimation.solution.otherwise import NOTHING, Otherwise, OwnHeading
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import Solution, solve
+from companion.estimation.solution.truth import NOTHING, Otherwise, OwnHeading
 
 
 class EstimatorInputs(NamedTuple):

@@ -50,8 +50,8 @@ from companion.estimation.request import What
 from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.joint import Weighed, weigh
 from companion.estimation.solution.prior import Expectation
-from companion.estimation.solution.results import Bias, in_words, record_of, unseen_turn, when_warm
-from companion.estimation.solution.solve import ImuSolution, Solution
+from companion.estimation.solution.results import in_words, record_of, unseen_turn, when_warm
+from companion.estimation.solution.solve import ImuSolution, Pair, Solution
 from companion.links.system.listeners import Listeners
 from companion.samples import Triad
 from companion.storage.changes import AUTOMATIC
@@ -123,7 +123,7 @@ class CalibrationRun(Job):
         """The measured window, or a dithered one."""
         self.solution: Solution | None = None
         """The estimate: residuals in the output of the autopilot's IMUs, whole biases of others."""
-        self.whole: dict[str, Bias] = {}
+        self.whole: dict[str, Pair] = {}
         """Whole biases by IMU, where the autopilot subtracts offsets."""
         self.points: dict[str, Point] = {}
         """Biases by IMU that later calibrations learn from, once this one has ended well."""

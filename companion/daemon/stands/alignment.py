@@ -31,7 +31,7 @@ from companion.estimation.records.align_record import (
     TurnRecord,
 )
 from companion.estimation.records.record import AlignmentUsed
-from companion.estimation.solution.otherwise import aged_m_s2
+from companion.estimation.solution.truth import aged_m_s2
 from companion.formats import Object, utc_now
 from companion.links.system.listeners import Listeners
 from companion.physics.frames import Array

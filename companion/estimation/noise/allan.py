@@ -90,7 +90,9 @@ def phi(ratio: Floats | float) -> Floats:
     return np.asarray(r * np.log1p(1.0 / r) + (2.0 + 1.0 / r) * np.log1p(r) - np.log(r))
 
 
-def floor_variance(flicker: Floats | float, walk: Floats | float, mean_s: Floats | float, horizon_s: float) -> Floats:
+def floor_variance(
+    flicker: Floats | float, walk: Floats | float, mean_s: Floats | float, horizon_s: Floats | float
+) -> Floats:
     """Return V(T, H) without its white part, which alone averaging reduces."""
     mean_s = np.asarray(mean_s, dtype=np.float64)
     return np.asarray(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 
@@ -19,8 +19,6 @@ from companion.samples import TRIADS, Triad, Vector
 FORMAT_VERSION = 1
 
 Outcome = Literal["verified", "stored", "failed", "rolled_back"]
-
-
 TiltFrom = Literal["gradienter", "accelerometers"]
 HeadingFrom = Literal["compass", "autopilot"]
 
@@ -82,27 +80,23 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
 
     def in_words(self) -> str:
         """One line for people."""
-        bound = self.heading_bound_deg
-        parts = [
-            "heading error bound unknown"
-            if bound is None
-            else "shows no heading here"
-            if bound >= 180.0
-            else f"heading good to {bound:.1f} deg"
-        ]
+        bound = "heading error bound unknown"
+        if self.heading_bound_deg is not None:
+            useless = self.heading_bound_deg >= 180.0
+            bound = "shows no heading here" if useless else f"heading good to {self.heading_bound_deg:.1f} deg"
+        parts = [bound]
         if self.heading_from == "field":
             parts.append("worked out from its field and the gradienter")
-        if self.field_gauss is not None:
-            parts.append(f"field {self.field_gauss:.3f} gauss{_earths(self.field_expected_gauss, '.3f')}")
-        if self.inclination_deg is not None:
-            parts.append(f"inclination {self.inclination_deg:.1f} deg{_earths(self.inclination_expected_deg, '.1f')}")
+        for what, found, expected, form, unit in (
+            ("field", self.field_gauss, self.field_expected_gauss, ".3f", "gauss"),
+            ("inclination", self.inclination_deg, self.inclination_expected_deg, ".1f", "deg"),
+        ):
+            if found is not None:
+                earths = "" if expected is None else f" (the Earth's {expected:{form}})"
+                parts.append(f"{what} {found:{form}} {unit}{earths}")
         if self.wander_deg is not None:
             parts.append(f"wandered {self.wander_deg:.1f} deg")
         return ", ".join(parts)
-
-
-def _earths(expected: float | None, form: str) -> str:
-    return "" if expected is None else f" (the Earth's {expected:{form}})"
 
 
 class Standing(msgspec.Struct, frozen=True, kw_only=True):
@@ -203,6 +197,18 @@ class CrossCovariance(msgspec.Struct, frozen=True, kw_only=True):
     biases is the sum of both IMUs' own less this and its transpose."""
 
 
+class TriadFigures(NamedTuple):
+    """Figures of the gyros or accelerometers of one IMU; None: not determined, or not applicable."""
+
+    bias: Vector | None
+    sigma_stat: Vector | None
+    sigma_use: Vector | None
+    sigma_warm_up: Vector | None
+    """Part of sigma_use."""
+    residual: Vector | None
+    sigma_in_force: Vector | None
+
+
 class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU: whole biases (measured without any offset, minus truth), sigmas, and what was written."""
 
@@ -237,48 +243,46 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     gyro_id: int | None = None
     """Device ids in the autopilot; None: it has none, or the record is of an older version."""
     accel_id: int | None = None
-
     gyro_sigma_in_force_rad_s: Vector | None = None
-    """One sigma of the gyro offsets that this calibration left unchanged; None where it wrote them."""
+    """One sigma of the offsets that this calibration left unchanged; None where it wrote them."""
     accel_sigma_in_force_m_s2: Vector | None = None
-    """One sigma of the accelerometer offsets that this calibration left unchanged; None where it wrote them."""
+
+    def of(self, triad: Triad) -> TriadFigures:
+        """Return the figures of one triad."""
+        if triad == "gyro":
+            sigmas = self.gyro_sigma_stat_rad_s, self.gyro_sigma_use_rad_s, self.gyro_sigma_warm_up_rad_s
+            return TriadFigures(self.gyro_bias_rad_s, *sigmas, self.residual_gyro_rad_s, self.gyro_sigma_in_force_rad_s)
+        sigmas = self.accel_sigma_stat_m_s2, self.accel_sigma_use_m_s2, self.accel_sigma_warm_up_m_s2
+        return TriadFigures(self.accel_bias_m_s2, *sigmas, self.residual_accel_m_s2, self.accel_sigma_in_force_m_s2)
 
     def sigma_in_force(self, triad: Triad) -> Vector | None:
         """Return one sigma of what the offsets in force leave in the output, for the next minutes."""
-        known = self.gyro_sigma_in_force_rad_s if triad == "gyro" else self.accel_sigma_in_force_m_s2
-        if known is not None:
-            return known
-        sigma, _, residual, _ = self._figures(triad)
-        if sigma is None or residual is None or triad not in self.unchanged:
-            return sigma
-        return _each(math.hypot, sigma, residual)
+        own = self.of(triad)
+        if own.sigma_in_force is not None:
+            return own.sigma_in_force
+        if own.sigma_use is None or own.residual is None or triad not in self.unchanged:
+            return own.sigma_use
+        return _each(math.hypot, own.sigma_use, own.residual)
 
     def settled_sigma(self, triad: Triad) -> Vector | None:
         """Return sigma_use without the warm-up, which moves the output alike under old and new offsets."""
-        whole, _, _, warm_up = self._figures(triad)
-        if whole is None or warm_up is None:
-            return whole
-        return _each(lambda use, part: math.sqrt(max(use**2 - part**2, 0.0)), whole, warm_up)
+        own = self.of(triad)
+        if own.sigma_use is None or own.sigma_warm_up is None:
+            return own.sigma_use
+        return _each(lambda use, part: math.sqrt(max(use**2 - part**2, 0.0)), own.sigma_use, own.sigma_warm_up)
 
     def confirming(self, before: ImuRecord | None) -> ImuRecord:
         """Return this record with the sigma of the offsets that it left unchanged; `before` describes their origin."""
-        gyro, accel = (self._confirmed(triad, before) for triad in TRIADS)
+
+        def confirmed(triad: Triad) -> Vector | None:
+            own = self.of(triad)
+            earlier = None if before is None or triad in before.held_back else before.sigma_in_force(triad)
+            if triad not in self.unchanged or None in (earlier, own.sigma_use, own.sigma_stat, own.residual):
+                return None
+            return _each(_confirmed_sigma, earlier, own.sigma_use, own.sigma_stat, own.residual)
+
+        gyro, accel = map(confirmed, TRIADS)
         return msgspec.structs.replace(self, gyro_sigma_in_force_rad_s=gyro, accel_sigma_in_force_m_s2=accel)
-
-    def _confirmed(self, triad: Triad, before: ImuRecord | None) -> Vector | None:
-        sigma, averaged, residual, _ = self._figures(triad)
-        earlier = None if before is None or triad in before.held_back else before.sigma_in_force(triad)
-        if earlier is None or sigma is None or averaged is None or residual is None or triad not in self.unchanged:
-            return None
-        return _each(_confirmed_sigma, earlier, sigma, averaged, residual)
-
-    def _figures(self, triad: Triad) -> tuple[Vector | None, Vector | None, Vector | None, Vector | None]:
-        """Return sigma_use, sigma_stat, the residual, and the part of sigma_use for a warm-up."""
-        if triad == "gyro":
-            sigmas = self.gyro_sigma_use_rad_s, self.gyro_sigma_stat_rad_s
-            return *sigmas, self.residual_gyro_rad_s, self.gyro_sigma_warm_up_rad_s
-        sigmas = self.accel_sigma_use_m_s2, self.accel_sigma_stat_m_s2
-        return *sigmas, self.residual_accel_m_s2, self.accel_sigma_warm_up_m_s2
 
 
 def _confirmed_sigma(earlier: float, sigma: float, averaged: float, residual: float) -> float:
@@ -291,9 +295,9 @@ def _confirmed_sigma(earlier: float, sigma: float, averaged: float, residual: fl
     return min(math.hypot(earlier, gain * residual), math.hypot(sigma, residual))
 
 
-def _each(function: Callable[..., float], *vectors: Vector) -> Vector:
+def _each(function: Callable[..., float], *vectors: Vector | None) -> Vector:
     """Apply a function axis by axis."""
-    x, y, z = map(function, *vectors)
+    x, y, z = map(function, *vectors)  # type: ignore[arg-type]
     return x, y, z
 
 

@@ -1,16 +1,15 @@
 """Is the calibration in force still good?
 
-What was found right (written and seen, or measured to be right as it is) ages: the bias wanders, the temperature
-changes, somebody changes the offsets. All limits come from the error budget (method 2.2 and 3.2):
+What was found right (written and seen, or measured to be right as it is) ages. Limits from the error budget (method
+2.2 and 3.2):
 
-- age: so long as the wandering expected of the sensor's Allan profile stays below `DRIFT_SIGMAS` sigma_use, and never
-  longer than the configured limit (30 minutes);
-- temperature: where the curve of the bias over it is known, `DRIFT_SIGMAS` sigma as well; else 3 K, configurable;
-- the rolling window: what is left in the output now may differ from what it must be by `RESIDUAL_SIGMAS` of what
-  both were known with.
+- age: the wandering expected of the sensor's Allan profile stays below `DRIFT_SIGMAS` sigma_use; at most the configured
+  limit (30 minutes);
+- temperature: the change of the bias by its curve stays below `DRIFT_SIGMAS` sigma; without a curve 3 K, configurable;
+- the rolling window: the output now differs from what it must be by less than `RESIDUAL_SIGMAS` of both.
 
-Age and temperature count from the last time that a still window agreed, so that an aircraft that stands about for an
-hour keeps its calibration without a single write.
+Age and temperature count from the last time that a still window agreed: an aircraft that stands about for an hour keeps
+its calibration without a single write.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ import math
 from typing import Final
 
 import msgspec
+import numpy as np
 
 from companion.config.sections import AllanModel
 from companion.estimation.noise.allan import floor_variance
@@ -86,7 +86,7 @@ def held_of(
     imu: ImuRecord, triad: Triad, now_s: float, averaged_s: float, *, corrected: bool, seen: bool
 ) -> Held | None:
     """State of one triad right after its calibration; None where that found nothing. `corrected`: by the autopilot."""
-    bias = imu.gyro_bias_rad_s if triad == "gyro" else imu.accel_bias_m_s2
+    bias = imu.of(triad).bias
     sigma, settled = imu.sigma_in_force(triad), imu.settled_sigma(triad)
     if sigma is None or settled is None or bias is None:
         return None
@@ -136,20 +136,9 @@ def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
 
     At most a day, far beyond the configured limit. The smallest axis of `sigma` counts; `averaged_s` is T.
     """
-    allowed = (DRIFT_SIGMAS * min(sigma)) ** 2
-
-    def drift(horizon_s: float) -> float:
-        return float(floor_variance(model.flicker, model.walk, averaged_s, horizon_s))
-
-    low_s, high_s = 1.0, _LONGEST_S
-    if drift(high_s) <= allowed:
-        return high_s
-    if drift(low_s) >= allowed:
-        return low_s
-    while high_s / low_s > 1.01:
-        middle_s = math.sqrt(low_s * high_s)
-        low_s, high_s = (middle_s, high_s) if drift(middle_s) <= allowed else (low_s, middle_s)
-    return low_s
+    horizons_s = np.geomspace(1.0, _LONGEST_S, 1200)
+    drift = floor_variance(model.flicker, model.walk, averaged_s, horizons_s)
+    return float(horizons_s[drift <= (DRIFT_SIGMAS * min(sigma)) ** 2].max(initial=1.0))
 
 
 def judge(triad: Triad, name: str, held: Held, model: AllanModel, limits: Limits, seen: Seen) -> list[Finding]:

@@ -1,4 +1,4 @@
-"""Names what contradicts earlier calibrations: one IMU, the gradienter, the believed gravity, or a turn.
+"""Names what contradicts earlier calibrations, and marks it as suspect in the history.
 
 One tilt, one gravity and one rotation are behind the readings of all IMUs. What has changed alike in all of them is
 the gradienter (or its zero), the gravity that the place was believed to have, or a turn; what has changed in one of
@@ -9,19 +9,25 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Literal
 
 import numpy as np
 
-from companion.physics.frames import Array, Matrix
+from companion.estimation.records.history import Measured, Point, PowerUp
+from companion.estimation.solution.prior import Prediction
+from companion.estimation.solution.solve import ImuSolution, Pair, Solution
+from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, DEG_H, MG, UNITS
-from companion.samples import TRIADS, Triad
+from companion.samples import TRIADS, Triad, Vector, rows_of
 
 Cause = Literal["gradienter", "gravity", "turn", "imu", "unclear"]
 
 TELLS: Final = 9.0
 """Least gain in chi square by which one explanation beats another: three sigmas."""
+AGREES: Final = 11.34
+"""Chi square of three axes that is passed by chance once in a hundred: beyond it nobody is warned yet, but what may
+well be of another sensor takes no part."""
 _IN_SHORT: Final[dict[Cause, str]] = {
     "gradienter": "gradienter or its zero moved",
     "gravity": "gravity differs",
@@ -33,19 +39,29 @@ _IN_SHORT: Final[dict[Cause, str]] = {
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Witness:
-    """One triad of one IMU against its prediction."""
+    """One triad of one IMU, measured and predicted."""
 
+    imu: int
+    """Index of the IMU in the solution."""
     name: str
-    difference: Array
-    """Measurement less prediction, (3,)."""
+    triad: Triad
+    expected: Prediction
+    measured: Array
     own_variance: Array
     """Variance of the difference that other IMUs do not share, (3,)."""
     common: Matrix
     """Covariance of the difference that all IMUs share, (3, 3)."""
-    limit: float
-    power_ups: int
-    same_zero: bool
-    """Both were measured with the same zero of the gradienter."""
+
+    @property
+    def rows(self) -> slice:
+        """Rows of this triad among the six of each IMU."""
+        start = 6 * self.imu + rows_of(self.triad).start
+        return slice(start, start + 3)
+
+    @property
+    def difference(self) -> Array:
+        """Measurement less prediction, (3,)."""
+        return np.asarray(self.measured - np.array(self.expected.value))
 
     @property
     def sigma(self) -> Array:
@@ -55,7 +71,13 @@ class Witness:
     @property
     def contradicts(self) -> bool:
         """Whether an axis is beyond the gate."""
-        return bool((np.abs(self.difference) > self.limit * self.sigma).any())
+        return bool((np.abs(self.difference) > self.expected.limit * self.sigma).any())
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the measurement is near enough for the prediction to take part."""
+        covariance = np.diag(self.own_variance) + self.common
+        return float(self.difference @ np.linalg.solve(covariance, self.difference)) < AGREES
 
     def along(self, up: Array) -> tuple[float, float]:
         """Give the difference about the vertical, and one sigma."""
@@ -68,7 +90,7 @@ class Witness:
 
     def is_explained(self, shift: Array) -> bool:
         """Whether the rest is within the gate once a common shift is subtracted."""
-        return bool((np.abs(self.difference - shift) <= self.limit * np.sqrt(self.own_variance)).all())
+        return bool((np.abs(self.difference - shift) <= self.expected.limit * np.sqrt(self.own_variance)).all())
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -93,84 +115,70 @@ class Doubt:
 
 
 def contradictions(
-    earlier: Sequence[tuple[Triad, Witness]],
-    today: Sequence[tuple[Triad, Witness]],
-    imus: int,
-    up: Array,
-    by_reading: Matrix | None,
+    earlier: Sequence[Witness], today: Sequence[Witness], imus: int, up: Array, by_reading: Matrix | None
 ) -> list[Doubt]:
     """Find all contradictions; empty while all is well.
 
     Args:
-        earlier: predictions from earlier power-ups.
-        today: predictions from this power-up, which say most: older ones count only where these are silent.
+        earlier: against predictions from earlier power-ups.
+        today: against those from this power-up, which say most: older ones count only where these are silent.
         imus: number of IMUs of the solution.
         up: unit vector in the vehicle's axes.
         by_reading: d (accelerometer bias) / d (gradienter's readings), (3, 2).
     """
+    gravity: tuple[Cause, Matrix] = ("gravity", up[:, None])
+    causes: dict[Triad, list[tuple[Cause, Matrix]]] = {
+        "gyro": [("turn", np.eye(3))],
+        "accel": [gravity] if by_reading is None else [("gradienter", by_reading), gravity],
+    }
     found: list[Doubt] = []
     for triad in TRIADS:
-        for known, is_today in ((today, True), (earlier, False)):
-            witnesses = [witness for of, witness in known if of == triad]
-            doubts = _doubts(triad, witnesses, up, by_reading, today=is_today)
-            if doubts or (is_today and len(witnesses) == imus):
-                found += doubts
-                break
+        of_today = [witness for witness in today if witness.triad == triad]
+        doubts = _doubts(of_today, causes[triad], today=True)
+        if not doubts and len(of_today) < imus:
+            doubts = _doubts([one for one in earlier if one.triad == triad], causes[triad], today=False)
+        found += doubts
     return found
 
 
-def _doubts(
-    triad: Triad, witnesses: Sequence[Witness], up: Array, by_reading: Matrix | None, *, today: bool
-) -> list[Doubt]:
+def _doubts(witnesses: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]], *, today: bool) -> list[Doubt]:
+    """Explain what contradicts by one shift of all IMUs, if a cause has such a one; else each by itself."""
     against = [witness for witness in witnesses if witness.contradicts]
     others = [witness for witness in witnesses if not witness.contradicts]
-    causes = _causes(triad, up, by_reading)
     for cause, directions in causes if against else ():
         shift, size = _common(against, directions)
-        if not all(witness.is_explained(shift) for witness in against):
-            continue
         gains = [witness.gain(shift) for witness in others]
-        if any(gain < -TELLS for gain in gains):
-            continue
         named = {witness.name for witness in against}
         named |= {witness.name for witness, gain in zip(others, gains, strict=True) if gain > TELLS}
-        if len(named) < 2:
-            continue
-        names = tuple(witness.name for witness in witnesses if witness.name in named)
-        return [Doubt(triad, cause, names, _of_all(cause, size, names, against))]
-    return [_alone(triad, witness, others, causes, today=today) for witness in against]
-
-
-def _causes(triad: Triad, up: Array, by_reading: Matrix | None) -> list[tuple[Cause, Matrix]]:
-    """List the common causes, and the directions in which each shifts all IMUs."""
-    if triad == "gyro":
-        return [("turn", np.eye(3))]
-    gravity: tuple[Cause, Matrix] = ("gravity", up[:, None])
-    return [gravity] if by_reading is None else [("gradienter", by_reading), gravity]
+        explains = all(witness.is_explained(shift) for witness in against) and min(gains, default=0.0) >= -TELLS
+        if explains and len(named) > 1:
+            names = tuple(witness.name for witness in witnesses if witness.name in named)
+            return [Doubt(against[0].triad, cause, names, _of_all(cause, size, ", ".join(names), against))]
+    return [_alone(witness, others, causes, today=today) for witness in against]
 
 
 def _common(witnesses: Sequence[Witness], directions: Matrix) -> tuple[Array, Array]:
     """Fit the one shift along these directions that explains all best; also give its size along each."""
-    weights = [directions.T / witness.own_variance for witness in witnesses]
-    normal = sum((weight @ directions for weight in weights), np.zeros((directions.shape[1],) * 2))
-    right = sum((w @ witness.difference for w, witness in zip(weights, witnesses, strict=True)), np.zeros(len(normal)))
-    size = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
+    by = np.vstack([directions / np.sqrt(witness.own_variance)[:, None] for witness in witnesses])
+    found = np.concatenate([witness.difference / np.sqrt(witness.own_variance) for witness in witnesses])
+    size = np.asarray(np.linalg.lstsq(by, found)[0], dtype=np.float64)
     return directions @ size, size
 
 
 def _alone(
-    triad: Triad, witness: Witness, others: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]], *, today: bool
+    witness: Witness, others: Sequence[Witness], causes: Sequence[tuple[Cause, Matrix]], *, today: bool
 ) -> Doubt:
     """Judge one IMU that contradicts: do the others rule out the common causes?"""
+    triad, name, expected = witness.triad, witness.name, witness.expected
     unit, words, digits = UNITS[triad]
     axis = int(np.argmax(np.abs(witness.difference) / witness.sigma))
     before = (
         "the calibration before in this power-up"
         if today
-        else f"{witness.power_ups} earlier power-ups (usual: {witness.sigma[axis] / unit:.{digits}f})"
+        else f"{expected.power_ups} earlier power-ups (usual: {witness.sigma[axis] / unit:.{digits}f})"
     )
     by = f"{witness.difference[axis] / unit:+.{digits}f} {words}"
-    line = f"{triad} {witness.name}: {'xyz'[axis]} differs by {by} from {before}"
+    line = f"{triad} {name}: {'xyz'[axis]} differs by {by} from {before}"
     for cause, directions in causes:
         shift, size = _common([witness], directions)
         if witness.is_explained(shift) and not any(other.gain(shift) < -TELLS for other in others):
@@ -179,15 +187,14 @@ def _alone(
                 "gravity": "height and latitude of the place are wrong",
                 "turn": "it turns (a boat?)",
             }[cause]
-            return Doubt(triad, "unclear", (witness.name,), f"{line}: this sensor is another one now, or {also}")
+            return Doubt(triad, "unclear", (name,), f"{line}: this sensor is another one now, or {also}")
     agree = ", ".join(other.name for other in others)
     end = f"while {agree} agrees with its own: look at this sensor" if agree else "look at this sensor"
-    return Doubt(triad, "imu", (witness.name,), f"{line}, {end}")
+    return Doubt(triad, "imu", (name,), f"{line}, {end}")
 
 
-def _of_all(cause: Cause, size: Array, imus: Sequence[str], against: Sequence[Witness]) -> str:
+def _of_all(cause: Cause, size: Array, names: str, against: Sequence[Witness]) -> str:
     """Say a contradiction of all IMUs to a pilot; `size` is the shift along the cause's directions."""
-    names = ", ".join(imus)
     if cause == "turn":
         return (
             f"all gyros ({names}) differ alike from before, by {float(np.linalg.norm(size)) / DEG_H:.0f} deg/h:"
@@ -200,7 +207,7 @@ def _of_all(cause: Cause, size: Array, imus: Sequence[str], against: Sequence[Wi
         )
     x, y = size / DEG
     by = f"{math.hypot(x, y):.2f} deg (x {x:+.2f}, y {y:+.2f})"
-    if all(witness.same_zero for witness in against):
+    if all(witness.expected.same_zero > 0.5 for witness in against):
         return (
             f"the gradienter has moved by {by}: all accelerometers ({names}) differ alike from before; look"
             " at its mounting, then companion align zero"
@@ -209,3 +216,55 @@ def _of_all(cause: Cause, size: Array, imus: Sequence[str], against: Sequence[Wi
         f"the gradienter's zero differs from the one before by {by} more than it should: all accelerometers"
         f" ({names}) say so; companion align zero"
     )
+
+
+def points(
+    solution: Solution,
+    whole: Mapping[str, Pair],
+    doubts: Iterable[Doubt],
+    *,
+    started_at: str,
+    unix_s: float,
+    power_ups: Mapping[str, PowerUp],
+    zero: str | None,
+) -> dict[str, Point]:
+    """Make each IMU's point of the history from the readings alone; what is doubted is marked as suspect."""
+    shared = solution.shared
+    doubted = {(doubt.triad, name) for doubt in doubts for name in doubt.names}
+    common = np.diag(shared.covariance).copy()
+    common[3:] = np.maximum(common[3:] - np.diag(shared.by_zero @ shared.by_zero.T), 0.0)
+
+    def measured(imu: ImuSolution, triad: Triad) -> Measured | None:
+        bias = whole[imu.name][TRIADS.index(triad)]
+        if bias is None:
+            return None
+        part = rows_of(triad)
+        return Measured(
+            bias=_short(bias if imu.warming is None else bias - imu.warming.ahead(triad)),
+            sigma_stat=_short(imu.sigma_stat[part]),
+            sigma_use=_short(np.sqrt(imu.own_variance(shared)[part])),
+            sigma_shared=_short(np.sqrt(common[part])),
+            suspect=(triad, imu.name) in doubted,
+        )
+
+    return {
+        imu.name: Point(
+            started_at=started_at,
+            unix_s=unix_s,
+            power_up=power_ups[imu.name],
+            temperature_degc=imu.mean_degc,
+            k_s=imu.k_s,
+            up=_short(shared.up),
+            zero=zero if whole[imu.name][1] is not None else None,
+            zero_sigma_rad=shared.zero_sigma_rad,
+            gyro=measured(imu, "gyro"),
+            accel=measured(imu, "accel"),
+        )
+        for imu in solution.imus
+        if imu.name in whole
+    }
+
+
+def _short(values: Array) -> Vector:
+    """Round to 9 decimals, 2e-4 deg/h."""
+    return vector(np.round(values, 9))

@@ -1,16 +1,16 @@
 """Combines the predictions of earlier calibrations with today's readings of all IMUs (method 3.3).
 
-A window that warmed is moved to its end first: the mean over it is that of its mean temperature. The curve predicts how
-the bias went from there to the end, the readings' own slope measures it, and each has a share by its variance. Where
-they contradict each other the window alone counts: its mean, or the end of its ramp.
+A window that warmed is moved to its end first: the curve predicts how the bias went from the mean to the end, the
+readings' own slope measures it, and each has a share by its variance. Where they contradict each other the window alone
+counts.
 
 Then, with d the biases by today's readings and p the predictions, all IMUs together,
 
     d = b + e_d     p = b + e_p     b_MAP = d + K (p - d)     K = cov(e_d, e_d - e_p) cov(e_d - e_p)^-1
 
-which for independent errors is (S_d^-1 + S_0^-1)^-1 (S_d^-1 d + S_0^-1 p). They are not independent: the error of the
-gradienter's zero is the same in all IMUs, and where the earlier calibrations were made with today's zero, in p as
-well, so that nothing averages it away. Where they were made with other zeros, several IMUs together tell today's tilt.
+The error of the gradienter's zero is the same in all IMUs, and where the earlier calibrations were made with today's
+zero, in p as well, so that nothing averages it away. Where they were made with other zeros, several IMUs together tell
+today's tilt.
 
 A sigma_use that is too cautious would hand the estimate to the prior. So K counts as e_d only what is *known* to be
 noise: what averaging has left (sigma_stat), the gradienter's scatter, what is not known of the platform's turn, and
@@ -31,7 +31,7 @@ import numpy as np
 from companion.estimation.means.warming import NEXT_S
 from companion.estimation.records.record import AccelPrior, GyroPrior, Prior, WhenWarm
 from companion.estimation.solution.doubt import Doubt, Witness, contradictions
-from companion.estimation.solution.prior import Expectation, ExpectedImu, Prediction
+from companion.estimation.solution.prior import Expectation, ExpectedImu
 from companion.estimation.solution.solve import ImuSolution, Pair, Shared, Solution, moved
 from companion.estimation.turning.watch import CHANCE_SIGMAS, Turn
 from companion.physics.frames import Array, vector
@@ -41,9 +41,6 @@ from companion.samples import TRIADS, Triad, rows_of
 Whole = Mapping[str, Pair]
 """By IMU: whole gyro and accelerometer bias by the readings alone, (3,) each, vehicle FRD."""
 
-AGREES: Final = 11.34
-"""Chi square of three axes that is passed by chance once in a hundred: beyond it nobody is warned yet, but what may
-well be of another sensor takes no part."""
 BOUNDS_RAD_S: Final = 0.1 * DEG
 """Largest sigma of a gyro's prediction that says something of a turn."""
 _CONTRADICTS: Final = 4.0
@@ -71,54 +68,21 @@ class Weighed:
         }
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class _Known:
-    """One triad with a prediction."""
-
-    imu: int
-    triad: Triad
-    expected: Prediction
-    measured: Array
-    witness: Witness
-
-    @property
-    def rows(self) -> slice:
-        start = 6 * self.imu + rows_of(self.triad).start
-        return slice(start, start + 3)
-
-    @property
-    def agrees(self) -> bool:
-        """Whether the measurement is near enough for the prediction to take part."""
-        covariance = np.diag(self.witness.own_variance) + self.witness.common
-        difference = self.witness.difference
-        return float(difference @ np.linalg.solve(covariance, difference)) < AGREES
-
-
 def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed:
     """Check a solution against earlier calibrations, and let them take part where they may."""
-    expected = {each.name: each for each in expectation.imus}
-    ends = [at_end(imu, expected.get(imu.name), solution.shared) for imu in solution.imus]
+    shared, expected = solution.shared, {each.name: each for each in expectation.imus}
+    ends = [at_end(imu, expected.get(imu.name), shared) for imu in solution.imus]
     whole = {imu.name: moved(whole[imu.name], shift) for imu, shift, _ in ends if imu.name in whole}
-    imus = tuple(_with_effect(imu, expected.get(imu.name), solution.shared) for imu, _, _ in ends)
+    imus = tuple(_with_effect(imu, expected.get(imu.name), shared) for imu, _, _ in ends)
     solution = dataclasses.replace(solution, imus=imus)
-    earlier, today = (_known(solution, whole, expected, today=today) for today in (False, True))
-    doubts = contradictions(
-        [(one.triad, one.witness) for one in earlier],
-        [(one.triad, one.witness) for one in today],
-        len(imus),
-        solution.shared.up,
-        solution.shared.by_reading,
-    )
-    found = Weighed(solution, tuple(doubts))
-    used = [
-        one
-        for one in earlier
-        if one.expected.weighs and (imus[one.imu].name, one.triad) not in found.doubted and one.agrees
-    ]
-    weighed, shift = _combined(solution, used, zero_is_known=expectation.zero_is_known)
-    weighed = _grounded(weighed, earlier, today)
+    earlier, today = (_witnesses(solution, whole, expected, today=today) for today in (False, True))
+    doubts = contradictions(earlier, today, len(imus), shared.up, shared.by_reading)
+    doubted = Weighed(solution, tuple(doubts)).doubted
+    used = [one for one in earlier if one.expected.weighs and (one.name, one.triad) not in doubted and one.agrees]
+    combined, shift = _combined(solution, used, zero_is_known=expectation.zero_is_known)
+    combined = _grounded(combined, earlier, today)
     final = []
-    for k, (imu, (_, _, followed)) in enumerate(zip(weighed.imus, ends, strict=True)):
+    for k, (imu, (_, _, followed)) in enumerate(zip(combined.imus, ends, strict=True)):
         own = [doubt.words for doubt in doubts if not doubt.of_all and imu.name in doubt.names]
         prior = _prior([one for one in earlier if one.imu == k], used)
         if imu.name in whole:
@@ -126,8 +90,8 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
             imu = with_warm(imu, now, expected.get(imu.name), followed)
         final.append(dataclasses.replace(imu, prior=prior, warnings=(*imu.warnings, *own)))
     common = [doubt.words for doubt in doubts if doubt.of_all]
-    weighed = dataclasses.replace(weighed, imus=tuple(final), warnings=(*solution.warnings, *common))
-    return Weighed(weighed, found.doubts)
+    combined = dataclasses.replace(combined, imus=tuple(final), warnings=(*solution.warnings, *common))
+    return Weighed(combined, tuple(doubts))
 
 
 # --- a window that warmed
@@ -213,41 +177,31 @@ def _with_effect(imu: ImuSolution, expected: ExpectedImu | None, shared: Shared)
     return dataclasses.replace(imu, effective=effect.effective(*figures), warnings=warnings)
 
 
-def _known(solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu], *, today: bool) -> list[_Known]:
+def _witnesses(solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu], *, today: bool) -> list[Witness]:
     """Pair each prediction with its measurement."""
-    found: list[_Known] = []
+    shared, found = solution.shared, []
     for triad, (k, imu) in itertools.product(TRIADS, enumerate(solution.imus)):
         said, measured = expected.get(imu.name), whole[imu.name][TRIADS.index(triad)] if imu.name in whole else None
         known = None if said is None else (said.today if today else said.earlier).get(triad)
-        if measured is not None and known is not None:
-            found.append(_Known(k, triad, known, measured, _witness(imu, solution.shared, triad, known, measured)))
+        if measured is None or known is None:
+            continue
+        part = rows_of(triad)
+        common = shared.covariance[part, part]
+        if triad == "accel":
+            zero, other = shared.by_zero, shared.tilted(known.other_zero_rad)
+            common = common + (np.square(1.0 - known.same_zero) - 1.0) * (zero @ zero.T) + other @ other.T
+        own_variance = imu.own_variance(shared)[part] + np.array(known.variance)
+        found.append(Witness(k, imu.name, triad, known, measured, own_variance, common))
     return found
 
 
-def _witness(imu: ImuSolution, shared: Shared, triad: Triad, expected: Prediction, measured: Array) -> Witness:
-    part = rows_of(triad)
-    common = shared.covariance[part, part]
-    if triad == "accel":
-        zero, other = shared.by_zero, shared.tilted(expected.other_zero_rad)
-        common = common + (np.square(1.0 - expected.same_zero) - 1.0) * (zero @ zero.T) + other @ other.T
-    return Witness(
-        name=imu.name,
-        difference=measured - np.array(expected.value),
-        own_variance=imu.own_variance(shared)[part] + np.array(expected.variance),
-        common=common,
-        limit=expected.limit,
-        power_ups=expected.power_ups,
-        same_zero=expected.same_zero > 0.5,
-    )
-
-
-def _combined(solution: Solution, used: Sequence[_Known], *, zero_is_known: bool) -> tuple[Solution, Array]:
+def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: bool) -> tuple[Solution, Array]:
     """Combine measurements and predictions by the equations at the top; also give the shift of all biases, (6 n,)."""
     shared, count = solution.shared, len(solution.imus)
     if not used:
         return solution, np.zeros(6 * count)
     index = np.concatenate([np.arange(one.rows.start, one.rows.stop) for one in used])
-    innovation = -np.concatenate([one.witness.difference for one in used])
+    innovation = -np.concatenate([one.difference for one in used])
     blocks = {(imu.name, imu.name): imu.covariance for imu in solution.imus} | dict(solution.cross)
     blocks |= {(other, one): matrix.T for (one, other), matrix in solution.cross.items()}
     s_d = np.block([[blocks[one.name, other.name] for other in solution.imus] for one in solution.imus])
@@ -290,7 +244,7 @@ def _combined(solution: Solution, used: Sequence[_Known], *, zero_is_known: bool
     return dataclasses.replace(solution, imus=tuple(imus), cross=cross), shift
 
 
-def _grounded(solution: Solution, earlier: Sequence[_Known], today: Sequence[_Known]) -> Solution:
+def _grounded(solution: Solution, earlier: Sequence[Witness], today: Sequence[Witness]) -> Solution:
     """Bound the platform's turn by the gyros' predictions, where neither a compass nor a rest has measured it.
 
     What they read more about the vertical is taken for chance up to `CHANCE_SIGMAS`, and else belongs to sigma. Only
@@ -300,7 +254,7 @@ def _grounded(solution: Solution, earlier: Sequence[_Known], today: Sequence[_Kn
         return solution
     up, more_rad_s = solution.shared.up, 0.0
     for known in (earlier, today):
-        found = [one.witness.along(up) for one in known if one.triad == "gyro"]
+        found = [one.along(up) for one in known if one.triad == "gyro"]
         rate, sigma = min(found, key=lambda each: each[1], default=(0.0, math.inf))
         if abs(rate) > CHANCE_SIGMAS * sigma:
             more_rad_s = max(more_rad_s, abs(rate))
@@ -317,19 +271,19 @@ def _grounded(solution: Solution, earlier: Sequence[_Known], today: Sequence[_Kn
     )
 
 
-def _prior(known: Sequence[_Known], used: Sequence[_Known]) -> Prior | None:
+def _prior(known: Sequence[Witness], used: Sequence[Witness]) -> Prior | None:
     """Make the record's entry of one IMU's predictions."""
-    found: dict[Triad, GyroPrior | AccelPrior] = {}
+    found: dict[str, Any] = dict.fromkeys(TRIADS)
     for one in known:
-        witness, expected = one.witness, one.expected
+        expected = one.expected
         kind, unit = (GyroPrior, "rad_s") if one.triad == "gyro" else (AccelPrior, "m_s2")
         figures: dict[str, Any] = {
             f"expected_{unit}": expected.value,
             f"sigma_{unit}": vector(np.sqrt(np.array(expected.variance))),
             f"measured_{unit}": vector(one.measured),
-            "shift_sigma": vector(witness.difference / witness.sigma),
+            "shift_sigma": vector(one.difference / one.sigma),
         }
         found[one.triad] = kind(
             used=one in used, power_ups=expected.power_ups, temperature_model=expected.by_temperature, **figures
         )
-    return Prior(**{triad: found.get(triad) for triad in TRIADS}) if found else None  # type: ignore[arg-type]
+    return Prior(**found) if known else None

@@ -45,12 +45,12 @@ _NINETY_FIVE: Final = 1.96
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Heading:
-    """The true heading of the vehicle, how sure it is, and why."""
+class CompassHeading:
+    """True heading of the vehicle by the compass, and its error."""
 
     heading_rad: float
     sigma_rad: float
-    """Without what a wrong tilt adds, which `heading_by_up` tells."""
+    """One sigma at an exact tilt; `heading_by_up` gives the effect of a wrong one."""
     heading_by_up: Array
     """Gradient by up in the vehicle's axes, (3,): zero for a device's own heading."""
     is_usable: bool
@@ -59,12 +59,10 @@ class Heading:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class _Field:
-    """Heading by the mean field."""
-
-    strength_gauss: float | None
-    inclination_rad: float | None
-    heading_rad: float | None
+class _MeanField:
+    strength_gauss: float | None = None
+    inclination_rad: float | None = None
+    heading_rad: float | None = None
     """Heading of the vehicle by the compass' north, with our tilt compensation."""
     bound_deg: float | None = None
     """Largest turn of the heading by a disturbance."""
@@ -78,14 +76,14 @@ def assess(
     up: Array,
     up_covariance: Matrix | None,
     may_turn_deg: float = 0.0,
-) -> Heading:
-    """The heading of the vehicle from the compass' window, and everything that bounds its error.
+) -> CompassHeading:
+    """Estimate the heading from the compass' window, and bound its error.
 
-    `up_covariance` None: up is not from a gradienter, and no inclination can be told. `may_turn_deg` is how far the
-    aircraft itself may have turned, unseen, within the window.
+    `up_covariance` None: up is not from a gradienter, so the inclination is unknown. `may_turn_deg`: unseen turn of
+    the aircraft within the window.
     """
     heading = vehicle_heading_rad(compass, window.heading_deg, up)
-    found = _Field(None, None, None) if field is None else _look(field, compass, local, up, up_covariance)
+    found = _MeanField() if field is None else _judge(field, compass, local, up, up_covariance)
     gradient, vertical = np.zeros(3), False
     if window.from_field and field is not None:
         try:
@@ -103,14 +101,27 @@ def assess(
         chance_deg = _NINETY_FIVE * math.hypot(tilt_deg, window.sigma_deg, declination_sigma_deg)
         bound_deg = min(math.hypot(max(found.bound_deg, abs(difference or 0.0)), wander_deg, chance_deg), 180.0)
     sigma_deg = math.hypot(max(compass.sigma_at(up), wander_deg), window.sigma_deg, declination_sigma_deg)
-    # Where there is a field to be told from the Earth's, or a north that the compass could show.
+    # A compass that shows true north does not depend on the horizontal field.
     use = local.field.compass_use if compass.magnetic and local.field is not None else "good"
     useless = vertical or (bound_deg or 0.0) > USELESS_DEG or use == "none"
     if useless:
         bound_deg = 180.0
-    return Heading(
+    earths = local.field
+    warnings = ["compass field is vertical: no heading"] if vertical else []
+    if use == "none":
+        warnings.append("too near the magnetic pole for a compass: heading unknown, gyro sigma widened")
+    elif use == "poor":
+        warnings.append("near the magnetic pole: the compass heading is weak")
+    if earths is not None:
+        warnings += _disturbed(found, earths, bound_deg, useless=useless, near_pole=use == "none")
+    warnings += _unsteady(window, difference, may_turn_deg)
+    if field is not None and field.unit == "counts":
+        warnings.append("compass field in counts: only its direction is checked (counts_per_gauss is not set)")
+    if field is not None and up_covariance is None:
+        warnings.append("compass field without a gradienter: heading error bound unknown")
+    return CompassHeading(
         heading_rad=heading + (local.declination_deg * DEG if compass.magnetic else 0.0),
-        # A heading is never surer than what is known of its error.
+        # The sigma is never below the bound: a disturbance may last for the whole flight.
         sigma_rad=max(sigma_deg, bound_deg or 0.0) * DEG,
         heading_by_up=gradient,
         is_usable=not useless,
@@ -118,41 +129,34 @@ def assess(
             heading_bound_deg=_rounded(bound_deg, 2),
             heading_from="field" if window.from_field else "device",
             field_gauss=_rounded(found.strength_gauss, 5),
-            field_expected_gauss=None if local.field is None else _rounded(local.field.strength_gauss, 5),
+            field_expected_gauss=None if earths is None else _rounded(earths.strength_gauss, 5),
             inclination_deg=None if found.inclination_rad is None else _rounded(found.inclination_rad / DEG, 3),
-            inclination_expected_deg=None if local.field is None else _rounded(local.field.inclination_deg, 3),
+            inclination_expected_deg=None if earths is None else _rounded(earths.inclination_deg, 3),
             device_minus_field_deg=_rounded(difference, 2),
             wander_deg=_rounded(window.wander_deg, 2),
         ),
-        warnings=(
-            *(["compass field is vertical: no heading"] if vertical else []),
-            *_near_pole(use),
-            *_disturbed(found, local.field, bound_deg, useless=useless, use=use),
-            *_unsteady(window, difference, may_turn_deg),
-            *_unchecked(field, up_covariance),
-        ),
+        warnings=tuple(warnings),
     )
 
 
-def _look(
+def _judge(
     field: FieldWindow, compass: CompassModel, local: LocalEarth, up: Array, up_covariance: Matrix | None
-) -> _Field:
-    """Judge the mean field, and how far a disturbance that would look like this may turn the heading."""
+) -> _MeanField:
+    """Bound the effect of a disturbance that would look like the mean field."""
     vector = compass.vehicle_from_sensor @ np.array(field.field)
     size = float(np.linalg.norm(vector))
     strength = size if field.unit == "gauss" else None
     if up_covariance is None or size == 0.0:
-        return _Field(strength, None, None)
-    inclination = inclination_rad(vector, up)
+        return _MeanField(strength)
+    inclination, expected = inclination_rad(vector, up), local.field
     try:
         own = heading_rad(np.array(field.field), compass.vehicle_from_sensor.T @ up)
         by_up = inclination_by_up(vector, up)
     except ValueError:
-        return _Field(strength, inclination, None, 180.0 if local.field is not None else None)
+        return _MeanField(strength, inclination, None, None if expected is None else 180.0)
     own = vehicle_heading_rad(compass, own / DEG, up)
-    expected = local.field
     if expected is None:
-        return _Field(strength, inclination, own)
+        return _MeanField(strength, inclination, own)
     noise = float(np.linalg.norm(field.sigma)) / size
     dip_sigma_rad = math.sqrt((expected.inclination_sigma_deg * DEG) ** 2 + by_up @ up_covariance @ by_up + noise**2)
     whole = expected.strength_gauss
@@ -168,21 +172,13 @@ def _look(
             math.hypot(expected.strength_sigma_gauss, noise * size),
         )
         unseen = BOUND_OF_TWO * seen
-    return _Field(strength, inclination, own, deflection_bound_deg(unseen, across))
-
-
-def _near_pole(use: str) -> list[str]:
-    if use == "none":
-        return ["too near the magnetic pole for a compass: heading unknown, gyro sigma widened"]
-    return ["near the magnetic pole: the compass heading is weak"] if use == "poor" else []
+    return _MeanField(strength, inclination, own, deflection_bound_deg(unseen, across))
 
 
 def _disturbed(
-    found: _Field, earths: MagneticField | None, bound_deg: float | None, *, useless: bool, use: str
+    found: _MeanField, earths: MagneticField, bound_deg: float | None, *, useless: bool, near_pole: bool
 ) -> list[str]:
-    """In what the field is not the Earth's, and what that makes of the heading."""
-    if earths is None:
-        return []
+    """Warn of a field that is not the Earth's."""
     warnings, parts = [], []
     if found.strength_gauss is not None:
         off = found.strength_gauss / earths.strength_gauss - 1.0
@@ -196,33 +192,18 @@ def _disturbed(
     if found.inclination_rad is not None:
         dip = found.inclination_rad / DEG - earths.inclination_deg
         if abs(dip) > INCLINATION_GATE_DEG:
-            # Towards the nadir in the north and towards the zenith in the south is steeper.
-            steeper = dip * math.copysign(1.0, earths.inclination_deg) > 0.0
-            parts.append(f"{abs(dip):.1f} deg {'steeper' if steeper else 'flatter'} than the Earth's")
-    if not parts:
-        if useless and use != "none":
-            warnings.append(
-                "compass field too flat or too steep to show a heading: heading unknown, gyro sigma widened"
-            )
-        return warnings
-    consequence = ""
-    if useless:
-        consequence = "heading useless; "
-    elif bound_deg is not None:
-        consequence = f"heading may be off by {bound_deg:.0f} deg; "
-    return [*warnings, f"compass field {' and '.join(parts)}: {consequence}move away from iron"]
-
-
-def _unchecked(field: FieldWindow | None, up_covariance: Matrix | None) -> list[str]:
-    warnings = []
-    if field is not None and field.unit == "counts":
-        warnings.append("compass field in counts: only its direction is checked (counts_per_gauss is not set)")
-    if field is not None and up_covariance is None:
-        warnings.append("compass field without a gradienter: heading error bound unknown")
+            parts.append(f"{abs(dip):.1f} deg off the Earth's inclination")
+    if parts:
+        consequence = "" if bound_deg is None else f"heading may be off by {bound_deg:.0f} deg; "
+        consequence = "heading useless; " if useless else consequence
+        warnings.append(f"compass field {' and '.join(parts)}: {consequence}move away from iron")
+    elif useless and not near_pole:
+        warnings.append("compass field too flat or too steep to show a heading: heading unknown, gyro sigma widened")
     return warnings
 
 
 def _unsteady(window: HeadingWindow, difference: float | None, may_turn_deg: float) -> list[str]:
+    """Warn of a heading that moves, or that contradicts the field."""
     warnings = []
     if window.wander_deg is not None and window.wander_deg > WANDER_WARNING_DEG:
         moves = f"compass moves by {window.wander_deg:.1f} deg"

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final, Literal
 
 import msgspec
@@ -30,8 +30,6 @@ from companion.estimation.noise.allan import floor_variance
 from companion.estimation.records.align_record import Determined, ImuAlignmentRecord
 from companion.estimation.records.history import GUARDS_FROM, WEIGHS_FROM, Measured, Point, PowerUp, believed
 from companion.estimation.records.record import Effective
-from companion.estimation.solution.doubt import Doubt
-from companion.estimation.solution.solve import ImuSolution, Pair, Solution
 from companion.estimation.temperature.curve import (
     CATALOGUE_PER_K,
     WARM_AFTER,
@@ -45,85 +43,14 @@ from companion.estimation.temperature.curve import (
 from companion.physics.frames import Array, Floats, Matrix, skew, symmetric, vector
 from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG, MG, G
-from companion.samples import TRIADS, Triad, Vector, rows_of
+from companion.samples import Triad, Vector
 
 LEVEL: Final = np.array([0.0, 0.0, -1.0])
 WORTH_SAYING_M_S2: Final = 1.0 * MG
 """Least effect of the attitude in a warning; a wheel on a stone makes less."""
 _SIGMAS: Final = 2.0
 _PRIORS: Final = Priors()
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class PoseEffect:
-    """Matrix S - [m x] of one IMU: mean and one sigma of each element, both (3, 3)."""
-
-    mean: Matrix
-    sigma: Matrix
-    misalignment_mean: Matrix
-    misalignment_sigma: Matrix
-    source: Literal["assumed", "alignment"]
-
-    def change(self, gravity_m_s2: float, at: Array, then: Array) -> tuple[Array, Array]:
-        """Give the bias at `at` less the bias at `then`, and one sigma of that; each (3,), m/s^2."""
-        by = gravity_m_s2 * (at - then)
-        mean = (self.mean + self.misalignment_mean) @ by
-        variance = (np.square(self.sigma) + np.square(self.misalignment_sigma)) @ np.square(by)
-        return mean, np.sqrt(variance)
-
-    def effective(self, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> Effective:
-        """Make the entry of the record, without misalignment, which turns the axes and is no bias of the sensor.
-
-        Args:
-            gravity_m_s2: local gravity.
-            up: unit vector, the attitude of the calibration, (3,).
-            sigma_use_m_s2: sigma of the bias at this attitude, (3,).
-        """
-        # The mean is known but not subtracted from what is written, so it counts in full.
-        whole = np.sqrt(np.square(self.mean) + np.square(self.sigma))
-        to_level = np.square(gravity_m_s2 * (LEVEL - up))
-        own = np.square(whole) @ np.square(gravity_m_s2 * up)
-        return Effective(
-            scale_from=self.source,
-            scale_sigma_m_s2=vector(gravity_m_s2 * np.diag(whole)),
-            level_sigma_m_s2=vector(np.sqrt(np.square(sigma_use_m_s2) + np.square(whole) @ to_level)),
-            sensor_sigma_m_s2=vector(np.sqrt(np.square(sigma_use_m_s2) + own)),
-        )
-
-    def warning(self, name: str, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> str | None:
-        """Warn a pilot who has calibrated a tilted aircraft; None: it stood about level."""
-        whole = np.square(self.mean) + np.square(self.sigma)
-        moves = np.sqrt(whole @ np.square(gravity_m_s2 * (LEVEL - up)))
-        if not (moves > np.maximum(WORTH_SAYING_M_S2, _SIGMAS * sigma_use_m_s2)).any():
-            return None
-        return (
-            f"accel {name}: effective at this attitude; level again it may be off by {moves.max() / MG:.1f} mg, since"
-            " its scale error looks like a bias: calibrate level (companion align tilts tells the scale)"
-        )
-
-
-def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:
-    """Give the known scale, shear and misalignment of one IMU."""
-    none: Determined | None = None
-    scale, scale_sigma = _known(aligned.accel_scale if aligned else none, 1.0, _PRIORS.scale)
-    shear, shear_sigma = _known(aligned.accel_shear if aligned else none, 1.0, _PRIORS.shear)
-    turn, turn_sigma = _known(aligned.misalignment_deg if aligned else none, DEG, _PRIORS.misalignment_deg * DEG)
-    return PoseEffect(
-        mean=np.diag(scale) + symmetric(shear),
-        sigma=np.diag(scale_sigma) + symmetric(shear_sigma),
-        misalignment_mean=-skew(turn),
-        misalignment_sigma=symmetric(turn_sigma[::-1]),
-        source="alignment" if aligned is not None and any(aligned.accel_scale.known) else "assumed",
-    )
-
-
-def _known(found: Determined | None, unit: float, assumed: float) -> tuple[Array, Array]:
-    if found is None:
-        return np.zeros(3), np.full(3, assumed)
-    known = np.array(found.known)
-    return np.where(known, found.value, 0.0) * unit, np.where(known, np.array(found.sigma) * unit, assumed)
-
-
+_MISALIGNMENT_RAD: Final = _PRIORS.misalignment_deg * DEG
 GATE_SIGMAS: Final = 4.0
 TEMPERATURE_SIGMA_K: Final = 10.0
 """Temperature change between two calibrations of one power-up, where no temperature is known."""
@@ -134,6 +61,72 @@ _UNEXPLAINED: Final = 0.1
 for one simulated aircraft in some hundreds); with that of the air, a heater or a processor 0.1 to 1 and more."""
 _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class PoseEffect:
+    """Matrix S - [m x] of one IMU: mean and one sigma of each element, (3, 3) each."""
+
+    mean: Matrix
+    sigma: Matrix
+    misalignment_mean: Matrix
+    misalignment_sigma: Matrix
+    source: Literal["assumed", "alignment"]
+
+    def change(self, gravity_m_s2: float, at: Array, then: Array) -> tuple[Array, Array]:
+        """Give the bias at `at` less the bias at `then`, and one sigma of that; each (3,), m/s^2."""
+        by = gravity_m_s2 * (at - then)
+        variance = (np.square(self.sigma) + np.square(self.misalignment_sigma)) @ np.square(by)
+        return (self.mean + self.misalignment_mean) @ by, np.sqrt(variance)
+
+    def _variance(self, gravity_m_s2: float, by: Array) -> Array:
+        """Give the variance of the bias by a change of up, (3,), without misalignment, which turns the axes only.
+
+        The mean is known but not subtracted from what is written, so it counts in full.
+        """
+        return np.asarray((np.square(self.mean) + np.square(self.sigma)) @ np.square(gravity_m_s2 * by))
+
+    def effective(self, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> Effective:
+        """Make the entry of the record; `up` (3,) is the attitude of the calibration, `sigma_use_m_s2` (3,) there."""
+        here = np.square(sigma_use_m_s2)
+        scale = np.sqrt(np.diag(np.square(self.mean) + np.square(self.sigma)))
+        return Effective(
+            scale_from=self.source,
+            scale_sigma_m_s2=vector(gravity_m_s2 * scale),
+            level_sigma_m_s2=vector(np.sqrt(here + self._variance(gravity_m_s2, LEVEL - up))),
+            sensor_sigma_m_s2=vector(np.sqrt(here + self._variance(gravity_m_s2, up))),
+        )
+
+    def warning(self, name: str, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> str | None:
+        """Warn a pilot who has calibrated a tilted aircraft; None: it stood about level."""
+        moves = np.sqrt(self._variance(gravity_m_s2, LEVEL - up))
+        if not (moves > np.maximum(WORTH_SAYING_M_S2, _SIGMAS * sigma_use_m_s2)).any():
+            return None
+        return (
+            f"accel {name}: effective at this attitude; level again it may be off by {moves.max() / MG:.1f} mg, since"
+            " its scale error looks like a bias: calibrate level (companion align tilts tells the scale)"
+        )
+
+
+def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:
+    """Give the known scale, shear and misalignment of one IMU."""
+
+    def known(found: Determined | None, unit: float, assumed: float) -> tuple[Array, Array]:
+        if found is None:
+            return np.zeros(3), np.full(3, assumed)
+        known = np.array(found.known)
+        return np.where(known, found.value, 0.0) * unit, np.where(known, np.array(found.sigma) * unit, assumed)
+
+    scale, scale_sigma = known(aligned.accel_scale if aligned else None, 1.0, _PRIORS.scale)
+    shear, shear_sigma = known(aligned.accel_shear if aligned else None, 1.0, _PRIORS.shear)
+    turn, turn_sigma = known(aligned.misalignment_deg if aligned else None, DEG, _MISALIGNMENT_RAD)
+    return PoseEffect(
+        mean=np.diag(scale) + symmetric(shear),
+        sigma=np.diag(scale_sigma) + symmetric(shear_sigma),
+        misalignment_mean=-skew(turn),
+        misalignment_sigma=symmetric(turn_sigma[::-1]),
+        source="alignment" if aligned is not None and any(aligned.accel_scale.known) else "assumed",
+    )
 
 
 class Prediction(msgspec.Struct, frozen=True, kw_only=True):
@@ -200,11 +193,13 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
     nodes, poses, shared = [], [], []
     for group in groups:
         found = [_of(point, triad) for point in group]
-        biases, pose = _here(group, found, triad, now, effect)
+        biases, pose = _here(group, triad, now, effect)
         zero = group[-1].zero_sigma_rad * now.gravity_m_s2 if triad == "accel" else 0.0
+        states = [(point.temperature_degc or 0.0, point.k_s) if by_degc else (0.0, 0.0) for point in group]
+        each = zip(states, biases, found, strict=True)
         nodes.append(
             PowerUpNodes(
-                [_node(*each, by_degc=by_degc) for each in zip(group, biases, map(_white, found), strict=True)],
+                [Node(degc, vector(bias), _white(one), k_s) for (degc, k_s), bias, one in each],
                 common_variance=float(np.square(pose).mean()) + zero**2,
             )
         )
@@ -239,11 +234,13 @@ def expect_today(
     found = last.of(triad)
     if found is None:
         return None
-    bias, pose = _here([last], [found], triad, now, effect)
+    bias, pose = _here([last], triad, now, effect)
     then_degc, now_degc = last.temperature_degc, now.temperature_degc
-    kelvin = now_degc - then_degc if then_degc is not None and now_degc is not None else TEMPERATURE_SIGMA_K
-    change, of_change = np.zeros(3), np.full(3, (CATALOGUE_PER_K[triad] * kelvin) ** 2)
-    if curve is not None and then_degc is not None and now_degc is not None:
+    if then_degc is None or now_degc is None:
+        change, of_change = np.zeros(3), np.full(3, (CATALOGUE_PER_K[triad] * TEMPERATURE_SIGMA_K) ** 2)
+    elif curve is None:
+        change, of_change = np.zeros(3), np.full(3, (CATALOGUE_PER_K[triad] * (now_degc - then_degc)) ** 2)
+    else:
         change, of_change = curve.change((then_degc, last.k_s), (now_degc, now.k_s))
     drift = _in_run(model, max(abs(now.unix_s - last.unix_s), _SHORTEST_GAP_S))
     variance = np.square(found.sigma_use) + np.square(found.sigma_shared) + np.square(pose[0]) + of_change + drift
@@ -260,16 +257,27 @@ def expect_today(
 
 
 def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve | None:
-    """Fit how a bias follows the temperature within a power-up; None: too little is known."""
+    """Fit how a bias follows the temperature within a power-up; None: too little is known.
+
+    An accelerometer's variance grows with the change of attitude from the first point of the power-up.
+    """
     groups = believed(points, triad)
     if len(groups) < WEIGHS_FROM or not _have_temperatures(groups):
         return None
-    nodes = [PowerUpNodes([_along(group[0], point, triad) for point in group]) for group in groups]
+    nodes, assumed = [], pose_effect(None)
+    for group in groups:
+        of_group = []
+        for point in group:
+            found = _of(point, triad)
+            _, sigma = assumed.change(G, np.array(point.up), np.array(group[0].up))
+            variance = _white(found) + (float(np.square(sigma).mean()) if triad == "accel" else 0.0)
+            of_group.append(Node(point.temperature_degc or 0.0, found.bias, variance, point.k_s))
+        nodes.append(PowerUpNodes(of_group))
     curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad], may_be_mean=False)
     assert curve is not None
     low, high = curve.span_degc
-    _, variance = curve.change((low, 0.0), (low + 1.0, 0.0))
-    known = high > low and variance.max() < (_KNOWN * CATALOGUE_PER_K[triad]) ** 2
+    _, of_kelvin = curve.change((low, 0.0), (low + 1.0, 0.0))
+    known = high > low and of_kelvin.max() < (_KNOWN * CATALOGUE_PER_K[triad]) ** 2
     return curve if known and curve.unexplained < _UNEXPLAINED else None
 
 
@@ -277,58 +285,6 @@ def follow(curve: Curve, path: Path, settles: Settling | None, model: AllanModel
     """Predict by a curve the bias over a window, and when the IMU is warm."""
     wander = 0.0 if settles is None else _in_run(model, max(WARM_AFTER * settles.tau_s, _SHORTEST_GAP_S))
     return curve.along(path.states, path.span_s, path.variance, settles, wander)
-
-
-def points(
-    solution: Solution,
-    whole: Mapping[str, Pair],
-    doubts: Iterable[Doubt],
-    *,
-    started_at: str,
-    unix_s: float,
-    power_ups: Mapping[str, PowerUp],
-    zero: str | None,
-) -> dict[str, Point]:
-    """Make each IMU's point of the history from the readings alone; what is doubted is marked as suspect."""
-    shared = solution.shared
-    doubted = {(doubt.triad, name) for doubt in doubts for name in doubt.names}
-    common = np.diag(shared.covariance).copy()
-    common[3:] = np.maximum(common[3:] - np.diag(shared.by_zero @ shared.by_zero.T), 0.0)
-
-    def measured(imu: ImuSolution, triad: Triad) -> Measured | None:
-        bias = whole[imu.name][TRIADS.index(triad)]
-        if bias is None:
-            return None
-        part = rows_of(triad)
-        return Measured(
-            bias=_short(bias if imu.warming is None else bias - imu.warming.ahead(triad)),
-            sigma_stat=_short(imu.sigma_stat[part]),
-            sigma_use=_short(np.sqrt(imu.own_variance(shared)[part])),
-            sigma_shared=_short(np.sqrt(common[part])),
-            suspect=(triad, imu.name) in doubted,
-        )
-
-    return {
-        imu.name: Point(
-            started_at=started_at,
-            unix_s=unix_s,
-            power_up=power_ups[imu.name],
-            temperature_degc=imu.mean_degc,
-            k_s=imu.k_s,
-            up=_short(shared.up),
-            zero=zero if whole[imu.name][1] is not None else None,
-            zero_sigma_rad=shared.zero_sigma_rad,
-            gyro=measured(imu, "gyro"),
-            accel=measured(imu, "accel"),
-        )
-        for imu in solution.imus
-        if imu.name in whole
-    }
-
-
-def _short(values: Array) -> Vector:
-    """Round to 9 decimals, 2e-4 deg/h."""
-    return vector(np.round(values, 9))
 
 
 def _of(point: Point, triad: Triad) -> Measured:
@@ -350,31 +306,13 @@ def _in_run(model: AllanModel, gap_s: float = _SHORTEST_GAP_S) -> float:
     return float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * gap_s))
 
 
-def _node(point: Point, bias: Array, variance: float, *, by_degc: bool) -> Node:
-    degc, k_s = (point.temperature_degc or 0.0, point.k_s) if by_degc else (0.0, 0.0)
-    return Node(degc, vector(bias), variance, k_s)
-
-
-def _along(first: Point, point: Point, triad: Triad) -> Node:
-    """Make a node of a power-up; an accelerometer's variance grows with the change of attitude from the first."""
-    found = _of(point, triad)
-    variance = _white(found)
-    if triad == "accel":
-        _, sigma = pose_effect(None).change(G, np.array(point.up), np.array(first.up))
-        variance += float(np.square(sigma).mean())
-    return _node(point, np.array(found.bias), variance, by_degc=True)
-
-
-def _here(
-    points: Sequence[Point], found: Sequence[Measured], triad: Triad, now: Now, effect: PoseEffect
-) -> tuple[Floats, Floats]:
+def _here(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect) -> tuple[Floats, Floats]:
     """Convert biases to today's attitude, and give one sigma of the conversion; each (points, 3)."""
-    bias = np.array([one.bias for one in found])
+    bias = np.array([_of(point, triad).bias for point in points])
     pose = np.zeros_like(bias)
     if triad == "accel":
-        up: Array = np.array(now.up)
         for k, point in enumerate(points):
-            change, pose[k] = effect.change(now.gravity_m_s2, up, np.array(point.up))
+            change, pose[k] = effect.change(now.gravity_m_s2, np.array(now.up), np.array(point.up))
             bias[k] += change
     return bias, pose
 

@@ -6,16 +6,14 @@ import datetime
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
+import msgspec
 import numpy as np
 
 from companion.estimation.records.record import CrossCovariance, ImuRecord, Record, Standing
-from companion.estimation.solution.solve import ImuSolution, Solution
+from companion.estimation.solution.solve import ImuSolution, Pair, Solution
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, DEG_H, MG
-from companion.samples import Vector
-
-Bias = tuple[Array | None, Array | None]
-"""Gyro bias, rad/s, and accelerometer bias, m/s^2, each (3,); None: not estimated."""
+from companion.samples import TRIADS, Vector
 
 
 def record_of(
@@ -26,33 +24,53 @@ def record_of(
     state: Literal["done", "failed", "cancelled"] = "done",
     reason: str | None = None,
     warnings: Sequence[str] = (),
-    whole: Mapping[str, Bias] | None = None,
+    whole: Mapping[str, Pair] | None = None,
 ) -> Record:
     """Build the record of a solution; without a solution it has no IMUs.
 
     `reason` None: the figures in words. `whole`: sums of residual and offsets, by IMU whose owner subtracts offsets.
     """
-    owned = whole or {}
-    imus = () if solution is None else tuple(_imu(imu, owned.get(imu.name)) for imu in solution.imus)
-    seen = () if solution is None else (*solution.warnings, *unseen_turn(solution))
-    return Record(
+    record = Record(
         state=state,
-        reason=in_words(solution, imus) if reason is None else reason,
-        warnings=(*seen, *warnings),
+        reason="nothing measured" if reason is None else reason,
+        warnings=tuple(warnings),
         started_at=started_at.isoformat(timespec="milliseconds"),
         duration_s=round(duration_s, 3),
-        pose=solution.pose if solution else None,
-        site=solution.site if solution else None,
-        magnetic=solution.magnetic if solution else None,
-        standing=_standing(solution) if solution else None,
+        pose=None,
+        site=None,
+        imus=(),
+    )
+    if solution is None:
+        return record
+    imus = tuple(_imu(imu, (whole or {}).get(imu.name)) for imu in solution.imus)
+    turn, told = solution.turn, solution.turn.is_told
+    known = {imu.name: _known(imu) for imu in solution.imus}
+    return msgspec.structs.replace(
+        record,
+        reason=in_words(solution, imus) if reason is None else reason,
+        warnings=(*solution.warnings, *unseen_turn(solution), *warnings),
+        pose=solution.pose,
+        site=solution.site,
+        magnetic=solution.magnetic,
+        standing=Standing(
+            platform=solution.platform,
+            turn_deg_s=round(turn.rate_rad_s / DEG, 6) if told else None,
+            turn_sigma_deg_s=round(turn.sigma_rad_s / DEG, 6) if told else None,
+            told_by=turn.by if told else None,
+        ),
         imus=imus,
-        cross_covariance=_cross(solution) if solution else (),
+        cross_covariance=tuple(
+            CrossCovariance(imus=pair, covariance=covariance)
+            for pair, matrix in solution.cross.items()
+            if (covariance := _where_known(matrix, *(known[name] for name in pair))) is not None
+        ),
     )
 
 
-def _imu(estimate: ImuSolution, whole: Bias | None) -> ImuRecord:
-    gyro, accel = whole or (estimate.gyro_rad_s, estimate.accel_m_s2)
-    has_gyro, has_accel = estimate.gyro_rad_s is not None, estimate.accel_m_s2 is not None
+def _imu(estimate: ImuSolution, whole: Pair | None) -> ImuRecord:
+    gyro, accel = whole or estimate.biases
+    known = _known(estimate)
+    has_gyro, has_accel = known[0], known[3]
     return ImuRecord(
         name=estimate.name,
         samples=estimate.samples,
@@ -63,7 +81,7 @@ def _imu(estimate: ImuSolution, whole: Bias | None) -> ImuRecord:
         accel_bias_m_s2=_axes(accel),
         accel_sigma_stat_m_s2=_axes(estimate.sigma_stat[3:] if has_accel else None),
         accel_sigma_use_m_s2=_axes(estimate.accel_sigma_use_m_s2 if has_accel else None),
-        covariance=_where_known(estimate.use_covariance, _known(estimate), _known(estimate)),
+        covariance=_where_known(estimate.use_covariance, known, known),
         gyro_sigma_warm_up_rad_s=_axes(np.sqrt(estimate.warm_up_variance[:3]) if has_gyro else None),
         accel_sigma_warm_up_m_s2=_axes(np.sqrt(estimate.warm_up_variance[3:]) if has_accel else None),
         residual_gyro_rad_s=_axes(estimate.gyro_rad_s if whole else None),
@@ -77,16 +95,6 @@ def _imu(estimate: ImuSolution, whole: Bias | None) -> ImuRecord:
 
 def _axes(values: Array | None) -> Vector | None:
     return None if values is None else vector(values)
-
-
-def _standing(solution: Solution) -> Standing:
-    turn, told = solution.turn, solution.turn.is_told
-    return Standing(
-        platform=solution.platform,
-        turn_deg_s=round(turn.rate_rad_s / DEG, 6) if told else None,
-        turn_sigma_deg_s=round(turn.sigma_rad_s / DEG, 6) if told else None,
-        told_by=turn.by if told else None,
-    )
 
 
 def unseen_turn(solution: Solution) -> tuple[str, ...]:
@@ -110,12 +118,6 @@ def _known(imu: ImuSolution) -> list[bool]:
     return [imu.gyro_rad_s is not None] * 3 + [imu.accel_m_s2 is not None] * 3
 
 
-def _cross(solution: Solution) -> tuple[CrossCovariance, ...]:
-    known = {imu.name: _known(imu) for imu in solution.imus}
-    found = {pair: _where_known(matrix, *(known[name] for name in pair)) for pair, matrix in solution.cross.items()}
-    return tuple(CrossCovariance(imus=pair, covariance=matrix) for pair, matrix in found.items() if matrix is not None)
-
-
 def _where_known(matrix: Matrix, rows: list[bool], columns: list[bool]) -> tuple[tuple[float | None, ...], ...] | None:
     if not any(rows) or not any(columns):
         return None
@@ -127,22 +129,17 @@ def in_words(solution: Solution | None, imus: Sequence[ImuRecord]) -> str:
     if solution is None:
         return "nothing measured"
     parts: list[str] = []
-    gyros = [sigma for imu in imus if (sigma := imu.sigma_in_force("gyro")) is not None]
-    accels = [sigma for imu in imus if (sigma := imu.sigma_in_force("accel")) is not None]
+    gyros, accels = ([sigma for imu in imus if (sigma := imu.sigma_in_force(triad)) is not None] for triad in TRIADS)
     if gyros:
+        measured = [imu for imu in solution.imus if imu.gyro_rad_s is not None]
+        worst = max(measured, key=lambda imu: float(imu.gyro_sigma_use_rad_s.max()))
+        warms = worst.warm_up_variance[:3].max() > np.diag(worst.covariance)[:3].max()
         # Without decimals, so that it stays one STATUSTEXT.
         sigma_deg_h = np.max(gyros) / DEG_H
-        parts.append(f"{sigma_deg_h:.0f} deg/h warming" if _warms(solution) else f"{sigma_deg_h:.1f} deg/h")
+        parts.append(f"{sigma_deg_h:.0f} deg/h warming" if warms else f"{sigma_deg_h:.1f} deg/h")
     if accels:
         parts.append(f"{np.max(accels) / MG:.2f} mg")
     unknown = ", ".join(f"{triad} {name}" for name, triad in solution.unknown)
     kept = any(imu.unchanged for imu in imus) and not any(imu.written for imu in imus)
     begin = "unchanged," if kept else "sigma"
     return f"{begin} {', '.join(parts)}{f'; not known: {unknown}' if unknown else ''}"
-
-
-def _warms(solution: Solution) -> bool:
-    """Whether the gyros' sigma is mainly that of a warm-up."""
-    gyros = [imu for imu in solution.imus if imu.gyro_rad_s is not None]
-    worst = max(gyros, key=lambda imu: float(imu.gyro_sigma_use_rad_s.max()))
-    return bool(worst.warm_up_variance[:3].max() > np.diag(worst.covariance)[:3].max())

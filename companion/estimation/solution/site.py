@@ -41,7 +41,7 @@ class Uncertain:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Remedies:
-    """Remedies for what is missing: in the configuration, or for a command that asks for an estimate."""
+    """Words for what is missing: for a configuration, or for a command that asks for an estimate."""
 
     latitude: str = "set vehicle.latitude_deg or wait for GPS"
     height: str = "set vehicle.height_m or wait for GPS"
@@ -94,48 +94,43 @@ class LocalEarth:
 def local_earth(where: Whereabouts, remedies: Remedies = IN_CONFIGURATION) -> LocalEarth:
     """Compute everything that the equations need of a place."""
     warnings: list[str] = []
-    covariance = np.zeros((3, 3))
-    gravity: float | None = None
+    covariance, gravity, field = np.zeros((3, 3)), None, None
     if where.latitude_deg is None:
         warnings.append(f"latitude unknown: Earth rate and gravity uncertain ({remedies.latitude})")
         rate = np.array([earth.EARTH_RATE_RAD_S * _MEAN_COS, 0.0, 0.0])
         covariance = earth.EARTH_RATE_RAD_S**2 * np.diag([_VARIANCE_COS, 0.0, _VARIANCE_SIN])
-        used_gravity, gravity_sigma = _MEAN_GRAVITY_M_S2, _GRAVITY_SIGMA_M_S2
+        gravity_sigma = _GRAVITY_SIGMA_M_S2
     else:
         rate = earth.earth_rate_ned_rad_s(where.latitude_deg)
-        used_gravity = gravity = earth.gravity_m_s2(where.latitude_deg, where.height_m or 0.0)
+        gravity = earth.gravity_m_s2(where.latitude_deg, where.height_m or 0.0)
         gravity_sigma = GRAVITY_MODEL_SIGMA_M_S2
         if where.height_m is None:
             warnings.append(f"height unknown: gravity uncertain by 0.3 mg ({remedies.height})")
             gravity_sigma = math.hypot(gravity_sigma, UNKNOWN_HEIGHT_SIGMA_M * GRAVITY_BY_HEIGHT_1_S2)
-    field = _magnetic_field(where, warnings)
+        if where.longitude_deg is not None and where.date is not None:
+            first, last = earth.WMM_VALID_YEARS
+            if not first <= where.date.year < last:
+                warnings.append(
+                    f"the date {where.date.isoformat()} lies outside the magnetic model ({first:.0f} to {last:.0f}):"
+                    " declination of its nearest year used"
+                )
+            field = earth.magnetic_field(where.latitude_deg, where.longitude_deg, where.height_m or 0.0, where.date)
+    declination_deg = None if field is None else field.declination_deg
     return LocalEarth(
         site=Site(
             latitude_deg=where.latitude_deg,
             height_m=where.height_m,
             gravity_m_s2=gravity,
-            declination_deg=None if field is None else field.declination_deg,
+            declination_deg=declination_deg,
             source=where.source,
         ),
-        gravity_m_s2=used_gravity,
+        gravity_m_s2=_MEAN_GRAVITY_M_S2 if gravity is None else gravity,
         gravity_sigma_m_s2=gravity_sigma,
         rate_ned_rad_s=rate,
         rate_ned_covariance=covariance,
-        declination_deg=0.0 if field is None else field.declination_deg,
+        declination_deg=declination_deg or 0.0,
         declination_sigma_deg=UNKNOWN_DECLINATION_SIGMA_DEG if field is None else field.declination_sigma_deg,
         warnings=tuple(warnings),
         field=field,
         remedies=remedies,
     )
-
-
-def _magnetic_field(where: Whereabouts, warnings: list[str]) -> earth.MagneticField | None:
-    if where.latitude_deg is None or where.longitude_deg is None or where.date is None:
-        return None
-    first, last = earth.WMM_VALID_YEARS
-    if not first <= where.date.year < last:
-        warnings.append(
-            f"the date {where.date.isoformat()} lies outside the magnetic model ({first:.0f} to {last:.0f}):"
-            " declination of its nearest year used"
-        )
-    return earth.magnetic_field(where.latitude_deg, where.longitude_deg, where.height_m or 0.0, where.date)

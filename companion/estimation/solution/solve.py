@@ -1,8 +1,7 @@
 """Estimates biases with covariances from the averages of one still stretch.
 
-The gradienter gives the direction of up, the compass the heading, the site gravity and the Earth's rate; what each
-sensor should have read follows, and the rest is its bias. "Bias" is the effective one at this pose: a scale error
-times 1 g on the vertical axis cannot be told from a bias in one pose (method 2.3) and is what the
+A bias is the mean reading less what the attitude, gravity and the Earth's rate make. It is the effective one at this
+pose: a scale error times 1 g on the vertical axis cannot be told from a bias in one pose (method 2.3) and is what the
 autopilot's offset has to carry here; it is not part of sigma.
 
 The bias equations of the paper in their corrected form:
@@ -37,9 +36,8 @@ from companion.estimation.means.warming import Warming
 from companion.estimation.means.windows import Hidden, ImuWindow, Window
 from companion.estimation.records.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site, WhenWarm
 from companion.estimation.request import What
-from companion.estimation.solution.otherwise import NOTHING, Otherwise
 from companion.estimation.solution.site import LocalEarth, Remedies
-from companion.estimation.solution.truth import Truth, truth_of
+from companion.estimation.solution.truth import NOTHING, Otherwise, Truth, truth_of
 from companion.estimation.stillness.plausible import implausible
 from companion.estimation.turning.watch import Turn
 from companion.physics.frames import Array, Matrix, roll_pitch_from_up, skew
@@ -63,7 +61,7 @@ class ImuSolution:
     name: str
     samples: int
     temperature_degc: float | None
-    """At the end of the window, where it is known to have changed."""
+    """At the end of the window."""
     gyro_rad_s: Array | None
     accel_m_s2: Array | None
     sigma_stat: Array
@@ -233,10 +231,9 @@ def solve(
     imus = tuple(
         _estimate(imu, truth, local, shared, asked, tipped, window.powered_s.get(imu.name, 0.0)) for imu in believed
     )
-    if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
-        refusals = dict.fromkeys(words for imu in believed for words in untold(imu, asked))
-        if refusals:
-            raise CalibrationRefusedError("; ".join(refusals))
+    refusals = dict.fromkeys(hidden.words for imu in believed for triad, hidden in imu.hidden.items() if triad in asked)
+    if refusals and all(bias is None for imu in imus for bias in imu.biases):
+        raise CalibrationRefusedError("; ".join(refusals))
     unknown = [(imu.name, triad) for triad in asked for imu in believed if imu.refused(triad)]
     if turn_unseen:
         unknown += [(imu.name, "gyro") for imu in window.imus]
@@ -323,6 +320,7 @@ def _estimate(
     covariance = shared.covariance + own
     path = None if imu.warming is None or imu.dithered else imu.warming.path
     unseen = np.zeros(6) if imu.warming is None else imu.warming.unseen(powered_s)
+    wide = "" if imu.warming is None else imu.warming.in_words(imu.name, powered_s, np.diag(covariance))
     return ImuSolution(
         name=imu.name,
         samples=imu.samples,
@@ -333,8 +331,8 @@ def _estimate(
         covariance=covariance,
         warm_up_variance=unseen,
         k_s=0.0 if imu.warming is None else imu.warming.rate_k_s,
-        warnings=(*imu.warnings, *untold(imu, asked)),
-        drifting=(*imu.drifting, *widened(imu, asked, powered_s, np.diag(covariance))),
+        warnings=(*imu.warnings, *dict.fromkeys(of.words for triad, of in imu.hidden.items() if triad in asked)),
+        drifting=imu.drifting if gyro is None or not wide else (*imu.drifting, wide),
         # A dither's means come after the window.
         warming=None if imu.dithered else imu.warming,
         dithered=imu.dithered,
@@ -356,19 +354,6 @@ def believable(imu: ImuWindow, up: Array, local: LocalEarth) -> ImuWindow:
     found = implausible(imu.name, *means, local.gravity_m_s2 * up, np.array(imu.mounting), local.remedies.mounting)
     hidden = {triad: Hidden(f"{words}; {local.remedies.any_bias}", useless=True) for triad, words in found.items()}
     return msgspec.structs.replace(imu, hidden={**imu.hidden, **hidden}) if hidden else imu
-
-
-def untold(imu: ImuWindow, asked: Collection[Triad]) -> list[str]:
-    """Say which of the asked triads this IMU's readings do not tell, or not well."""
-    return list(dict.fromkeys(hidden.words for triad, hidden in imu.hidden.items() if triad in asked))
-
-
-def widened(imu: ImuWindow, asked: Collection[Triad], powered_s: float, variance: Array) -> list[str]:
-    """Say why the sigma is wide if a warm-up makes it so; `variance` (6,): the other parts."""
-    if imu.warming is None or "gyro" not in asked or imu.refused("gyro") is not None:
-        return []
-    words = imu.warming.in_words(imu.name, powered_s, variance)
-    return [words] if words else []
 
 
 def wide_gyros(imus: Sequence[ImuWindow], earth_covariance: Matrix | None, remedies: Remedies) -> list[str]:

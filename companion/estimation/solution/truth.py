@@ -1,31 +1,65 @@
-"""Attitude of the aircraft from everything but its gyros: the reference for every sensor."""
+"""Attitude of the aircraft from everything but its gyros: the reference for every sensor.
+
+A gradienter tells the tilt and a compass the heading. Without a gradienter, accelerometers whose bias, scale and shear
+are known from all sides (`alignment.faces`) show up by themselves, f = (I + S)^-1 (read - b), if the length of f still
+is gravity; the tilt of the board in the aircraft stays in it. Without a compass the autopilot's yaw is the heading.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from companion.errors import CalibrationRefusedError
+from companion.estimation.alignment.align_model import response
+from companion.estimation.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Sides
 from companion.estimation.means.pose import CompassModel, GradienterModel, TiltWindow, up_in_vehicle
-from companion.estimation.means.windows import Window
+from companion.estimation.means.windows import ImuWindow, Window
+from companion.estimation.noise.allan import AllanModel, floor_variance
 from companion.estimation.records.record import HeadingFrom, Magnetic, TiltFrom
 from companion.estimation.solution import magnetic
-from companion.estimation.solution.otherwise import NOTHING, Otherwise, OwnHeading, tilt_in_words, up_by_sides
 from companion.estimation.solution.site import LocalEarth, Uncertain
-from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
+from companion.estimation.temperature.curve import CATALOGUE_PER_K, CATALOGUE_SCATTER
+from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, symmetric_by
 from companion.physics.gradienter import up_jacobian
-from companion.physics.units import DEG
+from companion.physics.units import DEG, MG
 
 # Without a gradienter the accelerometers level the Earth's rate; a 50 mg bias tilts it by 3 degrees (0.8 deg/h).
 LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0
+UNKNOWN_K: Final = 5.0
+"""Assumed change of an unknown temperature."""
+_MEAN_S: Final = 12.0
+_SOON_S: Final = 180.0
+LENGTH_SIGMAS: Final = 4.0
+"""Largest error of the length of gravity; beyond it the figures of the sides are outdated."""
+
+
+class OwnHeading(msgspec.Struct, frozen=True):
+    """The autopilot's yaw, clockwise from true north."""
+
+    heading_deg: float
+    sigma_deg: float
+
+
+class Otherwise(msgspec.Struct, frozen=True, kw_only=True):
+    """Fallbacks for a missing gradienter or compass."""
+
+    sides: dict[str, Sides] = {}
+    """Figures of the accelerometers from all sides, by IMU."""
+    heading: OwnHeading | None = None
+
+
+NOTHING: Final = Otherwise()
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Reference for the sensors, from everything but themselves."""
+    """Reference for the sensors."""
 
     up: Array
     up_covariance: Matrix
@@ -36,7 +70,7 @@ class Truth:
     reading_sigma_rad: tuple[float, float]
     """Sigma of the gradienter's two means, without its zero."""
     tilt_from: TiltFrom | None
-    """None: the accelerometers' own, of which nothing is known."""
+    """None: from accelerometers of unknown bias."""
     heading_rad: float | None = None
     heading_sigma_rad: float | None = None
     heading_from: HeadingFrom | None = None
@@ -45,12 +79,12 @@ class Truth:
 
     @property
     def body_from_ned(self) -> Matrix:
-        """The attitude; with an unknown heading, that of heading north."""
+        """The attitude; heading north where the heading is unknown."""
         gamma, theta = roll_pitch_from_up(self.up)
         return body_from_ned(gamma, theta, self.heading_rad or 0.0)
 
     def earth_rate(self, local: LocalEarth) -> Uncertain:
-        """The Earth's rate in the vehicle's axes."""
+        """Give the Earth's rate in the vehicle's axes."""
         return local.rate_in_body(self.body_from_ned, heading_known=self.heading_rad is not None)
 
 
@@ -84,11 +118,10 @@ def truth_of(
     reading_sigma = (0.0, 0.0)
     tilt_from: TiltFrom | None = None
     if gradienter is not None and window.tilt is not None:
-        up, by_reading, up_covariance = _up(window.tilt, gradienter)
+        up, by_reading, up_covariance = _up_by_gradienter(window.tilt, gradienter)
         reading_sigma, tilt_from = (window.tilt.x_sigma_deg * DEG, window.tilt.y_sigma_deg * DEG), "gradienter"
-    elif (found_up := up_by_sides(window.imus, otherwise, local, warnings)) is not None:
-        up, up_covariance, tilt_from = found_up.up, found_up.covariance, "accelerometers"
-        warnings.append(tilt_in_words(found_up))
+    elif (by_sides := _up_by_sides(window.imus, otherwise, local, warnings)) is not None:
+        (up, up_covariance), tilt_from = by_sides, "accelerometers"
     else:
         mean = np.mean([imu.accel_m_s2 for imu in window.imus], axis=0)
         up = mean / np.linalg.norm(mean)
@@ -120,7 +153,6 @@ def truth_of(
 
 
 def _with_own_heading(without: Truth, own: OwnHeading, warnings: list[str]) -> Truth:
-    """Use the autopilot's yaw as the heading."""
     sigma_rad = own.sigma_deg * DEG
     warnings.append(f"no compass: heading {own.heading_deg:.0f} deg by the autopilot, good to {own.sigma_deg:.0f} deg")
     return dataclasses.replace(
@@ -132,8 +164,8 @@ def _with_own_heading(without: Truth, own: OwnHeading, warnings: list[str]) -> T
     )
 
 
-def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix, Matrix]:
-    """Up in the vehicle's axes, its derivatives by the readings (3x2), and its covariance (3x3, radian squared)."""
+def _up_by_gradienter(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix, Matrix]:
+    """Give up in the vehicle's axes, its derivatives by the readings, (3, 2), and its covariance, (3, 3), rad^2."""
     x_deg, y_deg = tilt.x_deg - model.offset_deg[0], tilt.y_deg - model.offset_deg[1]
     try:
         up = up_in_vehicle(model, tilt.x_deg, tilt.y_deg)
@@ -142,3 +174,67 @@ def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix, Matrix
         raise CalibrationRefusedError(str(error)) from None
     variance = [(math.hypot(model.sigma_deg, sigma) * DEG) ** 2 for sigma in (tilt.x_sigma_deg, tilt.y_sigma_deg)]
     return up, jacobian, jacobian @ np.diag(variance) @ jacobian.T
+
+
+def _up_by_sides(
+    imus: Sequence[ImuWindow], otherwise: Otherwise, local: LocalEarth, warnings: list[str]
+) -> tuple[Array, Matrix] | None:
+    """Estimate up, and its covariance, by the first IMU that was measured on all sides and still agrees with gravity.
+
+    Two IMUs are not averaged: their boards may sit differently, and the first one is what the autopilot flies by.
+    """
+    for imu in imus:
+        known = otherwise.sides.get(imu.name)
+        if known is None or imu.refused("accel") is not None:
+            continue
+        force, covariance = _force(imu, known)
+        length = float(np.linalg.norm(force))
+        up = force / length
+        off = length - local.gravity_m_s2
+        sigma = float(np.hypot(np.sqrt(up @ covariance @ up), local.gravity_sigma_m_s2))
+        if abs(off) > LENGTH_SIGMAS * sigma:
+            warnings.append(
+                f"imu {imu.name} reads {off / MG:+.1f} mg of gravity more than it did on all sides: no tilt from it;"
+                " companion align faces measures it again"
+            )
+            continue
+        across = (np.eye(3) - np.outer(up, up)) / length
+        up_covariance = across @ covariance @ across.T
+        sigma_deg = float(np.sqrt(np.linalg.eigvalsh(up_covariance)[-1])) / DEG
+        warnings.append(
+            f"no gradienter: tilt by the accelerometers of imu {imu.name}, known from all sides, to {sigma_deg:.2g} deg"
+        )
+        return up, up_covariance
+    return None
+
+
+def _force(imu: ImuWindow, known: Sides) -> tuple[Array, Matrix]:
+    """Give the specific force in the vehicle's axes, (3,), and its covariance, (3, 3)."""
+    figures, turn = known.figures, known.vehicle_from_sensor
+    inverse = np.linalg.inv(response(figures[SCALE], figures[SHEAR]))
+    force = inverse @ (turn.T @ np.array(imu.accel_m_s2) - figures[BIAS])
+    by = np.zeros((3, FIGURES))
+    by[:, BIAS] = np.eye(3)
+    by[:, SCALE] = np.diag(force)
+    by[:, SHEAR] = symmetric_by(force)
+    mean = turn.T @ np.diag(np.square(imu.accel_sigma_stat_m_s2)) @ turn
+    inside = inverse @ (by @ np.diag(np.square(known.sigma)) @ by.T + mean) @ inverse.T
+    return turn @ force, turn @ inside @ turn.T
+
+
+def aged_m_s2(noise: AllanModel, gap_s: float | None, kelvin: float | None) -> float:
+    """Estimate one sigma of the change of the accelerometers' biases since all sides were measured.
+
+    `gap_s`: time since then, None: perhaps another power-up. `kelvin`: change of the temperature.
+    """
+    if gap_s is None:
+        wander = CATALOGUE_SCATTER["accel"] ** 2
+    else:
+        # The sigma of the stands themselves holds what comes within minutes.
+        late, soon = (
+            floor_variance(noise.flicker, noise.walk, _MEAN_S, 2.0 * each) for each in (max(gap_s, _SOON_S), _SOON_S)
+        )
+        wander = float(late - soon)
+    if kelvin is None:
+        kelvin = 0.0 if gap_s is not None and gap_s <= _SOON_S else UNKNOWN_K
+    return math.sqrt(wander + (CATALOGUE_PER_K["accel"] * kelvin) ** 2)

@@ -17,8 +17,9 @@ from scipy import linalg
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.records.history import PowerUp
 from companion.estimation.request import What
+from companion.estimation.solution.doubt import points
 from companion.estimation.solution.joint import Weighed, Whole, weigh
-from companion.estimation.solution.prior import Expectation, ExpectedImu, Prediction, points
+from companion.estimation.solution.prior import Expectation, ExpectedImu, Prediction
 from companion.estimation.solution.results import record_of
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution, solve

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.estimation.means.pose import FieldWindow, HeadingWindow
-from companion.estimation.solution.magnetic import Heading, assess
+from companion.estimation.solution.magnetic import CompassHeading, assess
 from companion.estimation.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.physics.earth import MagneticField
 from companion.physics.magnetic import heading_rad, inclination_rad
@@ -99,7 +99,7 @@ FLIPPED = np.array([1.0, -1.0, -1.0])
 """The trial's axes (z up) to forward, right, down: half a turn about the first."""
 
 
-def assessed(where: LocalEarth, field: Floats, sigma: Floats, up: Floats) -> Heading:
+def assessed(where: LocalEarth, field: Floats, sigma: Floats, up: Floats) -> CompassHeading:
     (x, y, z), (sx, sy, sz) = (field * FLIPPED).tolist(), sigma.tolist()
     return assess(
         HeadingWindow(heading_deg=0.0, sigma_deg=0.0, from_field=True),

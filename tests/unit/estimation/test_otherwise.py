@@ -14,9 +14,9 @@ from companion.estimation.alignment.faces import BIAS, Face, Sides, faces
 from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.noise.allan import floor_variance, noise_profile
 from companion.estimation.request import What
-from companion.estimation.solution.otherwise import Otherwise, OwnHeading, aged_m_s2
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import Solution, solve
+from companion.estimation.solution.truth import Otherwise, OwnHeading, aged_m_s2
 from companion.physics.frames import rotation_matrix, vector
 from companion.physics.units import DEG_H, MG
 from sim.aircraft import Pose, VirtualAircraft

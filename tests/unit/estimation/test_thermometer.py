@@ -32,14 +32,8 @@ def shown(seconds: int, **by: Degc) -> tuple[Thermometers, dict[str, list[float 
 @pytest.mark.parametrize(
     ("degc", "words"),
     [
-        (lambda t_s: warm(t_s) + 273.15, r"shows 3\d\d\.\d\d, allowed -40 to 105 degC \(in kelvin or tenths\?\)"),
-        (lambda t_s: warm(t_s) * 10.0, r"shows 3\d\d\.\d\d, allowed .* tenths\?\)"),
-        (lambda t_s: 110.0 + warm(t_s) / 10.0, r"shows 113\.\d\d, allowed -40 to 105 degC \(in degF or tenths\?\)"),
-        (lambda t_s: -300.0, r"shows -300.00, allowed -40 to 105 degC; nothing"),
-        (lambda t_s: 24.37 + 0.03, "is stuck at 24.40 degC, while that of own moved by 1[0-9] K"),
-        (lambda t_s: 24.47, "is stuck at 24.47 degC, while that of own moved by 1[0-9] K"),
-        (lambda t_s: 45.23, "is stuck at 45.23 degC, while that of own moved by 1[0-9] K"),
-        (lambda t_s: 25.0, "is stuck at 25.00 degC, while that of own moved by 1[0-9] K"),
+        (lambda t_s: warm(t_s) + 273.15, r"shows 3\d\d\.\d\d, allowed -40 to 105 degC: in another unit\?"),
+        (lambda t_s: -300.0, r"shows -300.00, allowed -40 to 105 degC"),
         (lambda t_s: warm(t_s) + (40.0 if t_s % 100 == 99 else 0.0), "jumps: more than 5 K within a second"),
     ],
 )
@@ -56,24 +50,12 @@ def test_a_bad_one_is_named_with_what_was_found_and_not_believed(degc: Degc, wor
     assert thermometers.trouble("own") == ""
 
 
-@pytest.mark.parametrize(
-    ("degc", "other"),
-    [
-        (lambda t_s: 31.25, lambda t_s: 30.5),  # both boards have come to rest, steps of 1/8 K
-        (lambda t_s: 31.13, lambda t_s: 31.13),  # as hundredths
-        (lambda t_s: 24.0, lambda t_s: 24.0 + t_s // 600),  # steps of 1 K beside a board that warms a little
-        (lambda t_s: 45.0, warm),  # heated, steps of 1 K
-        (lambda t_s: 45.0 + 0.01 * (t_s % 3), warm),  # heated, fine steps
-        (lambda t_s: 62.12, warm),  # heated, eighths as hundredths
-        (lambda t_s: -18.4 + 0.001 * t_s, lambda t_s: 65.0),  # winter beside a heated one
-        (lambda t_s: 25.0 if t_s < 500 else 45.0 + 0.01 * (t_s % 2), lambda t_s: None),  # one jump: another source
-        (lambda t_s: 0.01, lambda t_s: 0.01),
-    ],
-)
-def test_a_calm_coarse_or_heated_one_is_believed(degc: Degc, other: Degc) -> None:
-    thermometers, found = shown(3000, fc=degc, own=other)
+@pytest.mark.parametrize("degc", [lambda t_s: 31.25, lambda t_s: 62.12, lambda t_s: 45.0 + 0.01 * (t_s % 3)])
+def test_a_calm_coarse_or_heated_one_is_believed(degc: Degc) -> None:
+    # Steps of 1/8 K, as hundredths; fine steps of a heated one. All for longer than a stuck one takes.
+    thermometers, found = shown(4 * 3600, fc=degc)
     assert thermometers.trouble("fc") == ""
-    assert found["fc"][-1] == degc(2999)
+    assert found["fc"][-1] == degc(4 * 3600 - 1)
 
 
 def test_one_alone_is_stuck_after_hours_and_good_again_when_it_moves() -> None:
