@@ -21,7 +21,6 @@ from companion.estimation.records.flight_record import (
     KeptFlight,
     Term,
     drift_lines,
-    legend,
     next_flight,
 )
 from companion.physics.units import unit_of
@@ -123,9 +122,8 @@ def _flight_lines(number: int, found: Flight) -> list[str]:
     lines += [f"  note: {note}" for note in found.notes]
     for imu in found.imus:
         lines += _imu_lines(imu)
-    if terms := legend(found.imus):
-        lines += ["left over: bias that the offsets did not take off, ± one sigma", *(f"  {words}" for words in terms)]
-        lines.append(f"  {UNSEEN}")
+    if any(axis.in_flight for imu in found.imus for axis in imu.axes):
+        lines += ["left over: bias that the offsets did not take off, ± one sigma (docs/flight.md)", f"  {UNSEEN}"]
     return [*lines, *([f"next flight: {next_flight(found)}"] if any(imu.drift for imu in found.imus) else [])]
 
 

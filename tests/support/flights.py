@@ -8,6 +8,7 @@ from companion.estimation.records.flight_record import (
     AXES,
     Drift,
     Flight,
+    FlightMoment,
     ImuFlight,
     KeptFlight,
     Split,

@@ -1,4 +1,4 @@
-"""What a log of the autopilot says of a flight, as it is kept; SI units, over what the offsets in force left."""
+"""Records of flights, from logs of the autopilot; SI units. Biases are those that the offsets in force left."""
 
 from __future__ import annotations
 
@@ -15,16 +15,7 @@ HEADS: Final = {
     "in_flight": "in the air", "ekf": "EKF", "turn_on": "motors off", "temperature": "temperature", "motors": "motors",
     "vibration": "vibration", "trend": "per minute",
 }  # fmt: skip
-"""The terms of a `Split`, as tables name them."""
-_MEANINGS: Final = {
-    "in_flight": "mean bias from take-off to landing",
-    "ekf": "the EKF's own estimate in the latter half of the flight",
-    "turn_on": "bias while standing, before the motors start",
-    "temperature": "warming from there into the air, by the learned curve",
-    "motors": "change as the motors start: vibration, and warming where no curve is known",
-    "vibration": "change for each m/s^2 of vibration level",
-    "trend": "change in each minute of flight",
-}
+"""Terms of a `Split`, as tables name them (docs/flight.md)."""
 UNSEEN: Final = "accel x, y: not counted, in the air nothing tells them from tilt"
 _WORTH: Final = {"deg/h": 30.0, "mg": 1.5}
 """Smaller findings are nobody's worry."""
@@ -42,33 +33,33 @@ class Split(msgspec.Struct, frozen=True, kw_only=True):
 
     axis: str
     in_flight: Term | None
-    """Its mean in the air."""
+    """Mean from take-off to landing."""
     ekf: Term | None
-    """As the EKF had it in the latter half of that."""
+    """The EKF's own estimate in the latter half of the flight."""
     turn_on: Term | None
-    """Before the motors."""
+    """Mean while standing, before the motors start."""
     temperature: Term | None
-    """From there to the mean in the air, by the learnt curve."""
+    """Change from there into the air, by the learned curve."""
     motors: Term | None
-    """The step at their start: vibration rectification, and temperature where no curve is known."""
+    """Step at the motors' start: vibration rectification, and temperature where no curve is known."""
     vibration: Term | None
-    """For each m/s^2 of vibration level."""
+    """Change for each m/s^2 of vibration level."""
     trend: Term | None
-    """A minute of flight."""
+    """Change in a minute of flight."""
 
 
 class Drift(msgspec.Struct, frozen=True):
-    """How far free inertial navigation is from the solution after a time."""
+    """Distance of free inertial navigation from the solution after a time."""
 
     seconds: float
     starts: int
     median_m: float
     worst_m: float
-    """In one start of twenty it is more."""
+    """Exceeded by one start in twenty."""
 
 
 class Stages(msgspec.Struct, frozen=True):
-    """Of a flight, in s of the autopilot's clock; None where the log does not tell."""
+    """Times of a flight by the autopilot's clock; None: not in the log."""
 
     armed_s: float
     motors_s: float | None
@@ -88,7 +79,7 @@ class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
     accel_id: int | None = None
     set_gyro_rad_s: tuple[float, ...] | None
     set_accel_m_s2: tuple[float, ...] | None
-    """The offsets in force, in the IMU's own axes."""
+    """Offsets in force, in the IMU's own axes."""
     axes: tuple[Split, ...]
     drift: dict[str, list[Drift]]
     """Drift without aid, by whose offsets: `flown`, `before`."""
@@ -99,12 +90,12 @@ class Flight(msgspec.Struct, frozen=True, kw_only=True):
     """From an arming to the disarming after it."""
 
     key: str
-    """Of this arming of this start of this autopilot, however often and from whichever file it is read."""
+    """Identity of this arming of this start of this autopilot, whichever file it is read from."""
     system_id: int | None
     began_at: str | None
     stages: Stages
     reference: str
-    """What the drift is measured from: "ekf", or "truth" of a simulator."""
+    """Solution that the drift is measured from: "ekf", or "truth" of a simulator."""
     imus: tuple[ImuFlight, ...]
     notes: tuple[str, ...]
 
@@ -113,26 +104,14 @@ class KeptFlight(msgspec.Struct, frozen=True, kw_only=True):
     """One file of the flights."""
 
     log: str
-    """The name of the file it was read from."""
+    """Name of the log."""
     read_at: str
     flight: Flight
     format_version: int = FORMAT_VERSION
 
 
-def legend(imus: Sequence[ImuFlight]) -> list[str]:
-    """Explain the terms that the tables of these IMUs have, a line for each."""
-    axes = [axis for imu in imus for axis in imu.axes]
-    return [f"{head}: {_MEANINGS[term]}" for term, head in HEADS.items() if any(getattr(axis, term) for axis in axes)]
-
-
-def is_worth_saying(axis: str, value: float) -> bool:
-    """Whether a part of a bias is more than nobody's worry."""
-    unit, name, _ = unit_of(axis)
-    return abs(value) / unit > _WORTH[name]
-
-
 def drift_lines(imu: ImuFlight) -> list[str]:
-    """The figure that counts, a line for each time."""
+    """Say the drift in words, a line for each time."""
     lines = []
     for flown in imu.drift.get("flown", ()):
         others = [
@@ -148,7 +127,7 @@ def drift_lines(imu: ImuFlight) -> list[str]:
 
 
 def figure(imus: Sequence[ImuFlight]) -> str | None:
-    """The one line of a flight, of its first IMU and 30 s, else what is next to that; None where it did not fly."""
+    """Summarise a flight by the drift of its first IMU at 30 s, or next to that; None: it did not fly."""
     first = next((imu for imu in imus if imu.drift.get("flown")), None)
     if first is None:
         return None
@@ -157,7 +136,7 @@ def figure(imus: Sequence[ImuFlight]) -> str | None:
 
 
 def next_flight(found: Flight) -> str:
-    """The largest thing that is surely there."""
+    """Name the largest significant part of a bias, and its remedy."""
     worst: tuple[float, str] = (0.0, "nothing to do: what the offsets left is small or not surely there")
     for imu in found.imus:
         for axis in imu.axes:

@@ -29,7 +29,7 @@ GUARDS_FROM: Final = 3
 WEIGHS_FROM: Final = 5
 """Least earlier power-ups that take part in the estimate."""
 NEW_AFTER: Final = 3
-"""Power-ups in a row that contradict earlier ones and are no outliers any more: the sensor is another one now."""
+"""Power-ups in a row that contradict earlier ones and are no outliers any more: the sensor was replaced."""
 KEEP_POWER_UPS: Final = 48
 KEEP_POINTS: Final = 8
 """Most points of a power-up."""
@@ -50,7 +50,7 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fal
     host: str
     """One and the same as long as the companion computer runs."""
     since_unix_s: float | None
-    """When the sensor's own device started, by the wall clock; None where it does not tell."""
+    """Start of the sensor's own device, by the wall clock; None: unknown."""
 
     def is_same(self, other: PowerUp) -> bool:
         """Return False only if the power was surely off in between."""
@@ -76,7 +76,7 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fa
     suspect: bool = False
     """It contradicted what was known."""
     chosen: bool = False
-    """It did, and was written all the same, because somebody had asked for it: what was known counts no more."""
+    """It contradicted, and was written on request: earlier points count no more."""
 
     @property
     def is_outlier(self) -> bool:
@@ -132,8 +132,8 @@ def by_power_up(points: Sequence[Point]) -> list[list[Point]]:
 def kept(points: Sequence[Point]) -> tuple[Point, ...]:
     """Choose the points worth keeping: winter is not forgotten in summer.
 
-    Where there are too many power-ups that one goes whose temperatures the others have told most often, of several the
-    oldest; where one has too many points, its latest and those at the most different temperatures stay.
+    Of too many power-ups the one goes whose temperatures are the most common, of several the oldest. Of too many points
+    of one power-up the latest and those at the most different temperatures stay.
     """
     groups = [_thinned(group) for group in by_power_up(points)]
     while len(groups) > KEEP_POWER_UPS:
@@ -158,26 +158,18 @@ def _thinned(group: Sequence[Point]) -> Sequence[Point]:
 def believed(points: Sequence[Point], triad: Triad) -> list[list[Point]]:
     """Choose the points for a prediction of one triad, by power-up.
 
-    Outliers are left out. `NEW_AFTER` of them in a row are none: then it is what was before them that is left out. So
-    it is at once with one that somebody has decided for.
+    Outliers are left out. `NEW_AFTER` of them in a row, or a chosen one, are none: then all before them is left out.
     """
     measured = [point for point in points if point.of(triad) is not None]
     start = max((k for k, point in enumerate(measured) if _is_chosen(point, triad)), default=0)
     groups = by_power_up(measured[start:])
-    outliers = [all(_is_suspect(point, triad) for point in group) for group in groups]
-    first = row = 0
-    accepted: set[int] = set()
-    for k, outlier in enumerate(outliers):
-        row = row + 1 if outlier else 0
+    trusted = [[point for point in group if not _is_suspect(point, triad)] for group in groups]
+    first = row = end = 0
+    for k, group in enumerate(trusted):
+        row = 0 if group else row + 1
         if row >= NEW_AFTER:
-            first = k + 1 - row
-            accepted = set(range(first, k + 1))
-    found: list[list[Point]] = []
-    for k in range(first, len(groups)):
-        kept = groups[k] if k in accepted else [p for p in groups[k] if not _is_suspect(p, triad)]
-        if kept:
-            found.append(kept)
-    return found
+            first, end = k + 1 - row, k + 1
+    return [*groups[first:end], *(group for group in trusted[end:] if group)]
 
 
 def _is_suspect(point: Point, triad: Triad) -> bool:

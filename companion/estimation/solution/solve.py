@@ -4,18 +4,8 @@ A bias is the mean reading less what the attitude, gravity and the Earth's rate 
 pose: a scale error times 1 g on the vertical axis cannot be told from a bias in one pose (method 2.3) and is what the
 autopilot's offset has to carry here; it is not part of sigma.
 
-The bias equations of the paper in their corrected form:
-
-| paper | printed                                           | here                                                |
-|-------|---------------------------------------------------|-----------------------------------------------------|
-| (2)   | gravity in body axes                              | specific force: minus gravity, at rest g * up       |
-| (3)   | accelerometer = gravity + bias                    | accelerometer = specific force + bias               |
-| (4)   | dN = -mean + g sin, dE with cos cos, dU + g cos   | bias = mean - g * up, one vector equation           |
-| (5)   | T11, T12 with wrong signs; latitude in row 2      | physics.frames.body_from_ned (orthogonal)           |
-| (6)   | -mean - T Omega                                   | bias = mean - C_n^b w_ie^n                          |
-
-Coded as printed, (4) returns the negative of the north bias and (6) minus the bias less twice the Earth's rate
-(method 1.3). Everything is FRD and NED; `up` is the unit vector of specific force at rest.
+The equations are those of the paper with its errata mended (method 1.3): an accelerometer's bias is mean - g * up, a
+gyro's mean - C_n^b w_ie^n. Everything is FRD and NED; `up` is the unit vector of specific force at rest.
 """
 
 from __future__ import annotations
@@ -166,16 +156,6 @@ def moved(biases: Pair, shift: Array) -> Pair:
     return gyro, accel
 
 
-def accelerometer_bias(mean_m_s2: Array, up: Array, gravity_m_s2: float) -> Array:
-    """Equation (4), corrected: mean reading minus the specific force at rest; shape (3,), FRD, m/s^2."""
-    return mean_m_s2 - gravity_m_s2 * up
-
-
-def gyro_bias(mean_rad_s: Array, earth_rate_body_rad_s: Array) -> Array:
-    """Equation (6), corrected: mean reading minus the Earth's rotation in body axes; shape (3,), FRD, rad/s."""
-    return mean_rad_s - earth_rate_body_rad_s
-
-
 def solve(
     window: Window,
     local: LocalEarth,
@@ -311,9 +291,9 @@ def _estimate(
 ) -> ImuSolution:
     gyro = accel = None
     if "gyro" in asked and imu.refused("gyro") is None:
-        gyro = gyro_bias(np.array(imu.gyro_rad_s), _earth_seen(imu, truth, local) + tipped)
+        gyro = np.array(imu.gyro_rad_s) - _earth_seen(imu, truth, local) - tipped
     if "accel" in asked and imu.refused("accel") is None:
-        accel = accelerometer_bias(np.array(imu.accel_m_s2), truth.up, local.gravity_m_s2)
+        accel = np.array(imu.accel_m_s2) - local.gravity_m_s2 * truth.up
     own = imu.covariance
     if own is None:
         own = np.diag(np.square([*imu.gyro_sigma_use_rad_s, *imu.accel_sigma_use_m_s2]))

@@ -5,12 +5,9 @@ The bias of power-up s at the temperature T is
     o_s + c1 d + c2 d^2 + c3 d^3,    d = (T - lag dT/dt - 35 degC) / 20 K.
 
 Each power-up has an offset o_s of its own, scattered about a mean with the variance tau^2 (run to run); the cubic is
-common to all. The die is as warm as its thermometer was `lag` before: that is why heating and cooling differ.
-
-The fit is generalised least squares over means of still seconds at one temperature (`Node`). Within a power-up the
-offset is free, between power-ups it scatters by tau. The coefficients have a prior as wide as the catalogue's parts
-move, so the model is uncertain at temperatures that were not seen. A lower order than three would claim the same sigma
-where little was seen as where much was.
+common to all. The die is as warm as its thermometer was `lag` before: that is why heating and cooling differ. The fit
+is generalised least squares over means of still seconds at one temperature (`Node`). The coefficients have a prior as
+wide as the catalogue's parts move, so the model is uncertain at temperatures that were not seen.
 
 Each power-up is predicted from the others at its first node. The errors choose the lag, choose between cubic and mean,
 and scale tau until the actual error matches the predicted one. The change from the first node to the last is predicted
@@ -89,7 +86,7 @@ class PowerUpNodes:
 
     nodes: Sequence[Node]
     common_variance: float = 0.0
-    """Variance of an error that all nodes share, perhaps with other power-ups; it lowers the weight."""
+    """Variance of an error that all nodes share; it lowers the weight."""
 
 
 class Warm(msgspec.Struct, frozen=True, kw_only=True):
@@ -116,9 +113,8 @@ class Along(msgspec.Struct, frozen=True, kw_only=True):
         """Subtract what the autopilot compensates by temperature: then no change until warm is predicted."""
         if not shift.any() and not slope.any():
             return self
-        return msgspec.structs.replace(
-            self, shift=vector(self.shift - shift), slope=vector(self.slope - slope), warm=None
-        )
+        left = {"shift": vector(self.shift - shift), "slope": vector(self.slope - slope)}
+        return msgspec.structs.replace(self, warm=None, **left)
 
 
 class Settling(msgspec.Struct, frozen=True):
@@ -166,10 +162,8 @@ class Curve:
     def at(self, degc: float, k_s: float = 0.0) -> tuple[Array, Array]:
         """Predict the next power-up's bias at a temperature, and its variance, (3,) each; a line beyond the range."""
         x, (low, high) = self._row(degc, k_s), self.span_degc
-        mean_slope = float(np.abs((self._row(high) - self._row(low)) @ self.coefficients).max()) / max(
-            high - low, VALID_K
-        )
-        outside = (max(self.per_kelvin, mean_slope) * self.beyond_k(degc)) ** 2
+        moved = float(np.abs((self._row(high) - self._row(low)) @ self.coefficients).max())
+        outside = (max(self.per_kelvin, moved / max(high - low, VALID_K)) * self.beyond_k(degc)) ** 2
         return x @ self.coefficients, self.scatter + float(x @ self.covariance @ x) * self.widening + outside
 
     def change(self, then: State, now: State) -> tuple[Array, Array]:

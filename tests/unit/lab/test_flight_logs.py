@@ -114,12 +114,8 @@ def test_people_read_the_figure_that_counts(log: Path, tmp_path: Path, capsys: p
     out = capsys.readouterr().out
     assert "IMU 1, 100 Hz: offsets of no calibration known here\n" in out
     assert "30 s without GNSS: " in out
-    head = next(line for line in out.splitlines() if line.startswith("  left over"))
-    columns = [words.strip() for words in head.split("  ") if words.strip()][1:]
-    # Each column is explained, once.
-    _, _, below = out.partition("left over: bias that the offsets did not take off, ± one sigma\n")
-    assert [line.strip().partition(":")[0] for line in below.splitlines()[: len(columns)]] == columns
-    assert "  accel x, y: not counted, in the air nothing tells them from tilt\n" in below
+    _, _, below = out.partition("left over: bias that the offsets did not take off, ± one sigma (docs/flight.md)\n")
+    assert below.startswith("  accel x, y: not counted, in the air nothing tells them from tilt\n")
     assert "-0 ±" not in out
     assert max(map(len, out.splitlines())) <= 100
     assert out.splitlines()[-2].startswith("next flight: IMU 1 gyro x: ")
