@@ -83,69 +83,19 @@ def test_ideal_sensors_give_the_true_biases_for_every_pose_law_and_mounting(
     assert solution.pose.gamma_deg == pytest.approx(roll, abs=1e-9)
 
 
-@settings(max_examples=100)
-@given(laws, tilts, tilts, headings, gyros, accels, turns)
-def test_turning_the_vehicle_axes_with_all_sensors_turns_the_biases(
-    law: Law, pitch: float, roll: float, heading: float, gyro: Array, accel: Array, turn: Array
-) -> None:
-    # The same sensors on the same ground; only what is called the vehicle's front is turned.
-    local = local_earth(PLAIN)
-
-    def result(frame: Array) -> tuple[Array, Array]:
-        window = ideal_window(
-            ned_body=ned_from_body(pitch, roll, heading) @ frame.T,
-            body_gradienter=frame,
-            law=law,
-            latitude_deg=40.0,
-            gravity_m_s2=local.gravity_m_s2,
-            heading_deg=heading,
-            gyro_bias=frame @ gyro,
-            accel_bias=frame @ accel,
-        )
-        solution = solve(window, local, _gradienter(law, frame), _compass(frame), What.BOTH)
-        return _vectors(_only(solution))
-
-    for turned, straight in zip(result(turn), result(np.eye(3)), strict=True):
-        np.testing.assert_allclose(turned, turn @ straight, rtol=0, atol=1e-9)
-
-
-@settings(max_examples=100)
-@given(tilts, tilts, headings, gyros, accels)
-def test_a_constant_added_to_the_readings_is_added_to_the_bias(
-    pitch: float, roll: float, heading: float, gyro: Array, accel: Array
-) -> None:
-    local = local_earth(PLAIN)
-
-    def result(gyro_bias: Array, accel_bias: Array) -> tuple[Array, Array]:
-        window = ideal_window(
-            ned_body=ned_from_body(pitch, roll, heading),
-            body_gradienter=np.eye(3),
-            law="axis",
-            latitude_deg=40.0,
-            gravity_m_s2=local.gravity_m_s2,
-            heading_deg=heading,
-            gyro_bias=gyro_bias,
-            accel_bias=accel_bias,
-        )
-        return _vectors(_only(solve(window, local, _gradienter("axis"), _compass(), What.BOTH)))
-
-    zero = np.zeros(3)
-    for with_constant, without, constant in zip(result(gyro, accel), result(zero, zero), (gyro, accel), strict=True):
-        np.testing.assert_allclose(with_constant - without, constant, rtol=0, atol=1e-12)
-
-
-def _window(heading_deg: float = 40.0, sigma: float = 0.0) -> tuple[Window, LocalEarth]:
-    local = local_earth(PLAIN)
+def _window(
+    ned_body: Array | None = None, *, heading_deg: float = 40.0, latitude_deg: float = 40.0, gyro_bias: float = 0.0
+) -> tuple[Window, LocalEarth]:
+    local = local_earth(PLAIN) if latitude_deg == 40.0 else _local(latitude_deg)
     window = ideal_window(
-        ned_body=ned_from_body(5.0, -3.0, 40.0),
+        ned_body=ned_from_body(5.0, -3.0, 40.0) if ned_body is None else ned_body,
         body_gradienter=np.eye(3),
         law="slope",
-        latitude_deg=40.0,
+        latitude_deg=latitude_deg,
         gravity_m_s2=local.gravity_m_s2,
         heading_deg=heading_deg,
-        gyro_bias=np.zeros(3),
+        gyro_bias=np.full(3, gyro_bias),
         accel_bias=np.zeros(3),
-        sigma=sigma,
     )
     return window, local
 
@@ -177,18 +127,8 @@ def test_covariance_is_that_of_a_monte_carlo() -> None:
 
 def test_level_sensitivities_are_the_methods() -> None:
     # Method 2.1: 17.5 micro-g per 0.001 deg of tilt; W cos L = 0.186 deg/h per degree of heading at 45 deg.
-    local = _local(45.0)
-    window = ideal_window(
-        ned_body=np.eye(3),
-        body_gradienter=np.eye(3),
-        law="axis",
-        latitude_deg=45.0,
-        gravity_m_s2=local.gravity_m_s2,
-        heading_deg=0.0,
-        gyro_bias=np.zeros(3),
-        accel_bias=np.zeros(3),
-    )
-    imu = _only(solve(window, local, _gradienter("axis", sigma_deg=0.001), _compass(), What.BOTH))
+    window, local = _window(np.eye(3), heading_deg=0.0, latitude_deg=45.0)
+    imu = _only(solve(window, local, _gradienter("slope", sigma_deg=0.001), _compass(), What.BOTH))
     np.testing.assert_allclose(imu.accel_sigma_use_m_s2[:2] / MG * 1000, 17.45, atol=0.03)
     assert imu.gyro_sigma_use_rad_s[1] / DEG_H == pytest.approx(0.186, abs=0.001)
 
@@ -196,18 +136,8 @@ def test_level_sensitivities_are_the_methods() -> None:
 def test_without_a_compass_the_horizontal_earth_rate_is_in_sigma() -> None:
     # Method 2.1: 7.5 deg/h rms per horizontal axis at 45 deg, 5.3 at 60.
     for latitude_deg, expected in ((45.0, 7.5), (60.0, 5.3)):
-        local = _local(latitude_deg)
-        window = ideal_window(
-            ned_body=np.eye(3),
-            body_gradienter=np.eye(3),
-            law="axis",
-            latitude_deg=latitude_deg,
-            gravity_m_s2=local.gravity_m_s2,
-            heading_deg=0.0,
-            gyro_bias=np.zeros(3),
-            accel_bias=np.zeros(3),
-        )
-        solution = solve(window, local, _gradienter("axis"), None, What.BOTH)
+        window, local = _window(np.eye(3), heading_deg=0.0, latitude_deg=latitude_deg)
+        solution = solve(window, local, _gradienter("slope"), None, What.BOTH)
         imu = _only(solution)
         np.testing.assert_allclose(imu.gyro_sigma_use_rad_s[:2] / DEG_H, expected, atol=0.05)
         assert solution.pose.psi_deg is None
@@ -247,17 +177,7 @@ def test_without_a_gradienter_gyros_only() -> None:
 
 
 def test_on_a_deck_no_gyro_is_calibrated_without_a_heading() -> None:
-    local = _local(50.0)
-    window = ideal_window(
-        ned_body=ned_from_body(1.0, 2.0, 30.0),
-        body_gradienter=np.eye(3),
-        law="slope",
-        latitude_deg=50.0,
-        gravity_m_s2=local.gravity_m_s2,
-        heading_deg=30.0,
-        gyro_bias=np.full(3, 0.001),
-        accel_bias=np.zeros(3),
-    )
+    window, local = _window(ned_from_body(1.0, 2.0, 30.0), heading_deg=30.0, latitude_deg=50.0, gyro_bias=0.001)
     blind = msgspec.structs.replace(window, heading=None)
     level = _gradienter("slope")
     with pytest.raises(CalibrationRefusedError, match="on a deck gyros need a compass"):
@@ -292,18 +212,8 @@ def test_a_compass_mounted_backwards_and_on_its_side_of_a_tilted_aircraft() -> N
     ned_body = ned_from_body(20.0, -25.0, 310.0)
     mounting = about(2, math.radians(170.0)) @ about(1, math.radians(10.0))
     forward = ned_body @ mounting @ np.array([1.0, 0.0, 0.0])
-    local = local_earth(PLAIN)
-    window = ideal_window(
-        ned_body=ned_body,
-        body_gradienter=np.eye(3),
-        law="axis",
-        latitude_deg=40.0,
-        gravity_m_s2=local.gravity_m_s2,
-        heading_deg=math.degrees(math.atan2(forward[1], forward[0])),
-        gyro_bias=np.zeros(3),
-        accel_bias=np.zeros(3),
-    )
-    solution = solve(window, local, _gradienter("axis"), _compass(mounting), What.BOTH)
+    window, local = _window(ned_body, heading_deg=math.degrees(math.atan2(forward[1], forward[0])))
+    solution = solve(window, local, _gradienter("slope"), _compass(mounting), What.BOTH)
     assert solution.pose.psi_deg == pytest.approx(310.0, abs=1e-9)
 
 

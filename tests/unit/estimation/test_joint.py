@@ -25,7 +25,7 @@ from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution, solve
 from companion.estimation.turning.watch import Turn
 from companion.samples import Triad
-from tests.prior_study import BY_READING, DEG, DEG_H, LEVEL, MG, G, imu_solution, shared_errors, solution
+from tests.prior_study import BY_READING, DEG, DEG_H, MG, G, imu_solution, shared_errors, solution
 from tests.support.windows import about, ideal_window, ned_from_body
 
 Array = NDArray[np.float64]
@@ -191,68 +191,6 @@ def test_what_a_compass_does_not_know_of_a_turn_earlier_power_ups_know_better() 
     # Of two gyros' sums and differences: 1 / (1/70^2 + 1/(2 70^2 + 20^2)), and 1 / (1/70^2 + 1/20^2).
     together, apart = 1 / (1 / 70**2 + 1 / (2 * 70**2 + 20**2)), 1 / (1 / 70**2 + 1 / 20**2)
     assert float(np.mean(sigmas)) / DEG_H == pytest.approx(np.sqrt((together + apart) / 2.0), rel=0.01)
-
-
-# --- symmetries
-
-
-def _turned_case(turn: Array, order: Sequence[int]) -> tuple[Solution, Weighed]:
-    random = np.random.default_rng(6)
-    by_reading = turn @ BY_READING
-    covariance = np.zeros((6, 6))
-    covariance[3:, 3:] = by_reading @ by_reading.T * ZERO_RAD**2
-    shared = Shared(turn @ LEVEL, G, covariance, by_reading, (0.0, 0.0), ZERO_RAD)
-    accels = [random.normal(0, 2 * MG, 3) for _ in range(3)]
-    gyros = [random.normal(0, 100 * DEG_H, 3) for _ in range(3)]
-    stat = np.array([20.0 * DEG_H] * 3 + [0.05 * MG] * 3)
-    found, known = [], []
-    for k in range(3):
-        found.append(
-            imu_solution(f"imu{k}", turn @ gyros[k], turn @ accels[k], stat, covariance + np.diag(np.square(stat)))
-        )
-        known.append(
-            ExpectedImu(
-                name=f"imu{k}",
-                earlier={
-                    "gyro": expected(turn @ (gyros[k] + random.normal(0, 30 * DEG_H, 3)), 40.0 * DEG_H),
-                    "accel": expected(turn @ (accels[k] + random.normal(0, 0.5 * MG, 3)), 0.7 * MG, same_zero=0.5),
-                },
-            )
-        )
-    of = solution([found[k] for k in order], shared)
-    return of, weighed(of, known)
-
-
-TURNS = [
-    np.array(matrix, dtype=np.float64)
-    for matrix in (
-        np.eye(3),
-        [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
-        [[0, 0, 1], [1, 0, 0], [0, 1, 0]],
-        [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
-    )
-]
-
-
-@pytest.mark.parametrize("turn", TURNS)
-@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 0, 2)])
-def test_turning_everything_and_exchanging_imus_turns_and_exchanges_the_result(
-    turn: Array, order: tuple[int, ...]
-) -> None:
-    _, plain = _turned_case(np.eye(3), (0, 1, 2))
-    of, found = _turned_case(turn, order)
-    assert [imu.name for imu in found.solution.imus] == [f"imu{k}" for k in order]
-    by_name = {imu.name: imu for imu in plain.solution.imus}
-    both = linalg.block_diag(turn, turn)
-    for imu in found.solution.imus:
-        np.testing.assert_allclose(gyro_of(imu), turn @ gyro_of(by_name[imu.name]), atol=1e-9 * DEG_H)
-        np.testing.assert_allclose(accel_of(imu), turn @ accel_of(by_name[imu.name]), atol=1e-9 * MG)
-        np.testing.assert_allclose(imu.covariance, both @ by_name[imu.name].covariance @ both.T, atol=1e-15)
-    for (one, other), block in found.solution.cross.items():
-        same = plain.solution.cross
-        straight = same[one, other] if (one, other) in same else same[other, one].T
-        np.testing.assert_allclose(block, both @ straight @ both.T, atol=1e-15)
-    assert len(of.cross) == 3
 
 
 # --- whose fault a contradiction is
