@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.config.sections import AllanModel
-from companion.estimation.records.history import Measured, Point, PowerUp
+from companion.estimation.records.history import MeasuredBias, Point, PowerUp
 from companion.estimation.records.record import Pose, PoseSigma, Site
 from companion.estimation.solution.joint import Weighed, weigh
 from companion.estimation.solution.prior import Expectation, ExpectedImu, Now, PoseEffect, expect, pose_effect
@@ -168,7 +168,7 @@ def one_trial(
         for r in range(case.power_ups):
             mean = mean + random.normal(0.0, case.ageing, 3)
             bias = mean + random.normal(0.0, case.scatter, 3) + slope * (temperatures[r] - 25.0)
-            one = Measured(
+            one = MeasuredBias(
                 bias=axes(measured(bias, earlier) * unit),
                 sigma_stat=axes(stat[:3]),
                 sigma_use=axes(np.full(3, claimed * unit)),

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import msgspec
 import sqlalchemy as sa
 
-from companion.estimation.solution.by_temperature import ByTemperature, Expected, ExpectedForces, Seen
+from companion.estimation.solution.by_temperature import ByTemperature, Expected, ExpectedForces, WindowBias
 from companion.fleet.schema import Moment, findings, rejected
 from companion.fleet.schema import aircraft as known
 from companion.physics.units import UNITS
@@ -93,7 +93,7 @@ def glance(connection: sa.Connection, now: datetime.datetime, number: int = 1) -
     silent = sum(group.silent for group in groups)
     words = [f"{group.number} {_STANDINGS[group.standing][1]}" for group in groups]
     words += [f"{silent} silent for a week"] * (silent > 0)
-    head = tag("tr", *(tag("th", words) for words in ("Aircraft", "Calibration", "Seen")))
+    head = tag("tr", *(tag("th", words) for words in ("Aircraft", "Calibration", "WindowBias")))
     return page(
         "Fleet",
         now,
@@ -217,7 +217,7 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
                 drift(points, triad, name=f"{imu} {triad}"),
             ]
         seen = [
-            Seen(
+            WindowBias(
                 at_unix_s=seconds_of(axes["x"].started_at) or 0.0,
                 started_at="",
                 power_up=number,

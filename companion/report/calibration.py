@@ -10,7 +10,7 @@ from typing import Final
 import msgspec
 
 from companion.estimation.collector.trace import Trace, VerdictTrace
-from companion.estimation.records.record import Arming, ImuRecord, Outcome, Record, outcome_word
+from companion.estimation.records.record import ArmingRecord, ImuRecord, Outcome, Record, outcome_word
 from companion.physics.units import UNITS
 from companion.report.markup import Child, Markup, cell, join, number, row, tag
 from companion.report.page import (
@@ -49,7 +49,7 @@ class Material(msgspec.Struct, frozen=True, kw_only=True):
     """Why there is no trace; empty where there is one."""
     earlier: Sequence[tuple[int, Record]]
     """Calibrations of the same aircraft, oldest first, this one last."""
-    armings: Sequence[Arming]
+    armings: Sequence[ArmingRecord]
     """While it was in force, oldest first."""
     damaged: Sequence[str]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from companion.errors import StorageError
-from companion.estimation.records.record import Arming, Record
+from companion.estimation.records.record import ArmingRecord, Record
 from companion.report.calibration import Material
 from companion.storage.records import Entry, RecordStore
 from companion.storage.state import BoundedList
@@ -33,9 +33,9 @@ def material(directory: Path, wanted: int | None) -> Material:
     if not any(entry.record for entry in entries):
         raise StorageError(f"no calibration can be read: {'; '.join(damaged[:3])}")
     entry, record = _find(entries, wanted)
-    armings: list[Arming] = []
+    armings: list[ArmingRecord] = []
     try:
-        armings = BoundedList(directory / "armings.json", Arming, keep=0).all()
+        armings = BoundedList(directory / "armings.json", ArmingRecord, keep=0).all()
     except StorageError as error:
         damaged.append(str(error))
     trace, why = None, "this record has no trace of its seconds (it is older, or its trace made room)."

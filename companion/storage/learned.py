@@ -9,7 +9,7 @@ from typing import Final
 import msgspec
 
 from companion.estimation.records import align_record, history
-from companion.estimation.records.record import Arming
+from companion.estimation.records.record import ArmingRecord
 from companion.storage.state import BoundedList, StateFile
 
 
@@ -50,9 +50,9 @@ def alignments_in(directory: Path) -> BoundedList[Done]:
     return BoundedList(directory / "by-hand.json", Done, KEEP_DONE)
 
 
-def armings_in(directory: Path) -> BoundedList[Arming]:
+def armings_in(directory: Path) -> BoundedList[ArmingRecord]:
     """Return the list of the latest armings, `armings.json` in a storage directory."""
-    return BoundedList(directory / "armings.json", Arming, KEEP_ARMINGS)
+    return BoundedList(directory / "armings.json", ArmingRecord, KEEP_ARMINGS)
 
 
 FORMAT_VERSION: Final = 2

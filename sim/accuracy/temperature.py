@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from companion.estimation.noise.allan import noise_profile
-from companion.estimation.records.history import Measured, Point, PowerUp, kept
+from companion.estimation.records.history import MeasuredBias, Point, PowerUp, kept
 from companion.estimation.solution.prior import Now, expect, pose_effect
 from sim.accuracy.figures import Claim, Section, covered, rms
 from sim.earth import Array
@@ -110,7 +110,7 @@ class Aircraft:
             stat = self._noise.white / math.sqrt(count)
             bias = day.bias[rows].mean(axis=0) + self._random.normal(0.0, stat, 3)
             use = math.hypot(stat, self._noise.flicker)
-            measured = Measured(
+            measured = MeasuredBias(
                 bias=_vector(bias), sigma_stat=(stat,) * 3, sigma_use=(use,) * 3, sigma_shared=(0.0,) * 3
             )
             points.append(

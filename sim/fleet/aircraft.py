@@ -15,7 +15,7 @@ import aiomqtt
 import msgspec
 
 from companion.estimation.records.flight_record import AXES, Drift, ImuFlight, Split, Stages, Term
-from companion.estimation.records.record import Arming, ImuRecord, Record, WrittenParameter
+from companion.estimation.records.record import ArmingRecord, ImuRecord, Record, WrittenParameter
 from companion.fleet.collector import connected, stop
 from companion.fleet.contract import FORMAT_VERSION
 from companion.physics.units import DEG_H, MG
@@ -95,7 +95,7 @@ class Aircraft:
     def arm(self, at: datetime.datetime) -> int:
         """It arms, with what is in force."""
         known = self._calibration is not None
-        arming = Arming(
+        arming = ArmingRecord(
             armed_at=_iso(at),
             state="calibrated" if known else "uncalibrated",
             reason="" if known else "never calibrated",

@@ -16,7 +16,7 @@ from companion.cli.show import status_lines
 from companion.daemon.job import Job
 from companion.daemon.offsets import firmware_calibration
 from companion.estimation.records.history import PowerUp
-from companion.estimation.records.record import Record, Standing
+from companion.estimation.records.record import PlatformTurn, Record
 from companion.lab.replay.engine import replay
 from companion.storage.learned import BiasStore
 from sim.devices import Gradienter
@@ -254,7 +254,7 @@ def test_who_has_no_compass_and_no_history_is_told_what_was_assumed(tmp_path: Pa
     for record in records:
         # The second has the first before it, which may have turned as well.
         assert sum("whether the ground turns" in words for words in record.warnings) == 1
-        assert record.standing == Standing(platform="ground", turn_deg_s=None, turn_sigma_deg_s=None, told_by=None)
+        assert record.standing == PlatformTurn(platform="ground", turn_deg_s=None, turn_sigma_deg_s=None, told_by=None)
     assert "whether the ground turns" in "".join(rig.ground.texts())
 
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.daemon.offsets.reboot import owed_in
-from companion.estimation.records.record import Arming
+from companion.estimation.records.record import ArmingRecord
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from companion.storage.learned import SIGNING_FILE, BiasStore, Done, alignment_in, faces_in, signing_time_in
 from companion.storage.records import RecordStore
@@ -70,7 +70,7 @@ def test_any_bytes_in_any_file(data: bytes) -> None:
         owed_in(folder).load()
         BoundedList(folder / "by-hand.json", Done, 5).read()
         BiasStore(folder).read()
-        BoundedList(folder / "armings.json", Arming, 5).read()
+        BoundedList(folder / "armings.json", ArmingRecord, 5).read()
         signing_time_in(folder).load()
         RecordStore(folder).history()
 

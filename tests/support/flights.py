@@ -8,7 +8,6 @@ from companion.estimation.records.flight_record import (
     AXES,
     Drift,
     Flight,
-    FlightMoment,
     ImuFlight,
     KeptFlight,
     Split,

@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 
 from companion.estimation.collector.trace import Trace, VerdictTrace
-from companion.estimation.records.history import Measured, Point, PowerUp, kept
+from companion.estimation.records.history import MeasuredBias, Point, PowerUp, kept
 from companion.estimation.records.record import (
-    Arming,
+    ArmingRecord,
     ImuRecord,
     Pose,
     PoseSigma,
@@ -149,10 +149,10 @@ def white_trace(
     )
 
 
-def arming(of: Record, *, good: bool = True) -> Arming:
+def arming(of: Record, *, good: bool = True) -> ArmingRecord:
     """An arming three minutes after that calibration began."""
     at = datetime.datetime.fromisoformat(of.started_at) + datetime.timedelta(minutes=3)
-    return Arming(
+    return ArmingRecord(
         armed_at=at.isoformat(timespec="milliseconds"),
         state="calibrated" if good else "uncalibrated",
         reason="calibrated 3 min ago, sigma 3.6 deg/h, 0.12 mg" if good else "last calibration failed",
@@ -213,20 +213,20 @@ def windows_of_days(days: int, windows: int = 3, *, first_degc: float = 8.0, ste
     return found
 
 
-def _measured(bias: Array, sigma: float) -> Measured:
+def _measured(bias: Array, sigma: float) -> MeasuredBias:
     each = (sigma, sigma, sigma)
     x, y, z = bias.tolist()
-    return Measured(bias=(x, y, z), sigma_stat=each, sigma_use=each, sigma_shared=(0.0, 0.0, 0.0))
+    return MeasuredBias(bias=(x, y, z), sigma_stat=each, sigma_use=each, sigma_shared=(0.0, 0.0, 0.0))
 
 
-def _triad(dice: random.Random, scale: float) -> Measured:
+def _triad(dice: random.Random, scale: float) -> MeasuredBias:
     """In all the digits that are kept."""
 
     def axes(sigma: float) -> Vector:
         x, y, z = (round(dice.uniform(0.1, 1.0) * sigma, 9) for _ in "xyz")
         return x, y, z
 
-    return Measured(
+    return MeasuredBias(
         bias=axes(-scale), sigma_stat=axes(scale / 100), sigma_use=axes(scale / 50), sigma_shared=axes(scale / 60)
     )
 

@@ -21,7 +21,7 @@ from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import StorageError
-from companion.estimation.records.record import Arming as ArmingRecord
+from companion.estimation.records.record import ArmingRecord
 from companion.formats import Object, utc_now
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector

@@ -40,7 +40,7 @@ from companion.estimation.solution.prior import (
     pose_effect,
 )
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution, moved
-from companion.estimation.temperature.curve import Along, Curve, Settling, settling
+from companion.estimation.temperature.curve import Along, Curve, WarmUpTime, settling
 from companion.formats import Object
 from companion.physics.frames import Array, vector
 from companion.samples import TRIADS, Triad, Vector
@@ -63,12 +63,12 @@ class Curves:
         self._profiles, self._imus = core.profiles, imus
         self._names = {imu.name for imu in core.config.imu}
         self._of: dict[tuple[str, Triad], Curve | None] = {}
-        self._settling: dict[str, Settling | None] = {}
+        self._settling: dict[str, WarmUpTime | None] = {}
 
     def follow(self, known: Mapping[str, KnownImu]) -> None:
         """Fit the curves anew; blocking."""
         of: dict[tuple[str, Triad], Curve | None] = {}
-        settles: dict[str, Settling | None] = {}
+        settles: dict[str, WarmUpTime | None] = {}
         for name in known.keys() & self._names:
             seen, profile = known[name].points, noise_profile(self._profiles.of(name))
             of |= {(name, triad): curve_of(seen, triad, profile.of(triad)) for triad in TRIADS}

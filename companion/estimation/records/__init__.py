@@ -1,1 +1,1 @@
-"""What is kept of calibrations and alignments, and whether it is still good."""
+"""Records of calibrations, alignments and flights, and whether a calibration is still good."""

@@ -87,7 +87,7 @@ class ImuFlight(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Flight(msgspec.Struct, frozen=True, kw_only=True):
-    """From an arming to the disarming after it."""
+    """One flight, from arming to disarming."""
 
     key: str
     """Identity of this arming of this start of this autopilot, whichever file it is read from."""

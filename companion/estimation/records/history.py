@@ -64,7 +64,7 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=Fal
         return mine is not None and theirs is not None and abs(mine - theirs) < SAME_START_S
 
 
-class Measured(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
+class MeasuredBias(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
     """One triad's whole bias, vehicle FRD, rad/s or m/s^2, as the readings alone gave it."""
 
     bias: tuple[_Bias, _Bias, _Bias]
@@ -99,10 +99,10 @@ class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False
     zero: str | None = None
     """Zero of the gradienter behind the accelerometers' bias; None without them."""
     zero_sigma_rad: float = 0.0
-    gyro: Measured | None = None
-    accel: Measured | None = None
+    gyro: MeasuredBias | None = None
+    accel: MeasuredBias | None = None
 
-    def of(self, triad: Triad) -> Measured | None:
+    def of(self, triad: Triad) -> MeasuredBias | None:
         """Return one triad."""
         return self.gyro if triad == "gyro" else self.accel
 
@@ -112,7 +112,7 @@ class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False
         return msgspec.structs.replace(self, gyro=rates, accel=_as_chosen(self.accel))
 
 
-def _as_chosen(found: Measured | None) -> Measured | None:
+def _as_chosen(found: MeasuredBias | None) -> MeasuredBias | None:
     return msgspec.structs.replace(found, chosen=True) if found is not None and found.suspect else found
 
 

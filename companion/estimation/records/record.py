@@ -99,7 +99,7 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
         return ", ".join(parts)
 
 
-class Standing(msgspec.Struct, frozen=True, kw_only=True):
+class PlatformTurn(msgspec.Struct, frozen=True, kw_only=True):
     """Platform under the aircraft, and its own turn; the gyros' sigma allows for it."""
 
     platform: Literal["ground", "deck"]
@@ -301,7 +301,7 @@ def _each(function: Callable[..., float], *vectors: Vector | None) -> Vector:
     return x, y, z
 
 
-class Arming(msgspec.Struct, frozen=True, kw_only=True):
+class ArmingRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Calibration in force when the aircraft armed.
 
     "calibrated": by the calibration that began at `calibration`. "checked": offsets of unknown origin, measured to be
@@ -351,11 +351,11 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     """UTC, ISO 8601: when what this calibration has written was put back on request."""
     magnetic: Magnetic | None = None
     """Quality of the heading; None without a compass."""
-    standing: Standing | None = None
+    standing: PlatformTurn | None = None
     """None: nothing was measured, or by an older version."""
     cross_covariance: tuple[CrossCovariance, ...] = ()
     """Every two IMUs."""
-    armings: tuple[Arming, ...] = ()
+    armings: tuple[ArmingRecord, ...] = ()
     """Armings while this calibration was in force; empty in the file, filled in by the history."""
 
     @property

@@ -26,7 +26,7 @@ _ENOUGH_K: Final = 5.0
 _DAY_S: Final = 86400.0
 
 
-class Seen(msgspec.Struct, frozen=True, kw_only=True):
+class WindowBias(msgspec.Struct, frozen=True, kw_only=True):
     """One still window; vehicle FRD."""
 
     at_unix_s: float
@@ -66,7 +66,7 @@ class ByTemperature(msgspec.Struct, frozen=True, kw_only=True):
     """Amount of data, in words."""
     power_ups: int = 0
     days: int = 0
-    points: tuple[Seen, ...] = ()
+    points: tuple[WindowBias, ...] = ()
     curve: tuple[Expected, ...]
     """Expected gyro biases of the next power-up; empty: not known yet."""
     accel_curve: tuple[ExpectedForces, ...] = ()
@@ -91,19 +91,19 @@ def by_temperature(
     now_degc: float | None = None,
     started_at: str = "",
 ) -> ByTemperature:
-    """Build the summary of one IMU.
+    """Build the summary of one IMU from its points and curves.
 
     Args:
         name: of the IMU.
         points: all points kept of the IMU.
-        curve: the gyros' curve through them.
-        accel: the accelerometers' curve through them.
+        curve: the gyros' curve.
+        accel: the accelerometers' curve.
         power_up: the present one; None: unknown.
         now_degc: the temperature; None: that of the last window of this power-up.
         started_at: the calibration that counts as now, in a look back; empty: the last window of this power-up.
     """
     groups = by_power_up([point for point in points if point.temperature_degc is not None and point.gyro is not None])
-    seen = [found for k, group in enumerate(groups) for point in group if (found := _seen(point, k)) is not None]
+    seen = [_window(point, k) for k, group in enumerate(groups) for point in group]
     same = (k for k, group in enumerate(groups) for p in group if power_up is not None and p.power_up.is_same(power_up))
     today = next(same, None)
     of_today = [one for one in seen if one.power_up == today and started_at in ("", one.started_at)]
@@ -127,10 +127,10 @@ def by_temperature(
     )
 
 
-def _seen(point: Point, power_up: int) -> Seen | None:
-    if point.temperature_degc is None or point.gyro is None:
-        return None
-    return Seen(
+def _window(point: Point, power_up: int) -> WindowBias:
+    assert point.temperature_degc is not None
+    assert point.gyro is not None
+    return WindowBias(
         at_unix_s=round(point.unix_s),
         started_at=point.started_at,
         power_up=power_up,
@@ -152,7 +152,7 @@ def _forces(curve: Curve, degc: float) -> ExpectedForces:
     return ExpectedForces(degc=round(degc, 2), accel_mg=_in(MG, bias), sigma_mg=_in(MG, map(math.sqrt, variance)))
 
 
-def _moved(last: Seen, curve: Curve | None, degc: float) -> Expected:
+def _moved(last: WindowBias, curve: Curve | None, degc: float) -> Expected:
     """Move the last measured bias to another temperature; without a curve it stays at its own."""
     if curve is None:
         return Expected(degc=last.degc, gyro_deg_h=last.gyro_deg_h, sigma_deg_h=last.sigma_deg_h)

@@ -14,7 +14,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from companion.estimation.records.history import Measured, Point, PowerUp
+from companion.estimation.records.history import MeasuredBias, Point, PowerUp
 from companion.estimation.solution.prior import Prediction
 from companion.estimation.solution.solve import ImuSolution, Pair, Solution
 from companion.physics.frames import Array, Matrix, vector
@@ -70,12 +70,12 @@ class Witness:
 
     @property
     def contradicts(self) -> bool:
-        """Whether an axis is beyond the gate."""
+        """Return True if an axis is beyond the gate."""
         return bool((np.abs(self.difference) > self.expected.limit * self.sigma).any())
 
     @property
     def agrees(self) -> bool:
-        """Whether the measurement is near enough for the prediction to take part."""
+        """Return True if the prediction may take part."""
         covariance = np.diag(self.own_variance) + self.common
         return float(self.difference @ np.linalg.solve(covariance, self.difference)) < AGREES
 
@@ -89,7 +89,7 @@ class Witness:
         return float(np.sum((np.square(self.difference) - np.square(self.difference - shift)) / self.own_variance))
 
     def is_explained(self, shift: Array) -> bool:
-        """Whether the rest is within the gate once a common shift is subtracted."""
+        """Return True if the difference is within the gate once a common shift is subtracted."""
         return bool((np.abs(self.difference - shift) <= self.expected.limit * np.sqrt(self.own_variance)).all())
 
 
@@ -105,7 +105,7 @@ class Doubt:
 
     @property
     def of_all(self) -> bool:
-        """Whether it concerns this triad of all IMUs, not only of those named."""
+        """Return True if it concerns this triad of all IMUs, not only of those named."""
         return self.cause not in ("imu", "unclear")
 
     @property
@@ -234,12 +234,12 @@ def points(
     common = np.diag(shared.covariance).copy()
     common[3:] = np.maximum(common[3:] - np.diag(shared.by_zero @ shared.by_zero.T), 0.0)
 
-    def measured(imu: ImuSolution, triad: Triad) -> Measured | None:
+    def measured(imu: ImuSolution, triad: Triad) -> MeasuredBias | None:
         bias = whole[imu.name][TRIADS.index(triad)]
         if bias is None:
             return None
         part = rows_of(triad)
-        return Measured(
+        return MeasuredBias(
             bias=_short(bias if imu.warming is None else bias - imu.warming.ahead(triad)),
             sigma_stat=_short(imu.sigma_stat[part]),
             sigma_use=_short(np.sqrt(imu.own_variance(shared)[part])),

@@ -4,7 +4,7 @@ A window that warmed is moved to its end first: the curve predicts how the bias 
 readings' own slope measures it, and each has a share by its variance. Where they contradict each other the window alone
 counts.
 
-Then, with d the biases by today's readings and p the predictions, all IMUs together,
+Then measurements and predictions are combined. With d the biases by today's readings and p the predictions,
 
     d = b + e_d     p = b + e_p     b_MAP = d + K (p - d)     K = cov(e_d, e_d - e_p) cov(e_d - e_p)^-1
 
@@ -39,7 +39,7 @@ from companion.physics.units import DEG, UNITS
 from companion.samples import TRIADS, Triad, rows_of
 
 Whole = Mapping[str, Pair]
-"""By IMU: whole gyro and accelerometer bias by the readings alone, (3,) each, vehicle FRD."""
+"""Whole gyro and accelerometer bias by IMU, by the readings alone, (3,) each, vehicle FRD."""
 
 BOUNDS_RAD_S: Final = 0.1 * DEG
 """Largest sigma of a gyro's prediction that says something of a turn."""

@@ -28,7 +28,7 @@ from companion.estimation.alignment.align_model import Priors
 from companion.estimation.means.warming import Path
 from companion.estimation.noise.allan import floor_variance
 from companion.estimation.records.align_record import Determined, ImuAlignmentRecord
-from companion.estimation.records.history import GUARDS_FROM, WEIGHS_FROM, Measured, Point, PowerUp, believed
+from companion.estimation.records.history import GUARDS_FROM, WEIGHS_FROM, MeasuredBias, Point, PowerUp, believed
 from companion.estimation.records.record import Effective
 from companion.estimation.temperature.curve import (
     CATALOGUE_PER_K,
@@ -37,7 +37,7 @@ from companion.estimation.temperature.curve import (
     Curve,
     Node,
     PowerUpNodes,
-    Settling,
+    WarmUpTime,
     fit,
 )
 from companion.physics.frames import Array, Floats, Matrix, skew, symmetric, vector
@@ -281,19 +281,19 @@ def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve 
     return curve if known and curve.unexplained < _UNEXPLAINED else None
 
 
-def follow(curve: Curve, path: Path, settles: Settling | None, model: AllanModel) -> Along:
+def follow(curve: Curve, path: Path, settles: WarmUpTime | None, model: AllanModel) -> Along:
     """Predict by a curve the bias over a window, and when the IMU is warm."""
     wander = 0.0 if settles is None else _in_run(model, max(WARM_AFTER * settles.tau_s, _SHORTEST_GAP_S))
     return curve.along(path.states, path.span_s, path.variance, settles, wander)
 
 
-def _of(point: Point, triad: Triad) -> Measured:
+def _of(point: Point, triad: Triad) -> MeasuredBias:
     found = point.of(triad)
     assert found is not None  # `believed` returns only these
     return found
 
 
-def _white(found: Measured) -> float:
+def _white(found: MeasuredBias) -> float:
     return float(np.square(found.sigma_stat).mean())
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from companion.estimation.records.record import CrossCovariance, ImuRecord, Record, Standing
+from companion.estimation.records.record import CrossCovariance, ImuRecord, PlatformTurn, Record
 from companion.estimation.solution.solve import ImuSolution, Pair, Solution
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, DEG_H, MG
@@ -52,7 +52,7 @@ def record_of(
         pose=solution.pose,
         site=solution.site,
         magnetic=solution.magnetic,
-        standing=Standing(
+        standing=PlatformTurn(
             platform=solution.platform,
             turn_deg_s=round(turn.rate_rad_s / DEG, 6) if told else None,
             turn_sigma_deg_s=round(turn.sigma_rad_s / DEG, 6) if told else None,

@@ -117,7 +117,7 @@ class Along(msgspec.Struct, frozen=True, kw_only=True):
         return msgspec.structs.replace(self, warm=None, **left)
 
 
-class Settling(msgspec.Struct, frozen=True):
+class WarmUpTime(msgspec.Struct, frozen=True):
     """Time constant of a board's warm-up, and one sigma."""
 
     tau_s: float
@@ -185,7 +185,7 @@ class Curve:
         states: tuple[State, State, State],
         span_s: float,
         end_variance: float,
-        settles: Settling | None,
+        settles: WarmUpTime | None,
         wander: float = 0.0,
     ) -> Along:
         """Predict the bias within a window.
@@ -229,7 +229,7 @@ class Curve:
         return np.asarray(d**power + straight_on)
 
 
-def settling(power_ups: Iterable[Sequence[State]]) -> Settling | None:
+def settling(power_ups: Iterable[Sequence[State]]) -> WarmUpTime | None:
     """Estimate the time constant of a board from the states of earlier power-ups; None: too few tell it.
 
     From where it rose fastest to the last state a board has gained tau times what it has slowed down.
@@ -244,7 +244,7 @@ def settling(power_ups: Iterable[Sequence[State]]) -> Settling | None:
         return None
     tau = float(np.median(found))
     scatter = MAD_TO_SIGMA * float(np.median(np.abs(np.subtract(found, tau))))
-    return Settling(tau, math.hypot(scatter, _TAU_SIGMA * tau))
+    return WarmUpTime(tau, math.hypot(scatter, _TAU_SIGMA * tau))
 
 
 def fit(

@@ -8,7 +8,7 @@ import pytest
 from companion.autopilot.firmware.ardupilot_calibration import parameters_of
 from companion.autopilot.firmware.imu_calibration import whole_bias
 from companion.estimation.noise.allan import noise_profile
-from companion.estimation.records.history import Measured, Point, PowerUp
+from companion.estimation.records.history import MeasuredBias, Point, PowerUp
 from companion.estimation.solution.prior import curve_of
 from companion.estimation.temperature.polynomial import Polynomial, of_curve
 from tests.unit.autopilot.test_ardupilot import IMU1, read
@@ -103,7 +103,7 @@ def test_a_curve_becomes_the_same_curve_in_the_sensors_axes(order: int) -> None:
             power_up=PowerUp(host=str(day), since_unix_s=None),
             temperature_degc=degc,
             up=(0.0, 0.0, -1.0),
-            gyro=Measured(
+            gyro=MeasuredBias(
                 bias=(float(x), float(y), float(z)),
                 sigma_stat=(1e-7,) * 3,
                 sigma_use=(1e-7,) * 3,

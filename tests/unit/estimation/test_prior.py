@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.align_record import Determined, ImuAlignmentRecord
-from companion.estimation.records.history import Measured, Point, PowerUp, believed, by_power_up
+from companion.estimation.records.history import MeasuredBias, Point, PowerUp, believed, by_power_up
 from companion.estimation.solution.prior import (
     Now,
     Prediction,
@@ -46,7 +46,7 @@ def point(
     sigma: float = 0.0,
 ) -> Point:
     x, y, z = (float(value) for value in bias)
-    one = Measured(
+    one = MeasuredBias(
         bias=(x, y, z),
         sigma_stat=(sigma, sigma, sigma),
         sigma_use=(1e-5, 1e-5, 1e-5),

@@ -13,7 +13,7 @@ from companion.estimation.means.warming import temperature_path
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import kept
 from companion.estimation.solution.prior import curve_of
-from companion.estimation.temperature.curve import Along, Curve, Node, PowerUpNodes, Settling, Warm, fit, settling
+from companion.estimation.temperature.curve import Along, Curve, Node, PowerUpNodes, Warm, WarmUpTime, fit, settling
 from sim.accuracy.mid_warm_up import RATES_K_MIN, SPANS_S, mid_warm_up
 from sim.accuracy.temperature import Aircraft
 from sim.imu_model import DEG_H, PARTS
@@ -243,7 +243,7 @@ def test_the_end_of_a_window_and_when_it_is_warm(curve: Curve) -> None:
     seconds_of = np.arange(60.0) + 0.5
     path = temperature_path(seconds(exponential(seconds_of).tolist()))
     assert path is not None
-    found = curve.along(path.states, path.span_s, path.variance, Settling(240.0, 12.0))
+    found = curve.along(path.states, path.span_s, path.variance, WarmUpTime(240.0, 12.0))
     bias = bent(exponential(seconds_of))
     end = float(bent(exponential(np.array([60.0])))[0])
     assert found.shift == pytest.approx((end - bias.mean(),) * 3, abs=3.0 * math.sqrt(max(found.shift_variance)) + 0.5)
@@ -255,7 +255,7 @@ def test_the_end_of_a_window_and_when_it_is_warm(curve: Curve) -> None:
     assert np.abs(np.subtract(warm.change, change)).max() < 3.0 * math.sqrt(max(warm.variance))
     assert math.sqrt(max(warm.variance)) < 0.25 * change
     # Where no power-up has been, and where nobody knows how it settles, nothing is foretold.
-    assert curve.along(path.states, path.span_s, path.variance, Settling(1200.0, 60.0)).warm is None
+    assert curve.along(path.states, path.span_s, path.variance, WarmUpTime(1200.0, 60.0)).warm is None
     assert curve.along(path.states, path.span_s, path.variance, None).warm is None
     # What somebody takes off by temperature the readings do not show.
     none = found.less(np.array(found.shift), np.array(found.slope))

@@ -19,7 +19,7 @@ import pytest
 
 from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
-from companion.estimation.records.record import Arming
+from companion.estimation.records.record import ArmingRecord
 from companion.estimation.solution.by_temperature import by_temperature
 from companion.estimation.solution.prior import curve_of
 from companion.mqtt import fleet as face_module
@@ -387,7 +387,7 @@ def test_everything_that_the_disk_has_and_each_change_once(tmp_path: Path) -> No
     async def main() -> None:
         aircraft = Aircraft(tmp_path, location="full")
         collector = aircraft.collector
-        store, armed = RecordStore(tmp_path), BoundedList(tmp_path / "armings.json", Arming, 200)
+        store, armed = RecordStore(tmp_path), BoundedList(tmp_path / "armings.json", ArmingRecord, 200)
         by_hand = BoundedList(tmp_path / "by-hand.json", Done, 50)
         async with aircraft.running() as face:
             aircraft.connection.connect()

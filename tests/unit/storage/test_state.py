@@ -14,7 +14,7 @@ import msgspec
 import pytest
 
 from companion.errors import StorageError
-from companion.estimation.records.record import Arming
+from companion.estimation.records.record import ArmingRecord
 from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.learned import SIGNING_FILE, BiasStore, alignment_in, faces_in, signing_time_in
 from companion.storage.profiles import ProfileStore, read_profile
@@ -52,7 +52,7 @@ FILES: dict[str, Callable[[Path], Any]] = {
     "alignment.json": lambda folder: alignment_in(folder).load(),
     "faces.json": lambda folder: faces_in(folder).load(),
     "biases.json": lambda folder: BiasStore(folder).read() or None,
-    "armings.json": lambda folder: BoundedList(folder / "armings.json", Arming, 200).read() or None,
+    "armings.json": lambda folder: BoundedList(folder / "armings.json", ArmingRecord, 200).read() or None,
     SIGNING_FILE: lambda folder: signing_time_in(folder).load(),
 }
 
@@ -236,7 +236,7 @@ def test_the_seal_is_of_any_layout() -> None:
 
 
 def test_a_list_from_before_there_were_checksums_goes_on(tmp_path: Path) -> None:
-    arming = Arming(
+    arming = ArmingRecord(
         armed_at="2026-05-01T10:00:00+00:00",
         state="checked",
         reason="",
@@ -249,7 +249,7 @@ def test_a_list_from_before_there_were_checksums_goes_on(tmp_path: Path) -> None
     )
     path = tmp_path / "armings.json"
     path.write_bytes(msgspec.json.encode([arming]))
-    kept = BoundedList(path, Arming, 2)
+    kept = BoundedList(path, ArmingRecord, 2)
     assert kept.read() == kept.all() == [arming]
     later = msgspec.structs.replace(arming, armed_at="later")
     kept.append(later)
