@@ -93,7 +93,7 @@ def glance(connection: sa.Connection, now: datetime.datetime, number: int = 1) -
     silent = sum(group.silent for group in groups)
     words = [f"{group.number} {_STANDINGS[group.standing][1]}" for group in groups]
     words += [f"{silent} silent for a week"] * (silent > 0)
-    head = tag("tr", *(tag("th", words) for words in ("Aircraft", "Calibration", "WindowBias")))
+    head = tag("tr", *(tag("th", words) for words in ("Aircraft", "Calibration", "Seen")))
     return page(
         "Fleet",
         now,

@@ -71,10 +71,8 @@ class StandRecord(msgspec.Struct, frozen=True, kw_only=True):
     """One still window, as it was measured."""
 
     x_deg: float | None
-    """The gradienter's own readings."""
     y_deg: float | None
     roll_deg: float
-    """With the zero that was found."""
     pitch_deg: float
     heading_deg: float
     on_spot: bool
@@ -86,9 +84,7 @@ class SpotRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     format_version: int = FORMAT_VERSION
     measured_at: str
-    """UTC, ISO 8601; the host's clock."""
     slope_deg: float
-    """Slope of the spot."""
     checked: bool
     """True if a spot that moved between the stands would have been noticed."""
     chi_square: float
@@ -105,10 +101,8 @@ class AlignmentRecord(SpotRecord, frozen=True, kw_only=True):
     offset_deg: Pair
     """Zero of the gradienter on top of `gradienter.offset_deg`."""
     sigma_deg: float
-    """The larger sigma of both axes."""
     covariance_deg2: tuple[Pair, Pair]
     temperature_degc: float | None
-    """Temperature of the gradienter."""
     imus: tuple[ImuAlignmentRecord, ...]
 
 
@@ -140,9 +134,7 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
     host: str
     """Identity of the companion computer's start, whose clock counts."""
     started_s: float
-    """When the sensor's device started, on that clock."""
     up_s: float
-    """For how long it had been on."""
 
     def is_same(self, other: Running) -> bool:
         """Return whether the power has surely been on in between."""
@@ -154,12 +146,9 @@ class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     accel_id: int | None
-    """The accelerometer's device id in the autopilot."""
     corrections: dict[str, float]
-    """Offsets and scales that were active, by parameter."""
     temperature_degc: float | None
     running: Running | None = None
-    """None where the device does not tell since when it has been on."""
     accel_bias_mg: Determined
     accel_scale: Determined
     accel_shear: Determined
@@ -169,7 +158,6 @@ class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     scatter_mg: float
     """Rms by which the stands' readings, corrected, miss the length of gravity."""
     written: dict[str, WrittenParameter]
-    """Empty where nothing was to be written."""
     whole_bias_mg: Vector | None = None
     """Bias of the sensor without any offset, as it is written; None: of an earlier version."""
 
@@ -202,7 +190,6 @@ class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
     """One IMU, turned on a spot without a gradienter."""
 
     written: dict[str, WrittenParameter] = {}
-    """Empty where nothing was to be written."""
     whole_bias_mg: Vector | None = None
     """`level_bias_mg` without the autopilot's offsets, as it would be written; None: of an earlier version."""
 

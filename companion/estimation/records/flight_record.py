@@ -104,7 +104,6 @@ class KeptFlight(msgspec.Struct, frozen=True, kw_only=True):
     """One file of the flights."""
 
     log: str
-    """Name of the log."""
     read_at: str
     flight: Flight
     format_version: int = FORMAT_VERSION

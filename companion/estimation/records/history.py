@@ -93,7 +93,6 @@ class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False
     power_up: PowerUp
     temperature_degc: float | None
     k_s: float = 0.0
-    """Rate of the temperature, K/s."""
     up: Vector
     """Unit vector in the vehicle's axes: the attitude at which the accelerometers' bias was measured."""
     zero: str | None = None

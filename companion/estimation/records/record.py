@@ -67,7 +67,6 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
     heading_from: Literal["device", "field"]
     """Tilt compensation: the device's own, or ours with the gradienter."""
     field_gauss: float | None
-    """Measured field; None where the device gives counts only, or no field."""
     field_expected_gauss: float | None
     """Field and inclination of the Earth by WMM2025."""
     inclination_deg: float | None
@@ -76,7 +75,6 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
     device_minus_field_deg: float | None
     """The device's own heading less that from its field and the gradienter, where it gives both."""
     wander_deg: float | None
-    """Change of the heading while nothing else showed a turn of the aircraft."""
 
     def in_words(self) -> str:
         """One line for people."""
@@ -130,16 +128,12 @@ class GyroPrior(msgspec.Struct, frozen=True, kw_only=True):
     used: bool
     """True if it took part in the estimate; it guards in any case."""
     power_ups: int
-    """Number of earlier power-ups."""
     temperature_model: bool
-    """True: a cubic over temperature; false: a mean."""
     expected_rad_s: Vector
     sigma_rad_s: Vector
     """One sigma of today's bias about the prediction."""
     measured_rad_s: Vector
-    """Today's whole bias by the readings alone."""
     shift_sigma: Vector
-    """Measured less expected, in sigmas of that difference."""
 
 
 class AccelPrior(msgspec.Struct, frozen=True, kw_only=True):
@@ -170,7 +164,6 @@ class Effective(msgspec.Struct, frozen=True, kw_only=True):
     """Scale error times 1 g, one sigma an axis: an axis' bias moves by it times the change of its share of gravity;
     the vertical one's of a level aircraft that is tilted, times 1 - cos(tilt)."""
     level_sigma_m_s2: Vector
-    """Sigma of the bias as that of the level aircraft."""
     sensor_sigma_m_s2: Vector
     """Sigma of the bias as the sensor's own, in its own axes, whatever its attitude."""
 
@@ -179,7 +172,6 @@ class WhenWarm(msgspec.Struct, frozen=True, kw_only=True):
     """Whole biases that the curve over temperature predicts for the warm board."""
 
     degc: float
-    """Temperature of the warm board, by the warm-ups of earlier power-ups."""
     gyro_bias_rad_s: Vector
     gyro_sigma_rad_s: Vector
     accel_bias_m_s2: Vector | None
@@ -204,7 +196,6 @@ class TriadFigures(NamedTuple):
     sigma_stat: Vector | None
     sigma_use: Vector | None
     sigma_warm_up: Vector | None
-    """Part of sigma_use."""
     residual: Vector | None
     sigma_in_force: Vector | None
 
@@ -228,9 +219,7 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     warnings: tuple[str, ...] = ()
     written: dict[str, WrittenParameter] = {}
     prior: Prior | None = None
-    """None: no prediction."""
     effective: Effective | None = None
-    """None where the accelerometers were not determined."""
     held_back: tuple[Literal["gyro", "accel"], ...] = ()
     """Measured, not written: it contradicts earlier calibrations and was not requested."""
     unchanged: tuple[Literal["gyro", "accel"], ...] = ()
@@ -318,7 +307,6 @@ class ArmingRecord(msgspec.Struct, frozen=True, kw_only=True):
     confirmed_ago_s: float | None
     """Time since a still window last agreed with the offsets in force."""
     gyro_sigma_use_rad_s: float | None
-    """The largest of all axes in force."""
     accel_sigma_use_m_s2: float | None
 
 
@@ -350,11 +338,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     undone_at: str | None = None
     """UTC, ISO 8601: when what this calibration has written was put back on request."""
     magnetic: Magnetic | None = None
-    """Quality of the heading; None without a compass."""
     standing: PlatformTurn | None = None
-    """None: nothing was measured, or by an older version."""
     cross_covariance: tuple[CrossCovariance, ...] = ()
-    """Every two IMUs."""
     armings: tuple[ArmingRecord, ...] = ()
     """Armings while this calibration was in force; empty in the file, filled in by the history."""
 

@@ -159,19 +159,16 @@ def _judge(
         return _MeanField(strength, inclination, own)
     noise = float(np.linalg.norm(field.sigma)) / size
     dip_sigma_rad = math.sqrt((expected.inclination_sigma_deg * DEG) ** 2 + by_up @ up_covariance @ by_up + noise**2)
-    whole = expected.strength_gauss
-    if strength is None:
-        seen = math.hypot(whole * (inclination - expected.inclination_deg * DEG), whole * dip_sigma_rad)
-        unseen, across = BOUND_OF_ONE * seen, whole * math.cos(inclination)
-    else:
-        across = strength * math.cos(inclination)
-        seen = math.hypot(
-            across - expected.horizontal_gauss,
-            strength * math.sin(inclination) - expected.down_gauss,
-            whole * dip_sigma_rad,
-            math.hypot(expected.strength_sigma_gauss, noise * size),
-        )
-        unseen = BOUND_OF_TWO * seen
+    # A device without a unit shows the dip only: its field is taken for as strong as the Earth's.
+    used = expected.strength_gauss if strength is None else strength
+    across = used * math.cos(inclination)
+    seen = math.hypot(
+        across - expected.horizontal_gauss,
+        used * math.sin(inclination) - expected.down_gauss,
+        expected.strength_gauss * dip_sigma_rad,
+        0.0 if strength is None else math.hypot(expected.strength_sigma_gauss, noise * size),
+    )
+    unseen = seen * (BOUND_OF_ONE if strength is None else BOUND_OF_TWO)
     return _MeanField(strength, inclination, own, deflection_bound_deg(unseen, across))
 
 

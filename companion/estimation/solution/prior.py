@@ -139,7 +139,6 @@ class Prediction(msgspec.Struct, frozen=True, kw_only=True):
     """Limit of the gate in sigmas: 4, or an equally improbable one where the scatter is known from few points."""
     power_ups: int
     weighs: bool
-    """True if the prediction may take part in the estimate."""
     by_temperature: bool = False
     same_zero: float = 0.0
     """Share that was measured with today's zero of the gradienter, so that its error is in both."""
@@ -152,13 +151,10 @@ class ExpectedImu(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     earlier: dict[Triad, Prediction | None] = {}
-    """Prediction from earlier power-ups."""
     today: dict[Triad, Prediction | None] = {}
-    """Prediction from a calibration earlier in this power-up."""
     along: dict[Triad, Along | None] = {}
     """Prediction by the curve for a window in which the temperature changed."""
     effect: PoseEffect | None = None
-    """Effect of the attitude on the accelerometers' bias."""
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):

@@ -46,12 +46,12 @@ class ImuSolution:
 
     `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of a prediction of the next minutes, without what a
     warm-up may do in them: that moves the bias under old and new offsets alike, and no comparison must count it.
+    `temperature_degc` is that of the end of the window, `k_s` its rate, K/s.
     """
 
     name: str
     samples: int
     temperature_degc: float | None
-    """At the end of the window."""
     gyro_rad_s: Array | None
     accel_m_s2: Array | None
     sigma_stat: Array
@@ -62,16 +62,12 @@ class ImuSolution:
     """Words on its drift, or on its biases when warm."""
     warm_up_variance: Array = dataclasses.field(default_factory=lambda: np.zeros(6))
     k_s: float = 0.0
-    """Rate of its temperature, K/s."""
     warming: Warming | None = None
-    """Slopes within the window; None: unknown."""
     when_warm: WhenWarm | None = None
     dithered: bool = False
     """The telemetry was seen to follow this IMU's offsets step by step."""
     prior: Prior | None = None
-    """Predictions from earlier calibrations, for the record."""
     effective: Effective | None = None
-    """Sigma of the accelerometers' bias at another attitude."""
 
     @property
     def biases(self) -> Pair:
@@ -140,9 +136,7 @@ class Solution:
     unknown: tuple[tuple[str, Triad], ...] = ()
     """IMUs and triads that were asked for and whose readings do not tell; the IMU's warnings say why."""
     magnetic: Magnetic | None = None
-    """Quality of the heading; None without a compass."""
     turn: Turn = dataclasses.field(default_factory=Turn)
-    """Rate of the platform itself."""
     platform: Platform = "ground"
     cross: Mapping[tuple[str, str], Matrix] = dataclasses.field(default_factory=dict)
     """Cross-covariance (6x6) of every two IMUs, in their order."""

@@ -77,7 +77,6 @@ class Node(msgspec.Struct, frozen=True):
     variance: float
     """Variance of the white noise, mean over the axes."""
     k_s: float = 0.0
-    """Rate of the temperature, K/s."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -131,9 +130,7 @@ class Curve:
     order: int
     """0: a mean; 3: a cubic."""
     lag_s: float
-    """Lag of the die behind its thermometer."""
     coefficients: Matrix
-    """Mean and coefficients of the terms, (1 + order, 3)."""
     covariance: Matrix
     """Covariance of the coefficients, for an axis with the usual scatter."""
     widening: Array
@@ -145,13 +142,9 @@ class Curve:
     scatter: Array
     """Variance of one more power-up about the model, wandering included, (3,)."""
     mean_square_error: float
-    """Mean square error of the predictions of left-out power-ups."""
     shares: Array
-    """Weight of each power-up in the mean, (n,)."""
     freedom: float
-    """Degrees of freedom of the scatter."""
     span_degc: tuple[float, float]
-    """Lowest and highest temperature seen."""
     per_kelvin: float
     """One sigma of the change per kelvin beyond them."""
 
