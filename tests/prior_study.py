@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -111,10 +110,7 @@ def imu_solution(name: str, gyro: Array, accel: Array, stat: Array, covariance: 
 
 def solution(imus: Sequence[ImuSolution], shared: Shared) -> Solution:
     """Of several IMUs."""
-    cross = dict.fromkeys(itertools.combinations([imu.name for imu in imus], 2), shared.covariance)
-    return Solution(
-        pose=_POSE, site=_SITE, imus=tuple(imus), warnings=(), unknown=(), magnetic=None, shared=shared, cross=cross
-    )
+    return Solution(pose=_POSE, site=_SITE, imus=tuple(imus), warnings=(), unknown=(), magnetic=None, shared=shared)
 
 
 def shared_errors(zero_sigma_rad: float, noise_rad: float = 0.0, gravity_sigma: float = 0.0) -> Shared:

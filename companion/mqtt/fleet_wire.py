@@ -30,7 +30,7 @@ _ROUNDED: Final[dict[str, int]] = {
     "inclination_expected_deg": 1,
 }
 """Figures that give away a place (gravity and the field do, too), and the decimals that leave it a kilometre."""
-_WORKED_OUT: Final[dict[str, object]] = {"covariance": None, "cross_covariance": [], "effective": None}
+_WORKED_OUT: Final[dict[str, object]] = {"covariance": None, "effective": None}
 """Figures whose digits give away the gravity and the latitude behind them, and their substitutes."""
 _EARTHS: Final = re.compile(r"(the Earth's) [\d.]+")
 

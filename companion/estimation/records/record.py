@@ -180,15 +180,6 @@ class WhenWarm(msgspec.Struct, frozen=True, kw_only=True):
     """Words for people on the axes that will move most; empty: not worth saying."""
 
 
-class CrossCovariance(msgspec.Struct, frozen=True, kw_only=True):
-    """Covariance of two IMUs' errors: tilt, heading, gravity and the Earth's rate are common."""
-
-    imus: tuple[str, str]
-    covariance: tuple[tuple[float | None, ...], ...]
-    """6x6 as an IMU's own `covariance`; rows of the first, columns of the second. That of the difference of their
-    biases is the sum of both IMUs' own less this and its transpose."""
-
-
 class TriadFigures(NamedTuple):
     """Figures of the gyros or accelerometers of one IMU; None: not determined, or not applicable."""
 
@@ -339,7 +330,6 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     """UTC, ISO 8601: when what this calibration has written was put back on request."""
     magnetic: Magnetic | None = None
     standing: PlatformTurn | None = None
-    cross_covariance: tuple[CrossCovariance, ...] = ()
     armings: tuple[ArmingRecord, ...] = ()
     """Armings while this calibration was in force; empty in the file, filled in by the history."""
 

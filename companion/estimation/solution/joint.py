@@ -202,9 +202,10 @@ def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: boo
         return solution, np.zeros(6 * count)
     index = np.concatenate([np.arange(one.rows.start, one.rows.stop) for one in used])
     innovation = -np.concatenate([one.difference for one in used])
-    blocks = {(imu.name, imu.name): imu.covariance for imu in solution.imus} | dict(solution.cross)
-    blocks |= {(other, one): matrix.T for (one, other), matrix in solution.cross.items()}
-    s_d = np.block([[blocks[one.name, other.name] for other in solution.imus] for one in solution.imus])
+    parts = [slice(6 * k, 6 * k + 6) for k in range(count)]
+    s_d = np.kron(np.ones((count, count)), shared.covariance)
+    for imu, part in zip(solution.imus, parts, strict=True):
+        s_d[part, part] = imu.covariance
     zero, none = shared.by_zero, np.zeros((3, 2))
     # Every accelerometer's share of the zero's error: in d it is whole, in p as far as that was measured with it.
     zero_in_d = np.tile(np.vstack([none, zero]), (count, 1))
@@ -231,17 +232,12 @@ def _combined(solution: Solution, used: Sequence[Witness], *, zero_is_known: boo
     stat = np.sqrt(np.diag(rest @ np.diag(np.square(stat)) @ rest.T + gain @ s_p @ gain.T))
     stat = np.minimum(stat, np.sqrt(np.diag(covariance)))
     shift = gain @ innovation
-    part = {imu.name: slice(6 * k, 6 * k + 6) for k, imu in enumerate(solution.imus)}
     imus = []
-    for imu, at in zip(solution.imus, part.values(), strict=True):
-        gyro, accel = moved(imu.biases, shift[at])
-        imus.append(
-            dataclasses.replace(
-                imu, gyro_rad_s=gyro, accel_m_s2=accel, covariance=covariance[at, at], sigma_stat=stat[at]
-            )
-        )
-    cross = {(one, other): covariance[part[one], part[other]] for one, other in itertools.combinations(part, 2)}
-    return dataclasses.replace(solution, imus=tuple(imus), cross=cross), shift
+    for imu, part in zip(solution.imus, parts, strict=True):
+        gyro, accel = moved(imu.biases, shift[part])
+        found = {"covariance": covariance[part, part], "sigma_stat": stat[part]}
+        imus.append(dataclasses.replace(imu, gyro_rad_s=gyro, accel_m_s2=accel, **found))
+    return dataclasses.replace(solution, imus=tuple(imus)), shift
 
 
 def _grounded(solution: Solution, earlier: Sequence[Witness], today: Sequence[Witness]) -> Solution:
@@ -267,7 +263,6 @@ def _grounded(solution: Solution, earlier: Sequence[Witness], today: Sequence[Wi
         solution,
         shared=dataclasses.replace(solution.shared, covariance=solution.shared.covariance + by_turn),
         imus=tuple(dataclasses.replace(imu, covariance=imu.covariance + by_turn) for imu in solution.imus),
-        cross={pair: matrix + by_turn for pair, matrix in solution.cross.items()},
     )
 
 

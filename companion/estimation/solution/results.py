@@ -9,7 +9,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from companion.estimation.records.record import CrossCovariance, ImuRecord, PlatformTurn, Record
+from companion.estimation.records.record import ImuRecord, PlatformTurn, Record
 from companion.estimation.solution.solve import ImuSolution, Pair, Solution
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, DEG_H, MG
@@ -44,7 +44,6 @@ def record_of(
         return record
     imus = tuple(_imu(imu, (whole or {}).get(imu.name)) for imu in solution.imus)
     turn, told = solution.turn, solution.turn.is_told
-    known = {imu.name: _known(imu) for imu in solution.imus}
     return msgspec.structs.replace(
         record,
         reason=in_words(solution, imus) if reason is None else reason,
@@ -59,18 +58,12 @@ def record_of(
             told_by=turn.by if told else None,
         ),
         imus=imus,
-        cross_covariance=tuple(
-            CrossCovariance(imus=pair, covariance=covariance)
-            for pair, matrix in solution.cross.items()
-            if (covariance := _where_known(matrix, *(known[name] for name in pair))) is not None
-        ),
     )
 
 
 def _imu(estimate: ImuSolution, whole: Pair | None) -> ImuRecord:
     gyro, accel = whole or estimate.biases
-    known = _known(estimate)
-    has_gyro, has_accel = known[0], known[3]
+    has_gyro, has_accel = estimate.gyro_rad_s is not None, estimate.accel_m_s2 is not None
     return ImuRecord(
         name=estimate.name,
         samples=estimate.samples,
@@ -81,7 +74,7 @@ def _imu(estimate: ImuSolution, whole: Pair | None) -> ImuRecord:
         accel_bias_m_s2=_axes(accel),
         accel_sigma_stat_m_s2=_axes(estimate.sigma_stat[3:] if has_accel else None),
         accel_sigma_use_m_s2=_axes(estimate.accel_sigma_use_m_s2 if has_accel else None),
-        covariance=_where_known(estimate.use_covariance, known, known),
+        covariance=_where_known(estimate.use_covariance, [has_gyro] * 3 + [has_accel] * 3),
         gyro_sigma_warm_up_rad_s=_axes(np.sqrt(estimate.warm_up_variance[:3]) if has_gyro else None),
         accel_sigma_warm_up_m_s2=_axes(np.sqrt(estimate.warm_up_variance[3:]) if has_accel else None),
         residual_gyro_rad_s=_axes(estimate.gyro_rad_s if whole else None),
@@ -114,14 +107,10 @@ def when_warm(solution: Solution) -> list[str]:
     return [words for imu in solution.imus if imu.when_warm is not None for words in imu.when_warm.words]
 
 
-def _known(imu: ImuSolution) -> list[bool]:
-    return [imu.gyro_rad_s is not None] * 3 + [imu.accel_m_s2 is not None] * 3
-
-
-def _where_known(matrix: Matrix, rows: list[bool], columns: list[bool]) -> tuple[tuple[float | None, ...], ...] | None:
-    if not any(rows) or not any(columns):
+def _where_known(matrix: Matrix, known: list[bool]) -> tuple[tuple[float | None, ...], ...] | None:
+    if not any(known):
         return None
-    return tuple(tuple(float(matrix[i, j]) if rows[i] and columns[j] else None for j in range(6)) for i in range(6))
+    return tuple(tuple(float(matrix[i, j]) if known[i] and known[j] else None for j in range(6)) for i in range(6))
 
 
 def in_words(solution: Solution | None, imus: Sequence[ImuRecord]) -> str:

@@ -11,9 +11,8 @@ gyro's mean - C_n^b w_ie^n. Everything is FRD and NED; `up` is the unit vector o
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import Final
 
 import msgspec
@@ -107,7 +106,7 @@ class Shared:
     up: Array
     gravity_m_s2: float
     covariance: Matrix
-    """6x6 (gyro rad/s, accelerometer m/s^2), part of every IMU's own and the cross-covariance of any two."""
+    """6x6 (gyro rad/s, accelerometer m/s^2), part of every IMU's own and that of any two."""
     by_reading: Matrix | None
     """d (accelerometer bias) / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
     reading_sigma_rad: tuple[float, float]
@@ -138,8 +137,6 @@ class Solution:
     magnetic: Magnetic | None = None
     turn: Turn = dataclasses.field(default_factory=Turn)
     platform: Platform = "ground"
-    cross: Mapping[tuple[str, str], Matrix] = dataclasses.field(default_factory=dict)
-    """Cross-covariance (6x6) of every two IMUs, in their order."""
 
 
 def moved(biases: Pair, shift: Array) -> Pair:
@@ -221,7 +218,6 @@ def solve(
         shared=shared,
         turn=window.turn,
         platform=platform,
-        cross=dict.fromkeys(itertools.combinations((imu.name for imu in imus), 2), shared.covariance),
     )
 
 
