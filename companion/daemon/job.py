@@ -40,11 +40,7 @@ class CurvesWritten(msgspec.Struct, frozen=True):
     """Curves over temperature that were written to the autopilot."""
 
     imus: dict[str, dict[str, WrittenParameter]]
-    """Parameters by IMU."""
     warnings: tuple[str, ...]
-
-
-Product = Record | AlignmentRecord | FacesRecord | TurnRecord | Undone | CurvesWritten
 
 
 class JobCancelledError(Exception):
@@ -59,23 +55,23 @@ class Job:
         kind: str,
         what: What,
         requester: str,
-        deadline_s: float | None,
+        timeout_s: float | None = None,
         *,
         reboot: bool = False,
         automatic: bool = False,
     ) -> None:
+        loop = asyncio.get_running_loop()
         self.kind, self.what, self.requester = kind, what, requester
         self.reboot = reboot
         """Whether to restart the autopilot once the result is stored."""
         self.automatic = automatic
         """Whether nobody asked for it."""
         self.was_armed = False
-        """Whether the aircraft was armed since the start, be it for a moment."""
-        self.deadline_s = deadline_s
+        """Whether the aircraft was armed at any moment since the start."""
+        self.deadline_s = None if timeout_s is None else loop.time() + timeout_s
         """Loop time by which measuring must end; None: no limit."""
-        self.finished: asyncio.Future[JobResult] = asyncio.get_running_loop().create_future()
-        self.product: Product | None = None
-        """Record of a calibration or an alignment, or the restored parameters of an undo."""
+        self.finished: asyncio.Future[JobResult] = loop.create_future()
+        self.product: Record | AlignmentRecord | FacesRecord | TurnRecord | Undone | CurvesWritten | None = None
         self.words = ""
         """Present activity, for people."""
         self.hold_still_s: int | None = None
@@ -102,14 +98,9 @@ class Job:
         return self.product if isinstance(self.product, Record) else None
 
     @property
-    def undone(self) -> Undone | None:
-        """Result of an undo."""
-        return self.product if isinstance(self.product, Undone) else None
-
-    @property
     def undid_calibration(self) -> bool:
         """Whether the write of a calibration was undone, also of an automatic one."""
-        return self.kind == "undo" and (self.undone is None or not self.undone.by_hand)
+        return self.kind == "undo" and not (isinstance(self.product, Undone) and self.product.by_hand)
 
     @property
     def short(self) -> str:
@@ -118,21 +109,17 @@ class Job:
 
     @property
     def left_s(self) -> float:
-        """Estimated remaining time."""
+        """Estimated remaining time of the present activity."""
         return max(0.0, self._until_s - asyncio.get_running_loop().time())
 
-    def deliver(self, product: Product) -> None:
-        """Set the product."""
-        self.product = product
+    def lasts(self, seconds: float) -> None:
+        """Set the expected duration of the present activity."""
+        self._until_s = asyncio.get_running_loop().time() + seconds
 
     def progress(self, percent: float, words: str, hold_still_s: int | None = None) -> None:
         """Set percentage and present activity; and the time to hold still, where that is all."""
         self.progress_percent = max(self.progress_percent, min(99, int(percent)))
         self.words, self.hold_still_s = words, hold_still_s
-
-    def lasts(self, seconds: float) -> None:
-        """Set the expected duration of the present activity."""
-        self._until_s = asyncio.get_running_loop().time() + seconds
 
     def going_on(self, percent: float, otherwise: str = "") -> GoOn:
         """Make a `GoOn` that shows its words, or `otherwise`, at this percentage."""
@@ -183,7 +170,7 @@ class Job:
         self._nudge.set()
 
     def finish(self, result: JobResult) -> None:
-        """Tell everybody who waits."""
+        """Set the result."""
         self.progress_percent = 100
         if not self.finished.done():
             self.finished.set_result(result)

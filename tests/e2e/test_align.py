@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from companion.commands import Align
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from companion.estimation.records.record import Record
@@ -64,7 +65,7 @@ async def follow(rig: Rig, hands: Hands, job: Job) -> JobResult:
 
 
 async def aligned(rig: Rig, hands: Hands) -> JobResult:
-    return await follow(rig, hands, started(rig.service.calibrating.start_alignment({"action": "zero"}, "test")))
+    return await follow(rig, hands, started(rig.service.calibrating.start_alignment(Align(action="zero"), "test")))
 
 
 def test_the_horizontal_accelerometers_become_as_good_as_the_turn(tmp_path: Path) -> None:
@@ -110,7 +111,7 @@ def test_a_spot_that_moved_is_refused_in_words_and_the_old_zero_stays(tmp_path: 
     async def main() -> None:
         async with made.running():
             await made.ready()
-            job = started(made.service.calibrating.start_alignment({"action": "zero"}, "test"))
+            job = started(made.service.calibrating.start_alignment(Align(action="zero"), "test"))
             await moved(made, hands, job, 2, 180.0)
             hands.bump(0.3, 0.0)
             await moved(made, hands, job, 3, 180.0)
@@ -190,13 +191,13 @@ def test_armed_in_the_middle_it_ends(tmp_path: Path) -> None:
     async def main() -> None:
         async with made.running():
             await made.ready()
-            job = started(made.service.calibrating.start_alignment({"action": "zero"}, "test"))
+            job = started(made.service.calibrating.start_alignment(Align(action="zero"), "test"))
             await made.until(lambda: "measuring" in job.words, 60.0)
             made.double.arm()
             result = await job.finished
             assert result.outcome == "failed"
             assert "armed during the alignment" in result.reason
-            refused = made.service.calibrating.start_alignment({"action": "zero"}, "test")
+            refused = made.service.calibrating.start_alignment(Align(action="zero"), "test")
             assert isinstance(refused, Refusal)
             assert refused.kind == "armed"
 
@@ -210,7 +211,7 @@ def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, to
     async def main() -> None:
         async with made.running():
             await made.ready()
-            job = started(made.service.calibrating.start_alignment({"action": "zero"}, "test"))
+            job = started(made.service.calibrating.start_alignment(Align(action="zero"), "test"))
             await made.until(lambda: "waiting for it to move" in job.words, 60.0)
             if told:
                 made.double.write_as_another_station(offset_names(1, "accel")[0], 0.03)

@@ -13,6 +13,7 @@ import pytest
 
 from companion.cli.client import stands_lines
 from companion.cli.show import status_lines
+from companion.commands import Align
 from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.daemon.stands.alignment import ByHand
@@ -38,7 +39,7 @@ def rig(folder: Path, **more: Any) -> tuple[Rig, Hands]:
 
 def faced(rig: Rig, *, write: bool) -> Job:
     wanted = {"action": "faces", "write": write, "timeout_s": 2000.0}
-    return started(rig.service.calibrating.start_alignment(wanted, "test"))
+    return started(rig.service.calibrating.start_alignment(Align.read(wanted), "test"))
 
 
 def read(rig: Rig, what: str) -> np.ndarray[Any, Any]:
@@ -145,7 +146,7 @@ def test_who_asks_for_what_cannot_be_is_told_at_once(tmp_path: Path) -> None:
     async def main() -> None:
         async with made.running():
             await made.ready()
-            refused = made.service.calibrating.start_alignment({"action": "faces", "write": True}, "test")
+            refused = made.service.calibrating.start_alignment(Align(action="faces", write=True), "test")
             assert isinstance(refused, Refusal)
             assert "push.parameters is false" in refused.reason
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from companion.cli.client import stands_lines
+from companion.commands import Align
 from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.estimation.records.align_record import TurnRecord
@@ -39,7 +40,7 @@ FACES = {"action": "faces", "write": True, "timeout_s": 2000.0}
 
 def turn(rig: Rig, headings: int, *, write: bool) -> Job:
     wanted = {"action": "turn", "headings": headings, "write": write}
-    return started(rig.service.calibrating.start_alignment(wanted, "test"))
+    return started(rig.service.calibrating.start_alignment(Align.read(wanted), "test"))
 
 
 async def turned(rig: Rig, hands: Hands, headings: int, *, write: bool, meddle: Meddle = NOTHING) -> TurnRecord:
@@ -116,10 +117,10 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
     async def sides() -> None:
         async with first.running():
             await first.ready()
-            refused = first.service.calibrating.start_alignment({"action": "turn", "level": True}, "test")
+            refused = first.service.calibrating.start_alignment(Align(action="turn", level=True), "test")
             assert isinstance(refused, Refusal)
             assert "align faces --write first" in refused.reason
-            job = started(first.service.calibrating.start_alignment(FACES, "test"))
+            job = started(first.service.calibrating.start_alignment(Align.read(FACES), "test"))
             result = await follow(first, hand, job)
             assert result.outcome == "done", result
 
@@ -132,7 +133,7 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
             await made.ready()
             result, calibration = await calibrated(made)
             assert result.outcome == "done", result
-            job = started(made.service.calibrating.start_alignment({"action": "turn", "level": True}, "test"))
+            job = started(made.service.calibrating.start_alignment(Align(action="turn", level=True), "test"))
             result = await follow(made, hands, job)
             assert result.outcome == "done", result
             record = job.product
@@ -176,13 +177,15 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
         async with made.running():
             await made.ready()
             old = {name: made.autopilot.parameter(name) for name in ("CAL_ACC0_XOFF", "CAL_ACC0_YOFF", "CAL_ACC0_ZOFF")}
-            result = await follow(made, hands, started(made.service.calibrating.start_alignment(FACES, "test")))
+            result = await follow(
+                made, hands, started(made.service.calibrating.start_alignment(Align.read(FACES), "test"))
+            )
             assert result.outcome == "done", result
             hands.spot(made.aircraft.time_at(made.now_s), STEEP.pitch_deg, STEEP.roll_deg)
             await asyncio.sleep(15.0)
             if not follows:
                 monkeypatch.setattr(SensorCalibration, "_set_rotation", lambda *_: None)
-            job = started(made.service.calibrating.start_alignment({"action": "turn", "level": True}, "test"))
+            job = started(made.service.calibrating.start_alignment(Align(action="turn", level=True), "test"))
             result = await follow(made, hands, job)
             if not follows:
                 assert result.outcome == "failed"

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from companion.commands import Align
 from companion.component.service import Refusal
 from companion.estimation.deck.estimate import DeckWork
 from companion.estimation.records.record import Record
@@ -144,7 +145,7 @@ def test_no_zero_of_a_gradienter_is_measured_on_a_deck(tmp_path: Path) -> None:
     async def main() -> None:
         async with boat(tmp_path).running() as rig:
             await rig.ready()
-            refused = rig.service.calibrating.start_alignment({"action": "zero", "timeout_s": 60.0}, "test")
+            refused = rig.service.calibrating.start_alignment(Align(action="zero", timeout_s=60.0), "test")
             assert isinstance(refused, Refusal)
             assert "ashore" in refused.reason
 

@@ -88,13 +88,14 @@ def test_the_gates_countdown_never_counts_up_and_is_kept(tmp_path: Path, firmwar
             while (answer := rig.service.arming.readiness.answer()).verdict != "accept":
                 assert rig.now_s < began_s + 90.0
                 assert len(f"Not armed: {answer.words}") <= 50
-                said.add(answer.words.rpartition(": ")[2])
+                said.add(answer.words)
                 seconds = re.search(r"(\d+) s", answer.words)
                 if seconds and "at most" not in answer.words:
                     counted.append(int(seconds[1]))
                     ends.append(rig.now_s + float(seconds[1]))
                 await asyncio.sleep(0.25)
-            assert {"writing offsets", "checking new offsets"} <= said
+            assert any("writing offsets" in words for words in said)
+            assert any("checking new offsets" in words for words in said)
             assert counted == sorted(counted, reverse=True)
             # It may stand still for a moment, where what comes next is not known better.
             assert -4.0 < ends[0] - rig.now_s < 8.0

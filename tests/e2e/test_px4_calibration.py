@@ -176,7 +176,7 @@ def test_armed_between_the_steps_nothing_is_written_until_disarmed_and_then_the_
             await asyncio.sleep(1.0)
             assert "DISARM NOW: yaw rate wrong by 1.3 deg/s" in rig.ground.texts()
             await asyncio.sleep(5.0)
-            assert "Old values NOT back: disarm, keep it connected" in rig.ground.texts()
+            assert "Restore pending: disarm and keep the link up" in rig.ground.texts()
             assert not any(write.armed for write in rig.px4.writes)
             rig.px4.disarm()
             await rig.until(lambda: not rig.service.offsets.ledger.pending, 30.0)

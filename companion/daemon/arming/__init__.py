@@ -1,1 +1,1 @@
-"""What is in force, whether it may arm, and what happens at arming."""
+"""The calibration in force, the arm gate, and automatic calibrations."""

@@ -1,4 +1,4 @@
-"""Who has changed the autopilot's offsets: what it says that it has is compared with what was there before.
+"""Detects changes of the autopilot's offsets that are not ours.
 
 Offsets that change while nobody here writes were changed by somebody else, or by a boot that measured the gyros itself
 (INS_GYR_CAL = 1, autopilots 1.5).
@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-
-import msgspec
+from typing import NamedTuple
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.vehicle.vehicle import Vehicle
@@ -21,36 +20,36 @@ from companion.estimation.records.validity import Why
 logger = logging.getLogger(__name__)
 
 
-class _Known(msgspec.Struct, frozen=True):
+class _Known(NamedTuple):
     offsets: tuple[float, ...]
     """Gyro offsets first; not by name, since what is learned of PX4's slots gives the same IMU other names."""
     boots: int
 
 
 class OffsetWatch:
-    """Compares; `poll` often. `lost` is told which IMU's offsets are ours no longer, and why."""
+    """Compares; `poll` often. `lost` is called with the IMU whose offsets are ours no longer, and why."""
 
     def __init__(self, vehicle: Vehicle, imus: Mapping[str, AutopilotImu], lost: Callable[[str, Why], object]) -> None:
         self._vehicle, self._imus, self._lost = vehicle, imus, lost
         self._known: dict[str, _Known] = {}
         self._before: dict[str, _Known] = {}
-        """What was known before a job, until what that has left is looked at."""
+        """Offsets before a job, until those after it are read."""
         self._failed = self._asked_restart = False
         self._written: dict[str, dict[str, float]] = {}
-        """By IMU: what a calibration has just left there, until that is looked at."""
+        """Values by IMU that a calibration has just written, until they are read."""
         self.foreign: str | None = None
-        """What somebody else has changed since the last request, in few words."""
+        """Change by somebody else since the last request, in few words."""
 
     def known(self) -> dict[str, _Known]:
-        """What is in the autopilot, to be compared with later."""
+        """Return the present offsets, to be compared with later."""
         return dict(self._known)
 
     def let_go(self) -> None:
-        """What the autopilot has from now on is our own doing, until it is looked at again."""
+        """Expect changes of our own until the next `poll`."""
         self._before, self._known = dict(self._known) or self._before, {}
 
     def on_ended(self, job: Job, result: JobResult) -> None:
-        """A calibration, an alignment or an undo has come to its end."""
+        """Note the end of a calibration, an alignment or an undo."""
         self.let_go()
         self._written, self._failed = {}, result.outcome != "done"
         if job.kind == "undo":
@@ -63,36 +62,30 @@ class OffsetWatch:
                 self._written[imu.name] = {name: one.after for name, one in imu.written.items()}
 
     def poll(self) -> None:
-        """Compare the autopilot's offsets with those that were there before."""
+        """Compare the autopilot's offsets with those before."""
         for name, imu in self._imus.items():
             calibration = imu.calibration
             if calibration is None:
                 continue
             now = _Known(tuple(calibration.offsets.values()), self._vehicle.boots)
-            known = self._known.get(name)
-            self._known[name] = now
+            known, self._known[name] = self._known.get(name), now
             if known is None:
-                self._look_after_job(name, self._before.pop(name, now), now, calibration)
+                self._check_after_job(name, self._before.pop(name, now), now, calibration)
             elif known.boots != now.boots:
                 self._lost(name, Why.REPLACED if known.offsets != now.offsets else Why.REBOOTED)
             elif known != now:
                 self._changed_by_others(name)
 
-    def _look_after_job(self, name: str, before: _Known, now: _Known, calibration: ImuCalibration) -> None:
-        """What a job has left is compared with what there is: between the two the EKF may have settled for minutes."""
+    def _check_after_job(self, name: str, before: _Known, now: _Known, calibration: ImuCalibration) -> None:
+        """Compare with what a job has left: between the two the EKF may have settled for minutes."""
         written = self._written.pop(name, {})
         restarted = before.boots != now.boots and not self._asked_restart
-        if self._failed and before.offsets != now.offsets:
-            # What was ours has been put back by now; what a restart has not replaced is somebody else's.
-            if before.boots == now.boots:
-                self._changed_by_others(name)
-            else:
-                self._lost(name, Why.FAILED)
-        elif written and calibration.contradicts(written):
-            if restarted:
-                self._lost(name, Why.REPLACED)
-            else:
-                self._changed_by_others(name)
+        changed = (self._failed and before.offsets != now.offsets) or (written and calibration.contradicts(written))
+        if changed and before.boots != now.boots and (self._failed or restarted):
+            # What was ours has been restored by now.
+            self._lost(name, Why.FAILED if self._failed else Why.REPLACED)
+        elif changed:
+            self._changed_by_others(name)
         elif restarted:
             self._lost(name, Why.REBOOTED)
 

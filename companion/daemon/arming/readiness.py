@@ -31,11 +31,11 @@ logger = logging.getLogger(__name__)
 POLL_S: Final = 0.25
 BY_ITSELF: Final = "calibrates by itself"
 STEADY_S: Final = 2.0
-"""How long it must have been still when somebody arms, who has just let go of it."""
+"""Stillness required of an aircraft that somebody has just let go of."""
 COUNTDOWN_KEPT_S: Final = 2.0
-"""A countdown that was not asked for meanwhile begins anew."""
+"""A countdown that was not shown for so long begins anew."""
 OLDEST_ANSWER_S: Final = 1.5
-"""An older answer, which the loop has not renewed, is not given."""
+"""Age beyond which an answer, which the loop has not renewed, is not given."""
 _STEPS: Final[dict[State, str]] = {
     State.DITHERING: "dithering offsets",
     State.WRITING: "writing offsets",
@@ -56,9 +56,7 @@ _WAITS: Final = {
     Rung.PENDING: f"{_STEPS[State.UNDOING]}: wait",
 }
 LATE_S: Final = 2.0
-"""Until the last second of telemetry is complete and judged."""
-MOVED_S: Final = 4.0
-"""An estimate that has slipped by this much belongs to a check that a movement has restarted."""
+"""Time until the last second of telemetry is complete and judged."""
 
 ArmedState = Literal["calibrated", "checked", "uncalibrated"]
 
@@ -75,8 +73,6 @@ class Readiness:
         self.in_force, self._automatic, self._owed = in_force, automatic, owed
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
-        self._promised: tuple[State, float] | None = None
-        """State of a write under way, and the time at which its end was promised."""
         self._countdown = -math.inf, math.inf
         """Time of the last countdown to a calibration, and the seconds that it named."""
         self._has_gated = False
@@ -195,7 +191,7 @@ class Readiness:
 
     def until_calibrated_s(self, now_s: float) -> float:
         """Seconds of holding still until an automatic calibration would be in force."""
-        status, write_s = self._collector.status(now_s), math.ceil(self._write_s)
+        status, write_s = self._collector.status(now_s), math.ceil(self._vehicle.kind.write_s + self._check_s)
         if status.enough:
             return write_s
         # Before the noise is known this is the longest there is: the wait may only get shorter.
@@ -210,37 +206,16 @@ class Readiness:
 
     @property
     def _check_s(self) -> float:
-        """Time to see the effect of new offsets."""
-        return self._vehicle.kind.settle_s + min(self._min_still_s, LOOK_S) + LATE_S
-
-    @property
-    def _write_s(self) -> float:
-        """Time from the end of the measurement until the new offsets are verified, without a dither."""
-        return self._vehicle.kind.write_s + self._check_s + self._vehicle.kind.ekf_reset_s
+        """Time until the effect of new offsets is seen and the EKF has settled."""
+        kind = self._vehicle.kind
+        return kind.settle_s + min(self._min_still_s, LOOK_S) + LATE_S + kind.ekf_reset_s
 
     def _during_write(self, now_s: float) -> ArmAnswer:
         state, job = self._manager.state, self._manager.running
-        words, job_s = _STEPS[state], 0.0 if job is None else job.left_s
-        if state is State.SETTLING:
-            return ArmAnswer("wait", f"{words}: {self._promise_s(state, job_s, now_s):.0f} s at most")
-        if state in (State.UNDOING, State.RESTARTING):
-            return ArmAnswer("wait", f"{words}: wait")
-        estimate_s = self._write_s
+        words, left_s = _STEPS[state], 0.0 if job is None else math.ceil(job.left_s)
         if state is State.VERIFYING:
-            estimate_s = self._check_s - self._collector.glance(now_s).still_s + self._vehicle.kind.ekf_reset_s
-        elif state is State.DITHERING:
-            estimate_s += job_s
-        return ArmAnswer.hold_still(self._promise_s(state, estimate_s, now_s), words)
-
-    def _promise_s(self, state: State, estimate_s: float, now_s: float) -> float:
-        """Return the seconds left; an earlier promise for the same state holds, unless a movement restarts a check."""
-        end_s = now_s + estimate_s
-        if self._promised is not None and self._promised[0] is state:
-            promised_s = self._promised[1]
-            restarted = state is State.VERIFYING and end_s > promised_s + MOVED_S
-            end_s = end_s if restarted else min(end_s, promised_s)
-        self._promised = (state, end_s)
-        return max(1.0, math.ceil(end_s - now_s))
+            return ArmAnswer.hold_still(self._check_s - self._collector.glance(now_s).still_s, words)
+        return ArmAnswer("wait", f"{words}: {left_s} s at most" if left_s else f"{words}: wait")
 
     # --- in words, for arming, status and history
 

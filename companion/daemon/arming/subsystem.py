@@ -11,6 +11,7 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.vehicle.vehicle import VehicleEvent
+from companion.commands import History
 from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.gate_setup import GateSetup
@@ -66,15 +67,14 @@ class Armings:
         readiness, in_force = self._readiness, self._readiness.in_force
         now_s = asyncio.get_running_loop().time()
         state, words = readiness.state(now_s)
-        calibrated_s, confirmed_s = in_force.calibrated_s, in_force.confirmed_s
         self.last = ArmingRecord(
             armed_at=utc_now(),
             state=state,
             reason=words,
             at_arm=readiness.at_arm,
             calibration=in_force.calibration.started_at if in_force.calibration is not None else None,
-            calibrated_ago_s=None if calibrated_s is None else round(now_s - calibrated_s, 1),
-            confirmed_ago_s=None if confirmed_s is None else round(now_s - confirmed_s, 1),
+            calibrated_ago_s=_ago_s(now_s, in_force.calibrated_s),
+            confirmed_ago_s=_ago_s(now_s, in_force.confirmed_s),
             gyro_sigma_use_rad_s=in_force.sigma("gyro"),
             accel_sigma_use_m_s2=in_force.sigma("accel"),
         )
@@ -99,41 +99,68 @@ class Arming(Subsystem):
         self.in_force = InForce(core, devices.imus, calibrating.manager, calibrating.estimator, calibrating.memory)
         self.automatic = Automatic(core, devices.imus, calibrating.manager, self.in_force)
         # In this order: the next automatic calibration asks for what is in force.
-        for on_ended in (self.in_force.on_ended, self.automatic.on_ended):
-            calibrating.manager.on_ended.add(on_ended)
+        calibrating.manager.on_ended.add(self.in_force.on_ended)
+        calibrating.manager.on_ended.add(self.automatic.on_ended)
         self.readiness = Readiness(core, offsets.owed, calibrating.manager, self.in_force, self.automatic)
         self.armings = Armings(core, self.readiness)
-        self.gate_setup = GateSetup(core, self.readiness)
+        self.gate_setup = GateSetup(core)
 
     def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
         return {"history": self._answer_history}
 
     def status(self) -> Object:  # noqa: D102
-        now_s = asyncio.get_running_loop().time()
+        setup = self.gate_setup
         return {
             "arming": {
                 **self.readiness.status(),
-                "setup": self.gate_setup.status(),
+                "setup": {"known": setup.known, "problem": setup.problem if setup.known else None},
                 "last": msgspec.to_builtins(self.armings.last),
             },
             "automatic": self.automatic.status(),
-            "calibration": shown_calibration(self.in_force, now_s),
+            "calibration": self._calibration(),
         }
 
     def tasks(self) -> Sequence[Task]:  # noqa: D102
-        looking: list[Task] = [("gate-setup", self.gate_setup.run)]
+        setup: list[Task] = [("gate-setup", self.gate_setup.run)]
         if self._core.only_listening is not None:
-            return looking
-        return [
-            ("readiness", self.readiness.run),
-            ("armings", self.armings.run),
-            ("automatic", self.automatic.run),
-            *looking,
-        ]
+            return setup
+        writing: list[Task] = [("readiness", self.readiness.run), ("automatic", self.automatic.run)]
+        return [*writing, ("armings", self.armings.run), *setup]
 
-    async def _answer_history(self, request: Object, _face: str) -> AsyncIterator[Object]:
+    def _calibration(self) -> Object | None:
+        """Return the calibration in force; without one the last good one that was not undone; else None.
+
+        `calibrated_ago_s` and `confirmed_ago_s` are null unless it is known to be in force: a wall clock that was wrong
+        in the field gives no age.
+        """
+        in_force, now_s = self.in_force, asyncio.get_running_loop().time()
+        known, record = in_force.calibration is not None, in_force.calibration or in_force.earlier
+        if record is None:
+            return None
+        return {
+            "in_force": known,
+            "started_at": record.started_at,
+            "calibrated_ago_s": _ago_s(now_s, in_force.calibrated_s) if known else None,
+            "confirmed_ago_s": _ago_s(now_s, in_force.confirmed_s),
+            "imus": [
+                {
+                    "name": imu.name,
+                    "temperature_degc": imu.temperature_degc,
+                    "when_warm": [] if imu.when_warm is None else list(imu.when_warm.words),
+                    "temperature_now_degc": in_force.temperatures_degc.get(imu.name),
+                    "gyro_bias_deg_h": _scaled(imu.gyro_bias_rad_s, DEG_H, 2),
+                    "gyro_sigma_deg_h": _scaled(imu.gyro_sigma_use_rad_s, DEG_H, 2),
+                    "accel_bias_mg": _scaled(imu.accel_bias_m_s2, MG, 4),
+                    "accel_sigma_mg": _scaled(imu.accel_sigma_use_m_s2, MG, 4),
+                    "held_back": list(imu.held_back),
+                }
+                for imu in record.imus
+            ],
+        }
+
+    async def _answer_history(self, request: History, _face: str) -> AsyncIterator[Object]:
         # A thousand records take longer to read than a ground station waits for an answer.
-        yield await self._core.offload(self._history, request["limit"])
+        yield await self._core.offload(self._history, request.limit)
 
     def _history(self, limit: int | None) -> Object:
         armings = self.armings.history()
@@ -169,37 +196,8 @@ class Arming(Subsystem):
         return [msgspec.to_builtins(kept) | {"number": number} for number, kept in found.items()]
 
 
-def shown_calibration(in_force: InForce, now_s: float) -> dict[str, object] | None:
-    """Return the calibration in force for `status`; without one the last good one that was not undone; else None.
-
-    `calibrated_ago_s` and `confirmed_ago_s` are null unless it is known to be in force: a wall clock that was wrong in
-    the field gives no age.
-    """
-    known = in_force.calibration is not None
-    record = in_force.calibration or in_force.earlier
-    if record is None:
-        return None
-    calibrated_s, confirmed_s = in_force.calibrated_s, in_force.confirmed_s
-    return {
-        "in_force": known,
-        "started_at": record.started_at,
-        "calibrated_ago_s": round(now_s - calibrated_s, 1) if known and calibrated_s is not None else None,
-        "confirmed_ago_s": round(now_s - confirmed_s, 1) if confirmed_s is not None else None,
-        "imus": [
-            {
-                "name": imu.name,
-                "temperature_degc": imu.temperature_degc,
-                "when_warm": [] if imu.when_warm is None else list(imu.when_warm.words),
-                "temperature_now_degc": in_force.temperatures_degc.get(imu.name),
-                "gyro_bias_deg_h": _scaled(imu.gyro_bias_rad_s, DEG_H, 2),
-                "gyro_sigma_deg_h": _scaled(imu.gyro_sigma_use_rad_s, DEG_H, 2),
-                "accel_bias_mg": _scaled(imu.accel_bias_m_s2, MG, 4),
-                "accel_sigma_mg": _scaled(imu.accel_sigma_use_m_s2, MG, 4),
-                "held_back": list(imu.held_back),
-            }
-            for imu in record.imus
-        ],
-    }
+def _ago_s(now_s: float, time_s: float | None) -> float | None:
+    return None if time_s is None else round(now_s - time_s, 1)
 
 
 def _scaled(axes: Vector | None, unit: float, decimals: int) -> list[float] | None:

@@ -41,14 +41,6 @@ class IntoAutopilot:
         self._core, self._imus, self._measuring, self._memory = core, imus, measuring, memory
         self._path, self._ledger = offsets.write_path, offsets.ledger
 
-    def why_not(self) -> str | None:
-        """Why nothing could be written; None where all is well."""
-        if not self._imus:
-            return "there is no IMU of the autopilot: none is configured"
-        if not self._core.wanted.push:
-            return "nothing is written while push.parameters is false"
-        return self._core.vehicle.kind.why_no_thermal_write
-
     def why_no_undo(self) -> str | None:
         """Why curves cannot be put back now; None where the latest write is of them."""
         steps = self._ledger.steps(self._core.vehicle.system_id)
@@ -86,7 +78,7 @@ class IntoAutopilot:
         plan = await self._path.write(job, Plan(tuple(targets), self._core.vehicle.boots), window, log)
         await self._path.settle(job, plan, window, log)
         warnings = (*log.warnings, *(words for each in log.imu_warnings.values() for words in each))
-        job.deliver(CurvesWritten(log.written, warnings))
+        job.product = CurvesWritten(log.written, warnings)
         return f"written: {'; '.join(words)}"
 
     async def _find(self, window: Window, *, overwrite: bool) -> tuple[list[Target], list[str], list[str]]:

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Awaitable, Callable, Collection, Coroutine
-from typing import Literal
+from typing import Final, Literal
 
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -18,7 +19,7 @@ from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.component.tunes import Tune
 from companion.daemon.calibrating.run import CalibrationParts, CalibrationRun
-from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
+from companion.daemon.calibrating.why_not import Obstacle, Rung, obstacle
 from companion.daemon.job import Job, JobCancelledError, Undone
 from companion.daemon.stands.alignment import ByHand
 from companion.errors import CompanionError, StorageError
@@ -26,13 +27,17 @@ from companion.estimation.machine import Event, State
 from companion.estimation.records.record import Record
 from companion.estimation.request import What
 from companion.formats import utc_now
+from companion.links.system.connection import Budget
 from companion.links.system.listeners import Listeners
 from companion.storage.changes import BY_HAND, ChangeSet
 from companion.storage.records import RecordStore
 
 logger = logging.getLogger(__name__)
 
-_SEVERITIES = {"done": Severity.NOTICE, "failed": Severity.ERROR, "cancelled": Severity.NOTICE}
+STARTS_PER_S: Final = 1.0
+"""Requests a second that are served for long: nobody presses faster, a script that starts and cancels does."""
+BURST: Final = 10.0
+_SEVERITIES: Final = {"done": Severity.NOTICE, "failed": Severity.ERROR, "cancelled": Severity.NOTICE}
 
 
 class CalibrationManager:
@@ -42,7 +47,7 @@ class CalibrationManager:
         core = parts.core
         self._parts, self._core, self._machine, self._vehicle = parts, core, core.machine, core.vehicle
         self._recovery, self._store, self._by_hand = parts.offsets.recovery, store, by_hand
-        self._starts = StartLimit()
+        self._starts = Budget(STARTS_PER_S, BURST)
         self._task: asyncio.Task[None] | None = None
         self.job: Job | None = None
         """The running or the latest job."""
@@ -51,9 +56,8 @@ class CalibrationManager:
         self.last: Record | None = None
         """Record of the latest calibration, loaded from disk at start."""
         self.on_ended: Listeners[Job, JobResult] = Listeners()
-        """Listeners to the end of a job; they come before the requester."""
+        """Notified of the end of a job, before its requester."""
         core.vehicle.on_event.add(self._on_event)
-        core.wanted.on_retarget.add(lambda _settings: self._retarget())
         self._recovery.on_recovered = self._recovered
 
     def load(self) -> None:
@@ -110,19 +114,18 @@ class CalibrationManager:
         reboot: bool = False,
     ) -> Job | Refusal:
         """Start a calibration, adopt a running automatic one that includes this request, or refuse."""
-        deadline_s = _deadline_s(timeout_s)
         own = self._automatic_run()
         if isinstance(own, CalibrationRun) and own.is_adoptable and own.what in (what, What.BOTH):
-            own.adopt(requester, deadline_s, reboot=reboot)
+            own.adopt(requester, timeout_s, reboot=reboot)
             return own
         untold = what is What.ACCELEROMETERS and self._core.config.gradienter is None
         missing = "accelerometers need a gradienter: none is configured" if untold else None
-        if (refusal := self._refusal(requester, missing)) is not None:
+        if (refusal := self._refusal(missing)) is not None:
             return refusal
         run = CalibrationRun(
-            self._parts, what, requester, deadline_s, self.last_good, reboot=reboot, automatic=automatic
+            self._parts, what, requester, timeout_s, self.last_good, reboot=reboot, automatic=automatic
         )
-        return self._start(run, Event.REQUEST, self._calibrate(run))
+        return self._start(run, Event.REQUEST, self._finish(run, run.calibrate()))
 
     def start_job(
         self,
@@ -137,27 +140,23 @@ class CalibrationManager:
 
         `missing`: why it cannot be done on this aircraft, if so. `run` carries it out; returns the result in words.
         """
-        if (refusal := self._refusal(requester, missing)) is not None:
+        if (refusal := self._refusal(missing)) is not None:
             return refusal
-        job = Job(kind, what, requester, _deadline_s(timeout_s))
-        return self._start(job, Event.REQUEST, self._align(job, run))
+        job = Job(kind, what, requester, timeout_s)
+        return self._start(job, Event.REQUEST, self._finish(job, run(job)))
 
     def start_undo(self, requester: str, *, force: bool = False) -> Job | Refusal:
         """Start restoring the values from before the last write (see `Recovery.undo`), or refuse."""
-        running, task = self._automatic_run(), self._task
-        if running is not None and task is not None:
-            # Whoever wants old values back must not wait for new ones that nobody asked for.
-            if (refusal := self._starts.refuses(requester)) is not None:
-                return refusal
-            running.cancel(requester)
-            self.job = job = Job("undo", What.BOTH, requester, None)
-            work = self._undo_instead(task, running, job, force=force)
-            self._task = asyncio.get_running_loop().create_task(work, name="undo")
-            return job
-        if (refusal := self._refusal(requester, self._recovery.why_no_undo(), "nothing_to_undo")) is not None:
+        running = self._automatic_run()
+        missing = None if running is not None else self._recovery.why_no_undo()
+        if (refusal := self._refusal(missing, "nothing_to_undo", but=running)) is not None:
             return refusal
-        job = Job("undo", What.BOTH, requester, None)
-        return self._start(job, Event.UNDO, self._undo(job, force=force))
+        job = Job("undo", What.BOTH, requester)
+        if running is None:
+            return self._start(job, Event.UNDO, self._finish(job, self._undo(job, force=force)))
+        # Whoever wants old values back must not wait for new ones that nobody asked for.
+        running.cancel(requester)
+        return self._start(job, None, self._undo_instead(self._task, running, job, force=force))
 
     def cancel(self, requester: str) -> bool:
         """Cancel the running job; returns whether there was one."""
@@ -173,21 +172,33 @@ class CalibrationManager:
             await asyncio.wait([self._task])
 
     def _refusal(
-        self, requester: str, missing: str | None, kind: Literal["other", "nothing_to_undo"] = "other"
+        self,
+        missing: str | None,
+        kind: Literal["other", "nothing_to_undo"] = "other",
+        *,
+        but: Job | None = None,
     ) -> Refusal | None:
+        """Refuse what cannot be started; `but` is a running job that does not count."""
         if self._core.only_listening is not None:
             return Refusal("other", self._core.only_listening)
-        if (found := self.why_not()) is not None:
+        if but is None and (found := self.why_not()) is not None:
             return found.refusal
-        return self._starts.refuses(requester) if missing is None else Refusal(kind, missing)
+        if missing is not None:
+            return Refusal(kind, missing)
+        now_s = asyncio.get_running_loop().time()
+        if (left := self._starts.left(now_s)) < 1.0:
+            return Refusal("busy", f"too many requests, wait {math.ceil((1.0 - left) / STARTS_PER_S)} s")
+        self._starts.spend(1, now_s)
+        return None
 
     def _automatic_run(self) -> Job | None:
         """Return the automatic calibration under way, while disarmed."""
         job = self.running
         return job if job is not None and job.automatic and self._vehicle.arm_state is ArmState.DISARMED else None
 
-    def _start(self, job: Job, event: Event, work: Coroutine[None, None, None]) -> Job:
-        self._machine.on(event)
+    def _start(self, job: Job, event: Event | None, work: Coroutine[None, None, None]) -> Job:
+        if event is not None:
+            self._machine.on(event)
         self.job = job
         logger.info("%s asked for by %s", job.kind, job.requester)
         self._task = asyncio.get_running_loop().create_task(work, name=job.kind)
@@ -201,28 +212,30 @@ class CalibrationManager:
         elif event == "disarmed":
             self._core.collector.reset("just disarmed")
 
-    def _retarget(self) -> None:
-        if self.running is None:
-            self._core.collector.retarget(self._core.wanted.settings)
-
     # --- one job to its end
 
-    async def _calibrate(self, run: CalibrationRun) -> None:
-        result = await _result(run, run.calibrate())
-        record = run.make_record(result)
-        run.deliver(record)
-        await self._keep(record, run)
-        self._core.collector.retarget(self._core.wanted.settings)
-        self._end(run, result)
-
-    async def _align(self, job: Job, run: Callable[[Job], Awaitable[str]]) -> None:
-        result = await _result(job, run(job))
-        await self._by_hand.keep(job, result)
+    async def _finish(self, job: Job, work: Awaitable[str]) -> None:
+        """Await the work, keep what it has made, and end the job."""
+        try:
+            result = JobResult("done", await work)
+        except JobCancelledError as cancelled:
+            result = JobResult("cancelled", str(cancelled))
+        except CompanionError as error:
+            result = JobResult("failed", str(error))
+        except Exception as error:
+            logger.exception("the %s met a fault of the program", job.kind)
+            result = JobResult("failed", f"internal error: {error!r}; the log has the details")
+        if isinstance(job, CalibrationRun):
+            job.product = record = job.make_record(result)
+            await self._keep(record, job)
+        else:
+            await self._by_hand.keep(job, result)
         self._core.collector.retarget(self._core.wanted.settings)
         self._end(job, result)
 
-    async def _undo_instead(self, task: asyncio.Task[None], before: Job, job: Job, *, force: bool) -> None:
+    async def _undo_instead(self, task: asyncio.Task[None] | None, before: Job, job: Job, *, force: bool) -> None:
         """Undo while an automatic calibration ran: what that has written goes first."""
+        assert task is not None
         await asyncio.wait([task])
         record = before.record
         self._machine.on(Event.UNDO)
@@ -230,16 +243,13 @@ class CalibrationManager:
             self._machine.on(Event.CONCLUDED)
             self._end(job, JobResult("done", "auto calibration taken back"))
         else:
-            await self._undo(job, force=force)
+            await self._finish(job, self._undo(job, force=force))
 
-    async def _undo(self, job: Job, *, force: bool) -> None:
-        async def run() -> str:
-            step, written = await self._recovery.undo(force=force)
-            job.deliver(Undone(step, written, await self._note_undone(step)))
-            self._machine.on(Event.CONCLUDED)
-            return f"{len(written)} old values back{step.origin.what and f': {step.origin.what}'}"
-
-        self._end(job, await _result(job, run()))
+    async def _undo(self, job: Job, *, force: bool) -> str:
+        step, written = await self._recovery.undo(force=force)
+        job.product = Undone(step, written, await self._note_undone(step))
+        self._machine.on(Event.CONCLUDED)
+        return f"{len(written)} old values back{step.origin.what and f': {step.origin.what}'}"
 
     def _end(self, job: Job, result: JobResult) -> None:
         """End a job; the state table has its `done` already."""
@@ -254,17 +264,17 @@ class CalibrationManager:
             # A pilot who has just armed has no use for the end of what nobody asked for.
             self._core.say(max(severity, Severity.WARNING) if job.automatic else severity, words, Weight.RESULT)
             if self.why_not((Rung.PENDING,)) is not None:
-                self._core.say(Severity.WARNING, "Old values NOT back: disarm, keep it connected", Weight.RESULT)
+                self._core.say(Severity.WARNING, "Restore pending: disarm and keep the link up", Weight.RESULT)
         if not job.automatic and result.outcome != "cancelled":
             self._core.tunes.play(Tune.DONE if result.outcome == "done" else Tune.FAILED)
         self.on_ended.tell(job, result)
         job.finish(result)
 
     async def _recovered(self, step: ChangeSet, words: str, *, undone: bool) -> None:
-        """The recovery has ended an interrupted write, or an undo."""
+        """Note that the recovery has ended an interrupted write, or an undo."""
         if undone:
-            job = Job("undo", What.BOTH, "recovery", None)
-            job.deliver(Undone(step, {}, await self._note_undone(step)))
+            job = Job("undo", What.BOTH, "recovery")
+            job.product = Undone(step, {}, await self._note_undone(step))
             result = JobResult("done", words)
             self.on_ended.tell(job, result)
             job.finish(result)
@@ -273,7 +283,7 @@ class CalibrationManager:
     # --- records
 
     async def _keep(self, record: Record, run: CalibrationRun) -> None:
-        """Keep a record and the readings behind it on disk, and say so where that fails."""
+        """Save a record and the readings behind it; report a failure."""
         self.last = record
         seen = self._core.collector.snapshot(run.begun_s, run.measured_s)
 
@@ -308,20 +318,3 @@ class CalibrationManager:
             self.last = msgspec.structs.replace(self.last, undone_at=now)
         await self._parts.memory.forget(marked)
         return not (marked or step.origin.what)
-
-
-def _deadline_s(timeout_s: float | None) -> float | None:
-    return None if timeout_s is None else asyncio.get_running_loop().time() + timeout_s
-
-
-async def _result(job: Job, work: Awaitable[str]) -> JobResult:
-    """Await work and turn whatever it raises into a result."""
-    try:
-        return JobResult("done", await work)
-    except JobCancelledError as cancelled:
-        return JobResult("cancelled", str(cancelled))
-    except CompanionError as error:
-        return JobResult("failed", str(error))
-    except Exception as error:
-        logger.exception("the %s met a fault of the program", job.kind)
-        return JobResult("failed", f"internal error: {error!r}; the log has the details")

@@ -92,7 +92,7 @@ class CalibrationRun(Job):
         parts: CalibrationParts,
         what: What,
         requester: str,
-        deadline_s: float | None,
+        timeout_s: float | None,
         before: Record | None,
         *,
         reboot: bool = False,
@@ -100,7 +100,7 @@ class CalibrationRun(Job):
     ) -> None:
         """`before`: the last calibration, if it was good and has not been undone."""
         kind = AUTOMATIC if automatic else "calibration"
-        super().__init__(kind, what, requester, deadline_s, reboot=reboot, automatic=automatic)
+        super().__init__(kind, what, requester, timeout_s, reboot=reboot, automatic=automatic)
         self._parts, self._core, self._machine = parts, parts.core, parts.core.machine
         self._imus, self._measuring, self._path = parts.imus, parts.measuring, parts.offsets.write_path
         self.before, self.system_id = before, parts.core.vehicle.system_id
@@ -163,10 +163,11 @@ class CalibrationRun(Job):
         """Whether a request may still take over this automatic run as a whole."""
         return self.automatic and not self.cancelled and not self.held_back
 
-    def adopt(self, requester: str, deadline_s: float | None, *, reboot: bool) -> None:
+    def adopt(self, requester: str, timeout_s: float | None, *, reboot: bool) -> None:
         """Hand an automatic calibration to somebody who asks for one."""
         self.reboot |= reboot
-        self.kind, self.requester, self.deadline_s, self.automatic = "calibration", requester, deadline_s, False
+        self.kind, self.requester, self.automatic = "calibration", requester, False
+        self.deadline_s = None if timeout_s is None else asyncio.get_running_loop().time() + timeout_s
 
     def _announce(self) -> None:
         if self.automatic:

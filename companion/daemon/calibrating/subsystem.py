@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Mapping
 from functools import partial
-from typing import Final
+from typing import Final, Literal
 
 import msgspec
 
 from companion.autopilot.vehicle.ekf import OwnAttitude
-from companion.commands import Align
+from companion.commands import Align, Calibrate, Cancel, Temperature, Undo
 from companion.component.service import Refusal
 from companion.daemon.biases.into_autopilot import IntoAutopilot
 from companion.daemon.biases.memory import BiasMemory
@@ -20,15 +20,18 @@ from companion.daemon.calibrating.run import CalibrationParts
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.job import ALIGNMENT, TEMPERATURE, Job
+from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job, Undone
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.alignment import AlignmentInForce, ByHand, FacesInForce
-from companion.daemon.stands.alignments import KINDS, Alignments
+from companion.daemon.stands.all_sides import SidesTask
 from companion.daemon.stands.measuring import Measuring
+from companion.daemon.stands.on_spot import TurnTask, ZeroTask
+from companion.daemon.stands.session import PoseSession, PoseTask
+from companion.daemon.stands.writes import AccelWrites, LevelWrites
 from companion.errors import CalibrationRefusedError, RequestRefusedError
+from companion.estimation.alignment.poses import HEADINGS, AlignmentRequest
 from companion.estimation.means.windows import Window
-from companion.estimation.records.record import Record
 from companion.estimation.request import What
 from companion.estimation.solution.prior import Expectation
 from companion.formats import Object
@@ -41,6 +44,13 @@ HEARD_WITHIN_S: Final = 5.0
 """Longest wait of an undo for an autopilot not heard since the start."""
 ALIGN_TIMEOUT_S: Final = 900.0
 """An alignment that nobody ends must not keep calibrations from starting for ever."""
+_KINDS: Final[dict[Literal["zero", "tilts", "turn", "faces"], str]] = {
+    "zero": ALIGNMENT,
+    "tilts": ALIGNMENT,
+    "turn": TURN,
+    "faces": FACES,
+}
+"""Kind of job by action of an alignment."""
 
 
 class Calibrating(Subsystem):
@@ -48,7 +58,7 @@ class Calibrating(Subsystem):
 
     def __init__(self, core: Core, devices: Devices, offsets: Offsets) -> None:
         config, imus = core.config, devices.imus
-        self._core, self._offsets = core, offsets
+        self._core, self._offsets, self._imus = core, offsets, imus
         self.store = RecordStore(config.storage.path)
         self.alignment = AlignmentInForce(config, core.offload)
         self.memory = BiasMemory(core, imus, devices.sensors, self.alignment)
@@ -58,18 +68,16 @@ class Calibrating(Subsystem):
         self.estimator = Estimator(core, self.alignment, self.faces, own)
         self.on_solved: Listeners[Window, Window, EstimatorInputs, What, Expectation] = Listeners()
         ditherer = Ditherer(core, imus, offsets.writer, offsets.ledger)
-        self.stands = Alignments(core, imus, measuring, offsets, own, self.alignment, self.faces)
+        accel, level = AccelWrites(core, imus, offsets), LevelWrites(core, imus, offsets, own)
+        self.stands = PoseSession(core, imus, measuring, accel, level)
         self.by_hand = ByHand(core, imus)
         self._into_autopilot = IntoAutopilot(core, imus, measuring, self.memory, offsets)
         parts = CalibrationParts(core, imus, measuring, ditherer, self.estimator, self.memory, offsets, self.on_solved)
         self.manager = CalibrationManager(parts, self.store, self.by_hand)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
-        self.alignment.load()
-        self.faces.load()
-        self.by_hand.load()
-        self.memory.load()
-        self.manager.load()
+        for part in (self.alignment, self.faces, self.by_hand, self.memory, self.manager):
+            part.load()
 
     def commands(self) -> Mapping[str, Handler]:
         """Return the handlers; each raises `RequestRefusedError`, or another `CompanionError` once it has started."""
@@ -82,87 +90,86 @@ class Calibrating(Subsystem):
         }
 
     def status(self) -> Object:  # noqa: D102
-        manager, job = self.manager, self.manager.running
+        manager, running, job, last = self.manager, self.manager.running, self.manager.job, self.manager.last
         still = self._core.collector.status(asyncio.get_running_loop().time())
+        words = manager.reason if running is None else running.words
         return {
             "state": manager.state.shown,
-            "reason": job.words if job is not None else manager.reason,
-            "progress": manager.progress_percent if job is not None else None,
+            "reason": words,
+            "progress": None if running is None else manager.progress_percent,
             "still_s": round(still.still_s, 1),
             "waiting_for": still.waiting_for,
             "alignment": self.alignment.status(),
             "by_hand": self.by_hand.latest(),
             "stands": msgspec.to_builtins(self.stands.shown),
-            "last": _summary(manager.last),
-            "job": self._job(),
+            "last": None
+            if last is None
+            else {
+                "state": last.state,
+                "started_at": last.started_at,
+                "reason": last.reason,
+                "magnetic": msgspec.to_builtins(last.magnetic),
+                "when_warm": [words for imu in last.imus if imu.when_warm is not None for words in imu.when_warm.words],
+            },
+            "job": None
+            if job is None
+            else {
+                "kind": job.kind,
+                "what": job.what.name.lower(),
+                "requester": job.requester,
+                "state": manager.state.shown,
+                "percent": manager.progress_percent,
+                "text": words,
+            },
         }
 
-    def _job(self) -> Object | None:
-        """Progress of the latest job; None before the first."""
-        manager, job = self.manager, self.manager.job
-        if job is None:
-            return None
-        return {
-            "kind": job.kind,
-            "what": job.what.name.lower(),
-            "requester": job.requester,
-            "state": manager.state.shown,
-            "percent": manager.progress_percent,
-            "text": job.words if manager.running is not None else manager.reason,
-        }
-
-    async def _calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
-        what, timeout_s, reboot = What[request["what"].upper()], request["timeout_s"], request["reboot"]
-        job = _accepted(self.manager.start_calibration(what, f"{face} calibrate", timeout_s, reboot=reboot))
-        if not request["wait"]:
+    async def _calibrate(self, asked: Calibrate, face: str) -> AsyncIterator[Object]:
+        job = _accepted(
+            self.manager.start_calibration(asked.biases, f"{face} calibrate", asked.timeout_s, reboot=asked.reboot)
+        )
+        if not asked.wait:
             yield {"kind": "result", "state": self.manager.state.shown, "reason": "calibration started"}
             return
         async for reply in self._progress(job):
             yield reply
         yield {"kind": "result", "record": msgspec.to_builtins(job.record)}
 
-    async def _temperature(self, request: Object, face: str) -> AsyncIterator[Object]:
+    async def _temperature(self, asked: Temperature, face: str) -> AsyncIterator[Object]:
         """Show the curves, write them, or undo their write."""
-        action, into = request.get("action"), self._into_autopilot
-        if action == "undo":
+        into = self._into_autopilot
+        if asked.action == "undo":
             await self._hear()
             if (why := into.why_no_undo()) is not None:
                 raise RequestRefusedError("nothing_to_undo", why)
-            async for reply in self._undo(request, face):
+            async for reply in self._undo(Undo(), face):
                 yield reply
-        elif action == "write":
-            job = _accepted(
-                self.manager.start_job(
-                    TEMPERATURE,
-                    What.GYROS,
-                    f"{face} temperature",
-                    ALIGN_TIMEOUT_S,
-                    into.why_not(),
-                    lambda job: into.run(job, overwrite=request.get("overwrite") is True),
-                )
-            )
-            async for reply in self._to_end(job, "written"):
+        elif asked.action == "write":
+            missing = self._why_not_written(write=True) or self._core.vehicle.kind.why_no_thermal_write
+            run, by = partial(into.run, overwrite=asked.overwrite), f"{face} temperature"
+            job = self.manager.start_job(TEMPERATURE, What.GYROS, by, ALIGN_TIMEOUT_S, missing, run)
+            async for reply in self._to_end(_accepted(job), "written"):
                 yield reply
         else:
             yield {"kind": "result", "imus": await self._core.offload(self.memory.temperature)}
 
-    async def _cancel(self, _request: Object, face: str) -> AsyncIterator[Object]:
+    async def _cancel(self, _asked: Cancel, face: str) -> AsyncIterator[Object]:
         running = self.manager.cancel(f"{face} cancel")
         if running and self.manager.job is not None:
             await asyncio.shield(self.manager.job.finished)
         reason = self.manager.reason if running else "nothing was running"
         yield {"kind": "result", "state": self.manager.state.shown, "reason": reason}
 
-    async def _undo(self, request: Object, face: str) -> AsyncIterator[Object]:
+    async def _undo(self, asked: Undo, face: str) -> AsyncIterator[Object]:
         await self._hear()
-        job = _accepted(self.manager.start_undo(f"{face} undo", force=request.get("force") is True))
+        job = _accepted(self.manager.start_undo(f"{face} undo", force=asked.force))
         result = await asyncio.shield(job.finished)
+        undone = job.product if isinstance(job.product, Undone) else None
         yield {
             "kind": "result",
             "state": result.outcome,
             "reason": result.reason,
-            "written": {} if job.undone is None else msgspec.to_builtins(job.undone.written),
-            "undone": None if job.undone is None else job.undone.step.shown(),
+            "written": {} if undone is None else msgspec.to_builtins(undone.written),
+            "undone": None if undone is None else undone.step.shown(),
             "undoable": self._offsets.undoable(),
         }
 
@@ -171,20 +178,19 @@ class Calibrating(Subsystem):
         if vehicle.heartbeat_age_s is None:  # the daemon may have started just now
             await comes(vehicle.found, HEARD_WITHIN_S)
 
-    async def _align(self, request: Object, face: str) -> AsyncIterator[Object]:
+    async def _align(self, asked: Align, face: str) -> AsyncIterator[Object]:
         """Show, forget or measure the alignment."""
-        action = request.get("action")
-        if action == "show":
+        if asked.action == "show":
             yield {"kind": "result", **self._shown()}
-        elif action == "forget":
+        elif asked.action == "forget":
             if (busy := self.manager.why_not((Rung.BUSY,))) is not None:
                 raise CalibrationRefusedError(busy.words)
             was = await self.alignment.forget()
             words = "the configuration's zero and sigma are in force" if was else "there was no alignment to forget"
             yield {"kind": "result", "state": "done", "reason": words}
         else:
-            job = _accepted(self.start_alignment(request, f"{face} align"))
-            if request.get("wait") is False:
+            job = _accepted(self.start_alignment(asked, f"{face} align"))
+            if not asked.wait:
                 yield {"kind": "result", "state": self.manager.state.shown, "reason": f"{job.kind} started"}
                 return
             async for reply in self._to_end(job, "alignment"):
@@ -201,36 +207,63 @@ class Calibrating(Subsystem):
         found = {"alignment": msgspec.to_builtins(alignment.record), "accelerometers": sides}
         return {"state": state, "reason": reason, **found}
 
-    def start_alignment(self, request: Object, by: str) -> Job | Refusal:
+    def start_alignment(self, asked: Align, by: str) -> Job | Refusal:
         """Start an alignment, or refuse.
 
         Raises:
-            CalibrationRefusedError: the request is not understood.
+            CalibrationRefusedError: it is not said which.
         """
-        timeout_s = request.get("timeout_s") or ALIGN_TIMEOUT_S
-        asked = self.stands.parse(request)
-        if asked is None:
+        action = next((each for each in _KINDS if each == asked.action), None)
+        if action is None:
             allowed = Align.fields()["action"].allowed
             raise CalibrationRefusedError(f"align: 'action': found nothing; allowed: {allowed}")
-        kind, what = KINDS[asked.action]
+        on_turn = action == "turn"
+        request = AlignmentRequest(
+            action,
+            asked.headings or (HEADINGS if on_turn else 2),
+            write=asked.write and action in ("turn", "faces"),
+            level=asked.level and on_turn,
+        )
         if self._core.config.vehicle.platform == "deck":
-            if kind == ALIGNMENT:
-                return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
-            return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
-        missing, run = self.stands.blocking_reason(asked), partial(self.stands.run, request=asked)
-        return self.manager.start_job(kind, what, by, timeout_s, missing, run)
+            unmeasured = "a zero is not" if _KINDS[action] == ALIGNMENT else "accelerometers are not"
+            return Refusal("other", f"{unmeasured} measured on a deck that moves: align ashore")
+        task: PoseTask
+        if action == "faces":
+            task = SidesTask(request, self._imus, self.faces)
+        elif on_turn:
+            task = TurnTask(self._core, request, self._imus, self.faces)
+        else:
+            task = ZeroTask(self._core, request, self.alignment)
+        what = What.BOTH if _KINDS[action] == ALIGNMENT else What.ACCELEROMETERS
+        run = partial(self.stands.run, request=request, task=task)
+        timeout_s = asked.timeout_s or ALIGN_TIMEOUT_S
+        return self.manager.start_job(_KINDS[action], what, by, timeout_s, self._why_not_aligned(request), run)
+
+    def _why_not_aligned(self, request: AlignmentRequest) -> str | None:
+        """Say why there is nothing to measure, or nothing could be written; None when there is."""
+        if _KINDS[request.action] == ALIGNMENT:
+            has_one = self._core.config.gradienter is not None
+            return None if has_one else "there is no gradienter to align: none is configured"
+        if request.level and request.write:
+            return "either --write (offsets) or --level (the board's tilt): what is in one is not in the other"
+        if request.level and self.faces.record is None:
+            return "the board's tilt needs accelerometers known from all sides: companion align faces --write first"
+        return self._why_not_written(write=request.write or request.level)
+
+    def _why_not_written(self, *, write: bool) -> str | None:
+        """Say why no IMU of the autopilot can be measured, or written to; None when it can."""
+        if not self._imus:
+            return "there is no IMU of the autopilot: none is configured"
+        if write and not self._core.wanted.push:
+            return "nothing is written while push.parameters is false"
+        return None
 
     async def _to_end(self, job: Job, product: str) -> AsyncIterator[Object]:
         """Yield progress, then the result with the job's product under this key."""
         async for reply in self._progress(job):
             yield reply
-        result = job.finished.result()
-        yield {
-            "kind": "result",
-            "state": result.outcome,
-            "reason": result.reason,
-            product: msgspec.to_builtins(job.product),
-        }
+        result, made = job.finished.result(), msgspec.to_builtins(job.product)
+        yield {"kind": "result", "state": result.outcome, "reason": result.reason, product: made}
 
     async def _progress(self, job: Job) -> AsyncIterator[Object]:
         while job.is_running:
@@ -248,15 +281,3 @@ def _accepted(answer: Job | Refusal) -> Job:
     if isinstance(answer, Refusal):
         raise RequestRefusedError(answer.kind, answer.reason)
     return answer
-
-
-def _summary(record: Record | None) -> Object | None:
-    if record is None:
-        return None
-    return {
-        "state": record.state,
-        "started_at": record.started_at,
-        "reason": record.reason,
-        "magnetic": msgspec.to_builtins(record.magnetic),
-        "when_warm": [words for imu in record.imus if imu.when_warm is not None for words in imu.when_warm.words],
-    }

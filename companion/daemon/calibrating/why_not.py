@@ -1,13 +1,8 @@
-"""Obstacles to starting a calibration, in the order in which they are told; and the limit on repeated requests.
-
-A person who asks is never held up by the limit; a script that starts and cancels is.
-"""
+"""Obstacles to starting a calibration, in the order in which they are reported."""
 
 from __future__ import annotations
 
-import asyncio
 import enum
-import math
 from collections.abc import Collection, Iterator
 from typing import Final, Literal, NamedTuple
 
@@ -15,13 +10,6 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.daemon.offsets.ledger import Ledger
-from companion.links.system.connection import Budget
-
-STARTS_PER_S: Final = 1.0
-"""Requests a second that one sender may make for long: nobody presses faster."""
-BURST: Final = 10.0
-MOST_REQUESTERS: Final = 16
-"""Senders with a budget of their own, more than an aircraft has; newcomers beyond share one, as ids can be made up."""
 
 
 class Rung(enum.Enum):
@@ -84,31 +72,3 @@ def _obstacles(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[Ob
         yield Obstacle(Rung.SECOND, why)
     if ledger.pending:
         yield Obstacle(Rung.PENDING, "putting old values back first")
-
-
-class StartLimit:
-    """Budget of starts for each requester."""
-
-    def __init__(self) -> None:
-        self._budgets: dict[str, Budget] = {}
-        self._newcomers = Budget(STARTS_PER_S, BURST)
-
-    def refuses(self, requester: str) -> Refusal | None:
-        """Count one start; returns a refusal where the budget is spent."""
-        now_s = asyncio.get_running_loop().time()
-        budget = self._budget(requester, now_s)
-        left = budget.left(now_s)
-        if left < 1.0:
-            wait_s = math.ceil((1.0 - left) / STARTS_PER_S)
-            return Refusal("busy", f"too many requests, wait {wait_s} s")
-        budget.spend(1, now_s)
-        return None
-
-    def _budget(self, requester: str, now_s: float) -> Budget:
-        if requester not in self._budgets:
-            # A full budget need not be remembered.
-            self._budgets = {name: each for name, each in self._budgets.items() if each.left(now_s) < BURST}
-            if len(self._budgets) >= MOST_REQUESTERS:
-                return self._newcomers
-            self._budgets[requester] = Budget(STARTS_PER_S, BURST)
-        return self._budgets[requester]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, get_args
 
 import msgspec
 
-from companion.commands import ALL
+from companion.commands import ALL, Monitor, Status
 from companion.component.component import Component
 from companion.component.own_parameters import AT_ARM, RESULTS, Parameter
 from companion.component.service import JobResult
@@ -102,15 +102,15 @@ class Faces(Subsystem):
             understood = ALL[str(command)].read(request)
         except CalibrationRefusedError as error:
             raise CalibrationRefusedError(f"{command}: {error}") from None
-        async for reply in handler(msgspec.to_builtins(understood), face):
+        async for reply in handler(understood, face):
             yield reply
 
-    async def _status(self, _request: Object, _face: str) -> AsyncIterator[Object]:
+    async def _status(self, _request: Status, _face: str) -> AsyncIterator[Object]:
         yield {"kind": "result", "status": await self.refresh()}
 
-    async def _monitor(self, request: Object, _face: str) -> AsyncIterator[Object]:
+    async def _monitor(self, request: Monitor, _face: str) -> AsyncIterator[Object]:
         """Stream the status every 0.5 s; with `pose` the attitude every 0.2 s too, a new state or record at once."""
-        if not request["pose"]:
+        if not request.pose:
             while True:
                 yield {"kind": "progress", "status": await self.refresh()}
                 await asyncio.sleep(MONITOR_EVERY_S)

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from companion.autopilot.firmware.base import NETS
+from companion.commands import AutopilotSetup
 from companion.configured import models
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
@@ -46,7 +47,7 @@ class Heading(Subsystem):
     def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
         return {"autopilot-setup": self._answer_setup}
 
-    async def _answer_setup(self, _request: Object, _face: str) -> AsyncIterator[Object]:
+    async def _answer_setup(self, _request: AutopilotSetup, _face: str) -> AsyncIterator[Object]:
         firmware = self._core.vehicle.kind
         found = await self._core.parameters.read_many(firmware.heading_names(), optional=True)
         port = await self._core.parameters.read_many(firmware.port_names, optional=True)

@@ -17,6 +17,7 @@ from typing import Final, TypeVar
 import msgspec
 
 from companion.autopilot.firmware.imu_messages import EkfBiasReading
+from companion.commands import Record
 from companion.component.service import JobResult
 from companion.configured import models
 from companion.daemon.calibrating.estimator import EstimatorInputs
@@ -293,8 +294,8 @@ class Recorder(Subsystem):
     def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
         return {"record": self._answer}
 
-    async def _answer(self, request: Object, _face: str) -> AsyncIterator[Object]:
-        if request.get("stop") is True:
+    async def _answer(self, request: Record, _face: str) -> AsyncIterator[Object]:
+        if request.stop:
             if (recording := self._on_request) is None:
                 raise StorageError("nothing is being recorded on request")
             await self._flush()
@@ -303,7 +304,7 @@ class Recorder(Subsystem):
                     await self._end(recording, "stopped")
             yield {"kind": "result", **recording.ended.result()}
             return
-        seconds, name = request.get("seconds"), request.get("file")
+        seconds, name = request.seconds, request.file
         recording = await self._start(name, seconds)
         most = f"; ends at {recording.most_bytes >> 30} GB" if seconds is None else ""
         while not recording.ended.done():

@@ -215,7 +215,7 @@ class PoseSession:
                 level = await self._write_level(job, task.board, last, log)
         finally:
             warnings = (*log.warnings, *(words for each in log.imu_warnings.values() for words in each))
-            job.deliver(record := completed(record, warnings, log.written, level))
+            job.product = record = completed(record, warnings, log.written, level)
         if shortfall is None:
             await task.keep(record)
         elif request.write:

@@ -114,7 +114,7 @@ def test_the_record_waits_for_nothing_after_its_last_second(tmp_path: Path) -> N
 def test_a_pause_ends_when_there_is_something_to_look_at() -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
-        job = Job("calibration", What.BOTH, "test", None)
+        job = Job("calibration", What.BOTH, "test")
         begun_s = loop.time()
         loop.call_later(0.05, job.look_again)
         await job.pause(1.0)

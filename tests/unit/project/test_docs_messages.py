@@ -46,7 +46,7 @@ NOT_MESSAGES = {
     "there is no IMU of the autopilot: none is configured", "the configuration's zero and sigma are in force",
     "there was no alignment to forget", "one of them", "the companion ends", "starts with companion run",
     "a ground station is heard; it reaches the companion as component 191 of this vehicle",
-    "nothing is being recorded on request", "there is no IMU of the autopilot to measure: none is configured",
+    "nothing is being recorded on request",
     "nose up", "nose down", "left side down", "right side down", "… (after … more like this, left out)",
     "the board would sit more than 10 deg askew: no level is for that", "learned from … h at rest in …, saved …",
 }  # fmt: skip
