@@ -227,30 +227,6 @@ def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, to
     run_virtual(main())
 
 
-def test_px4_and_an_imu_of_our_own(tmp_path: Path) -> None:
-    mounting_deg = (0.0, 0.0, 90.0)
-    made, hands = rig(tmp_path, firmware="px4", own_imu=True)
-    made.config = replaced(made.config, gradienter={"mounting": mounting_deg})
-    made.devices["gradienter"] = Gradienter(
-        made.aircraft, seed=1, law="slope", offset_deg=ZERO_DEG, mounting_deg=mounting_deg
-    )
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            result = await aligned(made, hands)
-            assert result.outcome == "done", result
-            record = made.service.calibrating.alignment.record
-            assert record is not None
-            assert [imu.name for imu in record.imus] == ["fc", "own"]
-            assert np.abs(np.subtract(record.offset_deg, ZERO_DEG)).max() < 2.5 * record.sigma_deg
-            true_mg = made.own_model.true_bias(made.aircraft.time_at(made.now_s)).accel_m_s2 / MG
-            own = record.imus[1]
-            assert (np.abs(np.subtract(own.level_bias_mg, true_mg)) < 3.0 * np.array(own.level_sigma_mg)).all()
-
-    run_virtual(main())
-
-
 def test_a_recording_replays_with_the_zero_that_was_in_force(tmp_path: Path) -> None:
     made, hands = rig(tmp_path, recordings_mb=64)
 

@@ -122,23 +122,6 @@ def test_without_write_nothing_is_written_and_what_is_missing_is_said(tmp_path: 
     run_virtual(main())
 
 
-def test_a_scale_that_somebody_changes_meanwhile_voids_the_stands(tmp_path: Path) -> None:
-    made, hands = rig(tmp_path)
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            job = faced(made, write=False)
-            task = asyncio.ensure_future(follow(made, hands, job))
-            await made.until(lambda: job.words.startswith("3 of"), 200.0)
-            made.double.parameters.set("INS_ACCSCAL_X", 1.01)
-            result = await task
-            assert result.outcome == "failed"
-            assert "were changed in between: align again" in result.reason
-
-    run_virtual(main())
-
-
 def test_who_asks_for_what_cannot_be_is_told_at_once(tmp_path: Path) -> None:
     made, _ = rig(tmp_path)
     made.config = msgspec.structs.replace(made.config, push=msgspec.structs.replace(made.config.push, parameters=False))

@@ -252,19 +252,6 @@ def test_cancelling_an_automatic_calibration_ends_it_for_good(tmp_path: Path) ->
     run_virtual(main())
 
 
-def test_nothing_is_written_by_itself_while_armed(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
-            await rig.ready()
-            rig.double.arm()
-            await asyncio.sleep(60.0)
-            assert rig.double.writes == []
-            rig.double.disarm()
-            await calibrated_by_itself(rig)
-
-    run_virtual(main())
-
-
 def test_failures_are_not_repeated_for_ever(tmp_path: Path) -> None:
     async def main() -> None:
         async with Rig(tmp_path, at_arm="gate", max_s=12.0, **SLOW).running() as rig:

@@ -18,7 +18,6 @@ from companion.estimation.records.record import Record
 from companion.estimation.request import What
 from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H, MG
-from tests.support.component import ACCEPTED, CALIBRATE, UNDO
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -95,29 +94,6 @@ def test_both_imus_are_calibrated_at_once_and_the_autopilot_is_right_afterwards(
             assert np.abs(second.residual_gyro_rad_s).max() < 20 * DEG_H
             assert fc.gyro_bias_rad_s is not None
             np.testing.assert_allclose(second.gyro_bias_rad_s, fc.gyro_bias_rad_s, atol=20 * DEG_H)
-
-    run_virtual(main())
-
-
-def test_a_ground_station_calibrates_and_undoes(tmp_path: Path) -> None:
-    vehicle = (7, 191)
-
-    async def main() -> None:
-        async with Rig(tmp_path, system_id=7, **QUICK).running() as rig:
-            await rig.ready()
-            before = {name: rig.double.parameter(name) for name in FC_PARAMETERS}
-            await rig.until(lambda: rig.double.hears(191), 5.0)
-            rig.ground.command(CALIBRATE, 0.0, target=vehicle)
-            await rig.until(lambda: rig.ground.finals(CALIBRATE) == [ACCEPTED], 90.0)
-            assert {name: rig.double.parameter(name) for name in FC_PARAMETERS} != before
-            texts = " | ".join(rig.ground.texts())
-            assert "Calibration started" in texts
-            assert "Calibration done: sigma" in texts
-            rig.ground.command(UNDO, target=vehicle)
-            await rig.until(lambda: rig.ground.finals(UNDO) == [ACCEPTED], 30.0)
-            assert {name: rig.double.parameter(name) for name in FC_PARAMETERS} == before
-            await asyncio.sleep(2.0)
-            assert rig.ground.finals() == [ACCEPTED, ACCEPTED]
 
     run_virtual(main())
 

@@ -16,7 +16,6 @@ from companion.daemon.calibrating.run import CalibrationRun
 from companion.daemon.job import Job
 from companion.estimation.machine import State
 from companion.estimation.request import What
-from companion.storage.learned import BiasStore
 from sim.devices import Gradienter
 from sim.imu_model import MG
 from tests.e2e.test_automatic import calibrated_by_itself, values
@@ -128,23 +127,6 @@ def test_what_somebody_asked_for_is_true_from_then_on_also_for_calibrations_by_i
     run_virtual(main())
 
 
-def test_an_undo_of_what_was_asked_for_makes_the_earlier_ones_count_again(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
-            before = await held_back(rig)
-            manager, known = rig.service.calibrating.manager, rig.service.calibrating.store
-            assert (await calibrated(rig))[0].outcome == "done"
-            undo = manager.start_undo("test")
-            assert isinstance(undo, Job)
-            assert (await undo.finished).outcome == "done"
-            assert accelerometers(rig) == before
-            for each in BiasStore(tmp_path).read().values():
-                assert not any(point.accel is not None and point.accel.chosen for point in each.points)
-            assert known.history(1)[0].undone_at is not None
-
-    run_virtual(main())
-
-
 def test_nothing_is_held_back_any_more_once_the_gradienter_is_where_it_was(tmp_path: Path) -> None:
     async def main() -> None:
         async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
@@ -189,20 +171,5 @@ def test_who_asks_in_the_middle_is_not_answered_with_half_of_it(tmp_path: Path) 
             await manager.job.finished
             assert (await calibrated(rig))[0].outcome == "done"
             assert any("ACC" in name for name in rig.service.calibrating.store.history(1)[0].imus[0].written)
-
-    run_virtual(main())
-
-
-def test_a_request_that_comes_first_is_written_with_the_warning(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
-            await calibrated_by_itself(rig)
-            before = accelerometers(rig)
-            knocked(rig)
-            await asyncio.sleep(20.0)
-            assert (await calibrated(rig))[0].outcome == "done"
-            assert all(accelerometers(rig)[name] != value for name, value in before.items())
-            assert "Held back" not in "".join(rig.ground.texts())
-            assert "The gradienter has moved" in "".join(rig.ground.texts())
 
     run_virtual(main())

@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -84,32 +83,26 @@ class ImuIdentities:
             "system": str(self._vehicle.system_id),
             "firmware": str(self._vehicle.firmware),
         }
-        if calibration is not None:
-            return found | _of_autopilot(calibration)
-        # What is not known at the moment is no change.
-        return {**before, **found}
+        if calibration is None:
+            # What is not known at the moment is no change.
+            return {**before, **found}
+        return found | {
+            "gyro": str(calibration.gyro_id),
+            "accel": str(calibration.accel_id),
+            "orientation": _plain((np.round(calibration.orientation, 4) + 0.0).ravel().tolist()),
+            "scale": _plain(calibration.accel_scale),
+        }
 
     def aligned(self, name: str) -> ImuAlignmentRecord | None:
         """Give an IMU's part of the alignment in force."""
-        record = self._alignment.record
-        if record is None or self._alignment.unused is not None:
-            return None
-        return next((imu for imu in record.imus if imu.name == name), None)
+        record = self._alignment.record if self._alignment.unused is None else None
+        return None if record is None else next((imu for imu in record.imus if imu.name == name), None)
 
 
 def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Say what differs between two identities; empty: nothing."""
     keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
     return ", ".join(_IN_WORDS.get(key, key) for key in keys)
-
-
-def _of_autopilot(calibration: ImuCalibration) -> dict[str, str]:
-    return {
-        "gyro": str(calibration.gyro_id),
-        "accel": str(calibration.accel_id),
-        "orientation": _plain((np.round(calibration.orientation, 4) + 0.0).ravel().tolist()),
-        "scale": _plain(calibration.accel_scale),
-    }
 
 
 def _plain(value: object) -> str:

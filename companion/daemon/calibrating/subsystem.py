@@ -28,7 +28,7 @@ from companion.daemon.stands.all_sides import SidesTask
 from companion.daemon.stands.measuring import Measuring
 from companion.daemon.stands.on_spot import TurnTask, ZeroTask
 from companion.daemon.stands.session import PoseSession, PoseTask
-from companion.daemon.stands.writes import AccelWrites, LevelWrites
+from companion.daemon.stands.writes import AlignmentWrites
 from companion.errors import CalibrationRefusedError, RequestRefusedError
 from companion.estimation.alignment.poses import HEADINGS, AlignmentRequest
 from companion.estimation.means.windows import Window
@@ -68,8 +68,7 @@ class Calibrating(Subsystem):
         self.estimator = Estimator(core, self.alignment, self.faces, own)
         self.on_solved: Listeners[Window, Window, EstimatorInputs, What, Expectation] = Listeners()
         ditherer = Ditherer(core, imus, offsets.writer, offsets.ledger)
-        accel, level = AccelWrites(core, imus, offsets), LevelWrites(core, imus, offsets, own)
-        self.stands = PoseSession(core, imus, measuring, accel, level)
+        self.stands = PoseSession(core, imus, measuring, AlignmentWrites(core, imus, offsets, own))
         self.by_hand = ByHand(core, imus)
         self._into_autopilot = IntoAutopilot(core, imus, measuring, self.memory, offsets)
         parts = CalibrationParts(core, imus, measuring, ditherer, self.estimator, self.memory, offsets, self.on_solved)

@@ -34,7 +34,6 @@ from companion.estimation.records.record import AlignmentUsed
 from companion.estimation.solution.truth import aged_m_s2
 from companion.formats import Object, utc_now
 from companion.links.system.listeners import Listeners
-from companion.physics.frames import Array
 from companion.physics.units import MG
 from companion.storage.changes import PREDICTION, ChangeSet
 from companion.storage.learned import KEEP_DONE, Done, alignment_in, alignments_in, faces_in, this_boot
@@ -148,24 +147,21 @@ class FacesInForce:
 
     def status(self) -> list[Object]:
         """List the bias and scale errors left in the output of each IMU, with their sigmas."""
-        found: list[Object] = []
-        record = self.record
-        for kept in () if record is None else record.imus:
-            now = self._now(kept.name, kept.temperature_degc)
-            if record is None or now is None:
-                continue
-            found.append(
-                {
-                    "name": kept.name,
-                    "measured_at": record.measured_at,
-                    "temperature_degc": kept.temperature_degc,
-                    "bias_left_mg": (now.figures[BIAS] / MG).round(4).tolist(),
-                    "bias_sigma_mg": (now.sigma[BIAS] / MG).round(4).tolist(),
-                    "scale_left": now.figures[SCALE].round(7).tolist(),
-                    "scale_sigma": now.sigma[SCALE].round(7).tolist(),
-                }
-            )
-        return found
+        known = {} if self.record is None else {imu.name: imu for imu in self.record.imus}
+        left = {name: self._now(name, kept.temperature_degc) for name, kept in known.items()}
+        return [
+            {
+                "name": name,
+                "measured_at": None if self.record is None else self.record.measured_at,
+                "temperature_degc": known[name].temperature_degc,
+                "bias_left_mg": (now.figures[BIAS] / MG).round(4).tolist(),
+                "bias_sigma_mg": (now.sigma[BIAS] / MG).round(4).tolist(),
+                "scale_left": now.figures[SCALE].round(7).tolist(),
+                "scale_sigma": now.sigma[SCALE].round(7).tolist(),
+            }
+            for name, now in left.items()
+            if now is not None
+        ]
 
     def running(self, name: str) -> Running | None:
         """Return since when an IMU has been on; None where its device does not tell."""
@@ -186,45 +182,33 @@ class FacesInForce:
 
     def known(self, name: str, calibration: ImuCalibration, temperature_degc: float | None) -> Sides | None:
         """Return the errors left in one IMU's output, in its own axes; None if this sensor was never measured."""
-        if self.record is None:
-            return None
-        kept = next((imu for imu in self.record.imus if imu.name == name), None)
+        imus = () if self.record is None else self.record.imus
+        kept = next((imu for imu in imus if imu.name == name), None)
         if kept is None or kept.accel_id != calibration.accel_id:
             return None
         names = calibration.parameters
-        try:
-            offset = np.array([kept.corrections[one] for one in names.accel_offset])
-            x, y, z = (kept.corrections[one] for one in names.accel_scale)
-        except KeyError:
+        if not {*names.accel_offset, *names.accel_scale} <= kept.corrections.keys():
             return None
-        return _under(calibration, kept, offset, calibration.in_use((x, y, z)), self._widened(kept, temperature_degc))
+        # Output = scale (raw - offset), then and now.
+        offset = np.array([kept.corrections[one] for one in names.accel_offset])
+        x, y, z = (kept.corrections[one] for one in names.accel_scale)
+        scale, now = calibration.in_use((x, y, z)), calibration.in_use()
+        bias, error = np.array(kept.accel_bias_mg.value) * MG, np.array(kept.accel_scale.value)
+        right_offset, right_scale = offset + bias / scale, scale / (1.0 + error)
+        figures, sigma = np.zeros(FIGURES), np.zeros(FIGURES)
+        figures[BIAS] = now * (right_offset - np.array(calibration.accel_offset_m_s2))
+        figures[SCALE], figures[SHEAR] = now / right_scale - 1.0, kept.accel_shear.value
+        sigma[BIAS] = np.hypot(np.array(kept.accel_bias_mg.sigma) * MG, self._widened_m_s2(kept, temperature_degc))
+        sigma[SCALE], sigma[SHEAR] = kept.accel_scale.sigma, kept.accel_shear.sigma
+        return Sides(figures, sigma, calibration.orientation)
 
-    def _widened(self, kept: FacesImuRecord, temperature_degc: float | None) -> float:
-        """Return the widening of the biases' sigma since, m/s^2: drift and temperature, or another power-up."""
+    def _widened_m_s2(self, kept: FacesImuRecord, temperature_degc: float | None) -> float:
+        """Return the widening of the biases' sigma since: drift and temperature, or another power-up."""
         now, before = self.running(kept.name), kept.running
         gap_s = now.up_s - before.up_s if now is not None and before is not None and before.is_same(now) else None
         degrees = kept.temperature_degc, temperature_degc
         kelvin = None if degrees[0] is None or degrees[1] is None else degrees[1] - degrees[0]
         return aged_m_s2(noise_profile(self._profiles.of(kept.name)).accel, gap_s, kelvin)
-
-
-def _under(
-    calibration: ImuCalibration,
-    kept: FacesImuRecord,
-    offset: Array,
-    scale: Array,
-    widened_m_s2: float,
-) -> Sides:
-    """Convert the errors to other offsets and scales: output = scale (raw - offset), then and now."""
-    bias, error = np.array(kept.accel_bias_mg.value) * MG, np.array(kept.accel_scale.value)
-    right_offset, right_scale = offset + bias / scale, scale / (1.0 + error)
-    now, taken_off = calibration.in_use(), np.array(calibration.accel_offset_m_s2)
-    figures, sigma = np.zeros(FIGURES), np.zeros(FIGURES)
-    figures[BIAS], figures[SCALE] = now * (right_offset - taken_off), now / right_scale - 1.0
-    figures[SHEAR] = kept.accel_shear.value
-    sigma[BIAS] = np.hypot(np.array(kept.accel_bias_mg.sigma) * MG, widened_m_s2)
-    sigma[SCALE], sigma[SHEAR] = kept.accel_scale.sigma, kept.accel_shear.sigma
-    return Sides(figures, sigma, calibration.orientation)
 
 
 class ByHand:
@@ -285,16 +269,13 @@ class ByHand:
         return [self._shown(done) for done in sorted(here.values(), key=self._done.index, reverse=True)]
 
     def _shown(self, done: Done) -> Object:
-        return {**msgspec.to_builtins(done), "in_force": self._in_force(done)}
-
-    def _in_force(self, done: Done) -> bool | None:
-        """Return whether the autopilot holds all written values; None where none is read from it."""
+        """Show an alignment; `in_force`: whether the autopilot holds all written values, None where it is not known."""
+        in_force: bool | None = None
         if done.undone_at is not None:
-            return False
-        if done.system_id != self._vehicle.system_id:
-            return None
-        now: dict[str, float] = {}
-        for imu in self._imus.values():
-            now |= {} if imu.calibration is None else imu.calibration.corrections
-        seen = [same_float32(now[name], value) for name, value in done.written.items() if name in now]
-        return all(seen) if seen else None
+            in_force = False
+        elif done.system_id == self._vehicle.system_id:
+            known = [imu.calibration.corrections for imu in self._imus.values() if imu.calibration is not None]
+            now = {name: value for corrections in known for name, value in corrections.items()}
+            seen = [same_float32(now[name], value) for name, value in done.written.items() if name in now]
+            in_force = all(seen) if seen else None
+        return {**msgspec.to_builtins(done), "in_force": in_force}

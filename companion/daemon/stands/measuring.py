@@ -17,10 +17,9 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.job import Job
 from companion.errors import AutopilotError, CalibrationRefusedError
-from companion.estimation.collector.outlook import Settings, Status
+from companion.estimation.collector.outlook import Status
 from companion.estimation.machine import Event, State
 from companion.estimation.means.windows import Window
-from companion.estimation.request import What
 from companion.links.system.listeners import Listeners
 
 POLL_S: Final = 0.2
@@ -86,7 +85,12 @@ class Measuring:
             JobCancelledError: cancelled.
         """
         collector = self._core.collector
-        collector.retarget(self._wanted(job.what))
+        settings = self._core.wanted.settings
+        gyro = settings.target_gyro_sigma_rad_s if job.what.gyros else math.inf
+        accel = settings.target_accel_sigma_m_s2 if job.what.accelerometers else math.inf
+        collector.retarget(
+            msgspec.structs.replace(settings, target_gyro_sigma_rad_s=gyro, target_accel_sigma_m_s2=accel)
+        )
         failures = {name: imu.failures for name, imu in self._imus.items()}
         collector.on_second.append(job.look_again)
         try:
@@ -125,12 +129,3 @@ class Measuring:
                 raise AutopilotError(
                     f"{imu.upset}, {upsets} times now: does something else write, or pretend to be the autopilot?"
                 )
-
-    def _wanted(self, what: What) -> Settings:
-        """Return the targets of the requested biases; the others have none."""
-        settings = self._core.wanted.settings
-        return msgspec.structs.replace(
-            settings,
-            target_gyro_sigma_rad_s=settings.target_gyro_sigma_rad_s if what.gyros else math.inf,
-            target_accel_sigma_m_s2=settings.target_accel_sigma_m_s2 if what.accelerometers else math.inf,
-        )

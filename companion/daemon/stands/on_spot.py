@@ -90,9 +90,10 @@ class SpotTask(PoseTask):
             for stand, attitude, window in zip(self.stands, self.result.attitudes, state.windows, strict=True)
         )
 
-    def _refuse(self, *, gradienter: bool) -> None:
-        if self.result.complaint is not None:
-            raise CalibrationRefusedError(in_words(self.result.complaint, gradienter=gradienter))
+    def _estimated(self, result: Alignment) -> None:
+        self.result = result
+        if result.complaint is not None:
+            raise CalibrationRefusedError(in_words(result.complaint, gradienter=self._request.action != "turn"))
 
 
 class ZeroTask(SpotTask):
@@ -134,8 +135,7 @@ class ZeroTask(SpotTask):
             zero_deg=self._zero_deg,
         )
         law, mounted = self._gradienter.law, self._gradienter.vehicle_from_sensor
-        self.result = align(law, mounted, self.stands, ground(local, self._compass))
-        self._refuse(gradienter=True)
+        self._estimated(align(law, mounted, self.stands, ground(local, self._compass)))
         return []
 
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> AlignmentRecord:  # noqa: D102
@@ -200,8 +200,7 @@ class TurnTask(SpotTask):
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:  # noqa: D102
         names = readable(state.windows, among=self._imus)
         self.stands = as_stands(state, names, on_spot=self.total)
-        self.result = turned(self.stands, ground(local, None))
-        self._refuse(gradienter=False)
+        self._estimated(turned(self.stands, ground(local, None)))
         return []
 
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> TurnRecord:  # noqa: D102

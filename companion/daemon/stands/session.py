@@ -27,7 +27,7 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.daemon.offsets.plan import WriteLog
 from companion.daemon.stands.measuring import POLL_S, Measuring
-from companion.daemon.stands.writes import AccelWrites, LevelWrites
+from companion.daemon.stands.writes import AlignmentWrites
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.faces import Mounting
 from companion.estimation.alignment.poses import LEVEL, AlignmentRequest, HeldPose, Hold, Wish, leaned_deg
@@ -37,7 +37,6 @@ from companion.estimation.records.align_record import HandRecord, completed
 from companion.estimation.records.record import WrittenParameter
 from companion.estimation.solution.site import LocalEarth
 from companion.physics.units import DEG
-from companion.storage.changes import Origin
 
 STAND_S: Final = 12.0
 """Seconds of stillness for each stand: averaging beyond 10 s improves no accelerometer (method 2.3)."""
@@ -107,7 +106,7 @@ class SessionState:
 
 
 class PoseTask(abc.ABC):
-    """Poses, acceptance test, fit and record of one alignment; holds its estimate."""
+    """Poses, acceptance test, fit and record of one alignment, with its estimate."""
 
     imus_alone: ClassVar[bool] = True
     """Neither gradienter nor compass is waited for: turned over, either may fall silent."""
@@ -151,11 +150,7 @@ class PoseTask(abc.ABC):
         return {}
 
     async def keep(self, record: HandRecord) -> None:
-        """Make the result the active one.
-
-        Raises:
-            StorageError: it could not be kept; the one before stays active.
-        """
+        """Make the result the active one; a `StorageError` leaves the one before active."""
         del record
 
     @abc.abstractmethod
@@ -167,15 +162,10 @@ class PoseSession:
     """Guides one operator through the poses of one alignment at a time."""
 
     def __init__(
-        self,
-        core: Core,
-        imus: Mapping[str, AutopilotImu],
-        measuring: Measuring,
-        offsets: AccelWrites,
-        levels: LevelWrites,
+        self, core: Core, imus: Mapping[str, AutopilotImu], measuring: Measuring, writes: AlignmentWrites
     ) -> None:
         self._core, self._machine, self._collector, self._say = core, core.machine, core.collector, core.say
-        self._imus, self._measuring, self._offsets, self._levels = imus, measuring, offsets, levels
+        self._imus, self._measuring, self._writes = imus, measuring, writes
         self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
         self.shown: StandsShown | None = None
         """None before the first alignment."""
@@ -188,7 +178,7 @@ class PoseSession:
             JobCancelledError: cancelled, likewise.
         """
         if request.write and request.action == "faces":
-            await self._offsets.prepare()
+            await self._writes.path.offsets_still_hold()
         state = self._begin(job, task)
         while (wish := task.wish(state)) is not None:
             await self._measure(state, task, wish)
@@ -210,9 +200,9 @@ class PoseSession:
         level: dict[str, WrittenParameter] = {}
         try:
             if request.write and shortfall is None:
-                await self._offsets.write(job, last, task.changes(), log)
+                await self._writes.write_accelerometers(job, last, task.changes(), log)
             elif request.level and task.board is not None:
-                level = await self._write_level(job, task.board, last, log)
+                level = await self._writes.write_level(job, task.board, last, log)
         finally:
             warnings = (*log.warnings, *(words for each in log.imu_warnings.values() for words in each))
             job.product = record = completed(record, warnings, log.written, level)
@@ -380,13 +370,6 @@ class PoseSession:
                         f"imu {name} was exchanged in between (device id {old}, now {new}): align again"
                     )
             raise _changed(name)
-
-    async def _write_level(self, job: Job, board: Mounting, last: Window, log: WriteLog) -> dict[str, WrittenParameter]:
-        written, warning = await self._levels.write(job, board, last, Origin("level", log.started))
-        if warning is not None:
-            log.warnings.append(warning)
-            self._say(Severity.WARNING, warning)
-        return written
 
 
 def _changed(name: str) -> CalibrationRefusedError:

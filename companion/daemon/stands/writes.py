@@ -11,7 +11,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -21,6 +21,7 @@ from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.ekf import OwnAttitude
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
+from companion.component.statustext import Severity
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
@@ -29,7 +30,7 @@ from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import AutopilotError, CalibrationRefusedError
 from companion.estimation.alignment.faces import Mounting
 from companion.estimation.machine import Event
-from companion.estimation.means.windows import ImuWindow, Window
+from companion.estimation.means.windows import Window
 from companion.estimation.records.record import Outcome, WrittenParameter
 from companion.physics.frames import Array, Matrix
 from companion.storage.changes import Origin
@@ -47,77 +48,42 @@ POLL_S: Final = 0.25
 REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the new level after that"
 
 
-class AccelWrites:
-    """Writes accelerometer offsets and scales, all or nothing."""
+class AlignmentWrites:
+    """Writes accelerometer offsets and scales, or the level, all or nothing, and verifies the effect."""
 
-    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], offsets: Offsets) -> None:
-        self._core, self._imus, self._path = core, imus, offsets.write_path
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], offsets: Offsets, own: OwnAttitude) -> None:
+        self._core, self._vehicle, self._imus, self._own = core, core.vehicle, imus, own
+        self.path, self._writer, self._owed = offsets.write_path, offsets.writer, offsets.owed
 
-    def why_not(self, *, write: bool) -> str | None:
-        """Say why nothing can be measured or written; None when it can."""
-        if not self._imus:
-            return "there is no IMU of the autopilot to measure: none is configured"
-        if write and not self._core.wanted.push:
-            return "nothing is written while push.parameters is false"
-        return None
-
-    async def prepare(self) -> None:
-        """Verify, before the first stand, that the parameters are the offsets in use.
-
-        Raises:
-            AutopilotError: they cannot be read, or be made sure.
-            StorageError: the old values could not be kept.
-        """
-        await self._path.offsets_still_hold()
-
-    async def write(self, job: Job, last: Window, changes: Mapping[str, Sequence[Change]], log: WriteLog) -> None:
+    async def write_accelerometers(
+        self, job: Job, last: Window, changes: Mapping[str, Sequence[Change]], log: WriteLog
+    ) -> None:
         """Write the changes of each IMU; the aircraft stands still as in the last stand.
 
         Raises:
             CompanionError: it failed, and why; the old values are restored, or the error names those that are not.
             JobCancelledError: cancelled; likewise.
         """
-        if not await self._path.offsets_still_hold():
+        if not await self.path.offsets_still_hold():
             raise CalibrationRefusedError("the offsets were changed in between: align again")
         means = {imu.name: imu for imu in last.imus}
-        targets = tuple(self._target(means[name], each) for name, each in changes.items())
+        targets: list[Target] = []
+        for name, each in changes.items():
+            imu, calibration, read = self._imus[name], self._imus[name].in_force, means[name].accel_m_s2
+            _, step = output_step(calibration, each, read)
+            left = left_in(means[name], None, -np.array(step))
+            targets.append(Target(name, calibration, tuple(each), left, imu.stream.kind, watched=True, read_m_s2=read))
+            log.warn(name, *warnings_about(calibration, each))
+        plan = await self.path.write(job, Plan(tuple(targets), self._vehicle.boots), last, log)
         for target in targets:
-            log.warn(target.name, *warnings_about(target.calibration, target.changes))
-        plan = Plan(targets, self._core.vehicle.boots)
-        plan = await self._path.write(job, plan, last, log)
-        for target in targets:
-            kept = log.written.get(target.name, {})
-            seen = {kept[name].outcome for name in target.calibration.parameters.accel_offset if name in kept}
-            if seen == {"verified"}:
+            kept, names = log.written.get(target.name, {}), target.calibration.parameters
+            if {kept[name].outcome for name in names.accel_offset if name in kept} == {"verified"}:
                 # One step of the output showed offsets and scales together.
-                plan.mark(log, target.calibration.parameters.accel_scale, "verified")
-        await self._path.settle(job, plan, last, log)
+                plan.mark(log, names.accel_scale, "verified")
+        await self.path.settle(job, plan, last, log)
 
-    def _target(self, imu: ImuWindow, changes: Sequence[Change]) -> Target:
-        calibration = self._imus[imu.name].in_force
-        _, step = output_step(calibration, changes, imu.accel_m_s2)
-        solution = left_in(imu, None, -np.array(step))
-        kind = self._imus[imu.name].stream.kind
-        return Target(imu.name, calibration, tuple(changes), solution, kind, watched=True, read_m_s2=imu.accel_m_s2)
-
-
-class _LevelPlan(NamedTuple):
-    changes: list[Change]
-    turn: Matrix
-    """Rotation of up in the vehicle's axes, (3, 3)."""
-
-
-class LevelWrites:
-    """Writes the level, verifies its effect, and restores the old one without it."""
-
-    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], offsets: Offsets, own: OwnAttitude) -> None:
-        self._core, self._machine, self._imus, self._own = core, core.machine, imus, own
-        self._path, self._writer, self._owed = offsets.write_path, offsets.writer, offsets.owed
-
-    async def write(
-        self, job: Job, board: Mounting, last: Window, origin: Origin
-    ) -> tuple[dict[str, WrittenParameter], str | None]:
-        """Write and verify; the aircraft stands still as in the last stand. Returns what was written, and a warning.
+    async def write_level(self, job: Job, board: Mounting, last: Window, log: WriteLog) -> dict[str, WrittenParameter]:
+        """Write the level, watch the attitude follow, and restore the old one if it does not.
 
         Raises:
             CompanionError: it failed, and why; the old values are restored, or the error names those that are not.
@@ -125,70 +91,70 @@ class LevelWrites:
         """
         if math.degrees(max(abs(board.roll_rad), abs(board.pitch_rad))) > MOST_DEG:
             raise CalibrationRefusedError("the board would sit more than 10 deg askew: no level is for that")
-        plan = _LevelPlan(
-            *await self._core.vehicle.kind.plan_level(self._core.parameters, board.roll_rad, board.pitch_rad)
-        )
+        kind = self._vehicle.kind
+        changes, turn = await kind.plan_level(self._core.parameters, board.roll_rad, board.pitch_rad)
+        written: dict[str, WrittenParameter] = {}
+        outcome: Outcome = "failed"
+        warning: str | None = None
         with self._own.asked():
             job.progress(MEASURED_PERCENT, "reading the autopilot's attitude")
             before = await self._own.up_since(asyncio.get_running_loop().time())
-            await self._path.begin(job, len(plan.changes))
-            written: dict[str, WrittenParameter] = {}
-            outcome: Outcome | None = None
-            warning: str | None = None
+            await self.path.begin(job, len(changes))
 
             async def apply() -> list[Change]:
-                written.update(await self._writer.apply(plan.changes))
-                return plan.changes
+                written.update(await self._writer.apply(changes))
+                return changes
 
             async def verify() -> None:
                 nonlocal outcome, warning
-                outcome, warning = await self._verify(job, plan, before, last)
-                if outcome is None:
-                    raise AutopilotError("the attitude did not follow the new level, or it moved")
+                outcome, warning = await self._verify_level(job, turn, before, last)
                 if warning == REBOOT:
-                    await self._owed.after(plan.changes)
+                    await self._owed.after(changes)
 
-            imus = list(self._imus.values()) if self._core.vehicle.kind.level_turns_imus else []
-            await self._path.commit(plan.changes, origin, imus, apply, verify)
-        assert outcome is not None
+            imus = list(self._imus.values()) if kind.level_turns_imus else []
+            await self.path.commit(changes, Origin("level", log.started), imus, apply, verify)
         for event in (Event.VERIFIED, Event.CONCLUDED):
-            self._machine.on(event)
-        return {name: msgspec.structs.replace(one, outcome=outcome) for name, one in written.items()}, warning
+            self._core.machine.on(event)
+        if warning is not None:
+            log.warnings.append(warning)
+            self._core.say(Severity.WARNING, warning)
+        return {name: msgspec.structs.replace(one, outcome=outcome) for name, one in written.items()}
 
-    async def _verify(
-        self, job: Job, plan: _LevelPlan, before: Array | None, last: Window
-    ) -> tuple[Outcome | None, str | None]:
-        """Watch the attitude; returns the outcome, None if it did not follow, and a warning."""
-        loop = asyncio.get_running_loop()
+    async def _verify_level(
+        self, job: Job, turn: Matrix, before: Array | None, last: Window
+    ) -> tuple[Outcome, str | None]:
+        """Watch the attitude turn; returns the outcome and a warning.
+
+        Raises:
+            AutopilotError: it did not follow.
+        """
+        loop, vehicle = asyncio.get_running_loop(), self._vehicle
         job.progress(WRITTEN_PERCENT, "watching the attitude take the new level")
-        since_s = loop.time() + USED_AFTER_S
-        boots = self._core.vehicle.boots
-        while loop.time() < since_s + WITHIN_S and self._core.vehicle.boots == boots:
+        since_s, boots = loop.time() + USED_AFTER_S, vehicle.boots
+        while loop.time() < since_s + WITHIN_S and vehicle.boots == boots:
             job.check_cancelled()
             now = self._own.up(max(since_s, loop.time() - LATEST_S))
             if before is not None and now is not None:
-                if _angle_deg(plan.turn @ before, before) < SEEN_DEG:
+                if _angle_deg(turn @ before, before) < SEEN_DEG:
                     return "stored", "the new level is too near the old one to be seen"
-                if _follows(before, now, plan.turn):
+                if _follows(before, now, turn):
                     return "verified", None
             await job.pause(POLL_S)
-        if self._core.vehicle.kind.level_turns_imus and await self._imus_turned(plan, last):
-            return "verified", REBOOT
-        unseen = before is None and not self._core.vehicle.kind.level_turns_imus
-        return ("stored", "the effect of the new level was not seen: no ATTITUDE comes") if unseen else (None, None)
+        if vehicle.kind.level_turns_imus:
+            if await self._imus_turned(turn, last):
+                return "verified", REBOOT
+        elif before is None:
+            return "stored", "the effect of the new level was not seen: no ATTITUDE comes"
+        raise AutopilotError("the attitude did not follow the new level, or it moved")
 
-    async def _imus_turned(self, plan: _LevelPlan, last: Window) -> bool:
+    async def _imus_turned(self, turn: Matrix, last: Window) -> bool:
         """Verify that the output of the IMUs has turned; only PX4 turns it."""
         with contextlib.suppress(CalibrationRefusedError):
             for imu in self._imus.values():
                 await imu.refresh()
-            after = await self._core.window()
-            were = {imu.name: np.array(imu.accel_m_s2) for imu in last.imus}
-            return all(
-                _follows(were[imu.name], np.array(imu.accel_m_s2), plan.turn)
-                for imu in after.imus
-                if imu.name in self._imus and imu.name in were
-            )
+            were = {imu.name: np.array(imu.accel_m_s2) for imu in last.imus if imu.name in self._imus}
+            after = {imu.name: np.array(imu.accel_m_s2) for imu in (await self._core.window()).imus}
+            return all(_follows(were[name], after[name], turn) for name in were.keys() & after.keys())
         return False
 
 
