@@ -1,6 +1,6 @@
-"""Curves of the biases over temperature into the autopilot's own temperature calibration, when asked to.
+"""Writes bias curves over temperature to the autopilot's own temperature calibration, on request.
 
-The output at the temperature of that moment stays as it is, and that is what is looked at before it may stay.
+The output at the present temperature stays as it is; that is verified.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from companion.storage.changes import BY_TEMPERATURE
 
 
 class IntoAutopilot:
-    """Writes them; all or nothing."""
+    """Writes the curves of all IMUs, or none."""
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class IntoAutopilot:
         self._path, self._ledger = offsets.write_path, offsets.ledger
 
     def why_no_undo(self) -> str | None:
-        """Why curves cannot be put back now; None where the latest write is of them."""
+        """Say why the write of curves cannot be undone; None where it is the latest write."""
         steps = self._ledger.steps(self._core.vehicle.system_id)
         after = [step.origin.what or "a write" for step in steps]
         if BY_TEMPERATURE not in after:
@@ -51,14 +51,12 @@ class IntoAutopilot:
         return None if not later else f"written since: {', '.join(later)}; companion undo puts that back first"
 
     async def run(self, job: Job, *, overwrite: bool) -> str:
-        """Measure, write and look; returns in words what was written.
+        """Measure, write and verify; returns in words what was written.
 
-        Args:
-            job: what is told of it.
-            overwrite: also where the autopilot has a temperature calibration that is not ours.
+        `overwrite`: replace a temperature calibration of the autopilot that is not ours.
 
         Raises:
-            CompanionError: it failed, and why; the old values are back, or it is said which are not.
+            CompanionError: it failed, and why; the old values are restored, or the error names those that are not.
             JobCancelledError: cancelled; likewise.
         """
         log = WriteLog()
@@ -82,58 +80,45 @@ class IntoAutopilot:
         return f"written: {'; '.join(words)}"
 
     async def _find(self, window: Window, *, overwrite: bool) -> tuple[list[Target], list[str], list[str]]:
-        """Give the targets of the write, their words, and why other IMUs are left as they are."""
-        # The curve of an IMU that is another one now must not be written.
-        exchanged = self._memory.forgotten()
+        """Return the targets of the write, their words, and why other IMUs are left as they are."""
+        exchanged = self._memory.forgotten()  # the curve of an IMU that was replaced must not be written
         targets: list[Target] = []
         words: list[str] = []
         left: list[str] = []
-        for means in window.imus:
-            if means.name not in self._imus:
-                continue
-            imu, curve = self._imus[means.name], self._memory.curves.of(means.name, "gyro")
-            calibration, name, degc = imu.in_force, means.name, means.temperature_degc
+        for means in (means for means in window.imus if means.name in self._imus):
+            name, degc, imu = means.name, means.temperature_degc, self._imus[means.name]
+            curve, calibration = self._memory.curves.of(name, "gyro"), imu.in_force
+            enabled_by = calibration.thermal.enabled_by
             if curve is None:
                 left.append(exchanged.get(name) or f"imu {name}: no curve yet (companion temperature)")
             elif degc is None:
                 left.append(f"imu {name}: it tells no temperature now")
-            elif calibration.thermal.enabled_by and not overwrite and not self._is_ours(calibration.thermal):
+            elif enabled_by and not overwrite and not self._is_ours(calibration.thermal):
                 left.append(
-                    f"imu {name}: {calibration.thermal.enabled_by} is on, and not by the companion: kept"
+                    f"imu {name}: {enabled_by} is on, and not by the companion: kept"
                     " (companion temperature --overwrite replaces it)"
                 )
             else:
                 gyro, accel = of_curve(curve, calibration.orientation), self._of_accelerometers(name, curve)
-                changes = await self._core.vehicle.kind.thermal_changes(
-                    self._core.parameters, calibration, gyro, accel, degc
-                )
+                kind, parameters = self._core.vehicle.kind, self._core.parameters
+                changes = await kind.thermal_changes(parameters, calibration, gyro, accel, degc)
                 named = {change.parameter for target in targets for change in target.unseen}
-                changes = [change for change in changes if change.parameter not in named]
-                kind = imu.stream.own_kind
-                targets.append(
-                    Target(
-                        name,
-                        calibration,
-                        (),
-                        left_in(means, np.zeros(3), np.zeros(3)),
-                        kind,
-                        watched=True,
-                        unseen=tuple(changes),
-                    )
-                )
+                unseen = tuple(change for change in changes if change.parameter not in named)
+                nothing = left_in(means, np.zeros(3), np.zeros(3))
+                targets.append(Target(name, calibration, (), nothing, imu.stream.own_kind, watched=True, unseen=unseen))
                 low, high = curve.span_degc
                 words.append(f"{name}, {low:.0f} to {high:.0f} degC")
         return targets, words, left
 
     def _of_accelerometers(self, name: str, gyro: Curve) -> Polynomial | None:
-        """Their curve, where it has seen what that of the gyros has: an autopilot has one span for both."""
+        """Return their curve if it spans the same temperatures as the gyros': an autopilot has one span for both."""
         curve, calibration = self._memory.curves.of(name, "accel"), self._imus[name].in_force
         if curve is None or not np.allclose(curve.span_degc, gyro.span_degc, rtol=0.0, atol=LOOK_K):
             return None
         return of_curve(curve, calibration.orientation, calibration.accel_scale)
 
     def _is_ours(self, thermal: Thermal) -> bool:
-        """Whether it is as our writes have left it."""
+        """Whether our writes left it so."""
         ours: dict[str, float | None] = {}
         for step in reversed(self._ledger.steps(self._core.vehicle.system_id)):
             if step.origin.what == BY_TEMPERATURE:

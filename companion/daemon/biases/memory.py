@@ -174,8 +174,7 @@ class BiasMemory:
                 continue
             known = self._known.pop(name)
             self.curves.forget(name)
-            for triad in TRIADS:
-                self._today.pop((name, triad), None)
+            self._today = {key: each for key, each in self._today.items() if key[0] != name}
             if known.points:
                 found[name] = f"imu {name}: {what} changed since then: its earlier biases are forgotten"
                 logger.info("%s", found[name])
@@ -186,8 +185,7 @@ class BiasMemory:
 
         An autopilot outlives our board's power, and without a clock nobody knows since when it has been on.
         """
-        known, point = self._known.get(name), self._point(name, started_at)
-        if known is None or point is None:
+        if (point := self._point(name, started_at)) is None:
             return "its calibration is not known of"
         if what := self._changed(name):
             return f"another IMU than was calibrated ({what})"
@@ -196,10 +194,8 @@ class BiasMemory:
 
     def on_since(self, name: str, started_at: str) -> bool:
         """Whether an IMU is the one of a calibration, and its device has run ever since."""
-        point = self._point(name, started_at)
-        if point is None or self._changed(name):
-            return False
-        return point.power_up.started_with(self.identities.power_up(name, time.time()))
+        point = None if self._changed(name) else self._point(name, started_at)
+        return point is not None and point.power_up.started_with(self.identities.power_up(name, time.time()))
 
     def expectation(self, solution: Solution, unix_s: float) -> Expectation:
         """Predict the biases of these IMUs today."""
@@ -302,12 +298,8 @@ class BiasMemory:
         degc, power_up = imu.mean_degc, self.identities.power_up(imu.name, unix_s)
         if imu.gyro_rad_s is None or degc is None or self._changed(imu.name):
             return False
-        same = [
-            point.gyro
-            for point in self._points(imu.name)
-            if point.gyro is not None and point.power_up.is_same(power_up) and _is_near(point, degc)
-        ]
-        best = min((max(one.sigma_stat) for one in same), default=math.inf)
+        near = [each for each in self._points(imu.name) if each.power_up.is_same(power_up) and _is_near(each, degc)]
+        best = min((max(each.gyro.sigma_stat) for each in near if each.gyro is not None), default=math.inf)
         return bool(imu.sigma_stat[:3].max() < _MUCH_BETTER * best)
 
     async def forget(self, started: Collection[str]) -> None:

@@ -224,8 +224,9 @@ class Calibrating(Subsystem):
             level=asked.level and on_turn,
         )
         if self._core.config.vehicle.platform == "deck":
-            unmeasured = "a zero is not" if _KINDS[action] == ALIGNMENT else "accelerometers are not"
-            return Refusal("other", f"{unmeasured} measured on a deck that moves: align ashore")
+            if _KINDS[action] == ALIGNMENT:
+                return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
+            return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
         task: PoseTask
         if action == "faces":
             task = SidesTask(request, self._imus, self.faces)
