@@ -90,6 +90,32 @@ class SpotTask(PoseTask):
             for stand, attitude, window in zip(self.stands, self.result.attitudes, state.windows, strict=True)
         )
 
+    def _make_stands(
+        self,
+        state: SessionState,
+        names: Sequence[str],
+        north_deg: float = 0.0,
+        zero_deg: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Make the stands of these IMUs; `north_deg` is the poses' north from the true one."""
+        stands = []
+        for number, (window, pose) in enumerate(zip(state.windows, state.poses, strict=True)):
+            imus, tilt = {imu.name: imu for imu in window.imus}, window.tilt
+            noise_deg = (1.0, 1.0) if tilt is None else (tilt.x_sigma_deg, tilt.y_sigma_deg)
+            x_sigma_deg, y_sigma_deg = (math.hypot(READING_SIGMA_DEG, each) for each in noise_deg)
+            stands.append(
+                Stand(
+                    imus=tuple(_imu_stand(imus[name]) for name in names),
+                    tilt_deg=None if tilt is None else (tilt.x_deg - zero_deg[0], tilt.y_deg - zero_deg[1]),
+                    tilt_sigma_deg=(x_sigma_deg, y_sigma_deg),
+                    heading_rad=(pose.heading_deg + north_deg) * DEG,
+                    heading_sigma_rad=pose.heading_sigma_deg * DEG,
+                    on_spot=number < self._request.on_spot,
+                    counted=pose.counted,
+                )
+            )
+        self.stands = stands
+
     def _estimated(self, result: Alignment) -> None:
         self.result = result
         if result.complaint is not None:
@@ -127,13 +153,9 @@ class ZeroTask(SpotTask):
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:  # noqa: D102
         assert self._gradienter is not None
         compass = self._core.config.compass
-        self.stands = as_stands(
-            state,
-            readable(state.windows),
-            on_spot=self._request.on_spot,
-            north_deg=local.declination_deg if compass is not None and compass.reference == "magnetic" else 0.0,
-            zero_deg=self._zero_deg,
-        )
+        magnetic = compass is not None and compass.reference == "magnetic"
+        north_deg = local.declination_deg if magnetic else 0.0
+        self._make_stands(state, readable(state.windows), north_deg, self._zero_deg)
         law, mounted = self._gradienter.law, self._gradienter.vehicle_from_sensor
         self._estimated(align(law, mounted, self.stands, ground(local, self._compass)))
         return []
@@ -198,8 +220,7 @@ class TurnTask(SpotTask):
         return pose, objection(self._request, state.poses, pose)
 
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:  # noqa: D102
-        names = readable(state.windows, among=self._imus)
-        self.stands = as_stands(state, names, on_spot=self.total)
+        self._make_stands(state, readable(state.windows, among=self._imus))
         self._estimated(turned(self.stands, ground(local, None)))
         return []
 
@@ -245,37 +266,6 @@ class TurnTask(SpotTask):
             words += f"; the board sits at roll {board.roll_rad / DEG:+.2f}, pitch {board.pitch_rad / DEG:+.2f} deg"
         end = "level written" if request.level else "written" if request.write else "not written"
         return f"{words}: {end}"
-
-
-def as_stands(
-    state: SessionState,
-    names: Sequence[str],
-    *,
-    on_spot: int,
-    north_deg: float = 0.0,
-    zero_deg: tuple[float, float] = (0.0, 0.0),
-) -> list[Stand]:
-    """Return the stands of these IMUs for the estimator.
-
-    The first `on_spot` stands share the spot; `north_deg` is the poses' north from the true one, `zero_deg` the
-    gradienter's as configured.
-    """
-    stands = []
-    for number, (window, pose) in enumerate(zip(state.windows, state.poses, strict=True)):
-        imus, tilt = {imu.name: imu for imu in window.imus}, window.tilt
-        x_sigma_deg, y_sigma_deg = (1.0, 1.0) if tilt is None else (tilt.x_sigma_deg, tilt.y_sigma_deg)
-        stands.append(
-            Stand(
-                imus=tuple(_imu_stand(imus[name]) for name in names),
-                tilt_deg=None if tilt is None else (tilt.x_deg - zero_deg[0], tilt.y_deg - zero_deg[1]),
-                tilt_sigma_deg=(math.hypot(READING_SIGMA_DEG, x_sigma_deg), math.hypot(READING_SIGMA_DEG, y_sigma_deg)),
-                heading_rad=(pose.heading_deg + north_deg) * DEG,
-                heading_sigma_rad=pose.heading_sigma_deg * DEG,
-                on_spot=number < on_spot,
-                counted=pose.counted,
-            )
-        )
-    return stands
 
 
 def _imu_stand(imu: ImuWindow) -> ImuStand:
