@@ -15,12 +15,13 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from companion.config.sections import AllanModel
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align_model import response
 from companion.estimation.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Sides
 from companion.estimation.means.pose import CompassModel, GradienterModel, TiltWindow, up_in_vehicle
 from companion.estimation.means.windows import ImuWindow, Window
-from companion.estimation.noise.allan import AllanModel, floor_variance
+from companion.estimation.noise.allan import floor_variance
 from companion.estimation.records.record import HeadingFrom, Magnetic, TiltFrom
 from companion.estimation.solution import magnetic
 from companion.estimation.solution.site import LocalEarth, Uncertain

@@ -29,7 +29,6 @@ from companion.estimation.solution.joint import weigh
 from companion.estimation.solution.results import record_of
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Solution, solve
-from companion.estimation.solution.truth import NOTHING, Otherwise
 from companion.lab.logs.playback import UNUSABLE, Playback, config_of
 from companion.lab.logs.recording import Head, Message, Recording
 from companion.physics.frames import Array

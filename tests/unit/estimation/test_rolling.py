@@ -13,7 +13,6 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.collector import measurement
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
-from companion.estimation.noise.allan import AllanModel, NoiseProfile
 from companion.physics.units import DEG, DEG_H
 from companion.recording.messages import encode
 from companion.samples import ImuSample, TiltSample
