@@ -50,7 +50,7 @@ from companion.estimation.request import What
 from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.joint import Weighed, weigh
 from companion.estimation.solution.prior import Expectation
-from companion.estimation.solution.results import in_words, record_of, unseen_turn, when_warm
+from companion.estimation.solution.results import imu_records, in_words, record_of, unseen_turn, when_warm
 from companion.estimation.solution.solve import ImuSolution, Pair, Solution
 from companion.links.system.listeners import Listeners
 from companion.samples import Triad
@@ -332,14 +332,11 @@ class CalibrationRun(Job):
             state=result.outcome,
             reason=result.reason,
             warnings=self.log.warnings,
-            whole=self.whole,
+            imus=self._imu_records(),
         )
-        return msgspec.structs.replace(
-            record, imus=self._imu_records(), system_id=self.system_id, alignment=self.alignment
-        )
+        return msgspec.structs.replace(record, system_id=self.system_id, alignment=self.alignment)
 
     def _imu_records(self) -> tuple[ImuRecord, ...]:
-        found = record_of(self.solution, self.log.started_at, 0.0, whole=self.whole).imus
         before = {} if self.before is None else {imu.name: imu for imu in self.before.imus}
         return tuple(
             msgspec.structs.replace(
@@ -351,7 +348,7 @@ class CalibrationRun(Job):
                 gyro_id=self.device_ids.get(imu.name, (None, None))[0],
                 accel_id=self.device_ids.get(imu.name, (None, None))[1],
             ).confirming(before.get(imu.name))
-            for imu in found
+            for imu in imu_records(self.solution, self.whole)
         )
 
 

@@ -24,11 +24,11 @@ def record_of(
     state: Literal["done", "failed", "cancelled"] = "done",
     reason: str | None = None,
     warnings: Sequence[str] = (),
-    whole: Mapping[str, Pair] | None = None,
+    imus: Sequence[ImuRecord] | None = None,
 ) -> Record:
     """Build the record of a solution; without a solution it has no IMUs.
 
-    `reason` None: the figures in words. `whole`: sums of residual and offsets, by IMU whose owner subtracts offsets.
+    `reason` None: the figures in words. `imus`: their records, where the plain ones of the solution are not all.
     """
     record = Record(
         state=state,
@@ -42,7 +42,7 @@ def record_of(
     )
     if solution is None:
         return record
-    imus = tuple(_imu(imu, (whole or {}).get(imu.name)) for imu in solution.imus)
+    imus = imu_records(solution, {}) if imus is None else tuple(imus)
     turn, told = solution.turn, solution.turn.is_told
     return msgspec.structs.replace(
         record,
@@ -59,6 +59,11 @@ def record_of(
         ),
         imus=imus,
     )
+
+
+def imu_records(solution: Solution | None, whole: Mapping[str, Pair]) -> tuple[ImuRecord, ...]:
+    """Build the records of all IMUs; `whole`: sums of residual and offsets, by IMU whose owner subtracts offsets."""
+    return () if solution is None else tuple(_imu(imu, whole.get(imu.name)) for imu in solution.imus)
 
 
 def _imu(estimate: ImuSolution, whole: Pair | None) -> ImuRecord:

@@ -26,7 +26,7 @@ from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.records.record import AlignmentUsed, Record, from_json
 from companion.estimation.request import What
 from companion.estimation.solution.joint import weigh
-from companion.estimation.solution.results import record_of
+from companion.estimation.solution.results import imu_records, record_of
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Solution, solve
 from companion.lab.logs.playback import UNUSABLE, Playback, config_of
@@ -197,13 +197,13 @@ class Replay:
         corrected = {imu.name for imu in recorded.imus if imu.residual_gyro_rad_s or imu.residual_accel_m_s2}
         began, seconds = datetime.datetime.fromisoformat(recorded.started_at), recorded.duration_s
         whole = {found.name: self._whole(found) for found in solution.imus if found.name in corrected}
-        again = record_of(solution, began, seconds, state=recorded.state, reason=recorded.reason, whole=whole)
         earlier = {imu.name: imu for imu in recorded.imus}
         imus = tuple(
             msgspec.structs.replace(imu, written=was.written, gyro_id=was.gyro_id, accel_id=was.accel_id)
-            for imu, was in ((imu, earlier[imu.name]) for imu in again.imus if imu.name in earlier)
+            for imu, was in ((imu, earlier[imu.name]) for imu in imu_records(solution, whole) if imu.name in earlier)
         )
-        again = msgspec.structs.replace(again, imus=imus, system_id=recorded.system_id, alignment=recorded.alignment)
+        again = record_of(solution, began, seconds, state=recorded.state, reason=recorded.reason, imus=imus)
+        again = msgspec.structs.replace(again, system_id=recorded.system_id, alignment=recorded.alignment)
         return compared(recorded, again)
 
     def goes_on(self, head: Head) -> bool:
