@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.estimation.collector.intake import SourceStatus
 from companion.estimation.means.windows import WHITE_SHARE, Estimate, ImuEstimate
-from companion.estimation.noise.allan import floor_variance
 from companion.physics.frames import Floats
+
+_NO_ROOM: Final = 1e-300
 
 
 class Obstacle(msgspec.Struct, frozen=True):
@@ -105,39 +106,19 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
 
 def is_enough(settings: Settings, found: Sequence[ImuEstimate]) -> bool:
     """Tell whether every axis meets its target, or its white part is below 30 % of the part that stays."""
-    target = _targets(settings)
-    return all(
-        bool(_done(one.white_variance, one.use_variance, target, _waited_for(settings, one)).all())
-        for one in (each.own for each in found)
-    )
+    return all(bool((each.own.white_variance <= _room(settings, each.own)).all()) for each in found)
 
 
 def expected_s(settings: Settings, found: Sequence[ImuEstimate]) -> int:
-    """Good seconds after which it is expected to be enough, the noise staying as seen so far."""
-    if not found:
-        return settings.min_slots
-    own = [each.own for each in found]
-    seconds = np.arange(settings.min_slots, settings.max_slots + 1, dtype=np.float64)[:, None]
-    white = np.square(np.concatenate([one.white for one in own])) / seconds
-    floor = floor_variance(
-        np.concatenate([one.flicker for one in own]),
-        np.concatenate([one.walk for one in own]),
-        seconds,
-        settings.horizon_s,
-    )
-    undecided = np.concatenate([_waited_for(settings, one) for one in own])
-    done = _done(white, white + floor, np.tile(_targets(settings), len(own)), undecided).all(axis=1)
-    return settings.min_slots + int(done.argmax()) if done.any() else settings.max_slots
+    """Return the good seconds after which it is expected to be enough, the noise staying as seen so far."""
+    needed = [np.square(each.own.white) / np.maximum(_room(settings, each.own), _NO_ROOM) for each in found]
+    longest = max((float(each.max()) for each in needed), default=0.0)
+    return min(max(math.ceil(min(longest, settings.max_s)), settings.min_slots), settings.max_slots)
 
 
-def _targets(settings: Settings) -> Floats:
-    return np.repeat([settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2], 3)
-
-
-def _waited_for(settings: Settings, own: Estimate) -> NDArray[np.bool_]:
-    return own.undecided & (not settings.dither)
-
-
-def _done(white: Floats, use: Floats, target: Floats, undecided: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    enough = (white < WHITE_SHARE * (use - white)) & ~undecided
-    return np.asarray(np.where(undecided, np.isinf(target), use <= np.square(target)) | enough)
+def _room(settings: Settings, own: Estimate) -> Floats:
+    """Return the variance that white noise may leave in each axis; below zero for integers that are waited for."""
+    target = np.repeat([settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2], 3)
+    stays = own.use_variance - own.white_variance
+    room = np.maximum(np.square(target) - stays, WHITE_SHARE * stays)
+    return np.where(own.undecided & np.isfinite(target) & (not settings.dither), -1.0, room)

@@ -35,7 +35,7 @@ LONGEST_GAP_S: Final = 0.5
 _SETTLED_LAGS: Final = 10.0
 _KEPT_SHOWN: Final = 4
 """Seconds that wait for the gradienter's readings."""
-_FALLS: Final = 2.0
+_FALLS: Final = 2.5
 """Power of the time with which the white part of a variance falls, until estimates show it: that of a slope through
 waves or white noise falls with the third, a sensor's own white noise with the first."""
 _FALLS_LEAST: Final = 1.0
