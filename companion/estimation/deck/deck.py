@@ -17,7 +17,7 @@ import numpy as np
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.measurement import Measurement, Stillness, WindowSource
 from companion.estimation.collector.outlook import Progress, Settings
-from companion.estimation.deck.estimate import MAX_S, MIN_LOOK_S, MIN_S, DeckFound, DeckWork, ImuSecond, Known
+from companion.estimation.deck.estimate import MAX_S, MIN_LOOK_S, MIN_S, DeckFound, DeckWork, ImuSecond, TriadVariances
 from companion.estimation.deck.smoother import passage
 from companion.estimation.deck.waves import Fluid, Level, level
 from companion.estimation.means.pose import CompassModel, GradienterModel
@@ -313,7 +313,7 @@ class Aim(NamedTuple):
         return f"{_figure(self.sigma / unit)} {name}, goal {_figure(self.goal / unit)}"
 
 
-def aim(first: tuple[int, Known], newest: tuple[int, Known], target: float) -> Aim:
+def aim(first: tuple[int, TriadVariances], newest: tuple[int, TriadVariances], target: float) -> Aim:
     """Return the aim of a triad by the first and the newest estimate, each with its number of seconds."""
     (first_s, was), (newest_s, known) = first, newest
     floor = known.use - known.white

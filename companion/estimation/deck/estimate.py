@@ -51,7 +51,7 @@ random walk of B / sqrt(T), it is the flicker's part of V(T, H)."""
 _GRAVITY_M_S2: Final = 9.8
 
 
-class Known(NamedTuple):
+class TriadVariances(NamedTuple):
     """Largest variances of the axes of a triad."""
 
     use: float
@@ -63,7 +63,7 @@ class DeckFound(NamedTuple):
     """A window, and how far it is."""
 
     window: Window
-    known: tuple[Known, ...]
+    known: tuple[TriadVariances, ...]
     """Gyros and accelerometers of one IMU after another."""
 
 
@@ -161,7 +161,7 @@ class DeckWork(Work, frozen=True, kw_only=True):
         levels: Sequence[Level],
         headings: Floats,
         reference: tuple[float, float] | None,
-    ) -> tuple[ImuWindow, tuple[Known, Known], Found]:
+    ) -> tuple[ImuWindow, tuple[TriadVariances, TriadVariances], Found]:
         gradienter = self.gradienter
         span_s = float(len(seconds))
         compared = None if gradienter is None else compare(levels)
@@ -206,8 +206,8 @@ class DeckWork(Work, frozen=True, kw_only=True):
         )
         # A slope, weighed most in its middle, misses some of a bias that walks: no averaging takes that away.
         walked = _MIDDLE * followed_walk(gyro, span_s) ** 2 * span_s
-        gyros = Known(float(use[:3].max() ** 2), max(float(np.diag(gyro_own).max()) - walked, 0.0))
-        return window, (gyros, Known(float(use[3:].max() ** 2), float(np.diag(own).max()))), found
+        gyros = TriadVariances(float(use[:3].max() ** 2), max(float(np.diag(gyro_own).max()) - walked, 0.0))
+        return window, (gyros, TriadVariances(float(use[3:].max() ** 2), float(np.diag(own).max()))), found
 
     def _believed(
         self,

@@ -13,7 +13,7 @@ import pytest
 from companion.component.statustext import LINE_BYTES
 from companion.errors import CalibrationRefusedError
 from companion.estimation.deck.deck import Aim, Deck, aim, more
-from companion.estimation.deck.estimate import DeckFound, Known
+from companion.estimation.deck.estimate import DeckFound, TriadVariances
 from companion.estimation.deck.smoother import passage
 from companion.estimation.deck.waves import Fluid, Level, Wander, Waves, fit_waves, whitened
 from companion.estimation.means.pose import CompassModel, GradienterModel
@@ -267,7 +267,7 @@ def test_the_time_that_is_said_is_the_time_it_takes(
     deck = Deck(*AROUND)
     deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["icm42688p"]))
     feed(deck, ImuModel(aircraft, "icm42688p", seed=5), 212, np.random.default_rng(5), 1.0)
-    past: list[tuple[int, Known]] = []
+    past: list[tuple[int, TriadVariances]] = []
     said: list[Aim] = []
     for end in range(60, 211, 30 if least_s > 100 else 15):
         found = deck.work(range(1, 1 + end)).run()
