@@ -27,13 +27,12 @@ from companion.fleet.contract import MOST_BYTES, answers, ranges
 from companion.fleet.store import Message, Outcome, Store
 from companion.links.system.connection import Backoff, Reconnection
 from companion.mqtt.broker import explain, is_of_protocol, read_password, tls_context
+from companion.mqtt.client import FIRST_WAIT_S, LONGEST_WAIT_S, MQTT_3_1_1, MQTT_5, WORTH_S, make_client
 
 if TYPE_CHECKING:
     import aiomqtt
 
 logger = logging.getLogger(__name__)
-_quiet = logging.getLogger(f"{__name__}.aiomqtt")
-_quiet.setLevel(logging.CRITICAL)
 
 BATCH: Final = 500
 """Most messages in one transaction."""
@@ -58,14 +57,9 @@ REST: Final = 4.0
 ANSWER_S: Final = 10.0
 """Timeout of the broker's answers."""
 STOP_AGAIN_S: Final = 0.5
-FIRST_WAIT_S: Final = 0.5
-LONGEST_WAIT_S: Final = 30.0
-WORTH_S: Final = 10.0
 _HELLO: Final = "fleet/+/hello"
 _ITEM: Final = "fleet/+/item"
 _SHARED: Final = "$share/collectors/"
-_MQTT_5: Final = 5
-_MQTT_3_1_1: Final = 4
 
 
 class _Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -143,7 +137,7 @@ class Collector:
     def __init__(self, settings: Mqtt, store: Store) -> None:
         self.settings, self.store = settings, store
         self.client_id = settings.client_id or f"collector-{socket.gethostname()[:40]}-{secrets.token_hex(4)}"
-        self._protocol = _MQTT_5
+        self._protocol: int = MQTT_5
         self._reconnection = Reconnection("fleet", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S)
 
     @property
@@ -175,40 +169,27 @@ class Collector:
         except CompanionError:
             raise
         except (aiomqtt.MqttError, OSError, TimeoutError) as error:
-            if not reached and self._protocol == _MQTT_5 and is_of_protocol(error):
+            if not reached and self._protocol == MQTT_5 and is_of_protocol(error):
                 # A broker without MQTT 5 refuses it, closes the connection, or does not answer.
-                self._protocol = _MQTT_3_1_1
+                self._protocol = MQTT_3_1_1
                 return f"{self.where}: no MQTT 5 there, so one collector only; going on with MQTT 3.1.1"
-            self._protocol = _MQTT_5
+            self._protocol = MQTT_5
             return f"{self.where}: {explain(error, self.settings, self.client_id, reached=reached)}"
         finally:
             self.store.close()
         return f"{self.where}: the connection has ended"
 
     def _client(self, password: str | None) -> aiomqtt.Client:
-        import aiomqtt
-        from paho.mqtt.packettypes import PacketTypes
-        from paho.mqtt.properties import Properties
-
-        properties = None
-        if self._protocol == _MQTT_5:
-            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
-            properties.MaximumPacketSize = 2 * MOST_BYTES
-        return aiomqtt.Client(
-            self.settings.host,
-            self.settings.broker_port,
-            username=self.settings.username,
+        return make_client(
+            self.settings,
+            self._protocol,
+            2 * MOST_BYTES,
             password=password,
             identifier=self.client_id,
-            protocol=aiomqtt.ProtocolVersion(self._protocol),
-            clean_session=True if properties is None else None,
-            keepalive=self.settings.keepalive_s,
-            properties=properties,
             timeout=ANSWER_S,
             tls_context=tls_context(self.settings),
             max_queued_incoming_messages=WAITING,
             queue_type=Waiting,
-            logger=_quiet,
         )
 
     async def _serve(self, client: aiomqtt.Client) -> None:
@@ -229,7 +210,7 @@ class Collector:
                 raise end
 
     async def _subscribe(self, client: aiomqtt.Client) -> None:
-        alone = self._protocol == _MQTT_3_1_1
+        alone = self._protocol == MQTT_3_1_1
         shared = "" if alone else _SHARED
         for topic in (shared + _ITEM, shared + _HELLO):
             await self._subscribe_to(client, topic)

@@ -1,6 +1,6 @@
-"""The broker as it is configured: what we show it, and what its silence or refusal means, for who stands beside.
+"""Credentials for the broker, and its refusals in words.
 
-Password and certificates are read anew for every connection: what was corrected is found without a restart.
+Password and certificates are read for every connection, so that a correction needs no restart.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAX_PASSWORD_BYTES: Final = 4096
 
 
 def read_password(settings: Mqtt) -> str | None:
-    """The password, or None where none is configured.
+    """Read the password; None: none is configured.
 
     Raises:
         LinkError: one line that names the file and what is wrong with it.
@@ -42,7 +42,7 @@ def read_password(settings: Mqtt) -> str | None:
 
 
 def is_open_to_all(settings: Mqtt) -> bool:
-    """Whether everybody on this computer can read the password."""
+    """Return whether everybody on this computer can read the password."""
     path = settings.password_path
     try:
         return path is not None and bool(path.stat().st_mode & stat.S_IROTH)
@@ -51,7 +51,7 @@ def is_open_to_all(settings: Mqtt) -> bool:
 
 
 def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
-    """What TLS needs, or None without TLS.
+    """Make the TLS context; None: without TLS.
 
     Raises:
         LinkError: one line that names the file and what is wrong with it.
@@ -70,7 +70,7 @@ def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
 
 
 def load_pair(context: ssl.SSLContext, cert: Path, key: Path) -> None:
-    """Take a certificate and its key; raises OSError, of which `unusable` makes a line."""
+    """Load a certificate and its key; raises OSError, which `unusable` turns into a line."""
     for file in (cert, key):
         file.open("rb").close()  # OpenSSL does not say which of them it cannot read
     # Without a password of ours OpenSSL would ask at the terminal for that of an encrypted key.
@@ -78,7 +78,7 @@ def load_pair(context: ssl.SSLContext, cert: Path, key: Path) -> None:
 
 
 def unusable(error: OSError, where: Path) -> LinkError:
-    """What is wrong with a file of certificates or keys, in one line that names it."""
+    """Turn the error of a file of certificates or keys into one line that names it."""
     if isinstance(error, ssl.SSLError):
         what = (error.reason or str(error)).lower().replace("_", " ")
         return LinkError(f"{where}: not usable: {what} (wanted: PEM, a key without a passphrase)")
@@ -101,13 +101,13 @@ _UNAVAILABLE: Final = (136, 137)
 _SHUTTING_DOWN: Final = 139
 _TAKEN_OVER: Final = 142
 _LOST: Final = (7, 128)
-"""paho's own number, and what it makes of it for MQTT 5."""
+"""Codes of a lost connection: paho's own, and that of MQTT 5."""
 _SILENT: Final = (16, 141)
-"""Likewise: nothing was heard for twice the keepalive."""
+"""Codes of silence for twice the keepalive: paho's own, and that of MQTT 5."""
 
 
 def causes(error: BaseException) -> list[BaseException]:
-    """The error and what it came from, outermost first; of a group, its first member's."""
+    """List an error and its causes, outermost first; of a group, the first member's."""
     found: list[BaseException] = []
     inner: BaseException | None = error
     while inner is not None and inner not in found:
@@ -120,7 +120,7 @@ def causes(error: BaseException) -> list[BaseException]:
 
 
 def reason_code(error: BaseException) -> int | None:
-    """What the broker (or paho) said by number, where it said anything."""
+    """Return the reason code of the broker (or paho), if there is one."""
     for cause in causes(error):
         code = getattr(cause, "rc", None)
         if code is not None:
@@ -129,17 +129,17 @@ def reason_code(error: BaseException) -> int | None:
 
 
 def is_of_protocol(error: BaseException) -> bool:
-    """Whether the broker may not speak the version of MQTT that it was spoken to in."""
+    """Return whether the broker may lack the version of MQTT that was tried."""
     return reason_code(error) == UNSUPPORTED_PROTOCOL or _is_unanswered(error)
 
 
 def _is_unanswered(error: BaseException) -> bool:
-    """Whether what listens there took the connection and then said nothing in time (aiomqtt has no type for it)."""
+    """Return whether the connection was accepted and then silent (aiomqtt has no type for it)."""
     return any(str(cause) == "Operation timed out" for cause in causes(error))
 
 
 def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bool) -> str:
-    """Why there is no connection, in one line without the broker's address; `reached`: there was one."""
+    """Say in one line why there is no connection, without the address; `reached`: there was one."""
     code = reason_code(error)
     if code is not None:
         return _of_code(code, error, settings, client_id)

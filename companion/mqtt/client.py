@@ -1,4 +1,4 @@
-"""The connection to an MQTT broker: kept, made again after every loss, and spoken to by way of an outbox.
+"""Connection to an MQTT broker: made again after every loss, fed from an outbox.
 
 aiomqtt 2 speaks MQTT 3.1.1 and 5. Only this module knows it, as its version 3 will be another library. MQTT 5 is tried
 first: only there can a message say that it was published to be retained, and only there is the broker told how long a
@@ -15,7 +15,7 @@ import logging
 import math
 import ssl
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from companion.config.sections import Mqtt
 from companion.links.system.connection import Backoff, Reconnection
@@ -33,12 +33,12 @@ _quiet.setLevel(logging.CRITICAL)
 
 INSTALL: Final = "pip install 'aiomqtt>=2.5,<3' where the companion is installed"
 GREETING_DEADLINE_S: Final = 5.0
-"""For the broker's first words; until then MQTT 3.1.1 is not tried on one that is silent to MQTT 5."""
+"""Timeout of the broker's first answer; a broker that is silent to MQTT 5 is then tried with MQTT 3.1.1."""
 ANSWER_DEADLINE_S: Final = 5.0
 FIRST_WAIT_S: Final = 0.5
 LONGEST_WAIT_S: Final = 30.0
 WORTH_S: Final = 10.0
-"""A connection that lasted so long was worth one: the next attempts begin with short waits again."""
+"""Least duration of a connection after which the next attempts begin with short waits again."""
 MQTT_3_1_1: Final = 4
 MQTT_5: Final = 5
 """The numbers of the two protocols on the wire."""
@@ -49,9 +49,9 @@ MAX_WAITING: Final = 1000
 than it empties it: a flood of some hundred requests has to fit. With 64 KiB each they fit the process's memory."""
 _REFUSED: Final = 128
 LONG_BYTES: Final = 4096
-"""What is shorter is no reason for a broker to end a connection."""
+"""Shortest message that a broker may end a connection for."""
 LOSSES: Final = 3
-"""So often a connection ends at one long message before it is left out."""
+"""Connections that end at one long message before it is left out."""
 LEFT_OUT_S: Final = 3600.0
 
 
@@ -101,7 +101,7 @@ class MqttLink:
 
     @property
     def connected(self) -> bool:
-        """Whether the broker has accepted us."""
+        """True while the broker accepts us."""
         return self._connected_s is not None
 
     @property
@@ -156,7 +156,7 @@ class MqttLink:
         await self._reconnection.keep(self._once)
 
     async def _once(self) -> str:
-        """One connection, to its end, in the newest protocol that the broker speaks; why it has ended."""
+        """Hold one connection in the newest protocol of the broker; return why it has ended."""
         before, reason = self.connections, f"{self.where}: the connection has ended"
         for protocol in (MQTT_5, MQTT_3_1_1) if self._protocol == MQTT_5 else (MQTT_3_1_1,):
             self._protocol = protocol
@@ -179,7 +179,7 @@ class MqttLink:
         return reason
 
     async def flush(self, within_s: float) -> None:
-        """Wait until everything was sent, if there is a connection, and for so long at most."""
+        """Wait until everything was sent, at most so long; without a connection not at all."""
         if self.connected:
             await comes(self.outbox.emptied, within_s)
 
@@ -203,28 +203,17 @@ class MqttLink:
 
     def _client(self, password: str | None, context: ssl.SSLContext | None) -> aiomqtt.Client:
         import aiomqtt
-        from paho.mqtt.packettypes import PacketTypes
-        from paho.mqtt.properties import Properties
 
-        properties = None
-        if self._protocol == MQTT_5:
-            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
-            properties.MaximumPacketSize = MAX_PACKET_BYTES
-        return aiomqtt.Client(
-            self.settings.host,
-            self.settings.broker_port,
-            username=self.settings.username,
+        return make_client(
+            self.settings,
+            self._protocol,
+            MAX_PACKET_BYTES,
             password=password,
             identifier=self.client_id,
-            protocol=aiomqtt.ProtocolVersion(self._protocol),
             will=aiomqtt.Will(self._will[0], self._will[1], qos=1, retain=True) if self._will else None,
-            clean_session=True if properties is None else None,
-            keepalive=self.settings.keepalive_s,
-            properties=properties,
             tls_context=context,
             timeout=GREETING_DEADLINE_S,
             max_queued_incoming_messages=MAX_WAITING,
-            logger=_quiet,
         )
 
     async def _speak(self, client: aiomqtt.Client) -> None:
@@ -277,7 +266,7 @@ class MqttLink:
             self.outbox.sent(parcel)
 
     def _count_loss(self) -> None:
-        """A long message at which connections end again and again is more than the broker, or the line, takes."""
+        """Count connections that end at the same long message: the broker or the line may not take it."""
         lost, self._under_way = self._under_way, None
         if lost is None or len(lost.payload) < LONG_BYTES:
             return
@@ -308,6 +297,29 @@ class MqttLink:
         self.outbox.opened()
         protocol = {MQTT_5: "MQTT 5", MQTT_3_1_1: "MQTT 3.1.1"}[self._protocol]
         self._reconnection.up(f"connected to {self.where} ({protocol})")
+
+
+def make_client(settings: Mqtt, protocol: int, most_bytes: int, **more: Any) -> aiomqtt.Client:
+    """Make a client of a broker with a clean session; `most_bytes`: longest packet that it may send (MQTT 5)."""
+    import aiomqtt
+    from paho.mqtt.packettypes import PacketTypes
+    from paho.mqtt.properties import Properties
+
+    properties = None
+    if protocol == MQTT_5:
+        properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+        properties.MaximumPacketSize = most_bytes
+    return aiomqtt.Client(
+        settings.host,
+        settings.broker_port,
+        username=settings.username,
+        protocol=aiomqtt.ProtocolVersion(protocol),
+        clean_session=True if properties is None else None,
+        keepalive=settings.keepalive_s,
+        properties=properties,
+        logger=_quiet,
+        **more,
+    )
 
 
 def _left_out_words(size: float) -> str:

@@ -37,11 +37,11 @@ class Daemon:
         self.record: Object | None = None
         """The last calibration's record."""
         self.alive = False
-        """Whether replies come."""
+        """True while replies come."""
         self.news = asyncio.Event()
         """Set at every reply, and when the stream ends."""
         self.clock_agrees = False
-        """Whether the autopilot's GNSS time confirms the clock of this computer."""
+        """True if the autopilot's GNSS time confirms the clock of this computer."""
 
     @property
     def vehicle(self) -> Object:

@@ -1,7 +1,7 @@
-"""Keeps what the fleet is to know, and sends it by the broker's connection until a collector has confirmed it.
+"""Keeps items for the fleet, and sends them by the broker's connection until a collector has confirmed them.
 
-The broker's receipt frees nothing: a broker may be wiped before a collector has looked. What is not confirmed in time
-is sent again; what a collector lacks although it had it (restored from a backup) it asks for.
+The broker's receipt frees nothing: a broker may be wiped before a collector has read it. An item that is not confirmed
+in time is sent again; a collector that was restored from a backup asks for items that it lacks.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from companion.mqtt import fleet_wire as wire
 from companion.mqtt.client import Incoming, MqttLink
 from companion.mqtt.daemon import Daemon
 from companion.mqtt.fleet_sources import Look, Sources, utc
-from companion.storage.fleet_items import Clock, Entry, FleetItems, Kept, Mark
+from companion.storage.fleet_items import Clock, FleetItems, Kept, Mark, SourceItems
 
 logger = logging.getLogger(__name__)
 
 LOOK_S: Final = 2.0
 BATCH: Final = 20
-"""Of what is taken from the disk at once; a whole history may wait there."""
+"""Most entries read from the disk at once; a whole history may wait there."""
 WINDOW: Final = 8
 """The most items under way without a confirmation."""
 CONFIRMED_WITHIN_S: Final = 30.0
@@ -39,11 +39,11 @@ HELLO_AGAIN_S: Final = 10.0
 SENT_WITHIN_S: Final = 1.0
 PAUSE_S: Final = 0.05
 CURVES_AFTER_S: Final = 60.0
-"""They have to be worked out first."""
+"""Delay of the first curves, which have to be worked out first."""
 CURVES_EVERY_S: Final = 6 * 3600.0
 INBOX: Final = 64
 AIRCRAFT, CURVE = "aircraft", "curve/"
-"""Marks: of which one the last was, and the curve that was told last."""
+"""Marks: the last aircraft, and the curve that was told last."""
 
 
 class AircraftFleet:
@@ -67,15 +67,15 @@ class AircraftFleet:
         self._woken = asyncio.Event()
         self._kept: list[Kept] = []
         self._of: str | None = None
-        """The aircraft that what is found is of."""
+        """Aircraft that new items belong to."""
         self._news = True
         self._caught_up = False
-        """What earlier runs have left was taken."""
+        """True once files of earlier runs were read."""
         self._started_s = 0.0
         self._curves_s = math.inf
         self._connection: tuple[MqttLink, int] | None = None
         self._greeted: dict[str, int] = {}
-        """By aircraft, the last sequence that the hello of this connection has told; -1: another hello is asked for."""
+        """Last sequence in the hello of this connection, by aircraft; -1: another hello is asked for."""
         self._hello_s = 0.0
         self._under_way: set[tuple[str, int]] = set()
         self._sent = 0
@@ -84,7 +84,7 @@ class AircraftFleet:
         self._wait_s = CONFIRMED_WITHIN_S
         self._problem: str | None = None
         self._fault = ""
-        """Of the program, said once."""
+        """Last fault of the program, logged once."""
 
     def status(self) -> Object:
         """For `companion status` and `check`."""
@@ -131,7 +131,7 @@ class AircraftFleet:
             self._items.close()
 
     async def _try(self, step: Callable[[], Awaitable[None]]) -> str | None:
-        """What was in its way, in words: what cannot be kept is no reason not to send, and the reverse."""
+        """Run a step; return its error in words. Keeping and sending do not hinder each other."""
         try:
             await step()
         except CompanionError as error:
@@ -160,7 +160,7 @@ class AircraftFleet:
         look = Look(uid, system_id, self._clock())
         if uid != self._of:
             moved = [look.item("event", utc_now(), {"what": "airframe changed", "before": self._of})]
-            await self._add(uid, [Entry({AIRCRAFT: Mark("", uid)}, moved if self._of is not None else [])])
+            await self._add(uid, [SourceItems({AIRCRAFT: Mark("", uid)}, moved if self._of is not None else [])])
             self._of = uid
         self._news |= await self._offload(self._sources.has_news)
         if self._news:
@@ -172,20 +172,20 @@ class AircraftFleet:
             await self._take_curves(look)
 
     async def _take_all(self, look: Look) -> None:
-        batch: list[Entry] = [Entry({})] * BATCH
+        batch: list[SourceItems] = [SourceItems({})] * BATCH
         while len(batch) == BATCH:
             batch = await self._offload(lambda: list(islice(self._sources.entries(look), BATCH)))
             await self._add(look.aircraft, batch)
             # A history is no hurry.
             await asyncio.sleep(PAUSE_S)
 
-    async def _add(self, aircraft: str, entries: list[Entry]) -> None:
+    async def _add(self, aircraft: str, entries: list[SourceItems]) -> None:
         if entries:
             await self._offload(self._items.add, aircraft, entries, utc(utc_now()))
             await self._count()
 
     async def _take_curves(self, look: Look) -> None:
-        """The curves of biases over temperature, where they are others than were told last."""
+        """Keep the curves of biases over temperature that differ from those told last."""
         marks = await self._offload(self._items.marks, f"{CURVE}{look.aircraft}/")
         entries = []
         reply = await self._daemon.result({"command": "temperature", "face": "fleet"})
@@ -193,7 +193,7 @@ class AircraftFleet:
             body = {key: imu[key] for key in ("imu", "power_ups", "days", "curve", "accel_curve")}
             key, mark = f"{CURVE}{look.aircraft}/{imu['imu']}", Mark("", imu["summary"])
             if imu["curve"] and marks.get(key) != mark:
-                entries.append(Entry({key: mark}, [look.item("curve", utc_now(), body)]))
+                entries.append(SourceItems({key: mark}, [look.item("curve", utc_now(), body)]))
         await self._add(look.aircraft, entries)
 
     def _clock(self) -> Callable[[str], Clock]:
@@ -238,7 +238,7 @@ class AircraftFleet:
         return link if link is not None and link.connected else None
 
     async def _greet(self) -> None:
-        """At every connection, and when there is more: listen for the fleet, and say what is kept."""
+        """Subscribe to the fleet's answers and send a hello, at every connection and when there is more."""
         link, now_s = self._link, asyncio.get_running_loop().time()
         if link is None:
             return
@@ -263,10 +263,9 @@ class AircraftFleet:
         self._sent, self._wait_s = 0, CONFIRMED_WITHIN_S
 
     async def _send(self) -> None:
-        """The next few, once the last few are confirmed, or have not been in time.
+        """Send the next few items, once the last few are confirmed or their time is over.
 
-        Then the next ones are sent all the same, and after the last the first again: one item that a collector does
-        not take holds up no other.
+        After the last the first are sent again: one item that a collector does not take holds up no other.
         """
         link, now_s = self._link, asyncio.get_running_loop().time()
         if link is None or not any(kept.waiting for kept in self._kept):

@@ -15,7 +15,7 @@ import msgspec
 
 from companion.errors import StorageError
 from companion.formats import Object
-from companion.storage.fleet_items import Clock, Entry, FleetItems, Item, Mark
+from companion.storage.fleet_items import Clock, FleetItems, Item, Mark, SourceItems
 from companion.storage.state import BoundedList, StateFile, named_in
 
 RECORD, ARMING, BY_HAND, PROFILE, FLIGHT, IMU = "record/", "arming/", "by-hand/", "profile/", "flight/", "imu/"
@@ -75,7 +75,7 @@ class Look(msgspec.Struct, frozen=True):
     """Returns how good the clock was at a time."""
 
     def owns(self, system_id: int | None) -> bool:
-        """Whether a record of that MAVLink system belongs to the aircraft."""
+        """Return whether a record of that MAVLink system belongs to the aircraft."""
         return self.system_id is None or system_id in (None, self.system_id)
 
     def item(self, kind: str, at: str, body: object) -> Item:
@@ -96,7 +96,7 @@ class Sources:
         self._settled = False
 
     def has_news(self) -> bool:
-        """Whether something may have been written since the last call.
+        """Return whether something may have been written since the last call.
 
         Once more after each change: a second write in the same tick of the file system's clock changes no time.
         """
@@ -105,7 +105,7 @@ class Sources:
         self._seen = seen
         return not (settled and self._settled)
 
-    def entries(self, look: Look) -> Iterator[Entry]:
+    def entries(self, look: Look) -> Iterator[SourceItems]:
         """Yield what was not told yet.
 
         Raises:
@@ -120,14 +120,14 @@ class Sources:
         yield from self._profiles(look)
         yield from self._flights(look)
 
-    def _told(self, prefix: str, stamps: Mapping[str, str], tell: Callable[[str, str], Told]) -> Iterator[Entry]:
+    def _told(self, prefix: str, stamps: Mapping[str, str], tell: Callable[[str, str], Told]) -> Iterator[SourceItems]:
         """Yield an entry for each key whose stamp differs from its mark; `tell` makes it from the mark's value."""
         marks = self._items.marks(prefix)
         for key, stamp in stamps.items():
             before = marks.pop(prefix + key, Mark("", ""))
             if before.stamp != stamp:
                 value, items = tell(key, before.value)
-                yield Entry({prefix + key: Mark(stamp, value)}, items)
+                yield SourceItems({prefix + key: Mark(stamp, value)}, items)
         if marks:
             self._items.forget(marks)
 
@@ -151,7 +151,7 @@ class Sources:
         except msgspec.ValidationError as error:
             raise StorageError(f"{self._directory / name}: cannot be used: {error}") from error
 
-    def _records(self, look: Look) -> Iterator[Entry]:
+    def _records(self, look: Look) -> Iterator[SourceItems]:
         parts = {key: mark.value for key, mark in self._items.marks(f"{IMU}{look.aircraft}/").items()}
         changed: dict[str, Mark] = {}
 
@@ -179,10 +179,10 @@ class Sources:
             return f"{record.started_at} {record.undone_at or ''}", items
 
         for entry in self._told(RECORD, self._stamps("records"), tell):
-            yield Entry({**entry.marks, **changed}, entry.items)
+            yield SourceItems({**entry.marks, **changed}, entry.items)
             changed.clear()
 
-    def _alignments(self, look: Look) -> Iterator[Entry]:
+    def _alignments(self, look: Look) -> Iterator[SourceItems]:
         listed = self._listed("by-hand.json")
         # "predicted": gyro offsets that version 0.1 wrote.
         done = {f"{one.what} {one.measured_at}": (one, body) for one, body in listed if one.state != "predicted"}
@@ -209,7 +209,7 @@ class Sources:
                 return found[1]
         return None
 
-    def _profiles(self, look: Look) -> Iterator[Entry]:
+    def _profiles(self, look: Look) -> Iterator[SourceItems]:
         def tell(name: str, before: str) -> Told:
             found = self._read(f"profiles/{name}.json")
             if found is None or found[0].saved_at == before:
@@ -218,7 +218,7 @@ class Sources:
 
         return self._told(PROFILE, self._stamps("profiles"), tell)
 
-    def _flights(self, look: Look) -> Iterator[Entry]:
+    def _flights(self, look: Look) -> Iterator[SourceItems]:
         def tell(number: str, before: str) -> Told:
             found = self._read(f"flights/{number}.json")
             flight = None if found is None else found[0].flight

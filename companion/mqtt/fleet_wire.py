@@ -42,7 +42,7 @@ class Said(msgspec.Struct, frozen=True):
     sequences: Annotated[list[tuple[_Sequence, _Sequence]], msgspec.Meta(max_length=MOST_RANGES)]
 
     def names(self, sequence: int) -> bool:
-        """Whether a sequence is among them."""
+        """Return whether a sequence is among them."""
         return any(first <= sequence <= last for first, last in self.sequences)
 
 

@@ -1,4 +1,4 @@
-"""What waits for the broker: bounded, whatever the broker does."""
+"""Messages that wait for the broker: bounded, whatever the broker does."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class Parcel(NamedTuple):
 
     @property
     def qos(self) -> int:
-        """Whether the broker's receipt is waited for."""
+        """1: wait for the broker's receipt."""
         return 0 if self.kind == "passing" else 1
 
     @property
     def retain(self) -> bool:
-        """Whether the broker keeps it for those who come later."""
+        """True: the broker keeps it for later subscribers."""
         return self.kind == "kept"
 
 
@@ -47,34 +47,34 @@ class Outbox:
         self._passing: dict[str, bytes] = {}
         self._filled = asyncio.Event()
         self.emptied = asyncio.Event()
-        """Set while everything was sent."""
+        """Set while nothing waits."""
         self.emptied.set()
         self._open = False
         self.dropped = 0
-        """Answers that nobody will get."""
+        """Answers that were dropped."""
 
     def __len__(self) -> int:
         return len(self._unsent) + len(self._answers) + len(self._passing)
 
     def keep(self, topic: str, payload: bytes) -> None:
-        """Have the broker keep this; an empty payload has it forget the topic."""
+        """Have the broker keep a payload; an empty one has it forget the topic."""
         if self._kept.get(topic) != payload:
             self._kept[topic] = payload
             self._unsent[topic] = None
             self._tell()
 
     def kept(self, topic: str) -> bytes | None:
-        """What the broker is to keep under a topic."""
+        """Return the payload that the broker keeps under a topic."""
         return self._kept.get(topic)
 
     def send_again(self, topic: str) -> None:
-        """Send what is kept under a topic once more, as somebody else has overwritten it."""
+        """Send the kept payload once more, after somebody else has overwritten it."""
         if topic in self._kept:
             self._unsent[topic] = None
             self._tell()
 
     def answer(self, topic: str, payload: bytes, *, droppable: bool) -> None:
-        """Send this once."""
+        """Send an answer once."""
         parcel = Parcel("answer", topic, payload, droppable)
         if len(self._answers) >= MAX_ANSWERS:
             self.dropped += 1
@@ -86,25 +86,25 @@ class Outbox:
         self._tell()
 
     def pass_on(self, topic: str, payload: bytes) -> None:
-        """Send this if it can be sent now."""
+        """Send telemetry if there is a connection."""
         if self._open:
             self._passing[topic] = payload
             self._tell()
 
     def opened(self) -> None:
-        """There is a connection: what is kept has to be said anew."""
+        """Start a connection: send all kept payloads again."""
         self._open = True
         self._unsent = dict.fromkeys(self._kept)
         self._tell()
 
     def closed(self) -> None:
-        """The connection is gone, and telemetry with it."""
+        """End a connection, and drop telemetry."""
         self._open = False
         self._passing.clear()
         self._tell()
 
     async def next(self) -> Parcel:
-        """The next to send; it stays (telemetry apart) until `sent`."""
+        """Return the next parcel; it stays (telemetry apart) until `sent`."""
         while True:
             if self._unsent:
                 topic = next(iter(self._unsent))
@@ -118,7 +118,7 @@ class Outbox:
             await self._filled.wait()
 
     def sent(self, parcel: Parcel) -> None:
-        """The broker has it."""
+        """Remove a parcel that the broker has."""
         if parcel.kind == "kept":
             if self._kept[parcel.topic] == parcel.payload:
                 self._unsent.pop(parcel.topic, None)

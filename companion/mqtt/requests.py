@@ -1,11 +1,11 @@
-"""Requests over MQTT: each is answered, none is obeyed twice, and no flood of them grows into anything.
+"""Requests over MQTT: each is answered, none is obeyed twice, and a flood stays bounded.
 
 An answer repeats the request's transaction. A calibration is answered twice: "accepted" at once, and how it ended;
 everything else once. Requests go to the control socket, as the command line's do, so refusals are the same too.
 
-Three kinds of request are not what somebody wants now:
+Three kinds of messages are no new request:
 - a retained one comes back at every connection, for ever: it is never obeyed, and the log says so once;
-- the empty payload that deletes a retained one looks like a request (on MQTT 3.1.1): it is let pass;
+- the empty payload that deletes a retained one looks like a request (on MQTT 3.1.1): it is ignored;
 - a repeat of a transaction (QoS 1 delivers at least once) gets the same answer again.
 """
 
@@ -118,7 +118,7 @@ class Requests:
         self._retained: set[str] = set()
 
     def accept(self, command: str, payload: bytes, *, retained: bool) -> None:
-        """Take one request; its answer comes later."""
+        """Accept one request; its answer comes later."""
         if _COMMAND.fullmatch(command) is None:
             logger.debug("mqtt: a request %.60r is ignored", command)
             return
@@ -132,7 +132,7 @@ class Requests:
             self._start(request)
 
     async def close(self, within_s: float) -> None:
-        """Let what waits be answered for so long, then drop it."""
+        """Wait so long for answers, then drop the requests."""
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=within_s)
         for task in list(self._tasks):
@@ -140,7 +140,7 @@ class Requests:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     def _is_leftover(self, command: str, payload: bytes, *, retained: bool) -> bool:
-        """Whether this only deletes a retained request; a retained one itself is reported."""
+        """Return whether this only deletes a retained request; report a retained one."""
         if retained and payload:
             if command not in self._retained:
                 self._retained.add(command)
@@ -152,7 +152,7 @@ class Requests:
         return True
 
     def _is_repeat(self, request: Request) -> bool:
-        """Whether this transaction is known already; then it is answered as before."""
+        """Return whether the transaction is known already; answer it as before."""
         if request.transaction is None:
             return False
         now_s = asyncio.get_running_loop().time()
@@ -220,7 +220,7 @@ class Requests:
 
 
 def _final(reply: Object) -> Object:
-    """The end of a request, with its state and reason in front whatever it was."""
+    """Make the final answer, with state and reason first."""
     record = reply.get("record")
     if record is not None:
         return {"state": record["state"], "reason": record["reason"], "record": record}

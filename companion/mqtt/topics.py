@@ -45,7 +45,7 @@ class Pace:
         self._said_s = 0.0
 
     def is_due(self, state: Object, now_s: float) -> bool:
-        """Whether to send it now; if so, it counts as sent."""
+        """Return whether to send a state now; then it counts as sent."""
         said = self._said
         if said == state:
             return False
@@ -74,6 +74,6 @@ class Topics:
         self.progress = f"{base}/calibration/progress"
         self.attitude = f"{base}/attitude"
         self.kept = (self.status, self.state, self.record)
-        """Those that the broker keeps."""
+        """Topics that the broker keeps."""
         self.request, self.response = f"{base}/request/", f"{base}/response/"
-        """Where a command is asked for and answered: its name follows."""
+        """Topics of a request and its response, without the name of the command."""

@@ -1,1 +1,1 @@
-"""What must survive a power cut."""
+"""Files that must survive a power cut."""

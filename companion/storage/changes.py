@@ -1,8 +1,8 @@
-"""What we changed in an autopilot: kept before the first write, so that it can be put back after any interruption.
+"""Changes of an autopilot: kept before the first write, so that they can be restored after any interruption.
 
 `journal.json` exists only while a write is under way (found at start, it means that the daemon died in the middle);
-`undo-N.json` holds the values before the last finished writes on the vehicle with system id N. What they say is written
-to an autopilot, so that they may name nothing else than what the companion writes, with values that can be.
+`undo-N.json` holds the values before the last finished writes on the vehicle with system id N. Their values are written
+to an autopilot: only parameters that the companion writes are accepted, within their ranges.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ BY_TEMPERATURE: Final = "temperature"
 PREDICTION: Final = "gyro prediction"
 """Gyro offsets that versions before 0.2 predicted and wrote: still in their files, and still undone."""
 BY_HAND: Final = ("faces", "turn", "level", BY_TEMPERATURE, PREDICTION)
-"""What leaves no calibration's record."""
+"""Writes without the record of a calibration."""
 
 
 class Changed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -52,14 +52,14 @@ Moment = Annotated[str, msgspec.Meta(pattern=r"^[-+:.0-9T]{0,40}\Z")]
 
 
 class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What has made a write."""
+    """Origin of a write."""
 
     what: Annotated[str, msgspec.Meta(pattern=r"^[a-z ]{0,30}\Z")] = ""
-    """As people call it: "calibration", "auto calibration", or one of `BY_HAND`; empty: not kept."""
+    """Name: "calibration", "auto calibration", or one of `BY_HAND`; empty: not kept."""
     at: Moment = ""
     """UTC, ISO 8601, by the host's clock: when that began; for calibrations `started_at` of the record."""
     since: Moment = ""
-    """Of several in one step: when the first of them began; empty: it is the only one."""
+    """Begin of the first of several writes in one step; empty: it is the only one."""
 
     @property
     def first(self) -> str:
@@ -68,7 +68,7 @@ class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What one write has changed on one vehicle."""
+    """Changes of one write on one vehicle."""
 
     system_id: int
     changes: tuple[Changed, ...]
@@ -82,9 +82,9 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         unforeseen: Mapping[str, float] | None = None,
         origin: Origin | None = None,
     ) -> ChangeSet:
-        """What is kept of changes before the first is made, and the old values of what the firmware will overwrite.
+        """Make the set before the first change; `unforeseen`: old values that the firmware will overwrite.
 
-        Of a vehicle that is not known nothing can be kept.
+        Changes of an unknown vehicle cannot be kept.
         """
         found = [Changed(change.parameter, change.before, change.after, change.via) for change in changes]
         found += [Changed(name, before, None) for name, before in (unforeseen or {}).items()]
@@ -92,7 +92,7 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def names(self) -> list[str]:
-        """Of the parameters."""
+        """Names of the parameters."""
         return [changed.parameter for changed in self.changes]
 
     def shown(self) -> Object:
@@ -110,7 +110,7 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return ChangeSet(self.system_id, (*were.values(), *joined), origin)
 
     def without(self, latest: ChangeSet) -> ChangeSet:
-        """What is left of a step when its latest write, or all of it, has been put back."""
+        """Return the rest of a step after the restore of its latest write, or of all of it."""
         back = {changed.parameter: changed.before for changed in latest.changes}
         left = [
             msgspec.structs.replace(changed, after=back.get(changed.parameter, changed.after))
@@ -137,7 +137,7 @@ class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
     system_id: int
     steps: tuple[ChangeSet, ...] = ()
     changes: tuple[Changed, ...] = ()
-    """Of versions that kept a single step."""
+    """Step of versions that kept a single one."""
 
     @property
     def all(self) -> tuple[ChangeSet, ...]:
@@ -182,7 +182,7 @@ class ChangeLog:
         return StateFile(self._directory / f"undo-{system_id}.json", Undoable, check)
 
     def undos(self) -> list[StateFile[Undoable]]:
-        """Of all vehicles of which there is one."""
+        """List the undo files of all vehicles."""
         try:
             return [self.undo_of(number) for number in numbers_in(self._directory, _UNDO)]
         except StorageError:

@@ -52,7 +52,7 @@ class Mark(NamedTuple):
     value: str
 
 
-class Entry(NamedTuple):
+class SourceItems(NamedTuple):
     """Items, and the marks of their sources."""
 
     marks: dict[str, Mark]
@@ -104,7 +104,7 @@ class FleetItems:
             with contextlib.suppress(sqlite3.Error):
                 connection.close()
 
-    def add(self, aircraft: str, entries: Iterable[Entry], now: str) -> None:
+    def add(self, aircraft: str, entries: Iterable[SourceItems], now: str) -> None:
         """Number and keep the items, and keep the marks; where older items are dropped for room, an event says so."""
         with self._transaction() as db:
             for entry in entries:

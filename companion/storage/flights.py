@@ -14,7 +14,7 @@ from companion.storage.state import StateFile, numbers_in, remove_durably
 logger = logging.getLogger(__name__)
 
 KEEP: Final = 100
-"""Of some 10 kB for each IMU."""
+"""Flights kept, some 10 kB for each IMU."""
 _NAME: Final = re.compile(r"(\d{6,})\.json")
 
 
@@ -39,7 +39,7 @@ class FlightStore:
         return number
 
     def numbers(self) -> list[int]:
-        """All that are there, ascending, whether they can be read or not.
+        """List all numbers, ascending, of unreadable files too.
 
         Raises:
             StorageError: the folder cannot be listed.
@@ -47,7 +47,7 @@ class FlightStore:
         return numbers_in(self.folder, _NAME)
 
     def newest(self, limit: int | None = None) -> dict[int, KeptFlight]:
-        """The latest by their numbers, the newest first; one that cannot be read is logged and passed over.
+        """Return the latest by number, the newest first; an unreadable one is logged and skipped.
 
         Raises:
             StorageError: the folder cannot be listed.

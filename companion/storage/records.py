@@ -107,11 +107,11 @@ class RecordStore:
             return Entry(number, path, None, f"not a readable record: {error}")
 
     def history(self, limit: int | None = None) -> list[Record]:
-        """The latest records, newest first; a file that cannot be read is logged and passed over."""
+        """List the latest records, newest first; an unreadable file is logged and skipped."""
         return list(self.numbered(limit).values())
 
     def numbered(self, limit: int | None) -> dict[int, Record]:
-        """The same by their numbers, by which people ask for one."""
+        """Return the latest records by number, newest first; an unreadable file is logged and skipped."""
         records: dict[int, Record] = {}
         entries = self.entries()
         while (limit is None or len(records) < limit) and (entry := next(entries, None)) is not None:
@@ -122,7 +122,7 @@ class RecordStore:
         return records
 
     def trace(self, entry: Entry) -> Trace | None:
-        """What was seen during a calibration; None where nothing was kept.
+        """Read the trace of a calibration; None: nothing was kept.
 
         Raises:
             StorageError: it is there and cannot be read, or is another record's.

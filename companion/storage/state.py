@@ -86,7 +86,7 @@ MOST_ASIDE: Final = 3
 """The most set-aside files of each name; the last one makes room."""
 
 UNREADABLE: Final = (ValueError, RecursionError, OverflowError, msgspec.MsgspecError)
-"""What reading any bytes as JSON of a type may raise."""
+"""Errors of reading any bytes as JSON of a type."""
 
 _SEAL: Final = re.compile(rb',\s*"sha256":\s*"([0-9a-f]{64})"\s*\}\s*\Z')
 _SEAL_BYTES: Final = 120
@@ -127,7 +127,7 @@ def named_in(folder: Path, kind: re.Pattern[str]) -> list[str]:
 
 
 def numbers_in(folder: Path, kind: re.Pattern[str]) -> list[int]:
-    """The same of numbers, ascending; raises as well."""
+    """Return the numbers in such names, ascending; raises as `named_in`."""
     return sorted(map(int, named_in(folder, kind)))
 
 
@@ -172,10 +172,10 @@ class StateFile(Generic[T]):
         self.path, self._mode = path, mode
         self._kind, self._check, self._newest = kind, check, newest
         self.unusable: str | None = None
-        """What `take` has met last, in one line; None where all was well."""
+        """Error of the last `load`, in one line; None: there was none."""
 
     def read(self) -> T | None:
-        """What is kept, if anything.
+        """Read the file; None: there is none.
 
         Raises:
             StorageError: it cannot be used: where and why, in one line.
@@ -197,7 +197,7 @@ class StateFile(Generic[T]):
         return found
 
     def load(self) -> T | None:
-        """What is kept, for the daemon: what cannot be used is set aside, said once, and counts as nothing."""
+        """Read the file for the daemon: an unusable one is set aside, logged, and counts as none."""
         self.unusable = None
         try:
             return self.read()
@@ -207,7 +207,7 @@ class StateFile(Generic[T]):
             return None
 
     def write(self, value: T) -> None:
-        """Keep this in the place of what was kept.
+        """Replace the content.
 
         Raises:
             StorageError: it could not be written, or is nothing that may be; what was there before still is.
@@ -221,7 +221,7 @@ class StateFile(Generic[T]):
         write_atomically(self.path, data, mode=self._mode)
 
     def clear(self) -> None:
-        """Keep nothing any more.
+        """Remove the file.
 
         Raises:
             StorageError: the file could not be removed.
@@ -272,7 +272,7 @@ class BoundedList(Generic[T]):
         self.write([*self.read(), entry][-self._keep :])
 
     def write(self, entries: list[T]) -> None:
-        """Keep these in the place of what was kept.
+        """Replace the entries.
 
         Raises:
             StorageError: they could not be written.

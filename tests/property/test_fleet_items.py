@@ -19,16 +19,16 @@ from hypothesis import strategies as st
 from companion.config.sections import Location
 from companion.errors import StorageError
 from companion.mqtt import fleet_wire as wire
-from companion.storage.fleet_items import FILE, Entry, FleetItems, Item, Mark, Waiting
+from companion.storage.fleet_items import FILE, FleetItems, Item, Mark, SourceItems, Waiting
 from tests.support.extent import extent
 from tests.support.fleet import CRANE, HERON
 
 AT = "2026-05-01T00:00:00.000Z"
 
 
-def entry(number: int, size: int = 300) -> Entry:
+def entry(number: int, size: int = 300) -> SourceItems:
     body = json.dumps({"number": number, "more": "x" * size}).encode()
-    return Entry({f"thing/{number}": Mark("", str(number))}, [Item("arming", AT, "unknown", body)])
+    return SourceItems({f"thing/{number}": Mark("", str(number))}, [Item("arming", AT, "unknown", body)])
 
 
 def told(items: FleetItems) -> list[tuple[int, int]]:
@@ -90,13 +90,13 @@ def test_a_log_with_rubbish_behind_any_byte_leaves_whole_writes(
 KILLED = """
 import sys
 from pathlib import Path
-from companion.storage.fleet_items import Entry, FleetItems, Item, Mark
+from companion.storage.fleet_items import SourceItems, FleetItems, Item, Mark
 items = FleetItems(Path(sys.argv[1]))
 number = len(items.marks("thing/"))
 while True:
     number += 1
     item = Item("arming", "", "unknown", b'{"number": %d, "more": "%s"}' % (number, b"x" * 9000))
-    items.add(sys.argv[2], [Entry({f"thing/{number}": Mark("", str(number))}, [item])], "")
+    items.add(sys.argv[2], [SourceItems({f"thing/{number}": Mark("", str(number))}, [item])], "")
     items.confirm(sys.argv[2], items.aircraft()[0].epoch, [(1, number // 2)], "")
     print(number, flush=True)
 """
