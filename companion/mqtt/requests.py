@@ -59,23 +59,23 @@ class Request(msgspec.Struct):
 def parse(command: str, payload: bytes) -> Request:
     """Judge a request's payload: a JSON object with known keys, or nothing. Never raises."""
 
-    def refused(reason: str, transaction: Transaction = None) -> Request:
+    def unfit(reason: str, transaction: Transaction = None) -> Request:
         return Request(command, transaction, problem=reason)
 
     if command not in KNOWN:
-        return refused(f"unknown request {command!r}; known: {', '.join(KNOWN)}")
+        return unfit(f"unknown request {command!r}; known: {', '.join(KNOWN)}")
     if len(payload) > MAX_PAYLOAD_BYTES:
-        return refused(f"a payload of {len(payload)} bytes; allowed: at most {MAX_PAYLOAD_BYTES}")
+        return unfit(f"a payload of {len(payload)} bytes; allowed: at most {MAX_PAYLOAD_BYTES}")
     try:
         content = msgspec.json.decode(payload) if payload.strip() else {}
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         why = "nested too deeply" if isinstance(error, RecursionError) else str(error)
-        return refused(f"the payload is not JSON: {why}; allowed: a JSON object, or nothing")
+        return unfit(f"the payload is not JSON: {why}; allowed: a JSON object, or nothing")
     if not isinstance(content, dict):
-        return refused(f"the payload is {shown(content)}; allowed: a JSON object, or nothing")
+        return unfit(f"the payload is {shown(content)}; allowed: a JSON object, or nothing")
     transaction = content.pop("transaction", None)
     if not _is_transaction(transaction):
-        return refused(
+        return unfit(
             f"'transaction': found {shown(transaction)}; allowed: a text of at most {MAX_TRANSACTION} characters, or a"
             " whole number"
         )
@@ -85,13 +85,13 @@ def parse(command: str, payload: bytes) -> Request:
         if key not in known:
             near = difflib.get_close_matches(key[:MAX_SHOWN], known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(('transaction', *known))}"
-            return refused(f"unknown key {shown(key)}; {hint}", transaction)
+            return unfit(f"unknown key {shown(key)}; {hint}", transaction)
         if value is None:
-            return refused(f"{key!r}: found null; allowed: {known[key].allowed}", transaction)
+            return unfit(f"{key!r}: found null; allowed: {known[key].allowed}", transaction)
     try:
         kind.read(content)
     except CalibrationRefusedError as error:
-        return refused(str(error), transaction)
+        return unfit(str(error), transaction)
     return Request(command, transaction, content)
 
 

@@ -28,6 +28,7 @@ NOT_FOR_PEOPLE = {
     # Command lines that cannot be read are answered at once, with what is allowed.
     "ArgumentTypeError",
     # What a request over MQTT found, and what is allowed.
+    "unfit",
     # Expressions and templates of other tools.
     "compile", "Formatter", "JournalFormatter", "OneLineFormatter",
     # Reasons beside the parameters that `companion autopilot-setup` prints.

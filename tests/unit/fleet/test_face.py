@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import datetime
 import json
 import os
@@ -574,26 +573,6 @@ def test_a_damaged_file_is_set_aside_and_all_is_told_anew(tmp_path: Path, damage
         one, two = {item["epoch"] for item in collector.database.values()}
         bodies = [[item["body"] for key, item in sorted(collector.database.items()) if key[1] == e] for e in (one, two)]
         assert bodies[0] == bodies[1]
-
-    virtually(main())
-
-
-def test_damage_within_an_item_is_no_end(tmp_path: Path) -> None:
-    keep(tmp_path, 0)
-
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path)
-        async with aircraft.running() as face:
-            await asyncio.sleep(15.0)
-            face._items.close()
-            with contextlib.closing(sqlite3.connect(tmp_path / fleet_items.FILE, isolation_level=None)) as db:
-                db.execute("UPDATE item SET body = x'ff00'")
-            sent: list[bytes] = []
-            aircraft.collector.take = lambda topic, payload: sent.append(payload)  # type: ignore[method-assign]
-            aircraft.connection.connect()
-            await asyncio.sleep(10.0)
-            assert json.loads(sent[-1])["body"] == {}
-            assert face.status()["good"] is True
 
     virtually(main())
 

@@ -61,13 +61,6 @@ def test_a_damaged_one_is_passed_over_with_a_line(tmp_path: Path, caplog: pytest
     assert store.read(7) is None
 
 
-def test_what_could_not_be_read_again_is_not_written(tmp_path: Path) -> None:
-    imu = imu_flight(drifts={"flown": (0.4, float("nan"))})
-    with pytest.raises(StorageError, match=r"\(000001\.json\)"):
-        FlightStore(tmp_path).save(kept_flight("1", imu))
-    assert not (tmp_path / "flights").exists()
-
-
 def test_the_history_tells_the_figure_of_each(tmp_path: Path) -> None:
     told = [
         {"number": 12, **msgspec.to_builtins(kept_flight())},
