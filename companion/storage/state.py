@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import hashlib
 import logging
 import os
 import re
 import stat
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
@@ -282,3 +283,32 @@ class BoundedList(Generic[T]):
 
 def _listed(found: _Entries[T] | list[T] | None) -> list[T]:
     return found.entries if isinstance(found, _Entries) else found or []
+
+
+@contextlib.contextmanager
+def only_daemon(directory: Path) -> Iterator[None]:
+    """Hold a storage directory for this process; the kernel releases it however the process ends.
+
+    Two daemons would read each other's journal as an interrupted write. The directory itself is locked, so that no
+    file has to be there. Where it can be neither made nor locked (a network file system), the daemon goes on without.
+
+    Raises:
+        StorageError: another daemon holds it.
+    """
+    try:
+        directory.mkdir(exist_ok=True)
+        descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        yield  # the ledger says why nothing can be kept, and nothing is written
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise StorageError(f"{directory}: another daemon works with this directory") from None
+    except OSError as error:
+        logger.warning("%s: cannot be locked: %s; run one daemon only", directory, error.strerror or error)
+    try:
+        yield
+    finally:
+        os.close(descriptor)

@@ -21,7 +21,7 @@ from companion.daemon.recorder.recorder import Recorder
 from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.transport import run_transport
-from companion.storage.lock import only_daemon
+from companion.storage.state import only_daemon
 
 if TYPE_CHECKING:
     from companion.daemon.faces.child import StartChild

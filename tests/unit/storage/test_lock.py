@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from companion.errors import StorageError
-from companion.storage.lock import only_daemon
+from companion.storage.state import only_daemon
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from companion.storage.lock import only_daemon
+from companion.storage.state import only_daemon
 with only_daemon(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600.0)

@@ -18,9 +18,8 @@ from companion.estimation.collector.trace import Trace
 from companion.estimation.records.record import GyroPrior, ImuRecord, Prior, Record, WrittenParameter, to_json
 from companion.storage import records as records_module
 from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
-from companion.storage.lock import only_daemon
 from companion.storage.records import RecordStore
-from companion.storage.state import remove_durably, write_atomically
+from companion.storage.state import only_daemon, remove_durably, write_atomically
 
 
 def _record(reason: str) -> Record:
