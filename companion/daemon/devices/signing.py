@@ -32,8 +32,6 @@ ASK_AGAIN_S: Final = 30.0
 """Pause before an autopilot that has answered is asked again."""
 AFTER_S: Final = 3.0
 """Time without a verified message before a fault is reported: longer than a key takes to be changed."""
-REPEAT_S: Final = 60.0
-"""Shortest time between two reports of one fault."""
 AHEAD_OF_CLOCK_S: Final = 86400.0
 """Signature time this far ahead of the system's clock comes from a wrong clock, not from a board without power."""
 
@@ -67,12 +65,10 @@ class LinkSigning:
         self.trouble = ""
         self._stored = signing_time_in(config.storage.path)
         self._reserved = 0
-        self._write_failed = self._setup_reported = False
+        self._write_failed = False
         self._named: set[Reason] = set()
         """Reasons for which a sender other than the autopilot was named."""
         self._fault: _Fault | None = None
-        self._reported_s: dict[_Fault, float] = {}
-        self._fault_reported = False
         self._refused: Counter[Reason] = Counter()
         """Refused messages of the autopilot, or of a sender that claims to be one, since its last verified one."""
         self._verified = False
@@ -85,7 +81,6 @@ class LinkSigning:
             # From the first byte on: messages before the key is read are refused too.
             self.signing = link.signing = Signing(required=self.mode == "require")
             self.signing.on_verified, self.signing.on_refused = self._on_verified, self._on_refused
-        link.subscribe(mavlink.MAVLink_setup_signing_message, self._on_setup)
 
     def load(self) -> None:
         """Read time and key, before anything is sent."""
@@ -149,15 +144,6 @@ class LinkSigning:
 
     # --- messages
 
-    def _on_setup(self, message: mavlink.MAVLink_setup_signing_message, _t_s: float) -> None:
-        if not self._setup_reported:
-            self._setup_reported = True
-            logger.warning(
-                "mavlink: %d/%d sends a signing key over this link in the clear; it is ignored here. Set keys over USB",
-                message.get_srcSystem(),
-                message.get_srcComponent(),
-            )
-
     def _is_autopilot(self, system: int, component: int) -> bool:
         return component == self._vehicle.component_id and self._vehicle.system_id in (None, system)
 
@@ -191,12 +177,9 @@ class LinkSigning:
             return
         self._fault = found
         if found is not None:
-            if now_s - self._reported_s.get(found, -math.inf) >= REPEAT_S:
-                self._reported_s[found], self._fault_reported = now_s, True
-                logger.warning("mavlink: %s", _FAULTS[found])
-                self._say(Severity.WARNING, _FAULTS[found], Weight.NEWS)
-        elif self._fault_reported and (self.signing is not None or self._vehicle.alive):
-            self._fault_reported = False
+            logger.warning("mavlink: %s", _FAULTS[found])
+            self._say(Severity.WARNING, _FAULTS[found], Weight.NEWS)
+        elif self.signing is not None or self._vehicle.alive:
             words = "Autopilot answers again" if self.signing is None else "Autopilot's signatures are right again"
             logger.info("mavlink: %s", words)
             self._say(Severity.NOTICE, words, Weight.NEWS)

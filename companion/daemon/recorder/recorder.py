@@ -105,9 +105,9 @@ class Recorder(Subsystem):
         self._where: Whereabouts | None = None
         self._no_keys = KeyFilter()
         core.link.on_bytes.add(self._on_mavlink)
-        core.on_tick.add(self._on_tick)
+        core.on_tick.add(lambda now_s: self.tape.put(messages.TICK, now_s, b""))
         for sensor in devices.sensors:
-            sensor.on_bytes.add(self._on_serial)
+            sensor.on_bytes.add(lambda name, data, t_s: self.tape.put(messages.SERIAL + name, t_s, data or b""))
         for imu in devices.imus.values():
             imu.on_change.add(partial(self._on_imu, imu))
         devices.ekf_bias.on_read.add(self._on_ekf_bias)
@@ -126,12 +126,6 @@ class Recorder(Subsystem):
             data = self._no_keys(data)
         if self.tape.is_on:
             self.tape.put(messages.MAVLINK, _now_s() if t_s is None else t_s, data or b"")
-
-    def _on_serial(self, name: str, data: bytes | None, t_s: float) -> None:
-        self.tape.put(messages.SERIAL + name, t_s, data or b"")
-
-    def _on_tick(self, now_s: float) -> None:
-        self.tape.put(messages.TICK, now_s, b"")
 
     def _on_imu(self, imu: AutopilotImu) -> None:
         vehicle, kind = self._core.vehicle, imu.stream.kind
@@ -189,7 +183,12 @@ class Recorder(Subsystem):
         try:
             while True:
                 try:
-                    await self._turn()
+                    if self._ring is not None and not self.tape.is_on:
+                        self._begin()
+                    await asyncio.sleep(FLUSH_S)
+                    if self.tape.is_on:
+                        self._note_place()
+                    await self._flush()
                 except Exception:
                     # Whatever it is, it must not take the daemon along.
                     logger.exception("recordings: internal error; none are kept until the next start")
@@ -207,14 +206,6 @@ class Recorder(Subsystem):
                     await self._in_thread(self._ring.close)
                 except StorageError as error:
                     logger.warning("recordings: %s", error)
-
-    async def _turn(self) -> None:
-        if self._ring is not None and not self.tape.is_on:
-            self._begin()
-        await asyncio.sleep(FLUSH_S)
-        if self.tape.is_on:
-            self._note_place()
-        await self._flush()
 
     def _begin(self) -> None:
         self._note_place()
@@ -267,11 +258,6 @@ class Recorder(Subsystem):
             if (error := task.exception()) is not None:
                 logger.debug("recordings: %s", error)
             raise
-        except StorageError:
-            raise
-        except Exception as error:
-            logger.exception("recordings: internal error")
-            raise StorageError(INTERNAL) from error
 
     async def _flush_file(self, recording: _OnRequest, batch: list[Message], beginning: Beginning) -> None:
         try:
@@ -321,29 +307,20 @@ class Recorder(Subsystem):
     async def _start(self, name: str | None, seconds: float | None) -> _OnRequest:
         if not is_available():
             raise StorageError(HOW_TO_INSTALL)
-        self._refuse_second()
-        loop = asyncio.get_running_loop()
-        path = Path(name) if name is not None else await self._offload(unused_path, self._folder)
-        file = await self._offload(create_on_request, path)
-        try:
-            self._refuse_second()  # somebody may have been quicker
-        except StorageError:
-            await self._offload(file.close)
-            raise
-        now_s = loop.time()
-        until_s = None if seconds is None else now_s + seconds
-        recording = self._on_request = _OnRequest(
-            file, self.tape.lost_in_all, now_s, until_s, MOST_BYTES[seconds is None], loop.create_future()
-        )
+        async with self._flushing:
+            if self._on_request is not None:
+                path = self._on_request.file.path
+                raise StorageError(f"already recording to {path}; end it with: companion record --stop")
+            path = Path(name) if name is not None else await self._offload(unused_path, self._folder)
+            file, now_s = await self._offload(create_on_request, path), _now_s()
+            ended: asyncio.Future[Object] = asyncio.get_running_loop().create_future()
+            until_s, most_bytes = None if seconds is None else now_s + seconds, MOST_BYTES[seconds is None]
+            recording = _OnRequest(file, self.tape.lost_in_all, now_s, until_s, most_bytes, ended)
+            self._on_request = recording
         if not self.tape.is_on:
             self._begin()
         logger.info("recording to %s", path)
         return recording
-
-    def _refuse_second(self) -> None:
-        if self._on_request is not None:
-            path = self._on_request.file.path
-            raise StorageError(f"already recording to {path}; end it with: companion record --stop")
 
     async def _end(self, recording: _OnRequest, why: str, state: str = "done") -> None:
         self._on_request = None
