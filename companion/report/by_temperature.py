@@ -62,6 +62,7 @@ def _figure(imu: ByTemperature, triad: Triad, when: str) -> Markup | None:
             across,
             svg.linear([*ends, *([now.gyro_deg_h[axis]] if now else [])], ticks=3),
             name=f"IMU {imu.imu}, {NAMES[triad].lower()} {AXES[axis]}: bias by temperature",
+            told=f"{len(dots)} points, {min(b for _, b, _ in dots):+.1f} to {max(b for _, b, _ in dots):+.1f}.",
             height=110.0,
             x_label="temperature of the IMU, degC" if axis == 2 else "",
             y_label=_label(imu, triad, axis, when),
