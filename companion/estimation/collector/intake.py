@@ -83,10 +83,8 @@ class Source:
         # A slow pose sensor's last batch counts for a short while.
         first, batches = slot if self.kind == "imu" else slot - _CARRY, self.batches.batches
         batch = next((batches[at] for at in range(slot, first - 1, -1) if at in batches), None)
-        if self.settling is not None:
-            own = batch if batch is not None and batch.slot == slot else None
-            if not self.settling.judge(slot, own, moved=moved):
-                self.unsettled.append(slot)
+        if self.settling is not None and not self.settling.judge(slot, moved=moved):
+            self.unsettled.append(slot)
         if batch is None:
             # Before the first whole second there is nothing to complain about.
             words = f"{self.label} was silent for a second" if batches else ""
@@ -222,5 +220,5 @@ class PoseSource(Source):
         circle = kind == "compass"
         batches = BatchSource(_LIMITS_HEADING if circle else _LIMITS_TILT, keep, circle=circle)
         super().__init__(kind, kind, batches, PoseGate(kind), may_move=may_move)
-        self.settling = None if model is None else Settling(model.lag_s, model.sigma_deg, circle=circle)
+        self.settling = None if model is None else Settling(model.lag_s, model.sigma_deg)
         self.unsettled = deque(maxlen=keep)

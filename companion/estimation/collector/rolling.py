@@ -23,7 +23,6 @@ from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.seconds.batch import Batch
 from companion.estimation.seconds.counting import TurnCounter
 from companion.estimation.stillness.gates import Verdict
-from companion.estimation.stillness.stretch import HeadingWatch
 from companion.estimation.turning.watch import Turn, TurnWatch
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
@@ -66,7 +65,6 @@ class RollingCollector:
         self._heading = None if compass is None else self._pose_source("compass")
         self._field = None if compass is None else FieldHeading(compass, gradienter, self._keep)
         self._turns = TurnWatch(settings.max_slots)
-        self._watch = HeadingWatch()
         self._next: int | None = None
         self._now_s = -math.inf
         self._trace = TraceLog()
@@ -209,7 +207,7 @@ class RollingCollector:
     @property
     def wander_deg(self) -> float | None:
         """Wander of the heading since the aircraft last moved; None until that is known."""
-        return self._watch.wander_deg
+        return self._turns.wander_deg
 
     def imu_seconds(self) -> dict[str, Batch]:
         """Return the last whole second of each IMU that has one, still or not."""
@@ -352,8 +350,6 @@ class RollingCollector:
         for source in sources:  # the IMUs first: they say whether it moved
             good = source.judge(slot, moved=moved) and good
             moved = moved or (source.kind == "imu" and not source.verdict.still and not source.verdict.fault)
-        if self._heading is not None:
-            self._watch.add_second(self._heading.batches.batches.get(slot), self._others())
         self._trace.add(slot, sources, good=good)
         if not self._windows.add(slot, good=good):
             self._break()
@@ -369,7 +365,7 @@ class RollingCollector:
         if self._windows.may_move or any(verdict.fault for verdict in others):
             return True
         if not all(verdict.still for verdict in others):
-            self._turns.moved(slot)
+            self._turns.moved()
             return True
         heading = None if self._heading is None else next(iter(self._heading.settled([slot])), None)
         imus = {name: source.batches.batches[slot] for name, source in self.imus.items()}

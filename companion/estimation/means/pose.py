@@ -17,8 +17,7 @@ import numpy as np
 
 from companion.estimation.noise.allan import white_noise
 from companion.estimation.noise.robust import huber_mean
-from companion.estimation.seconds.batch import Batch, BatchSource
-from companion.estimation.seconds.resolution import decimal, few_distinct
+from companion.estimation.seconds.batch import Batch, BatchSource, decimal, few_distinct
 from companion.physics.frames import Array, Floats, Matrix, body_from_ned, roll_pitch_from_up, vector
 from companion.physics.gradienter import Law, up_in_sensor
 from companion.physics.magnetic import heading_rad

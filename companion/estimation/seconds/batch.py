@@ -1,8 +1,8 @@
 """One-second batches: all that is kept of a stream.
 
-Batches lie on one grid for all sources (slot k holds k <= t < k + 1 s of the host's clock), so that a slot of one
-IMU and the same slot of the gradienter speak of the same second. Samples are plain tuples until a slot is over;
-then numpy looks at them once.
+Batches lie on one grid for all sources: slot k holds k <= t < k + 1 s of the host's clock, so that the same slot of an
+IMU and of the gradienter means the same second. Samples are plain tuples until a slot is over; then numpy summarises
+them once.
 """
 
 from __future__ import annotations
@@ -19,25 +19,34 @@ from numpy.typing import NDArray
 
 from companion.physics.frames import Floats
 
+MAX_SAMPLES: Final = 4096
+"""Samples kept of one slot, ten times the fastest stream; more are dropped and counted."""
 MAX_LEVELS: Final = 1024
-"""Integers between the lowest and the highest of one second that are counted one by one; at rest it is a tenth."""
+"""Largest range of integers within one second that are counted one by one; at rest it is a tenth of that."""
 
 _EVEN: Final = 1.4999
-"""Steps of a counter that are all within so much of each other are one step each, whatever the usual one is."""
+"""Counter steps within this ratio of each other are one sample each."""
 _OFF_BEAT: Final = 0.25
 """A step farther from a whole number of usual ones is no loss: lost samples leave whole steps out."""
 _MOST_OFF_BEAT: Final = 0.2
-"""Stamps of which a larger share does so count nothing: a sender that picks now this, now that sample."""
+"""With a larger share of such steps the stamps do not count samples: the sender picks some of them."""
 _LEAST_OF_A_PART: Final = 4
 _FINEST: Final = 5
 """Halvings of a second: 1/32 s; what is faster is vibration."""
 _PINNED_SIGMAS: Final = 4.0
 _PINNED_SAMPLES: Final = 5
 _PINNED_DISTINCT: Final = 8
+_MAX_TIME_S: Final = 1e12
+_BACKWARD_SAMPLES: Final = 20
+"""So many samples in a row from the past show that the clock went back, not that some were late."""
+_BACKWARD_S: Final = 2.0
+_PAUSE_S: Final = 3.0
+"""A sensor that was silent for longer may have been switched off."""
+_MAX_DECIMALS: Final = 4
 
 
 class Counts(msgspec.Struct, frozen=True):
-    """How often every integer came in one second."""
+    """Histogram of the integers of one second."""
 
     lowest: NDArray[np.int64]
     """(c,) integer of the first row, in steps of the stream."""
@@ -46,15 +55,15 @@ class Counts(msgspec.Struct, frozen=True):
 
 
 class Batch(msgspec.Struct, frozen=True):
-    """What one source said in one second; arrays are (c,) over its channels, in the source's units."""
+    """One second of one source; arrays are (c,) over its channels, in the source's units."""
 
     slot: int
     n: int
     mean: Floats
     variance: Floats
-    """Of one sample, n - 1 in the denominator; zero for a single sample."""
+    """Variance of one sample, n - 1 in the denominator; zero for a single sample."""
     white: Floats
-    """Half the mean square of successive differences (von Neumann): the part of the variance that is white."""
+    """Half the mean square of successive differences (von Neumann): the white part of the variance."""
     low: Floats
     high: Floats
     distinct: NDArray[np.int64]
@@ -63,14 +72,14 @@ class Batch(msgspec.Struct, frozen=True):
     largest_gap_s: float
     """Between samples, and to both ends of the slot."""
     missing: int | None
-    """By the device's sequence counter or clock; None where it has neither, or one that does not count samples."""
+    """Samples lost, by the device's sequence counter or clock; None where it has none that counts samples."""
     temperature_degc: float | None
     counts: Counts | None = None
-    """Of a stream of integers; None for floats, and for a second that spans more than `MAX_LEVELS`."""
+    """None for a stream of floats, and for a second that spans more than `MAX_LEVELS`."""
     allan: Floats = np.zeros((0, 0))
     """(k, c) Allan variances at averaging times of 1/2, 1/4 ... 1/32 of the second, each of four samples or more."""
     shared_variance: Floats = np.zeros(6)
-    """(6,) of an IMU: of an error that its samples, and those of other seconds, have in common."""
+    """(6,) variance of an error that all samples of an IMU, also of other seconds, have in common."""
 
 
 def summary(
@@ -82,31 +91,31 @@ def summary(
     *,
     circle: bool = False,
     steps: Floats | None = None,
+    shared_variance: Floats | None = None,
 ) -> Batch:
-    """What (n, c) rows of one second, at least one, say; those of an angle are unrolled, `steps` are of integers."""
+    """Summarise (n, c) rows of one second, at least one; angles are unrolled, `steps` are those of integers."""
     n = len(rows)
     ordered = np.sort(rows, axis=0)
     distinct = 1 + (ordered[1:] != ordered[:-1]).sum(axis=0)
     # The very sums of `mean` and `var`, each once.
     centre = np.add.reduce(rows, axis=0) / n
     off, successive = rows - centre, rows[1:] - rows[:-1]
-    gaps = times[1:] - times[:-1]
-    edges = float(times[0]) - float(slot), slot + 1.0 - float(times[-1])
     return Batch(
         slot=slot,
         n=n,
         mean=np.mod(centre, 360.0) if circle else centre,
-        variance=np.add.reduce(off * off, axis=0) / (n - 1) if n > 1 else np.zeros(rows.shape[1]),
-        white=np.add.reduce(successive * successive, axis=0) / (n - 1) / 2.0 if n > 1 else np.zeros(rows.shape[1]),
+        variance=np.add.reduce(off * off, axis=0) / max(n - 1, 1),
+        white=np.add.reduce(successive * successive, axis=0) / max(n - 1, 1) / 2.0,
         low=ordered[0],
         high=ordered[-1],
         distinct=np.asarray(distinct, dtype=np.int64),
-        clipped=is_clipped(ordered, distinct),
-        largest_gap_s=max(*edges, float(gaps.max()) if n > 1 else 0.0),
-        missing=None if stamps is None else missing_of(stamps),
+        clipped=_is_clipped(ordered, distinct),
+        largest_gap_s=float(np.diff(times, prepend=slot, append=slot + 1.0).max()),
+        missing=None if stamps is None else _missing(stamps),
         temperature_degc=temperature_degc,
-        counts=None if steps is None else counts_of(rows, steps),
+        counts=None if steps is None else _counts(rows, steps),
         allan=_allan_within(off),
+        shared_variance=np.zeros(6) if shared_variance is None else shared_variance,
     )
 
 
@@ -125,14 +134,13 @@ def _allan_within(off: Floats) -> Floats:
 
 @functools.lru_cache(maxsize=64)
 def _parts_of(n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Where the finest parts of n samples begin, (k,), and how many each has, (k, 1); k is a power of two."""
+    """Divide n samples into k parts, a power of two: first sample of each, (k,), and its number of samples, (k, 1)."""
     depth = min(max(int(math.log2(n / _LEAST_OF_A_PART)), 0), _FINEST)
     edges = np.arange((1 << depth) + 1) * n >> depth
     return edges[:-1], np.diff(edges)[:, None]
 
 
-def counts_of(rows: Floats, steps: Floats) -> Counts | None:
-    """How often every integer came in (n, c) rows of so large steps; None where they span too much."""
+def _counts(rows: Floats, steps: Floats) -> Counts | None:
     integers = np.rint(rows / steps).astype(np.int64)
     lowest = integers.min(axis=0)
     place = integers - lowest
@@ -145,7 +153,7 @@ def counts_of(rows: Floats, steps: Floats) -> Counts | None:
 
 
 def unrolled(rows: Floats) -> Floats:
-    """Angles in degrees, continued across north from the first finite one."""
+    """Unroll angles in degrees, (n, 1), from the first finite one."""
     finite = rows[np.isfinite(rows[:, 0]), 0]
     if len(finite) == 0:
         return rows
@@ -153,26 +161,22 @@ def unrolled(rows: Floats) -> Floats:
         return np.asarray(finite[0] + np.mod(rows - finite[0] + 180.0, 360.0) - 180.0)
 
 
-def first_of_each(stamps: Floats, rows: Floats) -> NDArray[np.bool_] | None:
-    """False for a row whose stamp and values were already seen: the same packet over a second route; None: none was.
+def _fresh(stamps: Floats, rows: Floats) -> NDArray[np.bool_]:
+    """Mark rows, (n,), that do not repeat an earlier stamp and its values: the same packet over a second route.
 
     A stamp alone is not enough: counters wrap, and some devices' clocks stand still.
     """
     if (stamps[1:] > stamps[:-1]).all():
-        return None
-    _, first, inverse = np.unique(stamps, return_index=True, return_inverse=True)
-    if len(first) == len(stamps):
-        return None
-    original = first[inverse]
-    fresh = np.asarray((original == np.arange(len(stamps))) | (rows != rows[original]).any(axis=1))
-    return None if fresh.all() else fresh
+        return np.ones(len(rows), dtype=np.bool_)
+    _, first = np.unique(np.column_stack((stamps, rows)), axis=0, return_index=True)
+    return np.isin(np.arange(len(rows)), first)
 
 
-def missing_of(stamps: Floats) -> int | None:
-    """Samples that a counter says were lost; a clock in seconds counts in its own steps just as well.
+def _missing(stamps: Floats) -> int | None:
+    """Count lost samples by a counter; a clock in seconds counts in its own steps just as well.
 
-    The step is learned (some devices count at an internal rate), and going down, as after a restart, is nobody's loss.
-    None where the stamps count no samples: PX4's telemetry takes those of 4 ms that are there when a message is due.
+    The step is learned, since some devices count at an internal rate; a step down, as after a restart, is no loss.
+    None where stamps count no samples: PX4's telemetry takes those of 4 ms that are there when a message is due.
     """
     steps = stamps[1:] - stamps[:-1]
     steps = steps[steps > 0]
@@ -185,12 +189,12 @@ def missing_of(stamps: Floats) -> int | None:
     return int((whole - 1.0).sum())
 
 
-def is_clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
+def _is_clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
     """Whether some channel's lowest or highest value is by far its commonest.
 
-    Noise thins out towards its ends; a pile at an end is the end of the range. Few distinct values prove nothing:
-    a quantised stream of a still sensor looks like that. And of 50 integers the lowest is the commonest by chance now
-    and then, so that it must be so by four standard deviations of such counts.
+    Noise thins out towards its ends; a pile at an end is the end of the range. Few distinct values prove nothing: a
+    quantised stream of a still sensor looks like that. Of 50 integers the lowest is now and then the commonest by
+    chance, so the pile must exceed the next by four standard deviations of such counts.
     """
     if len(ordered) <= _PINNED_SAMPLES:
         return False
@@ -207,22 +211,26 @@ def is_clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
     return False
 
 
-MAX_SAMPLES: Final = 4096
-"""Kept of one slot; what comes beyond is dropped and counted. Ten times the fastest stream."""
+def decimal(low: Floats, high: Floats) -> Floats:
+    """Find the last decimal that a stream prints, (c,), by the lowest and highest readings of any seconds, (..., c)."""
+    ends = np.vstack((low, high))
+    found = np.full(ends.shape[1], 10.0**-_MAX_DECIMALS)
+    for digits in range(_MAX_DECIMALS - 1, -1, -1):
+        fits = np.abs(ends - np.round(ends, digits)).max(axis=0) < 1e-9
+        found = np.where(fits, 10.0**-digits, found)
+    return found
 
-_MAX_TIME_S: Final = 1e12
-_BACKWARD_SAMPLES: Final = 20
-"""Samples in a row from the past that mean that the clock went back, not that some were late."""
-_BACKWARD_S: Final = 2.0
-_PAUSE_S: Final = 3.0
-"""A sensor that was silent for longer may have been switched off."""
+
+def few_distinct(distinct: Floats | NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(c,) whether no second, (m, c), shows more than two values: then noise does not spread the readings."""
+    return np.asarray(distinct.max(axis=0) < 3)
 
 
 class BatchSource:
     """Collects one stream into batches. Never raises on what arrives; counts what it drops by reason.
 
-    Beyond `limits` (c,), absolute values, nothing is believed; `keep` batches are kept. `circle`: the single channel
-    is an angle in degrees. `steps` (c,) are of a stream of integers, of which every second keeps how often each came.
+    Values beyond `limits` (c,) are dropped; `keep` batches are kept. `circle`: the single channel is an angle in
+    degrees. `steps` (c,): resolution of a stream of integers, whose histogram every second keeps.
     """
 
     def __init__(
@@ -231,29 +239,33 @@ class BatchSource:
         self.dropped: Counter[str] = Counter()
         self.batches: dict[int, Batch] = {}
         self.closed_through: int | None = None
-        """No batch of this slot or an earlier one will come any more."""
+        """No batch of this slot or an earlier one will follow."""
         self.last_s: float | None = None
         self.begun: int | None = None
-        """The second since which it has come without a longer pause."""
+        """First second without a longer pause since."""
         self.lost = 0
-        """Samples that never came, by the device's counter or clock, since the beginning."""
+        """Samples lost since the beginning, by the device's counter or clock."""
         self.restarts = 0
         """How often the clock went back and everything was dropped."""
         self._limits, self._keep, self._circle, self.steps = np.asarray(limits), keep, circle, steps
         self.believed: Callable[[int, float | None], float | None] = lambda slot, degc: degc
-        """What of the temperature of a second is believed."""
+        """Filter of a second's temperature."""
         self.on_second: Callable[[Batch, Floats, Floats], None] | None = None
-        """Told of every second, its times (n,) and its rows (n, c), before those are dropped."""
+        """Called with every second, its times (n,) and its rows (n, c), before those are dropped."""
         self._restart()
 
     def _restart(self) -> None:
         self._slot: int | None = None
         self._slot_start = self._slot_end = -math.inf
         self._newest = -_MAX_TIME_S
-        self._partial = True
         self._backward = 0
-        self._last_stamp = math.nan
         self._heard_s = -math.inf
+        self._skip_rest()
+
+    def _skip_rest(self) -> None:
+        """Drop the second under way, the rest of it included."""
+        self._partial = True
+        self._last_stamp = math.nan
         self._clear()
 
     def _clear(self) -> None:
@@ -264,14 +276,11 @@ class BatchSource:
         self._shared_variance: tuple[float, ...] | None = None
 
     def forget(self) -> None:
-        """Drop all batches and the second under way; what was counted stays."""
+        """Drop all batches and the second under way; counts stay."""
         self.batches.clear()
         if self._slot is not None:
             self.closed_through = self._slot
-        # The rest of the running second may still hold what is to be forgotten, so it is skipped.
-        self._partial = True
-        self._last_stamp = math.nan
-        self._clear()
+        self._skip_rest()
 
     def add(
         self,
@@ -281,14 +290,13 @@ class BatchSource:
         stamp: float | None = None,
         shared_variance: tuple[float, ...] | None = None,
     ) -> bool:
-        """Take one sample; True when a second has ended with it, or its clock is found to have gone back."""
+        """Add one sample; True when it ends a second, or shows that its clock went back."""
         ended = False
         if not self._newest <= t_s < self._slot_end:
             if not self._newest <= t_s < _MAX_TIME_S:
                 return self._from_the_past(t_s)
             ended = self._open(math.floor(t_s))
-        self._newest = t_s
-        self.last_s = t_s
+        self._newest = self.last_s = t_s
         self._backward = 0
         if len(self._rows) >= MAX_SAMPLES:
             self.dropped["too many a second"] += 1
@@ -313,9 +321,8 @@ class BatchSource:
         self.restarts += 1
         self.batches.clear()
         self.closed_through = math.floor(t_s)
-        self.last_s = t_s
         self._restart()
-        self._newest = t_s
+        self._newest = self.last_s = t_s
         return True
 
     def _open(self, slot: int) -> bool:
@@ -332,9 +339,8 @@ class BatchSource:
         """Close the second under way if it ended before `t_s`; True when it did."""
         if self._slot is None or not self._slot_end <= t_s < _MAX_TIME_S:
             return False
-        slot = math.floor(t_s)
-        self._open(slot)
-        # Whatever still comes from before is late now.
+        self._open(math.floor(t_s))
+        # A sample from before is late now.
         self._newest = max(self._newest, self._slot_start)
         return True
 
@@ -344,32 +350,28 @@ class BatchSource:
                 self.begun = math.floor(self._times[0])
             self._heard_s = self._times[-1]
         if self._slot is not None and self._rows and not self._partial:
-            batch = self._summarise(self._slot)
-            if batch is not None:
-                self.batches[batch.slot] = batch
-                while len(self.batches) > self._keep:
-                    del self.batches[next(iter(self.batches))]
+            self._summarise(self._slot)
         self._clear()
 
-    def _summarise(self, slot: int) -> Batch | None:
+    def _summarise(self, slot: int) -> None:
         times, rows = np.array(self._times), np.array(self._rows, dtype=np.float64)
         stamps = None if None in self._stamps else np.array(self._stamps, dtype=np.float64)
         if self._circle:
             rows = unrolled(rows)
         # NaN compares false, so this drops it too.
-        believable = np.abs(rows) <= self._limits
-        if not believable.all():
-            sound = believable.all(axis=1)
-            self.dropped["not a believable number"] += int((~sound).sum())
-            rows, times = rows[sound], times[sound]
-            stamps = None if stamps is None else stamps[sound]
-        if stamps is not None and (fresh := first_of_each(stamps, rows)) is not None:
-            self.dropped["repeated"] += int((~fresh).sum())
-            rows, times, stamps = rows[fresh], times[fresh], stamps[fresh]
-        if len(rows) == 0:
-            return None
+        good = np.asarray((np.abs(rows) <= self._limits).all(axis=1))
+        if not good.all():
+            self.dropped["not a believable number"] += int((~good).sum())
         if stamps is not None:
-            self.lost += missing_of(np.concatenate(((self._last_stamp,), stamps))) or 0
+            fresh = _fresh(stamps, np.where(good[:, None], rows, 0.0))
+            if (repeated := int((good & ~fresh).sum())) > 0:
+                self.dropped["repeated"] += repeated
+            good &= fresh
+        times, rows = times[good], rows[good]
+        if len(rows) == 0:
+            return
+        if stamps is not None:
+            stamps = np.append(self._last_stamp, stamps[good])
             self._last_stamp = stamps[-1]
         batch = summary(
             slot,
@@ -379,9 +381,11 @@ class BatchSource:
             self.believed(slot, sum(self._degc) / len(self._degc) if self._degc else None),
             circle=self._circle,
             steps=self.steps,
+            shared_variance=None if self._shared_variance is None else np.array(self._shared_variance),
         )
-        if self._shared_variance is not None:
-            batch = msgspec.structs.replace(batch, shared_variance=np.array(self._shared_variance))
+        self.lost += batch.missing or 0
+        self.batches[slot] = batch
+        while len(self.batches) > self._keep:
+            del self.batches[next(iter(self.batches))]
         if self.on_second is not None:
             self.on_second(batch, times, rows)
-        return batch

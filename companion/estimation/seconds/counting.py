@@ -1,8 +1,8 @@
-"""By how much an aircraft was turned on its spot: its gyros, sample by sample, integrated as rotations.
+"""Turn of an aircraft on its spot: its gyros, sample by sample, integrated as rotations.
 
-Hands that turn an aircraft tilt it too. Where that is some 4 deg, rates about down alone miss half a turn by 0.5 deg,
-and where it is 12, by 5; all three axes together by 0.05 and 0.1 (simulated: scales of 1 %, axes 0.5 deg from square).
-What is left is the gyros' scale, 1.8 deg of half a turn, which closing the circle tells (`alignment.align_model`).
+Hands that turn an aircraft tilt it too. With a tilt of 4 deg, rates about down alone miss half a turn by 0.5 deg, with
+12 deg by 5; all three axes together miss it by 0.05 and 0.1 (simulated: scales of 1 %, axes 0.5 deg from square). The
+gyros' scale remains, 1.8 deg of half a turn; closing the circle shows it (`alignment.align_model`).
 """
 
 from __future__ import annotations
@@ -17,34 +17,34 @@ from companion.physics.frames import Array, Floats, Matrix, rotations, running_p
 from companion.samples import ImuSample
 
 MAX_SAMPLES: Final = 60_000
-"""Since the stand before: ten minutes at 100 Hz, 2.4 MB. A turn of more is not counted."""
+"""Ten minutes at 100 Hz, 2.4 MB, since the stand before; a longer turn is not counted."""
 LEAST_SAMPLES: Final = 8
 HOLE_S: Final = 0.05
-"""Beyond the stream's interval: an aircraft that hands turn by 60 deg/s turns by 3 degrees meanwhile."""
+"""Longest hole beyond the stream's interval: hands that turn by 60 deg/s turn by 3 degrees meanwhile."""
 AT_REST_S: Final = 0.5
-"""In less nobody turns it from rest to rest."""
+"""Longest hole at rest: nobody turns an aircraft from rest to rest in less."""
 LATE_S: Final = 0.05
-"""Of the way of a sample; by more one of the clocks did not keep its pace: a simulated firmware on a busy computer."""
+"""Delay of a sample; a larger disagreement of the clocks is a wrong pace, as of a simulator on a busy computer."""
 MOVES_RAD_S: Final = math.radians(0.5)
 SIGMA_RAD: Final = math.radians(0.15)
-"""Of each turn, besides scale and stamps: axes that are not square, of an aircraft that is tilted on its way."""
+"""Error of each turn besides scale and stamps: axes that are not square, of an aircraft that is tilted on its way."""
 
 
 class Counted(NamedTuple):
-    """A turn about the vehicle's z axis, clockwise from above, not wrapped, and one sigma besides the gyros' scale."""
+    """Turn about the vehicle's z axis, clockwise from above, not wrapped, and one sigma besides the gyros' scale."""
 
     angle_rad: float
     sigma_rad: float
 
 
 class TurnCounter:
-    """The latest rates of one IMU, sample by sample."""
+    """Keeps the latest rates of one IMU, sample by sample."""
 
     def __init__(self) -> None:
         self._samples = array("d")
 
     def add(self, sample: ImuSample) -> None:
-        """Take one sample, rates in the sensor's axes."""
+        """Add one sample, rates in the sensor's axes."""
         if len(self._samples) >= 5 * MAX_SAMPLES:
             del self._samples[:]
         device_s = math.nan if sample.t_device_s is None else sample.t_device_s
@@ -53,10 +53,10 @@ class TurnCounter:
     def counted(
         self, start_s: float, end_s: float, bias_rad_s: Array, vehicle_from_sensor: Matrix, cut_rad_s: float = 0.0
     ) -> Counted | None:
-        """By how much it was turned between two times at which it stood; None where samples are missing.
+        """Integrate the turn between two times at rest; None where samples are missing. Drops what is older.
 
         Args:
-            start_s: end of the window before; what is older is let go.
+            start_s: end of the window before.
             end_s: beginning of the window after.
             bias_rad_s: (3,) in the vehicle's axes.
             vehicle_from_sensor: 3x3.
@@ -70,39 +70,32 @@ class TurnCounter:
             return None
         if (np.diff(rows[:, 1]) < -AT_REST_S).any():  # the device has begun anew
             return None
-        times, rates, late_s = _in_time(rows)
+        # By the device's clock where it has one, for on their way samples bunch, and come twice.
+        times, rates, late_s = rows[:, 0], rows[:, 2:], 0.0
+        device_s, order = np.unique(rows[:, 1], return_index=True)
+        if np.isfinite(device_s).all() and 2 * len(device_s) > len(rows):
+            times, rates, late_s = device_s, rows[order, 2:], abs(float(np.ptp(times) - np.ptp(device_s)))
         gaps = np.diff(times)
         if len(gaps) == 0 or max(gaps.max(), late_s) > AT_REST_S:
             return None
         rates = (rates + np.sign(rates) * cut_rad_s / 2.0) @ vehicle_from_sensor.T - bias_rad_s
-        # While it stands it does not turn, whatever integers and a bias that wanders make of minutes of it.
+        # At rest it does not turn, whatever integers and a bias that wanders make of minutes of it.
         moves_s = times[np.abs(rates).max(axis=1) > MOVES_RAD_S + cut_rad_s]
         if len(moves_s) == 0:
             return Counted(0.0, SIGMA_RAD)
         moves = (times > moves_s[0] - AT_REST_S) & (times < moves_s[-1] + AT_REST_S)
         times, rates = times[moves], rates[moves]
-        if len(times) < LEAST_SAMPLES or np.diff(times).max() > np.median(gaps.tolist(), axis=0) + HOLE_S:
+        if len(times) < LEAST_SAMPLES or np.diff(times).max() > np.median(gaps.tolist()) + HOLE_S:
             return None
         angle_rad = _turned_rad(times, rates)
-        # What every fourth sample counts by itself differs by twice as much as sampling and stamps make of all.
+        # Every fourth sample by itself misses by twice as much as sampling and stamps make of all.
         parts = [_turned_rad(times[k::4], rates[k::4]) - angle_rad for k in range(4)]
         off_pace = abs(angle_rad) * max(late_s - LATE_S, 0.0) / float(np.ptp(times))
         return Counted(angle_rad, math.hypot(SIGMA_RAD, float(np.linalg.norm(parts)) / math.sqrt(12.0), off_pace))
 
 
-def _in_time(rows: Floats) -> tuple[Floats, Floats, float]:
-    """Times and rates, and by how much the host's clock disagrees on how long it took.
-
-    By the device's clock where it has one, for on their way samples bunch, and come twice.
-    """
-    device_s, order = np.unique(rows[:, 1], return_index=True)
-    if np.isfinite(device_s).all() and 2 * len(device_s) > len(rows):
-        return device_s, rows[order, 2:], abs(float(np.ptp(rows[:, 0]) - np.ptp(device_s)))
-    return rows[:, 0], rows[:, 2:], 0.0
-
-
 def _turned_rad(times_s: Floats, rates_rad_s: Floats) -> float:
-    """Of rates (n, 3), by trapezoids: the twist about z of the whole rotation, followed all the way."""
+    """Twist about z of the rotation by rates (n, 3), by trapezoids, followed all the way."""
     vectors = (rates_rad_s[1:] + rates_rad_s[:-1]) / 2.0 * np.diff(times_s)[:, None]
     turns = running_products(rotations(vectors))
     return float(np.unwrap(np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1]))[-1])

@@ -1,14 +1,16 @@
-"""The level of one IMU's gyros at rest, and by how much they are off it now.
+"""Level of one IMU's gyros at rest, and how far the gyros are off it now.
 
-A gyro's bias does not jump; a platform that begins to turn does. So what the gyros have read at rest in this power-up
-bounds what they read more now. How well it does is a matter of the part: white noise of both means, flicker and random
-walk in between, and what warming up does, by the thermometer or by the slope of the readings themselves.
+A gyro's bias does not jump; a platform that begins to turn does. The mean rate at rest before the current window
+therefore bounds the turn within it. The bound depends on the part: white noise of both means, flicker and random walk
+in between, and warm-up, from the thermometer or from the slope of the rates.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from collections import deque
+from collections.abc import Iterable
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -17,86 +19,77 @@ from companion.config.sections import AllanModel, NoiseProfile
 from companion.estimation.noise.allan import floor_variance
 from companion.estimation.noise.slope import FEWEST, Slope, fit_slope, hidden_by_steps
 from companion.estimation.seconds.batch import Batch
-from companion.estimation.seconds.recent import Recent
 from companion.physics.frames import Array, Floats, Matrix
 from companion.physics.units import DEG, DEG_H
 
 LEVEL_S: Final = 5
-"""So many seconds at rest make a level."""
+"""Least seconds at rest that make a level."""
 RESTED_S: Final = 20
-"""So many before a step within a stretch: in its first seconds after switching on a gyro warms up as fast as a step."""
-TELLS_NOISE_S: Final = 20
-"""So many seconds tell the white noise of their means; fewer are taken for as noisy as the stretch before."""
+"""Least seconds before a step within a window: just after switching on, a gyro warms up as fast as a step."""
+NOISE_KNOWN_S: Final = 20
+"""Least seconds that show the white noise of their means; before that, the noise of the last window holds."""
 PER_K_RAD_S: Final = 54.0 * DEG_H
-"""Of a common gyro's bias (BMI088, method 2.1)."""
+"""Bias of a common gyro per kelvin (BMI088, method 2.1)."""
 PER_G_RAD_S: Final = 0.1 * DEG
-"""By how much an uncompensated MEMS gyro feels gravity: its level is another one at another tilt."""
+"""Sensitivity of an uncompensated MEMS gyro to gravity: another tilt gives another level."""
 EARTH_RAD_S: Final = 15.04 * DEG_H
-_WARMING_S: Final = 120.0
-"""A warm-up that is seen now has gone on for so long, up to twice as steeply; one that is not seen is over."""
-_WARMING_RAD_S2: Final = 0.5 * DEG_H
-_WARMED_RAD_S: Final = 10.0 * PER_K_RAD_S
-"""What an older level allows for where no thermometer tells, and at most."""
-_RAMP_SIGMAS: Final = 1.5
-_REMEMBERED: Final = 2
-"""Windows before the latest in which a turn may have begun."""
+WARMING_S: Final = 120.0
+"""A warm-up that is visible now may have been twice as steep for so long; an invisible one is over after it."""
+WARMING_RAD_S2: Final = 0.5 * DEG_H
+"""Drift of an older level without thermometer, at most by `WARMED_RAD_S`."""
+WARMED_RAD_S: Final = 10.0 * PER_K_RAD_S
+RAMP_SIGMAS: Final = 1.5
 HINT_SIGMAS: Final = 2.0
-"""A step of no more than that is chance."""
-ACROSS_SIGMAS: Final = 4.0
+"""A smaller step is chance."""
+STEP_SIGMAS: Final = 5.0
+STEP_CHI_SQUARE: Final = 12.0
+"""Gain of a step over a cubic, a warm-up, from which it is sure."""
+SIGNIFICANT: Final = 4.0
+"""Sigmas; rates are judged every second: 3 would be exceeded by chance in one still minute of a hundred."""
 ACROSS_SHARE: Final = 0.25
-"""A turn about the vertical shows across it by the error of the vertical only, some degrees."""
+"""Share of a turn about the vertical that an error of the vertical, some degrees, shows in the level plane."""
 
 
-class Change(msgspec.Struct, frozen=True, kw_only=True):
-    """What the gyros read more than at rest."""
+class GyroChange(msgspec.Struct, frozen=True, kw_only=True):
+    """Rate of one gyro triad above its level at rest."""
 
     down_rad_s: float
     """About the vertical, clockwise seen from above."""
     variance: float
     noise: float
-    """The part of it that is no warm-up, and was not before."""
+    """Part of the variance that neither warm-up nor tilt explains."""
     is_vouched: bool
-    """Somebody else has seen that nothing turned when the level was measured."""
+    """A compass has seen that nothing turned when the level was measured."""
     is_across: bool
-    """It has a part across the vertical that no turn of the ground has: the sensor has changed."""
-    largest_rad_s: float
-    """Of any axis."""
+    """Part of the change lies in the level plane, as no turn of the ground does: the sensor has changed."""
 
-
-class Common(NamedTuple):
-    """What all gyros show alike about the vertical."""
-
-    rate: float
-    variance: float
-    noise: float
-    is_vouched: bool
+    def contradicts(self, rate_rad_s: float, sigma_rad_s: float) -> bool:
+        """Whether another estimate of the platform's rate differs significantly."""
+        return abs(self.down_rad_s - rate_rad_s) > SIGNIFICANT * math.hypot(math.sqrt(self.variance), sigma_rad_s)
 
 
 class Step(msgspec.Struct, frozen=True, kw_only=True):
-    """Where within the stretch the rate about the vertical has most likely changed at once."""
+    """Most likely step of the rate about the vertical within the window."""
 
     first: int
-    """Second from which it has another mean."""
-    sigmas: float
-    """Of that difference, by the part's own noise."""
-    beats_drift_by: float
-    """Chi square by which a step fits better than a cubic does, a warm-up."""
-    jump_rad_s: float
+    """First second after it."""
+    is_sure: bool
+    """Neither the part's noise nor a warm-up explains it."""
     off_rad_s: float
-    """By how much the mean of the latest window is then off what was before."""
+    """Error that the step leaves in the mean of the window."""
 
 
 class Look(msgspec.Struct, frozen=True, kw_only=True):
-    """What one IMU shows."""
+    """Evidence of one IMU about a turn."""
 
-    change: Change | None
+    change: GyroChange | None
     tilting_rad_s: Array
-    """How fast the direction of gravity moves: (3,) horizontal, vehicle FRD."""
+    """Rotation of the direction of gravity: (3,) horizontal, vehicle FRD."""
     tilting_variance: float
-    """Of a component."""
+    """Variance of each component."""
     step: Step | None
     white: float
-    """N about the vertical."""
+    """White noise N about the vertical."""
 
 
 _SLOT: Final = 0
@@ -104,132 +97,98 @@ _RATES: Final = slice(1, 4)
 _READINGS: Final = slice(1, 7)
 """Rates and forces, vehicle FRD."""
 _DEGC: Final = 7
-_COLUMNS: Final = 8
-"""Of a second at rest; NaN where no thermometer told."""
-
-
-class _Level(msgspec.Struct):
-    """A mean that forgets: the weight is bounded."""
-
-    rows: Floats
-    slot: float
-    weight: float
-    degc: float
-    """NaN: not all of it is known."""
-    turn_variance: float | None
-    """What was not known of the platform's own turn at the time; None: nobody but the level itself told."""
+"""NaN without a thermometer."""
+_TURNED: Final = 8
+"""Variance of the platform's rate by the compass, for seconds of the level; NaN without a compass."""
 
 
 class ImuLevel:
-    """One IMU: its seconds of the stretch under way, and its level at rest from before them.
+    """Seconds of one IMU: those of the current window, and those at rest before it, which are its level.
 
-    `rotation`: sensor to vehicle FRD; `steps`: those of its stream, rad/s and m/s^2, 0 for floats.
+    `rotation`: sensor to vehicle FRD; `steps`: resolution of its stream, rad/s and m/s^2, 0 for floats.
     """
 
     def __init__(self, rotation: Matrix, profile: NoiseProfile, steps: tuple[float, float], span: int) -> None:
-        self._gyro, self._steps = profile.gyro, steps
-        self._memory = _REMEMBERED * span
+        self._gyro, self._steps, self._span = profile.gyro, steps, span
         self._turned = np.asarray(rotation, dtype=np.float64)
         self._least = np.repeat([[m.white, m.flicker, m.walk] for m in (profile.gyro, profile.accel)], 3, axis=0).T
         """N, B and K of its six channels."""
-        self._white = 0.0
-        self._spread = np.zeros(6)
-        """Variance of one reading."""
-        self._seconds = Recent(span + self._memory, _COLUMNS)
-        self.held = 0
-        """Seconds for which it has been off its level by itself."""
-        self.forget()
+        self._white = np.zeros(6)
+        """White noise of the last window that was long enough to show it; only that of the gyros is kept."""
+        self._window: deque[list[float]] = deque()
+        self._level: deque[list[float]] = deque(maxlen=2 * span)
+
+    def forget_level(self) -> None:
+        """Begin a new level."""
+        self._level.clear()
 
     def forget(self) -> None:
-        """Its readings are not comparable with earlier ones."""
-        self._clear()
-        self._level: _Level | None = None
-        self.held = 0
+        """Drop all: readings are not comparable with earlier ones."""
+        self._window.clear()
+        self._level.clear()
 
-    def _clear(self) -> None:
-        self._seconds.clear()
-        self._measured = 0
-        """Of those seconds, the latest, the others being older, but of the same stretch."""
+    def add(self, slot: int, batch: Batch, turned: float | None) -> None:
+        """Add a still second; one that leaves the window joins the level, with `turned` as in `new_stretch`."""
+        degc = math.nan if batch.temperature_degc is None else batch.temperature_degc
+        rates, forces = (self._turned @ batch.mean[:3]).tolist(), (self._turned @ batch.mean[3:]).tolist()
+        self._window.append([float(slot), *rates, *forces, degc])
+        self._variance = np.array(batch.variance)
+        self._keep(self._span, turned)
 
-    def add(self, slot: int, batch: Batch) -> None:
-        """A still second."""
-        mean, degc = batch.mean, batch.temperature_degc
-        rates, forces = (self._turned @ mean[:3]).tolist(), (self._turned @ mean[3:]).tolist()
-        self._seconds.append([slot, *rates, *forces, math.nan if degc is None else degc])
-        self._measured += 1
-        self._spread = np.array(batch.variance)
+    def new_stretch(self, turned: float | None) -> None:
+        """End the window; its seconds join the level.
 
-    def keep(self, least: int, *, trusted: bool, turn_variance: float | None) -> None:
-        """Make all but the latest `least` seconds part of the level if they can be trusted.
-
-        `turn_variance` is what was not known of the platform's own turn; None: nobody but the level itself tells.
+        `turned`: variance of the platform's rate by the compass, NaN without; None: it turns, and they do not join.
         """
-        if trusted and self._measured > least:
-            rows = self._seconds.rows[-self._measured :]
-            for second in rows[: self._measured - least]:
-                self._level = self._with(second, turn_variance)
-        self._measured = min(self._measured, least)
+        self._keep(0, turned if self._level or len(self._window) >= LEVEL_S else None)
 
-    def new_stretch(self, *, trusted: bool, turn_variance: float | None) -> None:
-        """What was measured is over, and makes part of the level if it can be trusted."""
-        enough = self._level is not None or self._measured >= LEVEL_S
-        self.keep(0, trusted=trusted and enough, turn_variance=turn_variance)
-        self._clear()
+    def split(self, slot: int) -> None:
+        """Make the seconds before a step the level; drop those after it."""
+        turned = self._usual()
+        self._level.clear()
+        while self._window and self._window[-1][_SLOT] >= slot:
+            self._window.pop()
+        self._keep(0, turned)
 
-    def split(self, slot: int, *, turn_variance: float | None) -> None:
-        """From that second on it is something new: the seconds before it are the level."""
-        known = None if self._level is None else self._level.turn_variance
-        self._level = None
-        for second in self._seconds.rows:
-            if second[_SLOT] < slot:
-                self._level = self._with(second, known if turn_variance is None else turn_variance)
-        self._clear()
+    def _keep(self, latest: int, turned: float | None) -> None:
+        while len(self._window) > latest:
+            second = self._window.popleft()
+            if turned is None:
+                continue
+            usual = self._usual()
+            if math.isnan(usual) and not math.isnan(turned):
+                self._level.clear()
+            self._level.append([*second, usual if math.isnan(turned) else turned])
 
-    def adopt(self) -> None:
-        """What it reads now is its level."""
-        self._level = None
-        self.held = 0
-
-    def _with(self, second: Floats, turn_variance: float | None) -> _Level:
-        level, readings, slot, degc = self._level, second[_READINGS], float(second[_SLOT]), float(second[_DEGC])
-        if level is None or (level.turn_variance is None and turn_variance is not None):
-            return _Level(readings.copy(), slot, 1.0, degc, turn_variance)
-        level.weight = min(level.weight, self._memory / _REMEMBERED - 1.0) + 1.0
-        share = 1.0 / level.weight
-        level.rows = level.rows + share * (readings - level.rows)
-        level.slot += share * (slot - level.slot)
-        if turn_variance is not None and level.turn_variance is not None:
-            level.turn_variance += share * (turn_variance - level.turn_variance)
-        level.degc += share * (degc - level.degc)
-        return level
+    def _usual(self) -> float:
+        """Variance of the platform's rate during the level."""
+        return sum(second[_TURNED] for second in self._level) / len(self._level) if self._level else math.nan
 
     def look(self) -> Look | None:
-        """Against its level, if there is one, and against gravity, over the seconds of this stretch."""
-        if self._measured < FEWEST:
+        """Compare the window with the level, if there is one, and with gravity; None while it is too short."""
+        if len(self._window) < FEWEST:
             return None
-        seconds = self._seconds.rows
-        latest = seconds[-self._measured :]
-        slots, rows = latest[:, _SLOT].astype(np.int64), latest[:, _READINGS]
-        # The vertical by its accelerometers, (3,) vehicle FRD; good to some degrees, and enough here.
+        window = np.array(self._window)
+        slots, rows = window[:, _SLOT].astype(np.int64), window[:, _READINGS]
+        # The vertical by its accelerometers, (3,) vehicle FRD; good to some degrees, which is enough here.
         force = rows[:, 3:].mean(axis=0)
         down = np.asarray(-force / _length(force))
-        hidden = [hidden_by_steps(self._steps[k // 3], float(self._spread[k])) for k in range(6)]
-        own = len(slots) >= TELLS_NOISE_S
+        shows_noise = len(slots) >= NOISE_KNOWN_S
         slope = fit_slope(
             slots,
             rows,
-            white=self._least[0] if own else np.maximum(self._least[0], [self._white] * 3 + [0.0] * 3),
+            white=self._least[0] if shows_noise else np.maximum(self._least[0], self._white),
             flicker=self._least[1],
             walk=self._least[2],
-            hidden=np.array(hidden),
+            hidden=np.array([hidden_by_steps(self._steps[k // 3], float(self._variance[k])) for k in range(6)]),
         )
-        change = self._change(latest, slope, down)
-        if own:
-            self._white = float(slope.white[:3].max())
+        change = self._change(window, slope, down)
+        if shows_noise:
+            self._white[:3] = slope.white[:3].max()
         white = float(np.sqrt(np.square(down) @ np.square(slope.white[:3])))
         step = None
-        if self._steps[0] == 0.0 and len(seconds) >= RESTED_S + LEVEL_S:
-            step = _step(seconds[:, _SLOT], seconds[:, _RATES] @ down, white, self._gyro, len(slots))
+        if self._steps[0] == 0.0 and len(window) >= RESTED_S + LEVEL_S:
+            step = _step(window[:, _SLOT], window[:, _RATES] @ down, white, self._gyro)
         up, moves = -down, slope.per_s[3:] / _length(force)
         return Look(
             change=change,
@@ -240,46 +199,41 @@ class ImuLevel:
             white=white,
         )
 
-    def _change(self, latest: Floats, slope: Slope, down: Array) -> Change | None:
-        level, white = self._level, slope.white[:3]
-        if level is None or level.weight < LEVEL_S:
+    def _change(self, window: Floats, slope: Slope, down: Array) -> GyroChange | None:
+        count, weight = len(window), len(self._level)
+        if weight < LEVEL_S:
             return None
-        count = len(latest)
-        off = latest[:, _RATES].mean(axis=0) - level.rows[:3]
-        middle = float(latest[:, _SLOT].mean()) - level.slot
-        gap_s = max(middle - (count + level.weight) / 2.0, 0.0)
-        variance = np.square(white) * (1.0 / count + 1.0 / level.weight)
-        variance = variance + floor_variance(self._gyro.flicker, self._gyro.walk, level.weight, count + 2.0 * gap_s)
-        unseen = level.turn_variance or 0.0
+        level = np.array(self._level).mean(axis=0)
+        now = window.mean(axis=0)
+        off = now[_RATES] - level[_RATES]
+        unseen = float(np.nan_to_num(level[_TURNED]))
+        age_s = float(now[_SLOT] - level[_SLOT])
+        gap_s = max(age_s - (count + weight) / 2.0, 0.0)
+        variance = np.square(slope.white[:3]) * (1.0 / count + 1.0 / weight)
+        variance = variance + floor_variance(self._gyro.flicker, self._gyro.walk, weight, count + 2.0 * gap_s)
         noise = float(np.square(down) @ variance) + unseen
-        # Warming up: as fast as the readings show, or as the thermometer says.
+        # Warm-up: as fast as the rates show, or as the thermometer says.
         ramp = np.abs(slope.per_s[:3])
-        ramp = np.where(ramp > _RAMP_SIGMAS * np.sqrt(slope.variance[:3]), ramp, 0.0)
-        variance = variance + np.square(2.0 * ramp * min(middle, _WARMING_S))
-        told = latest[:, _DEGC]
-        told = told[np.isfinite(told)]
-        if len(told) and math.isfinite(level.degc):
-            warmed = PER_K_RAD_S * (float(told.mean()) - level.degc)
+        ramp = np.where(ramp > RAMP_SIGMAS * np.sqrt(slope.variance[:3]), ramp, 0.0)
+        if math.isfinite(now[_DEGC] - level[_DEGC]):
+            warmed = PER_K_RAD_S * float(now[_DEGC] - level[_DEGC])
         else:
-            warmed = min(_WARMING_RAD_S2 * max(middle - _WARMING_S, 0.0), _WARMED_RAD_S)
+            warmed = min(WARMING_RAD_S2 * max(age_s - WARMING_S, 0.0), WARMED_RAD_S)
         # Integers of the stream hide up to half a step each time.
         hidden = 0.5 * self._steps[0]
-        was = level.rows[3:] / _length(level.rows[3:])
-        leaned = _length(down + was)
+        leaned = _length(down + level[4:7] / _length(level[4:7]))
         felt = (PER_G_RAD_S + EARTH_RAD_S) * leaned
-        variance = variance + warmed**2 + hidden**2 + felt**2
+        variance = variance + np.square(2.0 * ramp * min(age_s, WARMING_S)) + warmed**2 + hidden**2 + felt**2
         along = float(off @ down)
-        of_down = float(np.square(down) @ variance) + unseen
         across = off - along * down
-        # The heading may be another one: the Earth's rate is somewhere else in the level plane.
-        limit = ACROSS_SIGMAS * np.sqrt(variance + EARTH_RAD_S**2) + ACROSS_SHARE * abs(along)
-        return Change(
+        # The heading may be another one: the Earth's rate then points elsewhere in the level plane.
+        limit = SIGNIFICANT * np.sqrt(variance + EARTH_RAD_S**2) + ACROSS_SHARE * abs(along)
+        return GyroChange(
             down_rad_s=along,
-            variance=of_down,
+            variance=float(np.square(down) @ variance) + unseen,
             noise=noise,
-            is_vouched=level.turn_variance is not None,
+            is_vouched=math.isfinite(level[_TURNED]),
             is_across=bool((np.abs(across) > limit).any()),
-            largest_rad_s=float(np.abs(off).max()),
         )
 
 
@@ -287,11 +241,8 @@ def _length(vector: Floats) -> float:
     return math.sqrt(vector @ vector)
 
 
-def _step(slots: Floats, values: Floats, white: float, model: AllanModel, window: int) -> Step | None:
-    """The likeliest step in (m,) means of a second, m >= `RESTED_S` + `LEVEL_S`; the last `window` are measured.
-
-    None where it is no more than chance.
-    """
+def _step(slots: Floats, values: Floats, white: float, model: AllanModel) -> Step | None:
+    """Find the likeliest step in (m,) means of a second, m >= `RESTED_S` + `LEVEL_S`; None where it is chance."""
     count = len(values)
     values = values - values.mean()
     before = np.arange(RESTED_S, count - LEVEL_S + 1)
@@ -306,29 +257,19 @@ def _step(slots: Floats, values: Floats, white: float, model: AllanModel, window
         return None
     time = (slots - slots[0]) / (slots[-1] - slots[0])
     basis, _ = np.linalg.qr(np.vander(time, 4))
-    drift = float(np.square(values @ basis).sum())
+    better = jump[best] ** 2 / chance[best] - np.square(values @ basis).sum() / white**2
     return Step(
         first=int(slots[before[best]]),
-        sigmas=float(abs(jump[best]) / sigma),
-        beats_drift_by=float(jump[best] ** 2 / chance[best]) - drift / white**2,
-        jump_rad_s=float(jump[best]),
-        off_rad_s=float(jump[best]) * min(last / window, 1.0),
+        is_sure=bool(abs(jump[best]) > STEP_SIGMAS * sigma and better > STEP_CHI_SQUARE),
+        off_rad_s=float(jump[best]) * last / count,
     )
 
 
-def common_change(changes: list[Change]) -> Common | None:
-    """What all gyros show alike about the vertical; None: nobody says.
-
-    Of several that do not agree those that are at their level speak for the platform, and the others of themselves.
-    """
-    believed = [change for change in changes if not change.is_across]
-    at_level = [one for one in believed if abs(one.down_rad_s) <= ACROSS_SIGMAS * math.sqrt(one.variance)]
-    for group in (believed, at_level):
-        if not group:
-            continue
-        weight = sum(1.0 / one.variance for one in group)
-        rate = sum(one.down_rad_s / one.variance for one in group) / weight
-        if all(abs(one.down_rad_s - rate) <= ACROSS_SIGMAS * math.sqrt(one.variance) for one in group):
-            noise = 1.0 / sum(1.0 / one.noise for one in group)
-            return Common(rate, 1.0 / weight, noise, any(one.is_vouched for one in group))
-    return None
+def common_change(changes: Iterable[GyroChange]) -> GyroChange | None:
+    """Return what the gyros show of the platform: the most precise one, unless another stays at its level."""
+    believed = [one for one in changes if not one.is_across]
+    if not believed:
+        return None
+    best = min(believed, key=lambda one: one.variance)
+    rivals = [one for one in believed if one.contradicts(best.down_rad_s, math.sqrt(best.variance))]
+    return min([best, *rivals], key=lambda one: abs(one.down_rad_s) / math.sqrt(one.variance))

@@ -9,7 +9,6 @@ import pytest
 
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.means.pose import CompassModel, FieldHeading, GradienterModel, vehicle_heading_rad
-from companion.estimation.stillness.stretch import HeadingWatch
 from companion.physics.frames import wrap_deg
 from companion.physics.units import DEG
 from companion.samples import CompassSample, MagSample, TiltSample
@@ -219,9 +218,3 @@ def test_without_a_gradienter_the_field_alone_says_what_is_missing() -> None:
     feed.heading = give
     feed.run(15.0)
     assert feed.waiting_for() == "compass sends its field only: a heading from it needs a gradienter"
-
-
-def test_a_watch_without_witnesses_sees_nothing() -> None:
-    watch = HeadingWatch()
-    watch.add_second(None, [])
-    assert watch.wander_deg is None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import re
 from dataclasses import dataclass, field
@@ -20,8 +19,8 @@ from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.means.pose import GradienterModel
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.noise.allan import noise_profile
-from companion.estimation.seconds.batch import Batch
-from companion.estimation.stillness.stretch import UNKNOWN_DEG, Settling
+from companion.estimation.stillness.stretch import OFF_DEG, Settling
+from companion.physics.frames import wrap_deg
 from companion.physics.gradienter import attitude_from_readings
 from companion.protocols.registry import PROTOCOLS
 from companion.recording.messages import encode
@@ -125,7 +124,7 @@ def test_what_the_fluid_leaves_in_the_mean(lag_s: float, sigma_deg: float, witho
     assert within.error_deg() < min(0.1 * sigma_deg, 0.5 * without.error_deg())
     assert within.first_after_s(SET_DOWN_S) <= without.first_after_s(SET_DOWN_S) + longer_s
     # Never more than a tail's time and the five seconds that a mean takes.
-    bound_s = lag_s * math.log(30.0 * UNKNOWN_DEG / sigma_deg) + 10.0
+    bound_s = lag_s * math.log(30.0 * OFF_DEG / sigma_deg) + 10.0
     assert within.first_after_s(SET_DOWN_S) < bound_s
 
 
@@ -160,98 +159,45 @@ def test_a_knock_in_a_still_stretch_costs_no_more_seconds_than_before() -> None:
     assert max(errors) < 0.1 * SIGMA_DEG
 
 
-def turned(known: Lag, tilted: bool) -> tuple[float, float]:
-    """Error of the mean heading (or tilt) after a turn of 20 degrees (2 degrees) seen through a filter of 2 s."""
-    collector = RollingCollector(
-        settings(),
-        [imu()],
-        gradienter(*known) if tilted else None,
-        None if tilted else dataclasses.replace(HEADING, lag_s=known[0], sigma_deg=known[1]),
-    )
-    feed = Feeder(collector)
-    size, end_s = 2.0 if tilted else 20.0, 1006.0
-
-    def off(t_s: float) -> float:
-        return size if t_s < end_s else size * math.exp(-(t_s - end_s) / 2.0)
+def turned(lag_s: float) -> tuple[float, float]:
+    """Error of the mean heading after a turn of 20 degrees seen through a filter of 2 s, and when it was there."""
+    feed = Feeder(RollingCollector(settings(), [imu()], compass=dataclasses.replace(HEADING, lag_s=lag_s)))
+    end_s = 1006.0
 
     def change(_name: str, times: Floats, rows: Floats) -> Floats:
         rows[:, 2] += np.where(times < end_s, 0.5 * np.sin(40.0 * times), 0.0)
         return rows
 
     feed.change = change
-    if tilted:
-        feed.tilt = lambda t_s: (1.0 + off(t_s), 2.0)
-    else:
-        feed.heading = lambda t_s: (359.0 + off(t_s)) % 360.0
+    feed.heading = lambda t_s: (359.0 + 20.0 * math.exp(-max(t_s - end_s, 0.0) / 2.0)) % 360.0
     while (words := feed.waiting_for()) is not None:
         assert feed.now_s < 1100.0, words
         feed.run(0.5)
-    window = collector.window(feed.now_s)
-    if window.heading is not None:
-        return abs((window.heading.heading_deg - 359.0 + 180.0) % 360.0 - 180.0), feed.now_s
-    assert window.tilt is not None
-    return abs(window.tilt.x_deg - 1.0), feed.now_s
+    heading = feed.collector.window(feed.now_s).heading
+    assert heading is not None
+    return abs(wrap_deg(heading.heading_deg - 359.0)), feed.now_s
 
 
-@pytest.mark.parametrize("tilted", [False, True])
-def test_a_filter_of_either_sensor_is_waited_for(tilted: bool) -> None:
-    sigma_deg = 0.05 if tilted else 1.0
-    without_deg, at_s = turned(AT_ONCE, tilted)
-    within_deg, later_s = turned((2.0, sigma_deg), tilted)
-    assert without_deg > 0.2 * sigma_deg
-    assert within_deg < 0.1 * sigma_deg
+def test_a_filter_of_the_compass_is_waited_for() -> None:
+    (without_deg, at_s), (within_deg, later_s) = turned(0.0), turned(2.0)
+    assert without_deg > 0.2
+    assert within_deg < 0.1
     assert later_s < at_s + 12.0
 
 
-# --- one sensor
-
-
-def batch(slot: int, low: float, high: float, mean: float, n: int = 10) -> Batch:
-    one = np.ones(1)
-    return Batch(
-        slot=slot, n=n, mean=mean * one, variance=0 * one, white=1e-12 * one,
-        low=low * one, high=high * one, distinct=np.array([5]), clipped=False, largest_gap_s=0.1, missing=None,
-        temperature_degc=None,
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize("lag_s", [0.2, 0.43, 1.0, 3.0])
-def test_what_is_left_is_below_a_tenth_of_sigma_and_never_long_before(lag_s: float) -> None:
-    """Against the exponential itself; the step comes at any time of second 0."""
-    sigma_deg = 0.02
-    for rate_hz, size_deg, at_s in itertools.product((1, 8, 10), (0.05, 1.0, 5.0, 40.0), (0.0, 0.37, 0.9, 0.999)):
-        case = (rate_hz, size_deg, at_s)
-        settling = Settling(lag_s, sigma_deg, circle=True)
-        counts = None
-        for slot in range(120):
-            t_s = slot + (np.arange(rate_hz) + 0.5) / rate_hz
-            off = np.where(t_s < at_s, size_deg, size_deg * np.exp(-np.maximum(t_s - at_s, 0.0) / lag_s))
-            readings = 359.99 + off  # on the circle
-            row = batch(slot, readings.min(), readings.max(), float(np.mod(readings.mean(), 360.0)), rate_hz)
-            if settling.judge(slot, row, moved=slot == 0):
-                counts = slot
-                break
-        assert counts is not None, case
-        left_deg = size_deg * math.exp(-(counts - at_s) / lag_s)
-        assert left_deg <= 0.1 * sigma_deg * 1.05, case
-        # Not seconds too late either, where the readings come often enough to tell.
-        if rate_hz > 1:
-            needed_s = at_s + lag_s * math.log(max(size_deg / (0.1 * sigma_deg), 1.0))
-            assert counts <= max(needed_s, 1.0) + 2.0, case
-
-
-def test_after_a_silence_the_most_is_assumed() -> None:
-    settling = Settling(0.43, 0.005)
-    settling.judge(0, None, moved=True)
-    counted = [settling.judge(slot, batch(slot, 1.0, 1.0, 1.0), moved=False) for slot in range(1, 8)]
-    n = math.ceil(0.43 * math.log(5.0 / 0.0005))
-    assert n == 4
-    assert counted == [slot > n for slot in range(1, 8)]
+@pytest.mark.parametrize("size_deg", [0.05, 1.0, 5.0])
+def test_what_is_left_is_below_a_tenth_of_sigma(lag_s: float, size_deg: float) -> None:
+    """Against the exponential itself; the step comes at the very end of second 0."""
+    settling = Settling(lag_s, 0.02)
+    assert not settling.judge(0, moved=True)
+    counts = next(slot for slot in range(1, 120) if settling.judge(slot, moved=False))
+    assert size_deg * math.exp(-(counts - 1.0) / lag_s) <= 0.1 * 0.02
+    assert settling.left_s == 0
 
 
 def test_what_follows_at_once_always_counts() -> None:
-    settling = Settling(*AT_ONCE)
-    assert settling.judge(0, batch(0, 0.0, 9.0, 5.0), moved=True)
+    assert Settling(*AT_ONCE).judge(0, moved=True)
 
 
 def test_the_protocols_lag_is_the_default_and_the_configuration_comes_first() -> None:
