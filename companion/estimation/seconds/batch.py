@@ -1,8 +1,7 @@
 """One-second batches: all that is kept of a stream.
 
-Batches lie on one grid for all sources: slot k holds k <= t < k + 1 s of the host's clock, so that the same slot of an
-IMU and of the gradienter means the same second. Samples are plain tuples until a slot is over; then numpy summarises
-them once.
+Batches lie on one grid for all sources: slot k holds k <= t < k + 1 s of the host's clock. Samples are plain tuples
+until a slot is over; then numpy summarises them once.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ _PINNED_SAMPLES: Final = 5
 _PINNED_DISTINCT: Final = 8
 _MAX_TIME_S: Final = 1e12
 _BACKWARD_SAMPLES: Final = 20
-"""So many samples in a row from the past show that the clock went back, not that some were late."""
+"""Samples in a row from the past that show a clock gone back; fewer are late."""
 _BACKWARD_S: Final = 2.0
 _PAUSE_S: Final = 3.0
 """A sensor that was silent for longer may have been switched off."""
@@ -246,7 +245,7 @@ class BatchSource:
         self.lost = 0
         """Samples lost since the beginning, by the device's counter or clock."""
         self.restarts = 0
-        """How often the clock went back and everything was dropped."""
+        """Number of times that the clock went back and everything was dropped."""
         self._limits, self._keep, self._circle, self.steps = np.asarray(limits), keep, circle, steps
         self.believed: Callable[[int, float | None], float | None] = lambda slot, degc: degc
         """Filter of a second's temperature."""

@@ -1,1 +1,1 @@
-"""Whether the aircraft stands still, and since when."""
+"""Stillness of the aircraft: gates, learned noise and the still stretch."""

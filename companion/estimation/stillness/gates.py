@@ -1,7 +1,7 @@
 """Gates on the motion of the aircraft: one verdict a second for every source, in words that name the device.
 
 Motion of an aircraft is slow against the sampling, sensor noise is mostly white. Half the mean square of successive
-differences measures the white part in the batch itself, so that a gate on the rest of the variance works on a sensor
+differences measures the white part in the batch itself. A gate on the rest of the variance therefore works on a sensor
 of any noise from its first second on. Noise behind a filter is learned (`own_noise`). Every gate is widened by what
 chance does with the number of samples in the batch. A slow steady turn is left to gates on the means, and to `turning`.
 One set of constants serves all sensors; none is tuned to a recording.
@@ -29,7 +29,7 @@ GYRO_MOTION_RAD_S: Final = 0.10 * DEG
 order of the gradienter's own; handling and walking are 10 to 1000 times more, sensors at rest below a half of it."""
 
 ACCEL_MOTION_M_S2: Final = 10.0 * MG
-"""The same for specific force: 10 mg is a tilt of half a degree within a second."""
+"""rms of the slow part of specific force: 10 mg is a tilt of half a degree within a second."""
 
 GYRO_VIBRATION_RAD_S: Final = 1.0 * DEG
 ACCEL_VIBRATION_M_S2: Final = 50.0 * MG
@@ -209,7 +209,7 @@ class ImuGate:
         step = np.where(self._few_levels_s > 0, self._step, size)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.maximum(size, step) / np.minimum(size, step)
-        fits = np.abs(ratio - np.rint(ratio)) <= _ROUNDED
+            fits = np.abs(ratio - np.rint(ratio)) <= _ROUNDED
         self._few_levels_s = np.where(few, np.where(fits, self._few_levels_s + 1, 1), self._few_levels_s)
         self._few_levels_s[levels > _FEW_LEVELS] = 0
         self._step = np.where(few, np.where(fits, np.minimum(size, step), size), self._step)

@@ -1,7 +1,7 @@
 """Seconds that count: those of the still stretch, and those of a pose sensor that follow no movement.
 
 A stretch begins with `min_still_s` good seconds in a row. From then on up to 20 % of the seconds of a window may be
-rejected (a gust, a knock), for which the mean is robust, but at most three in a row: then the aircraft was moved.
+rejected (a gust, a knock), for which the mean is robust. More than three in a row end it: the aircraft was moved.
 
 A gradienter, or a compass that averages, goes on moving after the aircraft has stopped: both follow the truth with a
 time constant; the fluid of a field gradienter keeps a tenth of its error after every second (BEI INC manual; sensors

@@ -1,1 +1,1 @@
-"""Whether what the aircraft stands on turns, how fast, and who says so."""
+"""Rate at which the ground under the aircraft turns, with a sigma."""
