@@ -99,7 +99,7 @@ class Verdict(msgspec.Struct, frozen=True):
 STILL: Final = Verdict(still=True)
 
 
-def _moves(what: str, found: float, allowed: float, unit: str, hint: str = "") -> Verdict:
+def _words(what: str, found: float, allowed: float, unit: str, hint: str = "") -> Verdict:
     """'gyro fc moves 0.31 deg/s, max 0.10' and a hint, with as many digits as the difference takes."""
     for digits in (2, 3, 4):
         left, right = f"{found:.{digits}f}", f"{allowed:.{digits}f}"
@@ -230,10 +230,10 @@ class ImuGate:
                 allowed = math.sqrt(motion**2 + max(own.slow, 0.0) + _CHANCE * own.chance)
             hint = self._own.hint(number)
             if found > allowed:
-                return _moves(f"{part} {self._name} moves", found / unit, allowed / unit, unit_name, hint)
+                return _words(f"{part} {self._name} moves", found / unit, allowed / unit, unit_name, hint)
             found = math.sqrt(batch.variance[triad].mean())
             if found > shaking:
-                return _moves(f"{part} {self._name} shakes", found / unit, shaking / unit, unit_name, hint)
+                return _words(f"{part} {self._name} shakes", found / unit, shaking / unit, unit_name, hint)
         self._whites.append(batch.white)
         self._noise = np.mean(self._whites, axis=0)
         return None
@@ -247,7 +247,7 @@ class ImuGate:
         if turns > MOST_GYRO_RAD_S:
             return _fault(f"gyro {name} reads {turns / DEG:.0f} deg/s and nothing moves: deg/s for rad/s?")
         if turns > GYRO_BIAS_RAD_S:
-            return _moves(f"gyro {name} turns or is biased by", turns / DEG, GYRO_BIAS_RAD_S / DEG, "deg/s")
+            return _words(f"gyro {name} turns or is biased by", turns / DEG, GYRO_BIAS_RAD_S / DEG, "deg/s")
         if not self._recent:
             return None
         # A few samples say little about their own scatter; what is known says more.
@@ -258,10 +258,10 @@ class ImuGate:
         chance = _CHANCE * np.sqrt(scatter)
         found = _beyond(rate, self._recent, chance[:3])
         if found > GYRO_STEP_RAD_S:
-            return _moves(f"gyro {name} moved by", found / DEG, GYRO_STEP_RAD_S / DEG, "deg/s")
+            return _words(f"gyro {name} moved by", found / DEG, GYRO_STEP_RAD_S / DEG, "deg/s")
         found = _beyond(force, self._start, chance[3:])
         if found > ACCEL_STEP_M_S2:
-            return _moves(f"accel {name} tilted by", found / MG, ACCEL_STEP_M_S2 / MG, "mg")
+            return _words(f"accel {name} tilted by", found / MG, ACCEL_STEP_M_S2 / MG, "mg")
         return None
 
 
@@ -294,14 +294,14 @@ class PoseGate:
         every = slice(None)
         found, allowed = _slow_part(batch, every, self._motion_deg, (0.0, self._motion_deg**2))
         if found > allowed:
-            return _moves(f"{self._name} moves", found, allowed, "deg")
+            return _words(f"{self._name} moves", found, allowed, "deg")
         if self._start:
             # Relative to the first second, so that averaging on the circle needs no care.
             first = self._start[0]
             refined = _wrapped(np.array(self._start) - first).mean(axis=0)
             off = np.abs(_wrapped(batch.mean - first) - refined) - _CHANCE * np.sqrt(batch.white / batch.n)
             if off.max() > self._step_deg:
-                return _moves(f"{self._name} moved by", float(off.max()), self._step_deg, "deg")
+                return _words(f"{self._name} moved by", float(off.max()), self._step_deg, "deg")
         return STILL
 
 
