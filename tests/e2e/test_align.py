@@ -14,7 +14,6 @@ from companion.commands import Align
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from companion.estimation.records.record import Record
-from companion.lab.replay.engine import replay
 from sim.aircraft import Pose
 from sim.ardupilot.double import offset_names
 from sim.devices import HMR3300, Gradienter
@@ -105,27 +104,6 @@ async def moved(rig: Rig, hands: Hands, job: Job, stand: int, degrees: float) ->
     hands.turn(rig.aircraft.time_at(rig.now_s), degrees)
 
 
-def test_a_spot_that_moved_is_refused_in_words_and_the_old_zero_stays(tmp_path: Path) -> None:
-    made, hands = rig(tmp_path)
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            job = started(made.service.calibrating.start_alignment(Align(action="zero"), "test"))
-            await moved(made, hands, job, 2, 180.0)
-            hands.bump(0.3, 0.0)
-            await moved(made, hands, job, 3, 180.0)
-            result = await job.finished
-            assert result.outcome == "failed"
-            assert "the spot moved" in result.reason
-            assert made.service.calibrating.alignment.used is None
-            assert not (tmp_path / "alignment.json").exists()
-            await asyncio.sleep(10.0)
-            assert "the spot moved" in "".join(made.ground.texts())
-
-    run_virtual(main())
-
-
 def test_it_outlives_a_restart_and_is_not_used_with_another_configuration(tmp_path: Path) -> None:
     made, hands = rig(tmp_path)
 
@@ -162,27 +140,6 @@ def test_it_outlives_a_restart_and_is_not_used_with_another_configuration(tmp_pa
     assert sigma_mg > 1.7
     run_virtual(again({"mounting": "ROTATION_YAW_180", "port": "/elsewhere"}, "gradienter.port, gradienter.mounting"))
     run_virtual(again({}, None, forget=True))
-
-
-def test_what_was_calibrated_with_the_old_zero_is_calibrated_anew_by_itself(tmp_path: Path) -> None:
-    made, hands = rig(tmp_path, at_arm="warn")
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            manager, in_force = made.service.calibrating.manager, made.service.arming.in_force
-            await made.until(lambda: manager.last is not None and not in_force.findings(made.now_s), 200.0)
-            assert manager.last is not None
-            assert manager.last.alignment is None
-            assert (await aligned(made, hands)).outcome == "done"
-            assert [finding.words for finding in in_force.findings(made.now_s)] == ["gradienter aligned since then"]
-            await made.until(lambda: manager.last is not None and manager.last.alignment is not None, 150.0)
-            await made.until(lambda: not in_force.findings(made.now_s), 60.0)
-            off_mg, sigma_mg = worst_horizontal(manager.last, made)
-            assert sigma_mg <= TARGET_MG
-            assert off_mg < 2.5 * sigma_mg
-
-    run_virtual(main())
 
 
 def test_armed_in_the_middle_it_ends(tmp_path: Path) -> None:
@@ -225,21 +182,3 @@ def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, to
             assert made.service.calibrating.alignment.record is None
 
     run_virtual(main())
-
-
-def test_a_recording_replays_with_the_zero_that_was_in_force(tmp_path: Path) -> None:
-    made, hands = rig(tmp_path, recordings_mb=64)
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            assert (await aligned(made, hands)).outcome == "done"
-            result, _ = await calibrated(made)
-            assert result.outcome == "done"
-            await asyncio.sleep(2.0)
-
-    run_virtual(main())
-    paths = sorted((tmp_path / "recordings").glob("0*.mcap"))
-    (found,) = replay(paths).calibrations
-    assert found.record.alignment is not None
-    assert found.differences == []

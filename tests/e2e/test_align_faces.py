@@ -104,24 +104,6 @@ def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tmp_path
     run_virtual(main())
 
 
-def test_without_write_nothing_is_written_and_what_is_missing_is_said(tmp_path: Path) -> None:
-    made, hands = rig(tmp_path)
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            job = faced(made, write=False)
-            result = await follow(made, hands, job)
-            assert result.outcome == "done", result
-            assert result.reason.endswith("not written (--write does)")
-            np.testing.assert_allclose(read(made, "scale"), list(SCALES.values()), rtol=1e-6)
-            said = " ".join(made.ground.texts())
-            assert "on its back: z bias" in said
-            assert re.search(r"nose (up|down): x (bias|scale)", said)
-
-    run_virtual(main())
-
-
 def test_who_asks_for_what_cannot_be_is_told_at_once(tmp_path: Path) -> None:
     made, _ = rig(tmp_path)
     made.config = msgspec.structs.replace(made.config, push=msgspec.structs.replace(made.config.push, parameters=False))
@@ -136,12 +118,8 @@ def test_who_asks_for_what_cannot_be_is_told_at_once(tmp_path: Path) -> None:
     run_virtual(main())
 
 
-@pytest.mark.parametrize("wrong", [(0.015, -0.012, 0.004), (0.003, -0.002, 0.002)], ids=["far from 1", "near 1"])
-def test_px4s_offsets_are_written_and_such_scales_as_it_starts_with(
-    tmp_path: Path, wrong: tuple[float, float, float]
-) -> None:
-    made, hands = rig(tmp_path, firmware="px4", parameters={}, accel_scale=wrong)
-    far = max(wrong) > 0.01
+def test_px4s_offsets_and_scales_are_written_and_undone(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path, firmware="px4", parameters={}, accel_scale=(0.015, -0.012, 0.004))
 
     async def main() -> None:
         async with made.running():
@@ -154,9 +132,8 @@ def test_px4s_offsets_are_written_and_such_scales_as_it_starts_with(
             record = job.product
             assert isinstance(record, FacesRecord)
             (imu,) = record.imus
-            assert set(imu.written) == set(names if far else names[:3])
+            assert set(imu.written) == set(names)
             assert {one.outcome for one in imu.written.values()} == {"verified"}
-            assert any("scales stay 1" in words for words in record.warnings) is not far
             made.px4.reboot()
             await asyncio.sleep(20.0)
             hands.spot(made.aircraft.time_at(made.now_s), 0.0, 0.0)
@@ -171,32 +148,8 @@ def test_px4s_offsets_are_written_and_such_scales_as_it_starts_with(
     run_virtual(main())
 
 
-def test_a_gradienter_that_falls_silent_when_turned_over_is_not_waited_for_and_is_back_afterwards(
-    tmp_path: Path,
-) -> None:
-    made = Rig(tmp_path, imu_rate_hz=10.0, parameters=SCALES)
-    hands = Hands(made.aircraft, propped_deg=4.0, seed=3)
-
-    async def main() -> None:
-        async with made.running():
-            await made.ready()
-            result = await follow(made, hands, faced(made, write=False))
-            assert result.outcome == "done", result
-            hands.back(made.aircraft.time_at(made.now_s))
-            result, record = await calibrated(made)
-            assert result.outcome == "done", result
-            assert record.pose is not None
-            assert (record.pose.sigma_deg.theta or 90.0) < 0.1
-
-    run_virtual(main())
-
-
-@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_with_all_sides_known_later_calibrations_have_a_tilt_and_the_autopilots_heading(
-    tmp_path: Path, firmware: str
-) -> None:
-    options = {} if firmware == "ardupilot" else {"firmware": "px4", "parameters": {}}
-    made, hands = rig(tmp_path, **options)
+def test_with_all_sides_known_later_calibrations_have_a_tilt_and_the_autopilots_heading(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
 
     async def calibration() -> Record:
         result, record = await calibrated(made, What.GYROS)
@@ -206,11 +159,13 @@ def test_with_all_sides_known_later_calibrations_have_a_tilt_and_the_autopilots_
     async def main() -> None:
         async with made.running():
             await made.ready()
-            before = await calibration()
+            before, scales = await calibration(), read(made, "scale").tolist()
             assert before.pose is not None
             assert {before.pose.tilt_from, before.pose.heading_from, before.pose.theta_deg} == {None}
-            result = await follow(made, hands, faced(made, write=firmware == "ardupilot"))
+            result = await follow(made, hands, faced(made, write=False))
             assert result.outcome == "done", result
+            assert result.reason.endswith("not written (--write does)")
+            assert read(made, "scale").tolist() == scales, "nothing is written unless wanted"
             hands.spot(made.aircraft.time_at(made.now_s), 3.0, -4.0)
             made.autopilot.has_compass = True
             await asyncio.sleep(30.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import re
 from collections.abc import Callable
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.estimation.request import What
 from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H, MG
 from tests.e2e.test_calibration import calibrated, started
@@ -94,45 +92,5 @@ def test_preflight_storage_is_never_sent_and_the_firmwares_gyro_calibration_at_m
             mavlink.MAV_CMD_PREFLIGHT_CALIBRATION,
         }
         assert set(traffic.commands) <= harmless
-
-    run_virtual(main())
-
-
-def test_streams_at_a_quarter_of_their_rate_during_a_parameter_transfer_do_no_harm(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, max_s=20.0, imu_rate_hz=100.0).running() as rig:
-            await rig.ready()
-            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
-            await asyncio.sleep(4.0)
-            seen = rig.service.devices.imus["fc"].stream.samples
-            rig.double.channels[0].listing = True  # on our own link somebody reads all parameters, by a slow radio
-            await asyncio.sleep(6.0)
-            assert rig.service.devices.imus["fc"].stream.samples - seen == pytest.approx(150, abs=10)
-            rig.double.channels[0].listing = False
-            result = await job.finished
-            assert result.outcome == "done", result
-            left = rig.double.residual(1, rig.now_s)
-            assert np.abs(left.gyro_rad_s).max() < 20 * DEG_H
-            assert np.abs(left.accel_m_s2).max() < 0.3 * MG
-
-    run_virtual(main())
-
-
-def test_caltemp_is_left_alone_so_that_new_is_old_plus_residual(tmp_path: Path) -> None:
-    async def main() -> None:
-        temperatures = {"INS_GYR1_CALTEMP": 41.5, "INS_ACC1_CALTEMP": 39.25, "INS_TCAL1_ENABLE": 1.0}
-        rig = slow(tmp_path, parameters=temperatures)
-        async with rig.running():
-            await rig.ready()
-            result, record = await calibrated(rig)
-            assert result.outcome == "done", result
-            assert {name: rig.double.parameter(name) for name in temperatures} == temperatures
-            assert not [write.name for write in rig.double.writes if "CALTEMP" in write.name]
-            imu = record.imus[0]
-            assert imu.residual_gyro_rad_s is not None
-            for name, residual in zip(offset_names(1, "gyro"), imu.residual_gyro_rad_s, strict=True):
-                written = imu.written[name]
-                assert written.before is not None
-                assert written.after == pytest.approx(written.before + residual, abs=1e-9)
 
     run_virtual(main())

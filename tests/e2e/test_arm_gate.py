@@ -215,44 +215,6 @@ def test_ardupilots_script_hears_the_verdict_only_while_it_gates(tmp_path: Path)
     run_virtual(main())
 
 
-@pytest.mark.parametrize(
-    ("parameters", "problem"),
-    [
-        ({}, None),
-        ({"COM_ARM_AUTH_REQ": 0.0}, "set COM_ARM_AUTH_REQ 1"),
-        ({"COM_ARM_AUTH_ID": 10.0, "COM_ARM_AUTH_MET": 1.0}, "set COM_ARM_AUTH_ID 1, COM_ARM_AUTH_MET 0"),
-    ],
-)
-def test_a_px4_that_does_not_ask_is_found_and_what_to_set_is_said(
-    tmp_path: Path, parameters: dict[str, float], problem: str | None
-) -> None:
-    async def main() -> None:
-        async with px4(tmp_path, "gate", **parameters).running() as rig:
-            await rig.until(lambda: rig.service.arming.gate_setup.known, 30.0)
-            assert rig.service.arming.gate_setup.problem == problem
-            await asyncio.sleep(3.0)
-            assert ("NO GATE" in texts(rig)) == (problem is not None)
-
-    run_virtual(main())
-
-
-@pytest.mark.parametrize(("version", "script"), [("4.8", True), ("4.8", False), ("4.5", False)])
-def test_an_ardupilot_without_the_script_is_found(tmp_path: Path, version: str, script: bool) -> None:
-    async def main() -> None:
-        rig = Rig(tmp_path, at_arm="gate", version=version)
-        if script:
-            # A parameter that a script has made stands behind all others.
-            store = rig.double.parameters
-            store._types["CMPG_ENABLE"], store.values["CMPG_ENABLE"] = mavlink.MAV_PARAM_TYPE_REAL32, 1.0
-            store.names += ("CMPG_ENABLE",)
-        async with rig.running():
-            await rig.until(lambda: rig.service.arming.gate_setup.known, 60.0)
-            said = "the arming script does not run (see: companion lua)"
-            assert rig.service.arming.gate_setup.problem == (None if script else said)
-
-    run_virtual(main())
-
-
 def refuses_one(faults: Faults) -> None:
     faults.refuse = {"INS_GYROFFS_Z"}
 
@@ -271,5 +233,31 @@ def test_a_write_that_is_rolled_back_leaves_the_gate_shut(tmp_path: Path, fault:
                 await asyncio.sleep(0.25)
                 assert rig.service.arming.readiness.answer().verdict != "accept"
             assert rig.service.calibrating.store.history()[0].state == "failed"
+
+    run_virtual(main())
+
+
+def test_a_second_autopilot_with_our_system_id_shuts_the_gate(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, at_arm="gate", max_s=12.0).running() as rig:
+            await rig.ready()
+            other = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+            for _ in range(20):
+                beat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
+                rig.wire.carry_from_other(beat.pack(other))
+                await asyncio.sleep(1.0)
+            answer = rig.service.arming.readiness.answer()
+            assert (answer.verdict, answer.words) == ("refuse", "two autopilots have system id 1")
+            assert rig.double.writes == []
+
+    run_virtual(main())
+
+
+def test_a_px4_that_does_not_ask_is_found_and_what_to_set_is_said(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with px4(tmp_path, COM_ARM_AUTH_REQ=0.0).running() as rig:
+            await rig.until(lambda: rig.service.arming.gate_setup.known, 30.0)
+            assert rig.service.arming.gate_setup.problem == "set COM_ARM_AUTH_REQ 1"
+            await rig.until(lambda: "NO GATE" in texts(rig), 5.0)
 
     run_virtual(main())

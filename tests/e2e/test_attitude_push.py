@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -16,9 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.daemon.heading.attitude_service import AttitudeService
 from companion.daemon.job import Job
 from companion.estimation.request import What
-from sim.aircraft import Pose
 from sim.motions import Turn
-from sim.scenario import site_at
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 from tests.support.witness import Witness
@@ -118,48 +115,6 @@ def test_the_heading_follows_the_aircraft_through_a_turn(tmp_path: Path, firmwar
     run_virtual(main())
 
 
-def test_rate_and_stamps(tmp_path: Path) -> None:
-    """At most 50 Hz, never two closer than ArduPilot takes; stamps rise, on the clock that answers TIMESYNC."""
-    rate_hz = 50.0
-
-    async def main() -> None:
-        async with flight(tmp_path, firmware="ardupilot", rate_hz=rate_hz) as flying:
-            begin_s = flying.rig.now_s
-            await flying.sleep(4.0)
-            stamps = np.array([message.usec for message in flying.witness.of(Vision, begin_s)])
-            times = np.array(flying.witness.times(Vision, begin_s))
-            assert len(stamps) == pytest.approx(4.0 * rate_hz, rel=0.06, abs=1)
-            assert np.diff(stamps).min() >= 20_000
-            assert np.all(np.abs(times - stamps * 1e-6) < 0.05)
-            assert flying.rig.double.external_nav.rejected.total() == 0
-
-    run_virtual(main())
-
-
-def test_true_north_is_pushed_on_both_sides_of_the_seam(tmp_path: Path) -> None:
-    """The declination of Cape Town is -27 degrees."""
-    heading_deg = 359.5
-
-    async def main() -> None:
-        site = site_at(-33.9, 18.4, 50.0)
-        pose = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=heading_deg)
-        async with flight(tmp_path, pose=pose, site=site) as flying:
-            flying.rig.autopilot.arm()
-            flying.turn(heading_deg=-3.0)
-            await flying.sleep(5.0)
-            flying.turn(heading_deg=6.0)
-            await flying.sleep(6.0)
-            yaws = [message.yaw for message in flying.witness.of(Vision)]
-            steps = [abs(math.remainder(b - a, 2.0 * math.pi)) for a, b in itertools.pairwise(yaws)]
-            assert max(steps) < math.radians(1.0)
-            assert max(map(abs, yaws)) <= math.pi + 1e-6
-            expected = math.radians(heading_deg + 3.0)
-            assert abs(math.remainder(yaws[-1] - expected, 2.0 * math.pi)) < math.radians(2.0)
-            assert flying.theirs_deg() < 3.0
-
-    run_virtual(main())
-
-
 def test_nothing_is_pushed_before_a_calibration_or_without_a_compass(tmp_path: Path) -> None:
     async def main() -> None:
         async with flight(tmp_path, calibrated=False) as flying:
@@ -219,39 +174,6 @@ def test_a_new_alignment_that_turns_the_heading_is_a_reset(tmp_path: Path) -> No
             await flying.sleep(3.0)
             assert flying.witness.of(Vision)[-1].reset_counter == 1
             assert flying.theirs_deg() < 2.0
-
-    run_virtual(main())
-
-
-def test_px4_converges_on_our_clock(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flight(tmp_path, firmware="px4") as flying:
-            await flying.sleep(60.0)
-            vision = flying.rig.px4.vision
-            assert vision.converged
-            assert vision.active
-            assert 0.0 < vision.late_s < 0.02
-
-    run_virtual(main())
-
-
-def test_a_heading_that_differs_is_told(tmp_path: Path) -> None:
-    """The autopilot goes its own way by 12 degrees: told once, shown as a warning, and gone when it is over."""
-
-    async def main() -> None:
-        async with flight(tmp_path, used=False) as flying:
-            rig = flying.rig
-            await flying.sleep(5.0)
-            assert not flying.attitude.health.warning
-            rig.double.estimator.yaw_error_rad = math.radians(16.0)
-            await flying.sleep(8.0)
-            warning = flying.attitude.health.warning
-            assert warning is not None
-            assert "deg in heading" in warning
-            assert warning in rig.service.status()["warnings"]
-            assert sum("deg in heading" in text for text in rig.ground.texts()) == 1
-            await rig.until(lambda: not flying.attitude.health.warning, 120.0)
-            assert flying.attitude.health.pushing
 
     run_virtual(main())
 
@@ -368,20 +290,6 @@ def test_two_compasses_that_differ_are_not_settled_by_pushing(tmp_path: Path) ->
     run_virtual(main())
 
 
-def test_a_yaw_that_is_nobodys_does_not_stand_against_ours(tmp_path: Path) -> None:
-    """An ArduPilot with our heading and no second source set has none without us, though its compass is well."""
-
-    async def main() -> None:
-        async with flight(tmp_path, calibrated=False) as flying:
-            flying.rig.autopilot.has_compass = True
-            compass: Any = flying.rig.devices["compass"]
-            compass.heading_error_deg = 40.0
-            await flying.calibrate()
-            await flying.pushing(30.0)
-
-    run_virtual(main())
-
-
 def test_a_fault_of_ours_costs_the_push_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The collector gets every sample; on the ground it begins anew by itself."""
 
@@ -402,18 +310,5 @@ def test_a_fault_of_ours_costs_the_push_and_nothing_else(tmp_path: Path, monkeyp
 
     async def rig_stops(flying: Flight) -> None:
         await flying.rig.until(lambda: not flying.attitude.health.pushing, 2.0)
-
-    run_virtual(main())
-
-
-def test_off_sends_nothing(tmp_path: Path) -> None:
-    async def main() -> None:
-        rig = Rig(tmp_path, firmware="px4")
-        witness = Witness(rig)
-        async with rig.running():
-            await rig.ready()
-            assert rig.service.heading.attitude is None
-            assert rig.service.status()["attitude"] is None
-            assert not witness.of(mavlink.MAVLink_timesync_message)
 
     run_virtual(main())

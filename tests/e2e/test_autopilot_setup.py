@@ -97,24 +97,6 @@ def test_what_is_to_be_set_is_said_and_nothing_is_written(tmp_path: Path, firmwa
     run_virtual(main())
 
 
-@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_where_no_heading_is_sent_none_is_missed_and_one_that_is_expected_all_the_same_is(
-    tmp_path: Path, firmware: Firmware
-) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, firmware=firmware, parameters=BEFORE[firmware]).running() as rig:
-            await rig.ready()
-            lines = setup_lines(await ask(rig))
-            assert lines[0].startswith("heading: not wanted; for push.attitude: set ")
-            assert not [line for line in lines if line.startswith(("safety net", "risk")) or "VisOdom" in line]
-            await follow(rig)
-            lines = setup_lines(await ask(rig))
-            assert lines[0].endswith('push.attitude is "off": no heading is sent')
-            assert [line for line in lines if line.startswith("risk: ")]
-
-    run_virtual(main())
-
-
 @pytest.mark.parametrize(("parameter", "value", "named"), [
     ("EKF2_MAG_TYPE", 5, "EKF2_MAG_TYPE = 5"),
     ("SYS_HAS_MAG", 0, "SYS_HAS_MAG = 0"),
@@ -135,19 +117,6 @@ def test_without_a_compass_px4_has_nothing_to_go_back_to(
             shown = await ask(rig)
             assert (shown["state"], shown["net"]["kind"]) == ("not applied", "none")
             assert shown["reason"].startswith(f"this autopilot has no compass in use ({named}): ")
-
-    run_virtual(main())
-
-
-@pytest.mark.parametrize("parameter", ["COMPASS_USE", "EK3_SRC3_VELXY", "EK3_SRC2_YAW"])
-def test_ardupilots_net_needs_three_sets_of_sources_and_no_compass(tmp_path: Path, parameter: str) -> None:
-    async def main() -> None:
-        async with flight(tmp_path, calibrated=False, used=False) as flying:
-            rig = flying.rig
-            await follow(rig)
-            assert (await ask(rig))["net"]["kind"] == "command"
-            rig.autopilot.write_as_another_station(parameter, 2.0 if parameter.endswith("YAW") else 0.0)
-            assert (await ask(rig))["net"]["kind"] == ("command" if parameter == "COMPASS_USE" else "none")
 
     run_virtual(main())
 
@@ -189,21 +158,6 @@ def test_where_there_is_no_script_the_companion_asks_for_another_heading_and_for
             flying.attitude.close()  # as the end of the daemon does, at once
             await flying.sleep(0.1)
             assert rig.double.external_nav.source_set == 3
-
-    run_virtual(main())
-
-
-def test_on_the_ground_the_companion_asks_for_the_compass(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flight(tmp_path, calibrated=False, used=False) as flying:
-            rig = flying.rig
-            await set_up(flying)
-            rig.autopilot.arm()
-            rig.unplugged.add("own")
-            await rig.until(lambda: rig.double.external_nav.source_set == 3, 2.0)
-            rig.autopilot.disarm()
-            await rig.until(lambda: rig.double.external_nav.source_set == 2, 6.0)
-            assert "Heading: compass, companion's is not pushed" in rig.ground.texts()
 
     run_virtual(main())
 

@@ -27,7 +27,7 @@ CELLS: list[tuple[str, Phase, int]] = [
     ("kill", "writing", SEED),
     ("disk-full", "verifying", SEED),
     ("echoes-only", "writing", SEED),
-    *slice_of(SEED, 12),
+    *slice_of(SEED, 8),
 ]
 """The cells that show most of what a write must survive, and a slice of the others."""
 CELLS_A_TEST = 4

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import os
-import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -113,58 +110,6 @@ def test_two_devices_swapped_each_at_its_own_speed(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-def test_silence_is_said_once_and_nothing_is_tried(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with bench(tmp_path, Setting(9600), Setting(19200)) as (gradienter, _):
-            gradienter.muted = True
-            findings = [one for one in await found(text(tmp_path), 1.0) if one.name == "gradienter"]
-            (finding,) = findings
-            assert "silent" in finding.words
-            assert not finding.good
-
-    asyncio.run(main())
-
-
-def test_with_a_daemon_running_it_is_asked_and_its_ports_are_left_alone(tmp_path: Path) -> None:
-    path = tmp_path / "test.toml"
-    path.write_text(text(tmp_path, "baud = 115200"))
-
-    async def main() -> None:
-        async with bench(tmp_path, Setting(9600), Setting(115200)) as (gradienter, compass):
-            process = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "companion", "-c", str(path), "run"), stderr=asyncio.subprocess.DEVNULL
-            )
-            try:
-                # Its compass at 19200 hears a compass at 115200; its gradienter at 115200 one at 9600.
-                async with asyncio.timeout(150.0):
-                    while True:
-                        said = await companion("-c", str(path), "status", "--json")
-                        if said.code == 0 and all(
-                            device["trouble"] == "undecodable" for device in said.json["devices"][1:]
-                        ):
-                            break
-                check = await companion("-c", str(path), "check", "--json")
-                assert check.code == 1
-                findings = {one["name"]: one for one in check.json["findings"] if one["remedy"]}
-                assert "sudo systemctl stop companion" in findings["gradienter"]["remedy"]
-                assert set(check.json["findings"][0]) == {"name", "good", "words", "remedy", "port"}
-                # The same device at the speed that the daemon reads: it says itself who that is.
-                compass.line = Setting(19200)
-                compass.frame = tilt_frame
-                async with asyncio.timeout(150.0):
-                    while True:
-                        check = await companion("-c", str(path), "check", "--json")
-                        said_of = [one["words"] for one in check.json["findings"] if one["name"] == "compass"]
-                        if any("this is inclinometer_xy, a device for gradienter" in words for words in said_of):
-                            break
-            finally:
-                process.terminate()
-                await process.wait()
-            assert gradienter.master >= 0
-
-    asyncio.run(main())
-
-
 def sent_to(device: Chatter) -> bytes:
     """What a device was told, whether or not somebody still has its port open."""
     with contextlib.suppress(OSError):
@@ -187,21 +132,5 @@ def test_ports_listen_says_who_speaks_and_at_which_speed(tmp_path: Path) -> None
                 assert f"{tmp_path / name}: {device}\n" in said.out
             assert "companion setup takes them" in said.err
             assert [sent_to(one), sent_to(other)] == [b"", b""]
-
-    asyncio.run(main())
-
-
-def test_ports_listen_leaves_alone_what_somebody_holds_and_does_not_list_by_opening(tmp_path: Path) -> None:
-
-    async def main() -> None:
-        async with Chatter(tmp_path / "a", tilt_frame) as device:
-            held = os.open(device.path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
-            said = await companion("ports", "--listen", str(device.path), "--json")
-            os.close(held)
-            heard: dict[str, Any] = said.json["heard"][str(device.path)]
-            assert not heard["good"]
-            assert f"process {os.getpid()}" in heard["reason"]
-            listed = await companion("ports", "--json")
-            assert "heard" not in json.loads(listed.out)
 
     asyncio.run(main())

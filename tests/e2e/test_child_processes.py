@@ -126,8 +126,6 @@ def _rss_mib() -> float:
 @pytest.mark.parametrize(
     ("state", "blow"),
     [
-        (State.WAITING, signal.SIGSTOP),
-        (State.COLLECTING, signal.SIGKILL),
         (State.WRITING, signal.SIGSTOP),
         (State.VERIFYING, signal.SIGKILL),
     ],

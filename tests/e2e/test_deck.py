@@ -11,7 +11,6 @@ import numpy as np
 
 from companion.commands import Align
 from companion.component.service import Refusal
-from companion.estimation.deck.estimate import DeckWork
 from companion.estimation.records.record import Record
 from companion.estimation.request import What
 from companion.lab.replay.engine import replay
@@ -91,27 +90,6 @@ def test_px4_on_a_boat_is_calibrated_by_itself_and_then_arms(tmp_path: Path) -> 
     run_virtual(main())
 
 
-def test_the_gate_answers_while_a_small_board_works_for_seconds(tmp_path: Path) -> None:
-    async def slow(function: Any, *arguments: Any) -> Any:
-        if isinstance(getattr(function, "__self__", None), DeckWork):
-            await asyncio.sleep(4.0)
-        return function(*arguments)
-
-    async def main() -> None:
-        rig = boat(tmp_path, at_arm="gate")
-        rig.offload = slow
-        async with rig.running():
-            await rig.ready()
-            said = set()
-            for _ in range(450):
-                await asyncio.sleep(0.2)
-                said.add(rig.service.arming.readiness.answer().words)
-            assert not any("busy" in words for words in said), said
-            assert any(words.startswith("wait: some") for words in said), said
-
-    run_virtual(main())
-
-
 def test_a_replay_on_a_deck_gives_the_same_records(tmp_path: Path) -> None:
     async def main() -> list[Record]:
         async with boat(tmp_path, more=f"{DECK}[push]\nparameters = false\n", recordings_mb=64).running() as rig:
@@ -127,18 +105,6 @@ def test_a_replay_on_a_deck_gives_the_same_records(tmp_path: Path) -> None:
     records = run_virtual(main())
     assert len(records) == 2
     same(replay(ring(tmp_path)), records)
-
-
-def test_where_the_ground_is_meant_the_words_name_the_deck(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with boat(tmp_path, BOAT, more="").running() as rig:
-            await rig.ready()
-            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test", 60.0))
-            result = await job.finished
-            assert result.outcome == "failed"
-            assert "deck" in result.reason
-
-    run_virtual(main())
 
 
 def test_no_zero_of_a_gradienter_is_measured_on_a_deck(tmp_path: Path) -> None:

@@ -9,19 +9,17 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.daemon.stands.measuring import Measuring
-from companion.estimation.machine import State
 from companion.estimation.means.windows import Window
 from companion.estimation.request import What
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from sim.ardupilot.double import ArduPilotDouble, offset_names
-from sim.imu_model import DEG_H, MG
-from tests.e2e.test_calibration import FC_PARAMETERS, calibrated, started
+from sim.imu_model import DEG_H
+from tests.e2e.test_calibration import FC_PARAMETERS, calibrated
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -96,33 +94,6 @@ def test_offsets_that_change_unheard_after_the_measurement_are_measured_under_ag
     run_virtual(main())
 
 
-def test_integer_messages_that_hide_a_gyro_bias_leave_the_gyro_offsets(tmp_path: Path) -> None:
-    async def main() -> None:
-        rig = Rig(tmp_path, max_s=12.0)
-        before = values(rig.double)
-        rig.double.faults.int_only = True
-        async with rig.running():
-            await rig.until(lambda: rig.service.devices.imus["fc"].calibration is not None, 15.0)
-            await rig.until(lambda: rig.service.devices.imus["fc"].stream.samples > 0, 30.0)
-            result, record = await calibrated(rig, timeout_s=120.0)
-            assert result.outcome == "done"
-            assert "gyro fc" in result.reason
-            imu = record.imus[0]
-            # Gyro noise of a fifth of a step around zero: unknown, so nothing is written, and what to do is said.
-            assert imu.gyro_bias_rad_s is None
-            assert any("push.dither" in words for words in imu.warnings)
-            assert imu.accel_bias_m_s2 is not None
-            assert imu.accel_sigma_use_m_s2 is not None
-            true = rig.model.true_bias(rig.aircraft.time_at(rig.now_s))
-            off = np.abs(np.subtract(imu.accel_bias_m_s2, true.accel_m_s2))
-            assert np.all(off < 3 * np.array(imu.accel_sigma_use_m_s2))
-            assert off.max() < 0.15 * MG
-            changed = {name for name, value in values(rig.double).items() if value != before[name]}
-            assert changed == set(offset_names(1, "accel"))
-
-    run_virtual(main())
-
-
 def test_a_storage_that_cannot_be_written_refuses_with_the_reason_before_anything_is_measured(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
 
@@ -133,43 +104,5 @@ def test_a_storage_that_cannot_be_written_refuses_with_the_reason_before_anythin
             assert isinstance(refusal, Refusal)
             assert "cannot be written" in refusal.reason
             assert rig.service.calibrating.manager.mav_state == 5  # MAV_STATE_CRITICAL
-
-    run_virtual(main())
-
-
-def test_a_foreign_write_during_the_verification_is_never_called_verified(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, max_s=12.0).running() as rig:
-            await rig.ready()
-            before = values(rig.double)
-            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.calibrating.manager.state is State.VERIFYING, 60.0)
-            await asyncio.sleep(1.5)
-            foreign = rig.double.parameter("INS_GYROFFS_X") + 6e-5
-            rig.double.write_as_another_station("INS_GYROFFS_X", foreign)
-            result = await job.finished
-            assert result.outcome == "failed"
-            assert "somebody" in result.reason
-            assert "INS_GYROFFS_X" in result.reason
-            now = values(rig.double)
-            assert now.pop("INS_GYROFFS_X") == pytest.approx(foreign)
-            before.pop("INS_GYROFFS_X")
-            assert now == before
-
-    run_virtual(main())
-
-
-def test_every_imu_that_does_not_take_its_offsets_is_named(tmp_path: Path) -> None:
-    async def main() -> None:
-        second = '[[imu]]\nname = "fc2"\nsource = "autopilot"\ninstance = 2\nprofile = "icm42688p"\n'
-        rig = Rig(tmp_path, max_s=12.0, more=second, parameters={"INS_ACC2OFFS_X": 0.1})
-        async with rig.running():
-            await rig.ready()
-            rig.double.faults.echo_without_effect = True
-            result, record = await calibrated(rig)
-            assert result.outcome == "failed"
-            assert "imu fc: the autopilot stored" in result.reason
-            assert "imu fc2: the autopilot stored INS_ACC2OFFS_X but does not use it" in result.reason
-            assert {w.outcome for imu in record.imus for w in imu.written.values()} == {"rolled_back"}
 
     run_virtual(main())

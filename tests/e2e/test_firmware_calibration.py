@@ -17,7 +17,6 @@ from companion.estimation.request import What
 from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H
 from tests.e2e.test_calibration import FC_PARAMETERS, calibrated, started
-from tests.support.component import CALIBRATE, UNDO
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -96,30 +95,6 @@ def test_accelerometers_then_the_firmwares_calibration_once_then_the_fine_gyro_o
     run_virtual(main())
 
 
-def test_the_fine_offsets_are_right_on_a_turned_board(tmp_path: Path) -> None:
-    parameters = {
-        "AHRS_ORIENTATION": 101.0,
-        "CUST_ROT_ENABLE": 1.0,
-        "CUST_ROT1_ROLL": 10.0,
-        "CUST_ROT1_PITCH": -20.0,
-        "CUST_ROT1_YAW": 30.0,
-        "INS_GYROFFS_X": 1e-3,
-        "INS_GYROFFS_Y": -2e-3,
-    }
-
-    async def main() -> None:
-        rig = make(tmp_path, max_s=30.0, parameters=parameters, mounting_deg=(10.0, -20.0, 30.0))
-        async with rig.running():
-            await rig.ready()
-            sent = Sent(rig)
-            result, _ = await calibrated(rig)
-            assert result.outcome == "done", result
-            assert sent.commands == 1
-            assert gyro_error_deg_h(rig) < FINE_DEG_H
-
-    run_virtual(main())
-
-
 def test_with_a_temperature_calibration_on_any_imu_it_is_left_out_and_the_ekf_waited_for(tmp_path: Path) -> None:
     async def main() -> None:
         async with make(tmp_path, parameters={"INS_TCAL2_ENABLE": 1.0}).running() as rig:
@@ -162,33 +137,6 @@ def test_arming_or_a_cancel_while_the_ekf_settles_ends_the_waiting_and_not_the_r
     assert "wait 2 min before take-off: cancelled by test" in words
 
 
-def test_a_lost_command_is_not_repeated_and_the_fine_offsets_are_in_force(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with make(tmp_path).running() as rig:
-            await rig.ready()
-            sent = Sent(rig, lose_command=True)
-            result, record = await calibrated(rig)
-            assert result.outcome == "done", result
-            assert sent.commands == 1
-            assert "did not run" in " ".join(record.warnings)
-            assert gyro_error_deg_h(rig) < FINE_DEG_H
-
-    run_virtual(main())
-
-
-def test_a_command_that_comes_twice_is_answered_too_early_and_waited_out(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with make(tmp_path, duplicate=1.0).running() as rig:
-            await rig.ready()
-            result, _ = await calibrated(rig)
-            assert result.outcome == "done", result
-            assert rig.double.channels[0].received["COMMAND_LONG"] > 1
-            assert not rig.double.calibrating
-            assert gyro_error_deg_h(rig) < FINE_DEG_H
-
-    run_virtual(main())
-
-
 def test_a_calibration_of_the_firmware_that_fails_is_said_and_ours_stays(tmp_path: Path) -> None:
     async def main() -> None:
         async with make(tmp_path).running() as rig:
@@ -201,21 +149,6 @@ def test_a_calibration_of_the_firmware_that_fails_is_said_and_ours_stays(tmp_pat
             assert "Gyros not calibrated" in " ".join(record.warnings)
             assert "Gyros not calibrated" in rig.double.prearm_failures(rig.now_s)
             assert gyro_error_deg_h(rig) < FINE_DEG_H
-
-    run_virtual(main())
-
-
-def test_a_small_step_is_not_worth_the_firmwares_calibration(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with make(tmp_path, max_s=30.0).running() as rig:
-            await rig.ready()
-            assert (await calibrated(rig))[0].outcome == "done"
-            sent = Sent(rig)
-            assert (await calibrated(rig))[0].outcome == "done"
-            assert sent.commands == 0
-            result, _ = await calibrated(rig, What.ACCELEROMETERS)
-            assert result.outcome == "done"
-            assert sent.commands == 0
 
     run_virtual(main())
 
@@ -292,78 +225,6 @@ def test_a_daemon_that_died_during_the_firmwares_calibration_puts_everything_bac
     kept = run_virtual(until_it_dies())
     for coarse in (0.0, 3e-4):
         run_virtual(again(*kept, coarse))
-
-
-def test_a_daemon_that_died_after_it_leaves_alone_what_others_have_changed_since(tmp_path: Path) -> None:
-    first, second, foreign = tmp_path / "first", tmp_path / "second", "INS_GYR2OFFS_X"
-
-    async def until_it_dies() -> tuple[dict[str, float], dict[str, float]]:
-        async with make(first, auxiliary=True).running() as rig:
-            await rig.ready()
-            before = imu_parameters(rig)
-            started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.calibrating.manager.state is State.VERIFYING, 90.0)
-            second.mkdir()
-            (second / "journal.json").write_bytes((first / "journal.json").read_bytes())
-            return before, imu_parameters(rig)
-
-    async def again(before: dict[str, float], left: dict[str, float]) -> None:
-        assert left[foreign] != before[foreign]
-        async with make(second, auxiliary=True, parameters={**left, foreign: 0.0025}).running() as rig:
-            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
-            assert imu_parameters(rig) == {**before, foreign: np.float32(0.0025)}
-
-    run_virtual(again(*run_virtual(until_it_dies())))
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_fifth_of_all_packets_lost_leaves_the_whole_result_or_the_old_values(tmp_path: Path, seed: int) -> None:
-    async def main() -> None:
-        async with make(tmp_path, seed=seed).running() as rig:
-            await rig.ready()
-            sent = Sent(rig)
-            before = imu_parameters(rig)
-            rig.wire.loss = 0.2
-            result, _ = await calibrated(rig)
-            await rig.until(lambda: not rig.service.offsets.ledger.pending, 120.0)
-            assert sent.commands <= 1
-            if result.outcome == "done":
-                assert gyro_error_deg_h(rig) < FINE_DEG_H + 15.0
-            else:
-                assert imu_parameters(rig) == before
-
-    run_virtual(main())
-
-
-def test_another_station_that_sets_a_gyro_offset_meanwhile_is_not_overwritten_unsaid(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with make(tmp_path).running() as rig:
-            await rig.ready()
-            rig.double.faults.foreign_write_after = (9, "INS_ACCOFFS_Y", 0.25)
-            result, _ = await calibrated(rig)
-            assert result.outcome == "failed"
-            assert "INS_ACCOFFS_Y" in result.reason
-            assert rig.double.parameter("INS_ACCOFFS_Y") == 0.25
-
-    run_virtual(main())
-
-
-def test_a_ground_station_hears_progress_while_the_firmware_calibrates(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with make(tmp_path).running() as rig:
-            await rig.ready()
-            rig.double.faults.gyro_calibration_fails = True  # so it takes its full 30 s
-            await rig.until(lambda: rig.double.hears(191), 5.0)
-            rig.ground.command(CALIBRATE, 0.0, target=(1, 191))
-            await rig.until(lambda: rig.double.calibrating, 90.0)
-            since = len(rig.ground.acks(CALIBRATE))
-            await asyncio.sleep(10.0)
-            assert len(rig.ground.acks(CALIBRATE)) >= since + 15
-            await rig.until(lambda: bool(rig.ground.finals(CALIBRATE)), 300.0)
-            rig.ground.command(UNDO, target=(1, 191))
-            await rig.until(lambda: bool(rig.ground.finals(UNDO)), 60.0)
-
-    run_virtual(main())
 
 
 def test_the_undo_of_one_vehicle_is_never_written_to_another_and_waits_for_its_own(tmp_path: Path) -> None:

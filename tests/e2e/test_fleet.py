@@ -13,13 +13,12 @@ import pytest
 import sqlalchemy as sa
 
 from companion.config.sections import Mqtt
-from companion.daemon.process.check import run_check
 from companion.fleet.collector import Collector, stop
 from companion.fleet.store import Store
 from tests.support.broker import BEST, Broker, broker, hurry
 from tests.support.collecting import items_in, rows_of
 from tests.support.fleet import check
-from tests.support.mqtt_daemon import alone, until_connected
+from tests.support.mqtt_daemon import until_connected
 from tests.support.rig import Rig
 
 UID = b"virtual 0000".ljust(18, b"\0").hex()
@@ -106,32 +105,5 @@ def test_a_calibration_an_undo_and_an_arming_are_in_the_database_whatever_is_kil
         assert [tuple(row) for row in rows_of(database, sa.text("SELECT aircraft, name FROM fleet"))] == [
             (UID, "Heron 7")
         ]
-
-    asyncio.run(main())
-
-
-def test_status_and_check_say_how_it_stands(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with broker(tmp_path) as one:
-            section = f"{one.section()}[fleet]\n"
-            async with alone(tmp_path, section) as service:
-                await until_connected(service)
-                words = "no items waiting for the fleet, never confirmed so far"
-                await until(lambda: service.status()["fleet"]["summary"] == words)
-                config = service.config
-            found = {finding.name: finding for finding in await run_check(config, 0.5)}
-            assert found["fleet"].words.startswith("not looked at in a check")
-            assert found["fleet"].verdict == "ok"
-
-    asyncio.run(main())
-
-
-def test_nothing_of_it_is_imported_kept_or_said_where_it_is_not_switched_on(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with broker(tmp_path) as one, alone(tmp_path, one.section()) as service:
-            await until_connected(service)
-            assert service.status()["fleet"] is None
-            await asyncio.sleep(1.0)
-        assert not (tmp_path / "fleet.sqlite").exists()
 
     asyncio.run(main())

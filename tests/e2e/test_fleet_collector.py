@@ -19,7 +19,6 @@ from sim.fleet.aircraft import Aircraft
 from tests.support.broker import MOSQUITTO, broker
 from tests.support.collecting import (
     NOW,
-    CollectorProcess,
     items_in,
     rows_of,
     telling,
@@ -74,31 +73,6 @@ def test_a_broker_without_mqtt_5_gets_one_collector(
         asyncio.run(main())
     assert items_in(database) == told_by(fleet)
     assert "no MQTT 5 there, so one collector only; going on with MQTT 3.1.1" in caplog.text
-
-
-@pytest.mark.parametrize("database", ["sqlite"], indirect=True)
-def test_a_new_database_asks_for_all_that_was_confirmed_long_ago(database: str, tmp_path: Path) -> None:
-    """As one restored from a backup asks for what it lacks."""
-    fleet = fleet_of(4, 20, seed=6)
-    for each in fleet:
-        each.confirmed = {*each.told} - {7, 8, 19}
-
-    store = Store(database)
-    store.prepare()
-    store.close()
-
-    async def main() -> None:
-        async with broker(tmp_path) as one, telling(fleet, one):
-            # They have said hello before there is a collector.
-            collector = CollectorProcess(tmp_path, "collector", one, database)
-            try:
-                async with asyncio.timeout(90.0):
-                    while items_in(database) != told_by(fleet):
-                        await asyncio.sleep(0.2)
-            finally:
-                collector.kill()
-
-    asyncio.run(main())
 
 
 @pytest.mark.parametrize("database", KINDS, indirect=True)

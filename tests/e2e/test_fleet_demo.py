@@ -16,7 +16,6 @@ import pytest
 from companion.fleet.store import Message, Store
 from sim.fleet.aircraft import Aircraft
 from sim.fleet.demo import AIRCRAFT
-from tests.support import browser
 from tests.support.broker import MOSQUITTO, free_port
 from tests.support.collecting import NOW, basic, get, served
 
@@ -51,64 +50,6 @@ def test_one_command_shows_a_fleet(tmp_path: Path) -> None:
             if process.returncode is None:
                 process.kill()
                 await process.wait()
-
-    asyncio.run(main())
-
-
-@pytest.mark.skipif(MOSQUITTO is None, reason="no Mosquitto")
-def test_broker_and_collector_end_with_it_though_it_is_killed(tmp_path: Path) -> None:
-    async def main() -> None:
-        process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "sim", "fleet", "--page", f"127.0.0.1:{free_port()}"),
-            stdout=asyncio.subprocess.PIPE,
-            env={**os.environ, "TMPDIR": str(tmp_path)},
-        )
-        try:
-            assert process.stdout is not None
-            folder = (await process.stdout.readline()).decode().partition("file in ")[2].partition(",")[0]
-            async with asyncio.timeout(60.0):
-                while len(children := _children(folder)) < 2:
-                    await asyncio.sleep(0.1)
-        finally:
-            process.kill()
-            await process.wait()
-        async with asyncio.timeout(20.0):
-            while any(os.path.exists(f"/proc/{pid}") for pid in children):  # noqa: ASYNC240 - /proc is memory
-                await asyncio.sleep(0.05)
-
-    asyncio.run(main())
-
-
-def _children(folder: str) -> list[str]:
-    """List the processes of broker and collector: those with a configuration in the folder, without their shells."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        with contextlib.suppress(OSError):
-            words = path.read_bytes().decode().split("\0")
-            if words[0] != "sh" and any(word.startswith(f"{folder}/") for word in words):
-                found.append(path.parent.name)
-    return found
-
-
-def test_pages_fit_a_phone_and_a_desktop(tmp_path: Path) -> None:
-    if browser.find() is None:
-        pytest.skip("no Chromium")
-    one, bad = Aircraft(1), Aircraft(2)
-    one.live(NOW, 30)
-    bad.calibrate(NOW, "not still: " + "gyro_x_" * 30)
-
-    async def main() -> None:
-        async with served(tmp_path, one, bad) as port, browser.chromium(tmp_path) as chromium:
-            tab = await chromium.tab()
-            for size in (browser.PHONE, browser.DESKTOP):
-                for path, title in (
-                    ("/", "Fleet"),
-                    (f"/aircraft/{one.id}", one.name),
-                    (f"/aircraft/{bad.id}", bad.name),
-                ):
-                    await tab.open(f"http://127.0.0.1:{port}{path}", size)
-                    await tab.until(f"document.querySelector('h1')?.innerText === {title!r}")
-                    assert await tab.value("document.documentElement.scrollWidth") <= size[0], (path, size)
 
     asyncio.run(main())
 

@@ -14,7 +14,7 @@ import trustme
 
 from companion.cli import main as companion
 from companion.errors import ConfigError
-from companion.fleet.server import Certificate, Server
+from companion.fleet.server import Certificate
 from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW, get, served
 
@@ -114,17 +114,3 @@ def test_what_cannot_be_used_is_one_line(tmp_path: Path, capsys: pytest.CaptureF
     ):
         assert companion(["fleet", "run", "--database", str(tmp_path / "fleet.sqlite"), *more]) == 2
         assert words in capsys.readouterr().err
-
-
-def test_a_password_in_plain_text_on_a_network_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    cert, key = issue(tmp_path)
-    database = str(tmp_path / "fleet.sqlite")
-    for bind, certificate, warned in (
-        ("127.0.0.1:0", None, False),
-        ("0.0.0.0:0", None, True),
-        ("0.0.0.0:0", Certificate(cert, key), False),
-    ):
-        caplog.clear()
-        one = Server(bind, database, "Grus grus grus", certificate)
-        assert ("--cert and --key prevent it" in caplog.text) == warned
-        assert one.url.startswith("http:" if certificate is None else "https:")

@@ -13,7 +13,7 @@ import pytest
 import sqlalchemy as sa
 
 from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
-from companion.fleet import page, schema
+from companion.fleet import schema
 from companion.fleet.database import engine_of
 from companion.fleet.store import Message, Store
 from sim.fleet.aircraft import Aircraft
@@ -160,16 +160,6 @@ def test_rows_of_former_curves_go(told: str) -> None:
 
 
 NAMES = ("gyro_bias_deg_h", "gyro_sigma_deg_h", "accel_bias_mg", "accel_sigma_mg")
-
-
-def test_an_aircrafts_page_shows_flights_and_curves_of_either_database(told: str) -> None:
-    engine = engine_of(told, reads_only=True)
-    with engine.begin() as connection:
-        shown = page.aircraft(connection, ONE.id, NOW)
-    engine.dispose()
-    assert shown is not None
-    assert "<strong>2026-11-20 09:30 UTC: </strong>flight, 30 s without GNSS: off by 2.5 m<" in shown
-    assert "The curve of 9 power-ups, as told 2026-11-17." in shown
 
 
 def test_flights_each_once(told: str) -> None:

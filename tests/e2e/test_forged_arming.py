@@ -25,8 +25,8 @@ from tests.support.extent import extent
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
-CASES = extent(whole=1000, a_slice=12)
-CASES_A_TEST = extent(whole=25, a_slice=12)
+CASES = extent(whole=1000, a_slice=6)
+CASES_A_TEST = extent(whole=25, a_slice=6)
 ACTS_S = 10.0
 WIRE_S = 0.05
 """There and back, and what the autopilot takes to answer: so old may be what is known of it."""

@@ -11,10 +11,8 @@ import signal
 import socket
 import sys
 from pathlib import Path
-from typing import cast
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.motions import Handling
 from tests.support.ground_line import Said, finish, ground, ground_line
@@ -144,13 +142,6 @@ async def _run(*words: str) -> Said:
     return await finish(await ground(*words))
 
 
-def test_a_port_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
-    said = asyncio.run(_run("status", "--url", f"serial:{tmp_path}/radio:57600"))
-    assert said.code == FAILED
-    assert said.err.count("\n") == 1
-    assert "radio:57600 cannot be opened: No such file" in said.err
-
-
 def test_a_port_that_another_ground_station_has_is_named() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
@@ -185,43 +176,6 @@ async def _until_said(process: asyncio.subprocess.Process, words: str) -> None:
     async with asyncio.timeout(60.0):
         while words not in (line := await process.stderr.readline()).decode():
             assert line, f"{words!r} was never said"
-
-
-class _Chatterbox(asyncio.DatagramProtocol):
-    """A vehicle on UDP whose components speak in bytes that are no UTF-8, with noise between the packets."""
-
-    def __init__(self) -> None:
-        self._codecs = [mavlink.MAVLink(None, 1, 1), mavlink.MAVLink(None, 1, 191)]
-        self._transport: asyncio.DatagramTransport
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast("asyncio.DatagramTransport", transport)
-
-    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        for codec, kind, autopilot in zip(self._codecs, (2, 18), (3, 8), strict=True):
-            for message in (
-                mavlink.MAVLink_statustext_message(4, b"\xff\xfe \xb2\xe2\xca\xd4 \x1b[31m", 0, 0),
-                mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, mavlink.MAV_STATE_STANDBY, 3),
-            ):
-                self._transport.sendto(message.pack(codec), addr)
-                codec.seq = (codec.seq + 1) % 256
-        self._transport.sendto(b"\x00\xff noise", addr)
-
-
-def test_texts_that_are_no_utf_8_spoil_nothing() -> None:
-    async def main() -> None:
-        loop = asyncio.get_running_loop()
-        transport, _ = await loop.create_datagram_endpoint(_Chatterbox, local_addr=("127.0.0.1", 0))
-        port = transport.get_extra_info("sockname")[1]
-        try:
-            said = await finish(await ground("status", "--url", f"udpout:127.0.0.1:{port}", "--json"))
-        finally:
-            transport.close()
-        assert said.code == DONE, said
-        assert set(said.json["texts"]) == {"?? ???? ?[31m"}
-        assert set(said.err.splitlines()) == {"?? ???? ?[31m"}, "what the companion says, and nothing of MAVSDK's"
-
-    asyncio.run(main())
 
 
 def test_over_a_signed_link_with_the_key_and_with_another(tmp_path: Path) -> None:

@@ -10,14 +10,8 @@ import msgspec
 import pytest
 
 from companion.cli.show import monitor_lines, record_lines
-from companion.component.service import Refusal
 from companion.daemon.arming import automatic
-from companion.daemon.calibrating.run import CalibrationRun
-from companion.daemon.job import Job
 from companion.estimation.machine import State
-from companion.estimation.request import What
-from sim.devices import Gradienter
-from sim.imu_model import MG
 from tests.e2e.test_automatic import calibrated_by_itself, values
 from tests.e2e.test_bias_memory import knocked
 from tests.e2e.test_calibration import calibrated
@@ -37,12 +31,6 @@ def _soon_again(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def accelerometers(rig: Rig) -> dict[str, float]:
     return {name: value for name, value in values(rig).items() if "ACC" in name}
-
-
-def put_back(rig: Rig) -> None:
-    gradienter = rig.devices["gradienter"]
-    assert isinstance(gradienter, Gradienter)
-    gradienter.offset_deg = (0.0, 0.0)
 
 
 async def held_back(rig: Rig) -> dict[str, float]:
@@ -102,44 +90,6 @@ def test_accelerometers_are_held_back_when_the_gradienter_has_moved_until_somebo
     run_virtual(main())
 
 
-def test_what_somebody_asked_for_is_true_from_then_on_also_for_calibrations_by_itself(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
-            before = await held_back(rig)
-            manager, store = rig.service.calibrating.manager, rig.service.calibrating.store
-            assert (await calibrated(rig))[0].outcome == "done"
-            asked = accelerometers(rig)
-            assert all(asked[name] != value for name, value in before.items())
-            for _ in range(2):
-                await asyncio.sleep(10.0)
-                job = manager.start_calibration(What.BOTH, "the companion", automatic=True)
-                assert isinstance(job, Job)
-                assert (await job.finished).outcome == "done"
-                record = store.history(1)[0]
-                assert "held back" not in record.reason
-                assert not any("gradienter" in words for words in record.warnings)
-                assert rig.service.arming.in_force.held_back is None
-                now = accelerometers(rig)
-                assert all(abs(now[name] - value) < 0.5 * MG for name, value in asked.items()), (
-                    "the gradienter slipped by 5 mg"
-                )
-
-    run_virtual(main())
-
-
-def test_nothing_is_held_back_any_more_once_the_gradienter_is_where_it_was(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
-            before = await held_back(rig)
-            assert rig.service.arming.in_force.held_back is not None
-            put_back(rig)
-            await rig.until(lambda: rig.service.arming.in_force.held_back is None, 60.0)
-            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 60.0)
-            assert accelerometers(rig) == before
-
-    run_virtual(main())
-
-
 def test_a_restart_that_keeps_the_offsets_keeps_what_is_held_back_and_the_gate_opens_again(tmp_path: Path) -> None:
     async def main() -> None:
         async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
@@ -150,26 +100,5 @@ def test_a_restart_that_keeps_the_offsets_keeps_what_is_held_back_and_the_gate_o
             assert len(rig.service.calibrating.store.history()) == 2, "nothing had to be measured anew"
             assert rig.service.arming.in_force.held_back is not None
             assert accelerometers(rig) == before
-
-    run_virtual(main())
-
-
-def test_who_asks_in_the_middle_is_not_answered_with_half_of_it(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
-            await calibrated_by_itself(rig)
-            knocked(rig)
-            manager = rig.service.calibrating.manager
-            await rig.until(
-                lambda: len(rig.service.calibrating.store.history()) == 1 and manager.state is State.VERIFYING, 150.0
-            )
-            assert isinstance(manager.job, CalibrationRun)
-            assert manager.job.held_back
-            refused = manager.start_calibration(What.BOTH, "test")
-            assert isinstance(refused, Refusal)
-            assert refused.kind == "busy"
-            await manager.job.finished
-            assert (await calibrated(rig))[0].outcome == "done"
-            assert any("ACC" in name for name in rig.service.calibrating.store.history(1)[0].imus[0].written)
 
     run_virtual(main())

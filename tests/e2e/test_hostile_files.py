@@ -59,20 +59,6 @@ def test_a_damaged_file_is_named_and_nothing_of_it_is_written(
     run_virtual(main())
 
 
-def test_a_fifo_in_place_of_any_other_file_does_not_stop_the_start(tmp_path: Path) -> None:
-    (tmp_path / "records").mkdir()
-    names = ("alignment.json", "faces.json", "reboot-owed.json", "biases.json", "automatic.json", "armings.json")
-    for name in (*names, "records/000001.json", "flights"):
-        os.mkfifo(tmp_path / name)
-
-    async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
-            await rig.ready()
-            assert rig.service.offsets.ledger.fault is None
-
-    run_virtual(main())
-
-
 @pytest.mark.parametrize(("version", "name"), [("4.6", "CAL_GYRO0_XOFF"), ("4.8", "INS5_GYROFFS_X")])
 def test_a_journal_of_parameters_that_this_autopilot_has_not_is_brought_to_an_end(
     tmp_path: Path, version: str, name: str, caplog: pytest.LogCaptureFixture

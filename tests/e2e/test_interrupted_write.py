@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.cli.show import history_lines
-from companion.estimation.machine import State
 from companion.estimation.records.validity import Why
-from companion.estimation.request import What
 from tests.e2e.test_calibration import calibrated, started
 from tests.e2e.test_faults import values
 from tests.support.rig import Rig
@@ -28,34 +26,6 @@ async def told(rig: Rig) -> str:
     lines = await history(rig)
     (heading,) = [at for at, line in enumerate(lines) if "interrupted (UTC)" in line]
     return lines[heading + 1]
-
-
-def test_a_write_that_was_killed_stands_in_the_history_before_and_after_the_restore(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, **QUICK).running() as rig:
-            await rig.ready()
-            before = values(rig.double)
-            started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.calibrating.manager.state is State.WRITING, 60.0)
-            await rig.until(lambda: values(rig.double) != before, 10.0)
-            await rig.restart()
-            rig.wire.cut = True
-            await rig.until(lambda: rig.service.offsets.ledger.pending, 10.0)
-            pending = await told(rig)
-            assert pending.startswith("     20")
-            assert "calibration, 6 parameters: old values not restored yet: disarm and keep the link up" in pending
-            rig.wire.cut = False
-            await rig.until(lambda: not rig.service.offsets.ledger.pending, 30.0)
-            assert values(rig.double) == before
-            over = await told(rig)
-            assert over[:24] == pending[:24], "the begin of the calibration"
-            assert "calibration, 6 parameters: " in over
-            assert " old values back, 20" in over
-            await rig.restart()
-            await rig.ready()
-            assert await told(rig) == over
-
-    run_virtual(main())
 
 
 def test_an_undo_that_armed_in_its_middle_is_brought_to_its_end_and_told_as_one(tmp_path: Path) -> None:

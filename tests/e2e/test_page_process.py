@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import re
 import resource
 import socket
@@ -18,7 +17,6 @@ from tests.support.page import parsed
 
 pytestmark = pytest.mark.real_clock
 
-CROWD = 1000
 SECTION = '[web]\nbind = "127.0.0.1:0"\n'
 
 
@@ -64,26 +62,5 @@ def test_the_page_runs_out_of_memory_and_returns(tmp_path: Path) -> None:
             assert struck is not None
             assert await calibrated(rig, State.COLLECTING, lambda: starved(struck, port)) == "done"
             assert await answer(await opened(page, struck)) == 200
-
-    asyncio.run(main())
-
-
-def test_a_crowd_at_the_page_keeps_nobody_out(tmp_path: Path) -> None:
-    async def main() -> None:
-        rig = rig_of(tmp_path, SECTION)
-        async with beside(rig) as page, contextlib.AsyncExitStack() as stack:
-            port = await opened(page)
-
-            def crowd() -> None:
-                for number in range(CROWD):
-                    visitor = stack.enter_context(socket.create_connection(("127.0.0.1", port)))
-                    with contextlib.suppress(OSError):
-                        visitor.sendall(b"GET / HTTP/1.1\r\nX: " if number % 2 else b"")
-
-            crowding = asyncio.create_task(asyncio.to_thread(crowd))
-            assert await calibrated(rig) == "done"
-            await crowding
-            assert await answer(port) == 200
-            assert page.status()["good"]
 
     asyncio.run(main())

@@ -80,36 +80,6 @@ def test_offsets_that_px4_would_ignore_are_in_use_after_a_calibration_and_out_af
     run_virtual(main())
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {
-            "mounting_deg": (180.0, 0.0, 0.0),
-            "external": (0,),
-            "parameters": {"CAL_GYRO0_ROT": 8.0, "CAL_ACC0_ROT": 8.0, "SENS_BOARD_ROT": 2.0},
-        },
-        {"parameters": {"CAL_ACC0_XSCALE": 1.01, "CAL_GYRO0_XOFF": 0.02, "CAL_ACC0_ZOFF": -0.3}},
-    ],
-    ids=["external", "offsets were there"],
-)
-def test_a_calibration_takes_the_residual_out(tmp_path: Path, options: dict[str, Any]) -> None:
-    async def main() -> None:
-        async with px4_rig(tmp_path, imus=1, **options).running() as rig:
-            await rig.ready()
-            result, record = await calibrated(rig)
-            assert result.outcome == "done", result
-            (fc,) = record.imus
-            assert {written.outcome for written in fc.written.values()} == {"verified"}
-            assert in_use_as_stored(rig)
-            left = rig.px4.residual(1, rig.now_s)
-            assert fc.gyro_sigma_use_rad_s is not None
-            assert fc.accel_sigma_use_m_s2 is not None
-            assert np.abs(left.gyro_rad_s / fc.gyro_sigma_use_rad_s).max() < 3.5
-            assert np.abs(left.accel_m_s2 / fc.accel_sigma_use_m_s2).max() < 3.5
-
-    run_virtual(main())
-
-
 def test_a_small_accelerometer_vector_is_brought_into_use_before_anything_is_measured(tmp_path: Path) -> None:
     async def main() -> None:
         rig = px4_rig(tmp_path, parameters={"CAL_ACC0_XOFF": 0.006, "CAL_ACC0_YOFF": -0.005})
@@ -134,8 +104,7 @@ def test_a_small_accelerometer_vector_is_brought_into_use_before_anything_is_mea
 # --- what may come in between
 
 
-@pytest.mark.parametrize("after", [4, 7], ids=lambda n: f"after write {n}")
-def test_power_cut_of_the_companion_between_the_steps_is_mended(tmp_path: Path, after: int) -> None:
+def test_power_cut_of_the_companion_between_the_steps_is_mended(tmp_path: Path) -> None:
     async def main() -> None:
         parameters = {"CAL_GYRO0_XOFF": 0.004, "CAL_ACC0_ZOFF": 0.25}
         rig = px4_rig(tmp_path, parameters=parameters)
@@ -144,7 +113,7 @@ def test_power_cut_of_the_companion_between_the_steps_is_mended(tmp_path: Path, 
             await rig.ready()
             before |= values(rig)
             started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: len(rig.px4.writes) >= after, 60.0)
+            await rig.until(lambda: len(rig.px4.writes) >= 7, 60.0)
             rig.wire.cut = True  # the companion is gone for good
             journal = (tmp_path / "journal.json").read_bytes()
             assert ChangeLog(tmp_path).journal.read() is not None
@@ -157,32 +126,6 @@ def test_power_cut_of_the_companion_between_the_steps_is_mended(tmp_path: Path, 
             await asyncio.sleep(1.5)
             assert values(again) == before
             assert in_use_as_stored(again)
-
-    run_virtual(main())
-
-
-def test_armed_between_the_steps_nothing_is_written_until_disarmed_and_then_the_old_values_are_in_use(
-    tmp_path: Path,
-) -> None:
-    async def main() -> None:
-        async with px4_rig(tmp_path).running() as rig:
-            await rig.ready()
-            job = started(rig.service.calibrating.manager.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: len(rig.px4.writes) == 5, 60.0)
-            rig.px4.arm()
-            result = await job.finished
-            assert result.outcome == "failed"
-            assert "NOT back in" in result.reason
-            await asyncio.sleep(1.0)
-            assert "DISARM NOW: yaw rate wrong by 1.3 deg/s" in rig.ground.texts()
-            await asyncio.sleep(5.0)
-            assert "Restore pending: disarm and keep the link up" in rig.ground.texts()
-            assert not any(write.armed for write in rig.px4.writes)
-            rig.px4.disarm()
-            await rig.until(lambda: not rig.service.offsets.ledger.pending, 30.0)
-            await asyncio.sleep(1.5)
-            assert set(values(rig).values()) == {0.0}
-            assert in_use_as_stored(rig)
 
     run_virtual(main())
 
@@ -250,33 +193,3 @@ def test_rivals_are_stopped_with_the_biases_and_the_undo_starts_them_again(tmp_p
             assert set(values(rig).values()) == {0.0}
 
     run_virtual(main())
-
-
-def test_a_rival_that_was_switched_off_acts_and_is_named_until_the_next_boot(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with px4_rig(tmp_path, parameters={"IMU_GYRO_CAL_EN": 1.0}).running() as rig:
-            await rig.ready()
-            rig.px4.write_as_another_station("IMU_GYRO_CAL_EN", 0)
-            await rig.until(
-                lambda: any("Reboot PX4: its gyro calibration" in text for text in rig.ground.texts()), 10.0
-            )
-            rig.px4.write_as_another_station("CAL_GYRO0_XOFF", 0.05)
-            writes = rig.service.core.parameters.writes
-            await rig.until(lambda: abs(rig.px4.parameter("CAL_GYRO0_XOFF")) < 0.02, 60.0)
-            await rig.until(
-                lambda: (
-                    "The autopilot rewrote gyro offsets of fc: IMU_GYRO_CAL_EN (on until reboot)" in rig.ground.texts()
-                ),
-                10.0,
-            )
-            await asyncio.sleep(30.0)
-            assert rig.service.core.parameters.writes == writes  # nobody fights
-            rig.px4.reboot()
-            await rig.until(lambda: rig.service.core.vehicle.boots > 0, 30.0)
-            await rig.until(lambda: all(imu.calibration is not None for imu in rig.service.devices.imus.values()), 30.0)
-            assert rig.service.status()["warnings"] == []
-
-    run_virtual(main())
-
-
-# --- reaching the companion

@@ -12,7 +12,7 @@ import pytest
 from companion.autopilot.firmware.px4 import PX4
 from companion.autopilot.parameters.change import Change
 from companion.daemon.offsets.reboot import RebootOwed, owed_in
-from tests.e2e.test_calibration import calibrated, started
+from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig, inline
 from tests.support.virtual_time import run_virtual
 
@@ -50,23 +50,6 @@ def test_no_face_says_ready_after_a_restart_of_the_companion_until_px4_was_resta
                 rig.px4.reboot()
                 await rig.until(lambda: rig.service.status()["headline"]["word"] == "READY", 60.0)
                 assert not owed_in(tmp_path).path.exists()
-
-    run_virtual(main())
-
-
-def test_an_undo_leaves_the_same_tilt(tmp_path: Path) -> None:
-    async def main() -> None:
-        rig = Rig(tmp_path, firmware="px4", max_s=12.0, parameters={"CAL_ACC0_XOFF": 0.3})
-        async with rig.running():
-            await rig.ready()
-            assert (await calibrated(rig))[0].outcome == "done"
-            rig.px4.reboot()
-            await rig.until(lambda: rig.service.offsets.owed.words is None, 20.0)
-            await rig.until(lambda: rig.service.arming.in_force.reading() is None, 20.0)
-            await asyncio.sleep(4.0)
-            assert (await started(rig.service.calibrating.manager.start_undo("test")).finished).outcome == "done"
-            assert rig.service.offsets.owed.words == "reboot PX4: tilt 1.6 deg off"
-            await rig.until(lambda: "Before flight: reboot PX4: tilt 1.6 deg off" in rig.ground.texts(), 5.0)
 
     run_virtual(main())
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 import random
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import IO, Any
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -22,15 +20,12 @@ from mcap.writer import Writer
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.cli import main as companion
 from companion.config.sections import AllanModel, Config, NoiseProfile
-from companion.daemon.recorder import recorder as recorder_module
 from companion.errors import StorageError
 from companion.estimation.records.record import Record, to_json
 from companion.formats import Object
 from companion.lab.logs.recording import MAGIC
 from companion.lab.replay.engine import TOLERANCE_SIGMAS, Result, replay
 from companion.recording import messages
-from companion.recording import tape as tape_module
-from companion.recording.files import Ring
 from tests.e2e.test_calibration import calibrated
 from tests.e2e.test_dither import UNDITHERED, second_imu_only
 from tests.support.rig import Rig
@@ -163,22 +158,6 @@ def test_moved_armed_unplugged_restarted_and_over_several_files(tmp_path: Path) 
         replay([paths[0], *others])
 
 
-def test_a_window_begins_where_the_recorded_one_began_though_arming_is_not_recorded(tmp_path: Path) -> None:
-    async def during(rig: Rig) -> None:
-        # So that it ends long before the window is full.
-        rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=1.0, target_accel_sigma_m_s2=1.0)
-        await asyncio.sleep(12.0)
-        rig.double.arm()
-        await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.ARMED, 5.0)
-        rig.double.disarm()
-        await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.DISARMED, 5.0)
-        result, _ = await calibrated(rig)
-        assert result.outcome == "done", result
-
-    paths, records = record(tmp_path, during, min_still_s=5.0, max_s=30.0)
-    same(replay(paths), records)
-
-
 @pytest.mark.parametrize("dither", [False, True])
 def test_integers_are_replayed_as_such_but_for_a_dither_which_no_recording_holds(tmp_path: Path, dither: bool) -> None:
     async def main() -> list[Record]:
@@ -199,24 +178,6 @@ def test_integers_are_replayed_as_such_but_for_a_dither_which_no_recording_holds
         assert found.not_recomputed == "its means came from an offset dither"
     else:
         same(result, [kept])
-
-
-@pytest.mark.parametrize(("nudge", "found"), [(0.005, 0), (0.02, 1)])
-def test_a_bias_that_is_not_recomputed_within_the_tolerance_is_named(
-    usual: tuple[Path, Record], tmp_path: Path, nudge: float, found: int
-) -> None:
-    path, kept = usual
-    (fc, *others) = kept.imus
-    assert fc.gyro_bias_rad_s is not None
-    assert fc.gyro_sigma_use_rad_s is not None
-    x, y, z = fc.gyro_bias_rad_s
-    nudged = msgspec.structs.replace(fc, gyro_bias_rad_s=(x, y + nudge * fc.gyro_sigma_use_rad_s[1], z))
-    other = to_json(msgspec.structs.replace(kept, imus=(nudged, *others)))
-    (again,) = replay(
-        [rewritten(path, tmp_path / "o.mcap", lambda topic, data: other if topic == messages.RECORD else data)]
-    ).calibrations
-    assert [words.partition(":")[0] for words in again.differences] == ["imus[fc].gyro_bias_rad_s[1]"] * found
-    assert again.worst_sigmas == pytest.approx(nudge, rel=0.05)
 
 
 def rewritten(path: Path, to: Path, change: Callable[[str, bytes], bytes | None], **options: Any) -> Path:
@@ -348,21 +309,6 @@ def test_recording_on_request(tmp_path: Path) -> None:
     assert result.seconds == pytest.approx(14.5, abs=1.0)
 
 
-def test_a_recording_without_a_length_ends_at_its_size_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder_module, "MOST_BYTES", (1 << 32, 1 << 17))
-
-    async def main() -> list[Object]:
-        async with asyncio.timeout(300.0), Rig(tmp_path, own_imu=True).running() as rig:
-            return await asked(rig, file=str(tmp_path / "mine.mcap"))
-
-    began, *_, ended = run_virtual(main())
-    assert began["text"].endswith("; ends at 0 GB")
-    assert (ended["state"], ended["reason"]) == ("done", "ended at 0 GB, its size limit")
-    assert 1 << 17 <= ended["bytes"] < 1 << 18
-    assert ended["most_bytes"] == 1 << 17
-    assert replay([tmp_path / "mine.mcap"]).cut_short is None
-
-
 @pytest.mark.parametrize(("seconds", "state"), [(None, "done"), (60.0, "failed")])
 def test_a_recording_leaves_a_tenth_of_the_disk_free(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float | None, state: str
@@ -387,127 +333,6 @@ def test_a_recording_leaves_a_tenth_of_the_disk_free(
     reason = "ended with less than 10 % of the disk free (9.7 of 107.4 GB)"
     assert (ended["state"], ended["reason"]) == (state, reason)
     assert replay([tmp_path / "mine.mcap"]).cut_short is None
-
-
-# --- what goes wrong
-
-
-def full(path: Path) -> IO[bytes]:
-    return Path("/dev/full").open("wb")
-
-
-def test_a_full_disk_disturbs_nothing_is_said_once_and_ends_by_itself(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recorder_module, "RETRY_S", 10.0)
-
-    async def main() -> None:
-        async with Rig(tmp_path, recordings_mb=16).running() as rig:
-            recorder = rig.service.recorder
-            recorder._ring = Ring(tmp_path / "recordings", 16 << 20, full)
-            await rig.ready()
-            result, _ = await calibrated(rig)
-            assert result.outcome == "done"
-            await asyncio.sleep(4 * recorder_module.RETRY_S)
-            fault = rig.service.status()["recording"]["fault"]
-            assert "No space left on device" in fault
-            assert len(rig.service.recorder.tape) < 1000
-            recorder._ring = Ring(tmp_path / "recordings", 16 << 20)
-            await asyncio.sleep(1.2 * recorder_module.RETRY_S)
-            assert rig.service.status()["recording"]["fault"] is None
-
-    with caplog.at_level(logging.INFO):
-        run_virtual(main())
-    said = [entry for entry in caplog.records if "recordings:" in entry.message and entry.levelno >= logging.WARNING]
-    assert len(said) == 1
-    assert "No space left on device" in said[0].message
-    assert any("written again" in entry.message for entry in caplog.records)
-    assert replay(ring(tmp_path)[-1:]).seconds > 5.0
-
-
-def test_a_disk_that_hangs_holds_nothing_up_and_the_hole_is_in_the_file(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tape_module, "MOST_MESSAGES", 1000)
-    hangs_s = 0.0
-
-    async def offload(function: Callable[..., Any], *arguments: Any) -> Any:
-        if function.__qualname__ == "Ring.write":
-            await asyncio.sleep(hangs_s)
-        return function(*arguments)
-
-    async def main() -> list[Record]:
-        nonlocal hangs_s
-        rig = Rig(tmp_path, recordings_mb=16, own_imu=True, min_still_s=5.0, max_s=6.0)
-        rig.offload = offload
-        async with rig.running():
-            await rig.ready()
-            hangs_s, most = 40.0, 0
-            try:
-                result, during = await calibrated(rig)
-                for _ in range(30):
-                    await asyncio.sleep(1.0)
-                    most = max(most, len(rig.service.recorder.tape))
-            finally:
-                hangs_s = 0.0  # the daemon's end waits for the disk
-            assert result.outcome == "done"
-            assert during.duration_s < 30.0  # some 25, and not 40 more
-            assert most <= 1000
-            await asyncio.sleep(50.0)
-            lost = rig.service.status()["recording"]["lost"]
-            assert lost > 1000
-            result, after = await calibrated(rig)
-            assert result.outcome == "done"
-            await asyncio.sleep(2.0)
-        return [during, after]
-
-    _, after = run_virtual(main())
-    assert len([entry for entry in caplog.records if "the disk is too slow" in entry.message]) == 1
-    result = replay(ring(tmp_path))
-    assert any("messages were lost" in note for note in result.notes)
-    same(msgspec.structs.replace(result, calibrations=result.calibrations[-1:]), [after])
-
-
-@pytest.mark.parametrize(("megabytes", "said"), [(None, 0), (0, 0), (64, 1)])
-def test_without_the_means_the_daemon_runs_and_says_so_only_where_recordings_were_asked_for(
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-    megabytes: int | None,
-    said: int,
-) -> None:
-    monkeypatch.setattr(recorder_module, "is_available", lambda: False)
-
-    async def main() -> None:
-        rig = Rig(tmp_path)
-        storage = msgspec.structs.replace(rig.config.storage, recordings_mb=megabytes)
-        rig.config = msgspec.structs.replace(rig.config, storage=storage)
-        async with rig.running():
-            await rig.ready()
-            with pytest.raises(StorageError, match=r"pip install '\.\[recording\]'"):
-                await asked(rig)
-
-    run_virtual(main())
-    assert len([entry for entry in caplog.records if "'.[recording]'" in entry.message]) == said
-    assert not (tmp_path / "recordings").exists()
-
-
-def test_a_fault_of_the_recorder_s_own_does_not_take_the_daemon_along(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path, recordings_mb=16).running() as rig:
-            running = asyncio.create_task(asked(rig, file=str(tmp_path / "mine.mcap")))
-            await asyncio.sleep(2.0)
-            monkeypatch.setattr(rig.service.recorder, "_note_place", lambda: 1 / 0)
-            await rig.ready()
-            result, _ = await calibrated(rig)
-            assert result.outcome == "done"
-            assert (await running)[-1]["state"] == "failed"
-            assert "internal error" in rig.service.status()["recording"]["fault"]
-
-    run_virtual(main())
-    assert len([entry for entry in caplog.records if entry.levelno == logging.ERROR]) == 1
 
 
 # --- the command line
@@ -542,11 +367,3 @@ def test_the_command_ends_with_0_when_biases_agree_and_with_1_when_they_do_not(
     nudged = rewritten(path, tmp_path / "o.mcap", lambda topic, data: other if topic == messages.RECORD else data)
     assert companion(["replay", str(nudged)]) == 1
     assert "DIFFERENT imus[own].gyro_bias_rad_s[0]: recorded" in capsys.readouterr().out
-
-
-def test_without_the_extra_a_replay_says_what_to_install(
-    usual: tuple[Path, Record], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "zstandard", None)
-    assert companion(["replay", str(usual[0])]) == 1
-    assert "a recording needs more than is installed: pip install '.[recording]'" in capsys.readouterr().err

@@ -59,54 +59,6 @@ def test_with_the_rival_stopped_it_is_rebooted_and_the_offsets_are_confirmed(tmp
     run_virtual(main())
 
 
-def test_a_start_that_measured_the_gyros_itself_is_told_as_such(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with quick(tmp_path, parameters=ON).running() as rig:
-            await rig.ready()
-            result, _ = await calibrated(rig)
-            assert result.outcome == "done", result
-            await rig.ready()
-            ours = gyro(rig)
-            rig.double.reboot()
-            await rig.until(lambda: rig.service.core.vehicle.boots == 1, 60.0)
-            await rig.until(
-                lambda: "The autopilot rewrote gyro offsets of fc: INS_GYR_CAL=1" in rig.ground.texts(), 30.0
-            )
-            assert gyro(rig) != ours
-
-    run_virtual(main())
-
-
-def test_a_rival_is_told_once_while_it_is_on_whatever_restarts(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with quick(tmp_path, parameters=ON).running() as rig:
-            told = "The autopilot may rewrite gyro offsets: set INS_GYR_CAL to 0"
-            await rig.ready()
-            for boots in (1, 2):
-                rig.double.reboot()
-                await rig.until(lambda: rig.service.core.vehicle.boots == boots, 60.0)  # noqa: B023 - awaited at once
-                await rig.ready()
-            await asyncio.sleep(5.0)
-            assert rig.ground.texts().count(told) == 1
-            assert rig.service.status()["warnings"], "to be read always"
-            rig.double.write_as_another_station("INS_GYR_CAL", 0.0)
-            await rig.until(lambda: not rig.service.status()["warnings"], 30.0)
-            rig.double.write_as_another_station("INS_GYR_CAL", 1.0)
-            await rig.until(lambda: rig.ground.texts().count(told) == 2, 30.0)
-
-    run_virtual(main())
-
-
-def test_what_somebody_else_wrote_is_told_as_such(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with quick(tmp_path).running() as rig:
-            await rig.ready()
-            rig.double.write_as_another_station(offset_names(1, "accel")[1], 0.123)
-            await rig.until(lambda: "Somebody rewrote accelerometer offsets of fc" in rig.ground.texts(), 20.0)
-
-    run_virtual(main())
-
-
 def test_a_reboot_is_not_sent_to_an_aircraft_that_armed_meanwhile(tmp_path: Path) -> None:
     async def main() -> None:
         async with quick(tmp_path).running() as rig:
@@ -122,21 +74,5 @@ def test_a_reboot_is_not_sent_to_an_aircraft_that_armed_meanwhile(tmp_path: Path
             assert any("not rebooted: the aircraft is armed" in warning for warning in job.record.warnings)
             await asyncio.sleep(5.0)
             assert rig.service.core.vehicle.boots == 0
-
-    run_virtual(main())
-
-
-def test_ardupilot_without_a_ground_station_is_told_what_routing_needs(tmp_path: Path) -> None:
-    async def main() -> None:
-        rig = quick(tmp_path)
-        async with rig.running():
-            await rig.ready()
-            await asyncio.sleep(3.0)
-            assert "reaches the companion" in rig.service.status()["ground_stations"]["summary"]
-            rig.radio.cut = True
-            await asyncio.sleep(6.0)
-            ground = rig.service.status()["ground_stations"]
-            assert ground["good"]
-            assert "set not to forward" in ground["summary"]
 
     run_virtual(main())

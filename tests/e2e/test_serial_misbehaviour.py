@@ -18,7 +18,7 @@ import pytest
 
 from companion.links.system.connection import BURST_BYTES, BYTES_PER_S
 from sim.uart import Setting
-from tests.support.chatter import RECOVERY_S, Chatter, Listening, compass_frame, imu_frame, listening, tilt_frame
+from tests.support.chatter import RECOVERY_S, Chatter, Listening, compass_frame, listening, tilt_frame
 
 
 @pytest.fixture
@@ -164,18 +164,3 @@ def test_a_flood_holds_nobody_up(path: Path, caplog: pytest.LogCaptureFixture) -
 
 
 # The device -----------------------------------------------------------------------------------------------------------
-
-
-def test_nan_in_whole_frames(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    async def main() -> None:
-        async with (
-            Chatter(path, imu_frame, rate_hz=50.0) as device,
-            listening("imu", "imu_line", path) as one,
-        ):
-            await one.data()
-            device.frame = lambda number: imu_frame(number, rate=None if number % 3 else "nan")
-            await lasts(one, caplog, "non-finite", "NaN in ")
-            device.frame = imu_frame
-            await over(one, caplog)
-
-    asyncio.run(main())

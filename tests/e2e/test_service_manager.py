@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import os
 import signal
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
@@ -184,29 +183,5 @@ def test_sigterm_in_a_write_leaves_the_old_values(tmp_path: Path) -> None:
                 assert not status["putting_back"]
                 assert status["fault"] is None
                 assert status["last"]["state"] == "cancelled"
-
-    asyncio.run(main())
-
-
-def test_the_levels_of_the_journal(tmp_path: Path) -> None:
-    """Where stderr is the journal its lines carry priorities; where it merely inherited the variable they do not."""
-
-    async def first_line(environment: dict[str, str]) -> str:
-        read, write = os.pipe()
-        status = os.fstat(write)
-        filled = {key: value.format(f"{status.st_dev}:{status.st_ino}") for key, value in environment.items()}
-        command = CompanionProcess(tmp_path).command("run")
-        process = await asyncio.create_subprocess_exec(*command, stderr=write, env={**os.environ, **filled})
-        os.close(write)
-        line = await asyncio.to_thread(lambda: os.read(read, 4096))
-        process.terminate()
-        await process.wait()
-        os.close(read)
-        return line.decode()
-
-    async def main() -> None:
-        async with live_aircraft(tmp_path):
-            assert (await first_line({"JOURNAL_STREAM": "{}"})).startswith("<6>INFO ready: ")
-            assert " INFO ready: " in await first_line({"JOURNAL_STREAM": "1:2"})
 
     asyncio.run(main())

@@ -166,24 +166,6 @@ def test_an_autopilot_that_is_not_believed_is_said_and_why(tmp_path: Path, their
     run_virtual(main())
 
 
-def test_a_key_that_appears_later_is_taken(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    async def main() -> None:
-        rig = signed_rig(tmp_path)
-        path = tmp_path / "signing.key"
-        text = path.read_text()
-        path.chmod(0o644)
-        rig.autopilot.require_signatures(KEY, now())
-        async with rig.running():
-            await asyncio.sleep(3.0)
-            assert "chmod 600" in words_of(rig)
-            assert text.strip() not in caplog.text
-            path.chmod(0o600)
-            await rig.ready()
-            assert "disarmed" in words_of(rig)
-
-    run_virtual(main())
-
-
 def test_sign_alone_is_for_the_way_there(tmp_path: Path) -> None:
     """With "sign" the autopilot that wants signatures hears us, and a station that has no key yet is still answered."""
 
@@ -202,91 +184,5 @@ def test_sign_alone_is_for_the_way_there(tmp_path: Path) -> None:
             await asyncio.sleep(3.0)
             assert rig.service.status()["vehicle"]["signing"]["verified"] > verified
             assert rig.service.core.vehicle.alive
-
-    run_virtual(main())
-
-
-def lines(caplog: pytest.LogCaptureFixture, words: str) -> int:
-    return sum(words in record.getMessage() for record in caplog.records)
-
-
-def no_longer_signing(rig: Rig) -> None:
-    for channel in rig.autopilot.channels:
-        channel._codec.signing = mavlink.MAVLinkSigning()
-
-
-def test_an_autopilot_that_wants_signatures_is_named_though_nobody_asks_it_for_anything(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
-            await rig.ready()
-            await asyncio.sleep(3.0)
-            rig.autopilot.require_signatures(KEY, now())
-            await asyncio.sleep(8.0)
-            status = rig.service.status()
-            assert "give the companion its key" in status["vehicle"]["signing"]["summary"]
-            assert not status["vehicle"]["signing"]["good"]
-            await asyncio.sleep(40.0)
-            assert lines(caplog, "the autopilot wants signatures") == 1
-            no_longer_signing(rig)
-            await asyncio.sleep(5.0)
-            assert rig.service.status()["vehicle"]["signing"] is None
-            texts = "\n".join(rig.ground.texts())
-            assert "Autopilot answers again" in texts
-
-    run_virtual(main())
-
-
-def test_an_autopilot_that_signs_and_takes_unsigned_messages_is_not_complained_of(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """As over USB."""
-
-    async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
-            await rig.ready()
-            rig.autopilot.require_signatures(KEY, now())
-            for channel in rig.autopilot.channels:
-                channel._codec.signing.allow_unsigned_callback = lambda *_: True
-            await asyncio.sleep(20.0)
-            assert rig.service.core.vehicle.signs
-            assert rig.service.status()["vehicle"]["signing"] is None
-            assert lines(caplog, "answers nothing") == 0
-
-    run_virtual(main())
-
-
-def test_another_key_is_named_once_and_forgotten_when_the_keys_are_the_same(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO, "companion")
-
-    async def main() -> None:
-        rig = signed_rig(tmp_path)
-        rig.autopilot.require_signatures(KEY, now())
-        async with rig.running():
-            await rig.ready()
-            await asyncio.sleep(3.0)
-            assert rig.service.status()["vehicle"]["signing"]["good"]
-            assert lines(caplog, "another key") == 0
-            rig.autopilot.require_signatures(OTHER, now())
-            await asyncio.sleep(20.0)
-            status = rig.service.status()
-            assert "another key" in status["vehicle"]["signing"]["summary"]
-            assert not status["vehicle"]["signing"]["good"]
-            assert status["headline"]["tone"] != "good"
-            assert "another key" in status["headline"]["reason"]
-            assert lines(caplog, "the autopilot signs with another key: give both the same one") == 1
-            rig.autopilot.require_signatures(KEY, now() + 100 * 100_000)
-            await asyncio.sleep(6.0)
-            status = rig.service.status()
-            assert status["vehicle"]["signing"]["good"]
-            assert "another key" not in str(status["headline"])
-            assert lines(caplog, "Autopilot's signatures are right again") == 1
-            # A cable that is pulled afterwards is not blamed on keys that once were wrong.
-            rig.wire.unplug()
-            await asyncio.sleep(5.0)
-            assert "another key" not in str(rig.service.status()["headline"])
 
     run_virtual(main())

@@ -48,62 +48,6 @@ def calibrate(rig: Rig) -> Job:
     return answer
 
 
-def place(rig: Rig, latitude_deg: float, height_m: float) -> Callable[[], Message]:
-    def message() -> Message:
-        boot_ms = round((rig.service.core.vehicle.boot.clock.latest_s or 0.0) * 1e3)
-        lat, lon, alt = round(latitude_deg * 1e7), round(rig.site.longitude_deg * 1e7), round(height_m * 1e3)
-        return mavlink.MAVLink_global_position_int_message(boot_ms, lat, lon, alt, 0, 0, 0, 0, 0)
-
-    return message
-
-
-def test_a_calibration_waits_while_the_place_jumps_and_says_why(tmp_path: Path) -> None:
-    words = "height jumped 7950 m"
-
-    async def main() -> None:
-        async with Rig(tmp_path, **QUICK).running() as rig:
-            await rig.ready()
-            await asyncio.sleep(8.0)
-            async with spoofed(rig, 0.1, place(rig, 40.0, 8000.0)):
-                await asyncio.sleep(1.0)
-                job = calibrate(rig)
-                for _ in range(100):
-                    await asyncio.sleep(0.5)
-                    assert not job.finished.done()
-                assert words in job.words
-                assert "set vehicle.latitude_deg" in job.words
-                assert any(words in text.lower() for text in rig.ground.texts())
-            # The autopilot alone is heard again.
-            async with asyncio.timeout(30.0):
-                result = await job.finished
-            assert result.outcome == "done"
-            assert job.record is not None
-            assert job.record.site is not None
-            assert job.record.site.height_m == pytest.approx(50.0)
-            found = np.array(job.record.imus[0].accel_bias_m_s2) / MG
-            assert np.abs(found - ACCEL_BIAS_MG).max() < 0.3
-
-    run_virtual(main())
-
-
-def test_a_place_in_the_configuration_is_not_doubted(tmp_path: Path) -> None:
-    place_known = "[vehicle]\nlatitude_deg = 40.0\nlongitude_deg = 116.0\nheight_m = 50.0"
-
-    async def main() -> None:
-        async with Rig(tmp_path, more=place_known, **QUICK).running() as rig:
-            await rig.ready()
-            async with spoofed(rig, 0.1, place(rig, 0.001, 8000.0)):
-                job = calibrate(rig)
-                async with asyncio.timeout(60.0):
-                    result = await job.finished
-            assert result.outcome == "done"
-            assert job.record is not None
-            assert job.record.site is not None
-            assert job.record.site.source == "configuration"
-
-    run_virtual(main())
-
-
 def announced() -> Message:
     return mavlink.MAVLink_param_value_message(b"INS_GYROFFS_X", 0.3, 9, 1000, 65535)
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from companion.estimation.machine import State
-from companion.physics.units import DEG_H
 from sim.imu_model import DEG_H as SIM_DEG_H
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig
@@ -58,27 +57,5 @@ def test_headline_and_arming_say_the_same_at_every_moment(tmp_path: Path) -> Non
             looking.cancel()
             assert manager.state is not State.IDLE
             assert found == set()
-
-    run_virtual(main())
-
-
-def test_after_a_restart_the_figures_are_those_of_the_record_while_the_autopilot_has_run_on(tmp_path: Path) -> None:
-    async def main() -> None:
-        rig = Rig(tmp_path, **QUICK)
-        async with rig.running():
-            await rig.ready()
-            await asyncio.sleep(60.0)
-            _, record = await calibrated(rig)
-            sigma = record.imus[0].sigma_in_force("gyro")
-            assert sigma is not None
-            for boots in (0, 1):
-                if boots:
-                    rig.double.reboot()
-                    await asyncio.sleep(5.0)
-                await rig.restart()
-                await rig.until(lambda: rig.service.status()["arming"]["state"] == "checked", 60.0)
-                words = rig.service.status()["arming"]["in_force"]
-                figure = f", {max(sigma) / DEG_H:.1f} deg/h"
-                assert (figure in words) is (boots == 0), (words, figure)
 
     run_virtual(main())

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from companion.errors import RequestRefusedError
-from companion.storage.changes import BY_TEMPERATURE, Changed, ChangeLog, ChangeSet, Origin, Undoable
 from companion.storage.learned import BiasStore
 from sim.imu_model import DEG_H
 from sim.px4.defaults import SIMULATED_IDS
@@ -57,19 +56,5 @@ def test_a_write_is_refused_in_one_line_and_writes_nothing(tmp_path: Path, therm
             why = "PX4's thermal compensation (TC_*) is not written: the firmware of common boards is built without it"
             assert str(refused.value) == why
             assert rig.px4.parameters.values == before
-
-    run_virtual(main())
-
-
-def test_a_write_of_a_former_version_is_undone(tmp_path: Path) -> None:
-    async def main() -> None:
-        rig = WarmPx4(tmp_path, "started", **ON, TC_G0_X0_0=0.001)
-        changes = Changed("TC_G0_X0_0", 0.0, rig.px4.parameter("TC_G0_X0_0"), 0.05), Changed("TC_G_ENABLE", 0.0, 1.0)
-        step = ChangeSet(1, changes, Origin(BY_TEMPERATURE))
-        ChangeLog(tmp_path).undo_of(1).write(Undoable(1, (step,)))
-        async with rig.running():
-            await rig.ready()
-            assert (await rig.ask(action="undo"))["state"] == "done"
-            assert (rig.px4.parameter("TC_G0_X0_0"), rig.px4.parameter("TC_G_ENABLE")) == (0.0, 0.0)
 
     run_virtual(main())

@@ -46,8 +46,8 @@ class Warm(Rig):
 
         self.model._bias_at = bias_at  # type: ignore[method-assign]
 
-    async def learn(self, *, accel: bool = True) -> None:
-        """Eight power-ups at different temperatures; `accel`: with a gradienter."""
+    async def learn(self) -> None:
+        """Keep eight power-ups at different temperatures."""
         memory = self.service.calibrating.memory
         await self.ready()
         await self.rest()
@@ -66,7 +66,7 @@ class Warm(Rig):
                     power_up=PowerUp(host=f"day {run}", since_unix_s=1e6 * run),
                     temperature_degc=float(degc),
                     gyro=msgspec.structs.replace(first.gyro, bias=tuple(bias.tolist())),
-                    accel=msgspec.structs.replace(first.accel, bias=tuple(forces.tolist())) if accel else None,
+                    accel=msgspec.structs.replace(first.accel, bias=tuple(forces.tolist())),
                 )
             })  # fmt: skip
 
@@ -96,16 +96,13 @@ def truth(degc: float) -> Any:
 TURNED = {"mounting_deg": (0.0, 0.0, 90.0), "parameters": {"INS_GYR_CAL": 0.0, "AHRS_ORIENTATION": 2.0}}
 
 
-@pytest.mark.parametrize(("more", "accel"), [(TURNED, True), ({}, False)], ids=["turned", "without a gradienter"])
-def test_a_curve_is_written_takes_the_warming_off_and_is_undone_to_the_bit(
-    tmp_path: Path, more: dict[str, Any], accel: bool
-) -> None:
+def test_a_curve_is_written_takes_the_warming_off_and_is_undone_to_the_bit(tmp_path: Path) -> None:
     async def main() -> None:
-        rig = Warm(tmp_path, **more)
+        rig = Warm(tmp_path, **TURNED)
         for name in ("INS_TCAL1_ACC2_Y", "INS_TCAL1_GYR3_Z"):  # of somebody, and switched off
             rig.double.set_parameter(name, 12.345)
         async with rig.running():
-            await rig.learn(accel=accel)
+            await rig.learn()
             before, left, forces = rig.parameters(), rig.left_deg_h(), rig.left_mg()
             reply = await rig.ask(action="write")
             assert (reply["state"], reply["reason"]) == ("done", "written: fc, 13 to 34 degC"), reply
@@ -119,7 +116,7 @@ def test_a_curve_is_written_takes_the_warming_off_and_is_undone_to_the_bit(
                 c1, c2, c3 = (now[f"INS_TCAL1_GYR{k}_{axis}"] for k in (1, 2, 3))
                 got = c1 * low + c2 * low**2 + c3 * low**3
                 np.testing.assert_allclose(got, slope[n] * low + bend[n] * low**2, atol=3.0 * DEG_H * 1e6)
-            assert any(now[name] for name in NAMES if "ACC" in name) == accel
+            assert any(now[name] for name in NAMES if "ACC" in name)
             assert (now["INS_TCAL1_ENABLE"], now["INS_TCAL1_TMIN"], now["INS_TCAL1_TMAX"]) == (1.0, 13.0, 34.0)
             assert now["INS_GYR1_CALTEMP"] == pytest.approx(rig.model.temperature_degc(0.0), abs=0.01)
             assert {name: now[name] for name in OFFSETS} == {name: before[name] for name in OFFSETS}
@@ -127,8 +124,7 @@ def test_a_curve_is_written_takes_the_warming_off_and_is_undone_to_the_bit(
             for degc in (14.0, 28.0, 33.0):
                 rig.degc = degc
                 np.testing.assert_allclose(rig.left_deg_h(), left, atol=3.0)
-                moved = 0.0 if accel else ACCEL_SLOPE * (degc - 20.0)
-                np.testing.assert_allclose(rig.left_mg() - forces, moved, atol=0.05)
+                np.testing.assert_allclose(rig.left_mg(), forces, atol=0.05)
             rig.degc = 50.0  # beyond the span nothing is foretold
             edge = truth(rig.model.temperature_degc(0.0)) - truth(HIGH_DEGC)
             np.testing.assert_allclose(rig.left_deg_h() - left, edge, atol=5.0)

@@ -7,8 +7,6 @@ import contextlib
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
-import pytest
-
 from companion.component.service import Refusal
 from companion.estimation.request import What
 from tests.e2e.test_calibration import calibrated
@@ -22,10 +20,10 @@ WORDS = "second companion (1/191) on this link writes: stop one of them"
 
 
 class Shared:
-    """One port of an autopilot that several share: all hear it, and on a `bus` also each other."""
+    """One port of an autopilot on a bus: all hear it and each other."""
 
-    def __init__(self, port: End, *, bus: bool) -> None:
-        self._port, self._bus = port, bus
+    def __init__(self, port: End) -> None:
+        self._port = port
         self._taps: list[Tap] = []
         port.attach(lambda data: self._to_all(data))
 
@@ -40,8 +38,7 @@ class Shared:
 
     def from_tap(self, tap: Tap, data: bytes, t_s: float) -> None:
         self._port.receive(data, t_s)
-        if self._bus:
-            self._to_all(data, but=tap)
+        self._to_all(data, but=tap)
 
 
 class Tap:
@@ -59,19 +56,18 @@ class Tap:
 
 
 @contextlib.asynccontextmanager
-async def two(folder: Path, *, bus: bool) -> AsyncIterator[tuple[Rig, Rig]]:
-    """Two companions on one double: on one port, or (not `bus`) the second beside the ground station on the other."""
+async def two(folder: Path) -> AsyncIterator[tuple[Rig, Rig]]:
+    """Run two companions on one port of one double."""
     one = Rig(folder / "one", min_still_s=4.0, max_s=8.0)
     other = Rig(folder / "other", min_still_s=4.0, max_s=8.0)
-    for wire in (one.wire, one.radio, other.wire, other.radio):
+    for wire in (one.wire, other.wire, other.radio):
         wire.unplug()
-    first, ground = Shared(one.double, bus=bus), Shared(one.double.ground, bus=False)
-    one.wire = Wire(one.link, first.tap())
-    one.radio = Wire(one.ground, ground.tap())
+    shared = Shared(one.double)
+    one.wire = Wire(one.link, shared.tap())
     other.autopilot, other.aircraft = one.autopilot, one.aircraft
     for device, same in zip(other.devices.values(), one.devices.values(), strict=True):
         device.aircraft = same.aircraft
-    other.wire = Wire(other.link, (first if bus else ground).tap())
+    other.wire = Wire(other.link, shared.tap())
     async with one.running():
         other._start()
         feeding = asyncio.create_task(other._feed())
@@ -82,10 +78,9 @@ async def two(folder: Path, *, bus: bool) -> AsyncIterator[tuple[Rig, Rig]]:
             await other._stop(feeding)
 
 
-@pytest.mark.parametrize("bus", [True, False])
-def test_one_writes_and_the_other_refuses_by_name_and_an_undo_brings_all_back(tmp_path: Path, bus: bool) -> None:
+def test_one_writes_and_the_other_refuses_by_name_and_an_undo_brings_all_back(tmp_path: Path) -> None:
     async def main() -> None:
-        async with two(tmp_path, bus=bus) as both:
+        async with two(tmp_path) as both:
             for rig in both:
                 await rig.ready()
             await asyncio.sleep(8.0)
@@ -100,9 +95,7 @@ def test_one_writes_and_the_other_refuses_by_name_and_an_undo_brings_all_back(tm
             assert (status["headline"]["word"], status["headline"]["reason"]) == ("TWO COMPANIONS", WORDS)
             assert WORDS in status["warnings"]
             assert WORDS.replace("writes", "waits") in writer.service.status()["warnings"]
-            # On the port that it shares with the second, the ground station hears only the first.
-            speakers = both if bus else both[:1]
-            said = {(rig.service.offsets.companions.warning or "").replace("second", "Second") for rig in speakers}
+            said = {(rig.service.offsets.companions.warning or "").replace("second", "Second") for rig in both}
             assert said <= set(both[0].ground.texts())
             assert (await calibrated(writer))[0].outcome == "done"
             assert values(writer.double) != before
@@ -119,7 +112,7 @@ def test_a_write_that_the_second_has_begun_to_measure_for_is_not_done(tmp_path: 
     """A request may come before the other companion is heard."""
 
     async def main() -> None:
-        async with two(tmp_path, bus=True) as both:
+        async with two(tmp_path) as both:
             for rig in both:
                 await rig.ready()
             before = values(both[0].double)

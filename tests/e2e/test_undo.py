@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,6 @@ from typing import Any, NamedTuple
 import pytest
 
 from companion.autopilot.parameters.change import Change
-from companion.cli.show import undo_line
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
 from companion.storage.changes import MOST_STEPS, ChangeLog, ChangeSet, Origin, Undoable
@@ -286,42 +284,3 @@ def test_the_latest_of_several_that_are_one_step_can_be_taken_out_of_it_again(be
     assert both.without(second).without(second) == both.without(second)
     assert both.without(joined).steps == ()
     assert both.without(step(now, "level", dict.fromkeys(TRIM, 0.02), 3)) is both
-
-
-def test_a_prediction_of_an_older_version_is_in_the_history_and_is_undone(tmp_path: Path) -> None:
-    """Versions before 0.2 wrote predicted gyro offsets and kept them as a step of their own."""
-    predicted = step(FIRST, "gyro prediction", dict.fromkeys(GYROS, 0.003))
-    ChangeLog(tmp_path).undo_of(1).write(Undoable(1, (predicted,)))
-    entry = {
-        "what": "gyro prediction", "state": "predicted", "measured_at": predicted.origin.at, "system_id": 1,
-        "reason": "was 90 deg/h off, now 20", "written": dict.fromkeys(GYROS, 0.003), "undone_at": None,
-    }  # fmt: skip
-    (tmp_path / "by-hand.json").write_text(json.dumps({"entries": [entry]}))
-
-    async def main() -> None:
-        async with Rig(tmp_path, parameters=FIRST | dict.fromkeys(GYROS, 0.003)).running() as rig:
-            await rig.ready()
-            by_hand = rig.service.calibrating.by_hand
-            (shown,) = by_hand.history()
-            assert (shown["what"], shown["in_force"], shown["undone_at"]) == ("gyro prediction", True, None)
-            assert rig.service.status()["by_hand"] == [], "it is no alignment"
-            assert (await undone(rig)).reason == "3 old values back: gyro prediction"
-            assert read(rig) == FIRST
-            (shown,) = by_hand.history()
-            assert shown["undone_at"] is not None
-
-    run_virtual(main())
-
-
-def test_all_that_can_be_undone_is_shown_in_words() -> None:
-    first = step(FIRST, *WRITES[2], 1)
-    kept = Undoable(1, (step(FIRST, *WRITES[0]),)).and_then(first).and_then(step(FIRST, *WRITES[3], 2))
-    first_words, *lines = [undo_line([each.shown() for each in kept.steps[k:]]) for k in range(3)]
-    assert first_words == (
-        "the next undo takes back: auto calibration of 2026-11-23 06:02 UTC and all since 2026-11-23 06:01,"
-        " 3 parameters; 1 more after it"
-    )
-    assert lines == [
-        "the next undo takes back: calibration of 2026-11-23 06:00 UTC, 6 parameters",
-        "undo: nothing is left to take back",
-    ]

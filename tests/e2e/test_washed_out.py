@@ -7,7 +7,6 @@ from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.commands import Align
 from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.estimation.request import What
@@ -53,20 +52,6 @@ def test_requests_and_cancels_in_a_loop_leave_the_history_as_it_was(tmp_path: Pa
     run_virtual(main())
 
 
-def test_what_was_measured_before_the_cancel_is_a_record(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
-            await rig.ready()
-            job = ask(rig, "a pilot")
-            assert isinstance(job, Job)
-            await rig.until(lambda: rig.service.calibrating.manager.state.is_writing, 60.0)
-            rig.service.calibrating.manager.cancel("a pilot")
-            assert (await job.finished).outcome == "cancelled"
-            assert [record.state for record in rig.service.calibrating.store.history()] == ["cancelled"]
-
-    run_virtual(main())
-
-
 def test_an_arming_that_flickers_does_not_wash_out_the_armings(tmp_path: Path) -> None:
     async def main() -> None:
         async with Rig(tmp_path).running() as rig:
@@ -79,22 +64,5 @@ def test_an_arming_that_flickers_does_not_wash_out_the_armings(tmp_path: Path) -
                 await asyncio.sleep(0.05)
             await asyncio.sleep(1.0)
             assert len(rig.service.arming.armings.history()) == 1
-
-    run_virtual(main())
-
-
-def test_alignments_have_the_same_limit(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
-            await rig.ready()
-            answers = []
-            for _ in range(30):
-                answers.append(rig.service.calibrating.start_alignment(Align(action="zero"), "a script"))
-                rig.service.calibrating.manager.cancel("a script")
-                if isinstance(job := answers[-1], Job):
-                    await job.finished
-            reasons = [answer.reason for answer in answers if isinstance(answer, Refusal)]
-            assert len(reasons) in range(19, 21)
-            assert all(reason.startswith("too many requests") for reason in reasons)
 
     run_virtual(main())

@@ -59,10 +59,6 @@ class Tab:
         )
         await self.call("Emulation.setTouchEmulationEnabled", enabled=phone)
 
-    async def scheme(self, name: str) -> None:
-        """`light` or `dark`, as the device prefers."""
-        await self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": name}])
-
     async def value(self, expression: str) -> Any:
         reply = await self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in reply, reply["exceptionDetails"]

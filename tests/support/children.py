@@ -54,10 +54,3 @@ def in_process(service: Callable[[], Service]) -> StartChild:
         return InProcess(name, module, settings, service) if name == "mqtt" else Idle(name, module, settings)
 
     return make
-
-
-def mqtt_of(service: Service) -> MqttProcess:
-    """Return the work of a service's MQTT process that runs in this loop."""
-    child = service.faces.mqtt
-    assert isinstance(child, InProcess)
-    return child.work

@@ -54,18 +54,6 @@ def headings(path: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", re.sub(r"[`*]", "", heading).lower()).replace(" ", "-") for heading in found}
 
 
-def session(path: Path) -> list[tuple[str, list[str]]]:
-    """What is to be run: each command of the console blocks, with the lines that are shown after it."""
-    found: list[tuple[str, list[str]]] = []
-    for block in blocks(path):
-        for line in block.text.splitlines() if block.language == "console" else ():
-            if line.startswith("$ "):
-                found.append((line[2:], []))
-            elif line.strip():
-                found[-1][1].append(line)
-    return found
-
-
 def commands_in(path: Path) -> Iterator[str]:
     """Command lines of `companion` and `python -m sim`, from blocks and from code spans, as one would type them.
 

@@ -1,6 +1,6 @@
 """README.md and docs/*.md: links lead somewhere, configurations are taken, commands are understood.
 
-What is run instead of parsed: tests/e2e/test_docs_session.py. The conventions: docs/maintaining.md.
+The conventions: docs/maintaining.md.
 """
 
 from __future__ import annotations
