@@ -8,8 +8,6 @@ import os
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-import pytest
-
 from companion.config import parse
 from companion.daemon.process.check import Finding, run_check
 from sim.uart import Setting
@@ -73,25 +71,13 @@ def test_a_bench_in_order_has_nothing_to_say(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-@pytest.mark.parametrize(
-    ("sends", "keys", "remedy"),
-    [
-        pytest.param(Setting(9600, "even"), "", 'set parity = "even" in [gradienter]', id="BEI INC"),
-        pytest.param(
-            Setting(9600, "even"),
-            "baud = 115200",
-            'set baud = 9600 and parity = "even" in [gradienter]',
-            id="both",
-        ),
-    ],
-)
-def test_another_speed_or_parity(tmp_path: Path, sends: Setting, keys: str, remedy: str) -> None:
+def test_another_speed_and_parity(tmp_path: Path) -> None:
     async def main() -> None:
-        async with bench(tmp_path, sends, Setting(19200)):
-            (finding,) = of(await found(text(tmp_path, keys)), "gradienter", "ports")
+        async with bench(tmp_path, Setting(9600, "even"), Setting(19200)):
+            (finding,) = of(await found(text(tmp_path, "baud = 115200")), "gradienter", "ports")
             assert not finding.good
-            assert finding.remedy == remedy
-            assert finding.words.startswith(f"it sends at {sends.baud} 8{sends.parity[0].upper()}1, not ")
+            assert finding.remedy == 'set baud = 9600 and parity = "even" in [gradienter]'
+            assert finding.words.startswith("it sends at 9600 8E1, not ")
 
     asyncio.run(main())
 
