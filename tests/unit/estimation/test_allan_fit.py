@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -67,25 +65,6 @@ def test_more_sessions_tell_more_and_each_has_its_own_level() -> None:
     one, all_of_them = fit_axis(curve_of(parts[0]), 0), fit_axis(curve_of(*parts), 0)
     assert all_of_them.sigmas[1] < one.sigmas[1] / 2.0
     assert all_of_them.figures[1] / FLICKER_OF_FLOOR == pytest.approx(3.0, rel=0.15)
-
-
-def test_holes_do_not_bias_the_figures() -> None:
-    rng = np.random.default_rng(6)
-    kept = np.sort(rng.permutation(6000)[:4800])
-    figures = []
-    for _ in range(10):
-        values = slow(rng, 6000, 3.0 * FLICKER_OF_FLOOR, 0.16, 7.1)
-        figures.append(fit_axis(curve([(kept, values[kept, None])]), 0).figures)
-    white, flicker, _ = np.mean(figures, axis=0)
-    assert white == pytest.approx(7.1, rel=0.03)
-    assert flicker / FLICKER_OF_FLOOR == pytest.approx(3.0, rel=0.1)
-
-
-def test_a_minute_tells_white_noise_and_nothing_else() -> None:
-    for fit in fits(7, 20, 60, 7.1, 3.0, 0.16):
-        assert fit.figures[0] == pytest.approx(7.1, rel=0.5)
-        assert not fit.known[2]
-        assert math.isinf(fit.upper[2]) or fit.upper[2] > 0.16
 
 
 def test_what_never_changes_cannot_be_fitted() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from companion.estimation.means.windows import lost
-from companion.estimation.seconds.batch import MAX_SAMPLES, Batch, BatchSource
+from companion.estimation.seconds.batch import Batch, BatchSource
 
 
 def fill(source: BatchSource, rows: list[tuple[float, ...]], start_s: float, rate_hz: float, **more: Any) -> None:
@@ -60,16 +60,6 @@ def test_the_first_partial_second_is_not_a_batch() -> None:
     assert source.closed_through == 11
 
 
-def test_memory_is_bounded() -> None:
-    source = BatchSource((1e3,), 5)
-    for second in range(50):
-        fill(source, [(1.0,)] * 4, float(second), 4.0)
-    assert list(source.batches) == [44, 45, 46, 47, 48]
-    for _ in range(MAX_SAMPLES + 10):
-        source.add(60.5, (1.0,))
-    assert source.dropped["too many a second"] == 10
-
-
 def test_late_samples_are_counted_and_dropped() -> None:
     source = BatchSource((1e3,), 5)
     fill(source, [(1.0,)] * 10, 1.0, 10.0)
@@ -82,39 +72,10 @@ def test_late_samples_are_counted_and_dropped() -> None:
     assert source.batches[2].mean == pytest.approx([1.0])
 
 
-def test_equal_times_are_one_read_of_a_socket() -> None:
-    source = BatchSource((1e3,), 5)
-    source.add(1.0, (1.0,))
-    for _ in range(5):
-        source.add(2.5, (1.0,))
-    source.close_before(3.0)
-    assert source.batches[2].n == 5
-
-
-@pytest.mark.parametrize("time", [math.nan, math.inf, -math.inf, 1e300, -1e300])
-def test_impossible_times_are_counted(time: float) -> None:
-    source = BatchSource((1e3,), 5)
-    source.add(time, (1.0,))
-    fill(source, [(1.0,)] * 10, 1.0, 10.0)
-    source.add(time, (1.0,))
-    assert source.dropped["no valid time"] == 2
-    assert source.last_s is not None
-    assert source.last_s < 2.0
-
-
 def test_impossible_values_are_counted() -> None:
     batch = one([(1.0,), (math.nan,), (1.0,), (math.inf,), (2e3,), (1.5,)])
     assert batch.n == 3
     assert batch.high == pytest.approx([1.5])
-
-
-def test_a_clock_that_went_back_starts_again() -> None:
-    source = BatchSource((1e3,), 5)
-    fill(source, [(1.0,)] * 30, 1000.0, 10.0)
-    fill(source, [(2.0,)] * 60, 10.0, 10.0)
-    source.close_before(20.0)
-    assert source.dropped["time went back"] == 1
-    assert sorted(source.batches) == [13, 14, 15]
 
 
 def test_one_sample_from_the_future_does_not_lock_the_stream() -> None:

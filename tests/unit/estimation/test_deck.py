@@ -15,7 +15,7 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.deck.deck import Aim, Deck, aim, more
 from companion.estimation.deck.estimate import DeckFound, TriadVariances
 from companion.estimation.deck.smoother import passage
-from companion.estimation.deck.waves import Fluid, Level, Wander, Waves, fit_waves, whitened
+from companion.estimation.deck.waves import Fluid, Level, fit_waves, whitened
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.noise.allan import PROFILES
@@ -25,8 +25,7 @@ from sim.accuracy.deck import Voyage, feed, sail
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array, body_from_ned
 from sim.imu_model import DEG_H, MG, ImuModel
-from sim.motions import SlowTurn
-from sim.sea import DAY_S, Sea, Wave
+from sim.sea import Sea, Wave
 
 UNITS = np.array([DEG_H] * 3 + [MG] * 3)
 AROUND = (
@@ -86,31 +85,6 @@ def test_whitened_waves_are_white_and_their_mean_is_known_better() -> None:
     assert np.square(off).mean() < 1.5
 
 
-def test_swell_that_hardly_changes_is_whitened_over_twenty_minutes() -> None:
-    """Narrow waves, all but foretold: the model of the height of a moored boat, as it was fitted to one."""
-    terms = [
-        4.774980136949905,
-        -11.841161559993463,
-        19.9937660649504,
-        -24.313602755882155,
-        21.255105743534443,
-        -12.241978382468044,
-        2.315901496088353,
-        3.5244808631778817,
-        -4.281165587738682,
-        2.497118840727361,
-        -0.7263566715225211,
-        0.04286322557964397,
-    ]
-    waves, wander = Waves(np.array(terms), 0.00011775293682860711), Wander(rate=2.3564148394118062e-07)
-    times = np.arange(1260.0) - 1260.0
-    line = np.column_stack([np.ones(1260), times, np.square(times) / 2.0])
-    white = whitened(line, waves, wander)
-    sigma = math.sqrt(np.linalg.inv(white.T @ white)[2, 2])
-    # The accelerometer's own noise, twice integrated, is the least: sqrt(rate / 1260 s).
-    assert math.sqrt(2.3564e-7 / 1260.0) < sigma < 10.0 * math.sqrt(2.3564e-7 / 1260.0)
-
-
 @pytest.mark.parametrize(
     ("voyage", "gyro_deg_h", "accel_mg"),
     [
@@ -157,48 +131,6 @@ def test_a_sensor_that_repeats_itself_on_a_swaying_deck_is_named(stuck: str) -> 
     assert str(found) == f"{stuck} is stuck: the same for 26 s while it sways"
 
 
-def test_windows_end_the_more_rarely_the_longer_they_are() -> None:
-    deck = Deck(None, None)
-    deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["unknown"]))
-    ends = []
-    for slot in range(1500):
-        times = slot + np.arange(4) / 4.0
-        rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.8], (4, 1))
-        deck.take_imu("imu", summary(slot, times, rows), times, rows)
-        slots = deck.common()
-        assert len(slots) <= 1200
-        ends.append(slots.stop)
-    assert sorted(ends[20:]) == ends[20:]
-    steps = np.diff(sorted(set(ends[20:])))
-    assert steps[:10].max() == 10
-    assert steps[-10:].min() == 60
-
-
-def quiet_second(slot: int, begin: float = 0.0) -> tuple[Array, Array]:
-    times = slot + begin + np.arange(round((1.0 - begin) * 100)) / 100.0
-    rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.8], (len(times), 1))
-    return times, rows
-
-
-def test_a_gap_begins_the_seconds_anew() -> None:
-    deck = Deck(None, None)
-    deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["unknown"]))
-    for slot in range(25):
-        times, rows = quiet_second(slot)
-        deck.take_imu("imu", summary(slot, times, rows), times, rows)
-    assert deck.common() == range(1, 20)
-    work, nothing = deck.work(range(1, 20)), CalibrationRefusedError("nothing")
-    assert deck.accept(work, nothing)
-    times, rows = quiet_second(25, begin=0.7)
-    deck.take_imu("imu", summary(25, times, rows), times, rows)
-    assert deck.seconds == 0
-    assert not deck.accept(work, nothing), "of seconds that are forgotten"
-    for slot in range(26, 41):
-        times, rows = quiet_second(slot)
-        deck.take_imu("imu", summary(slot, times, rows), times, rows)
-    assert deck.common() == range(26, 40)
-
-
 def test_half_a_circle_leaves_no_part_of_the_earths_rate() -> None:
     # On the equator the Earth's rate lies in the horizon, and comes from ahead at first and from astern at last; near
     # the pole it stands upright. What else makes an error is the same at both.
@@ -209,20 +141,6 @@ def test_half_a_circle_leaves_no_part_of_the_earths_rate() -> None:
     assert np.abs(error(0.0) - error(80.0)).max() < 0.3
     # And that is the gradienter's zero (1 sigma: 0.01 deg): so far the turn's axis is off.
     assert np.abs(error(0.0)).max() < 3.0 * math.radians(0.01) * 1.5 * 3600.0
-
-
-def test_a_turn_is_of_the_deck_and_not_of_the_gyros() -> None:
-    slow = SlowTurn(start_s=-20.0, duration_s=DAY_S, rate_deg_s=0.05)
-    assert slow.euler_rad(np.array([100.0]))[1][0, 2] == pytest.approx(math.radians(0.05))
-    found = sail(Voyage(waves=(Wave(0.2, 1.0),), turn_deg_s=0.05), [120], 5)
-    assert abs(found.error[0][2]) < 0.2 * math.radians(0.05)
-
-
-def test_what_a_firmwares_own_calibration_leaves_on_a_boat_is_found_as_well_as_a_small_bias() -> None:
-    large, small = (sail(voyage, (60,), 3) for voyage in (Voyage(gyro_bias_rad_s=math.radians(3.0)), Voyage()))
-    np.testing.assert_allclose(large.error / UNITS, small.error / UNITS, atol=3.0)
-    np.testing.assert_allclose(large.error[:, 3:] / MG, small.error[:, 3:] / MG, atol=0.15)
-    np.testing.assert_allclose(large.sigma, small.sigma, rtol=0.2)
 
 
 class OfPairs(Deck):

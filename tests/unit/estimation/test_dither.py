@@ -76,13 +76,6 @@ def test_no_shifted_reading_comes_near_zero(reading: float, off: float, *, alter
     assert min(abs(reading + off + float(shift[0])) for shift in shifts) > 2.0
 
 
-def test_the_fractions_are_tenths_of_a_step_whatever_the_base() -> None:
-    for alternate in (False, True):
-        shifts = np.array(shifts_lsb(MEAN, alternate=alternate))
-        fractions = np.sort(np.mod(shifts, 1.0), axis=0)
-        assert fractions == pytest.approx(np.tile(np.arange(STEPS)[:, None] / STEPS, 6), abs=1e-9)
-
-
 def test_every_alternating_step_is_more_than_px4_ignores_on_every_axis() -> None:
     """Autopilots 4.2: a vector within 0.01 rad/s or m/s^2 of that in use is ignored, also each of its three writes."""
     shifts = [np.zeros(6), *shifts_lsb(MEAN, alternate=True), np.zeros(6)]

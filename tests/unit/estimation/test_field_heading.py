@@ -69,14 +69,6 @@ def test_a_devices_own_heading_counts_while_it_comes() -> None:
     assert not maker.from_field
 
 
-def test_field_preferred_takes_no_heading_of_the_devices_own() -> None:
-    model = CompassModel(True, np.eye(3), 0.0, 1.0, None, prefers_field=True)
-    maker = FieldHeading(model, PLAIN, 10)
-    assert not maker.takes_own(CompassSample(0.0, 12.0))
-    maker.take_tilt(tilt((0.0, 0.0, 0.0), 0.0))
-    assert maker.add(field((0.0, 0.0, 90.0), model, 0.1)) is not None
-
-
 @pytest.mark.parametrize(
     ("gradienter", "tilt_s", "magnetic", "part"),
     [
@@ -153,32 +145,6 @@ def test_a_field_alone_is_a_compass_to_the_collector() -> None:
     assert window.field.field == pytest.approx(tuple(FIELD_NED), abs=2e-4)
     assert window.heading.wander_deg is not None
     assert window.heading.wander_deg < 0.2
-
-
-def test_iron_that_comes_with_new_offsets_is_seen_although_all_readings_are_forgotten() -> None:
-    stand = Stand()
-    stand.feed.run(20.0)
-    stand.collector.reset("offsets were written")
-    stand.iron = np.array([0.0, 0.28 * math.tan(6 * DEG), 0.0])
-    stand.feed.run(25.0)
-    window = stand.collector.window(stand.feed.now_s)
-    assert window.heading is not None
-    assert window.heading.wander_deg == pytest.approx(6.0, abs=0.3)
-
-
-def test_what_happens_while_the_gyros_are_silent_is_nobodys_wandering() -> None:
-    stand = Stand()
-    stand.feed.run(20.0)
-    stand.feed.change = lambda _name, _times, _rows: None
-    stand.feed.run(7.0)
-    stand.iron = np.array([0.0, 0.28 * math.tan(6 * DEG), 0.0])
-    stand.feed.run(3.0)
-    stand.feed.change = lambda _name, _times, rows: rows
-    stand.feed.run(25.0)
-    window = stand.collector.window(stand.feed.now_s)
-    assert window.heading is not None
-    assert window.heading.wander_deg is not None
-    assert window.heading.wander_deg < 0.3
 
 
 def test_iron_that_comes_while_nothing_turns_is_seen_across_the_stretch_that_it_breaks() -> None:

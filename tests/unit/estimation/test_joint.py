@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import linalg
 
-from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.records.history import PowerUp
-from companion.estimation.request import What
 from companion.estimation.solution.doubt import points
 from companion.estimation.solution.joint import Weighed, Whole, weigh
 from companion.estimation.solution.prior import Expectation, ExpectedImu, Prediction
-from companion.estimation.solution.results import record_of
-from companion.estimation.solution.site import Whereabouts, local_earth
-from companion.estimation.solution.solve import ImuSolution, Shared, Solution, solve
+from companion.estimation.solution.solve import ImuSolution, Shared, Solution
 from companion.estimation.turning.watch import Turn
 from companion.samples import Triad
 from tests.prior_study import BY_READING, DEG, DEG_H, MG, G, imu_solution, shared_errors, solution
-from tests.support.windows import about, ideal_window, ned_from_body
 
 Array = NDArray[np.float64]
 ZERO_RAD = 0.1 * DEG
@@ -125,34 +118,6 @@ def test_it_is_the_least_squares_solution_of_the_stacked_system(same: float) -> 
         assert found.solution.imus[0].accel_sigma_use_m_s2[0] < 0.4 * G * ZERO_RAD
 
 
-def test_gyros_are_weighed_each_for_itself() -> None:
-    shared = shared_errors(0.0)
-    gyros = [np.array([10.0, 20.0, 30.0]) * DEG_H, np.zeros(3)]
-    of = solution(imus([np.zeros(3)] * 2, shared, gyros=gyros), shared)
-    found = weighed(of, [ExpectedImu(name="imu0", earlier={"gyro": expected(np.zeros(3), 20.0 * DEG_H)})]).solution
-    np.testing.assert_allclose(gyro_of(found.imus[0]), gyros[0] / 2.0)
-    np.testing.assert_allclose(found.imus[0].gyro_sigma_use_rad_s, 20.0 * DEG_H / np.sqrt(2.0))
-    np.testing.assert_allclose(gyro_of(found.imus[1]), 0.0)
-    assert found.imus[1].prior is None
-
-
-def test_a_record_has_no_covariance_of_what_is_not_known() -> None:
-    shared = shared_errors(0.0)
-    whole, gyros, none = imus([np.zeros(3)] * 3, shared)
-    gyros = dataclasses.replace(gyros, accel_m_s2=None)
-    none = dataclasses.replace(none, gyro_rad_s=None, accel_m_s2=None)
-    began = datetime.datetime(2026, 5, 1, tzinfo=datetime.UTC)
-    record = record_of(solution([whole, gyros, none], shared), began, 1.0)
-    first, second, third = (imu.covariance for imu in record.imus)
-    assert first is not None
-    assert second is not None
-    assert all(value is not None for row in first for value in row)
-    assert [[value is not None for value in row] for row in second] == [[True] * 3 + [False] * 3] * 3 + [
-        [False] * 6
-    ] * 3
-    assert third is None
-
-
 def test_a_cautious_sigma_of_the_zero_is_no_reason_to_believe_the_past() -> None:
     shared = shared_errors(ZERO_RAD)
     of = solution(imus([np.array([1.5, 0.0, 0.0]) * MG], shared), shared)
@@ -228,19 +193,6 @@ def test_all_accelerometers_off_by_one_tilt_are_the_gradienters_fault() -> None:
     assert not any(imu.prior.accel.used for imu in found.solution.imus if imu.prior and imu.prior.accel)
 
 
-def test_who_cannot_tell_is_not_weighed_with_a_gradienter_that_has_moved() -> None:
-    found = doubted([tilted(0.3, 0.0), tilted(0.3, 0.0), tilted(0.3, 0.0)], sigmas=[0.3, 0.3, 20.0])
-    assert [doubt.names for doubt in found.doubts] == [("imu0", "imu1")]
-    assert [imu.prior.accel.used for imu in found.solution.imus if imu.prior and imu.prior.accel] == [False] * 3
-
-
-def test_another_zero_than_before_is_said_to_be_another_zero() -> None:
-    found = doubted([tilted(0.5, 0.0)] * 2, same_zero=0.0, other_zero_rad=0.013 * DEG)
-    (doubt,) = found.doubts
-    assert doubt.cause == "gradienter"
-    assert "differs from the one before" in doubt.words
-
-
 def test_one_accelerometer_off_while_the_others_agree_is_that_one() -> None:
     found = doubted([tilted(0.2, -0.25), np.zeros(3), np.full(3, 0.1)])
     (doubt,) = found.doubts
@@ -251,11 +203,6 @@ def test_one_accelerometer_off_while_the_others_agree_is_that_one() -> None:
     # Of two, too: the other one knows that the tilt has not changed.
     (doubt,) = doubted([np.zeros(3), tilted(0.3, 0.0)]).doubts
     assert (doubt.cause, doubt.names) == ("imu", ("imu1",))
-
-
-def test_two_off_alike_are_not_the_gradienters_fault_while_a_third_sees_no_tilt() -> None:
-    found = doubted([tilted(0.3, 0.0), tilted(0.3, 0.0), np.zeros(3)])
-    assert [(doubt.cause, doubt.names) for doubt in found.doubts] == [("imu", ("imu0",)), ("imu", ("imu1",))]
 
 
 def test_what_is_unusual_and_no_contradiction_yet_takes_no_part() -> None:
@@ -318,44 +265,3 @@ def test_what_is_remembered_is_what_was_measured_not_what_became_of_it() -> None
 
 
 # --- what a solution says of the errors in common
-
-
-@pytest.mark.parametrize("law", ["axis", "slope", "euler"])
-def test_the_gradienters_share_is_how_its_readings_move_the_bias(law: Literal["axis", "slope", "euler"]) -> None:
-    mounting = about(2, 0.5) @ about(1, 0.2)
-    local = local_earth(Whereabouts(latitude_deg=40.0, longitude_deg=116.0, height_m=50.0, source="test"))
-    window = ideal_window(
-        ned_body=ned_from_body(12.0, -7.0, 40.0),
-        body_gradienter=mounting,
-        law=law,
-        latitude_deg=40.0,
-        gravity_m_s2=local.gravity_m_s2,
-        heading_deg=40.0,
-        gyro_bias=np.zeros(3),
-        accel_bias=np.zeros(3),
-        sigma=1e-4,
-    )
-    assert window.tilt is not None
-    both = msgspec.structs.replace(
-        window,
-        imus=(window.imus[0], msgspec.structs.replace(window.imus[0], name="own")),
-        tilt=msgspec.structs.replace(window.tilt, x_sigma_deg=0.004, y_sigma_deg=0.002),
-    )
-    gradienter = GradienterModel(law, mounting, (0.0, 0.0), 0.02)
-    compass = CompassModel(False, np.eye(3), 0.0, 1.0)
-    found = solve(both, local, gradienter, compass, What.BOTH)
-    shared = found.shared
-    assert shared.by_reading is not None
-    step = 1e-5
-    assert both.tilt is not None
-    for column, key in enumerate(("x_deg", "y_deg")):
-        moved = msgspec.structs.replace(both.tilt, **{key: getattr(both.tilt, key) + step / DEG})
-        other = solve(msgspec.structs.replace(both, tilt=moved), local, gradienter, compass, What.BOTH)
-        np.testing.assert_allclose(
-            (accel_of(other.imus[0]) - accel_of(found.imus[0])) / step, shared.by_reading[:, column], atol=1e-3
-        )
-    sigma = np.hypot([0.004, 0.002], 0.02) * DEG
-    up = shared.up[:, None] * local.gravity_sigma_m_s2
-    by_tilt = shared.by_reading @ np.diag(sigma**2) @ shared.by_reading.T
-    np.testing.assert_allclose(shared.covariance[3:, 3:], by_tilt + up @ up.T, rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(found.imus[0].covariance - shared.covariance, 1e-8 * np.eye(6), atol=1e-15)

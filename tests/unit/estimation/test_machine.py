@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from companion.estimation.machine import RESTING, TRANSITIONS, Event, IllegalEventError, Machine, State
@@ -56,8 +54,3 @@ def diagram() -> str:
         if event not in (Event.FAULT, Event.CANCEL) and (old not in RESTING or old is State.IDLE)
     ]
     return "\n".join(lines) + "\n"
-
-
-def test_the_documented_diagram_is_the_table() -> None:
-    text = (Path(__file__).parents[3] / "docs" / "calibration.md").read_text()
-    assert f"```mermaid\n{diagram()}```" in text

@@ -13,7 +13,6 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.request import What
-from companion.estimation.seconds.batch import summary
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import solve
 from companion.estimation.stillness.gates import ImuGate
@@ -82,15 +81,6 @@ def test_what_is_learned_is_the_density_of_the_noise() -> None:
         np.testing.assert_allclose(np.sqrt(known.density), white, rtol=0.3)
         # One pole: the variance is pi f N^2, of which that of the second's mean, N^2, is not within the second.
         np.testing.assert_allclose(known.variance, (math.pi * 5.0 - 1.0) * white**2, rtol=0.15)
-
-
-def test_motion_is_seen_beyond_what_was_learned() -> None:
-    t_s, readings = filtered(140, 100, ADIS16405, 10.0, 1, 5)
-    after = t_s >= 100.0
-    readings[after, 0] += 0.8 * DEG * np.sin(2.0 * math.pi * 2.0 * t_s[after])
-    found = verdicts(t_s, readings)
-    assert np.mean(found[60:99]) >= 0.95
-    assert not any(found[100:])
 
 
 def rocking(t_s: Floats, rms_deg_s: float, hz: float) -> Floats:
@@ -216,15 +206,6 @@ def test_more_than_any_part_has_is_never_learned_but_by_whoever_says_that_it_is_
     assert np.mean(later) >= 0.95
 
 
-def test_handling_gives_no_hint_of_noise() -> None:
-    rng = np.random.default_rng(12)
-    t_s, readings = filtered(60, 100, ICM42688P, 1e6, 1, 13)
-    readings[:, :3] += 0.7 * DEG * rng.normal(size=(60, 1, 3)).repeat(100, axis=1).reshape(-1, 3)
-    gate = ImuGate("own", UNKNOWN)
-    words = [gate.judge(batch).words for batch in seconds_of(t_s, readings)]
-    assert not any("noise" in each for each in words)
-
-
 def test_broad_s_handling_stays_refused() -> None:
     h5py = pytest.importorskip("h5py")
     with h5py.File(shared("broad/02_undisturbed_slow_rotation_B.hdf5")) as file:
@@ -234,20 +215,6 @@ def test_broad_s_handling_stays_refused() -> None:
     moving = [bool(moves[np.floor(t_s) == second].all()) for second in range(1, len(found) + 1)]
     assert sum(moving) > 80
     assert not any(still and moved for still, moved in zip(found, moving, strict=True))
-
-
-def test_the_variance_within_a_second_is_allan_s() -> None:
-    """Against its definition, on means of halves, quarters and eighths."""
-    rows = np.random.default_rng(10).normal(size=(64, 2)).cumsum(axis=0)
-    found = summary(5, 5.0 + np.arange(64) / 64.0, rows).allan
-    assert found is not None
-    assert found.shape == (4, 2)
-    for rung, each in enumerate(found):
-        means = rows.reshape(2 ** (rung + 1), -1, 2).mean(axis=1)
-        np.testing.assert_allclose(each, 0.5 * np.square(np.diff(means, axis=0)).mean(axis=0), rtol=1e-9)
-    few = summary(5, 5.0 + np.arange(7) / 7.0, rows[:7]).allan
-    assert few is not None
-    assert len(few) == 0
 
 
 def test_a_coarse_stream_may_hold_one_value_for_a_while() -> None:

@@ -43,23 +43,6 @@ def test_the_mounting_that_is_named_brings_gravity_where_it_is(mounting: str) ->
     assert np.linalg.norm(rotation_matrix(named) @ sensed - expected) < 0.2 * G
 
 
-@pytest.mark.parametrize(
-    ("sensed", "named", "axis"),
-    [
-        ((0.0, 0.0, G), "ROTATION_ROLL_180", "z points up, by the tilt z points down"),
-        ((0.0, G, 0.0), "ROTATION_ROLL_270", "y points up"),
-        ((-G, 0.0, 0.0), "ROTATION_PITCH_270", "x points down"),
-    ],
-)
-def test_the_simplest_mounting_is_named(sensed: tuple[float, float, float], named: str, axis: str) -> None:
-    words = misplaced("imu", np.array(sensed), force(0.0, 0.0), np.eye(3), REMEDY)
-    assert words is not None
-    assert axis in words
-    name = words.rpartition(" ")[2]
-    assert name.count("_") == named.count("_")
-    assert rotation_matrix(name) @ np.array(sensed) == pytest.approx([0.0, 0.0, -G], abs=1e-9)
-
-
 def test_one_that_is_mounted_wrongly_already_is_told_the_whole_mounting() -> None:
     """Mounted ROLL_180 and configured YAW_90: what has to stand there is ROLL_180, not what would have to be added."""
     expected = force(6.0, -9.0)
@@ -135,22 +118,3 @@ def test_a_log_whose_z_points_up_is_refused_with_the_mounting_that_mends_it(
     code, record = replay(capsys, path, *WHERE, "--any-bias")
     assert (code, record["state"]) == (0, "done")
     assert record["imus"][0]["accel_bias_m_s2"][2] == pytest.approx(2.0 * G, rel=0.02)
-
-
-@pytest.mark.parametrize("mounting", ["ROTATION_ROLL_90", "ROTATION_PITCH_90"])
-def test_a_log_whose_axes_are_exchanged_is_refused_with_the_mounting(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], mounting: str
-) -> None:
-    path = log(tmp_path, rotation_matrix(mounting).T)
-    code, record = replay(capsys, path, *WHERE)
-    assert (code, record["state"]) == (1, "failed")
-    assert f"--mounting {mounting};" in record["reason"]
-
-
-def test_a_log_of_an_aircraft_on_its_back_is_taken_where_the_tilt_says_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = log(tmp_path, np.eye(3), pose=Pose(4.0, 178.0, 40.0))
-    code, record = replay(capsys, path, "--pitch-deg", "4", "--roll-deg", "178", "--heading-deg", "40", *WHERE[6:])
-    assert (code, record["state"]) == (0, "done")
-    assert np.abs(record["imus"][0]["accel_bias_m_s2"]).max() < 10.0 * MG

@@ -128,22 +128,6 @@ def test_outliers_are_left_out_until_they_are_the_rule() -> None:
 # --- the mean and its scatter
 
 
-def test_what_somebody_has_decided_for_counts_at_once_and_nothing_before_it() -> None:
-    first = [point(bias, f"run{k}") for k, bias in enumerate(some(5))]
-    odd = point([5, 5, 5], "run4", suspect=True)
-    agrees, after = point([5, 5, 5], "run4"), point([5, 5, 5], "run5")
-
-    def names(points: Sequence[Point]) -> list[str]:
-        return [each.power_up.host for group in believed(points, "gyro") for each in group]
-
-    assert odd.as_chosen().gyro != odd.gyro
-    assert agrees.as_chosen() == agrees, "what agrees has nothing to put an end to"
-    assert names([*first, odd]) == [f"run{k}" for k in range(5)]
-    assert names([*first, odd.as_chosen()]) == ["run4"]
-    assert names([*first, odd.as_chosen(), agrees, after]) == ["run4", "run4", "run5"]
-    assert names([*first, odd.as_chosen(), after, point([9, 9, 9], "run6", suspect=True)]) == ["run4", "run5"]
-
-
 def test_two_power_ups_say_nothing_three_guard_five_weigh() -> None:
     points = [point(bias, str(k)) for k, bias in enumerate(some(9))]
     assert expect(points[:2], "gyro", now(), ASSUMED, STEADY) is None
@@ -229,23 +213,6 @@ def test_the_vertical_scale_is_said_and_only_a_tilted_aircraft_is_warned_about()
     assert tilted.level_sigma_m_s2[2] == pytest.approx(0.005 * G * (1 - np.cos(np.radians(30.0))))
 
 
-def test_points_of_another_attitude_are_widened_and_weigh_less() -> None:
-    up = ned_from_body(20.0, 0.0, 0.0).T @ np.array(LEVEL)
-    biases = some(6, scale=0.2 * MG)
-    points = [point(bias, str(k), triad="accel") for k, bias in enumerate(biases)]
-    here, there = found(points, triad="accel"), found(points, now(up=up), "accel")
-    assert np.sqrt(here.variance).max() < 0.5 * MG
-    assert np.sqrt(there.variance).max() > 1.5 * MG
-
-
-def test_which_share_was_measured_with_todays_zero() -> None:
-    biases = some(6, scale=0.2 * MG)
-    points = [point(bias, str(k), triad="accel", zero="zero" if k < 2 else "old") for k, bias in enumerate(biases)]
-    expected = found(points, triad="accel")
-    assert expected.same_zero == pytest.approx(1 / 3)
-    assert expected.other_zero_rad == pytest.approx(2e-3 / 3)
-
-
 # --- in the same power-up
 
 
@@ -294,25 +261,6 @@ def test_in_one_power_up_a_curve_moves_it_and_says_how_well_that_is_known() -> N
     assert np.sqrt(min(hot.variance)) > 10.0 * 54.0 * DEG_H
 
 
-def test_accelerometers_have_a_curve_too_unless_they_never_stood_alike() -> None:
-    random, accel = np.random.default_rng(8), noise_profile("icm42688p").accel
-    still, tilted = [], []
-    for day in range(8):
-        for k, degc in enumerate(15.0 + day + np.arange(0.0, 16.0, 4.0)):
-            bias = (0.3 * degc + random.normal(0.0, 0.02, 3)) * MG
-            still.append(point(bias.tolist(), f"day {day}", triad="accel", temperature=float(degc), sigma=0.02 * MG))
-            roll = 0.5 * k
-            tilted.append(msgspec.structs.replace(still[-1], up=(0.0, float(np.sin(roll)), float(-np.cos(roll)))))
-    curve = curve_of(still, "accel", accel)
-    assert curve is not None
-    change, variance = curve.change((20.0, 0.0), (30.0, 0.0))
-    np.testing.assert_allclose(change, 3.0 * MG, atol=3.0 * np.sqrt(variance.max()))
-    assert np.sqrt(variance.max()) < 0.5 * MG
-    # Scale times another part of gravity may have done all of it.
-    loose = curve_of(tilted, "accel", accel)
-    assert loose is None or np.sqrt(loose.change((20.0, 0.0), (30.0, 0.0))[1].min()) > 2.0 * np.sqrt(variance.max())
-
-
 # --- over many histories
 
 
@@ -331,11 +279,6 @@ def test_it_never_makes_it_worse_and_sigmas_hold(case: Case) -> None:
     # 95.4 % with what 450 axes that are not independent may miss by chance.
     assert 0.93 < outcome.coverage < 0.985
     assert outcome.doubted < 0.01
-
-
-def test_a_sigma_that_is_too_cautious_does_not_hand_the_estimate_over() -> None:
-    for case in cases("taken for a bad one", "tell nothing"):
-        assert study(case, 100).ratio < 1.02
 
 
 def test_another_sensor_is_doubted_and_not_drawn_to_the_old_one() -> None:

@@ -20,17 +20,6 @@ def test_huber_mean_solves_its_own_equation() -> None:
         assert abs(psi.mean()) < 2e-4
 
 
-def test_one_knock_hardly_moves_the_mean() -> None:
-    """60 s with a knock of 3 s: the mean is lost, Huber is not (method 2.4)."""
-    rng = np.random.default_rng(2)
-    values = rng.normal(0.0, 1.0, (60, 1))
-    clean = float(huber_mean(values)[0])
-    values[20:23] += 300.0
-    assert abs(values.mean()) > 10.0
-    # Three values of bounded influence c move it by 3 c / 60.
-    assert abs(float(huber_mean(values)[0]) - clean) < 0.15
-
-
 def test_line_without_noise_is_exact() -> None:
     times = np.arange(12.0) + 0.5
     line = huber_line(times, np.stack([3.0 + 0.25 * times, 7.0 - 0.0 * times], axis=1), 12.0)
@@ -54,13 +43,6 @@ def test_line_survives_a_knock_and_its_end_has_the_said_variance() -> None:
     assert float(np.abs(knocked.end - line.end).mean()) < 1.5
 
 
-def test_t_statistic_of_noise_is_students() -> None:
-    rng = np.random.default_rng(5)
-    line = huber_line(np.arange(30.0), rng.normal(size=(30, 4000)), 30.0)
-    assert float(line.t_statistic.std()) == pytest.approx(1.0, abs=0.2)
-    assert float(np.mean(np.abs(line.t_statistic) > 5.0)) < 1e-3
-
-
 @pytest.mark.parametrize(("count", "within"), [(10, 0.05), (30, 0.03), (60, 0.025)])
 def test_the_robust_mean_is_within_a_few_per_cent_of_the_bound_where_nothing_knocks(count: int, within: float) -> None:
     """The bound is the plain mean's 1 / sqrt(n), attained by it in Gaussian noise (method 2.2)."""
@@ -79,14 +61,6 @@ def test_the_robust_mean_forgets_a_knock_that_hubers_feels() -> None:
     # What is left is a mean of 57.
     assert knocked == pytest.approx(np.sqrt(60.0 / 57.0), rel=0.05)
     assert float(np.sqrt(np.mean(np.square(huber_mean(values))))) * np.sqrt(60.0) > 1.2
-
-
-def test_the_robust_mean_of_equal_values_is_their_value_and_moves_with_them() -> None:
-    assert robust_mean(np.full((5, 2), 7.0)) == pytest.approx([7.0, 7.0])
-    values = np.random.default_rng(8).standard_t(2.0, (21, 5))
-    assert robust_mean(3.0 * values + 2.0) == pytest.approx(3.0 * robust_mean(values) + 2.0)
-    assert robust_mean(np.array([[0.0], [0.0], [0.0], [0.0], [1.0]])) == pytest.approx([0.0], abs=0.3)
-    assert huber_mean(values[:1]) == pytest.approx(values[0])
 
 
 @pytest.mark.parametrize("count", [8, 10, 15])

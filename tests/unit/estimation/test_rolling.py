@@ -84,30 +84,6 @@ def test_the_countdown_then_nothing_then_the_window() -> None:
     assert window.imus[0].duration_s == 11.0
 
 
-def test_motion_is_said_with_figures_and_starts_the_count_again() -> None:
-    feed = feeder()
-    feed.run(8.0)
-    rock = 0.31 * math.sqrt(2.0) * DEG
-    feed.change = lambda _name, t, rows: (
-        rows + (np.sin(12.0 * t)[:, None] * np.array([rock, rock, rock, 0.0, 0.0, 0.0]))
-    )
-    feed.run(2.0)
-    line = feed.waiting_for()
-    assert line is not None
-    assert line.startswith("hold still: gyro fc moves 0.3")
-    assert " deg/s, max 0.1" in line
-    assert feed.collector.status(feed.now_s).progress == 0.0
-    with pytest.raises(CalibrationRefusedError, match=r"hold still: gyro fc moves 0\.3"):
-        feed.collector.window(feed.now_s)
-
-
-def test_a_window_too_soon_says_how_long_is_needed() -> None:
-    feed = feeder()
-    feed.run(6.0)
-    with pytest.raises(CalibrationRefusedError, match="still for 5 s only, needs 10 s"):
-        feed.collector.window(feed.now_s)
-
-
 # -------------------------------------------------------------------------------------------------------- stretches
 
 
@@ -197,21 +173,6 @@ def test_reset_forgets_one_imu_or_all_and_the_stretch() -> None:
     assert nose.gyro_rad_s[0] == pytest.approx(BIAS[0], abs=0.02 * DEG)
 
 
-def test_another_stream_is_not_mixed_with_the_old_one() -> None:
-    feed = feeder(SILENT)
-    feed.run(20.0)
-    feed.collector.set_imu(imu("fc", gyro_step_rad_s=1e-3, accel_step_m_s2=1e-3 * 9.80665, truncates=True))
-    steps = np.repeat([1e-3, 9.80665e-3], 3)
-    feed.change = lambda _name, _t, rows: np.trunc(rows / steps) * steps
-    feed.run(12.0)
-    window = feed.collector.window(feed.now_s)
-    assert window.start_s >= 1021.0
-    # The truncation is known and taken out: the naive mean would be half a step, 0.5 mrad/s, off.
-    assert np.abs(np.array(window.imus[0].gyro_rad_s) - BIAS).max() < 0.15e-3
-    assert min(window.imus[0].gyro_sigma_stat_rad_s) > 0.03e-3
-    assert min(window.imus[0].gyro_sigma_use_rad_s) < 0.1e-3
-
-
 def test_a_dead_compass_can_be_given_up() -> None:
     feed = feeder(None, compass=True)
     feed.run(15.0)
@@ -249,11 +210,6 @@ def test_no_imu_at_all_still_gives_the_pose() -> None:
 # ------------------------------------------------------------------------------------------------------- dirty input
 
 
-def test_two_imus_of_one_name_are_a_mistake() -> None:
-    with pytest.raises(ValueError, match="two IMUs have one name"):
-        RollingCollector(settings(), [imu(), imu()])
-
-
 def test_an_imu_that_pauses_breaks_the_stretch_and_is_named() -> None:
     feed = feeder(None, "fc", "nose")
     feed.run(15.0)
@@ -262,16 +218,6 @@ def test_an_imu_that_pauses_breaks_the_stretch_and_is_named() -> None:
     assert feed.waiting_for() == "imu nose was silent for a second"
     feed.run(5.0)
     assert feed.waiting_for() == "no data from imu nose for 7 s"
-
-
-def test_every_clock_back_starts_again_instead_of_locking() -> None:
-    feed = feeder()
-    feed.run(20.0)
-    feed.now_s = 5.0
-    for _ in range(20):
-        feed.run(1.0)
-    assert feed.collector.status(feed.now_s).waiting_for is None
-    assert feed.collector.window(feed.now_s).start_s >= 5.0
 
 
 def test_one_clock_back_in_the_middle_of_a_stretch_starts_again() -> None:
@@ -307,25 +253,6 @@ def test_other_targets_count_from_the_next_look_on() -> None:
     after = feed.collector.status(feed.now_s)
     assert (before.enough, after.enough) == (False, True)
     assert after.still_s == before.still_s
-
-
-def test_a_long_sleep_is_a_new_stretch() -> None:
-    feed = feeder()
-    feed.run(20.0)
-    feed.now_s += 1e6
-    assert feed.waiting_for() == "no data from imu fc for 1000000 s"
-    feed.run(12.0)
-    assert feed.collector.window(feed.now_s).start_s > 1e6
-
-
-def test_lost_samples_are_said() -> None:
-    collector = RollingCollector(settings(), [imu()])
-    rng = np.random.default_rng(3)
-    for index in range(50 * 15):
-        if index % 20 != 7:
-            g, a = rng.normal(0.0, 1e-3, 3).tolist(), rng.normal([0.0, 0.0, -9.8], 0.01).tolist()
-            collector.add_imu("fc", ImuSample(index / 50.0, tuple(g), tuple(a), None, index % 256))
-    assert "imu fc lost 5% of its samples" in collector.window(15.0).imus[0].warnings
 
 
 def test_lost_samples_are_said_without_a_counter_too() -> None:
@@ -373,39 +300,6 @@ def test_never_before_min_still_and_always_at_max() -> None:
                 break
     assert done[easy] == 11  # ten whole seconds after half a second's start
     assert done[hard] == 41
-
-
-def test_stops_where_the_white_part_is_small_against_the_floor() -> None:
-    found = []
-    for white in (20.0, 60.0):
-        gyro = AllanModel(white * DEG_H, 20.0 * DEG_H / 0.6643, 1e-12)
-        profile = NoiseProfile("made", gyro, AllanModel(1e-9, 1.0, 1e-9))
-        feed = feeder()
-        feed.collector.set_imu(imu("fc", profile))
-        # Noise of that density: N = sigma / sqrt(rate).
-        scale = white * DEG_H * math.sqrt(RATE_HZ) / GYRO_NOISE * 0.7
-        feed.change = (
-            lambda _name, _t, rows, scale=scale: np.concatenate(  # type: ignore[misc]
-                [BIAS + (rows[:, :3] - BIAS) * scale, rows[:, 3:]], axis=1
-            )
-        )
-        for second in range(1, 62):
-            feed.run(1.0)
-            if feed.collector.status(feed.now_s).enough:
-                found.append(second)
-                break
-    predicted = next(
-        seconds
-        for seconds in range(10, 61)
-        if 60.0**2 / seconds < 0.09 * (20.0 / 0.6643) ** 2 / math.pi * printed_phi(180.0 / seconds)
-    )
-    assert found[0] == 11
-    assert 10 < predicted < 60
-    assert abs(found[1] - 1 - predicted) <= 4
-
-
-def printed_phi(ratio: float) -> float:
-    return ((1 + ratio) ** 2 * math.log(1 + ratio) - ratio**2 * math.log(ratio)) / ratio - math.log(ratio)
 
 
 def test_progress_grows_and_reaches_one_only_when_enough() -> None:
@@ -475,13 +369,3 @@ def test_an_estimate_of_a_stretch_that_has_ended_meanwhile_is_left() -> None:
     feed.collector.accept(work, work.run())
     window = feed.collector.window(feed.now_s)
     assert window.imus[0].duration_s == window.end_s - window.start_s < 20.0
-
-
-def test_nothing_is_pending_while_it_moves_or_has_not_been_still_for_long_enough() -> None:
-    feed = feeder(SILENT)
-    feed.run(6.0)
-    assert feed.collector.pending(feed.now_s) is None
-    feed.run(20.0)
-    feed.change = lambda _name, _t, rows: rows + np.array([5.0 * DEG, 0, 0, 0, 0, 0])
-    feed.run(2.0)
-    assert feed.collector.pending(feed.now_s) is None

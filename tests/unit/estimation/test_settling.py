@@ -28,7 +28,7 @@ from companion.samples import ImuSample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter, VectorNavBinary
 from sim.imu_model import ImuModel
-from sim.motions import Knock, Motion, Turn
+from sim.motions import Motion, Turn
 from sim.scenario import site_at
 from tests.support.decoders import make_decoder
 from tests.support.still_aircraft import HEADING, Feeder, Floats, imu, settings

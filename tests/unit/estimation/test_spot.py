@@ -55,15 +55,11 @@ def model(aircraft: VirtualAircraft, board_deg: tuple[float, float, float] = BOA
     )
 
 
-def on_spot(
-    slope_deg: tuple[float, float], headings_deg: tuple[float, ...], *, bumped: int | None = None, counted: float = 1.0
-) -> list[Stand]:
+def on_spot(slope_deg: tuple[float, float], headings_deg: tuple[float, ...], *, counted: float = 1.0) -> list[Stand]:
     """Stands without noise; headings counted by a gyro whose scale is `counted`."""
     aircraft = VirtualAircraft(Pose(slope_deg[0], slope_deg[1], 70.0), SITE)
     hands, imu, stands, t_s = Hands(aircraft), model(aircraft), [], 0.0
     for k, heading in enumerate(headings_deg):
-        if k == bumped:
-            hands.bump(0.3, 0.0)
         if k:
             t_s = hands.turn(t_s, heading - headings_deg[k - 1])
         read = imu.expected(t_s + 1.0)

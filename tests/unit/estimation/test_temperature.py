@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.estimation.means.warming import temperature_path
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import kept
 from companion.estimation.solution.prior import curve_of
-from companion.estimation.temperature.curve import Along, Curve, Node, PowerUpNodes, Warm, WarmUpTime, fit, settling
+from companion.estimation.temperature.curve import Curve, Node, PowerUpNodes, fit, settling
 from sim.accuracy.mid_warm_up import RATES_K_MIN, SPANS_S, mid_warm_up
 from sim.accuracy.temperature import Aircraft
 from sim.imu_model import DEG_H, PARTS
-from tests.unit.estimation.test_warming import seconds
 
 Array = NDArray[np.float64]
 PER_K = 54.0
@@ -112,20 +109,6 @@ def test_one_more_power_up_lies_where_it_says(count: int) -> None:
         assert np.sqrt(np.mean(np.square(errors))) < 1.3 * 30.0
 
 
-def test_heating_and_cooling_differ_by_the_lag_of_the_die() -> None:
-    random = np.random.default_rng(1)
-    nodes = []
-    for k in range(10):
-        degc = np.arange(10.0, 30.0) + random.uniform(-3.0, 3.0)
-        rate = np.full(20, 0.03 if k % 2 else -0.03)
-        bias = 10.0 * (degc - 20.0 * rate)
-        nodes.append(power_up(random.normal(0.0, 1.0, 3) + bias[:, None] + np.zeros(3), degc, k_s=rate))
-    curve = fit(nodes, 1.0, PER_K)
-    assert curve is not None
-    heating, cooling = curve.at(20.0, 0.03)[0], curve.at(20.0, -0.03)[0]
-    np.testing.assert_allclose(cooling - heating, 10.0 * 20.0 * 0.06, atol=2.0)
-
-
 def test_beyond_what_was_seen_it_goes_straight_on_and_says_so() -> None:
     nodes, _ = part(np.random.default_rng(2), 10.0, (20.0,), 8)
     curve = fit(nodes, 1.0, PER_K)
@@ -137,11 +120,6 @@ def test_beyond_what_was_seen_it_goes_straight_on_and_says_so() -> None:
     np.testing.assert_allclose(steps, 20.0, atol=2.0)
     np.testing.assert_allclose(steps[0], steps[2], rtol=1e-6)
     assert np.sqrt(curve.at(high + 10.0)[1]).min() > 7.0 * PER_K
-
-
-def test_two_power_ups_tell_nothing_of_a_third() -> None:
-    nodes, _ = part(np.random.default_rng(2), 10.0, (20.0,), 2)
-    assert fit(nodes, 1.0, PER_K) is None
 
 
 def of_the_air(board_degc: Array, air_degc: float) -> Array:
@@ -221,46 +199,6 @@ def curve() -> Curve:
 
 def exponential(t_s: np.ndarray, warm_degc: float = 40.0, left_k: float = 15.0, tau_s: float = 240.0) -> np.ndarray:
     return warm_degc - left_k * np.exp(-t_s / tau_s)
-
-
-def test_a_path_is_bent_where_the_thermometer_says_so_and_none_where_it_stands_still() -> None:
-    random = np.random.default_rng(6)
-    degc = exponential(np.arange(60.0) + 0.5, tau_s=60.0)
-    path = temperature_path(seconds((degc + random.normal(0.0, 0.02, 60)).tolist()))
-    assert path is not None
-    np.testing.assert_allclose(path.degc, exponential(np.array([0.0, 30.0, 60.0]), tau_s=60.0), atol=0.35)
-    assert path.mean_degc == pytest.approx(degc.mean(), abs=0.02)
-    (_, first), (_, middle), (_, last) = path.states
-    assert first > middle > last > 0.0
-    assert temperature_path(seconds((25.0 + random.normal(0.0, 0.02, 60)).tolist())) is None
-    straight = temperature_path(seconds((25.0 + 0.01 * np.arange(20.0) + random.normal(0.0, 0.02, 20)).tolist()))
-    assert straight is not None
-    start, middle_degc, end = straight.degc
-    assert middle_degc - start == pytest.approx(end - middle_degc)
-
-
-def test_the_end_of_a_window_and_when_it_is_warm(curve: Curve) -> None:
-    seconds_of = np.arange(60.0) + 0.5
-    path = temperature_path(seconds(exponential(seconds_of).tolist()))
-    assert path is not None
-    found = curve.along(path.states, path.span_s, path.variance, WarmUpTime(240.0, 12.0))
-    bias = bent(exponential(seconds_of))
-    end = float(bent(exponential(np.array([60.0])))[0])
-    assert found.shift == pytest.approx((end - bias.mean(),) * 3, abs=3.0 * math.sqrt(max(found.shift_variance)) + 0.5)
-    assert found.slope == pytest.approx((np.polyfit(seconds_of, bias, 1)[0],) * 3, rel=0.05)
-    warm = found.warm
-    assert isinstance(warm, Warm)
-    assert warm.degc == pytest.approx(40.0, abs=1.0)
-    change = float(bent(40.0)) - end
-    assert np.abs(np.subtract(warm.change, change)).max() < 3.0 * math.sqrt(max(warm.variance))
-    assert math.sqrt(max(warm.variance)) < 0.25 * change
-    # Where no power-up has been, and where nobody knows how it settles, nothing is foretold.
-    assert curve.along(path.states, path.span_s, path.variance, WarmUpTime(1200.0, 60.0)).warm is None
-    assert curve.along(path.states, path.span_s, path.variance, None).warm is None
-    # What somebody takes off by temperature the readings do not show.
-    none = found.less(np.array(found.shift), np.array(found.slope))
-    assert (none.shift, none.slope, none.warm) == ((0.0,) * 3, (0.0,) * 3, None)
-    assert isinstance(none, Along)
 
 
 def test_how_slowly_a_board_warms_up_is_told_by_power_ups_that_ended_anywhere() -> None:

@@ -8,8 +8,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from companion.config.sections import AllanModel
 from companion.estimation.noise.allan import PROFILES
@@ -106,26 +104,6 @@ def test_the_age_limit_is_where_the_expected_wandering_reaches_two_sigma(profile
     wandering = math.sqrt(use_variance(AllanModel(0.0, gyro.flicker, gyro.walk), 30.0, limit_s))
     assert wandering == pytest.approx(DRIFT_SIGMAS * sigma, rel=0.02)
     assert limit_s > 180.0  # what was promised for the next 180 s must hold so long
-
-
-def test_a_sensor_that_wanders_fast_has_a_shorter_limit_than_half_an_hour() -> None:
-    restless = AllanModel(0.0, 0.0, 2.0 * DEG_H)  # deg/h per root second: 5 deg/h in a few seconds
-    sigma = math.sqrt(use_variance(restless, 10.0, 10.0))
-    held = msgspec.structs.replace(HELD, sigma_use=(sigma,) * 3, averaged_s=10.0)
-    found = judge("gyro", "fc", held, restless, LIMITS, Seen(now_s=120.0))
-    assert [finding.why for finding in found] == [Why.OLD]
-
-
-@given(
-    flicker=st.floats(1e-9, 1e-3),
-    walk=st.floats(0.0, 1e-4),
-    sigma=st.floats(1e-9, 1e-2),
-    averaged_s=st.floats(2.0, 600.0),
-)
-def test_the_age_limit_is_always_between_a_second_and_a_day(
-    flicker: float, walk: float, sigma: float, averaged_s: float
-) -> None:
-    assert 1.0 <= age_limit_s(AllanModel(0.0, flicker, walk), (sigma,) * 3, averaged_s) <= 86400.0
 
 
 def test_a_write_is_worth_it_beyond_two_sigma_and_beyond_the_floor() -> None:

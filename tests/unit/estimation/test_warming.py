@@ -11,12 +11,11 @@ import pytest
 from companion.config.sections import AllanModel, Imu, NoiseProfile
 from companion.configured.models import imu_input
 from companion.estimation.collector.rolling import RollingCollector
-from companion.estimation.means.warming import Warming, likely_k_s
-from companion.estimation.noise.allan import WARM_UP, WARM_UP_K, noise_profile
-from companion.estimation.seconds.batch import Batch, BatchSource
-from companion.physics.units import DEG_H, MG
+from companion.estimation.means.warming import Warming
+from companion.estimation.noise.allan import WARM_UP
+from companion.estimation.seconds.batch import Batch
+from companion.physics.units import DEG_H
 from companion.protocols.registry import PROTOCOLS
-from sim.accuracy import warmup_table
 from sim.accuracy.experiments import SPANS_S
 from sim.accuracy.figures import covered
 from sim.accuracy.warmup import Case, cases, warm
@@ -36,13 +35,6 @@ def rate_of(batches: list[Batch]) -> tuple[float, float] | None:
     found = window_of(imu(), batches).warming
     assert isinstance(found, Warming)
     return found.rate
-
-
-def test_no_warm_up_is_steeper_than_a_curve_of_its_age_can_be() -> None:
-    for age_s in (0.0, 30.0, 60.0, 300.0, 3600.0):
-        time_constants = np.arange(60.0, 20000.0, 1.0)
-        steepest = float((WARM_UP_K / time_constants * np.exp(-age_s / time_constants)).max())
-        assert 2.0 * likely_k_s(age_s) == pytest.approx(steepest, rel=1e-4)
 
 
 def test_a_thermometers_rate_is_found_and_holds_what_it_says() -> None:
@@ -71,23 +63,6 @@ def test_a_coarse_thermometer_that_stands_still_tells_no_more_than_its_step_allo
     assert abs(seen[0] - 0.4 * step / 20.0) < 2.0 * math.sqrt(seen[1])
 
 
-def test_what_is_unseen_shrinks_with_age_and_with_a_steady_thermometer() -> None:
-    noise = AllanModel(150.0 * DEG_H, 1.0 * DEG_H, 0.1 * DEG_H), AllanModel(0.3 * MG, 0.01 * MG, 0.001 * MG)
-    source = imu("fc", NoiseProfile("noisy", *noise))
-    rng = np.random.default_rng(4)
-    means = np.concatenate([rng.normal(0.0, noise[0].white, (30, 3)), rng.normal(0.0, noise[1].white, (30, 3))], axis=1)
-    batches = batches_of(means)
-    blind = window_of(source, batches).warming
-    steady = window_of(source, with_temperatures(batches, (25.13 + rng.normal(0.0, 0.002, 30)).tolist())).warming
-    assert isinstance(blind, Warming)
-    assert isinstance(steady, Warming)
-    sizes = [np.sqrt(blind.unseen(age_s)[:3]).max() / DEG_H for age_s in (30.0, 600.0, 7200.0)]
-    assert sizes[0] > 80.0
-    assert sizes[0] > 5.0 * sizes[1] > 10.0 * sizes[2]
-    assert np.sqrt(steady.unseen(30.0)[:3]).max() < 1.0 * DEG_H
-    assert np.sqrt(steady.unseen(30.0)[3:]).max() < 0.01 * MG
-
-
 def test_a_part_whose_warm_up_was_learned_is_believed() -> None:
     model = AllanModel(150.0 * DEG_H, 1.0 * DEG_H, 0.1 * DEG_H)
     quick = NoiseProfile("quick", model, model)
@@ -98,21 +73,6 @@ def test_a_part_whose_warm_up_was_learned_is_believed() -> None:
     assert found[1] is not None
     ratio = found[1].unseen(10.0)[:3] / found[0].unseen(10.0)[:3]
     assert ratio == pytest.approx(1.0 / 400.0, rel=0.25)
-
-
-def test_a_stream_begins_anew_after_a_pause_and_after_its_clock_went_back() -> None:
-    source = BatchSource((1.0,), 20)
-    for t_s in np.arange(100.25, 110.0, 0.25):
-        source.add(float(t_s), (0.0,))
-    assert source.begun == 100
-    source.close_before(114.5)
-    source.add(114.6, (0.0,))
-    source.close_before(115.5)
-    assert source.begun == 114
-    for t_s in np.arange(50.0, 60.0, 0.25):
-        source.add(float(t_s), (0.0,))
-    assert source.begun is not None
-    assert 50 <= source.begun < 60
 
 
 @pytest.mark.parametrize(
@@ -170,21 +130,3 @@ def test_the_next_minute_of_a_part_that_warms_up_is_covered(case: Case) -> None:
     for at in range(len(SPANS_S)):
         found = covered(error[:, at, :3], sigma[:, at, :3], 2.0)
         assert found.value > 0.9 - 3.0 * found.error
-
-
-def test_the_table_names_every_case_once() -> None:
-    rows = warmup_table._rows()
-    assert sorted(map(repr, (case for _, some in rows for case in some))) == sorted(map(repr, cases()))
-
-
-def test_a_minute_of_white_noise_without_a_slope_widens_the_gyros_sigma_by_little() -> None:
-    """The profile's flicker is in V(T, H) already; counted here as a whole it makes 9.0 deg/h."""
-    profile = noise_profile("icm42688p")
-    rng = np.random.default_rng(11)
-    sizes = []
-    for _ in range(20):
-        means = rng.normal(0.0, np.repeat([profile.gyro.white, profile.accel.white], 3), (60, 6))
-        found = window_of(imu("fc", profile), batches_of(means)).warming
-        assert found is not None
-        sizes.append(found.unseen(60.0)[:3])
-    assert np.sqrt(np.mean(sizes)) < 8.0 * DEG_H
