@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -97,20 +96,6 @@ def test_a_child_that_fails_is_started_again(
 
     asyncio.run(_runs(tmp_path, started_again))
     assert any(each.startswith(reason) for each in reasons), reasons
-
-
-def test_a_killed_child_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COMPANION_TEST_CHILD", "work")
-    killed: set[int] = set()
-
-    def killed_once(child: Child) -> bool:
-        if not killed and child.process_id is not None and child.status()["good"]:
-            killed.add(child.process_id)
-            os.kill(child.process_id, signal.SIGKILL)
-        return bool(killed) and child.process_id not in killed and bool(child.status()["good"])
-
-    asyncio.run(_runs(tmp_path, killed_once))
-    assert _starts(tmp_path) == 2
 
 
 def test_a_child_that_ignores_the_request_to_end_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,10 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from companion.config.sections import Control
 from companion.daemon.faces import control
 from companion.daemon.faces.control import ControlServer
-from companion.errors import CalibrationRefusedError, DaemonUnreachableError, LinkError
+from companion.errors import CalibrationRefusedError, LinkError
 from companion.formats import Object
 from companion.links.system import control_client
 from companion.links.system.control_client import ask
@@ -52,16 +51,6 @@ def test_request_progress_result_and_errors(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-def test_a_socket_below_a_missing_folder_is_refused(tmp_path: Path) -> None:
-    async def main() -> None:
-        with pytest.raises(LinkError, match=r"far/away/c.sock: cannot be opened: No such file or directory$"):
-            async with ControlServer(tmp_path / "far" / "away" / "c.sock", _echo):
-                pass
-
-    asyncio.run(main())
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_group_may_use_it_too(tmp_path: Path) -> None:
     path = tmp_path / "control.sock"
     ours = grp.getgrgid(os.getgid()).gr_name
@@ -72,27 +61,6 @@ def test_a_group_may_use_it_too(tmp_path: Path) -> None:
             assert path.stat().st_gid == os.getgid()
 
     asyncio.run(main())
-
-
-def test_a_group_that_does_not_exist_is_said_and_opens_nothing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = tmp_path / "control.sock"
-
-    async def main() -> None:
-        async with ControlServer(path, _echo, group="no-such-group"):
-            assert stat.S_IMODE(path.stat().st_mode) == 0o600
-
-    asyncio.run(main())
-    assert "group no-such-group may not use it: there is no such group" in caplog.text
-
-
-def test_the_group_is_the_configurations_else_that_of_the_unit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("COMPANION_CONTROL_GROUP", raising=False)
-    assert Control().group_name is None
-    monkeypatch.setenv("COMPANION_CONTROL_GROUP", "dialout")
-    assert Control().group_name == "dialout"
-    assert Control(group="pilots").group_name == "pilots"
 
 
 def test_a_stale_socket_is_replaced_and_a_live_one_refused(tmp_path: Path) -> None:
@@ -156,35 +124,6 @@ def test_garbage_is_answered_with_one_error_line(tmp_path: Path, line: bytes, ca
     assert answer.count(b"\n") == 1
     assert len(answer) < 300
     assert not caplog.records
-
-
-def test_no_daemon_is_said_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(DaemonUnreachableError, match=r"no daemon answers at .*none.sock \(no such socket\)$"):
-        asyncio.run(_all(tmp_path / "none.sock", {"command": "status"}))
-
-
-def test_a_client_that_leaves_in_the_middle_disturbs_nobody(tmp_path: Path) -> None:
-    path = tmp_path / "control.sock"
-    started = asyncio.Event()
-
-    async def endless(request: Object) -> AsyncIterator[Object]:
-        if request.get("command") == "status":
-            yield {"kind": "result"}
-            return
-        while True:
-            started.set()
-            yield {"kind": "progress", "pad": "x" * 1000}
-
-    async def main() -> None:
-        async with ControlServer(path, endless):
-            _, writer = await asyncio.open_unix_connection(str(path))
-            writer.write(b'{"command": "monitor"}\n')
-            await started.wait()
-            writer.close()
-            assert await _all(path, {"command": "status"}) == [{"kind": "result"}]
-
-    asyncio.run(main())
-    assert not os.path.exists(path)
 
 
 async def monitoring(request: Object) -> AsyncIterator[Object]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 
 import pytest
 
 from companion.config import parse
 from companion.config.sections import Config
-from companion.daemon.process.check import sensor_findings, system_findings
+from companion.daemon.process.check import system_findings
 from companion.links.serial.faults import port_faults, same_ports
 from tests.support.usb_tree import UsbTree
 
@@ -112,17 +111,6 @@ def test_a_login_console_is_named_with_what_ends_it(board: Board) -> None:
     assert "remove console=ttyS0,... from the kernel's command line" in line
 
 
-def test_a_console_is_found_by_its_command_line_where_we_may_not_look_into_it(board: Board) -> None:
-    board.process(77, "agetty", "/dev/ttyUSB1", "115200")
-    assert "sudo systemctl disable --now serial-getty@ttyUSB1.service" in faults(board, "/dev/ttyUSB1")[0]
-    assert not any("console" in line for line in faults(board, FTDI_ID))
-
-
-def test_the_kernels_own_messages(board: Board) -> None:
-    board.write("proc/cmdline", "console=ttyS0,115200\n")
-    assert any("the kernel's messages go to /dev/ttyS0" in line for line in faults(board, "/dev/ttyS0"))
-
-
 def test_modem_manager_is_named_with_what_keeps_it_away(board: Board) -> None:
     board.process(600, "ModemManager")
     assert not any("Modem" in line for line in faults(board, "/dev/ttyUSB1")), "it leaves the port alone"
@@ -170,37 +158,12 @@ def device(name: str, speaks: str | None, trouble: str | None = "undecodable") -
     return {"name": name, "trouble": trouble, "speaks": speaks}
 
 
-def test_what_a_running_daemon_has_understood_is_explained_without_opening_anything() -> None:
-    both = config(imu="tcp://127.0.0.1:4001")
-
-    def found(*devices: dict[str, object]) -> list[tuple[str, str]]:
-        findings = asyncio.run(sensor_findings(both, {"devices": list(devices)}, may_listen=False))
-        return [(finding.name, finding.words) for finding in findings]
-
-    assert found(device("own", None, None), device("gradienter", None, None)) == []
-    assert found(device("own", "inclinometer_xy"), device("gradienter", "vectornav")) == [
-        ("own", 'this is inclinometer_xy, a device for gradienter: give [[imu]] "own" the port of the imu'),
-        ("gradienter", "this is vectornav, a device for imu: give [gradienter] the port of the gradienter"),
-    ]
-    ((name, words),) = found(device("own", "imu_line"), device("gradienter", None, None))
-    assert (name, words) == ("own", 'this is imu_line, not vectornav: set protocol = "imu_line" in [[imu]] "own"')
-    ((name, words),) = found(device("own", None, "damaged"), device("gradienter", None, "damaged"))
-    assert name == "gradienter", "of tcp:// there is no speed to try"
-    assert "sudo systemctl stop companion" in words
-
-
 def test_one_port_under_two_names(board: Board) -> None:
     assert same_ports({"own": FTDI_ID, "gradienter": "/dev/ttyUSB0"}, board.root) == [
         ("own", "gradienter", "/dev/ttyUSB0")
     ]
     found = system_findings(config(gradienter="/dev/ttyUSB0"), [], board.root)
     assert any("own and gradienter are one and the same port, /dev/ttyUSB0" in one.words for one in found)
-
-
-def test_the_autopilots_port_is_looked_at_too(board: Board) -> None:
-    board.process(412, "agetty", "ttyS0", opened=("/dev/ttyS0",))
-    found = system_findings(config(autopilot="serial:/dev/ttyS0:921600"), [], board.root)
-    assert [one.name for one in found] == ["autopilot"]
 
 
 def test_a_machine_without_anything(tmp_path: Path) -> None:

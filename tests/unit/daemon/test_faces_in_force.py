@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -106,22 +105,6 @@ def test_under_the_same_offsets_it_is_what_was_measured(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.sigma[BIAS] / MG, 0.03, rtol=1e-3)
 
 
-def test_once_written_nothing_is_left_of_it(tmp_path: Path) -> None:
-    before = calibration()
-    changes = whole_accelerometer(before, vector(np.array(BIAS_MG) * MG), ERROR)
-    after = {change.parameter: change.after for change in changes}
-    names = before.parameters
-    written = dataclasses.replace(
-        before,
-        accel_offset_m_s2=vector(np.array([after[name] for name in names.accel_offset])),
-        accel_scale=vector(np.array([after[name] for name in names.accel_scale])),
-    )
-    found = kept(tmp_path, running()).known("fc", written, 25.0)
-    assert found is not None
-    np.testing.assert_allclose(found.figures[BIAS] / MG, 0.0, atol=1e-3)
-    np.testing.assert_allclose(found.figures[SCALE], 0.0, atol=1e-6)
-
-
 @pytest.mark.parametrize("up", [(0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.6, -0.8, 0.0)])
 def test_what_is_written_moves_the_output_to_the_truth_on_every_side(up: Vector) -> None:
     """By the firmware's own formula: R diag(scale) (raw - offset)."""
@@ -142,14 +125,6 @@ def test_what_is_written_moves_the_output_to_the_truth_on_every_side(up: Vector)
 
 def sigma_mg(found: Any) -> float:
     return float(found.sigma[0]) / MG
-
-
-def test_hours_and_kelvins_widen_the_biases(tmp_path: Path) -> None:
-    fresh = kept(tmp_path, running())
-    assert sigma_mg(fresh.known("fc", calibration(), 30.0)) == pytest.approx(1.0, rel=0.01)
-    old = kept(tmp_path, running(UP_S - 3600.0))
-    assert 0.032 < sigma_mg(old.known("fc", calibration(), 25.0)) < 0.1
-    assert sigma_mg(old.known("fc", calibration(), None)) > 1.0
 
 
 @pytest.mark.parametrize(

@@ -204,17 +204,6 @@ def test_a_disk_that_refuses_the_end_leaves_the_write_to_the_mender_and_nothing_
     asyncio.run(main())
 
 
-def test_an_error_is_told_as_it_is_though_the_disk_refuses_to_end_it(tmp_path: Path) -> None:
-    async def main() -> None:
-        disk = Disk()
-        ledger = opened(tmp_path, disk)
-        disk.refuses = {"clear"}
-        assert await end_of(ledger, raises(ALL_BACK)) is ALL_BACK
-        assert ledger.pending
-
-    asyncio.run(main())
-
-
 def test_a_second_write_does_not_take_the_place_of_one_that_is_open_or_was_interrupted(tmp_path: Path) -> None:
     async def main() -> None:
         ledger = opened(tmp_path)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.daemon.offsets.other_writers import EXPIRE_S, FIRST_BEATS, IDLE_BEATS, OtherCompanions
+from companion.daemon.offsets.other_writers import OtherCompanions
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.virtual_time import run_virtual
 
@@ -89,25 +89,6 @@ def test_exactly_one_of_two_refuses_to_write_and_each_names_the_other(apart_s: f
     run_virtual(main())
 
 
-def test_who_remains_writes_and_who_comes_back_waits() -> None:
-    async def main() -> None:
-        bus = Bus()
-        async with companion(bus) as second:
-            await asyncio.sleep(10.0)
-            for _ in range(2):
-                async with companion(bus) as first:
-                    await asyncio.sleep(8.0)
-                    assert first.others.why_not() is not None
-                await asyncio.sleep(EXPIRE_S + 1.0)
-                assert second.others.warning is None
-        async with companion(bus) as alone:
-            await asyncio.sleep(30.0)
-            assert alone.others.why_not() is None
-            assert alone.said == []
-
-    run_virtual(main())
-
-
 def test_a_lossy_link_does_not_let_both_write() -> None:
     async def main() -> None:
         lost = iter(range(10**6))
@@ -151,15 +132,5 @@ def test_who_writes_nothing_neither_announces_itself_nor_is_kept_from_measuring(
             await asyncio.sleep(30.0)
             assert one.others.warning is None
             assert silent.others.why_not() is None
-
-    run_virtual(main())
-
-
-def test_alone_it_is_announced_seldom() -> None:
-    async def main() -> None:
-        bus = Bus()
-        async with companion(bus):
-            await asyncio.sleep(100.0)
-            assert bus.packets <= FIRST_BEATS + 100 / IDLE_BEATS
 
     run_virtual(main())

@@ -117,35 +117,6 @@ def test_one_far_value_at_a_time_is_in_use_for_less_than_a_second_and_a_half(tmp
     assert max(seconds for _, seconds in stretches) < 1.5, stretches
 
 
-class SlowPx4(ScriptedPx4):
-    """A simulator on a busy machine: its clock, and all that it does by that, runs at a third of real time."""
-
-    PACE = 0.33
-
-    def uptime_s(self) -> float:
-        return self.PACE * super().uptime_s()
-
-    def changed(self) -> None:
-        if not self._pending:
-            self._pending = True
-            loop = asyncio.get_running_loop()
-            loop.call_at(max(loop.time() + 0.02, self._looked_s + 1.0 / self.PACE), self._look)
-
-
-def test_a_px4_whose_clock_runs_at_a_third_is_given_the_time_to_take_each_value(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with aboard(SlowPx4(devices=(ICM, BMI)), tmp_path) as stage:
-            found = await stage.write(1, 2)
-            assert [stage.memory.known("accel", device) for device in (ICM, BMI)] == [1, 2]
-            await asyncio.sleep(4.0)
-            for each, device in zip(found, (ICM, BMI), strict=True):
-                for sensor, offset in (("GYRO", each.parameters.gyro_offset), ("ACC", each.parameters.accel_offset)):
-                    wanted = [stage.px4.parameters[name] for name in offset]
-                    np.testing.assert_allclose(stage.px4.used[sensor, device], wanted, atol=1e-9)
-
-    run_virtual(main())
-
-
 def test_the_wrong_slot_is_put_back_and_named_and_the_next_write_takes_the_right_one(tmp_path: Path) -> None:
     px4 = ScriptedPx4(devices=(BMI, ICM))
     px4.parameters |= {"CAL_GYRO0_ID": ICM, "CAL_GYRO1_ID": BMI, "CAL_ACC0_ID": ICM, "CAL_ACC1_ID": BMI}
@@ -169,31 +140,6 @@ def test_the_wrong_slot_is_put_back_and_named_and_the_next_write_takes_the_right
                 "CAL_GYRO1",
                 "CAL_ACC1_",
             }
-
-    run_virtual(main())
-
-
-def test_only_one_half_may_be_in_the_wrong_slot(tmp_path: Path) -> None:
-    # The accelerometers of two chips started in the other order than their gyros.
-    px4 = ScriptedPx4(devices=(ICM, BMI))
-    swapped = {1: BMI, 2: ICM}
-    zero = np.zeros(3)
-
-    def output(instance: int) -> tuple[np.ndarray, np.ndarray]:
-        gyro, accel = px4.raw[instance - 1]
-        device = px4.devices[instance - 1]
-        return gyro - px4.used.get(("GYRO", device), zero), accel - px4.used.get(("ACC", swapped[instance]), zero)
-
-    px4.output = output  # type: ignore[method-assign]
-
-    async def main() -> None:
-        async with aboard(px4, tmp_path) as stage:
-            with pytest.raises(WriteFailedError, match="CAL_ACC0 act on the accelerometer of IMU 2") as caught:
-                await stage.write(1)
-            assert "CAL_GYRO" not in str(caught.value)
-            (found,) = await stage.write(1)
-            assert found.parameters.gyro_offset[0] == "CAL_GYRO0_XOFF"
-            assert found.parameters.accel_offset[0] == "CAL_ACC1_XOFF"
 
     run_virtual(main())
 
@@ -235,44 +181,6 @@ def test_where_every_slot_is_somebodys_a_write_without_effect_is_not_tried_on_an
             written = {m.param_id for m in px4.requests if m.get_type() == "PARAM_SET"}
             assert {name[:9] for name in written} == {"CAL_GYRO0", "CAL_ACC0_"}
             assert px4.parameters == before
-
-    run_virtual(main())
-
-
-def test_an_imu_that_nobody_could_be_asked_for_may_be_there(tmp_path: Path) -> None:
-    """The second IMU's telemetry must be asked for, and the packets that do so are lost."""
-    px4 = DeafPx4(devices=(ICM, BMI))
-    heard = px4._handle
-
-    def handle(message: Any) -> None:
-        if message.get_type() != "COMMAND_LONG" or (message.command, message.param1) != (511, 116):
-            heard(message)
-
-    px4._handle = handle  # type: ignore[method-assign]
-
-    async def main() -> None:
-        async with aboard(px4, tmp_path) as stage:
-            with pytest.raises(WriteFailedError, match="without effect"):
-                await stage.write(1)
-            assert stage.memory.known("accel", ICM) is None
-
-    run_virtual(main())
-
-
-def test_over_a_restart_nothing_is_concluded(tmp_path: Path) -> None:
-    """It starts with what it has stored: neither who moved nor who did not says whose slot that is."""
-    px4 = DeafPx4(devices=(ICM,))
-    px4.parameters |= {"CAL_GYRO1_ID": BMI, "CAL_ACC1_ID": BMI}  # a stranger, so that the first might be one too
-
-    async def main() -> None:
-        async with aboard(px4, tmp_path) as stage:
-            found = await stage.read(1)
-            async with stage.writes.standing_by([(found, small_changes(found), (0.0, 0.0, 0.0))]) as probe:
-                assert probe is not None
-                probe.mark("CAL_GYRO0_ZOFF")
-                stage.client.vehicle.boots += 1
-                assert await probe.verify("CAL_GYRO0_ZOFF") is None
-            assert stage.memory.known("gyro", ICM) is None
 
     run_virtual(main())
 
@@ -322,19 +230,5 @@ def test_while_the_aircraft_moves_nothing_is_concluded(tmp_path: Path) -> None:
                 await stage.writer.apply(changes, probe)
             assert stage.memory.known("gyro", ICM) is None
             assert stage.writes.seen_far(found) == {}
-
-    run_virtual(main())
-
-
-def test_the_streams_that_were_asked_for_are_given_back(tmp_path: Path) -> None:
-    px4 = ScriptedPx4(devices=(ICM, BMI))
-
-    async def main() -> None:
-        async with aboard(px4, tmp_path) as stage:
-            await stage.write(1)
-            await asyncio.sleep(1.0)
-            asked = [(int(m.param1), m.param2) for m in px4.requests if m.get_type() == "COMMAND_LONG"]
-            for message_id in (26, 116, 129):
-                assert [interval for which, interval in asked if which == message_id] == [20000.0, 0.0]
 
     run_virtual(main())

@@ -151,69 +151,6 @@ def test_a_compass_is_stuck_when_the_aircraft_turned_and_not_when_a_gyro_is_bias
     on_the_clock(check)
 
 
-def test_a_gradienter_that_begins_to_hang_while_it_is_tilted_is_stuck() -> None:
-    """Whoever takes the aircraft in hand pulls at the cable: its last reading is of the middle of the motion."""
-
-    def check() -> None:
-        bench = Bench("gradienter")
-
-        def lives(t_s: float) -> TiltSample:
-            return TiltSample(t_s, 0.43 + 1e-3 * (t_s % 3), -0.084)
-
-        bench.run(10.0, lives)
-        bench.run(0.5, lives, pitch_deg=8.0)
-        found = bench.run(6.0, tilt, pitch_deg=8.0)
-        assert found is not None
-        assert "while the aircraft tilted by 8 deg" in found.words
-
-    on_the_clock(check)
-
-
-def test_a_gradienter_that_follows_and_then_rests_is_left_in_peace() -> None:
-    """With a lag of its own, and coarse enough to repeat its digits from then on."""
-
-    def check() -> None:
-        bench = Bench("gradienter")
-        bench.run(10.0, tilt)
-        since_s = bench.now_s
-
-        def follows(t_s: float) -> TiltSample:
-            return TiltSample(t_s, 0.43, round(8.0 * (1.0 - math.exp(-(t_s - since_s) / 0.5)), 2))
-
-        for _ in range(30):
-            assert bench.run(1.0, follows, pitch_deg=8.0) is None
-        assert bench.resets == []
-
-    on_the_clock(check)
-
-
-def test_the_autopilots_imu_is_no_witness_while_its_offsets_are_being_written() -> None:
-    def check() -> None:
-        bench = Bench("gradienter")
-        bench.one.collector.set_imu(imu("second"))
-        bench.second = True
-        bench.run(10.0, tilt)
-        bench.offset = None
-        found = bench.run(8.0, tilt, pitch_deg=8.0)
-        assert found is not None, "the other IMU has seen it"
-        assert bench.run(5.0, tilt, pitch_deg=8.0) is not None, "and it is not forgotten while nothing is collected"
-
-    on_the_clock(check)
-
-
-def test_an_imu_that_comes_back_after_the_tilt_has_not_seen_it() -> None:
-    def check() -> None:
-        bench = Bench("gradienter")
-        bench.one.collector.set_imu(imu("second"))
-        bench.second, bench.offset = True, None
-        bench.run(8.0, tilt)
-        bench.run(1.0, tilt, pitch_deg=8.0)
-        bench.offset = (0.0, 0.0, 0.0)
-        assert bench.run(5.0, tilt, pitch_deg=8.0) is not None
-
-    on_the_clock(check)
-
-
 def test_new_offsets_and_another_orientation_are_no_tilt() -> None:
     def check() -> None:
         bench = Bench("gradienter")

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import tty
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -25,8 +24,8 @@ from companion.daemon.devices.sensors import SerialSensor
 from companion.links.serial.bytestream import ByteLink
 from companion.protocols.decoding.dialogue import Dialogue
 from companion.protocols.registry import PROTOCOLS, ProtocolInfo
-from companion.samples import CompassSample, ImuSample, Sample, TiltSample
-from tests.support.frames import pni_data, sentence, vectornav_imu
+from companion.samples import CompassSample, Sample, TiltSample
+from tests.support.frames import sentence
 from tests.support.virtual_time import run_virtual
 
 LINES = b"40.1, 5.0, -3.0\r\n40.2, 5.1, -3.1\r\n"
@@ -140,26 +139,6 @@ def test_headings_to_another_north_than_the_configured_one_are_refused_in_words(
     run_virtual(main())
 
 
-def test_each_role_says_how_it_is() -> None:
-    async def main() -> None:
-        sensor, _, _ = opened(device(*BOTH))
-        now_s = asyncio.get_running_loop().time
-        # The two-axis sibling: headings, but no tilt.
-        sensor.receive(b"\r\n" + b"40.1\r\n" * 5, now_s())
-        gradienter, compass = (role.status() for role in sensor.roles)
-        assert (gradienter["name"], gradienter["kind"], gradienter["frames"]) == ("gradienter", "gradienter", 0)
-        assert not gradienter["good"]
-        assert "none with tilt" in str(gradienter["summary"])
-        assert (compass["good"], compass["frames"]) == (True, 5)
-        assert compass["shared_with"] == ["gradienter"]
-        sensor.receive(LINES, now_s())
-        assert all(role.status()["good"] for role in sensor.roles)
-        await asyncio.sleep(4.0)
-        assert {"silent" in str(role.status()["summary"]) for role in sensor.roles} == {True}
-
-    run_virtual(main())
-
-
 def config(text: str) -> Config:
     return parse('[mavlink]\nurl = "tcp:h:1"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n' + text, "test")
 
@@ -181,24 +160,6 @@ def test_what_one_section_leaves_open_the_other_says() -> None:
 # --- what is said
 
 
-def test_the_dialogue_is_told_of_everything_and_asked_after_it() -> None:
-    async def main() -> None:
-        sensor, port, _ = opened(device(*BOTH, dialogue=Talker))
-        talker = sensor.dialogue
-        assert isinstance(talker, Talker)
-        running = asyncio.create_task(sensor.run())
-        await asyncio.sleep(0.3)
-        sensor.receive(b"\r\n", asyncio.get_running_loop().time())
-        talker.to_say = iter([b"*Q"])
-        sensor.receive(LINES, asyncio.get_running_loop().time())
-        assert talker.told == [("opened",), ("heard", b"\r\n", 0), ("heard", LINES, 2)]
-        assert port.sent == [b"*Q"]
-        assert {role.status()["words"] for role in sensor.roles} == {"said *Q"}
-        running.cancel()
-
-    run_virtual(main())
-
-
 def test_not_even_a_talkative_dialogue_floods_a_device_or_the_log(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
 
@@ -217,16 +178,6 @@ def test_not_even_a_talkative_dialogue_floods_a_device_or_the_log(caplog: pytest
 
     run_virtual(main())
     assert [record.message for record in caplog.records].count("gradienter, compass: said something") == 1
-
-
-def test_before_the_port_was_opened_nothing_is_said() -> None:
-    async def main() -> None:
-        sensor = SerialSensor(device(*BOTH, dialogue=Chatterbox), lambda role, part: None)
-        sensor.receive(LINES, asyncio.get_running_loop().time())
-        assert isinstance(sensor.dialogue, Talker)
-        assert sensor.dialogue.asked == []
-
-    run_virtual(main())
 
 
 TALKATIVE: dict[str, ProtocolInfo] = {
@@ -322,50 +273,3 @@ def test_while_another_program_has_the_port_open_nothing_is_sent(monkeypatch: py
         other.kill()
         other.wait()
         os.close(master)
-
-
-def test_what_a_device_says_against_itself_is_shown() -> None:
-    async def main() -> None:
-        which = SerialDevice("/nowhere", PROTOCOLS["compass"]["pni"], 38400, "none", read_only=True, roles=BOTH)
-        sensor, _, taken = opened(which)
-        uncalibrated = pni_data([(5, 40.0), (24, 5.0), (25, -3.0), (9, b"\0")])
-        sensor.receive(uncalibrated, 1.0)
-        assert [name for name, _ in taken] == ["gradienter", "compass"]
-        assert {role.status()["warned"]["not calibrated by the user"] for role in sensor.roles} == {1}  # type: ignore[index]
-
-    run_virtual(main())
-
-
-def test_every_sample_of_a_read_is_handed_on_once_in_its_order(tmp_path: Path) -> None:
-    """To the role that counts it; what else a frame holds is nobody's here."""
-    text = f"""
-    [mavlink]
-    url = "udpin:127.0.0.1:14550"
-    [[imu]]
-    name = "own"
-    source = "serial"
-    port = "{tmp_path / "imu"}"
-    protocol = "vectornav"
-    """
-    (device,) = serial_devices(parse(text, "companion.toml"))
-
-    async def main() -> None:
-        taken: list[tuple[Role, Sample]] = []
-        sensor = SerialSensor(device, lambda role, part: taken.append((role, part)))
-        frames = [vectornav_imu(time_ns=n * 1_000_000) for n in range(7)]
-        sensor.receive(b"".join(frames[:3]), 1.0)
-        sensor.receive(b"", 1.001)
-        sensor.receive(frames[3] + VNYMR + frames[4], 1.002)
-        sensor.receive(b"".join(frames[5:]), 1.004)
-        (role,) = device.roles
-        assert [(by, part.t_device_s) for by, part in taken if isinstance(part, ImuSample)] == [
-            (role, t_s) for t_s in (0.0, 0.001, 0.002, 0.003, None, 0.004, 0.005, 0.006)
-        ]
-        assert len(taken) == 8
-        (status,) = (each.status() for each in sensor.roles)
-        assert status["frames"] == 8
-
-    run_virtual(main())
-
-
-VNYMR = sentence("VNYMR,+010.000,-007.500,+000.500,-0.5,-0.25,+0.75,-01.500,-00.125,-09.750,-00.5,+00.25,-00.125")

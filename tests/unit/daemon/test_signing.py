@@ -15,14 +15,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.config import parse
-from companion.configured.models import doubtful
 from companion.daemon.devices import signing as daemon_signing
 from companion.daemon.devices.signing import AHEAD_S, LinkSigning
 from companion.errors import StorageError
 from companion.links.mavlink import signing as link_signing
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import EPOCH_S, TICKS_PER_S, SigningClock
-from companion.storage.learned import SIGNING_FILE, SigningTime, signing_time_in, this_boot
+from companion.storage.learned import SIGNING_FILE, SigningTime, signing_time_in
 from companion.storage.state import StateFile
 from tests.support.rig import inline
 from tests.support.virtual_time import run_virtual
@@ -169,23 +168,6 @@ def test_a_kept_time_far_ahead_is_named_with_the_way_back(tmp_path: Path, monkey
     run_virtual(main())
 
 
-def test_the_disk_is_written_rarely(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def main() -> None:
-        board, writes = Board(tmp_path, monkeypatch, wall_s=NOW_S), list[int]()
-        real = StateFile.write
-
-        def count(file: StateFile[SigningTime], what: SigningTime) -> None:
-            writes.append(what.ticks)
-            real(file, what)
-
-        monkeypatch.setattr(StateFile, "write", count)
-        async with board.daemon():
-            await asyncio.sleep(600.0)
-        assert 600 / AHEAD_S <= len(writes) <= 600 / (AHEAD_S - 6.0) + 2
-
-    run_virtual(main())
-
-
 def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -207,57 +189,3 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(
     assert [record.getMessage() for record in caplog.records] == [
         "mavlink signing: after a restart its time may go back: disk full"
     ]
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"{", b'{"ticks": -1}', b'{"ticks":9,"reserved":1,"uptime_s":1,"boot_id":""}']
-)
-def test_a_broken_file_is_none(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / SIGNING_FILE).write_bytes(content)
-    assert signing_time_in(tmp_path).load() is None
-
-
-def test_the_unit_hands_the_boot_id_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    own = this_boot()
-    assert len(own) == 32
-    monkeypatch.setenv("COMPANION_BOOT_ID", "0" * 32)
-    assert this_boot() == "0" * 32
-    unit = Path("systemd/companion.service").read_text(encoding="utf-8")
-    assert "Environment=COMPANION_BOOT_ID=%b\n" in unit
-
-
-def test_who_is_not_believed_is_told_of_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    async def main() -> None:
-        with pytest.MonkeyPatch.context() as monkeypatch:
-            board = Board(tmp_path, monkeypatch, wall_s=NOW_S)
-            async with board.daemon() as one:
-                assert one.signing is not None
-                for _ in range(3):
-                    one.signing.admits(b"\xfd\x00\x00\x00\x00\xff\xbe\x00\x00\x00\x00\x00")
-                    await asyncio.sleep(2.0)
-                status = one.status()
-                assert status is not None
-                assert status["summary"] == "0 messages checked, 3 dropped"
-                before = one.rejecting
-                assert before is None
-                one.signing.admits(b"\xfd\x00\x00\x00\x00\x01\x01\x00\x00\x00\x00\x00")
-                await asyncio.sleep(1.5)
-                assert str(one.rejecting).startswith("1 messages dropped: the autopilot does not sign on this link")
-                for system in range(2, 250):
-                    one.signing.admits(b"\xfd\x00\x00\x00\x00" + bytes([system]) + b"\xbe\x00\x00\x00\x00\x00")
-
-    with caplog.at_level(logging.WARNING):
-        run_virtual(main())
-    lines = [record.getMessage() for record in caplog.records]
-    assert lines == ["mavlink: 255/190 does not sign: its messages are dropped"]
-
-
-def test_off_is_off_and_a_key_without_use_is_doubted() -> None:
-    link = MavlinkLink()
-    config = parse(GOOD.replace("[[imu]]", 'signing = "off"\nsigning_key_file = "/k"\n[[imu]]', 1), "x.toml")
-    found = LinkSigning(config, link, cast("Vehicle", None), lambda *_: None, inline)
-    found.load()
-    assert link.signing is None
-    assert found.status() is None
-    assert found.rejecting is None
-    assert doubtful(config) == ['mavlink.signing_key_file is named, but signing = "off": nothing is signed or checked']

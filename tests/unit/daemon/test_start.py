@@ -9,13 +9,11 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 
-from companion import cli
 from companion.config import parse
-from companion.daemon.job import Job, JobCancelledError
+from companion.daemon.job import Job
 from companion.estimation.request import What
 from tests.bench_start import FULL, MINIMAL
 from tests.support.first_heartbeat import modules_at_first_heartbeat
@@ -70,16 +68,6 @@ def test_what_is_there_is_not_looked_through_again() -> None:
     assert ended.stdout == "good\n", ended.stderr
 
 
-def test_a_number_of_threads_that_somebody_wants_stays() -> None:
-    code = (
-        "import os; from companion.daemon.process.footprint import prepare; prepare();"
-        "print(os.environ['OPENBLAS_NUM_THREADS'])"
-    )
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "3"}
-    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert ended.stdout == "3\n"
-
-
 def test_the_record_waits_for_nothing_after_its_last_second(tmp_path: Path) -> None:
     """Without an autopilot's IMU, whose offsets would be read again: what is left is processor time and the disk."""
 
@@ -109,28 +97,3 @@ def test_the_record_waits_for_nothing_after_its_last_second(tmp_path: Path) -> N
         return waited_s
 
     assert max(run_virtual(main())) < 1e-6
-
-
-def test_a_pause_ends_when_there_is_something_to_look_at() -> None:
-    async def main() -> None:
-        loop = asyncio.get_running_loop()
-        job = Job("calibration", What.BOTH, "test")
-        begun_s = loop.time()
-        loop.call_later(0.05, job.look_again)
-        await job.pause(1.0)
-        assert loop.time() - begun_s == pytest.approx(0.05, abs=1e-6)
-        await job.pause(1.0)  # once is once
-        assert loop.time() - begun_s == pytest.approx(1.05, abs=1e-6)
-        loop.call_later(0.05, job.cancel, "somebody")
-        with pytest.raises(JobCancelledError, match="somebody"):
-            await job.pause(1.0)
-        job.look_again()
-        with pytest.raises(JobCancelledError):  # a cancel is never slept over
-            await job.pause(1.0)
-
-    run_virtual(main())
-
-
-def test_ctrl_c_before_the_command_line_is_read_leaves_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli, "_parser", Mock(side_effect=KeyboardInterrupt))
-    assert cli.main(["status"]) == 1

@@ -58,9 +58,3 @@ def test_an_armed_aircraft_stands_in_the_way_and_a_job_that_has_ended_does_not()
     assert found(job=ENDED) is None
     first: Any = found(job=ENDED, arm_state=ArmState.ARMED, pending=True)
     assert (first.rung, first.refusal.kind) == (Rung.ARMED, "armed")
-
-
-def test_who_minds_only_some_rungs_hears_of_no_others() -> None:
-    first: Any = found((Rung.UNKNOWN, Rung.PENDING), **EVERYTHING)
-    assert first.rung is Rung.UNKNOWN
-    assert found((Rung.BUSY,), fault="the disk is full", pending=True) is None
