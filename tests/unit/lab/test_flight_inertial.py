@@ -92,14 +92,6 @@ def test_a_bias_drifts_as_by_hand_and_another_offset_takes_it_away(perfect: Flow
     assert in_air["flown"][0].median_m > 40.0
 
 
-def test_no_start_flies_over_a_hole(perfect: Flown) -> None:
-    there = (perfect.t_s < 120.0) | (perfect.t_s > 121.0)
-    found = increments(perfect.t_s[there], perfect.readings[there], means=True)
-    (row,) = drift(found, navigation(perfect), WORLD, AIR, (10.0,), {"flown": NOTHING})["flown"]
-    assert 140 <= row.starts <= 146
-    assert row.worst_m < 0.05
-
-
 def test_the_delay_of_filters_is_found(perfect: Flown) -> None:
     late = of(perfect)._replace(t_s=of(perfect).t_s + 0.012)
     assert lag_s(late, navigation(perfect)) == pytest.approx(0.012, abs=0.0002)

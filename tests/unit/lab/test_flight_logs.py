@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from companion.physics.units import DEG_H, MG
 from companion.storage.flights import FlightStore
 from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.records import RecordStore
-from tests.support.autopilot_files import ulog_message, write_ulog
+from tests.support.autopilot_files import write_ulog
 from tests.support.flown import HEIGHT_M, LATITUDE_DEG, Flown, dataflash, fly, messages, parameters
 from tests.support.histories import SLOPES_DEG_H_K, windows_of_days
 from tests.support.made_noise import Floats
@@ -109,19 +108,6 @@ def test_a_flight_is_told_with_what_its_calibration_was_worth(
     assert at_30["before"]["median_m"] > 2.0 * at_30["flown"]["median_m"]
 
 
-def test_people_read_the_figure_that_counts(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert companion(["flight", str(log), *storage(tmp_path)]) == 0
-    out = capsys.readouterr().out
-    assert "IMU 1, 100 Hz: offsets of no calibration known here\n" in out
-    assert "30 s without GNSS: " in out
-    _, _, below = out.partition("left over: bias that the offsets did not take off, ± one sigma (docs/flight.md)\n")
-    assert below.startswith("  accel x, y: not counted, in the air nothing tells them from tilt\n")
-    assert "-0 ±" not in out
-    assert max(map(len, out.splitlines())) <= 100
-    assert out.splitlines()[-2].startswith("next flight: IMU 1 gyro x: ")
-    assert out.splitlines()[-1].startswith("kept as flight 1")
-
-
 def test_a_flight_is_kept_once_however_often_and_in_whatever_file_it_is_read(
     log: Path, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -141,31 +127,6 @@ def test_a_flight_is_kept_once_however_often_and_in_whatever_file_it_is_read(
     stood = dataflash(tmp_path / "stood.bin", messages(cut_off(flown, 66.0), parameters(STAT_BOOTCNT=9.0)))
     code, answer = said(capsys, stood, *folder)
     assert (code, len(answer["flights"]), answer["numbers"]) == (0, 1, [])
-
-
-def test_a_flight_that_cannot_be_kept_is_told_all_the_same(
-    log: Path, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = storage(tmp_path)
-    (tmp_path / "flights").write_bytes(b"in the way")
-    code = companion(["flight", "--json", str(log), *folder])
-    out, err = capsys.readouterr()
-    assert (code, json.loads(out)["numbers"], len(json.loads(out)["flights"])) == (0, [], 1)
-    assert err == f"note: not kept: {tmp_path}/flights: cannot be listed: Not a directory\n"
-    # Where there is no companion, none is begun.
-    elsewhere = tmp_path / "elsewhere"
-    config = Path(folder[1])
-    config.write_text(config.read_text().replace(f'directory = "{tmp_path}"', f'directory = "{elsewhere}"'))
-    assert companion(["flight", "--json", str(log), *folder]) == 0
-    assert capsys.readouterr().err == (
-        f"note: not kept: this computer has no companion's storage ({elsewhere}); on the companion flights are kept"
-        " for the history\n"
-    )
-    # Of a log without a flight there is nothing to keep.
-    stood = dataflash(tmp_path / "stood.bin", messages(cut_off(flown, 66.0), parameters()))
-    assert companion(["flight", "--json", str(stood), *folder]) == 0
-    assert capsys.readouterr().err == ""
-    assert not elsewhere.exists()
 
 
 def cut_off(flown: Flown, at_s: float) -> Flown:
@@ -244,83 +205,6 @@ def test_a_flight_of_px4_is_told_alike(flown: Flown, tmp_path: Path, capsys: pyt
     assert 60.0 < imu["drift"]["flown"][1]["median_m"] < 200.0
 
 
-def test_an_imu_that_px4_leaves_in_the_air_is_not_taken_for_the_other(
-    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """sensor_combined is of the one in use: from 150 s on of another, whose gyro x reads 500 deg/h more."""
-    readings = flown.readings.copy()
-    readings[flown.t_s > 150.0, 0] += 500.0 * DEG_H
-    status = {
-        ("vehicle_imu_status", k): (
-            flown.at_s[::25],
-            np.tile([gyro_id, gyro_id, 40.0, 0.1], (len(flown.at_s[::25]), 1)),
-        )
-        for k, gyro_id in enumerate((11.0, 22.0))
-    }
-    selection = np.array([1.0, 150.0]), np.array([[11.0], [22.0]])
-    path = of_px4(
-        dataclasses.replace(flown, readings=readings),
-        tmp_path / "x.ulg",
-        {("sensor_selection", 0): selection, **status},
-    )
-    _, answer = said(capsys, path, *storage(tmp_path))
-    (flight,) = answer["flights"]
-    assert flight["notes"] == ["PX4 has changed the IMU that it flies by"]
-    assert [imu["imu"] for imu in flight["imus"]] == [1, 2]
-    for imu, more_deg_h in zip(flight["imus"], (0.0, 500.0), strict=True):
-        term = imu["axes"][0]["in_flight"]
-        assert abs(term["value"] / DEG_H - GYRO_DEG_H[0] - more_deg_h) < 2.0 * term["sigma"] / DEG_H < 150.0
-
-
-def test_what_px4_could_not_write_is_said_and_not_flown_over(
-    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    there = (flown.t_s < 150.0) | (flown.t_s > 152.0)
-    path = of_px4(dataclasses.replace(flown, t_s=flown.t_s[there], readings=flown.readings[there]), tmp_path / "x.ulg")
-    with path.open("ab") as file:
-        file.write(ulog_message(b"O", struct.pack("<H", 1000)) * 2)
-    _, answer = said(capsys, path, *storage(tmp_path))
-    _, whole = said(capsys, of_px4(flown, tmp_path / "whole.ulg"), *storage(tmp_path))
-    (flight,), (expected,) = answer["flights"], whole["flights"]
-    assert flight["notes"] == ["gaps in it, in which PX4 could not write: 2"]
-    for rows, others in zip(*(each["imus"][0]["drift"]["flown"] for each in (flight, expected)), strict=True):
-        # None begins before the gap and ends after it.
-        assert rows["starts"] == pytest.approx(others["starts"] - rows["seconds"] - 2.0, abs=2.0)
-        assert rows["median_m"] == pytest.approx(others["median_m"], rel=0.2)
-    for axis, other in zip(flight["imus"][0]["axes"], expected["imus"][0]["axes"], strict=True):
-        assert axis["in_flight"]["value"] == pytest.approx(other["in_flight"]["value"], abs=other["in_flight"]["sigma"])
-
-
-def test_several_starts_in_one_file_are_each_by_their_own_clock(
-    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    one, path = dataflash(tmp_path / "one.bin", messages(flown, parameters())).read_bytes(), tmp_path / "two.bin"
-    # Cut off in the middle of a message, as by pulling the plug.
-    path.write_bytes(one[:-5] + one)
-    code, answer = said(capsys, path, *storage(tmp_path))
-    assert code == 0
-    assert len(answer["flights"]) == 2
-    assert answer["flights"][0]["imus"] == answer["flights"][1]["imus"]
-    assert companion(["flight", str(path), *storage(tmp_path)]) == 0
-    assert capsys.readouterr().out.startswith("2 starts of the autopilot in it, each by its own clock\n")
-
-
-@pytest.mark.parametrize(
-    ("left_out", "words"),
-    [
-        ({"XKQ"}, "no attitude and position of an EKF3 (ArduPilot) or EKF2 (PX4) in it"),
-        ({"IMU"}, "no samples of an IMU in it"),
-    ],
-)
-def test_a_log_without_what_it_takes_is_one_line(
-    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], left_out: set[str], words: str
-) -> None:
-    kept = [each for each in messages(flown, parameters()) if each[0] not in left_out]
-    path = dataflash(tmp_path / "x.bin", kept)
-    assert companion(["flight", str(path), *storage(tmp_path)]) == 1
-    assert capsys.readouterr().err == f"companion: {path}: {words}\n"
-
-
 @pytest.mark.parametrize(
     ("data", "words"),
     [
@@ -346,46 +230,6 @@ def test_another_file_is_one_line(
         path.write_bytes(data)
     assert companion(["flight", str(path), *storage(tmp_path)]) == 1
     assert capsys.readouterr().err == f"companion: {path}: {words}\n"
-
-
-def test_the_lane_in_use_is_the_reference(
-    log: Path, flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Until 200 s lane 0, then lane 1; of the other nothing is to be believed."""
-    told: list[tuple[str, tuple[Any, ...]]] = []
-    for name, values in messages(flown, parameters()):
-        if name in {"XKF1", "XKQ"}:
-            t_us, _, *rest = values
-            changed = t_us > 200e6
-            lost = (
-                [1.0, 0.0, 0.0, 0.0] if name == "XKQ" else [0, 0, 0, 30.0, 30.0, 5.0, 0, 900.0, 900.0, 90.0, *[0] * 4]
-            )
-            told += [(name, (t_us, int(changed), *rest)), (name, (t_us, int(not changed), *lost))]
-            if name == "XKF1":
-                told += [("XKF4", (t_us, core, *[0] * 12, int(changed))) for core in (0, 1)]
-        else:
-            told.append((name, values))
-    _, answer = said(capsys, dataflash(tmp_path / "lanes.bin", told), *storage(tmp_path))
-    _, whole = said(capsys, log, *storage(tmp_path))
-    (flight,), (expected,) = answer["flights"], whole["flights"]
-    assert flight["notes"] == ["the EKF has changed its lane: measured from the one in use"]
-    assert flight["imus"][0]["drift"] == expected["imus"][0]["drift"]
-    assert flight["imus"][0]["axes"] == expected["imus"][0]["axes"]
-
-
-def test_what_lies_far_off_is_left_aside_and_said(
-    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """An accelerometer that breaks in the air: 300 mg more from 200 s to the landing."""
-    readings = flown.readings.copy()
-    readings[flown.t_s > 200.0, 5] += 300.0 * MG
-    path = dataflash(tmp_path / "x.bin", messages(dataclasses.replace(flown, readings=readings), parameters()))
-    _, answer = said(capsys, path, *storage(tmp_path))
-    (imu,) = answer["flights"][0]["imus"]
-    # Of 70 s to 237 s.
-    assert imu["notes"] == ["3 of 16 stretches of 10 s left aside, far off the others: the EKF has jumped, or the IMU"]
-    vertical = imu["axes"][3]["in_flight"]
-    assert abs(vertical["value"] / MG - ACCEL_MG[2] - STEP_MG) < 2.0 * vertical["sigma"] / MG
 
 
 def test_what_a_failed_imu_reads_is_left_aside(
@@ -425,16 +269,3 @@ def test_a_truncated_and_damaged_log_is_read_as_far_as_it_goes(
     assert flight["stages"]["landing_s"] is None
     assert flight["stages"]["disarmed_s"] is None
     assert flight["imus"][0]["drift"]["flown"]
-
-
-def test_a_history_that_cannot_be_read_is_said_and_the_flight_told(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "records").write_text("in the place of a folder")
-    assert companion(["flight", "--json", str(log), *storage(tmp_path)]) == 0
-    heard = capsys.readouterr()
-    assert heard.err == (
-        f"note: {tmp_path}/records: cannot be listed: Not a directory: looked at without the companion's history,"
-        " and not kept; sudo may help\n"
-    )
-    assert json.loads(heard.out)["flights"][0]["imus"][0]["drift"]["flown"]

@@ -49,17 +49,6 @@ def test_seconds_are_those_of_the_daemon() -> None:
         np.testing.assert_array_equal(found.distinct, batch.distinct)
 
 
-def test_what_is_no_number_is_left_out() -> None:
-    t_s, readings = at_rest(5)
-    plain = seconds_of(t_s, readings)
-    readings[70, 3] = np.nan
-    t_s[130] = np.inf
-    found = seconds_of(t_s, readings)
-    assert [batch.n for batch in found] == [49, 49, 50]
-    assert [batch.slot for batch in found] == [batch.slot for batch in plain]
-    assert seconds_of(t_s[:0], readings[:0]) == []
-
-
 # --- stretches
 
 
@@ -99,17 +88,6 @@ ACCEL = AllanModel(0.05 * MG, 0.01 * FLICKER_OF_FLOOR * MG, 0.0005 * MG)
 
 def fitted(rest: Rest, fallback: NoiseProfile = UNKNOWN) -> LearnedNoise:
     return fit_profile("made", [rest], fallback)
-
-
-def test_one_choice_promises_too_much_for_no_axis() -> None:
-    rest = rest_of(7200, (GYRO, ACCEL), 4)
-    noisy = rest.means.copy()
-    noisy[:, 1] = slow(np.random.default_rng(5), 7200, 2.0 * GYRO.flicker, GYRO.walk, 2.0 * GYRO.white)
-    finding = fitted(Rest(rest.slots, noisy))
-    assert finding.profile.gyro.white == pytest.approx(2.0 * GYRO.white, rel=0.05)
-    assert finding.profile.gyro.floor == pytest.approx(2.0 * GYRO.floor, rel=0.2)
-    assert finding.profile.accel.white == pytest.approx(ACCEL.white, rel=0.05)
-    assert finding.axes[0].figures[0] == pytest.approx(GYRO.white, rel=0.05)
 
 
 def test_what_is_not_told_is_borrowed_and_named() -> None:
@@ -294,11 +272,3 @@ def test_of_real_recordings_the_next_seconds_are_where_they_were_promised_to_be(
     assert len(misses.miss) >= 12
     assert misses.share(slice(0, 3)) >= 0.90
     assert misses.share(slice(3, 6)) >= 0.90
-
-
-def test_px4_s_minute_tells_its_white_noise_and_says_what_it_does_not() -> None:
-    played = px4()
-    found = rests(played.t_s, np.hstack([played.gyro, played.accel]), "fc", UNKNOWN)
-    finding = fit_profile("fc", found.stretches, UNKNOWN)
-    assert {"gyro B", "gyro K"} <= set(finding.kept)
-    assert 5.0 < finding.profile.gyro.white / DEG_H < 30.0

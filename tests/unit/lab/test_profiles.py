@@ -15,11 +15,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.firmware.ardupilot import ArduPilot
 from companion.cli import main as companion
 from companion.config import parse
-from companion.config.sections import AllanModel, Config, NoiseProfile
+from companion.config.sections import AllanModel
 from companion.configured import models
 from companion.configured.profiles import Profiles
 from companion.errors import ConfigError, StorageError
-from companion.estimation.noise.allan import PROFILES, noise_profile
+from companion.estimation.noise.allan import noise_profile
 from companion.lab.logs.log_files import read_logs
 from companion.recording.files import Beginning, RecordingFile
 from companion.recording.messages import IMU, MAVLINK, ImuState, Message, encode
@@ -115,27 +115,6 @@ def test_names_that_are_not(tmp_path: Path, name: str) -> None:
 # --- in the configuration
 
 
-def test_a_saved_name_brings_its_figures_along(tmp_path: Path) -> None:
-    store = ProfileStore(tmp_path)
-    store.write(saved())
-    config = parse(SMALLEST.format("mine"), "x.toml", lambda _, name: saved_profile(tmp_path, name))
-    profile = config.imu[0].profile
-    assert isinstance(profile, NoiseProfile)
-    assert (profile.name, profile.gyro, profile.accel) == ("mine", GYRO, ACCEL)
-    (shown,) = Profiles(config).status()
-    assert shown["summary"] == "mine, learned from 1.5 h at rest in 1 recording, saved 2026-11-21"
-    # As a recording takes it along: a replay elsewhere has the figures.
-    assert msgspec.json.decode(msgspec.json.encode(config), type=Config) == config
-
-
-def test_the_catalogue_wins_and_is_not_looked_up() -> None:
-    def never(_: Path, name: str) -> str:
-        raise AssertionError("looked for saved profiles")
-
-    for name in PROFILES:
-        assert parse(SMALLEST.format(name), "x.toml", never).imu[0].profile == name
-
-
 @pytest.mark.parametrize(("name", "near"), [("mime", "mine"), ("bmi08", "bmi088")])
 def test_an_unknown_name_is_refused_with_the_nearest_of_both(tmp_path: Path, name: str, near: str) -> None:
     store = ProfileStore(tmp_path)
@@ -146,13 +125,6 @@ def test_an_unknown_name_is_refused_with_the_nearest_of_both(tmp_path: Path, nam
     assert text.startswith(f"x.toml: 'imu[0].profile': found {name!r}; allowed: \"icm42688p\", ")
     assert text.endswith(f"did you mean {near!r}?")
     assert '"mine"' in text
-
-
-def test_figures_are_not_written_into_the_file() -> None:
-    model = "{white = 1.0, flicker = 1.0, walk = 1.0}"
-    table = SMALLEST.format("x").replace('"x"', f'{{name = "x", gyro = {model}, accel = {model}}}')
-    with pytest.raises(ConfigError, match=r"'imu\[0\]\.profile': found a table; allowed: \"icm42688p\""):
-        parse(table, "x.toml")
 
 
 # --- the command
@@ -205,80 +177,6 @@ def test_learned_saved_and_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 @pytest.mark.parametrize(
-    ("wanted", "code", "words"),
-    [
-        (
-            "mein",
-            2,
-            (
-                '--profile: found \'mein\'; allowed: "icm42688p", "bmi088", "adis16470", "adis16405", "unknown", '
-                '"damaged", "mine", or'
-            ),
-        ),
-        ("mein", 2, "did you mean 'mine'?"),
-        ("./mine.json", 1, "mine.json: cannot be read: No such file or directory"),
-        ("mine.json", 1, "mine.json: cannot be read: No such file or directory"),
-        ("damaged", 1, "damaged.json: not a readable profile: "),
-    ],
-)
-@pytest.mark.parametrize("command", ["replay", "profile"])
-def test_a_profile_that_is_not_there_is_one_line(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    command: str,
-    wanted: str,
-    code: int,
-    words: str,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    ProfileStore(tmp_path).write(saved("mine"))
-    (tmp_path / "profiles" / "damaged.json").write_text("{", encoding="utf-8")
-    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    log = write_csv(tmp_path / "a.csv", *adis16405(30, 20, 1))
-    # Without a configuration: a laptop has none.
-    assert companion([command, str(log), "--profile", wanted]) == code
-    said = capsys.readouterr()
-    assert words in said.err
-    assert said.err.count("\n") == 1
-
-
-def test_the_table_says_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str], half_hour: Path) -> None:
-    save = ["--save", "mine", "--storage", str(tmp_path)]
-    assert companion(["profile", str(half_hour), "--profile", "adis16405", "--skip", "60", *save]) == 0
-    said = capsys.readouterr().out
-    for words in (
-        "imu imu: 0.48 h at rest in 1 recording",
-        "gyro x, deg/h",
-        "gyro: adis16405                     152.0             29.0",
-        "used of half_hour.csv: ",
-        "note: too short to tell gyro K",
-        f"check it: companion replay LOG --windows 60 --profile {tmp_path / 'profiles' / 'mine.json'}",
-    ):
-        assert words in said
-
-
-def test_the_seconds_at_rest_and_the_lines_left_out_are_counted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Two minutes at rest, half a minute in the hand, a line without a number; the clock began at 500 s."""
-    t_s, readings = adis16405(150, 20, seed=2)
-    readings[2400:, :3] += np.random.default_rng(1).normal(0.0, 0.5, (600, 3))
-    readings[7, 3] = np.nan
-    path = write_csv(tmp_path / "a.csv", t_s + 500.0, readings)
-    code, answer, _ = run(capsys, path)
-    assert code == 0
-    (used,) = answer["imus"][0]["used"]
-    assert 116 <= used["still_s"] <= 120
-    assert used["left_out"] == {"without a number in each of gx, gy, gz, ax, ay, az": 1}
-    assert any("were not at rest and are left out (gyro" in note for note in answer["imus"][0]["notes"])
-    assert companion(["profile", str(path)]) == 0
-    said = capsys.readouterr().out
-    assert f"used of a.csv: {used['still_s']} of 148 s" in said
-    assert "left out: 1 lines without a number in each of" in said
-
-
-@pytest.mark.parametrize(
     ("text", "more", "code", "words"),
     [
         ("t_s,gx\n1,2\n", [], 1, "line 1: no column for gx, gy, gz, ax, ay, az in t_s, gx"),
@@ -303,15 +201,6 @@ def test_every_mistake_is_one_line(
     assert words in said.err
     assert said.err.count("\n") == 1
     assert said.out == ""
-
-
-def test_a_last_line_that_may_be_cut_does_not_count(tmp_path: Path, half_hour: Path) -> None:
-    lines = half_hour.read_text(encoding="utf-8").splitlines()[:200]
-    path = tmp_path / "cut.csv"
-    # Cut in its last number, which is one all the same.
-    path.write_text("\n".join(lines)[:-2], encoding="utf-8")
-    (log,) = read_logs([path])
-    assert len(log.t_s) == len(lines) - 2
 
 
 # --- recordings of our own
@@ -378,20 +267,6 @@ def test_recordings_that_follow_on_each_other_are_one_session(tmp_path: Path) ->
     assert one.profile == "bmi088"
     assert one.began_at == "2023-11-14T22:15:00+00:00"
     assert (one.temperature_degc == 25.0).all()
-
-
-def test_a_recording_is_learned_from_and_compared_with_its_own_profile(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = recording(tmp_path / "1.mcap", seconds(100, 180), "fc")
-    code, answer, _ = run(capsys, path)
-    assert code == 0
-    (imu,) = answer["imus"]
-    assert (imu["name"], imu["compared"]["name"], imu["temperature_degc"]) == ("fc", "bmi088", [25.0, 25.0])
-    assert imu["profile"]["gyro"]["white"] == pytest.approx(1e-3 / 8.0**0.5, rel=0.3)
-    code, _, err = run(capsys, path, "--imu", "own")
-    assert code == 1
-    assert "no IMU 'own' in these files; there are: fc" in err
 
 
 def test_written_offsets_are_no_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import resource
 import struct
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -103,15 +102,6 @@ def test_what_px4_flies_by_and_its_sensors_are_imus_of_their_own(
     assert "no IMU 'sensor7' in these files; there are: sensor1, sensor_combined" in capsys.readouterr().err
 
 
-def test_without_the_extra_it_says_what_to_install(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write_ulog(tmp_path / "log.ulg", {("sensor_combined", 0): (TIMES, readings(1))})
-    monkeypatch.setitem(sys.modules, "pyulog", None)
-    assert companion(["replay", str(path)]) == 1
-    assert "a log of PX4 needs more than is installed: pip install '.[recording]'" in capsys.readouterr().err
-
-
 def test_every_imu_of_ardupilot_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_dataflash(tmp_path / "00000001.BIN", {0: (TIMES, readings(1)), 1: (TIMES + 1e-4, readings(3))})
     for instance, seed in ((0, 1), (1, 3)):
@@ -120,16 +110,6 @@ def test_every_imu_of_ardupilot_is_one(tmp_path: Path, capsys: pytest.CaptureFix
         assert_near(record, seed)
         assert record["imus"][0]["temperature_degc"] == pytest.approx(31.5)
         assert record["log"]["notes"][0].startswith("the autopilot's offsets are taken off in it")
-
-
-def test_numbers_that_are_none_and_late_ones_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = readings(1)
-    rows[1000:1010, 2] = np.nan
-    times = TIMES.copy()
-    times[2000:2005] = times[1999]
-    code, record = replay(capsys, write_dataflash(tmp_path / "x.bin", {0: (times, rows)}))
-    assert code == 0
-    assert record["log"]["left_out"] == {"without a number": 10, "late or repeated": 5}
 
 
 @pytest.mark.parametrize("kind", ["ulg", "bin"])

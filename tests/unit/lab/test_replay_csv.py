@@ -24,7 +24,6 @@ UNITS = {
     "common": ("t_ms,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g", 1e3, 180.0 / np.pi, 1.0 / G),
     "fine": ("t_us,gx_deg_h,gy_deg_h,gz_deg_h,ax_mg,ay_mg,az_mg", 1e6, 180.0 / np.pi * 3600.0, 1e3 / G),
 }
-WHERE = ["--pitch-deg", "5", "--roll-deg", "-3", "--heading-deg", "40", "--latitude-deg", "40", "--height-m", "50"]
 
 
 def rows(seconds: float = 60.0, rate_hz: int = 200) -> tuple[np.ndarray, ImuModel]:
@@ -74,20 +73,6 @@ def test_what_is_not_said_widens_sigma_and_is_named(tmp_path: Path, capsys: pyte
     assert max(imu["gyro_sigma_use_rad_s"]) > 6.0 * DEG_H
 
 
-def test_a_mounting_turns_the_axes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    data, _ = rows(20.0)
-    _, straight = replay(capsys, written(tmp_path / "a.csv", data), *WHERE)
-    # The sensor's x points to the right, its y backward.
-    turned = np.column_stack([data[:, 0], data[:, 2], -data[:, 1], data[:, 3], data[:, 5], -data[:, 4], data[:, 6]])
-    code, record = replay(capsys, written(tmp_path / "b.csv", turned), *WHERE, "--mounting", "ROTATION_YAW_90")
-    assert code == 0
-    np.testing.assert_allclose(
-        record["imus"][0]["gyro_bias_rad_s"],
-        straight["imus"][0]["gyro_bias_rad_s"],
-        atol=0.5 * DEG_H,
-    )
-
-
 GOOD = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n"
 
 
@@ -114,23 +99,6 @@ def test_every_mistake_in_the_file_is_one_line_with_its_place(
     assert str(path) in said.err
     assert said.err.count("\n") == 1
     assert said.out == ""
-
-
-@pytest.mark.parametrize(
-    ("more", "words"),
-    [
-        (["--pitch-deg", "5"], "both or neither"),
-        (["--mounting", "YAW_90"], "allowed: a MAVLink rotation"),
-        (["--profile", "best"], "allowed: icm42688p"),
-    ],
-)
-def test_every_mistake_in_the_options_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], words: str
-) -> None:
-    path = tmp_path / "imu.csv"
-    path.write_text(GOOD, encoding="utf-8")
-    assert companion(["replay", str(path), *more]) == 2
-    assert words in capsys.readouterr().err
 
 
 def by_hand(text: str, columns: int) -> list[list[float | None]]:

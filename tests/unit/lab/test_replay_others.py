@@ -139,16 +139,6 @@ def test_the_biases_are_found_whoever_wrote_the_log(
     assert used["seconds"] == pytest.approx(SECONDS, abs=0.1)
 
 
-def test_lines_without_a_number_are_counted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
-) -> None:
-    _, record = replay(capsys, written(tmp_path, spreadsheet(still[0])), *WHERE, "--columns", SHEET)
-    assert record["log"]["left_out"] == {"without a number in each of gx, gy, gz, ax, ay, az": 2 * SECONDS}
-    assert record["imus"][0]["temperature_degc"] == pytest.approx(24.5)
-    assert companion(["replay", str(tmp_path / "log.csv"), *WHERE, "--columns", SHEET]) == 0
-    assert "left out: 60 lines without a number in each of gx" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("named", [True, False])
 def test_a_log_without_times_has_a_rate(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel], named: bool
@@ -177,27 +167,6 @@ def test_repeated_lines_are_left_out_and_equal_times_refused(tmp_path: Path, sti
     ):
         read(path)
     assert np.diff(read(path, rate_hz=100.0).t_s) == pytest.approx(0.01)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda data: data * [1e-9, *[1.0] * 6], "it is 0.0 s long"),
-        (
-            lambda data: np.where([1, 0, 0, 0, 1, 1, 1], data, 1e9),
-            "2999 samples dropped: not a believable number",
-        ),
-    ],
-)
-def test_a_log_of_which_nothing_can_be_judged_says_why(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel],
-    change: Callable[[Floats], Floats], said: str,
-) -> None:  # fmt: skip
-    head = HEADER + "\n"
-    text = head + joined([[f"{value:.17g}" for value in row] for row in change(still[0])])
-    code, record = replay(capsys, written(tmp_path, text))
-    assert code == 1
-    assert record["reason"] == f"no 5 s at rest in it: {said}"
 
 
 def test_a_counter_of_32_bits_goes_on_behind_its_end(tmp_path: Path, still: tuple[Floats, ImuModel]) -> None:
@@ -234,49 +203,3 @@ def test_a_unit_that_gravity_contradicts_is_refused(
     assert "m/s^2 in all; allowed: gravity, 7 to 12.6: name their right unit" in said.err
     assert said.err.count("\n") == 1
     assert said.out == ""
-
-
-@pytest.mark.parametrize(
-    ("text", "more", "words"),
-    [
-        ("t,gx,gy,gz,ax,ay,az\n1,0,0,0,0,0,-9.8\n", [], "line 1: no column for t, gx, gy, gz, ax, ay, az in t, gx, gy"),
-        ("nothing\nof use\n", [], "line 1: no column for t, gx, gy, gz, ax, ay, az in nothing; a log without time"),
-        ("a\n" * 70, ["--columns", HEADER], "no line of numbers in it with 7 fields"),
-        (HEADER + "\n", [], "no line of numbers in it with 7 fields"),
-        ("0,0,0,0,0,0,-9.8\n", ["--columns", "t_s,gx"], "--columns: no column for gx, gy, gz, ax, ay, az in t_s, gx;"),
-        ("x;" * 50 + "\n", [], "in x, x, x, x, x, x, x, x, x, x, x, x and 38 more; a log"),
-    ],
-)
-def test_what_cannot_be_told_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, more: list[str], words: str
-) -> None:
-    path = written(tmp_path, text)
-    assert companion(["replay", str(path), *more]) == 1
-    said = capsys.readouterr()
-    assert words in said.err
-    assert said.err.count("\n") == 1
-
-
-def test_the_longest_stretch_was_used_and_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
-) -> None:
-    """8 s at rest, 4 s in the hand, 18 s at rest."""
-    data = still[0].copy()
-    data[800:1200, 1:4] += np.random.default_rng(1).normal(0.0, 0.3, (400, 3))
-    path = written(tmp_path, HEADER + "\n" + joined(data.tolist()))
-    _, record = replay(capsys, path, *WHERE, "--profile", "bmi088")
-    used = record["log"]
-    assert 12.0 <= used["from_s"] <= 13.0
-    assert 29.0 <= used["to_s"] <= 30.0
-    assert companion(["replay", str(path), *WHERE, "--profile", "bmi088"]) == 0
-    said = capsys.readouterr().out
-    assert "used: 12 to " in said
-
-
-def test_a_file_of_office_programs_in_utf_16_is_refused_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "log.csv"
-    path.write_bytes(f"{HEADER}\n0,0,0,0,0,0,-9.8\n".encode("utf-16"))
-    assert companion(["replay", str(path)]) == 1
-    assert capsys.readouterr().err.count("\n") == 1

@@ -6,13 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
 from companion.cli import main as companion
-from companion.lab.logs.log import StillLog
-from companion.lab.replay.estimate import Given, estimate
 from tests.support.made_noise import DEG_H, MG, Floats, adis16405, write_csv
 
 SECONDS, RATE_HZ = 3600, 10
@@ -76,84 +73,3 @@ def test_a_sigma_that_is_too_small_shows(
     assert axes["accel y"]["share"] < 0.1
     assert axes["accel y"]["rms"] == pytest.approx(2.5 * MG, rel=0.1)
     assert axes["gyro y"]["share"] > 0.85
-
-
-def test_windows_that_are_refused_are_counted_by_reason(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], hour: tuple[Floats, Floats]
-) -> None:
-    """Three minutes in the hand, and two that were not logged."""
-    t_s, readings = hour[0][:12000], hour[1][:12000].copy()
-    rng = np.random.default_rng(2)
-    readings[3000:4800, :3] += rng.normal(0.0, 0.3, (1800, 3))
-    kept = (t_s < 780.0) | (t_s >= 900.0)
-    path = write_csv(tmp_path / "hand.csv", t_s[kept], readings[kept])
-    code, answer = run(capsys, path, "--profile", "adis16405")
-    assert code == 0
-    found = answer["windows"]
-    assert (found["count"], found["done"]) == (19, 14)
-    counts = found["refused"]
-    assert counts.pop("no samples") == 2
-    # It shakes, or it turns.
-    assert sum(counts.values()) == 3
-    assert all(why.startswith("no 5 s at rest in it: hold still: gyro imu") for why in counts)
-    # Only windows that follow on one another are held against each other.
-    assert by_axis(answer, 60.0)["gyro x"]["pairs"] == 4 + 4 + 3
-
-
-def test_windows_in_another_pose_are_not_held_against_each_other(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], hour: tuple[Floats, Floats]
-) -> None:
-    """Turned over after seven minutes: calibrated in both poses, compared within each."""
-    t_s, readings = hour[0][:9000], hour[1][:9000]
-    turned = np.where(t_s[:, None] < 420.0, readings, readings * [1, -1, -1, 1, -1, -1])
-    _, answer = run(capsys, write_csv(tmp_path / "a.csv", t_s, turned), "--profile", "adis16405")
-    assert (answer["windows"]["count"], answer["windows"]["done"]) == (14, 14)
-    for each in by_axis(answer, 60.0).values():
-        assert each["pairs"] == 6 + 6
-        assert each["ratio"] < 1.5
-
-
-def test_what_was_switched_on_long_before_warms_up_no_more(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], hour: tuple[Floats, Floats]
-) -> None:
-    """Five minutes: so young a sensor may still warm up; a pause in the log may have been a switch."""
-    path = write_csv(tmp_path / "a.csv", hour[0][:3000], hour[1][:3000])
-    young = by_axis(run(capsys, path, "--profile", "adis16405")[1], 60.0)
-    old = by_axis(run(capsys, path, "--profile", "adis16405", "--powered", "7200")[1], 60.0)
-    # The windows after the pause are two of the three that foretell one.
-    kept = (hour[0][:3000] < 55.0) | (hour[0][:3000] > 65.0)
-    paused = write_csv(tmp_path / "b.csv", hour[0][:3000][kept], hour[1][:3000][kept])
-    _, answer = run(capsys, paused, "--profile", "adis16405", "--powered", "7200")
-    for axis in ("gyro x", "gyro y", "gyro z"):
-        assert old[axis]["sigma_use"] < 0.9 * young[axis]["sigma_use"]
-        assert old[axis]["sigma_use"] < by_axis(answer, 60.0)[axis]["sigma_use"]
-
-
-def test_a_log_that_is_too_short_says_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], hour: tuple[Floats, Floats]
-) -> None:
-    path = write_csv(tmp_path / "short.csv", hour[0][:1000], hour[1][:1000])
-    code, answer = run(capsys, path)
-    assert (code, answer["state"], answer["reason"]) == (1, "failed", "no two windows in a row that can be calibrated")
-    assert answer["windows"]["axes"] == []
-
-
-def test_an_autopilots_log_says_how_long_its_imu_has_been_on() -> None:
-    t_s, readings = adis16405(30, RATE_HZ, seed=3)
-    young = StillLog(
-        imu="fc", files=("a.bin",), began_unix_s=None, t_s=t_s, readings=readings,
-        temperature_degc=np.full(len(t_s), np.nan), clock_from_start=True,
-    )  # fmt: skip
-
-    def warm_up(log: StillLog, powered_s: float = 0.0) -> float:
-        sigma = estimate(log, Given(heading_deg=0.0, powered=powered_s)).record.imus[0].gyro_sigma_warm_up_rad_s
-        assert sigma is not None
-        return max(sigma) / DEG_H
-
-    old = msgspec.structs.replace(young, t_s=t_s + 3600.0)
-    assert warm_up(young) > 50.0
-    assert warm_up(old) < 10.0
-    # The same told by hand, of a log whose clock says nothing.
-    plain = msgspec.structs.replace(old, clock_from_start=False)
-    assert warm_up(plain) == pytest.approx(warm_up(young), rel=0.05)
-    assert warm_up(plain, 3600.0) == pytest.approx(warm_up(old), rel=0.05)

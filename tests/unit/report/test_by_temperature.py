@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import re
 from collections.abc import Iterator, Sequence
 from xml.etree import ElementTree
@@ -16,11 +15,10 @@ from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.history import Point
 from companion.estimation.solution.by_temperature import ByTemperature, by_temperature
 from companion.estimation.solution.prior import curve_of
-from companion.physics.units import DEG_H, MG
+from companion.physics.units import DEG_H
 from companion.report.by_temperature import biases_by_temperature
 from tests.support.histories import OFFSET_DEG_H, gyro_deg_h_at, windows_of_days
 
-NOW = datetime.datetime(2026, 6, 1, 12, 0, tzinfo=datetime.UTC)
 MODEL, ACCEL_MODEL = PROFILES["icm42688p"].gyro, PROFILES["icm42688p"].accel
 
 
@@ -105,46 +103,6 @@ def test_points_curve_band_and_now_lie_where_their_values_are() -> None:
         assert value == pytest.approx(imu.now.gyro_deg_h[axis], abs=drawn.unit)
         (dashes,) = drawn.paths("now")
         assert dashes[0][0] == pytest.approx(30.0, abs=0.1)
-
-
-def test_the_accelerometers_curve_is_drawn_where_it_was_shown() -> None:
-    slope_mg = np.array([0.3, -0.2, 0.1])
-
-    def warmer(point: Point) -> Point:
-        assert point.accel is not None
-        assert point.temperature_degc is not None
-        bias = np.array(point.accel.bias) + slope_mg * (point.temperature_degc - 25.0) * MG
-        return msgspec.structs.replace(point, accel=msgspec.structs.replace(point.accel, bias=tuple(bias.tolist())))
-
-    _, forces = plots(learned([warmer(point) for point in windows_of_days(10)]))
-    for axis, drawn in enumerate(forces):
-        (curve,), (_,) = drawn.paths("curve"), drawn.paths("area")
-        (low, first), *_, (high, last) = curve
-        assert (low, high) == pytest.approx((8.0, 38.0), abs=0.1)
-        assert (last - first) / (high - low) == pytest.approx(slope_mg[axis], abs=0.02)
-
-
-def test_what_is_now_is_the_last_window_moved_along_the_curve() -> None:
-    points = windows_of_days(10)
-    imu = learned(points, now_degc=30.0)
-    last = points[-1]
-    assert (imu.now, imu.today) != (None, None)
-    assert imu.now is not None
-    assert imu.at_power_up is not None
-    assert last.gyro is not None
-    assert last.temperature_degc is not None
-    moved = np.array(last.gyro.bias) / DEG_H + gyro_deg_h_at(30.0) - gyro_deg_h_at(last.temperature_degc)
-    assert (np.abs(imu.now.gyro_deg_h - moved) < 2.0 * np.array(imu.now.sigma_deg_h)).all()
-    assert max(imu.now.sigma_deg_h) < 7.0
-    np.testing.assert_allclose(imu.at_power_up.gyro_deg_h, gyro_deg_h_at(30.0), atol=2.0 * OFFSET_DEG_H)
-    assert min(imu.at_power_up.sigma_deg_h) > 0.6 * OFFSET_DEG_H
-
-
-def test_windows_of_one_power_up_are_joined_and_this_one_stands_out() -> None:
-    gyros, accelerometers = plots(learned(windows_of_days(6, windows=4)))
-    for drawn in (*gyros, *accelerometers):
-        assert [len(run) for run in drawn.paths("run")] == [4] * 6
-        assert len(drawn.paths("run past")) == 5
 
 
 @pytest.mark.parametrize(

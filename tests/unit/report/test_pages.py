@@ -14,17 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.cli import main
-from companion.estimation.records.record import Magnetic
 from companion.physics.units import DEG_H, MG
 from companion.report import calibration
-from companion.report.calibration import calibration_page, disturbances
+from companion.report.calibration import calibration_page
 from companion.report.page import unix_s
 from companion.report.source import material
 from companion.samples import Vector
-from companion.storage.flights import FlightStore
-from companion.storage.learned import BiasStore, KnownImu
 from companion.storage.records import RecordStore
-from tests.support.flights import imu_flight, kept_flight
 from tests.support.histories import a_season, arming, imu_record, record, white_trace
 
 NOW = datetime.datetime(2026, 6, 1, 12, 0, tzinfo=datetime.UTC)
@@ -111,30 +107,6 @@ def test_the_figures_are_those_of_the_record(tmp_path: Path) -> None:
     assert one.reason in found.text
 
 
-def test_how_good_the_compass_heading_can_be_is_one_line(tmp_path: Path) -> None:
-    found = Magnetic(
-        heading_bound_deg=6.24,
-        heading_from="field",
-        field_gauss=0.5731,
-        field_expected_gauss=0.5507,
-        inclination_deg=-59.04,
-        inclination_expected_deg=-59.5,
-        device_minus_field_deg=None,
-        wander_deg=0.12,
-    )
-    words = (
-        "heading good to 6.2 deg, worked out from its field and the gradienter, field 0.573 gauss (the Earth's 0.551),"
-        " inclination -59.0 deg (the Earth's -59.5), wandered 0.1 deg"
-    )
-    assert found.in_words() == words
-    RecordStore(tmp_path).save(msgspec.structs.replace(record(), magnetic=found))
-    assert f"Compass: {words}." in Page(_calibration(tmp_path)).text
-    nothing = msgspec.structs.replace(found, heading_bound_deg=180.0, field_gauss=None, inclination_deg=None)
-    assert nothing.in_words().startswith("shows no heading here, worked out")
-    bare = msgspec.structs.replace(nothing, heading_bound_deg=None, heading_from="device", wander_deg=None)
-    assert bare.in_words() == "heading error bound unknown"
-
-
 def test_a_page_needs_nothing_else_and_stays_small(tmp_path: Path) -> None:
     names = [f"imu {k}" for k in range(9)]
     store = RecordStore(tmp_path)
@@ -216,48 +188,6 @@ def test_a_record_without_its_seconds_still_gives_a_page_that_says_so(tmp_path: 
     assert "fc.gyro.bias.x" in broken.exact
 
 
-def test_drift_shows_the_calibrations_up_to_this_one_and_rings_it(tmp_path: Path) -> None:
-    store = RecordStore(tmp_path)
-    for k in range(8):
-        store.save(record(k, temperature_degc=10.0 + 2 * k))
-    store.save(record(8, system_id=2))
-    found = Page(_calibration(tmp_path, 6))
-    drawn = [held["d"] or "" for tag, held in found.tags if tag == "path" and held.get("class") == "dot sx"]
-    # 2 IMUs, 2 triads.
-    assert sorted(course.count("M") for course in drawn) == [6] * 4
-    assert sum(held.get("class") == "ring" for _, held in found.tags) == 3 * 4
-
-
-def test_seconds_in_a_row_that_moved_or_failed_are_one_line() -> None:
-    trace = white_trace(record(state="failed"), 20, moved=True)
-    by_name = {one.name: one for one in trace.verdicts}
-    moves = "gyro fc moves 0.31 deg/s, max 0.10"
-    fc = [(-2, -1, moves), (7, 8, moves), (16, 17, moves)]
-    assert [each for each in disturbances(trace, by_name["fc"]) if each[2] == moves] == fc
-    assert [each[:2] for each in disturbances(trace, by_name["gradienter"])][-1] == (16, 20)
-
-
-def test_a_calibration_says_where_flights_have_found_more_than_its_sigma(tmp_path: Path) -> None:
-    RecordStore(tmp_path).save(record())
-    store, biases = FlightStore(tmp_path), BiasStore(tmp_path)
-    identity = {"instance": "1", "gyro": "2752772", "accel": "2753028"}
-    biases.write({"fc": KnownImu(identity=identity)})
-    bare = Page(_calibration(tmp_path))
-    for k in range(4):
-        store.save(kept_flight(str(k), imu_flight(step=(0.0, 4.0, 45.0, 5.1))))
-    found = Page(_calibration(tmp_path))
-    ends = ", more than σ use, which is of the ground: damp the autopilot better."
-    assert found.text.count(ends) == 2
-    # Each to 12 deg/h or 0.6 mg; what all flights have wrong alike is 0.2 mg.
-    assert f"4 flights: motors move IMU 1 gyro z by +45 ± 6 deg/h{ends}" in found.text
-    assert f"4 flights: motors move IMU 1 accel z by +5.1 ± 0.4 mg{ends}" in found.text
-    # The figures of the calibration itself are what they were.
-    assert bare.exact == found.exact
-    # Flights of another sensor say nothing.
-    biases.write({"fc": KnownImu(identity=identity | {"gyro": "7", "accel": "8"})})
-    assert "motors move" not in Page(_calibration(tmp_path)).text
-
-
 def test_a_clock_that_went_back_is_said_and_order_is_used(tmp_path: Path) -> None:
     store = RecordStore(tmp_path)
     for k, year in enumerate((2026, 1970, 1970)):
@@ -306,50 +236,6 @@ def test_what_cannot_be_done_is_said_in_one_line(
     assert answer["state"] == "failed"
     assert reason in answer["reason"]
     assert len(said.err.splitlines()) == 1
-
-
-def test_no_record_at_all_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["report", "--storage", str(tmp_path), "--json"]) == 1
-    reason = json.loads(capsys.readouterr().out)["reason"]
-    assert "no calibration yet" in reason
-    assert "--storage DIR" in reason
-    (tmp_path / "records").mkdir()
-    assert main(["report", "--storage", str(tmp_path)]) == 1
-    assert "no calibration yet" in capsys.readouterr().err
-    assert main(["report", "-c", str(tmp_path / "none.toml")]) == 2
-    assert "none.toml" in capsys.readouterr().err
-
-
-def test_a_damaged_latest_record_is_named_and_the_one_before_it_taken(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    a_season(tmp_path / "kept", 3)
-    (tmp_path / "kept" / "records" / "000003.json").write_bytes(b"\xff\xfe")
-    assert main(["report", "--storage", str(tmp_path / "kept"), "-o", str(tmp_path), "--json"]) == 0
-    said = capsys.readouterr()
-    answer = json.loads(said.out)
-    assert answer["file"] == str(tmp_path / "companion-report-000002.html")
-    assert "000003.json: not a readable record" in answer["reason"]
-    assert "000003.json" in said.err
-    assert "000003.json: not a readable record" in Page(Path(answer["file"]).read_text()).text
-
-
-def test_a_page_on_stdout_is_all_that_is_there(tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
-    a_season(tmp_path, 2)
-    assert main(["report", "--storage", str(tmp_path), "-o", "-"]) == 0
-    assert "Calibration 2" in Page(capfdbinary.readouterr().out.decode()).text
-    assert main(["report", "--storage", str(tmp_path), "-o", "-", "--json"]) == 2
-
-
-def test_a_folder_that_only_root_may_enter_is_not_taken_for_an_empty_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def refuse(_: Path) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "iterdir", refuse)
-    assert main(["report", "--storage", str(tmp_path)]) == 1
-    assert "cannot be read: Permission denied; run it with sudo" in capsys.readouterr().err
 
 
 def test_what_was_held_back_is_not_shown_as_in_force(tmp_path: Path) -> None:
