@@ -35,21 +35,6 @@ def test_what_waits_is_bounded_in_bytes_and_in_number(queue: type[Waiting], most
         waiting.put_nowait(Message("fleet/0/hello", b"{}"))
 
 
-def test_who_brings_more_waits_for_room() -> None:
-    async def main() -> None:
-        inbox = Inbox(BATCH)
-        while not inbox.full():
-            inbox.put_nowait(LARGEST)
-        bringing = asyncio.create_task(inbox.put(LARGEST))
-        await asyncio.sleep(0)
-        assert not bringing.done()
-        inbox.get_nowait()
-        async with asyncio.timeout(10.0):
-            await bringing
-
-    asyncio.run(main())
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -71,10 +56,3 @@ def test_a_configuration_that_cannot_be_used_is_refused_in_one_line(
     assert str(refused.value).startswith(f"{path}: ")
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
-
-
-def test_a_configuration_names_the_broker(tmp_path: Path) -> None:
-    path = tmp_path / "collector.toml"
-    path.write_text('[mqtt]\nhost = "broker.example"\nusername = "collector"\n')
-    found = load_broker(path)
-    assert (found.host, found.username) == ("broker.example", "collector")

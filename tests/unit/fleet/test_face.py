@@ -12,31 +12,21 @@ from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import msgspec
 import pytest
 
-from companion.estimation.noise.allan import PROFILES
-from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
 from companion.estimation.records.record import ArmingRecord
-from companion.estimation.solution.by_temperature import by_temperature
-from companion.estimation.solution.prior import curve_of
-from companion.mqtt import fleet as face_module
 from companion.mqtt.fleet import AircraftFleet
-from companion.mqtt.fleet_sources import Sources
 from companion.storage import fleet_items
-from companion.storage.flights import FlightStore
 from companion.storage.learned import Done
 from companion.storage.profiles import ProfileStore
 from companion.storage.records import RecordStore
 from companion.storage.state import BoundedList, sealed, write_atomically
 from tests.support.extent import extent
-from tests.support.fleet import CRANE, HERON, Aircraft, check
-from tests.support.histories import arming, record, windows_of_days
+from tests.support.fleet import CRANE, HERON, Aircraft
+from tests.support.histories import arming, record
 from tests.support.virtual_time import run_virtual
 from tests.unit.lab.test_profiles import saved
-
-MODEL = PROFILES["icm42688p"]
 
 
 async def until(what: Callable[[], object], within_s: float = 3600.0) -> None:
@@ -69,50 +59,6 @@ def keep(folder: Path, *numbers: int) -> None:
 
 
 # --- nothing is lost
-
-
-def test_a_history_from_before_goes_once_and_in_order(tmp_path: Path) -> None:
-    keep(tmp_path, *range(50))
-
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path)
-        for _ in range(2):
-            async with aircraft.running() as face:
-                aircraft.connection.connect()
-                await until_told(face)
-                await asyncio.sleep(60.0)
-            aircraft.connection.disconnect()
-        collector = aircraft.collector
-        assert [key[2] for key in collector.deliveries] == list(range(1, 51))
-        assert begun(collector.of(HERON)) == starts(*range(50))
-        assert {item["clock"] for item in collector.of(HERON)} == {"unknown"}
-        assert (collector.hellos[-1]["first"], collector.hellos[-1]["last"]) == (1, 50)
-        assert collector.hellos[-1]["name"] == "Heron 7"
-
-    virtually(main())
-
-
-def test_a_broker_that_takes_everything_and_is_wiped_frees_nothing(tmp_path: Path) -> None:
-    keep(tmp_path, *range(20))
-
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path)
-        connection, collector = aircraft.connection, aircraft.collector
-        connection.loses = lambda: True
-        async with aircraft.running() as face:
-            connection.connect()
-            await asyncio.sleep(200.0)
-            assert not connection.outbox._answers, "the broker has taken all that was sent"
-            assert face.status()["waiting"] == 20
-            connection.disconnect()
-            await asyncio.sleep(100.0)
-            connection.loses = lambda: False
-            connection.connect()
-            await until_told(face)
-        assert begun(collector.of(HERON)) == starts(*range(20))
-        assert [key[2] for key in collector.deliveries] == list(range(1, 21))
-
-    virtually(main())
 
 
 def test_a_collector_that_is_away_is_written_to_ever_more_rarely_and_then_gets_all_in_order(
@@ -208,62 +154,6 @@ def test_nonsense_foreign_epochs_and_retained_words_change_nothing(tmp_path: Pat
     virtually(main())
 
 
-def test_what_the_broker_keeps_of_the_hello_is_as_of_now(tmp_path: Path) -> None:
-    """Or a collector from a backup would not know what it lacks."""
-    keep(tmp_path, 0)
-
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path)
-        outbox = aircraft.connection.outbox
-        async with aircraft.running() as face:
-            aircraft.connection.connect()
-            await until_told(face)
-            keep(tmp_path, 1, 2, 3)
-            await until_told(face)
-            await asyncio.sleep(15.0)
-            assert json.loads(outbox.kept(f"fleet/{HERON}/hello") or b"")["last"] == 4
-            assert len(aircraft.collector.hellos) == 2
-
-    virtually(main())
-
-
-def test_it_says_hello_again_when_it_is_asked_and_when_its_epoch_is_not_known(tmp_path: Path) -> None:
-    keep(tmp_path, 0)
-
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path)
-        collector = aircraft.collector
-        async with aircraft.running() as face:
-            aircraft.connection.connect()
-            await until_told(face)
-            (hello,) = collector.hellos
-            for epoch in (hello["epoch"], "0" * 16):
-                await asyncio.sleep(20.0)
-                collector.hellos.clear()
-                for _ in range(5):
-                    collector.say(HERON, "wanted", epoch, [])
-                    await asyncio.sleep(1.0)
-                assert len(collector.hellos) == 1, "and not for each of a flood"
-                assert collector.hellos[0] | {"at": ""} == hello | {"at": ""}
-
-    virtually(main())
-
-
-def test_items_that_nobody_confirms_hold_up_no_other(tmp_path: Path) -> None:
-    keep(tmp_path, *range(30))
-
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path)
-        collector = aircraft.collector
-        collector.confirms = lambda item: item["sequence"] > 10
-        async with aircraft.running() as face:
-            aircraft.connection.connect()
-            await until(lambda: face.status()["waiting"] == 10)
-        assert begun(collector.of(HERON)) == starts(*range(10, 30))
-
-    virtually(main())
-
-
 # --- whose, and when
 
 
@@ -301,20 +191,6 @@ def test_a_board_moved_to_another_airframe(tmp_path: Path) -> None:
     virtually(main())
 
 
-def test_what_was_recorded_of_another_system_before_is_not_its(tmp_path: Path) -> None:
-    for number, system_id in enumerate((1, 2, None)):
-        RecordStore(tmp_path).save(record(number, system_id=system_id))
-
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path)
-        async with aircraft.running() as face:
-            aircraft.connection.connect()
-            await until_told(face)
-        assert begun(aircraft.collector.of(HERON)) == starts(0, 2)
-
-    virtually(main())
-
-
 def test_without_a_unique_id_nothing_is_kept_and_that_is_said(tmp_path: Path) -> None:
     keep(tmp_path, 0)
 
@@ -329,28 +205,6 @@ def test_without_a_unique_id_nothing_is_kept_and_that_is_said(tmp_path: Path) ->
             await until_told(face)
             assert face.status()["good"] is True
         assert begun(aircraft.collector.of(HERON)) == starts(0)
-
-    virtually(main())
-
-
-def test_another_imu_is_an_event(tmp_path: Path) -> None:
-    for number, ids in enumerate(((11, 12), (11, 12), (21, 12), (None, None), (21, 12))):
-        one = record(number)
-        imus = [msgspec.structs.replace(imu, gyro_id=ids[0], accel_id=ids[1]) for imu in one.imus if imu.name == "fc"]
-        RecordStore(tmp_path).save(msgspec.structs.replace(one, imus=tuple(imus)))
-
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path)
-        async with aircraft.running() as face:
-            aircraft.connection.connect()
-            await until_told(face)
-        assert aircraft.collector.kinds() == ["calibration"] * 2 + ["event"] + ["calibration"] * 3
-        assert aircraft.collector.of(HERON)[2]["body"] == {
-            "what": "imu exchanged",
-            "imu": "fc",
-            "before": {"gyro_id": 11, "accel_id": 12},
-            "now": {"gyro_id": 21, "accel_id": 12},
-        }
 
     virtually(main())
 
@@ -428,94 +282,6 @@ def test_everything_that_the_disk_has_and_each_change_once(tmp_path: Path) -> No
     virtually(main())
 
 
-def test_what_is_written_in_the_same_tick_as_what_was_read_is_found(tmp_path: Path) -> None:
-    """A file system's clock ticks every few milliseconds."""
-    items = fleet_items.FleetItems(tmp_path)
-    sources = Sources(tmp_path, items)
-    assert [sources.has_news() for _ in range(4)] == [True, True, False, False]
-    keep(tmp_path, 0)
-    stamp = (tmp_path / "records").stat().st_mtime_ns
-    assert sources.has_news()
-    keep(tmp_path, 1)
-    os.utime(tmp_path / "records", ns=(stamp, stamp))
-    assert [sources.has_news() for _ in range(3)] == [True, False, False]
-    items.close()
-
-
-def test_a_flight_is_told_once_however_often_its_log_is_read(tmp_path: Path) -> None:
-    def flight(key: str, system_id: int = 1) -> KeptFlight:
-        stages = Stages(armed_s=10.0, motors_s=11.0, take_off_s=12.0, landing_s=99.0, disarmed_s=100.0)
-        term = Term(1e-4, 1e-5)
-        axis = Split(
-            axis="gyro x", in_flight=term, ekf=None, turn_on=None, temperature=None, motors=None, vibration=None,
-            trend=None,
-        )  # fmt: skip
-        imu = ImuFlight(
-            imu=1, rate_hz=400.0, calibration=None, gyro_id=7, set_gyro_rad_s=None, set_accel_m_s2=None, axes=(axis,),
-            drift={"flown": [Drift(30.0, 5, 12.0, 20.0)]}, notes=(),
-        )  # fmt: skip
-        found = Flight(
-            key=key, system_id=system_id, began_at="2026-05-01T08:00:00+00:00", stages=stages, reference="ekf",
-            imus=(imu,), notes=(),
-        )  # fmt: skip
-        return KeptFlight(log="00000012.BIN", read_at="2026-05-01T09:00:00+00:00", flight=found)
-
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path)
-        collector, store = aircraft.collector, FlightStore(tmp_path)
-        async with aircraft.running() as face:
-            aircraft.connection.connect()
-            store.save(flight("a"))
-            await until_told(face)
-            store.save(flight("b"))
-            store.save(flight("other", system_id=9))
-            store.save(msgspec.structs.replace(flight("a"), read_at="2026-05-02T09:00:00+00:00"))
-            await until_told(face)
-        bodies = [item["body"] for item in collector.of(HERON)]
-        assert bodies == [json.loads(msgspec.json.encode(flight(key))) for key in "ab"]
-        assert {item["at"] for item in collector.of(HERON)} == {"2026-05-01T08:00:00Z"}
-
-    virtually(main())
-
-
-def test_a_curve_is_told_when_it_is_another_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(face_module, "CURVES_AFTER_S", 15.0)
-    monkeypatch.setattr(face_module, "CURVES_EVERY_S", 60.0)
-
-    def shown(power_ups: int) -> dict[str, Any]:
-        row = {"degc": 20.0, "gyro_deg_h": [1.0, 2.0, 3.0], "sigma_deg_h": [1.0, 1.0, 1.0]}
-        return {
-            "imu": "fc", "summary": f"{power_ups} power-ups", "power_ups": power_ups, "days": 3, "points": [1, 2],
-            "curve": [row] if power_ups else [], "accel_curve": [], "needs": None, "today": 1, "now": row,
-        }  # fmt: skip
-
-    async def main() -> None:
-        aircraft = Aircraft(tmp_path)
-        for power_ups in (0, 4, 4, 5):
-            aircraft.curves = [shown(power_ups)]
-            async with aircraft.running():
-                await asyncio.sleep(20.0)
-        async with aircraft.running() as face:
-            aircraft.connection.connect()
-            await until_told(face)
-            points = windows_of_days(12)
-            real = by_temperature(
-                "fc",
-                points,
-                curve_of(points, "gyro", MODEL.gyro),
-                curve_of(points, "accel", MODEL.accel),
-                power_up=None,
-            )
-            aircraft.curves = [msgspec.to_builtins(real)]
-            await asyncio.sleep(100.0)
-        told = [item["body"] for item in aircraft.collector.of(HERON)]
-        assert [body["power_ups"] for body in told] == [4, 5, real.power_ups]
-        assert "points" not in told[0]
-        assert len(told[2]["curve"]) == len(real.curve) > 3
-
-    virtually(main())
-
-
 # --- the disk
 
 
@@ -575,23 +341,3 @@ def test_a_damaged_file_is_set_aside_and_all_is_told_anew(tmp_path: Path, damage
         assert bodies[0] == bodies[1]
 
     virtually(main())
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"sequence": 0}, {"aircraft": "1"}, {"kind": "other"}, {"body": {}}, {"clock": "bad"}, {"at": "2026-05-01"},
-        {"format_version": 2},
-    ],
-    ids=str,
-)  # fmt: skip
-def test_the_contract_refuses_what_is_wrong(wrong: dict[str, Any]) -> None:
-    """Or it would prove nothing."""
-    body = {"what": "level", "of": "2026-05-01T00:00:00Z", "undone_at": "2026-05-01T00:00:00Z"}
-    good = {
-        "format_version": 1, "aircraft": HERON, "epoch": "0" * 16, "sequence": 1, "kind": "undo",
-        "at": "2026-05-01T00:00:00Z", "clock": "good", "body": body,
-    }  # fmt: skip
-    check("item", msgspec.json.encode(good))
-    with pytest.raises(jsonschema.ValidationError):
-        check("item", msgspec.json.encode(good | wrong))

@@ -13,7 +13,7 @@ import pytest
 import sqlalchemy as sa
 
 from companion.fleet import page
-from companion.fleet.judgement import judge, judge_zero
+from companion.fleet.judgement import judge_zero
 from companion.fleet.store import Message, Store
 from companion.physics.units import DEG_H
 from sim.fleet.aircraft import Aircraft
@@ -90,24 +90,6 @@ def test_a_compass_that_got_iron_is_found() -> None:
     assert np.median(study.delays("compass got iron", parts=16, since=60, seed=3)) <= 15.0
 
 
-def test_a_knock_is_no_fault() -> None:
-    dice = np.random.default_rng(2)
-    history = study.fly(dice, 60)
-    history.biases[50] += 100.0 * study.TURN_ON
-    model = study.model_by([study.fly(dice, 100) for _ in range(6)])
-    assert judge(history, model) == []
-
-
-def test_words_say_which_axis_and_how_much() -> None:
-    dice = np.random.default_rng(8)
-    model = study.model_by([study.fly(dice, 100) for _ in range(6)])
-    (worst, *_) = judge(study.fly(dice, 160, study.FAULTS[2], 60, 1), model)
-    assert worst.words.startswith("gyro y turn-on scatter ")
-    assert worst.words.endswith(" times its model's")
-    assert worst.size == pytest.approx(3.0, rel=0.4)
-    assert abs(worst.since - 60) < 25
-
-
 def test_a_zero_counts_once_it_has_moved_beyond_its_sigmas() -> None:
     offsets = np.array([[0.10, 0.0], [0.12, 0.03], [0.11, 0.62]])
     sigmas = np.full(3, 0.02)
@@ -118,14 +100,6 @@ def test_a_zero_counts_once_it_has_moved_beyond_its_sigmas() -> None:
 
 
 # --- from items to findings
-
-
-def test_a_fleet_of_one_is_judged_by_itself(store: Store, database: str) -> None:
-    (found,) = judged(store, database, messages_of(faulty()))
-    assert found.words.startswith("replace IMU fc2: gyro x bias has moved by ")
-    assert float(found.words.partition("moved by ")[2].split()[0]) == pytest.approx(MOVED, rel=0.1)
-    assert "its turn-on scatter" in found.words
-    assert found.words.endswith(", since 11 October 2026")
 
 
 def test_a_fleet_without_faults_has_nothing_said_of_it(store: Store, database: str) -> None:
@@ -173,15 +147,6 @@ def test_absurd_figures_keep_nobody_from_being_judged(
     assert "cannot be judged" not in caplog.text
 
 
-def test_what_was_undone_does_not_count(store: Store, database: str) -> None:
-    one = faulty()
-    moved = [sequence for sequence in one.told if sequence > 30]
-    for sequence in moved:
-        started_at = json.loads(one.told[sequence])["body"]["started_at"]
-        one.tell("undo", NOW, {"what": "calibration", "of": started_at, "undone_at": started_at})
-    assert judged(store, database, messages_of(one)) == []
-
-
 def test_the_reading_counts_and_not_what_earlier_ones_made_of_it(store: Store, database: str) -> None:
     one = faulty()
     for sequence in [sequence for sequence in one.told if sequence > 30]:
@@ -205,18 +170,6 @@ def test_another_part_is_another_history(store: Store, database: str) -> None:
     assert power_ups == 30
 
 
-def test_calibrations_of_one_power_up_are_one(store: Store, database: str) -> None:
-    one = Aircraft(1)
-    flown(one, 20, 40.0)
-    for k in range(12):
-        # What it has started with is in all of them.
-        one.told[len(one.told) + 1] = one.told[20].replace(b'"sequence":20,', b'"sequence":%d,' % (21 + k))
-        at = datetime.datetime.fromisoformat(json.loads(one.told[20])["body"]["started_at"])
-        changed(one, 21 + k, started_at=(at + datetime.timedelta(minutes=3 * (k + 1))).isoformat())
-    assert judged(store, database, messages_of(one)) == []
-    assert {row[0] for row in rows_of(database, sa.text("SELECT power_ups FROM parts"))} == {20}
-
-
 def test_accelerometers_that_move_together_tell_of_the_gradienter(store: Store, database: str) -> None:
     one = Aircraft(1)
     flown(one, 60, 100.0)
@@ -229,33 +182,6 @@ def test_accelerometers_that_move_together_tell_of_the_gradienter(store: Store, 
     assert (found.kind, found.imu) == ("zero", None)
     # asin(0.05 / 9.80665) is 0.292 deg.
     assert "the gradienter's zero, by 0.29 deg" in found.words
-
-
-def test_a_new_zero_is_no_fault_of_the_accelerometers(store: Store, database: str) -> None:
-    one = Aircraft(1)
-    flown(one, 60, 100.0)
-    for sequence in one.told:
-        imus = json.loads(one.told[sequence])["body"]["imus"]
-        day = 1 + (sequence > 30)
-        zero = {"measured_at": f"2026-08-0{day}T08:00:00Z", "offset_deg": [0.1 * day, 0.0], "sigma_deg": 0.02}
-        for imu in imus:
-            imu["accel_bias_m_s2"][1] += 0.017 * (sequence > 30)
-        changed(one, sequence, imus=imus, alignment=zero)
-    assert judged(store, database, messages_of(one)) == []
-
-
-def test_the_model_is_compared_with_where_there_are_enough(store: Store, database: str) -> None:
-    for number in range(2, 8):
-        one = Aircraft(number)
-        flown(one, 30, 60.0)
-        judged(store, database, messages_of(one))
-    one = Aircraft(1)
-    flown(one, 12, 24.0, 40.0)
-    one.moved_rad_s = MOVED * DEG_H
-    flown(one, 15, 30.0)
-    (found,) = judged(store, database, messages_of(one))
-    assert "its model's turn-on scatter" in found.words
-    assert {row[0] for row in rows_of(database, sa.text("SELECT model FROM parts"))} == {"icm42688p"}
 
 
 def test_what_comes_during_a_judgement_is_judged_again(
@@ -278,30 +204,3 @@ def test_what_comes_during_a_judgement_is_judged_again(
     assert store.judge()
     assert not store.judge()
     assert len(rows_of(database, sa.text("SELECT * FROM findings"))) == 1
-
-
-def test_one_that_cannot_be_judged_stops_nothing(
-    store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def fails(*_: object) -> None:
-        raise ZeroDivisionError
-
-    store.take(messages_of(faulty()))
-    monkeypatch.setattr("companion.fleet.store.judged", fails)
-    assert store.judge()
-    assert not store.judge()
-    assert "cannot be judged" in caplog.text
-
-
-def test_pages_show_the_worst_first(store: Store, database: str) -> None:
-    one, other = faulty(1), faulty(2, after=25)
-    other.name = "Crane 9"
-    hello = [Message(f"fleet/{each.id}/hello", each.hello) for each in (one, other)]
-    found = judged(store, database, [*messages_of(one), *messages_of(other), *hello])
-    with store._reads.begin() as connection:
-        glance, its = page.glance(connection, NOW) or "", page.aircraft(connection, one.id, NOW) or ""
-    worst = sorted(found, key=lambda row: -row.size)
-    places = [glance.index(f'/aircraft/{row.aircraft}">') for row in worst]
-    assert places == sorted(places)
-    assert glance.count("replace IMU fc2") == 2
-    assert its.count("replace IMU fc2") == 1

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import datetime
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -82,12 +80,6 @@ def test_invented_aircraft_push_no_real_one_from_the_first_page(
     ]  # fmt: skip
 
 
-def test_a_fleet_of_one_page_has_no_others(store: Store, database: str) -> None:
-    assert "No aircraft was heard yet." in (shown(database) or "")
-    tell(store, Aircraft(1))
-    assert "/page/" not in (shown(database) or "")
-
-
 @pytest.mark.parametrize(
     "at", ["0001-01-01 00:00:00.000000", "9999-12-31 23:59:59.999999", "1969-12-31 23:59:59.000000"]
 )
@@ -111,29 +103,6 @@ def test_a_database_of_an_older_collector_with_an_extreme_date_has_pages(store: 
     assert its is not None
     assert "clock went back in between, so these stand in their order" in its
     assert one.name in (shown(database) or "")
-
-
-def test_an_aircrafts_page_shows_its_curve_with_sigma(store: Store) -> None:
-    one = Aircraft(1)
-    one.live(NOW, 12)
-    curve = [{"degc": 10.0 + k, "gyro_deg_h": [1.0 + k, 2.0, 3.0], "sigma_deg_h": [5.0, 5.0, 5.0]} for k in range(20)]
-    body = {"imu": "fc1", "power_ups": 12, "days": 11, "curve": curve, "accel_curve": []}
-    for imu in ("fc1", "fc9"):
-        one.tell("curve", NOW, {**body, "imu": imu})
-    one.tell("curve", NOW + datetime.timedelta(days=1), {**body, "power_ups": 13})
-    one.tell("curve", NOW, {"imu": ["no curve"]})
-    store.take([Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()])
-    with store._engine.begin() as connection:
-        shown = page.aircraft(connection, one.id, NOW)
-    assert shown is not None
-    assert "IMU fc1 by temperature" in shown
-    assert f"The curve of 13 power-ups, as told {NOW + datetime.timedelta(days=1):%Y-%m-%d}." in shown
-    assert 'class="area sx"' in shown
-    assert "fc9" not in shown
-    dots = re.search(r"IMU fc1 by temperature, gyro x: bias by temperature</title><desc>(\d+) points", shown)
-    assert dots is not None
-    assert int(dots[1]) == sum("fc1" in found for found in one.biases.values())
-    assert json.loads(one.told[1])["kind"] in ("calibration", "arming")
 
 
 # --- many clients
@@ -184,21 +153,5 @@ def test_a_page_is_made_anew_once_it_is_old(counting: Counting, monkeypatch: pyt
             await counting.renderer.get("/")
             await asyncio.sleep(0.01)
             assert counting.times == times
-
-    asyncio.run(main())
-
-
-def test_what_cannot_be_read_is_not_kept(counting: Counting, store: Store) -> None:
-    async def main() -> None:
-        with store._engine.begin() as connection:
-            connection.exec_driver_sql("ALTER TABLE aircraft RENAME TO gone")
-        with pytest.raises(sa.exc.OperationalError, match="no such table"):
-            await counting.renderer.get("/")
-        with store._engine.begin() as connection:
-            connection.exec_driver_sql("ALTER TABLE gone RENAME TO aircraft")
-        await asyncio.sleep(0.01)
-        assert b"1 aircraft" in (await counting.renderer.get("/") or b"")
-        assert await counting.renderer.get("/page/2") is None
-        assert await counting.renderer.get("/page/0") is None
 
     asyncio.run(main())

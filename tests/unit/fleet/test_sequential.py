@@ -29,36 +29,12 @@ def test_scatter_is_that_of_the_draws_whatever_the_temperature_and_a_step() -> N
     assert found.per_k == pytest.approx(0.3 * TRUE, rel=0.1)
 
 
-def test_wander_is_told_by_many_parts() -> None:
-    parts = [scatter_of_part(*drawn(400, seed, wander=0.2)) for seed in range(12)]
-    found = scatter_of_model(parts)
-    assert found is not None
-    assert found.wander == pytest.approx(0.2 * TRUE, rel=0.2)
-
-
-def test_a_bad_part_does_not_move_its_model() -> None:
-    parts = [scatter_of_part(*drawn(60, seed, scale=8.0 if seed == 3 else 1.0)) for seed in range(10)]
-    found = scatter_of_model(parts)
-    assert found is not None
-    assert found.turn_on == pytest.approx(TRUE, rel=0.15)
-    assert parts[3].turn_on == pytest.approx(8.0 * TRUE, rel=0.4)
-
-
 def test_too_few_tell_nothing() -> None:
     assert np.isnan(scatter_of_part(*drawn(7, 1)).turn_on).all()
     few = [scatter_of_part(*drawn(60, seed)) for seed in range(LEAST_PARTS - 1)]
     assert scatter_of_model(few) is None
     empty = Scatter(0, *np.full((3, 6), np.nan))
     assert scatter_of_model([*few, empty]) is None
-
-
-def test_gaps_and_unknown_temperatures_are_left_out() -> None:
-    biases, degc = drawn(300, 2)
-    biases[::7, 2] = np.nan
-    degc[5] = np.nan
-    assert scatter_of_part(biases, degc).turn_on == pytest.approx(TRUE, rel=0.2)
-    unknown = scatter_of_part(biases, np.full(300, np.nan)).turn_on
-    assert unknown == pytest.approx(TRUE * np.hypot(1.0, 0.3 * 40.0 / np.sqrt(12.0)), rel=0.25)
 
 
 def test_a_model_is_known_by_firmware_and_types() -> None:

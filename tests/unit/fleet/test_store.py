@@ -12,7 +12,6 @@ from typing import Any
 
 import hypothesis
 import hypothesis.strategies as st
-import msgspec
 import pytest
 import sqlalchemy as sa
 
@@ -179,18 +178,6 @@ def test_what_is_unknown_is_kept_and_taken_in_after_an_update(
     assert len(query(database, "SELECT * FROM biases")) == 6
 
 
-def test_a_newer_format_is_taken_in_after_an_update(
-    store: Store, database: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    one = aircraft(1)
-    store.take([changed(items_of(one)[0], format_version=2)])
-    for module in ("contract", "store"):
-        monkeypatch.setattr(f"companion.fleet.{module}.FORMAT_VERSION", 2)
-    store.prepare()
-    assert query(database, "SELECT state, kind FROM items") == [("taken", "calibration")]
-    assert len(query(database, "SELECT * FROM biases")) == 6
-
-
 @pytest.mark.parametrize("what", ["no text", "no number", "no JSON"])
 def test_what_can_never_be_taken_in_keeps_no_collector_from_its_start(
     store: Store, database: str, monkeypatch: pytest.MonkeyPatch, what: str
@@ -268,35 +255,6 @@ def test_a_bad_item_is_kept_aside_with_its_reason_and_stops_nothing(store: Store
     assert query(database, "SELECT * FROM biases WHERE sequence = 1") == []
 
 
-@pytest.mark.parametrize("which", ["instance", "gyro_id", "drift_m", "sigma"])
-def test_a_number_that_no_database_holds_stops_nothing(store: Store, which: str) -> None:
-    """2^63 is no integer of theirs; views turn others into units in which they are no numbers any more."""
-    one = aircraft(1)
-    one.fly(NOW)
-    one.learn(NOW)
-    *good, flight, curve, _ = items_of(one)
-    body, of_curve = (json.loads(each.payload)["body"] for each in (flight, curve))
-    (imu, *_), (node, *_) = body["flight"]["imus"], of_curve["curve"]
-    imu |= {"imu": 2**63} if which == "instance" else {"gyro_id": 2**63} if which == "gyro_id" else {}
-    imu["drift"]["flown"][0]["median_m"] = 1e305 if which == "drift_m" else 2.5
-    node["sigma_deg_h"] = [1.0, 1e305, 1.0] if which == "sigma" else [1.0, 1.0, 1.0]
-    changes = {"kind": "curve", "body": of_curve} if which == "sigma" else {"kind": "flight", "body": body}
-    bad = changed(good[0], sequence=100, **changes)
-    ((message, reason),) = store.take([*good, bad]).rejected
-    assert message == bad
-    assert reason.startswith(f"{which}: found ")
-
-
-def test_what_is_kept_aside_is_bounded(store: Store, database: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.fleet.store.MOST_REJECTED", 5)
-    topic = f"fleet/{aircraft(0).id}/item"
-    for number in range(12):
-        store.take([Message(topic, b"%d" % number * 10_000)])
-    kept = query(database, "SELECT payload FROM rejected")
-    assert len(kept) == 5
-    assert max(len(row[0]) for row in kept) == 4096
-
-
 # --- the database
 
 
@@ -340,24 +298,6 @@ def test_what_the_database_refuses_takes_nothing_else_with_it(
     assert store.take([Message(f"fleet/{one.id}/hello", one.hello)]).wanted == {}
 
 
-def test_what_the_database_refuses_in_any_form_is_confirmed_all_the_same(
-    store: Store, database: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    one = aircraft(2)
-    real = Store._put
-
-    def spoilt(self: Store, connection: sa.Connection, table: sa.Table, rows: list[dict[str, object]]) -> None:
-        for row in rows:
-            row |= {"received_at": None} if (table.name, row["sequence"]) == ("items", 2) else {}
-        real(self, connection, table, rows)
-
-    monkeypatch.setattr(Store, "_put", spoilt)
-    outcome = store.take(items_of(one))
-    assert sorted(outcome.confirmed[one.id, one.epoch]) == list(range(1, len(one.told) + 1))
-    assert [row[2] for row in items_in(database)] == [1, *range(3, len(one.told) + 1)]
-    assert query(database, "SELECT times FROM rejected") == [(1,)]
-
-
 @pytest.mark.parametrize(("version", "remedy"), [(3, "name a new database with --database"), (5, "update this one")])
 def test_a_database_of_another_version_is_refused_in_one_line_and_left_as_it_is(
     store: Store, database: str, version: int, remedy: str
@@ -371,33 +311,8 @@ def test_a_database_of_another_version_is_refused_in_one_line_and_left_as_it_is(
     assert items_in(database) == told_by([one])
 
 
-def test_a_view_that_is_lacking_is_made(store: Store, database: str) -> None:
-    asked = "SELECT name, sql FROM sqlite_master WHERE type = 'view' ORDER BY name"
-    before = query(database, asked)
-    with sqlite3.connect(database) as connection:
-        connection.execute("DROP VIEW bias_history")
-    store.prepare()
-    assert query(database, asked) == before
-
-
-def test_views_say_what_they_are_for(store: Store, database: str) -> None:
-    made = dict(query(database, "SELECT name, sql FROM sqlite_master WHERE type = 'view'"))
-    assert made.keys() == {name for name, _, _ in schema.views()}
-    assert all(f"/* {purpose} */" in made[name] for name, purpose, _ in schema.views())
-    assert all(rows_of(database, sa.select(sa.text("*")).select_from(sa.table(name))) == [] for name in made)
-    assert store.where.startswith("sqlite:///")
-
-
 @pytest.mark.parametrize("wrong", ["mysql://a:secret@h/x", "postgresql:/x://", "sqlite://", "://"])
 def test_an_address_that_is_none_is_one_line_without_the_password(wrong: str) -> None:
     with pytest.raises(CompanionError, match="allowed: postgresql://") as error:
         url_of(wrong)
     assert "secret" not in str(error.value)
-
-
-def test_records_keep_every_digit(store: Store, database: str) -> None:
-    one = aircraft(1)
-    store.take(items_of(one))
-    body = msgspec.json.decode(one.told[1])["body"]
-    found = query(database, "SELECT gyro_bias_rad_s FROM biases WHERE imu = 'fc1' ORDER BY axis")
-    assert [row[0] for row in found] == body["imus"][0]["gyro_bias_rad_s"]
