@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import random
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -151,16 +150,6 @@ def test_tilt_in_flight_stays_below_what_usual_filters_lose(route: BankedCircles
     assert rms([tilt for tilt, _ in errors]) < limit_deg
 
 
-def test_a_known_airspeed_leaves_nothing_of_a_turn() -> None:
-    aircraft = MovingAircraft(BankedCircles(start_s=1.0, bank_deg=15.0, launch_s=1.0), Pose(), NORTH)
-    without, with_it = (AttitudeEstimator(settings()) for _ in range(2))
-    for estimator in (without, with_it):
-        estimator.align(0.0, aircraft.body_from_ned(0.0), SURE)
-    plain = follow(without, ImuModel(aircraft, "perfect"), 60.0)
-    helped = follow(with_it, ImuModel(aircraft, "perfect"), 60.0, airspeed_m_s=15.0)
-    assert rms([tilt for tilt, _ in helped[100:]]) < 0.25 * rms([tilt for tilt, _ in plain[100:]])
-
-
 def test_the_ground_levels_what_was_aligned_wrongly() -> None:
     aircraft = VirtualAircraft(Pose(5.0, -3.0, 40.0), NORTH)
     estimator = AttitudeEstimator(settings())
@@ -184,43 +173,6 @@ def test_rest_finds_what_is_left_of_the_gyro_bias() -> None:
     assert estimator.gyro_bias_rad_s == pytest.approx(left, abs=15 * DEG_H)
 
 
-def test_a_movement_that_is_noticed_late_teaches_no_bias() -> None:
-    """Somebody turns it slowly, and for three seconds nobody has said that it does not stand still any more."""
-    estimator = AttitudeEstimator(settings())
-    estimator.align(0.0, np.eye(3), SURE)
-    for k in range(1, 601):
-        estimator.update([ImuSample(k * 0.005, (0.0, 0.0, 0.5 * DEG), (0.0, 0.0, -9.8))], phase="ground", still=True)
-    assert max(abs(value) for value in estimator.gyro_bias_rad_s) < 1.0 * DEG_H
-
-
-def test_in_flight_nothing_is_learned_from_a_moment_that_looks_still() -> None:
-    aircraft = VirtualAircraft(Pose(), NORTH)
-    estimator = AttitudeEstimator(settings())
-    estimator.align(0.0, aircraft.body_from_ned(0.0), SURE)
-    follow(estimator, ImuModel(aircraft, "perfect", gyro_bias_rad_s=(1e-3,) * 3), 5.0, phase="flight", still=True)
-    assert estimator.gyro_bias_rad_s == (0.0, 0.0, 0.0)
-
-
-def test_how_samples_are_cut_into_batches_changes_nothing() -> None:
-    aircraft = MovingAircraft(Shuttle(start_s=0.0), Pose(0.0, 0.0, 359.0), NORTH)
-    batches = list(samples(ImuModel(aircraft, seed=4), 8.0))
-    stream = [sample for batch in batches for sample in batch]
-    source, whole, cut = random.Random(1), AttitudeEstimator(settings()), AttitudeEstimator(settings())
-    for estimator in (whole, cut):
-        estimator.align(0.0, aircraft.body_from_ned(0.0), SURE)
-    whole.update(stream, phase="flight")
-    while stream:
-        size = source.randrange(1, 40)
-        cut.update(stream[:size], phase="flight")
-        stream = stream[size:]
-    one, other = whole.attitude(), cut.attitude()
-    assert one is not None
-    assert other is not None
-    # To the Earth's rotation in a batch times what the leveller did meanwhile.
-    assert one.quaternion == pytest.approx(other.quaternion, abs=1e-6)
-    assert one.sigma_rad == pytest.approx(other.sigma_rad, rel=1e-6)
-
-
 # ----------------------------------------------------------------------------------------------------- the compass
 
 
@@ -240,28 +192,6 @@ def test_a_compass_finds_true_north(site: Site, heading_deg: float) -> None:
     assert -math.pi <= found.yaw_rad <= math.pi
     # However often a compass is read, its own error stays.
     assert 0.8 * DEG < found.sigma_rad[2] < 1.3 * DEG
-
-
-def test_a_new_alignment_forgets_what_was_before_it() -> None:
-    """What an estimator has levelled by and what it has refused must not go into the next alignment."""
-    aircraft = VirtualAircraft(Pose(5.0, -3.0, 40.0), NORTH)
-    imu = ImuModel(aircraft, "perfect")
-    used, fresh = AttitudeEstimator(settings()), AttitudeEstimator(settings())
-    used.align(0.0, VirtualAircraft(Pose(20.0, 25.0, 200.0), NORTH).body_from_ned(0.0), SURE)
-    follow(used, imu, 30.0)
-    assert not used.add_heading(30.0, 100.0 * DEG, 1.0 * DEG)
-    for estimator in (used, fresh):
-        estimator.align(30.0, aircraft.body_from_ned(30.0), SURE)
-        for batch in samples(imu, 40.0, since_s=30.0):
-            estimator.update(batch, phase="flight")
-    assert used.compass.refused_for_s(40.0) == 0.0
-    for estimator in (used, fresh):
-        assert estimator.add_heading(40.0, 41.0 * DEG, 1.0 * DEG)
-    now, expected = used.attitude(), fresh.attitude()
-    assert now is not None
-    assert expected is not None
-    assert now.quaternion == pytest.approx(expected.quaternion, abs=1e-9)
-    assert now.sigma_rad == pytest.approx(expected.sigma_rad, rel=1e-6)
 
 
 def test_a_heading_from_a_wild_compass_is_refused_and_named() -> None:
@@ -290,15 +220,6 @@ def test_a_compass_that_turns_is_not_followed() -> None:
     assert found is not None
     assert error_deg(found, aircraft)[1] < 2.0
     assert 1.8 * DEG < found.sigma_rad[2] < 2.6 * DEG
-
-
-def test_a_pendulum_compass_is_not_read_in_a_turn() -> None:
-    aircraft = MovingAircraft(BankedCircles(start_s=0.0), Pose(), NORTH)
-    estimator = AttitudeEstimator(settings())
-    estimator.align(0.0, aircraft.body_from_ned(0.0), SURE)
-    follow(estimator, ImuModel(aircraft, "perfect"), 30.0)
-    _, _, yaw = aircraft.angles_rad(29.9)
-    assert not estimator.add_heading(29.9, yaw, 1.0 * DEG)
 
 
 def test_an_unknown_heading_is_taken_from_the_first_reading() -> None:
@@ -357,14 +278,6 @@ def test_without_an_alignment_there_is_no_attitude() -> None:
     assert not estimator.add_heading(0.1, 0.0, 0.1)
 
 
-def test_samples_out_of_order_are_left_out() -> None:
-    estimator = aligned()
-    estimator.update([at(0.1), at(0.05), at(0.1), at(0.2), at(math.nan)], phase="ground")
-    found = estimator.attitude()
-    assert found is not None
-    assert found.t_s == 0.2
-
-
 def test_a_gap_is_bridged_and_owned_up_to() -> None:
     whole, holed = aligned(), aligned()
     for estimator, skipped in ((whole, range(0)), (holed, range(200, 300))):
@@ -391,32 +304,3 @@ def test_nothing_in_a_sample_makes_it_raise(spoil: Callable[[], tuple[float, flo
     for number in range(1, 400):
         estimator.update([ImuSample(number * 0.01, spoil(), spoil())], phase="flight")
         estimator.attitude()
-
-
-def test_a_newer_calibration_keeps_the_attitude() -> None:
-    estimator = aligned()
-    estimator.update([at(0.005 * n) for n in range(1, 201)], phase="ground")
-    before = estimator.attitude()
-    estimator.settle(settings(gyro_bias_rad_s=(0.001, 0.0, 0.0)))
-    after = estimator.attitude()
-    assert before is not None
-    assert after is not None
-    assert after.quaternion == before.quaternion
-    assert estimator.gyro_bias_rad_s == pytest.approx((0.001, 0.0, 0.0))
-
-
-def test_what_is_kept_of_an_instant_is_the_attitude_of_then() -> None:
-    estimator, found = aligned(), {}
-    for number in range(200):
-        turning = ImuSample(number / 100, (0.0, 0.0, 0.3 if number < 100 else -0.6), (0.0, 0.0, -9.8))
-        estimator.update([turning], phase="flight")
-        now = estimator.attitude()
-        assert now is not None
-        found[number] = now.quaternion
-    for number in (50, 100, 150, 199):
-        kept = estimator.kept_at(number / 100 + 1e-4)
-        assert kept is not None
-        assert 0.0 <= number / 100 + 1e-4 - kept[0] <= 0.021, "a stretch before at most"
-        then = found[round(kept[0] * 100)]
-        assert abs(sum(a * b for a, b in zip(kept[1], then, strict=True))) == pytest.approx(1.0, abs=1e-9)
-    assert estimator.kept_at(-1.0) is None

@@ -63,11 +63,3 @@ def test_stretches_cover_the_time_and_hold_the_mean_force() -> None:
     assert sum(stretch.span_s for stretch in stretches) == pytest.approx(1.0)
     # The sensor's x looks east.
     assert stretches[-1].force_m_s2 == pytest.approx((0.0, 1.0, -9.8))
-
-
-def test_a_fast_turn_over_a_gap_is_still_a_turn() -> None:
-    strapdown = Strapdown()
-    strapdown.restart((1.0, 0.0, 0.0, 0.0), 0.0)
-    strapdown.integrate([ImuSample(0.5, (0.0, 0.0, 4.0), (0.0, 0.0, -9.8))])
-    w, _, _, z = strapdown.orientation
-    assert 2.0 * math.atan2(z, w) == pytest.approx(2.0)

@@ -8,11 +8,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from companion.cli.show import history_lines
 from companion.errors import StorageError
-from companion.storage import flights
 from companion.storage.flights import FlightStore
-from tests.support.flights import imu_flight, kept_flight
+from tests.support.flights import kept_flight
 
 
 def test_a_flight_comes_back_as_it_was_and_the_service_may_read_it(tmp_path: Path) -> None:
@@ -32,17 +30,6 @@ def test_the_same_flight_read_again_stays_one_with_the_later_reading(tmp_path: P
     assert store.newest()[1].log == "again.bin"
 
 
-def test_the_oldest_makes_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(flights, "KEEP", 3)
-    store = FlightStore(tmp_path)
-    assert [store.save(kept_flight(str(k))) for k in range(5)] == [1, 2, 3, 4, 5]
-    assert list(store.newest()) == [5, 4, 3]
-    # A number is not given twice, and one that is read again costs none.
-    assert store.save(kept_flight("3")) == 4
-    assert list(store.newest()) == [5, 4, 3]
-    assert list(store.newest(2)) == [5, 4]
-
-
 def test_a_damaged_one_is_passed_over_with_a_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     store = FlightStore(tmp_path)
     for k in range(3):
@@ -59,16 +46,3 @@ def test_a_damaged_one_is_passed_over_with_a_line(tmp_path: Path, caplog: pytest
         with pytest.raises(StorageError, match="cannot be used: "):
             store.read(2)
     assert store.read(7) is None
-
-
-def test_the_history_tells_the_figure_of_each(tmp_path: Path) -> None:
-    told = [
-        {"number": 12, **msgspec.to_builtins(kept_flight())},
-        {"number": 3, **msgspec.to_builtins(kept_flight("2", imu_flight(drifts={"flown": (0.4,)}), began_at=None))},
-    ]
-    at_30_s = "30 s without GNSS: 2.1 m (95 %: 5.0 m, 150 starts)"
-    assert history_lines([], [], [], [], told)[1:] == [
-        " no. flown (UTC)          what its log says",
-        f"  12 2026-11-23T08:00:46  {at_30_s}; with the offsets of before 31.0 m",
-        "   3 time unknown         10 s without GNSS: 0.4 m (95 %: 1.0 m, 150 starts)",
-    ]

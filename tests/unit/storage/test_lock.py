@@ -37,12 +37,6 @@ def test_a_second_one_is_refused_until_the_first_has_ended_even_by_kill_9(tmp_pa
         pass
 
 
-def test_a_directory_that_cannot_be_made_is_somebody_elses_fault_to_tell(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with only_daemon(tmp_path / "file"):
-        pass
-
-
 def test_the_command_ends_with_1_and_one_line(tmp_path: Path) -> None:
     config = tmp_path / "companion.toml"
     config.write_text(

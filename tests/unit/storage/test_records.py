@@ -19,7 +19,7 @@ from companion.estimation.records.record import GyroPrior, ImuRecord, Prior, Rec
 from companion.storage import records as records_module
 from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.records import RecordStore
-from companion.storage.state import only_daemon, remove_durably, write_atomically
+from companion.storage.state import only_daemon, write_atomically
 
 
 def _record(reason: str) -> Record:
@@ -131,14 +131,6 @@ def test_a_damaged_record_is_passed_over_and_said(tmp_path: Path, caplog: pytest
     assert "000002.json: not a readable record" in caplog.text
 
 
-def test_a_record_of_a_newer_companion_is_refused_in_one_line(tmp_path: Path) -> None:
-    store = RecordStore(tmp_path)
-    store.save(_record("newer")).write_bytes(b'{"format_version": 2, "reason": ["of", "another", "type"]}')
-    found = next(store.entries())
-    assert found.record is None
-    assert found.problem.endswith("found format 2; allowed: up to 1 (a newer companion has saved it)")
-
-
 def test_a_record_with_keys_that_were_removed_since_is_read(tmp_path: Path) -> None:
     """`by_model` stood in `prior` where a fleet's statistics had taken part."""
     gyro = GyroPrior(
@@ -171,35 +163,6 @@ def test_a_record_that_was_changed_is_passed_over_and_one_from_before_there_were
     assert next(store.entries()).problem.endswith("damaged, or changed by hand")
 
 
-def test_numbers_of_records_go_on_beyond_six_digits(tmp_path: Path) -> None:
-    store = RecordStore(tmp_path)
-    (tmp_path / "records").mkdir()
-    (tmp_path / "records" / "999999.json").write_bytes(b"")
-    for reason in ("first", "second"):
-        store.save(_record(reason))
-    assert [record.reason for record in store.history()] == ["second", "first"]
-
-
-def test_a_folder_in_the_place_of_an_old_record_costs_no_new_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(records_module, "KEEP", 1)
-    (tmp_path / "records" / "000001.json").mkdir(parents=True)
-    store = RecordStore(tmp_path)
-    store.save(_record("new"))
-    assert [record.reason for record in store.history()] == ["new"]
-    assert "000001.json: cannot be removed: " in caplog.text
-
-
-def test_old_records_make_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(records_module, "KEEP", 3)
-    store = RecordStore(tmp_path)
-    for n in range(5):
-        store.save(_record(str(n)))
-    assert [record.reason for record in store.history()] == ["4", "3", "2"]
-    assert len(list((tmp_path / "records").iterdir())) == 3
-
-
 def _trace(record: Record) -> Trace:
     return Trace(
         started_at=record.started_at, second=(-1, 0), good=(True, False), measured=None, cut=False, verdicts=()
@@ -220,24 +183,6 @@ def test_what_was_seen_lies_beside_its_record_and_goes_with_it(tmp_path: Path, m
     assert [record.reason for record in store.history()] == ["5", "4", "3", "2"]
 
 
-def test_a_trace_without_its_record_is_never_taken_for_the_next_ones(tmp_path: Path) -> None:
-    store = RecordStore(tmp_path)
-    first = _record("first")
-    # The power went between the two files.
-    store.save(first, _trace(first)).unlink()
-    store.save(_record("second"))
-    (entry,) = store.entries()
-    assert store.trace(entry) is None
-
-    other = tmp_path / "records" / "000001.trace.json.gz"
-    assert not other.exists()
-    (tmp_path / "elsewhere").mkdir()
-    RecordStore(tmp_path / "elsewhere").save(first, msgspec.structs.replace(_trace(first), started_at="2020"))
-    other.write_bytes((tmp_path / "elsewhere/records/000001.trace.json.gz").read_bytes())
-    with pytest.raises(StorageError, match="belongs to the calibration of 2020"):
-        store.trace(entry)
-
-
 @pytest.mark.parametrize("damage", ["cut", "garbage", "empty", "bomb"])
 def test_a_damaged_trace_is_named(tmp_path: Path, damage: str) -> None:
     store = RecordStore(tmp_path)
@@ -251,21 +196,6 @@ def test_a_damaged_trace_is_named(tmp_path: Path, damage: str) -> None:
     assert entry.record == record
     with pytest.raises(StorageError, match=r"000001\.trace\.json\.gz: not a readable trace"):
         store.trace(entry)
-
-
-def test_the_record_is_kept_where_its_trace_cannot_be(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def refuse(path: Path, data: bytes) -> None:
-        if "trace" in path.name:
-            raise StorageError(f"{path}: cannot be written: No space left on device")
-        write_atomically(path, data)
-
-    monkeypatch.setattr(records_module, "write_atomically", refuse)
-    store, record = RecordStore(tmp_path), _record("good")
-    store.save(record, _trace(record))
-    assert store.history() == [record]
-    assert "No space left on device; the record is kept without it" in caplog.text
 
 
 def test_a_storage_directory_below_a_missing_folder_is_refused(tmp_path: Path) -> None:
@@ -297,12 +227,6 @@ def test_a_journal_that_cannot_be_understood_is_an_error_not_an_empty_one(tmp_pa
     (tmp_path / "journal.json").write_text("{")
     with pytest.raises(StorageError, match=r"journal\.json: cannot be used"):
         ChangeLog(tmp_path).journal.read()
-
-
-def test_removing_what_cannot_be_removed_is_said(tmp_path: Path) -> None:
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(StorageError, match="cannot be removed"):
-        remove_durably(tmp_path / "folder")
 
 
 def test_a_folder_that_cannot_be_written_is_found_out_before_it_matters(tmp_path: Path) -> None:

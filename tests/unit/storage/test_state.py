@@ -19,7 +19,7 @@ from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.learned import SIGNING_FILE, BiasStore, alignment_in, faces_in, signing_time_in
 from companion.storage.profiles import ProfileStore, read_profile
 from companion.storage.records import RecordStore
-from companion.storage.state import MOST_ASIDE, MOST_BYTES, BoundedList, StateFile, sealed, unsealed
+from companion.storage.state import MOST_BYTES, BoundedList, StateFile, sealed
 from companion.web.access import kept_token
 
 # A read of a FIFO that nobody writes to never ends.
@@ -115,21 +115,6 @@ def test_what_is_no_regular_file_is_not_even_opened(tmp_path: Path, what: str, m
         ChangeLog(tmp_path).journal.read()
 
 
-def test_a_file_that_becomes_a_fifo_just_then_hangs_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "journal.json"
-    path.write_bytes(b"{}")
-    real = os.open
-
-    def swapped(what: Any, *others: Any, **options: Any) -> int:
-        path.unlink()
-        os.mkfifo(path)
-        return real(what, *others, **options)
-
-    monkeypatch.setattr(os, "open", swapped)
-    with pytest.raises(StorageError, match="not a regular file"):
-        ChangeLog(tmp_path).journal.read()
-
-
 def test_no_more_is_read_than_may_be_there(tmp_path: Path) -> None:
     sparse(tmp_path / "journal.json")
     tracemalloc.start()
@@ -139,22 +124,6 @@ def test_no_more_is_read_than_may_be_there(tmp_path: Path) -> None:
         assert tracemalloc.get_traced_memory()[1] < 10_000_000
     finally:
         tracemalloc.stop()
-
-
-def test_a_file_that_may_not_be_read_is_set_aside_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "journal.json"
-    path.write_bytes(b"{}")
-    real = os.open
-
-    def denied(what: Any, *others: Any, **options: Any) -> int:
-        if Path(what) == path:
-            raise PermissionError(13, "Permission denied")
-        return real(what, *others, **options)
-
-    monkeypatch.setattr(os, "open", denied)
-    journal = ChangeLog(tmp_path).journal
-    assert journal.load() is None
-    assert journal.unusable == f"{path}: cannot be read: Permission denied; set aside as journal.json.unusable"
 
 
 def test_where_it_cannot_be_set_aside_it_is_named_and_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,20 +139,6 @@ def test_where_it_cannot_be_set_aside_it_is_named_and_not_used(tmp_path: Path, m
         assert journal.load() is None
         assert journal.unusable is not None
         assert journal.unusable.endswith("it cannot be set aside either")
-
-
-def test_a_few_are_kept_of_each_name(tmp_path: Path) -> None:
-    path = tmp_path / "journal.json"
-    for number in range(MOST_ASIDE + 3):
-        path.write_text(str(number))
-        assert ChangeLog(tmp_path).journal.load() is None
-    kept = {entry.name: entry.read_text() for entry in tmp_path.iterdir()}
-    # The first that went wrong tells most.
-    assert kept == {
-        "journal.json.unusable": "0",
-        "journal.json.unusable-2": "1",
-        "journal.json.unusable-3": str(MOST_ASIDE + 2),
-    }
 
 
 CHANGES = ChangeSet(1, (Changed("INS_GYROFFS_X", before=0.0015, after=0.001), Changed("INS_ACCOFFS_Z", 0.25, -0.5)))
@@ -225,37 +180,6 @@ def test_a_value_changed_by_hand_is_noticed_and_a_file_from_before_there_were_ch
     path.write_bytes(msgspec.json.encode(msgspec.to_builtins(CHANGES) | {"sha257": "0"}))
     with pytest.raises(StorageError, match="unknown field"):
         log.undo_of(1).read()
-
-
-def test_the_seal_is_of_any_layout() -> None:
-    for text in (b'{"a":1}', b'{"a": [1, {"b": 2}]}\n', b'{\n  "a": "}"\n}\n'):
-        whole = sealed(text)
-        assert json.loads(whole)["sha256"]
-        assert json.loads(unsealed(whole)) == json.loads(text)
-        assert unsealed(text) == text
-
-
-def test_a_list_from_before_there_were_checksums_goes_on(tmp_path: Path) -> None:
-    arming = ArmingRecord(
-        armed_at="2026-05-01T10:00:00+00:00",
-        state="checked",
-        reason="",
-        at_arm="warn",
-        calibration=None,
-        calibrated_ago_s=None,
-        confirmed_ago_s=1.0,
-        gyro_sigma_use_rad_s=None,
-        accel_sigma_use_m_s2=None,
-    )
-    path = tmp_path / "armings.json"
-    path.write_bytes(msgspec.json.encode([arming]))
-    kept = BoundedList(path, ArmingRecord, 2)
-    assert kept.read() == kept.all() == [arming]
-    later = msgspec.structs.replace(arming, armed_at="later")
-    kept.append(later)
-    kept.append(later)
-    assert kept.read() == kept.all() == [later, later]
-    assert json.loads(path.read_bytes())["sha256"]
 
 
 # --- what may be written to an autopilot

@@ -14,23 +14,15 @@ import sys
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
 import zxingcpp
 
 from companion.cli import main as companion
-from companion.errors import DaemonUnreachableError, StorageError
-from companion.estimation.noise.allan import PROFILES
-from companion.estimation.solution.by_temperature import by_temperature
-from companion.estimation.solution.prior import curve_of
-from companion.links.system import connection
-from companion.report.by_temperature import biases_by_temperature
+from companion.errors import StorageError
 from companion.web import access, app, listener, viewers
-from companion.web.server import Page
-from tests.support.histories import windows_of_days
-from tests.support.page import RECORD, Answer, Companion, Object, Viewer, Visit, page, parsed, until
+from tests.support.page import RECORD, Answer, Object, Viewer, Visit, page, until
 
 
 @pytest.fixture(autouse=True)
@@ -111,15 +103,6 @@ def test_a_name_that_was_turned_into_our_address_is_not(
             assert said.status == 421, (method, path)
             assert visit.page.access.token.encode() not in said.body
         assert visit.companion.asked == []
-
-    run(tmp_path, visitor)
-
-
-def test_a_request_with_two_hosts_or_none_is_refused(tmp_path: Path) -> None:
-    async def visitor(visit: Visit) -> None:
-        assert parsed(await visit.raw(b"GET / HTTP/1.1\r\n\r\n")).status == 400
-        twice = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: evil.example\r\n\r\n"
-        assert parsed(await visit.raw(twice)).status == 400
 
     run(tmp_path, visitor)
 
@@ -260,21 +243,6 @@ def test_who_sends_byte_by_byte_is_not_waited_for(tmp_path: Path, monkeypatch: p
     run(tmp_path, visitor)
 
 
-def test_whoever_says_nothing_for_longest_makes_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(listener, "MAX_CONNECTIONS", 3)
-
-    async def visitor(visit: Visit) -> None:
-        silent = [await visit.connect() for _ in range(3)]
-        assert (await visit.ask("GET", "/")).status == 200
-        async with asyncio.timeout(30.0):
-            with contextlib.suppress(ConnectionError):
-                assert await silent[0][0].read() == b""
-        for _, writer in silent:
-            writer.close()
-
-    run(tmp_path, visitor)
-
-
 def test_a_burst_of_silent_connections_leaves_no_descriptor_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -298,24 +266,6 @@ def test_a_burst_of_silent_connections_leaves_no_descriptor_open(
         run(tmp_path, visitor)
     finally:
         gc.enable()
-
-
-def test_whoever_looks_on_does_not_make_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(listener, "MAX_CONNECTIONS", 2)
-
-    async def visitor(visit: Visit) -> None:
-        viewer = await visit.view()
-        await viewer.head()
-        await viewer.event()
-        silent = [await visit.connect() for _ in range(4)]
-        assert (await visit.ask("POST", "/cancel", b"{}", **visit.good_headers)).status == 200
-        assert visit.page.status()["viewers"] == 1
-        for _ in range(3):
-            await viewer.event()
-        for _, writer in [*silent, (None, viewer.writer)]:
-            writer.close()
-
-    run(tmp_path, visitor)
 
 
 @pytest.mark.parametrize(
@@ -357,34 +307,6 @@ def test_the_state_comes_at_once_and_again_after_every_action(tmp_path: Path) ->
     run(tmp_path, visitor)
 
 
-def test_nobody_is_asked_for_a_status_that_nobody_looks_at(tmp_path: Path) -> None:
-    async def visitor(visit: Visit) -> None:
-        looks = 0
-
-        def status() -> Object:
-            nonlocal looks
-            looks += 1
-            return {}
-
-        visit.companion.status, visit.companion.every_s = status, 0.001
-        await asyncio.sleep(0.05)
-        assert looks == 0
-        viewer = await visit.view()
-        await viewer.begin()
-        await viewer.event()
-        viewer.writer.close()
-        await until(lambda: visit.page.status()["viewers"] == 0)
-        await asyncio.sleep(0.05)
-        before = looks
-        await asyncio.sleep(0.1)
-        assert looks == before
-        again = await visit.view()
-        await again.begin()
-        assert await again.event() == ("message", {})
-
-    run(tmp_path, visitor)
-
-
 def test_a_foreign_site_is_told_no_token(tmp_path: Path) -> None:
     async def visitor(visit: Visit) -> None:
         for headers in ({"Sec_Fetch_Site": "cross-site"}, {"Origin": "http://evil.example"}):
@@ -393,17 +315,6 @@ def test_a_foreign_site_is_told_no_token(tmp_path: Path) -> None:
             assert head.status == 403
             assert "access-control-allow-origin" not in head.headers
             assert visit.page.access.token.encode() not in await viewer.reader.read()
-
-    run(tmp_path, visitor)
-
-
-def test_too_many_viewers_are_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewers, "MAX_VIEWERS", 2)
-
-    async def visitor(visit: Visit) -> None:
-        for _ in range(2):
-            await (await visit.view()).begin()
-        assert await visit.refusal() == "2 are looking already; the token makes room: companion web-token, on the board"
 
     run(tmp_path, visitor)
 
@@ -473,47 +384,6 @@ def test_a_viewer_who_does_not_read_is_dropped_and_the_others_see_everything(tmp
     run(tmp_path, visitor)
 
 
-def test_a_companion_that_refuses_ends_neither_page_nor_viewer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewers, "AGAIN_S", 0.01)
-
-    async def visitor(visit: Visit) -> None:
-        refused = asyncio.Event()
-
-        def refusing() -> Object:
-            refused.set()
-            raise DaemonUnreachableError("no daemon answers")
-
-        visit.companion.status = refusing
-        viewer = await visit.view()
-        await viewer.begin()
-        async with asyncio.timeout(30.0):
-            await refused.wait()
-        visit.companion.status = lambda: {"well": True}
-        assert await viewer.event() == ("message", {"well": True})
-
-    run(tmp_path, visitor)
-
-
-def test_an_address_in_use_is_said_and_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection.Backoff, "next_s", lambda _: 0.02)
-
-    async def main() -> None:
-        companion = Companion()
-        other = await asyncio.start_server(lambda _r, w: w.close(), "127.0.0.1", 0)
-        served = Page(f"127.0.0.1:{other.sockets[0].getsockname()[1]}", tmp_path, companion.ask)
-        task = asyncio.create_task(served.run())
-        await until(lambda: "in use" in (served.problem or ""))
-        assert served.status()["url"] is None
-        other.close()
-        await other.wait_closed()
-        await until(lambda: served.problem is None)
-        assert (await Visit(served, companion).ask("GET", "/")).status == 200
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-
-    asyncio.run(main())
-
-
 def test_the_last_records_and_a_download(tmp_path: Path) -> None:
     async def visitor(visit: Visit) -> None:
         said = await visit.ask("GET", "/records.json")
@@ -525,20 +395,6 @@ def test_the_last_records_and_a_download(tmp_path: Path) -> None:
         assert download.headers["content-disposition"] == f'attachment; filename="{file}"'
         assert re.fullmatch(r"[\w.-]+\.json", file)
         assert (await visit.ask("GET", "/records/companion-1970.json")).status == 404
-
-    run(tmp_path, visitor)
-
-
-def test_the_plots_over_temperature_are_drawn_for_who_asks(tmp_path: Path) -> None:
-    points = windows_of_days(10)
-    imu = by_temperature("fc", points, curve_of(points, "gyro", PROFILES["icm42688p"].gyro), power_up=None)
-
-    async def visitor(visit: Visit) -> None:
-        visit.companion.imus = [msgspec.to_builtins(imu)]
-        said = await visit.ask("GET", "/temperature.html")
-        assert said.status == 200
-        assert said.headers["content-type"].startswith("text/html")
-        assert said.body.decode() == biases_by_temperature([imu])
 
     run(tmp_path, visitor)
 
@@ -659,17 +515,6 @@ def test_who_has_the_token_is_let_in_whoever_guesses_meanwhile(
     run(tmp_path, visitor, bind="0.0.0.0:0")
     assert caplog.text.count("wrong token from 127.0.0.1") == app.MAX_WAITING + 1
     assert "2" * 12 not in caplog.text
-
-
-def test_on_the_board_itself_an_old_token_is_no_guess(tmp_path: Path) -> None:
-    async def visitor(visit: Visit) -> None:
-        old = await visit.ask("POST", "/cancel", b"{}", **visit.good_headers | {"X_Companion_Token": "2" * 12})
-        assert (old.status, old.json["reason"]) == (403, "the page was restarted: try again")
-        none = await visit.ask("POST", "/cancel", b"{}", **visit.good_headers | {"X_Companion_Token": None})
-        assert none.status == 403
-        assert visit.page.status()["wrong_tokens"] == 0
-
-    run(tmp_path, visitor)
 
 
 @pytest.mark.parametrize(
