@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import msgspec
@@ -15,7 +11,6 @@ import pytest
 from companion import cli, config
 from companion.cli.client import stands_lines
 from companion.estimation.records.align_record import AlignmentRecord, GradienterSettings
-from companion.storage.learned import alignment_in
 
 CONFIG = '[mavlink]\nurl = "tcp:h:1"\n[[imu]]\nname = "a"\nsource = "autopilot"\n[control]\nsocket = "{}"\n'
 RECORD = AlignmentRecord(
@@ -66,31 +61,3 @@ def test_the_lines_for_the_configuration_hold_the_whole_offset() -> None:
     assert "    sigma_deg = 0.0125" in lines
     # 0.0125 deg of g.
     assert any("0.22 mg" in line for line in lines)
-
-
-KILLED = """
-import sys
-from pathlib import Path
-import msgspec
-from companion.storage.learned import alignment_in
-store = alignment_in(Path(sys.argv[1]))
-record = store.read()
-print("begun", flush=True)
-while True:
-    store.write(record)
-"""
-
-
-def test_kill_in_the_middle_of_writing_leaves_a_whole_record(tmp_path: Path) -> None:
-    store = alignment_in(tmp_path)
-    store.write(RECORD)
-    for _ in range(5):
-        writer = subprocess.Popen(
-            [sys.executable, "-c", KILLED, str(tmp_path)], stdout=subprocess.PIPE, env={**os.environ}
-        )
-        assert writer.stdout is not None
-        writer.stdout.readline()
-        writer.send_signal(signal.SIGKILL)
-        writer.wait()
-        writer.stdout.close()
-        assert store.read() == RECORD

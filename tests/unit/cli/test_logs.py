@@ -6,12 +6,10 @@ import io
 import logging
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from companion.links.system.logs import LimitedHandler
-
-Log = Callable[[str], None]
 
 
 class Clock:
@@ -45,19 +43,6 @@ def test_a_flood_is_counted_and_the_next_line_of_its_place_says_so() -> None:
     assert lines[-1].startswith("armed 6000 (after ")
     counts = [int(line.partition("(after ")[2].partition(" more")[0]) for line in lines[10:]]
     assert sum(counts) + len(lines) == 6001
-
-
-def test_one_flood_hides_nothing_else() -> None:
-    clock = Clock()
-    with log_on(clock) as (logger, stream):
-        for k in range(100):
-            logger.log(logging.WARNING if k == 70 else logging.INFO, "vehicle: %s", "lost" if k == 70 else "armed")
-            if k == 50:
-                logger.error("two autopilots")
-    text = stream.getvalue()
-    assert "two autopilots\n" in text
-    assert "vehicle: lost\n" in text
-    assert text.count("armed") == 10
 
 
 WITHOUT_DESCRIPTORS = """

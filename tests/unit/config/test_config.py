@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
 from companion.config import load, parse
-from companion.config.sections import Config, Profile
+from companion.config.sections import Config
 from companion.errors import ConfigError
-from companion.estimation.noise.allan import PROFILES
 
 GOOD = """
 [mavlink]
@@ -41,62 +39,10 @@ def test_the_smallest_file_and_its_defaults() -> None:
     assert config.mqtt is None
 
 
-def test_one_device_may_serve_several_sections() -> None:
-    parse(GOOD + HMR_TWICE.replace("BAUD", "19200"), "x.toml")
-    # What one section leaves open the other says.
-    parse(GOOD + HMR_TWICE.replace("baud = BAUD\n", ""), "x.toml")
-
-
 def test_the_autopilot_s_port_is_nobody_else_s() -> None:
     text = GOOD.replace("udpout:127.0.0.1:14550", "serial:/dev/ttyUSB0:115200") + SERIAL
     with pytest.raises(ConfigError, match=r"'mavlink.url': found '/dev/ttyUSB0', which imu\[1\].port has already"):
         parse(text, "x.toml")
-
-
-def test_a_full_file() -> None:
-    config = parse(
-        GOOD
-        + SERIAL
-        + """
-mounting = [180, 0, 90.5]
-profile = "bmi088"
-[vehicle]
-latitude_deg = 40
-longitude_deg = 116.5
-height_m = 50
-system_id = 7
-[gradienter]
-port = "tcp://127.0.0.1:4001"
-protocol = "inclinometer_xy"
-parity = "even"
-law = "axis"
-mounting = "ROTATION_YAW_90"
-offset_deg = [0.01, -0.02]
-sigma_deg = 0.01
-[compass]
-port = "/dev/ttyS1"
-protocol = "hmr3300"
-reference = "true"
-[calibration]
-target_gyro_sigma_deg_h = 3
-at_arm = "off"
-[control]
-socket = "/tmp/c.sock"
-[storage]
-directory = "/tmp/c"
-[mqtt]
-host = "localhost"
-[web]
-bind = "127.0.0.1:8080"
-""",
-        "x.toml",
-    )
-    assert config.imu[1].mounting == (180.0, 0.0, 90.5)
-    assert config.gradienter is not None
-    assert config.gradienter.offset_deg == (0.01, -0.02)
-    assert config.vehicle.latitude_deg == 40.0
-    assert config.control.path == Path("/tmp/c.sock")
-    assert config.storage.path == Path("/tmp/c")
 
 
 @pytest.mark.parametrize(
@@ -111,7 +57,6 @@ bind = "127.0.0.1:8080"
         ("[calibration]\nmin_still_s = true", ["min_still_s", "found true", "2 to 600"]),
         ("[calibration]\nmax_s = 5", ["calibration.max_s", "found 5", "min_still_s (10)"]),
         ("[storage]\nrecordings_mb = 3", ["storage.recordings_mb", "found 3", "0 (none) or at least 8"]),
-        ("[storage]\nrecordings_mb = -1", ["storage.recordings_mb", "found -1"]),
         ("[calibration]\ntarget_gyro_sigma_deg_h = 0", ["target_gyro_sigma_deg_h", "found 0", "above 0"]),
         ("[calibration]\nat_arm = 'always'", ["at_arm", "found 'always'", '"gate", "warn", "off"']),
         (
@@ -124,7 +69,6 @@ bind = "127.0.0.1:8080"
         ),
         (SERIAL.replace("own", "fc"), ["imu[1].name", "found 'fc'", "imu[0]", "a name of its own"]),
         (SERIAL + "mounting = 'ROTATION_YAW_91'", ["imu[1].mounting", "ROTATION_YAW_91", "did you mean"]),
-        (SERIAL + "mounting = [1, 2]", ["imu[1].mounting", "found [1, 2]", "[number, number, number]"]),
         (SERIAL + "mounting = [1, 2, inf]", ["imu[1].mounting", "inf", "finite"]),
         (SERIAL + SERIAL.replace("own", "other"), ["imu[2].port", "/dev/ttyUSB0", "imu[1].port", "a port of its own"]),
         (
@@ -162,15 +106,11 @@ bind = "127.0.0.1:8080"
             "[gradienter]\nport = '/dev/x'\nprotocol = 'inclinometer_xy'\nlaw = 'axis'\nmounting = 'ROTATION_ROLL_180'",
             ["gradienter.mounting", "ROTATION_ROLL_180", "upside down", "upright"],
         ),
-        ("[mqtt]\nhost = ''", ["mqtt.host", "found ''", "not empty"]),
         ("[mqtt]\nport = 1883", ["mqtt.host", "missing", "not empty"]),
         (MQTT + "prot = 1883", ["mqtt.prot", "did you mean 'port'"]),
         (MQTT + "port = 0", ["mqtt.port", "found 0", "1 to 65535"]),
         (MQTT + "keepalive_s = 1", ["mqtt.keepalive_s", "found 1", "5 to 600"]),
-        (MQTT + "tls = 'yes'", ["mqtt.tls", "found 'yes'", "true or false"]),
         (MQTT + "base_topic = 'field/#'", ["mqtt.base_topic", "found 'field/#'", "without + #"]),
-        (MQTT + "base_topic = '/field'", ["mqtt.base_topic", "words with / between them"]),
-        (MQTT + "base_topic = 'field station'", ["mqtt.base_topic", "found 'field station'"]),
         (MQTT + "client_id = 'a\\nb'".replace("'", '"'), ["mqtt.client_id", "printable"]),
         (MQTT + "password_file = '/etc/p'", ["mqtt.username", "missing", "needed by password_file"]),
         (MQTT + "username = 'u'\npassword_file = 'a/b'", ["mqtt.password_file", "begins with /", "credential"]),
@@ -200,57 +140,27 @@ def test_a_mistake_is_one_line_that_says_it_all(text: str, words: list[str]) -> 
         assert word in message
 
 
+@pytest.mark.parametrize("bind", ["192.168.4.1", "8191", ":8191", "::1:8191", "board.local:8191", "127.0.0.1:65536"])
+def test_what_is_no_address_of_a_page_is_refused(bind: str) -> None:
+    with pytest.raises(ConfigError, match=r"x\.toml: 'web\.bind': found .*allowed: ADDRESS:PORT, such as 127"):
+        parse(GOOD + f'[web]\nbind = "{bind}"\n', "x.toml")
+
+
 @pytest.mark.parametrize(
-    ("bind", "good"),
-    [
-        ("127.0.0.1:8191", True),
-        ("localhost:8191", True),
-        ("0.0.0.0:80", True),
-        ("[::1]:8191", True),
-        ("192.168.4.1", False),
-        ("8191", False),
-        (":8191", False),
-        ("::1:8191", False),
-        ("board.local:8191", False),
-        ("127.0.0.1:65536", False),
-        ("[127.0.0.1:1", False),
-        ("http://127.0.0.1:8191", False),
-    ],
+    "url", ["udpin:127.0.0.1:99999", "udpout:127.0.0.1:0", "serial:ttyUSB0:57600", "serial:/dev/x"]
 )
-def test_addresses_of_the_page(bind: str, good: bool) -> None:
-    text = GOOD + f'[web]\nbind = "{bind}"\n'
-    if good:
-        web = parse(text, "x.toml").web
+def test_what_is_no_mavlink_url_is_refused(url: str) -> None:
+    with pytest.raises(ConfigError, match=r"x\.toml: 'mavlink\.url': found .*allowed: udpin:HOST:PORT"):
+        parse(GOOD.replace("udpout:127.0.0.1:14550", url), "x.toml")
+
+
+def test_addresses_and_urls_are_taken_as_they_stand() -> None:
+    for bind in ("127.0.0.1:8191", "localhost:8191", "0.0.0.0:80", "[::1]:8191"):
+        web = parse(GOOD + f'[web]\nbind = "{bind}"\n', "x.toml").web
         assert web is not None
         assert web.bind == bind
-        return
-    with pytest.raises(ConfigError, match=r"x\.toml: 'web\.bind': found .*allowed: ADDRESS:PORT, such as 127"):
-        parse(text, "x.toml")
-
-
-@pytest.mark.parametrize(
-    ("url", "good"),
-    [
-        ("serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0:57600", True),
-        ("udpin:0.0.0.0:14550", True),
-        ("tcp:autopilot.local:5760", True),
-        ("udpin:127.0.0.1:99999", False),
-        ("udpout:127.0.0.1:0", False),
-        ("serial:ttyUSB0:57600", False),
-        ("serial:/dev/ttyUSB0", False),
-    ],
-)
-def test_mavlink_urls(url: str, good: bool) -> None:
-    text = GOOD.replace("udpout:127.0.0.1:14550", url)
-    if good:
-        assert parse(text, "x.toml").mavlink.url == url
-        return
-    with pytest.raises(ConfigError, match=r"x\.toml: 'mavlink\.url': found .*allowed: udpin:HOST:PORT"):
-        parse(text, "x.toml")
-
-
-def test_the_profiles_that_may_be_named_are_those_that_exist() -> None:
-    assert set(get_args(Profile)) == set(PROFILES)
+    for url in ("serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0:57600", "tcp:autopilot.local:5760"):
+        assert parse(GOOD.replace("udpout:127.0.0.1:14550", url), "x.toml").mavlink.url == url
 
 
 @pytest.mark.parametrize(

@@ -15,12 +15,10 @@ from companion.ground.link import GroundLink
 from tests.support.component import (
     ACCEPTED,
     CALIBRATE,
-    FAILED,
     UNDO,
-    Bench,
     bench,
 )
-from tests.support.ground_wire import COMPANION, StationOnTheWire, is_final
+from tests.support.ground_wire import COMPANION, StationOnTheWire
 from tests.support.virtual_time import run_virtual
 
 
@@ -42,28 +40,6 @@ def exchange(
     )
 
 
-def test_progress_is_shown_and_the_end_is_the_companions() -> None:
-    async def main() -> None:
-        station = StationOnTheWire()
-        async with bench(ground=station) as b:
-            shown: list[int] = []
-            one = exchange(station, CALIBRATE, 1.0, on_progress=lambda percent, silent_s: shown.append(percent))
-            asking = asyncio.create_task(one.run())
-            for percent in (10, 40, 95):
-                await asyncio.sleep(1.0)
-                b.service.jobs[0].progress_percent = percent
-            await asyncio.sleep(1.0)
-            b.service.jobs[0].finish("failed", "no")
-            assert await asking == Answer(FAILED, begun=True)
-            assert [percent for percent in (10, 40, 95) if percent in shown] == [10, 40, 95]
-            assert shown == sorted(shown)
-            assert station.confirmations == [0], "nothing was lost: nothing is to be repeated"
-            assert not station.on_ack
-            assert b.service.started[0].what.name == "GYROS"  # type: ignore[union-attr]
-
-    run_virtual(main())
-
-
 @pytest.mark.parametrize("block", range(4))
 def test_on_a_lossy_radio_one_press_is_one_calibration_and_its_end_is_heard(block: int) -> None:
     """Three of ten packets lost, each way. Where an answer and all repeats are lost, no end is claimed."""
@@ -80,76 +56,6 @@ def test_on_a_lossy_radio_one_press_is_one_calibration_and_its_end_is_heard(bloc
 
     ends = [run_virtual(main(seed)) for seed in range(block * 50, block * 50 + 50)]
     assert ends.count("heard") >= 47
-
-
-def test_the_final_ack_is_asked_for_again_when_it_got_lost() -> None:
-    async def main() -> None:
-        station = StationOnTheWire()
-        lost = 0
-
-        def first_two_finals(message: mavlink.MAVLink_message) -> bool:
-            nonlocal lost
-            lost += is_final(message)
-            return is_final(message) and lost <= 2
-
-        station.deaf_to = first_two_finals
-        async with bench(ground=station) as b:
-            b.service.takes_s = 3.0
-            assert await exchange(station).run() == Answer(ACCEPTED, begun=True)
-            assert len(b.service.started) == 1
-            assert station.confirmations == [0, 1, 2]
-
-    run_virtual(main())
-
-
-def test_nobody_answers() -> None:
-    async def main() -> None:
-        station = StationOnTheWire()
-        async with bench(ground=station) as b:
-            b.wire.cut = True
-            begun_s = asyncio.get_running_loop().time()
-            assert await exchange(station).run() == Answer(None, begun=False)
-            assert asyncio.get_running_loop().time() - begun_s <= 6.0
-            assert station.confirmations == [0, 1, 2, 3, 4]
-
-    run_virtual(main())
-
-
-def test_an_end_that_nobody_heard_is_noticed_by_the_heartbeat() -> None:
-    async def main() -> None:
-        station = StationOnTheWire()
-        station.deaf_to = is_final
-        async with bench(ground=station) as b:
-            b.service.takes_s = 3.0
-            b.service.mav_state = mavlink.MAV_STATE_STANDBY
-            begun_s = asyncio.get_running_loop().time()
-            assert await exchange(station).run() == Answer(None, begun=True)
-            assert asyncio.get_running_loop().time() - begun_s <= 3.0 + 8.0
-            assert len(b.service.started) == 1
-
-    run_virtual(main())
-
-
-async def _cut_for(b: Bench, seconds: float) -> None:
-    b.wire.cut = True
-    await asyncio.sleep(seconds)
-    b.wire.cut = False
-
-
-def test_a_link_that_stays_away_is_given_up() -> None:
-    async def main() -> None:
-        station = StationOnTheWire()
-        async with bench(ground=station) as b:
-            b.service.mav_state = mavlink.MAV_STATE_CALIBRATING
-            silence: list[float] = []
-            one = exchange(station, on_progress=lambda percent, silent_s: silence.append(silent_s))
-            asking = asyncio.create_task(one.run())
-            await asyncio.sleep(2.0)
-            b.wire.cut = True
-            assert await asking == Answer(None, begun=True)
-            assert 19.0 <= max(silence) <= 21.0, "and until then it is said for how long nothing has come"
-
-    run_virtual(main())
 
 
 def test_answers_to_others_and_of_others_are_not_ours() -> None:

@@ -38,15 +38,6 @@ def test_the_vehicle_as_its_heartbeats_show_it() -> None:
     assert heard.vehicle(1, 16.0) == Vehicle(1, "PX4", "unknown"), "that heartbeat says nothing about now"
 
 
-def test_work_is_seen_in_the_heartbeat_but_only_in_a_new_one() -> None:
-    heard = Heard(191)
-    beat(heard, 1, 191, system_status=4, now_s=10.0)
-    assert heard.busy(1, 9.0) is False
-    assert heard.busy(1, 10.0) is None
-    beat(heard, 1, 191, system_status=2, now_s=11.0)
-    assert heard.busy(1, 10.0) is True
-
-
 def test_lines_that_go_on_are_one_text() -> None:
     heard = Heard(191)
     say(heard, "Calibration failed: armed in the middle;")

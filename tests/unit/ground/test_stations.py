@@ -88,14 +88,6 @@ def test_mission_planners_script_asks_the_companion_for_what_was_chosen(
     assert judge(Command(Key(255, 190, int(command)), (x1, x2, x3, x4, x5, x6, x7), 0, b"")) == expected
 
 
-def test_mission_planners_script_says_how_it_ended(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for answer, words in ((True, "Done."), (False, "NOT done")):
-        _run_script(SCRIPT.read_text(), _MissionPlanner(answer=answer), monkeypatch)
-        assert words in capsys.readouterr().out
-
-
 def test_mission_planners_script_is_python_2_too() -> None:
     """IronPython is: no annotations, no f-strings, `print` with one argument only."""
     for node in ast.walk(ast.parse(SCRIPT.read_text())):

@@ -47,19 +47,6 @@ def test_a_value_that_changes_while_it_is_sent_is_sent_again() -> None:
     asyncio.run(main())
 
 
-def test_what_was_not_acknowledged_stays() -> None:
-    async def main() -> None:
-        box = Outbox()
-        box.opened()
-        box.answer("response", b"1", droppable=False)
-        assert (await box.next()).payload == b"1"
-        box.closed()
-        box.opened()
-        assert await drain(box) == [("response", b"1")]
-
-    asyncio.run(main())
-
-
 def test_a_flood_of_refusals_pushes_out_refusals_and_no_result() -> None:
     async def main() -> None:
         box = Outbox()
@@ -80,19 +67,6 @@ def test_a_flood_of_refusals_pushes_out_refusals_and_no_result() -> None:
     asyncio.run(main())
 
 
-def test_an_answer_dropped_on_its_way_does_not_take_the_next_one_with_it() -> None:
-    async def main() -> None:
-        box = Outbox()
-        box.answer("response", b"first", droppable=True)
-        on_its_way = await box.next()
-        for number in range(MAX_ANSWERS):
-            box.answer("response", b"%d" % number, droppable=True)
-        box.sent(on_its_way)
-        assert (await drain(box))[0] == ("response", b"0")
-
-    asyncio.run(main())
-
-
 def test_telemetry_is_only_for_now() -> None:
     async def main() -> None:
         box = Outbox()
@@ -107,22 +81,5 @@ def test_telemetry_is_only_for_now() -> None:
         box.pass_on("attitude", b"lost")
         box.closed()
         assert len(box) == 0
-
-    asyncio.run(main())
-
-
-def test_waiting_for_something_and_for_nothing() -> None:
-    async def main() -> None:
-        box = Outbox()
-        await box.emptied.wait()
-        waiting = asyncio.create_task(box.next())
-        await asyncio.sleep(0)
-        box.keep("status", b"online")
-        parcel = await waiting
-        emptied = asyncio.create_task(box.emptied.wait())
-        await asyncio.sleep(0)
-        assert not emptied.done()
-        box.sent(parcel)
-        await emptied
 
     asyncio.run(main())

@@ -170,19 +170,6 @@ def test_a_retained_request_is_reported_once_and_its_deletion_is_no_request() ->
     run_virtual(main())
 
 
-def test_the_end_answers_who_still_waits() -> None:
-    async def main() -> None:
-        daemon = Daemon()
-        await daemon.take(b'{"transaction": 1}')
-        closing = asyncio.create_task(daemon.requests.close(0.5))
-        await asyncio.sleep(0.1)
-        daemon.end.set()
-        await closing
-        assert daemon.states() == ["accepted", "done"]
-
-    run_virtual(main())
-
-
 @pytest.mark.parametrize(
     ("command", "payload", "words"),
     [
@@ -218,23 +205,6 @@ def test_a_request_that_is_none_gets_one_clear_reason(command: str, payload: byt
     assert len(problem) < 300
 
 
-def test_a_refusal_repeats_the_transaction() -> None:
-    found = parse("calibrate", b'{"transaction": "t", "wat": 1}')
-    assert found == Request("calibrate", "t", problem="unknown key \"wat\"; did you mean 'what'?")
-
-
 @pytest.mark.parametrize("payload", [b"", b"  \n", b"{}", b'{"transaction": null}'])
 def test_an_empty_request_is_one(payload: bytes) -> None:
     assert parse("calibrate", payload) == Request("calibrate", None, {})
-
-
-def test_strange_topics_are_left_alone() -> None:
-    async def main() -> None:
-        daemon = Daemon()
-        for command in ("", "a/b", "x" * 33, "\x00", "é"):
-            await daemon.take(b"", command)
-        assert daemon.responses == []
-        await daemon.take(b"", "Calibrate")
-        assert "unknown request 'Calibrate'" in daemon.responses[0][1]["reason"]
-
-    run_virtual(main())

@@ -52,15 +52,6 @@ def test_a_password_file_that_cannot_be_read(tmp_path: Path) -> None:
     assert read_password(Mqtt(host=HOST)) is None
 
 
-def test_a_password_file_of_somebody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(LinkError, match="may not be read by this user"):
-        read_password(of_file(tmp_path / "password"))
-
-
 def test_certificates_that_cannot_be_used(tmp_path: Path) -> None:
     authority = trustme.CA()
     ours, other = authority.issue_cert("companion"), authority.issue_cert("other")
@@ -122,8 +113,3 @@ def test_why_there_is_no_connection(error: Exception, user: str | None, words: s
     said = explain(error, Mqtt(host=HOST, username=user), "me", reached=False)
     assert words in said
     assert "\n" not in said
-
-
-def test_a_broker_that_stops_answering_is_no_wrong_port() -> None:
-    said = explain(aiomqtt.MqttError("Operation timed out"), Mqtt(host=HOST), "me", reached=True)
-    assert said == "the broker does not answer any more"

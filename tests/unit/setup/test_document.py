@@ -37,7 +37,6 @@ sigma_deg = 0.02
 host = "box"
 """
 TILT = FoundDevice("/dev/tilt", "inclinometer_xy", Line(9600, "even"), "gradienter")
-RION = FoundDevice("/dev/rion", "rion", Line(9600, "none"), "gradienter")
 
 
 def comments(text: str) -> list[str]:
@@ -93,17 +92,6 @@ def test_a_device_that_is_there_again_keeps_what_its_owner_has_said_of_it() -> N
     assert (found.parity, found.law, found.offset_deg, found.sigma_deg) == ("even", "slope", (0.1, -0.2), 0.02)
     assert 'law = "slope"      # measured in May\n' in draft.result()
     assert draft.guessed == set()
-
-
-def test_another_device_brings_nothing_of_the_one_before_it() -> None:
-    draft = Draft(OWN, is_new=False)
-    draft.take(RION)
-    found = parse(draft.result(), "f").gradienter
-    assert found is not None
-    assert (found.port, found.protocol, found.offset_deg, found.sigma_deg) == ("/dev/rion", "rion", (0.0, 0.0), None)
-    assert draft.guessed == {"gradienter.law"}
-    assert "# This one hangs upside down." in draft.result()
-    assert "[mqtt]" in draft.result()
 
 
 @pytest.mark.parametrize(

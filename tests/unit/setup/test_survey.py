@@ -8,11 +8,11 @@ import pytest
 
 from companion import cli, config
 from companion.links.serial.listening import Heard
-from companion.protocols.guess import Candidate, Line
+from companion.protocols.guess import Line
 from companion.protocols.heartbeat import Heartbeat
 from companion.setup import draft as drafting
 from companion.setup.draft import Draft
-from companion.setup.survey import FoundDevice, HeardUdp, Survey, same_url
+from companion.setup.survey import FoundDevice, HeardUdp, Survey
 from tests.unit.setup.test_document import OWN
 
 PX4, STATION = Heartbeat(1, 1, 2, 12), Heartbeat(255, 190, 6, 8)
@@ -55,21 +55,6 @@ def _nobody() -> HeardUdp:
     return HeardUdp(14550, (), 0, from_here=True)
 
 
-@pytest.mark.parametrize(
-    ("one", "other", "same"),
-    [
-        ("udpin:127.0.0.1:14550", "udpin:0.0.0.0:14550", True),
-        ("udpin:127.0.0.1:14550", "udpin:127.0.0.1:14551", False),
-        ("udpin:127.0.0.1:14550", "udpout:127.0.0.1:14550", False),
-        ("tcp:a:5760", "tcp:b:5760", False),
-        ("serial:/dev/x:57600", "serial:/dev/x:57600", True),
-        ("serial:/dev/x:57600", "serial:/dev/x:921600", False),
-    ],
-)
-def test_urls_are_compared_by_where_they_lead(one: str, other: str, same: bool) -> None:
-    assert same_url(one, other) is same
-
-
 def test_a_device_that_works_as_it_is_gets_no_further_keys() -> None:
     """A configuration that leaves the speed to the protocol stays as its owner wrote it."""
     draft = Draft(OWN, is_new=False)
@@ -79,18 +64,6 @@ def test_a_device_that_works_as_it_is_gets_no_further_keys() -> None:
     draft.take(FoundDevice("/dev/tilt", "inclinometer_xy", Line(2400, "none"), "gradienter"))
     assert "baud = 2400\n" in draft.result()
     assert "parity" not in draft.result()
-
-
-def test_of_two_devices_of_a_kind_both_are_told() -> None:
-    def heard(protocol: str) -> Heard:
-        return Heard(Line(9600, "none"), Candidate(protocol, ("gradienter",), 9, 0), None, 500)
-
-    found = Survey({"/dev/a": heard("inclinometer_xy"), "/dev/b": heard("jewell"), "/dev/c": SILENT}, {})
-    assert [str(one) for one in found.devices("gradienter")] == [
-        "inclinometer_xy: /dev/a, 9600 8N1",
-        "jewell: /dev/b, 9600 8N1",
-    ]
-    assert found.devices("imu") == []
 
 
 def test_the_old_file_is_kept_and_a_link_is_followed(tmp_path: Path) -> None:
