@@ -14,9 +14,6 @@ SECTION = r"\d+(?:\.\d+)*"
 GAP = r"\s+(?:# )?"
 """A citation may be wrapped, also in a comment."""
 CITATION = re.compile(rf"(?i)\b(method|autopilots|sensors){GAP}({SECTION}(?:(?:,| and| to|, and){GAP}{SECTION})*)")
-OTHER_FORM = re.compile(
-    rf"(?i)\b(?:method|autopilots|sensors)(?:\.md{GAP}|(?:\.md|'s|,)*{GAP}(?:sections?{GAP}|§ ?))\d"
-)
 
 
 def texts() -> Iterator[tuple[str, str]]:
@@ -59,12 +56,3 @@ def test_every_cited_section_exists() -> None:
     assert len(found) > 200, "the pattern no longer finds the citations"
     wrong = [f"{where}: {document} {section}" for where, document, section in found if section not in known[document]]
     assert wrong == [], "no such section in docs/reference"
-
-
-def test_every_citation_has_the_one_form() -> None:
-    wrong = [
-        f"{place(name, text, match.start())}: {match[0]}"
-        for name, text in texts()
-        for match in OTHER_FORM.finditer(text)
-    ]
-    assert wrong == [], 'write the document and the number only: "method 2.3"'

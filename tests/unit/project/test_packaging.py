@@ -20,7 +20,6 @@ import pytest
 from dockerfile_parse import DockerfileParser
 
 import companion
-from tests.support.installed import unit_environment
 
 PROJECT = Path(__file__).resolve().parents[3]
 DEB = PROJECT / "packaging/deb"
@@ -106,18 +105,6 @@ def test_the_maintainer_scripts_are_shell(script: str) -> None:
     subprocess.run(["/bin/sh", "-n", str(DEB / script)], check=True)
 
 
-@pytest.mark.parametrize("script", ["preinst", "postinst"])
-def test_a_step_that_dpkg_may_invent_is_let_pass(script: str, tmp_path: Path) -> None:
-    command = ["/bin/sh", str(DEB / script), "unheard-of"]
-    done = subprocess.run(command, env={"PATH": str(tmp_path)}, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-
-
-def test_nothing_of_its_owners_is_in_the_package() -> None:
-    # It would be overwritten by the next version; the configuration is written by `companion setup`.
-    assert re.findall(r'"(etc/[^"]+)"', (DEB / "build_deb.py").read_text()) == []
-
-
 # --- the extension for BlueOS
 
 
@@ -127,12 +114,6 @@ def dockerfile(**arguments: str) -> DockerfileParser:
 
 def labels(**arguments: str) -> dict[str, str]:
     return dict(dockerfile(**arguments).labels)
-
-
-def test_the_container_has_the_units_settings_of_the_c_library() -> None:
-    ours = {name: value for name, value in dockerfile().envs.items() if name.startswith("MALLOC_")}
-    assert ours == {name: value for name, value in unit_environment().items() if name.startswith("MALLOC_")}
-    assert ours
 
 
 def test_the_paths_of_the_dockerfile_are_there_and_let_into_the_build() -> None:

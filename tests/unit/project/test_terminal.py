@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import io
 import json
 import logging
 import re
@@ -22,13 +21,10 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.cli import main, monitor
-from companion.cli.show import finding_lines
 from companion.daemon.process.check import Finding
 from companion.errors import LinkError
 from companion.ground.heard import Heard, Target
-from companion.ground.station import Display
 from companion.links.serial.ports import Holder, SerialPort
-from companion.links.system import logs
 from companion.links.system.logs import JournalFormatter, OneLineFormatter
 from companion.printable import printable
 from tests.support.ground_wire import StationOnTheWire
@@ -159,15 +155,6 @@ def texts(value: Any) -> Iterator[str]:
             yield from texts(item)
 
 
-@pytest.mark.parametrize("words", [*COMMANDS, ["record"]])
-def test_why_the_daemon_refuses(
-    daemon: _Daemon, config: Path, capsys: pytest.CaptureFixture[str], words: list[str]
-) -> None:
-    daemon.replies = [{"kind": "error", "reason": f"refused by {EVIL}"}]
-    assert main(["-c", str(config), *words]) == 1
-    assert f"companion: refused by {SHOWN}\n" in clean(capsys.readouterr().err)
-
-
 def test_the_monitor_in_a_pipe(replies: dict[str, Object], capsys: pytest.CaptureFixture[str]) -> None:
     view = monitor._Lines()
     view.show(poisoned(replies["status"]["status"]))
@@ -227,18 +214,6 @@ def test_what_the_check_finds(
     assert clean(said) == f"the autopilot says {SHOWN}\n"
 
 
-def test_each_line_of_the_check_begins_with_its_verdict() -> None:
-    found = [
-        Finding("fc", good=True, words="it sends"),
-        Finding("own", good=False, words="silent", remedy="plug it in"),
-        Finding("compass", good=True, words="the name changes", remedy="set port"),
-        Finding("warning", good=True, words="INS_GYR_CAL = 1"),
-    ]
-    assert [line.split()[:2] for line in finding_lines(found)] == [
-        ["ok", "fc"], ["wrong", "own"], ["warning", "compass"], ["warning", "INS_GYR_CAL"],
-    ]  # fmt: skip
-
-
 @pytest.mark.real_clock
 @pytest.mark.parametrize("form", [[], ["--json"]])
 def test_what_is_heard_on_the_ground(
@@ -259,14 +234,6 @@ def test_what_is_heard_on_the_ground(
     out, said = capsys.readouterr()
     clean(out + said)
     assert not form or "owned" in out
-
-
-def test_the_bar_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stderr", to := io.StringIO())
-    display = Display()
-    display.text(EVIL)
-    display.progress(20, EVIL)
-    assert clean(to.getvalue()) == f"{SHOWN}\n[ 20 %] {SHOWN}\n"
 
 
 @pytest.mark.parametrize(
@@ -305,14 +272,6 @@ def test_what_is_logged_is_one_line(formatter: type[logging.Formatter]) -> None:
     assert record.getMessage() == f"heard {EVIL}", "others read it as it was"
     record.exc_info = trouble
     assert "Traceback" in clean(formatter("%(message)s").format(record))
-
-
-def test_the_daemons_log_is_one_line_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stderr", to := io.StringIO())
-    monkeypatch.setattr(logging.getLogger(), "handlers", [])
-    logs.set_up("warning")
-    logging.getLogger("companion").warning("heard %s", EVIL)
-    assert clean(to.getvalue()).endswith(f"WARNING heard {SHOWN}\n")
 
 
 @given(st.text())
