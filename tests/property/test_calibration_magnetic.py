@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -124,17 +123,6 @@ def test_a_clean_field_and_a_good_magnetometer_are_good_to_two_degrees(place: st
     assert all(not draw.solution.warnings for draw in draws), draws[0].solution.warnings
 
 
-def test_a_gradienter_that_is_not_trusted_leaves_the_dip_unknown() -> None:
-    # A degree of tilt is a degree of dip, behind which three times as much may hide.
-    where = at.local("Quito")
-    window = at.window(where, (0.0, 0.0, 40.0), np.zeros(3), at.compass())
-    bounds = []
-    for sigma_deg in (0.01, 1.0):
-        bounds.append(_solved(window, where, sigma_deg)[1].heading_bound_deg)
-    assert (bounds[0] or 9.0) < 1.5
-    assert bounds[1] == pytest.approx(3.04 / math.cos(19.9 * DEG), rel=0.15)
-
-
 def test_counts_without_a_unit_bound_by_their_direction_alone() -> None:
     random = np.random.default_rng(9)
     draws = [Drawn("Beijing", random, random.uniform(0.0, 0.05), at.compass(), unit="counts") for _ in range(400)]
@@ -191,20 +179,6 @@ def test_near_the_magnetic_pole_it_is_said_that_a_compass_shows_little_and_at_it
     assert "too near the magnetic pole for a compass: heading unknown, gyro sigma widened" in solution.warnings
 
 
-def test_a_vertical_field_is_said_to_show_nothing() -> None:
-    where = at.local("Munich")
-    window = at.window(where, (0.0, 0.0, 40.0), np.zeros(3), at.compass())
-    assert window.field is not None
-    upright = msgspec.structs.replace(window, field=msgspec.structs.replace(window.field, field=(0.0, 0.0, 0.5)))
-    solution, magnetic = _solved(upright, where)
-    assert (solution.pose.psi_deg, solution.pose.sigma_deg.psi, magnetic.heading_bound_deg) == (None, None, 180.0)
-    assert "compass field is vertical: no heading" in solution.warnings
-    assert any(words.endswith("heading useless; move away from iron") for words in solution.warnings)
-    # The gyros are calibrated as without a compass.
-    blind = solve(msgspec.structs.replace(window, heading=None), where, at.gradienter(), None, What.BOTH)
-    np.testing.assert_array_equal(solution.imus[0].covariance, blind.imus[0].covariance)
-
-
 def test_tilt_errors_and_heading_are_one_covariance() -> None:
     """Stated sigmas against the scatter of solutions under random tilt errors, with nothing else unknown."""
     known = at.local("Tromso")
@@ -232,20 +206,6 @@ def test_tilt_errors_and_heading_are_one_covariance() -> None:
     )
 
 
-def test_a_device_that_gives_both_is_compared_with_itself() -> None:
-    where = at.local("Beijing")
-    assert where.field is not None
-    window = at.window(
-        where, (3.0, -2.0, 40.0), np.zeros(3), at.compass(), device_heading_deg=40.0 - where.field.declination_deg + 5.0
-    )
-    solution, magnetic = _solved(window, where)
-    assert magnetic.heading_from == "device"
-    assert magnetic.device_minus_field_deg == pytest.approx(5.0, abs=0.01)
-    assert solution.pose.psi_deg == pytest.approx(45.0, abs=0.01)
-    assert (magnetic.heading_bound_deg or 0.0) >= 5.0
-    assert any("own heading is 5 deg off" in words for words in solution.warnings)
-
-
 def test_without_gradienter_strength_is_checked_but_nothing_bounded() -> None:
     where = at.local("Beijing")
     north = 0.05 * at.earth_field_ned(where)
@@ -256,24 +216,3 @@ def test_without_gradienter_strength_is_checked_but_nothing_bounded() -> None:
     assert solution.magnetic.inclination_deg is None
     assert solution.magnetic.field_gauss == pytest.approx(1.05 * _strength("Beijing"), rel=1e-4)
     assert "compass field 5 % above the Earth's: move away from iron" in solution.warnings
-
-
-def test_a_heading_alone_is_bounded_by_its_wandering_only() -> None:
-    where = at.local("Beijing")
-    window = at.window(where, (3.0, -2.0, 40.0), np.zeros(3), at.compass(), device_heading_deg=47.0)
-    assert window.heading is not None
-    for wander_deg, sigma_deg, warned in ((0.2, 1.0, False), (6.0, 6.0, True)):
-        heading = msgspec.structs.replace(window.heading, wander_deg=wander_deg)
-        alone = msgspec.structs.replace(window, field=None, heading=heading)
-        solution = solve(alone, where, at.gradienter(), at.compass(sigma_deg=1.0), What.BOTH)
-        assert solution.magnetic is not None
-        assert (solution.magnetic.heading_bound_deg, solution.magnetic.wander_deg) == (None, wander_deg)
-        assert solution.pose.sigma_deg.psi == pytest.approx(math.hypot(sigma_deg, where.declination_sigma_deg))
-        assert any("gyros do not" in words for words in solution.warnings) == warned
-
-
-def test_a_wrong_scale_is_told_from_iron() -> None:
-    where = at.local("Beijing")
-    window = at.window(where, (0.0, 0.0, 0.0), 2.0 * at.earth_field_ned(where), at.compass())
-    solution, _ = _solved(window, where)
-    assert any("wrong counts_per_gauss, or a magnet" in words for words in solution.warnings)

@@ -191,13 +191,6 @@ def test_on_a_deck_no_gyro_is_calibrated_without_a_heading() -> None:
     np.testing.assert_allclose(_vectors(_only(seeing))[0], np.full(3, 0.001), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("what", "gyros", "accels"), [(What.GYROS, True, False), (What.ACCELEROMETERS, False, True)])
-def test_only_what_was_asked_for(what: What, gyros: bool, accels: bool) -> None:
-    window, local = _window()
-    imu = _only(solve(window, local, _gradienter("slope"), _compass(), what))
-    assert (imu.gyro_rad_s is not None, imu.accel_m_s2 is not None) == (gyros, accels)
-
-
 def test_magnetic_heading_gets_the_declination() -> None:
     import datetime
 
@@ -206,20 +199,3 @@ def test_magnetic_heading_gets_the_declination() -> None:
     solution = solve(window, local_earth(here), _gradienter("slope"), _compass(magnetic=True), What.BOTH)
     assert solution.pose.psi_deg == pytest.approx(40.0, abs=0.05)
     assert solution.site.declination_deg == pytest.approx(-7.47, abs=0.05)
-
-
-def test_a_compass_mounted_backwards_and_on_its_side_of_a_tilted_aircraft() -> None:
-    ned_body = ned_from_body(20.0, -25.0, 310.0)
-    mounting = about(2, math.radians(170.0)) @ about(1, math.radians(10.0))
-    forward = ned_body @ mounting @ np.array([1.0, 0.0, 0.0])
-    window, local = _window(ned_body, heading_deg=math.degrees(math.atan2(forward[1], forward[0])))
-    solution = solve(window, local, _gradienter("slope"), _compass(mounting), What.BOTH)
-    assert solution.pose.psi_deg == pytest.approx(310.0, abs=1e-9)
-
-
-def test_readings_that_cannot_be_are_refused() -> None:
-    window, local = _window()
-    assert window.tilt is not None
-    absurd = msgspec.structs.replace(window, tilt=msgspec.structs.replace(window.tilt, x_deg=60.0, y_deg=50.0))
-    with pytest.raises(CalibrationRefusedError, match="cannot belong together"):
-        solve(absurd, local, _gradienter("axis"), _compass(), What.BOTH)

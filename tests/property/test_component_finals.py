@@ -26,7 +26,6 @@ from tests.support.component import (
     FAILED,
     IN_PROGRESS,
     PREFLIGHT,
-    TEMPORARILY_REJECTED,
     UNDO,
     UNSUPPORTED,
     Bench,
@@ -280,13 +279,3 @@ def test_garbage_between_the_packets_does_no_harm(garbage: list[bytes], seed: in
             assert len(b.ground.finals(CANCEL)) == before + 1
 
     run_virtual(main())
-
-
-def test_results_are_the_ones_of_the_protocol() -> None:
-    assert (ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED) == (
-        mavlink.MAV_RESULT_ACCEPTED,
-        mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
-        mavlink.MAV_RESULT_DENIED,
-        mavlink.MAV_RESULT_UNSUPPORTED,
-        mavlink.MAV_RESULT_FAILED,
-    )

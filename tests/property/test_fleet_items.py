@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import sqlite3
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import get_args
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from companion.config.sections import Location
 from companion.errors import StorageError
 from companion.mqtt import fleet_wire as wire
-from companion.storage.fleet_items import FILE, FleetItems, Item, Mark, SourceItems, Waiting
+from companion.storage.fleet_items import FILE, FleetItems, Item, Mark, SourceItems
 from tests.support.extent import extent
 from tests.support.fleet import CRANE, HERON
 
@@ -151,25 +148,6 @@ def test_it_stays_small_and_says_what_was_lost(tmp_path: Path) -> None:
     assert heron.last > 399
 
 
-def test_confirmed_ones_make_room_first(tmp_path: Path) -> None:
-    items = FleetItems(tmp_path, most_bytes=50_000)
-    for number in range(1, 31):
-        items.add(HERON, [entry(number, 1000)], AT)
-    epoch = items.aircraft()[0].epoch
-    items.confirm(HERON, epoch, [(10, 30)], AT)
-    for number in range(31, 50):
-        items.add(HERON, [entry(number, 1000)], AT)
-    assert [sequence for sequence, _ in told(items)] == [*range(1, 10), *range(31, 50)]
-    items.close()
-
-
-def test_what_lies_in_its_place_is_refused_in_one_line(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / FILE)
-    items = FleetItems(tmp_path)
-    with pytest.raises(StorageError, match=r"fleet\.sqlite: cannot be used: not a regular file"):
-        items.aircraft()
-
-
 def test_a_newer_one_is_left_alone(tmp_path: Path) -> None:
     items = FleetItems(tmp_path)
     items.add(HERON, [entry(1)], AT)
@@ -195,10 +173,3 @@ def test_any_bytes_from_the_wire_are_heeded_or_not_and_never_raise(payload: byte
     if said is not None:
         assert all(1 <= first <= last <= 2**53 for first, last in said.sequences)
         assert not said.names(0)
-
-
-@given(st.binary(max_size=300))
-def test_any_bytes_of_a_body_become_an_item(body: bytes) -> None:
-    waiting = Waiting(1, HERON, "0" * 16, 1, Item("event", AT, "unknown", body))
-    for location in get_args(Location):
-        json.loads(wire.item(waiting, location))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import re
-import struct
 from collections import Counter
 from collections.abc import Callable
 
@@ -31,7 +30,7 @@ from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDeco
 from companion.protocols.inclinometers.jewell import JewellDecoder
 from companion.protocols.inclinometers.rion import LONGEST as RION_LONGEST
 from companion.protocols.inclinometers.rion import RionDecoder
-from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
+from companion.samples import CompassSample, Sample, TiltSample
 from tests.support.decoders import MIP_BYTES, STIM300_BYTES, VECTORNAV_BYTES, XSENS_BYTES
 from tests.support.frames import (
     STIM_CONTENTS,
@@ -335,26 +334,6 @@ def test_a_good_frame_after_anything_is_found(kind: type[Decoder], data: st.Data
     assert samples[-1:] == alone
 
 
-@given(st.integers(0, 65535), st.integers(0, 2**32 - 1), triples, triples)
-def test_an_imu_line_is_read_as_it_was_written(
-    sequence: int, t_us: int, gyro: tuple[float, float, float], accel: tuple[float, float, float]
-) -> None:
-    (sample,) = ImuLineDecoder().feed(imu_line(sequence, t_us, gyro, accel), 0.0)
-    assert isinstance(sample, ImuSample)
-    assert sample.gyro_rad_s == tuple(round(x, 6) for x in gyro)
-    assert sample.accel_m_s2 == tuple(round(x, 4) for x in accel)
-    assert (sample.sequence, sample.t_device_s) == (sequence, t_us / 1e6)
-
-
-@given(st.integers(0, 2**64 - 1), triples, triples, finite)
-def test_a_binary_frame_is_read_as_it_was_written(
-    time_ns: int, gyro: tuple[float, float, float], accel: tuple[float, float, float], temperature: float
-) -> None:
-    (sample,) = VectorNavDecoder().feed(vectornav_imu(time_ns, gyro, accel, temperature), 0.0)
-    assert sample == ImuSample(0.0, gyro, accel, temperature, None, time_ns / 1e9)
-    assert struct.pack("<3f", *gyro) == floats(*sample.gyro_rad_s)
-
-
 @given(st.lists(st.tuples(st.sampled_from("XYxG"), thousandths), max_size=30))
 def test_only_an_x_and_the_y_right_after_it_make_a_reading(lines: list[tuple[str, float]]) -> None:
     """Against a plain reading of the rule with a regular expression over the axes."""
@@ -367,23 +346,3 @@ def test_only_an_x_and_the_y_right_after_it_make_a_reading(lines: list[tuple[str
     unpaired = Counter(axes.replace("XY", ""))
     waiting = int(axes.endswith("X"))
     assert decoder.rejected.total() == unpaired.total() - waiting
-
-
-@given(st.integers(0, 35999), st.integers(-9000, 9000), st.integers(-9000, 9000))
-def test_an_angle_in_digits_is_read_as_it_was_written(heading: int, pitch: int, roll: int) -> None:
-    (sample,) = RionDecoder().feed(rion_angles(pitch / 100, roll / 100, heading / 100), 0.0)
-    assert sample == CompassSample(0.0, heading / 100, pitch / 100, roll / 100)
-
-
-@given(st.permutations([5, 7, 8, 9, 21, 24, 25, 27, 28, 29, 79]), st.floats(0, 359.5, width=32), finite, finite)
-def test_components_are_read_in_whatever_order_they_come(
-    order: list[int], heading: float, pitch: float, roll: float
-) -> None:
-    value = {5: heading, 24: pitch, 25: roll, 7: 20.5, 21: 0.5, 27: 12.5, 28: -25.0, 29: 50.0}
-    flag = {8: b"\0", 9: b"\1", 79: b"\1"}
-    frame = pni_data([(part, value[part] if part in value else flag[part]) for part in order])
-    samples = PniDecoder().feed(frame, 0.0)
-    if any(0.0 < abs(angle) < 1e-6 for angle in (heading, pitch, roll)):
-        assert samples == []  # no device prints so little: it is a float of the other byte order
-        return
-    assert samples == [CompassSample(0.0, heading, pitch, roll), MagSample(0.0, (0.125, -0.25, 0.5))]

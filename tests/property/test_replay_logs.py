@@ -58,7 +58,7 @@ def no_constant(word: str) -> float:
 
 
 COMMANDS = [
-    ["replay", "--latitude-deg", "40", "--longitude-deg", "116"],
+    ["replay", "--latitude-deg", "40", "--height-m", "50"],
     ["replay", "--pitch-deg", "0", "--roll-deg", "0", "--rate", "20"],
     ["replay", "--windows", "10"],
     ["profile"],
