@@ -32,7 +32,7 @@ from companion.links.mavlink.link import MavlinkLink
 from companion.protocols.registry import Kind
 from companion.samples import ImuSample
 from companion.storage.learned import BiasStore, KnownImu
-from tests import bench_attitude, bench_daemon, bench_replay, bench_start
+from tests import bench_daemon, bench_replay, bench_start
 from tests.support.component import ScriptedGate
 from tests.support.decoders import make_decoder
 from tests.support.frames import (
@@ -186,7 +186,6 @@ def main() -> None:
         f"biases of two years of three IMUs ({size} bytes) are read in {1e3 * read_s:.2f} ms,"
         f" {read_s / loads_s:.2f} x json.loads"
     )
-    bench_attitude.table()
     bench_start.main()
     bench_replay.main()
     bench_daemon.table(1, bench_daemon.TABLE_S, "vectornav")

@@ -106,9 +106,9 @@ class Tab:
         x, y = await self.middle(selector)
         await self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
-    async def picture(self, path: Path, *, whole: bool = False) -> None:
-        """A PNG of what is seen, or of the whole page."""
-        reply = await self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
+    async def picture(self, path: Path) -> None:
+        """Save a PNG of what is seen."""
+        reply = await self.call("Page.captureScreenshot", format="png")
         path.write_bytes(base64.b64decode(reply["data"]))  # noqa: ASYNC240 - a local file
 
 

@@ -36,9 +36,9 @@ def compass_frame(number: int) -> bytes:
     return f"12{number % 3}.4, 18.{number % 10}, -0.5\r\n".encode()
 
 
-def imu_frame(number: int, *, seconds: float | None = None, rate: str | None = None) -> bytes:
-    """An `$IMU` line; at 50 Hz by its own clock unless told otherwise."""
-    t_us = round((number / 50.0 if seconds is None else seconds) * 1e6) % 2**32
+def imu_frame(number: int, *, rate: str | None = None) -> bytes:
+    """An `$IMU` line; at 50 Hz by its own clock."""
+    t_us = round(number / 50.0 * 1e6) % 2**32
     x = f"{1e-4 * (number % 13):.6f}" if rate is None else rate
     return nmea(f"IMU,{number % 65536},{t_us},{x},0.0,0.0,0.01,0.02,-9.8,25.0")
 

@@ -235,7 +235,6 @@ def stim300(
     gyro: tuple[int, ...] = (1 << 14, -2 << 14, 1 << 13),
     accel: tuple[int, ...] = (0, 0, 1 << 19),
     inclination: tuple[int, ...] = (0, 0, 1 << 22),
-    temperatures: tuple[int, ...] = (25 * 256, 30 * 256, 35 * 256),
     status: dict[str, int] | None = None,
     counter: int = 225,
     latency_us: int = 0,
@@ -247,7 +246,7 @@ def stim300(
     for letter in clusters:
         body += int24(*{"r": gyro, "a": accel, "i": inclination}[letter]) + bytes([said.get(letter, 0)])
     if "t" in contents:
-        for _, degrees in zip(clusters, temperatures, strict=False):
+        for _, degrees in zip(clusters, (25 * 256, 30 * 256, 35 * 256), strict=False):
             body += struct.pack(">3h", degrees, degrees, degrees) + bytes([said.get("t", 0)])
     if "x" in contents:
         body += int24(-5) + b"\0"

@@ -194,14 +194,14 @@ def gyro_deg_h_at(degc: float) -> Array:
     return np.array([100.0, -50.0, 0.0]) + np.array(SLOPES_DEG_H_K) * (degc - 20.0)
 
 
-def windows_of_days(days: int, windows: int = 3, *, first_degc: float = 8.0, step_k: float = 3.0) -> list[Point]:
+def windows_of_days(days: int, windows: int = 3, *, step_k: float = 3.0) -> list[Point]:
     """One power-up a day, each somewhat warmer than that before, of a gyro that follows a line."""
     random, found = np.random.default_rng(2), []
     for day in range(days):
         power_up = PowerUp(host=f"boot {day}", since_unix_s=1.78e9 + 86400.0 * day)
         offset = random.normal(0.0, OFFSET_DEG_H, 3)
         for k in range(windows):
-            degc = first_degc + step_k * day + 1.5 * k
+            degc = 8.0 + step_k * day + 1.5 * k
             gyro = _measured((gyro_deg_h_at(degc) + offset) * DEG_H, 2.0 * DEG_H)
             found.append(
                 Point(

@@ -24,7 +24,6 @@ CALIBRATE = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
 ARM = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
 INTERVAL = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
 REQUEST = mavlink.MAV_CMD_REQUEST_MESSAGE
-REBOOT = mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS = range(6)
 LATEST_S = 1.2
 """After this every consumer has looked at a change."""
@@ -37,7 +36,7 @@ def now_s() -> float:
 class PX4Stage:
     """The companion is 1/191 on TELEM2, the ground station 255/190 on TELEM1. Rivals are off unless asked for."""
 
-    def __init__(self, *, rivals: bool = False, ground_heartbeat: bool = True, **options: Any) -> None:
+    def __init__(self, *, rivals: bool = False, **options: Any) -> None:
         self.aircraft: VirtualAircraft = options.pop("aircraft", None) or VirtualAircraft(POSE)
         spec, count = options.pop("spec", "perfect"), options.pop("imus", 1)
         gyro, accel = options.pop("gyro_bias", GYRO_BIAS), options.pop("accel_bias", ACCEL_BIAS)
@@ -51,7 +50,6 @@ class PX4Stage:
         self.companion, self.ground = Station(1, 191), Station(255, 190)
         self.companion_wire = Wire(self.companion, self.double, seed=1)
         Wire(self.ground, self.double.ground, seed=2)
-        self._ground_heartbeat = ground_heartbeat
         self._tasks: list[asyncio.Task[None]] = []
 
     async def __aenter__(self) -> Self:
@@ -69,8 +67,7 @@ class PX4Stage:
     async def _heartbeats(self) -> None:
         while True:
             self.companion.heartbeat()
-            if self._ground_heartbeat:
-                self.ground.heartbeat(mavlink.MAV_TYPE_GCS)
+            self.ground.heartbeat(mavlink.MAV_TYPE_GCS)
             await asyncio.sleep(1.0)
 
     async def set(self, name: str, value: float) -> None:

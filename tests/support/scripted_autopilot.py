@@ -39,12 +39,11 @@ class ScriptedAutopilot:
         autopilot: int = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
         kind: int = mavlink.MAV_TYPE_QUADROTOR,
         parameters: dict[str, float] | None = None,
-        heartbeat_s: float = 1.0,
         param_errors: bool = True,
     ) -> None:
         self.autopilot, self.kind = autopilot, kind
         self.parameters = {name: f32(value) for name, value in (parameters or {}).items()}
-        self.heartbeat_s = heartbeat_s
+        self.heartbeat_s = 1.0
         self.param_errors = param_errors
         self.armed = False
         self.beating = True
@@ -66,7 +65,6 @@ class ScriptedAutopilot:
         self.imu_temperature_cdegc = 2715
         self.highres_id = 0
         self.intervals: dict[int, float] = {}
-        self.answered_reads = 0
         self._boot_s = 0.0
         self._codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
         self._codec.robust_parsing = True
@@ -155,7 +153,6 @@ class ScriptedAutopilot:
         if message.get_type() == "PARAM_REQUEST_READ":
             name = message.param_id if message.param_index < 0 else next(iter(self.parameters))
             if name in self.parameters:
-                self.answered_reads += 1
                 kind, index = mavlink.MAV_PARAM_TYPE_REAL32, 0 if message.param_index == 0 else 65535
                 value = self.parameters[name]
                 self.send(mavlink.MAVLink_param_value_message(name.encode(), value, kind, 1362, index))

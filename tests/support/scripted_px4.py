@@ -53,7 +53,6 @@ class ScriptedPx4(ScriptedAutopilot):
         self.devices, self.capabilities = devices, capabilities
         self.raw = [(np.array([0.001, -0.0006, 0.0015]), np.array([0.1, -0.2, -9.8])) for _ in devices]
         self.used: dict[tuple[str, int], np.ndarray] = {}
-        self.updates = 0
         self.noise: tuple[float, float] = (0.0004, 0.005)
         self.wrong_types: list[str] = []
         self._random = np.random.default_rng(5)
@@ -72,7 +71,6 @@ class ScriptedPx4(ScriptedAutopilot):
     def _handle(self, message: Any) -> None:
         kind = message.get_type()
         if kind == "PARAM_REQUEST_READ" and message.param_index < 0 and message.param_id in self.parameters:
-            self.answered_reads += 1
             self.value(message.param_id)
         elif kind == "COMMAND_LONG" and message.command == 512 and int(message.param1) == 0:
             self.beat()
@@ -133,7 +131,6 @@ class ScriptedPx4(ScriptedAutopilot):
 
     def load(self, *, boot: bool = False) -> None:
         """Take parameters into use as PX4 does: a vector within 0.01 of the one in use is ignored."""
-        self.updates += 1
         if boot:
             self.used.clear()
         for sensor in ("GYRO", "ACC"):
