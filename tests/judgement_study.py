@@ -33,14 +33,6 @@ FAULTS: Final = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Part:
-    """One IMU: its power-ups."""
-
-    history: History
-    model: Scatter | None = None
-
-
 def fly(dice: np.random.Generator, n: int, fault: str = "", since: int = 0, column: int = 0) -> History:
     """One IMU over `n` power-ups; from `since` on with a fault of one column."""
     own = TURN_ON * np.exp(dice.normal(0.0, 0.25, 6))

@@ -11,6 +11,7 @@ import contextlib
 import datetime
 import json
 import random
+import subprocess
 import sys
 import tempfile
 import time
@@ -38,7 +39,6 @@ from tests.support.collecting import (
     until_confirmed,
 )
 from tests.support.postgres import Postgres, postgres
-from tests.support.small_disk import small_disk
 
 Kind = Literal["sqlite", "postgresql"]
 KINDS: tuple[Kind, ...] = ("sqlite", "postgresql")
@@ -239,9 +239,23 @@ async def _collected(scene: Scene) -> AsyncIterator[None]:
 
 
 @contextlib.contextmanager
+def _small_disk(size_mb: int) -> Iterator[Path | None]:
+    """Mount a file system of that size, to be filled; None: this user may not mount one."""
+    with tempfile.TemporaryDirectory(prefix="companion-small-") as folder:
+        mount = ["mount", "-t", "tmpfs", "-o", f"size={size_mb}m", "tmpfs", folder]
+        if subprocess.run(mount, check=False, capture_output=True).returncode != 0:
+            yield None
+            return
+        try:
+            yield Path(folder)
+        finally:
+            subprocess.run(["umount", folder], check=True)
+
+
+@contextlib.contextmanager
 def _on_small_disk(kind: Kind, server: Postgres | None) -> Iterator[tuple[Path, str]]:
     """A small file system, and the address of a new database on it."""
-    with small_disk(ROOM_MB[kind]) as folder:
+    with _small_disk(ROOM_MB[kind]) as folder:
         if folder is None:
             raise NotApplicableError(NO_MOUNTS)
         if kind == "sqlite":

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 from companion.estimation.records.flight_record import (
     AXES,
     Drift,
@@ -25,14 +23,9 @@ SIGMA = (12.0, 12.0, 12.0, 0.6)
 DRIFTS = {"flown": (0.4, 2.1, 9.5), "before": (6.0, 31.0, 160.0)}
 
 
-def imu_flight(
-    number: int = 1,
-    *,
-    step: Sequence[float] = STEP,
-    drifts: Mapping[str, tuple[float, ...]] = DRIFTS,
-) -> ImuFlight:
-    """One that stood for 30 s and then flew."""
-    figures = list(zip(LEFT, step, UNITS, strict=True))
+def _imu_flight() -> ImuFlight:
+    """Make the flight of an IMU that stood for 30 s and then flew."""
+    figures = list(zip(LEFT, STEP, UNITS, strict=True))
 
     axes = tuple(
         Split(
@@ -49,21 +42,18 @@ def imu_flight(
     )
     drift = {
         name: [Drift(seconds, 150, m, 2.4 * m) for seconds, m in zip((10.0, 30.0, 60.0), each, strict=False)]
-        for name, each in drifts.items()
+        for name, each in DRIFTS.items()
     }
     return ImuFlight(
-        imu=number, rate_hz=400.0, calibration="2026-11-23T06:12:13.000+00:00", gyro_id=2752772, accel_id=2753028,
+        imu=1, rate_hz=400.0, calibration="2026-11-23T06:12:13.000+00:00", gyro_id=2752772, accel_id=2753028,
         set_gyro_rad_s=(0.001,) * 3, set_accel_m_s2=(0.02,) * 3, axes=axes, drift=drift, notes=(),
     )  # fmt: skip
 
 
-def kept_flight(
-    key: str = "1", *imus: ImuFlight, began_at: str | None = "2026-11-23T08:00:46+00:00", system_id: int | None = 1
-) -> KeptFlight:
-    """One of an aircraft with one IMU."""
-    stages = Stages(64.0, 65.0, 67.0, 240.0, 242.0)
+def kept_flight(key: str = "1") -> KeptFlight:
+    """Make a flight of an aircraft with one IMU."""
     flight = Flight(
-        key=key, system_id=system_id, began_at=began_at, stages=stages, reference="ekf", notes=(),
-        imus=imus or (imu_flight(),),
+        key=key, system_id=1, began_at="2026-11-23T08:00:46+00:00", stages=Stages(64.0, 65.0, 67.0, 240.0, 242.0),
+        reference="ekf", notes=(), imus=(_imu_flight(),),
     )  # fmt: skip
     return KeptFlight(log="00000012.BIN", read_at="2026-11-23T09:10:11+00:00", flight=flight)

@@ -59,7 +59,7 @@ class UsbTree:
         self._node(place, "usb", uevent, **attributes)
         return place
 
-    def serial_port(self, device: str, name: str, *, driver: str, interface: str = "00", number: int = 0) -> None:
+    def serial_port(self, device: str, name: str, *, driver: str, interface: str = "00") -> None:
         """A port of a device: ttyUSB behind a bridge, ttyACM on the interface itself."""
         socket = device.rpartition("/")[2]
         here = f"{device}/{socket}:1.{int(interface)}"
@@ -68,7 +68,7 @@ class UsbTree:
         self._node(here, "usb", uevent, **numbers, bInterfaceProtocol="ff")
         if name.startswith("ttyUSB"):
             here += f"/{name}"
-            self._node(here, "usb-serial", {"DRIVER": driver}, port_number=str(number), latency_timer="16")
+            self._node(here, "usb-serial", {"DRIVER": driver}, port_number="0", latency_timer="16")
         major, minor = (188 if "USB" in name else 166), re.sub(r"\D", "", name)
         node = f"{here}/tty/{name}"
         self._node(node, "tty", {"MAJOR": str(major), "MINOR": minor, "DEVNAME": name}, dev=f"{major}:{minor}")
@@ -76,7 +76,7 @@ class UsbTree:
         self._link(f"sys/class/tty/{name}", node)
         (self.root / f"dev/{name}").touch()
         path = f"platform-soc-usb-0:{socket.partition('-')[2]}:1.{int(interface)}"
-        path += f"-port{number}" if name.startswith("ttyUSB") else ""
+        path += "-port0" if name.startswith("ttyUSB") else ""
         (self.root / f"dev/serial/by-path/{path}").symlink_to(f"../../{name}")
 
     def links(self, rules: Path, name: str) -> tuple[set[str], dict[str, str], str]:

@@ -57,5 +57,9 @@ def test_a_residual_is_judged_by_how_well_it_is_known(residual_deg_h: float, *, 
     assert is_left(residual_deg_h) is left
 
 
+def test_what_is_known_no_better_than_the_next_minutes_is_left() -> None:
+    assert is_left(33.0, estimated_deg_h=17.0)
+
+
 def test_offsets_that_the_last_calibration_has_not_written_are_replaced() -> None:
     assert not is_left(0.0, written_rad_s=2e-3)

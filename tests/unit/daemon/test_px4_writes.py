@@ -185,6 +185,24 @@ def test_where_every_slot_is_somebodys_a_write_without_effect_is_not_tried_on_an
     run_virtual(main())
 
 
+def test_over_a_restart_nothing_is_concluded(tmp_path: Path) -> None:
+    """It starts with what it has stored: neither who moved nor who did not says whose slot that is."""
+    px4 = DeafPx4(devices=(ICM,))
+    px4.parameters |= {"CAL_GYRO1_ID": BMI, "CAL_ACC1_ID": BMI}  # a stranger, so that the first might be one too
+
+    async def main() -> None:
+        async with aboard(px4, tmp_path) as stage:
+            found = await stage.read(1)
+            async with stage.writes.standing_by([(found, small_changes(found), (0.0, 0.0, 0.0))]) as probe:
+                assert probe is not None
+                probe.mark("CAL_GYRO0_ZOFF")
+                stage.client.vehicle.boots += 1
+                assert await probe.verify("CAL_GYRO0_ZOFF") is None
+            assert stage.memory.known("gyro", ICM) is None
+
+    run_virtual(main())
+
+
 def test_old_values_that_are_back_are_in_use(tmp_path: Path) -> None:
     px4 = ScriptedPx4(devices=(ICM, BMI))
 

@@ -21,7 +21,7 @@ from companion.errors import StorageError
 from companion.links.mavlink import signing as link_signing
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import EPOCH_S, TICKS_PER_S, SigningClock
-from companion.storage.learned import SIGNING_FILE, SigningTime, signing_time_in
+from companion.storage.learned import SIGNING_FILE, SigningTime, signing_time_in, this_boot
 from companion.storage.state import StateFile
 from tests.support.rig import inline
 from tests.support.virtual_time import run_virtual
@@ -189,3 +189,12 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(
     assert [record.getMessage() for record in caplog.records] == [
         "mavlink signing: after a restart its time may go back: disk full"
     ]
+
+
+def test_the_unit_hands_the_boot_id_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = this_boot()
+    assert len(own) == 32
+    monkeypatch.setenv("COMPANION_BOOT_ID", "0" * 32)
+    assert this_boot() == "0" * 32
+    unit = Path("systemd/companion.service").read_text(encoding="utf-8")
+    assert "Environment=COMPANION_BOOT_ID=%b\n" in unit

@@ -1,4 +1,4 @@
-"""The state table: what must be possible from everywhere, and that the diagram in the documentation is this table."""
+"""The state table: what must be possible from everywhere."""
 
 from __future__ import annotations
 
@@ -43,14 +43,3 @@ def test_nothing_counts_as_right_from_the_first_write_until_it_is_concluded() ->
 def test_an_event_out_of_place_is_a_programs_fault() -> None:
     with pytest.raises(IllegalEventError, match="VERIFIED cannot happen while idle"):
         Machine().on(Event.VERIFIED)
-
-
-def diagram() -> str:
-    """Give the diagram without what the words below it say: faults, cancels, and requests after the first one."""
-    lines = ["stateDiagram-v2", "    [*] --> idle"]
-    lines += [
-        f"    {old.value} --> {new.value}: {event.value}"
-        for (old, event), new in TRANSITIONS.items()
-        if event not in (Event.FAULT, Event.CANCEL) and (old not in RESTING or old is State.IDLE)
-    ]
-    return "\n".join(lines) + "\n"

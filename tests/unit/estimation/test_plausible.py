@@ -77,18 +77,18 @@ def test_the_unit_of_gravity_is_known_by_its_size() -> None:
 # ------------------------------------------------------------------------------------------------ through the commands
 
 
-def log(tmp_path: Path, turn: Array, seconds: float = 20.0, scale: float = 1.0, pose: Pose | None = None) -> Path:
-    """A still ADIS16470 whose axes are turned, or whose forces are in another unit."""
+def log(tmp_path: Path, turn: Array) -> Path:
+    """Write 20 s of a still ADIS16470 whose axes are turned."""
     model = ImuModel(
-        VirtualAircraft(pose or Pose(5.0, -3.0, 40.0), site_at(40.0, 116.0, 50.0)),
+        VirtualAircraft(Pose(5.0, -3.0, 40.0), site_at(40.0, 116.0, 50.0)),
         "adis16470",
         seed=2,
         gyro_bias_rad_s=[100.0 * DEG_H, -60.0 * DEG_H, 30.0 * DEG_H],
         accel_bias_m_s2=[2.0 * MG, -3.0 * MG, 1.0 * MG],
     )
-    times = 3.0 + np.arange(round(seconds * 100.0)) / 100.0
+    times = 3.0 + np.arange(2000) / 100.0
     rows = model.read(times, 0.01)
-    data = np.column_stack([times, rows[:, :3] @ turn.T, rows[:, 3:] @ turn.T * scale])
+    data = np.column_stack([times, rows[:, :3] @ turn.T, rows[:, 3:] @ turn.T])
     path = tmp_path / "log.csv"
     path.write_text(
         "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n"

@@ -173,6 +173,21 @@ def test_reset_forgets_one_imu_or_all_and_the_stretch() -> None:
     assert nose.gyro_rad_s[0] == pytest.approx(BIAS[0], abs=0.02 * DEG)
 
 
+def test_another_stream_is_not_mixed_with_the_old_one() -> None:
+    feed = feeder(SILENT)
+    feed.run(20.0)
+    feed.collector.set_imu(imu("fc", gyro_step_rad_s=1e-3, accel_step_m_s2=1e-3 * 9.80665, truncates=True))
+    steps = np.repeat([1e-3, 9.80665e-3], 3)
+    feed.change = lambda _name, _t, rows: np.trunc(rows / steps) * steps
+    feed.run(12.0)
+    window = feed.collector.window(feed.now_s)
+    assert window.start_s >= 1021.0
+    # The truncation is known and taken out: the naive mean would be half a step, 0.5 mrad/s, off.
+    assert np.abs(np.array(window.imus[0].gyro_rad_s) - BIAS).max() < 0.15e-3
+    assert min(window.imus[0].gyro_sigma_stat_rad_s) > 0.03e-3
+    assert min(window.imus[0].gyro_sigma_use_rad_s) < 0.1e-3
+
+
 def test_a_dead_compass_can_be_given_up() -> None:
     feed = feeder(None, compass=True)
     feed.run(15.0)

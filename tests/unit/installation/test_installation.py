@@ -18,7 +18,6 @@ from companion.errors import CompanionError
 from companion.installation import install as installation
 from companion.installation import install as installing
 from companion.installation.install import Target, install, uninstall, unreachable
-from tests.support.systemd import SYSTEMD_ANALYZE, needs_systemd_analyze
 
 UNIT = "usr/local/lib/systemd/system/companion.service"
 FIRST_RUN = "usr/local/lib/systemd/system/companion-setup.service"
@@ -27,6 +26,10 @@ MODULES = "usr/local/lib/modules-load.d/companion.conf"
 CONFIGURATION = "etc/companion/companion.toml"
 SAMPLE = CONFIGURATION + ".sample"
 EXECUTABLE = "/opt/elsewhere/bin/companion"
+SYSTEMD_ANALYZE = shutil.which("systemd-analyze") or ""
+needs_systemd_analyze = pytest.mark.skipif(
+    not SYSTEMD_ANALYZE, reason="systemd-analyze is not here (Debian: apt-get install systemd)"
+)
 
 
 def target(root: Path, *, executable: str = EXECUTABLE) -> Target:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +166,7 @@ def column(states: Any) -> Floats:
     return np.asarray(states, dtype=np.float64)[:, None]
 
 
-def of_px4(flown: Flown, path: Path, more: Mapping[tuple[str, int], tuple[Floats, Floats]] | None = None) -> Path:
+def of_px4(flown: Flown, path: Path) -> Path:
     at, slow = flown.at_s, flown.at_s[::25]
     place = np.tile([LATITUDE_DEG, HEIGHT_M], (len(at), 1))
     spun = ((slow >= flown.motors_s) & (slow < flown.disarmed_s))[:, None]
@@ -182,8 +181,7 @@ def of_px4(flown: Flown, path: Path, more: Mapping[tuple[str, int], tuple[Floats
             ("vehicle_land_detected", 0): (slow, column((slow < 67.0) | (slow >= 240.0))),
             ("actuator_motors", 0): (slow, 0.5 * np.hstack([np.tile(spun, (1, 4)), np.full((len(slow), 8), np.nan)])),
             ("estimator_sensor_bias", 0): (slow, np.tile([0.0, *bias], (len(slow), 1))),
-        }
-        | dict(more or {}),
+        },
     )
 
 

@@ -18,12 +18,7 @@ from sim.scenario import site_at
 POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
 GYRO_DEG_H = (162.0, -98.0, 40.0)
 ACCEL_MG = (2.4, -2.1, 0.9)
-G = 9.80665
-UNITS = {
-    "si": ("t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2", 1.0, 1.0, 1.0),
-    "common": ("t_ms,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g", 1e3, 180.0 / np.pi, 1.0 / G),
-    "fine": ("t_us,gx_deg_h,gy_deg_h,gz_deg_h,ax_mg,ay_mg,az_mg", 1e6, 180.0 / np.pi * 3600.0, 1e3 / G),
-}
+GOOD = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n"
 
 
 def rows(seconds: float = 60.0, rate_hz: int = 200) -> tuple[np.ndarray, ImuModel]:
@@ -39,12 +34,9 @@ def rows(seconds: float = 60.0, rate_hz: int = 200) -> tuple[np.ndarray, ImuMode
     return np.column_stack([times, model.read(times, 1.0 / rate_hz)]), model
 
 
-def written(path: Path, data: np.ndarray, units: str = "si", separator: str = ",", head: str | None = None) -> Path:
-    names, time, rate, force = UNITS[units]
-    scaled = data * np.array([time, rate, rate, rate, force, force, force])
-    lines = [names.replace(",", separator)] if head is None else [head] if head else []
-    lines += [separator.join(f"{value:.9g}" if k else f"{value:.6f}" for k, value in enumerate(row)) for row in scaled]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+def written(path: Path, data: np.ndarray) -> Path:
+    lines = [",".join(f"{value:.9g}" for value in row) for row in data]
+    path.write_text(GOOD + "\n".join(lines) + "\n", encoding="utf-8")
     return path
 
 
@@ -71,9 +63,6 @@ def test_what_is_not_said_widens_sigma_and_is_named(tmp_path: Path, capsys: pyte
     off = np.subtract(imu["gyro_bias_rad_s"], model.mean_bias(3.0, 33.0).gyro_rad_s)
     assert (np.abs(off) / imu["gyro_sigma_use_rad_s"]).max() < 3.5
     assert max(imu["gyro_sigma_use_rad_s"]) > 6.0 * DEG_H
-
-
-GOOD = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n"
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,7 @@ from companion.links.serial.listening import Heard
 from companion.protocols.guess import Line
 from companion.protocols.heartbeat import Heartbeat
 from companion.setup import draft as drafting
-from companion.setup.draft import Draft
-from companion.setup.survey import FoundDevice, HeardUdp, Survey
-from tests.unit.setup.test_document import OWN
+from companion.setup.survey import HeardUdp, Survey
 
 PX4, STATION = Heartbeat(1, 1, 2, 12), Heartbeat(255, 190, 6, 8)
 SILENT = Heard(None, None, None, 0)
@@ -53,17 +51,6 @@ def test_what_somebody_holds_is_not_silent(tmp_path: Path) -> None:
 
 def _nobody() -> HeardUdp:
     return HeardUdp(14550, (), 0, from_here=True)
-
-
-def test_a_device_that_works_as_it_is_gets_no_further_keys() -> None:
-    """A configuration that leaves the speed to the protocol stays as its owner wrote it."""
-    draft = Draft(OWN, is_new=False)
-    assert draft.lines == {"/dev/tilt": Line(9600, "none")}
-    draft.take(FoundDevice("/dev/tilt", "inclinometer_xy", Line(9600, "none"), "gradienter"))
-    assert draft.result() == OWN
-    draft.take(FoundDevice("/dev/tilt", "inclinometer_xy", Line(2400, "none"), "gradienter"))
-    assert "baud = 2400\n" in draft.result()
-    assert "parity" not in draft.result()
 
 
 def test_the_old_file_is_kept_and_a_link_is_followed(tmp_path: Path) -> None:

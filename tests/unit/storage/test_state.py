@@ -19,7 +19,7 @@ from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.learned import SIGNING_FILE, BiasStore, alignment_in, faces_in, signing_time_in
 from companion.storage.profiles import ProfileStore, read_profile
 from companion.storage.records import RecordStore
-from companion.storage.state import MOST_BYTES, BoundedList, StateFile, sealed
+from companion.storage.state import MOST_ASIDE, MOST_BYTES, BoundedList, StateFile, sealed
 from companion.web.access import kept_token
 
 # A read of a FIFO that nobody writes to never ends.
@@ -139,6 +139,20 @@ def test_where_it_cannot_be_set_aside_it_is_named_and_not_used(tmp_path: Path, m
         assert journal.load() is None
         assert journal.unusable is not None
         assert journal.unusable.endswith("it cannot be set aside either")
+
+
+def test_a_few_are_kept_of_each_name(tmp_path: Path) -> None:
+    path = tmp_path / "journal.json"
+    for number in range(MOST_ASIDE + 3):
+        path.write_text(str(number))
+        assert ChangeLog(tmp_path).journal.load() is None
+    kept = {entry.name: entry.read_text() for entry in tmp_path.iterdir()}
+    # The first that went wrong tells most.
+    assert kept == {
+        "journal.json.unusable": "0",
+        "journal.json.unusable-2": "1",
+        "journal.json.unusable-3": str(MOST_ASIDE + 2),
+    }
 
 
 CHANGES = ChangeSet(1, (Changed("INS_GYROFFS_X", before=0.0015, after=0.001), Changed("INS_ACCOFFS_Z", 0.25, -0.5)))

@@ -22,7 +22,7 @@ import zxingcpp
 from companion.cli import main as companion
 from companion.errors import StorageError
 from companion.web import access, app, listener, viewers
-from tests.support.page import RECORD, Answer, Object, Viewer, Visit, page, until
+from tests.support.page import RECORD, Answer, Object, Viewer, Visit, page, parsed, until
 
 
 @pytest.fixture(autouse=True)
@@ -103,6 +103,15 @@ def test_a_name_that_was_turned_into_our_address_is_not(
             assert said.status == 421, (method, path)
             assert visit.page.access.token.encode() not in said.body
         assert visit.companion.asked == []
+
+    run(tmp_path, visitor)
+
+
+def test_a_request_with_two_hosts_or_none_is_refused(tmp_path: Path) -> None:
+    async def visitor(visit: Visit) -> None:
+        assert parsed(await visit.raw(b"GET / HTTP/1.1\r\n\r\n")).status == 400
+        twice = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: evil.example\r\n\r\n"
+        assert parsed(await visit.raw(twice)).status == 400
 
     run(tmp_path, visitor)
 
