@@ -23,6 +23,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.component.service import ArmGate
 from companion.component.statustext import Say, Severity, Weight, shortened, to_ascii
 from companion.links.mavlink.link import MavlinkLink
+from companion.lua import to_script
 
 VALID_S: Final = 10
 """How long the autopilot may arm on an ACCEPTED without asking again; 0 would expire at once."""
@@ -82,14 +83,11 @@ class ArmAuthoriser:
 
 
 PERIOD_S: Final = 0.5
-PAYLOAD_TYPE: Final = 33191
-"""Payload type from the range that MAVLink leaves to local use (above 32767); a mark in the payload tells it apart."""
 MARK: Final = b"CMPA\x01"
 REASON_BYTES: Final = 41 - len("Companion: ")
 """What ArduPilot shows of an auxiliary authorisation's reason (autopilots 5.3), less what the script puts before it."""
 VERDICTS: Final = {"wait": 0, "accept": 1, "refuse": 2}
 NOT_GATING: Final = 3
-_TUNNEL_BYTES: Final = 128
 
 
 class ArmingScript:
@@ -113,8 +111,4 @@ class ArmingScript:
         answer = self._gate.answer()
         verdict = VERDICTS[answer.verdict] if self._gate.at_arm == "gate" else NOT_GATING
         reason = shortened(to_ascii(answer.words), REASON_BYTES).encode("ascii")
-        data = MARK + bytes([verdict]) + reason
-        payload = list(data.ljust(_TUNNEL_BYTES, b"\0"))
-        return mavlink.MAVLink_tunnel_message(
-            system_id, mavlink.MAV_COMP_ID_AUTOPILOT1, PAYLOAD_TYPE, len(data), payload
-        )
+        return to_script(system_id, MARK + bytes([verdict]) + reason)

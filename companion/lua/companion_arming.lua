@@ -1,5 +1,6 @@
 -- companion_arming.lua: ArduPilot arms only while the companion computer says that a fresh calibration is in force,
--- and flies by its gyros and GNSS as soon as the companion's heading is not to be had.
+-- flies by its gyros and GNSS as soon as the companion's heading is not to be had, and tells the companion every IMU's
+-- output in floats, which no message of ArduPilot does.
 --
 -- Copyright the companion authors. SPDX-License-Identifier: Apache-2.0
 --
@@ -12,10 +13,14 @@
 --
 -- The verdict comes twice a second as TUNNEL (#385) from our own system, type 33191; payload: "CMPA", version 1, a
 -- verdict byte (0 wait, 1 accept, 2 refuse, 3 the companion does not gate any more), then the reason as ASCII.
+--
+-- Payload "CMPF", version 1, asks for floats. For 3 s after it, while disarmed, the port it came by gets about eleven
+-- DEBUG_FLOAT_ARRAY (#350) a second, named CMP_IMU: of IMU 1, 2 and 3 the gyro in rad/s, the accelerometer in m/s^2,
+-- both means of four readings in the autopilot's axes (FRD), and the temperature in deg C; zeros where there is none.
 
 local TUNNEL = 385
 local PAYLOAD_TYPE = 33191
-local MARK = "CMPA\1"
+local MARK, ASK = "CMPA\1", "CMPF\1"
 local ACCEPT, NOT_GATING = 1, 3
 local SILENT_MS = 3000
 local PERIOD_MS = 200
@@ -55,8 +60,16 @@ local looked_ms = nil
 local silent_since_ms, well_since_ms = nil, nil
 local fell, is_latched = nil, false -- the set that was fallen back to
 local strayed_rad, last_yaw_rad, last_ms = 0, nil, nil
-local is_broken = false
+local is_broken, floats_broken = false, false
 local gated_ms, gate_after_ms = nil, PERIOD_MS
+
+-- Floats: the mean of four readings, 20 ms apart.
+local DEBUG_FLOAT_ARRAY = 350
+local PAYLOAD_BYTES = 252
+local NAME = "CMP_IMU"
+local IMUS, READINGS, READ_MS, ASKED_MS = 3, 4, 20, 3000
+local asked_ms, asked_port = nil, nil
+local readings, gyro_sums, accel_sums = 0, {}, {}
 
 -- To what is shown, at the end of a word if that leaves half of it.
 local function shorten(text)
@@ -105,12 +118,12 @@ local function listen()
 end
 
 local function receive()
-    local ok, message = pcall(mavlink.receive_chan)
+    local ok, message, port = pcall(mavlink.receive_chan)
     if not ok then
-        ok, message = pcall(mavlink.receive_chan, mavlink)
+        ok, message, port = pcall(mavlink.receive_chan, mavlink)
     end
     if ok then
-        return message
+        return message, port
     end
     return nil
 end
@@ -124,7 +137,7 @@ local function number(message, at, bytes)
     return value
 end
 
-local function take(message)
+local function take(message, port)
     if number(message, AT_MESSAGE, 3) ~= TUNNEL or number(message, AT_TYPE, 2) ~= PAYLOAD_TYPE then
         return
     end
@@ -138,6 +151,10 @@ local function take(message)
     end
     local length = string.byte(message, AT_LENGTH) or 0
     local payload = string.sub(message, AT_PAYLOAD, AT_PAYLOAD + length - 1)
+    if payload == ASK then
+        asked_ms, asked_port = millis(), port
+        return
+    end
     if #payload <= #MARK or string.sub(payload, 1, #MARK) ~= MARK then
         return
     end
@@ -250,17 +267,60 @@ local function gate()
     end
     if listening then
         for _ = 1, 10 do
-            local message = receive()
+            local message, port = receive()
             if message == nil then
                 break
             end
-            take(message)
+            take(message, port)
         end
     end
     if param:get("CMPG_ENABLE") == 0 then
         arming:set_aux_auth_passed(auth_id)
     else
         judge()
+    end
+end
+
+local function is_asked()
+    return not floats_broken and asked_ms ~= nil and since_ms(asked_ms) < ASKED_MS and not arming:is_armed()
+end
+
+-- An IMU that was unhealthy at any of the readings is left out of the message.
+local function read_imus()
+    for i = 1, IMUS do
+        local healthy = ins:get_gyro_health(i - 1) and ins:get_accel_health(i - 1)
+        if readings == 0 then
+            gyro_sums[i], accel_sums[i] = healthy and ins:get_gyro(i - 1), healthy and ins:get_accel(i - 1)
+        elseif healthy and gyro_sums[i] then
+            gyro_sums[i], accel_sums[i] = gyro_sums[i] + ins:get_gyro(i - 1), accel_sums[i] + ins:get_accel(i - 1)
+        else
+            gyro_sums[i] = false
+        end
+    end
+    readings = readings + 1
+end
+
+local function send_floats()
+    local parts = { string.pack("<i4i4I2c10", (micros()):toint(), 0, 1, NAME) }
+    for i = 1, IMUS do
+        local gyro, accel = gyro_sums[i], accel_sums[i]
+        if gyro then
+            parts[i + 1] = string.pack("<fffffff",
+                gyro:x() / readings, gyro:y() / readings, gyro:z() / readings,
+                accel:x() / readings, accel:y() / readings, accel:z() / readings, ins:get_temperature(i - 1))
+        else
+            parts[i + 1] = string.rep("\0", 28)
+        end
+    end
+    local payload = table.concat(parts)
+    call("send_chan", asked_port, DEBUG_FLOAT_ARRAY, payload .. string.rep("\0", PAYLOAD_BYTES - #payload))
+    readings = 0
+end
+
+local function tell_floats()
+    read_imus()
+    if readings >= READINGS then
+        send_floats()
     end
 end
 
@@ -271,8 +331,19 @@ local function update()
         is_broken = true
         gcs:send_text(WARNING, shorten("Companion heading: " .. tostring(problem)))
     end
+    local again_ms = GUARD_MS
+    if is_asked() then
+        again_ms = READ_MS
+        ok, problem = pcall(tell_floats)
+        if not ok then
+            floats_broken = true
+            gcs:send_text(WARNING, shorten("Companion floats: " .. tostring(problem)))
+        end
+    else
+        readings = 0
+    end
     if gated_ms ~= nil and since_ms(gated_ms) < gate_after_ms then
-        return update, GUARD_MS
+        return update, again_ms
     end
     gated_ms, gate_after_ms = millis(), PERIOD_MS
     ok, problem = pcall(gate)
@@ -283,7 +354,7 @@ local function update()
         gcs:send_text(WARNING, shorten("Companion gate: " .. tostring(problem)))
         gate_after_ms = 5 * PERIOD_MS
     end
-    return update, GUARD_MS
+    return update, again_ms
 end
 
 add_parameters()

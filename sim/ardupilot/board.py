@@ -49,6 +49,7 @@ class Board(AutopilotDouble):
         parameters: values that differ from the defaults, such as {"INS_GYR_CAL": 0}; set before the first boot.
         up_s: how long it has been running when the simulation begins.
         auxiliary: whether the board has parameters of IMU 4 and 5, and a gyro behind 4 that no message shows.
+        script: whether companion_arming.lua runs on it; of that, only what it tells of the IMUs in floats.
     """
 
     external_nav: YawSource
@@ -64,6 +65,7 @@ class Board(AutopilotDouble):
         parameters: Mapping[str, float] | None = None,
         up_s: float = 30.0,
         auxiliary: bool = False,
+        script: bool = False,
         seed: int = 0,
     ) -> None:
         if not 1 <= len(imus) <= 3:
@@ -78,7 +80,7 @@ class Board(AutopilotDouble):
             tunes_go_on=False,
         )
         self.system_id, self.version, self.vehicle = system_id, version, vehicle
-        self._auxiliary = auxiliary
+        self._auxiliary, self.script = auxiliary, script
         self.parameters = self._new_store(parameters or {})
         self.estimator = CoarseEstimator()
         self.airspeed_m_s = 0.0

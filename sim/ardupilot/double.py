@@ -16,10 +16,10 @@ from sim.aircraft import VirtualAircraft
 from sim.ardupilot.board import Board
 from sim.ardupilot.commands import CommandServer
 from sim.ardupilot.external_nav import ExternalNav
-from sim.ardupilot.messages import BUILDERS
+from sim.ardupilot.messages import BUILDERS, script_floats
 from sim.ardupilot.parameter_server import ParameterServer
 from sim.ardupilot.parameters import device_id, offset_names
-from sim.firmware.channel import Channel, Message
+from sim.firmware.channel import Channel, Message, Stream
 from sim.firmware.command import command_of
 from sim.firmware.double import HEARTBEAT
 from sim.firmware.faults import Faults
@@ -28,6 +28,11 @@ from sim.firmware.writes import Write
 from sim.imu_model import ImuModel
 
 __all__ = ["ArduPilotDouble", "Faults", "Write", "float32", "offset_names"]
+
+
+FLOATS = mavlink.MAVLINK_MSG_ID_DEBUG_FLOAT_ARRAY
+FLOATS_EVERY_S = 0.09
+FLOATS_ASKED_S = 3.0
 
 
 class ArduPilotDouble(Board):
@@ -49,6 +54,7 @@ class ArduPilotDouble(Board):
         self._router = Router(self.system_id, self.channels)
         self._parameter_server = ParameterServer(self)
         self._commands = CommandServer(self)
+        self._floats_until_s = 0.0
         self._boot_gyros(0.0)
 
     # What tests and people do to it.
@@ -130,9 +136,11 @@ class ArduPilotDouble(Board):
 
     # The inside.
 
-    def build(self, message_id: int, loop_s: float) -> Message:
-        """A message of `BUILDERS`."""
-        return BUILDERS[message_id](self, loop_s)
+    def build(self, message_id: int, loop_s: float) -> Message | None:
+        """A message of `BUILDERS`, or the script's floats; None while it may not send those."""
+        if message_id != FLOATS:
+            return BUILDERS[message_id](self, loop_s)
+        return script_floats(self, loop_s) if loop_s < self._floats_until_s and not self.armed else None
 
     def _started(self, loop_s: float) -> None:
         self.estimator.reset(self.aircraft.time_at(loop_s) - self._up_s)
@@ -189,6 +197,10 @@ class ArduPilotDouble(Board):
             self.external_nav.take(message, loop_s)
         elif isinstance(message, mavlink.MAVLink_play_tune_message):
             self.buzzer.take(message, loop_s, armed=self.armed)
+        elif isinstance(message, mavlink.MAVLink_tunnel_message):
+            if self.script and bytes(message.payload[: message.payload_length]) == b"CMPF\x01":
+                self._floats_until_s = loop_s + FLOATS_ASKED_S
+                channel.streams.setdefault(FLOATS, Stream(FLOATS_EVERY_S, loop_s + FLOATS_EVERY_S))
         elif isinstance(message, mavlink.MAVLink_timesync_message) and message.tc1 == 0:
             self.answer(channel, mavlink.MAVLink_timesync_message(self.boot_us(loop_s) * 1000, message.ts1))
 

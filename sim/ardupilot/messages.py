@@ -134,6 +134,16 @@ def autopilot_version(double: Board, loop_s: float) -> Message:
     )
 
 
+def script_floats(double: Board, loop_s: float) -> Message:
+    """DEBUG_FLOAT_ARRAY of companion_arming.lua; where the script averages four readings, this is one."""
+    values = [0.0] * 58
+    for index, imu in enumerate(double.imus):
+        degc = imu.temperature_degc(double.aircraft.time_at(loop_s))
+        output = double.imu_output(index, loop_s).tolist()
+        values[7 * index : 7 * index + 7] = [*output, degc]
+    return mavlink.MAVLink_debug_float_array_message(double.boot_us(loop_s), b"CMP_IMU", 1, values)
+
+
 BUILDERS: dict[int, Builder] = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: sys_status,

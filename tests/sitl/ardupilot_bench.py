@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.lua import ARMING_SCRIPT
 from sim.companion_process import CompanionProcess, Record
 from sim.imu_model import DEG_H, MG
 from sim.sitl.ardupilot import ArduPilotSitl
@@ -79,7 +80,7 @@ class Bench:
 
 
 @contextlib.asynccontextmanager
-async def bench(tmp_path: Path, *, gyr_cal: bool = False) -> AsyncIterator[Bench]:
+async def bench(tmp_path: Path, *, gyr_cal: bool = False, script: bool = False) -> AsyncIterator[Bench]:
     reason = missing("ardupilot-sitl")
     if reason is not None:
         pytest.skip(reason)
@@ -87,6 +88,9 @@ async def bench(tmp_path: Path, *, gyr_cal: bool = False) -> AsyncIterator[Bench
         vehicle = ArduPilotSitl(
             Path(os.environ[BINARIES["ardupilot-sitl"]]), world(), tmp_path / "ap", gyr_cal=gyr_cal, companion=link.near
         )
+        if script:
+            vehicle.scripts.mkdir(parents=True)
+            (vehicle.scripts / ARMING_SCRIPT.name).write_bytes(ARMING_SCRIPT.read_bytes())
         async with vehicle, ground_station(vehicle) as ground:
             await ground.wait_for(lambda: bool(ground.vehicle_heartbeats()), 60.0, "a heartbeat")
             await asyncio.sleep(SETTLE_S)

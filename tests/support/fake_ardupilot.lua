@@ -14,6 +14,7 @@ end
 meta.__sub = function(a, b) return stamp((a.ms - b.ms) % 2 ^ 32) end
 meta.__index = { toint = function(self) return math.floor(self.ms) end }
 function millis() return stamp(now % 2 ^ 32) end
+function micros() return stamp((now * 1000) % 2 ^ 32 - (now * 1000 % 2 ^ 32 >= 2 ^ 31 and 2 ^ 32 or 0)) end
 
 gcs = { send_text = function(_, severity, words) said[#said + 1] = severity .. ":" .. words end }
 local parameters = {}
@@ -40,11 +41,27 @@ ahrs = {
     set_posvelyaw_source_set = function(_, set) flight.set = set end,
 }
 for _, name in ipairs({ "roll", "pitch", "yaw" }) do ahrs["get_" .. name .. suffix] = angle(name) end
+local vectors = {}
+local function vector(x, y, z)
+    return setmetatable({ x = function() return x end, y = function() return y end, z = function() return z end }, vectors)
+end
+vectors.__add = function(a, b) return vector(a:x() + b:x(), a:y() + b:y(), a:z() + b:z()) end
+-- The IMUs: `fly sick k` makes IMU k (0..) unhealthy; every reading of the accelerometers is 1 more than the last in x.
+local imus, read = tonumber(arg[3] or "2"), 0
+local function healthy(_, k) return k < imus and flight.sick ~= k end
 ins = {
-    get_gyro = function(_, _)
-        local rate = flight.rate
-        return { x = function() return 0 end, y = function() return 0 end, z = function() return rate end }
+    get_gyro_health = healthy,
+    get_accel_health = healthy,
+    get_gyro = function(_, k)
+        assert(k < imus)
+        return vector(0.125 * k, 0, flight.rate)
     end,
+    get_accel = function(_, k)
+        assert(k < imus)
+        read = read + 1
+        return vector(read, k, -9.75)
+    end,
+    get_temperature = function(_, k) return 40.5 + k end,
 }
 arming = {
     is_armed = function(_) return flight.armed ~= 0 end,
@@ -80,6 +97,12 @@ if kind ~= "4.4" then
             if first == nil then return end
             if first == "boom" then return {} end
             return first, 1, millis()
+        end),
+        send_chan = bound(3, function(port, id, payload)
+            assert(#payload == 252)
+            local hex = payload:gsub(".", function(byte) return ("%02x"):format(byte:byte()) end)
+            said[#said + 1] = ("sent %d %d %s"):format(port, id, hex)
+            return true
         end),
     }
 end

@@ -39,7 +39,7 @@ from companion.autopilot.firmware.imu_calibration import (
     Range,
     offset_ranges,
 )
-from companion.autopilot.firmware.imu_messages import HIGHRES, RAW, SCALED, SCALED2, SCALED3
+from companion.autopilot.firmware.imu_messages import HIGHRES, RAW, SCALED, SCALED2, SCALED3, SCRIPT
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import (
@@ -103,7 +103,7 @@ class ArduPilot(Firmware):
     write_s = 5.0
     """4 s with its own gyro calibration in between."""
     ekf_reset_s = 3.0
-    imu_messages = {1: (HIGHRES, SCALED, RAW), 2: (SCALED2,), 3: (SCALED3,)}
+    imu_messages = {1: (HIGHRES, SCRIPT[1], SCALED, RAW), 2: (SCRIPT[2], SCALED2), 3: (SCRIPT[3], SCALED3)}
     gyro_calibration = GyrosAtRest()
     estimator_message = mavlink.MAVLink_ekf_status_report_message
     faster_log = "LOG_BITMASK with IMU_FAST"

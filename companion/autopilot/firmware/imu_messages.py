@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, Final
@@ -104,6 +105,32 @@ SCALED2: Final = ImuMessage(_integer_kind("SCALED_IMU2"), mavlink.MAVLink_scaled
 SCALED3: Final = ImuMessage(_integer_kind("SCALED_IMU3"), mavlink.MAVLink_scaled_imu3_message, _scaled)
 RAW: Final = ImuMessage(_integer_kind("RAW_IMU"), mavlink.MAVLink_raw_imu_message, _raw)
 """Calibrated and filtered in spite of its name, the same as SCALED_IMU (ArduPilot)."""
+
+SCRIPT_ASK: Final = b"CMPF\x01"
+"""Payload that asks the script for floats; it sends them for 3 s."""
+_SCRIPT_NAME: Final = "CMP_IMU"
+_SCRIPT_FLOATS: Final = 7
+
+
+def _from_script(instance: int, message: Any) -> Reading | str:
+    if message.name != _SCRIPT_NAME or message.array_id != 1:
+        return ""  # somebody else's
+    values = message.data[_SCRIPT_FLOATS * (instance - 1) :][:_SCRIPT_FLOATS]
+    if not all(map(math.isfinite, values)):
+        return "the script tells a value that is not a number"
+    gx, gy, gz, ax, ay, az, degc = values
+    return Reading(message.time_usec * 1e-6, (gx, gy, gz), (ax, ay, az), degc or None)
+
+
+SCRIPT: Final = {
+    instance: ImuMessage(
+        StreamKind("floats of the script", gyro_step_rad_s=0.0, accel_step_m_s2=0.0, truncates=False),
+        mavlink.MAVLink_debug_float_array_message,
+        functools.partial(_from_script, instance),
+    )
+    for instance in (1, 2, 3)
+}
+"""Means of four readings, calibrated and filtered, about eleven a second, only while disarmed and asked for."""
 
 PX4_FLOATS: Final = dataclasses.replace(HIGHRES, kind=dataclasses.replace(HIGHRES.kind, message="HIGHRES_IMU+bias"))
 """HIGHRES_IMU of the IMU that PX4 flies by. PX4 takes EKF2's own estimate of the bias off it, so at rest it tells

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import itertools
 import logging
 import math
 from collections.abc import Callable, Sequence
@@ -19,9 +20,10 @@ from companion.autopilot.firmware import imu_messages
 from companion.autopilot.firmware.firmwares import FIRMWARES
 from companion.autopilot.firmware.imu_messages import TEMPERATURE_AGE_S, ImuMessage, ImuSamples, StreamKind
 from companion.autopilot.telemetry.ekf_bias import EkfBias
-from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.system.waiting import comes
+from companion.lua import to_script
 from companion.samples import ImuSample
 
 logger = logging.getLogger(__name__)
@@ -46,6 +48,8 @@ _REFUSED: Final = -1
 _BESIDE_CONSOLE: Final = 0.85
 """Share of the rate that the bias' answers leave on a slow line."""
 _TEMPERATURE_RATE_HZ: Final = 2.0
+_ASK_SCRIPT_S: Final = 1.0
+"""Time between requests to ArduPilot's script, which sends for 3 s after one."""
 _SEEN_BY_RATE_HZ: Final = 4.0
 """Rate of PX4's integers beside its floats: a write looks who is there for 0.4 s (`daemon.offsets.px4_writes`)."""
 _ABSENT_AFTER: Final = 10
@@ -69,6 +73,11 @@ class _Source:
     def name(self) -> str:
         """Name of the message."""
         return self.message.kind.message
+
+    @property
+    def from_script(self) -> bool:
+        """Whether ArduPilot's script sends it; `ask_script` asks for it."""
+        return self.message in imu_messages.SCRIPT.values()
 
     @property
     def absent(self) -> bool:
@@ -97,7 +106,9 @@ class ImuStream:
         rate_hz: float,
         ekf_bias: EkfBias,
         on_kind_change: Callable[[StreamKind | None], None],
+        may_be_slow: Callable[[], bool] = lambda: True,
     ) -> None:
+        """`may_be_slow`: whether the eleven samples a second of ArduPilot's script will do."""
         self.kind: StreamKind | None = None
         """Kind of message that brings the samples; None while there are none."""
         self.samples = 0
@@ -108,7 +119,7 @@ class ImuStream:
         """Turns of `run`, one at least every `BEAT_WITHIN_S`, whether samples come or not."""
         self._vehicle, self._instance = vehicle, instance
         self._on_sample, self._on_kind_change = on_sample, on_kind_change
-        self._ekf_bias = ekf_bias
+        self._ekf_bias, self._may_be_slow = ekf_bias, may_be_slow
         self._rates_hz = [rate_hz, *(rate for rate in SLOWER_RATES_HZ if rate < rate_hz)]
         self._link = link
         self._sources: list[_Source] = []
@@ -124,6 +135,13 @@ class ImuStream:
             return None
         seen_by = self._sources[-1] if self._current.message is imu_messages.PX4_FLOATS else self._current
         return seen_by.message.kind
+
+    @property
+    def wants_script(self) -> bool:
+        """Whether the floats of ArduPilot's script are better than what comes, or are what comes."""
+        sources = itertools.takewhile(lambda source: source is not self._current, self._sources)
+        here = [] if self._current is None else [self._current]
+        return any(source.from_script and self._usable(source) for source in (*sources, *here))
 
     @property
     def decided(self) -> bool:
@@ -169,7 +187,8 @@ class ImuStream:
         if self._ekf_bias.may_look:
             # Floats that begin late would begin a measurement anew.
             await comes(self._ekf_bias.settled, BEAT_WITHIN_S / 2.0)
-        self._sources = [_Source(message, self._rates_hz) for message in messages]
+        sources = [_Source(message, self._rates_hz) for message in messages]
+        self._sources = [source for source in sources if self._may_be_slow() or not source.from_script]
         if messages[0] is imu_messages.PX4_FLOATS and self._rates_hz[0] < SLOWER_RATES_HZ[0]:
             self._sources[0].rates_hz = [_BESIDE_CONSOLE * self._rates_hz[0], *self._rates_hz[1:]]
         self._reader = ImuSamples()
@@ -187,8 +206,8 @@ class ImuStream:
         """The first source, best first, that sends."""
         for source in filter(self._usable, self._sources):
             for _ in range(_ASKS):
-                if self._restart.is_set() or source.refused:
-                    break
+                if self._restart.is_set() or source.refused or source.from_script:
+                    break  # the script's take over as soon as they come
                 result = await self._ask(source)
                 if result != _REFUSED and await self._sends(source):
                     return source
@@ -200,6 +219,8 @@ class ImuStream:
 
     async def _ask(self, source: _Source) -> int | None:
         """Ask for a message at the fastest rate that is not denied: the last answer, None when none came in time."""
+        if source.from_script:
+            return None
         while True:
             self.turns += 1
             rate_hz = source.rates_hz[source.rate]
@@ -239,7 +260,8 @@ class ImuStream:
         while not await self._pause(_LOOK_S):
             now_s = loop.time()
             if not self._usable(source):
-                self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, source.message.message.id, 0.0)
+                if not source.from_script:  # which has stopped by itself
+                    self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, source.message.message.id, 0.0)
                 return
             better = self._better_than(source)
             if better is not None:
@@ -290,13 +312,15 @@ class ImuStream:
         """HIGHRES_IMU carries the barometer's; the IMU's comes with the integer messages."""
         if source.message.message is imu_messages.HIGHRES.message:
             rate_hz = _TEMPERATURE_RATE_HZ if source.message is imu_messages.HIGHRES else _SEEN_BY_RATE_HZ
-            for each in self._sources[1:]:
+            for each in (each for each in self._sources[1:] if not each.from_script):
                 result = await self._vehicle.commands.request_message_interval(each.message.message.id, rate_hz)
                 if result in (mavlink.MAV_RESULT_ACCEPTED, None):
                     return
 
     def _usable(self, source: _Source) -> bool:
-        """Not while it wants a bias that is not known, or is of another IMU."""
+        """Not while it wants a bias that is not known, or is of another IMU; from the script only while disarmed."""
+        if source.from_script:
+            return self._vehicle.arm_state is ArmState.DISARMED
         return source.message is not imu_messages.PX4_FLOATS or self._ekf_bias.known_of(self._instance)
 
     async def _pause(self, seconds: float) -> bool:
@@ -367,10 +391,18 @@ class ImuStream:
 
     def _why_none(self) -> str:
         ordinal = {1: "first", 2: "second", 3: "third"}[self._instance]
-        sources = list(filter(self._usable, self._sources))
+        sources = [source for source in self._sources if self._usable(source) and not source.from_script]
         if all(source.absent for source in sources if not source.refused and not source.reason):
             zero = [source.name for source in sources if source.absent]
             if zero:
                 return f"{zero[0]} is all zero: there is no {ordinal} IMU"
         words = [f"{source.name} {source.reason or 'does not come'}" for source in sources]
         return f"no samples of IMU {self._instance}: {', '.join(words)}"
+
+
+async def ask_script(link: MavlinkLink, streams: Sequence[ImuStream]) -> None:
+    """Ask ArduPilot's script for floats of every IMU as long as a stream wants them; runs until cancelled."""
+    while True:
+        if any(stream.wants_script for stream in streams):
+            link.send(to_script(link.system_id, imu_messages.SCRIPT_ASK))
+        await asyncio.sleep(_ASK_SCRIPT_S)

@@ -76,6 +76,7 @@ class AutopilotImu:
             rate_hz=rate_hz,
             ekf_bias=ekf_bias,
             on_kind_change=self._kind_changed,
+            may_be_slow=lambda: not self.on_counting,
         )
         core.parameters.on_value.add(self._on_parameter)
         core.vehicle.on_event.add(self._on_event)

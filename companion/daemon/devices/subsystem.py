@@ -19,6 +19,7 @@ from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.ekf_bias import EkfBias
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
+from companion.autopilot.telemetry.imu_stream import ask_script
 from companion.configured import models
 from companion.configured.models import Role, baud_of, collect, serial_devices
 from companion.daemon.core import Core, Subsystem, Task
@@ -174,6 +175,7 @@ class Devices(Subsystem):
             ("signing", self.signing.run),
             ("reach", self.reach.run),
             *([("ekf-bias", self.ekf_bias.run)] if self._asks else []),
+            ("script-floats", lambda: ask_script(self._core.link, [imu.stream for imu in self.imus.values()])),
             *((imu.name, imu.run) for imu in self.imus.values()),
             *(((sensor.name, sensor.run) for sensor in self.sensors) if ports else ()),
             *([("sensor-watch", self.watch.run)] if ports else []),

@@ -1,4 +1,4 @@
-"""ArduPilot's arming script under Lua 5.3 with faked bindings (autopilots 5.3, "Aux auth")."""
+"""The script that we install on ArduPilot, under Lua 5.3 with faked bindings (autopilots 5.3, "Aux auth")."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ SILENT = "Companion silent: arming blocked"
 class Script:
     """The script in a Lua process; every call gives (state, reason, texts)."""
 
-    def __init__(self, kind: str) -> None:
+    def __init__(self, kind: str, imus: int = 2) -> None:
         assert LUA is not None
         self.process = subprocess.Popen(
-            [LUA, str(HARNESS), str(ARMING_SCRIPT), kind],
+            [LUA, str(HARNESS), str(ARMING_SCRIPT), kind, str(imus)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
