@@ -7,8 +7,10 @@ topic that nobody knows, and one that nobody publishes, are said so. PX4 `mavlin
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.firmware.channel import Channel
@@ -19,6 +21,8 @@ _PROMPT = "pxh> "
 _STEP_S = 0.01
 """A port's loop sends one message each time, if the line has room."""
 _PACKET = 93
+STATUS_S = 0.1
+"""From one `vehicle_imu_status` to the next."""
 
 
 class Shell:
@@ -68,6 +72,7 @@ class Shell:
             "estimator_selector_status": self._selector,
             "estimator_sensor_bias": self._biases,
             "vehicle_imu": self._imus,
+            "vehicle_imu_status": self._statuses,
         }.get(topic)
         if instances is None:
             return f"Topic {topic} did not match any known topics\nCommand 'listener' failed, returned -1.\n"
@@ -125,6 +130,38 @@ class Shell:
             for imu in self._double.vehicle_imus
         ]
 
+    def _statuses(self, loop_s: float) -> list[list[str]]:
+        """Means of 0.1 s of raw readings, turned into the vehicle's axes; the same until the next is published."""
+        t_s = math.floor(self._double.aircraft.time_at(loop_s) / STATUS_S) * STATUS_S
+        found = []
+        for imu in self._double.vehicle_imus:
+            gyro, accel = np.split(imu.raw_mean(t_s, STATUS_S), 2)
+            degc = imu.model.temperature_degc(t_s)
+            found.append(
+                [
+                    *_stamp(self._double.boot_us(loop_s) - round((self._double.aircraft.time_at(loop_s) - t_s) * 1e6)),
+                    f"accel_device_id: {_device(imu.device_id)}",
+                    f"gyro_device_id: {_device(imu.device_id)}",
+                    *(f"{kind}_clipping: [0, 0, 0]" for kind in ("accel", "gyro")),
+                    *(f"{kind}_error_count: 0" for kind in ("accel", "gyro")),
+                    *(f"{kind}_rate_hz: 250.00000" for kind in ("accel", "gyro", "accel_raw", "gyro_raw")),
+                    "accel_vibration_metric: 0.00656",
+                    "gyro_vibration_metric: 0.00049",
+                    "delta_angle_coning_metric: 0.00000",
+                    f"mean_accel: {_vector(accel)}",
+                    f"mean_gyro: {_vector(gyro)}",
+                    "var_accel: [0.00002, 0.00004, 0.00002]",
+                    "var_gyro: [0.00000, 0.00000, 0.00000]",
+                    f"temperature_accel: {degc:.5f}",
+                    f"temperature_gyro: {degc:.5f}",
+                ]
+            )
+        return found
+
+
+def _vector(values: Iterable[float]) -> str:
+    return f"[{', '.join(f'{value:.5f}' for value in values)}]"
+
 
 def _stamp(boot_us: int) -> Iterable[str]:
     return (f"timestamp: {boot_us} (0.196000 seconds ago)",)
@@ -137,7 +174,7 @@ def _device(number: int) -> str:
 def _bias(kind: str, device_id: int, bias: Iterable[float]) -> Iterable[str]:
     return (
         f"{kind}_device_id: {_device(device_id)}",
-        f"{kind}_bias: [{', '.join(f'{value:.5f}' for value in bias)}]",
+        f"{kind}_bias: {_vector(bias)}",
         f"{kind}_bias_limit: 0.15000",
         f"{kind}_bias_variance: [0.00000, 0.00000, 0.00000]",
     )

@@ -86,3 +86,11 @@ class VehicleImu:
             noise, self._noise = self._noise[-1], self._noise[:-1]
             self._last = Sample(end_s, self.correct(self.model.expected(end_s - self.interval_s / 2.0) + noise))
         return self._last
+
+    def raw_mean(self, t_s: float, over_s: float) -> Array:
+        """Mean (6) of the sensor until this time, turned into vehicle FRD and nothing else; asked again, the same."""
+        seed = [round(t_s / over_s), self.index, 7]
+        noise = np.random.default_rng(seed).standard_normal(6) * (self.density / math.sqrt(over_s))
+        raw = self.model.expected(t_s - over_s / 2.0) + noise
+        result: Array = np.concatenate((self.gyro.rotation @ raw[:3], self.accel.rotation @ raw[3:]))
+        return result

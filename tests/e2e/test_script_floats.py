@@ -14,6 +14,7 @@ from companion.config.sections import Imu
 from companion.estimation.request import What
 from sim.ardupilot.double import ArduPilotDouble, offset_names
 from sim.imu_model import DEG_H, MG, AxisNoise, ImuModel, ImuSpec
+from sim.px4.double import PX4Double
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -122,5 +123,40 @@ def test_somebody_elses_float_arrays_are_no_samples(tmp_path: Path, name: bytes)
                 rig.double.channels[0].send(array)
                 await asyncio.sleep(0.05)
             assert messages(rig)[1:] == ["SCALED_IMU2", "SCALED_IMU3"]
+
+    run_virtual(main())
+
+
+def px4(folder: Path, *, console: bool) -> Rig:
+    """Make a PX4 with two quiet IMUs, of which the second is in integers only."""
+    rig = Rig(folder, firmware="px4", max_s=60.0, min_still_s=10.0, seed=3)
+    imus = [Imu(name=f"fc{k}", source="autopilot", instance=k, profile="icm42688p") for k in (1, 2)]
+    rig.config = msgspec.structs.replace(rig.config, imu=imus)
+    models = [
+        ImuModel(
+            rig.aircraft,
+            QUIET,
+            seed=13 + k,
+            gyro_bias_rad_s=[value * DEG_H for value in gyro],
+            accel_bias_m_s2=[value * MG for value in accel],
+        )
+        for k, (gyro, accel) in enumerate(BIASES)
+    ]
+    parameters = {"MAV_1_FORWARD": 1.0, "IMU_GYRO_CAL_EN": 0.0, "SENS_IMU_AUTOCAL": 0.0}
+    rig.autopilot = PX4Double(rig.aircraft, models, parameters=parameters, console=console, seed=3, up_s=3600.0)
+    rig.wire, rig.radio = Wire(rig.link, rig.autopilot, seed=3), Wire(rig.ground, rig.autopilot.ground, seed=4)
+    return rig
+
+
+def test_px4s_console_tells_the_second_imu_without_a_write_before_the_result(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with px4(tmp_path, console=True).running() as rig:
+            await rig.until(lambda: messages(rig) == ["HIGHRES_IMU+bias", "SCALED_IMU2"], 30.0)
+            _, record = await calibrated(rig, What.BOTH)
+            print(record.state, record.reason, record.warnings, [imu.warnings for imu in record.imus])
+            left = rig.px4.residual(2, rig.now_s)
+            print(left.gyro_rad_s / DEG_H, left.accel_m_s2 / MG, record.imus[1].gyro_sigma_use_rad_s)
+            assert np.abs(left.gyro_rad_s).max() / DEG_H < 6.0
+            assert np.abs(left.accel_m_s2).max() / MG < 0.15
 
     run_virtual(main())

@@ -32,12 +32,14 @@ SAVED_S = 4.0
 
 
 @contextlib.asynccontextmanager
-async def flying(folder: Path) -> AsyncIterator[tuple[Px4Sitl, GroundStation]]:
+async def flying(
+    folder: Path, *, gyro_deg_h: tuple[float, float, float] = GYRO_DEG_H
+) -> AsyncIterator[tuple[Px4Sitl, GroundStation]]:
     """PX4 as it comes, its own background calibration on."""
     reason = missing("px4-sitl")
     if reason is not None:
         pytest.skip(reason)
-    scenario = demo(pose=DEMO_POSE, part="white_only", gyro_deg_h=GYRO_DEG_H, accel_mg=ACCEL_MG, seed=1)
+    scenario = demo(pose=DEMO_POSE, part="white_only", gyro_deg_h=gyro_deg_h, accel_mg=ACCEL_MG, seed=1)
     vehicle = Px4Sitl(Path(os.environ[BINARIES["px4-sitl"]]), scenario, folder)
     async with vehicle, ground_station(vehicle) as ground:
         await ground.wait_for(lambda: bool(ground.vehicle_heartbeats()), 60.0, "a heartbeat")

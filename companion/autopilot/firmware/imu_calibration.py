@@ -211,6 +211,13 @@ class ImuCalibration:
         scale = np.asarray(self.accel_scale if accel_scale is None else accel_scale, dtype=np.float64)
         return np.ones(3) if np.linalg.norm(scale - 1.0) <= self.scale_unused_within else scale
 
+    def output(self, gyro_rad_s: Vector, accel_m_s2: Vector, degc: float | None) -> Array:
+        """Return what the firmware makes of a raw reading in vehicle FRD: (6,), rad/s and m/s^2."""
+        rotation, (thermal_gyro, thermal_accel) = self.orientation, self.thermal.taken_off(degc)
+        gyro = np.asarray(gyro_rad_s) - rotation @ (thermal_gyro + self.gyro_offset_rad_s)
+        board = rotation.T @ np.asarray(accel_m_s2) - thermal_accel - self.accel_offset_m_s2
+        return np.concatenate((gyro, rotation @ (self.in_use() * board)))
+
     def thermal_change(self, triad: Triad, degc: float, then_degc: float) -> Array:
         """Return how much less one triad's output is at another temperature, (3,), vehicle FRD."""
         half = 0 if triad == "gyro" else 1

@@ -1,9 +1,6 @@
 """The bias that PX4's EKF takes off HIGHRES_IMU, read at PX4's console.
 
-HIGHRES_IMU is the reading of one IMU in floats less this bias, which no message tells. The console does, as a ground
-station's "MAVLink console" (SERIAL_CONTROL): `listener` prints what is published, in five decimals: 2 deg/h,
-1 micro-g. Nothing else is typed there, and nothing while the autopilot is not known to be disarmed. Each of PX4's
-MAVLink ports has a console of its own (autopilots 10.3).
+HIGHRES_IMU is the reading of one IMU in floats less this bias, which no message tells, and the console does.
 
 The bias is published once a second, or as soon as it has moved by 0.001 rad/s or m/s^2, and wanders slowly between.
 """
@@ -19,11 +16,10 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.imu_messages import EkfBiasReading
+from companion.autopilot.telemetry.px4_console import ID, VECTOR, Px4Console
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
-from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners
 from companion.links.system.waiting import comes
 
@@ -32,7 +28,6 @@ logger = logging.getLogger(__name__)
 LOOK_EVERY_S: Final = 5.0
 """In turn at the bias and at which EKF flies: 1300 bytes each, 4.5 % of a line of 57600 baud."""
 _AT_FIRST_S: Final = 1.0
-_ANSWER_S: Final = 4.0
 MISSES: Final = 10
 _AGAIN_S: Final = 60.0
 """After so many answers that did not come or were not understood."""
@@ -41,36 +36,29 @@ _OLD_S: Final = 45.0
 _CALM_S: Final = 60.0
 """New offsets set the estimate to nothing, and it is some seconds until it is back. On a deck they are watched for 40 s
 by the integers, and floats that came back earlier would begin that anew."""
-_BYTES: Final = 70
-_SHELL: Final = mavlink.SERIAL_CONTROL_DEV_SHELL
-_ASKING: Final = mavlink.SERIAL_CONTROL_FLAG_RESPOND | mavlink.SERIAL_CONTROL_FLAG_EXCLUSIVE
 _UNITS: Final = np.repeat([1e-3, 1e-2], 3)
 _JUMP: Final = 0.5 * _UNITS
 """Largest step from one look to the next: 100 deg/h, 0.5 mg."""
 _STEADY: Final = 0.02 * _UNITS
 """Within a second, before it is used: 4 deg/h, 0.02 mg."""
 
-_LONGEST: Final = 8192
-_PROMPT: Final = re.compile("(nsh|pxh)> ")
-_ID: Final = r"(\d+)[^\n]*\n\s*"
-_VECTOR: Final = r"\[(-?\d+\.\d+), (-?\d+\.\d+), (-?\d+\.\d+)\]\s*"
 # Seventy bytes that are lost leave no other match: each value has its neighbours beside it.
 _PRIMARY: Final = re.compile(r"primary_instance: (\d+)\s|estimator_selector_status[^>]*never published")
 _BIAS: Final = re.compile(
-    rf"gyro_device_id: {_ID}gyro_bias: {_VECTOR}gyro_bias_limit.*"
-    rf"accel_device_id: {_ID}accel_bias: {_VECTOR}accel_bias_limit",
+    rf"gyro_device_id: {ID}gyro_bias: {VECTOR}gyro_bias_limit.*"
+    rf"accel_device_id: {ID}accel_bias: {VECTOR}accel_bias_limit",
     re.DOTALL,
 )
 _IMU: Final = re.compile(
     r"(?:Instance (\d+):|TOPIC: vehicle_imu)\s+vehicle_imu\s+timestamp: [^\n]*\n\s*timestamp_sample: [^\n]*\n\s*"
-    rf"accel_device_id: {_ID}gyro_device_id: {_ID}"
+    rf"accel_device_id: {ID}gyro_device_id: {ID}"
 )
 
 
 class EkfBias:
     """Reads the bias again and again; `run` it."""
 
-    def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
+    def __init__(self, console: Px4Console, vehicle: Vehicle) -> None:
         self.instance: int | None = None
         """The IMU (1..) that HIGHRES_IMU shows; None while its bias is not known."""
         self.settled = asyncio.Event()
@@ -79,10 +67,9 @@ class EkfBias:
         """Latest reading; `known_of` says whether it may be used."""
         self.on_read: Listeners[EkfBiasReading] = Listeners()
         """Notified of every reading."""
-        self._link, self._vehicle = link, vehicle
+        self._console, self._vehicle = console, vehicle
         self._held, self._misses = 0, 0
-        self._text, self._asked, self._number = "", "", -1
-        self._answered, self._woken = asyncio.Event(), asyncio.Event()
+        self._woken = asyncio.Event()
         self._from_s = -math.inf
         self._imus: dict[tuple[int, int], int] = {}
         """IMUs (1..) by the device ids of accelerometer and gyro."""
@@ -115,14 +102,12 @@ class EkfBias:
 
     async def run(self) -> None:
         """Read until cancelled."""
-        unsubscribe = self._link.subscribe(mavlink.MAVLink_serial_control_message, self._on_text)
         ignore = self._vehicle.on_event.add(self._on_event)
         try:
             while True:
                 self._woken.clear()
                 await comes(self._woken, await self._look() if self.may_look else _TURN_S)
         finally:
-            unsubscribe()
             ignore()
 
     @property
@@ -155,7 +140,7 @@ class EkfBias:
         """Whether the console told what was wanted of it: which EKF flies, or the bias of that one."""
         self._at_bias = self._primary is not None and (self.instance is None or not self._at_bias)
         if not self._at_bias:
-            found = await self._print("estimator_selector_status", _PRIMARY)
+            found = await self._console.listener("estimator_selector_status", _PRIMARY)
             if found is None:
                 return False
             primary = int(found[1] or 0)  # a single EKF has no selector
@@ -163,14 +148,14 @@ class EkfBias:
                 self.forget()
                 self._primary = primary
             return True
-        found = await self._print("estimator_sensor_bias", _BIAS, "-i", str(self._primary))
+        found = await self._console.listener("estimator_sensor_bias", _BIAS, "-i", str(self._primary))
         if found is None:
             return False
         key = int(found[5]), int(found[1])
         if key not in self._imus:
-            if await self._print("vehicle_imu", _IMU) is None:
+            if await self._console.listener("vehicle_imu", _IMU) is None:
                 return False
-            imus = _IMU.findall(self._text)
+            imus = _IMU.findall(self._console.text)
             self._imus = {(int(accel), int(gyro)): int(number or 0) + 1 for number, accel, gyro in imus}
             return key in self._imus
         self._take(found, self._imus[key])
@@ -188,27 +173,6 @@ class EkfBias:
         self.reading = EkfBiasReading(tuple(bias.tolist()), tuple(variance.tolist()), now_s)
         self.instance = instance if steady and not self._held else None
         self.on_read.tell(self.reading)
-
-    async def _print(self, topic: str, pattern: re.Pattern[str], *which: str) -> re.Match[str] | None:
-        """Have the console print what is published; None: it did not in time, or something else."""
-        self._text, self._asked = "", topic
-        self._answered.clear()
-        line = " ".join(("listener", topic, *which, "\n")).encode()
-        self._link.send(
-            mavlink.MAVLink_serial_control_message(_SHELL, _ASKING, 0, 0, len(line), [*line.ljust(_BYTES, b"\0")])
-        )
-        await comes(self._answered, _ANSWER_S)
-        self._asked = ""
-        return pattern.search(self._text)
-
-    def _on_text(self, message: mavlink.MAVLink_serial_control_message, _t_s: float) -> None:
-        number, before = message.get_seq(), self._number
-        if self._asked and message.device == _SHELL and self._vehicle.sent(message) and number != before:
-            self._number = number  # the same again is a copy
-            text = bytes(message.data[: message.count]).decode("ascii", "replace")
-            self._text = (self._text + text)[-_LONGEST:]
-            if _PROMPT.search(self._text, max(self._text.find(self._asked), 0)) and self._asked in self._text:
-                self._answered.set()
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event in ("rebooted", "found"):

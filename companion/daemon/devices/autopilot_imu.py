@@ -16,6 +16,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.ekf_bias import EkfBias
+from companion.autopilot.telemetry.imu_status import RawMean
 from companion.autopilot.telemetry.imu_stream import ImuStream
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.config.sections import Imu
@@ -154,6 +155,26 @@ class AutopilotImu:
             self._collector.reset(why, self.name)
         self.on_change.tell()
         return holds
+
+    @property
+    def wants_raw(self) -> bool:
+        """Whether its telemetry is integers, so that raw means tell more."""
+        kind = self.stream.kind
+        return self.calibration is not None and kind is not None and kind.gyro_step_rad_s > 0.0
+
+    def take_raw(self, raw: RawMean) -> None:
+        """Take a mean of its raw readings, less the offsets in force: what its telemetry shows in integers."""
+        known = self.calibration
+        if known is None:
+            return
+        if (raw.gyro_id, raw.accel_id) != (known.gyro_id, known.accel_id):
+            # The console knows which device it is; the slots' order was a guess.
+            self._slots.learn("gyro", raw.gyro_id, self.instance)
+            self._slots.learn("accel", raw.accel_id, self.instance)
+            self._stale.set()
+            return
+        output = known.output(raw.gyro_rad_s, raw.accel_m_s2, raw.temperature_degc)
+        self._collector.add_raw(self.name, raw.t_s, tuple(output.tolist()), raw.temperature_degc)
 
     def _on_sample(self, sample: ImuSample) -> None:
         if self.on_sample:

@@ -17,9 +17,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.firmware.firmwares import port_needs
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.ekf_bias import EkfBias
+from companion.autopilot.telemetry.imu_status import ImuStatus, RawMean
+from companion.autopilot.telemetry.imu_stream import ask_script
+from companion.autopilot.telemetry.px4_console import Px4Console
 from companion.autopilot.vehicle.parameter_client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
-from companion.autopilot.telemetry.imu_stream import ask_script
 from companion.configured import models
 from companion.configured.models import Role, baud_of, collect, serial_devices
 from companion.daemon.core import Core, Subsystem, Task
@@ -108,12 +110,16 @@ class Devices(Subsystem):
         self.slots = SlotMemory()
         rate_hz = models.imu_rate_hz(core.config) if imu_rate_hz is None else imu_rate_hz
         imus = [imu for imu in core.config.imu if imu.source == "autopilot"]
-        self.ekf_bias = EkfBias(core.link, core.vehicle)
+        console = Px4Console(core.link, core.vehicle)
+        self.ekf_bias = EkfBias(console, core.vehicle)
         # On a deck the integers are moved enough, and the console's answers on a slow line would delay readings.
         self._asks = bool(imus) and (rate_hz >= models.IMU_RATE_HZ or core.config.vehicle.platform == "ground")
         if not self._asks:
             self.ekf_bias.settled.set()
         self.imus = {imu.name: AutopilotImu(core, imu, self.slots, self.ekf_bias, rate_hz) for imu in imus}
+        self._status = ImuStatus(
+            console, self.ekf_bias, self._wants_raw, self._take_raw, slow=rate_hz < models.IMU_RATE_HZ
+        )
         self.sensors = [SerialSensor(device, self._take, core.offload) for device in serial_devices(core.config)]
         self.watch = SensorWatch(self.sensors, core.collector, self._offsets_of, core.say)
         self.signing = LinkSigning(core.config, core.link, core.vehicle, core.say, core.offload)
@@ -174,12 +180,20 @@ class Devices(Subsystem):
             ("collector", self._core.keep_ticking),
             ("signing", self.signing.run),
             ("reach", self.reach.run),
-            *([("ekf-bias", self.ekf_bias.run)] if self._asks else []),
+            *([("ekf-bias", self.ekf_bias.run), ("imu-status", self._status.run)] if self._asks else []),
             ("script-floats", lambda: ask_script(self._core.link, [imu.stream for imu in self.imus.values()])),
             *((imu.name, imu.run) for imu in self.imus.values()),
             *(((sensor.name, sensor.run) for sensor in self.sensors) if ports else ()),
             *([("sensor-watch", self.watch.run)] if ports else []),
         ]
+
+    def _wants_raw(self) -> list[int]:
+        return [imu.instance for imu in self.imus.values() if imu.wants_raw]
+
+    def _take_raw(self, raw: RawMean) -> None:
+        for imu in self.imus.values():
+            if imu.instance == raw.instance:
+                imu.take_raw(raw)
 
     def _take(self, role: Role, part: Sample) -> None:
         reading = collect(self._core.collector, role, part)

@@ -150,6 +150,9 @@ class ImuSource(Source):
         batches = BatchSource(LIMITS_IMU, keep, steps=integer_steps(imu))
         super().__init__("imu", imu.name, batches, _gate(imu, sways=may_move), may_move=may_move)
         self.imu = imu
+        self.raw = BatchSource(LIMITS_IMU, keep)
+        """Means that come beside a stream of integers, in floats."""
+        self._raw_count = 0
         self.counter: TurnCounter | None = None
         """Set while turns on a spot are counted."""
         self._breaks = 0
@@ -161,6 +164,16 @@ class ImuSource(Source):
         """Set the new kind of the stream."""
         self.imu, self.gate = imu, _gate(imu, sways=self._may_move)
         self.batches.steps = integer_steps(imu)
+
+    def add_raw(self, t_s: float, row: tuple[float, ...], temperature_degc: float | None) -> None:
+        """Add a mean that tells more than the stream."""
+        self._raw_count += 1
+        self.raw.add(t_s, row, temperature_degc, float(self._raw_count))
+
+    def forget(self) -> None:
+        """Drop the seconds so far."""
+        super().forget()
+        self.raw.forget()
 
     def has_restarted(self, sample: ImuSample) -> bool:
         """Return whether the stream was interrupted just before a sample."""

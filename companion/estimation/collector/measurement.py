@@ -112,8 +112,8 @@ class WindowSource(ABC):
         """Number of the stretch that is under way."""
 
     @abstractmethod
-    def set_imu(self, imu: ImuInput, batches: BatchSource) -> None:
-        """Add an IMU with its seconds, or begin anew with one whose stream is another now."""
+    def set_imu(self, imu: ImuInput, batches: BatchSource, raw: BatchSource) -> None:
+        """Add an IMU with its seconds and those of means beside it, or begin anew: its stream is another now."""
 
     @abstractmethod
     def set_pose(self, kind: str, batches: BatchSource) -> None:
@@ -211,6 +211,8 @@ class GroundWork(Work, frozen=True, kw_only=True):
 
     imus: list[ImuInput]
     batches: list[list[Batch]]
+    raw: list[list[Batch]]
+    """Means in floats beside a stream of integers, of those of the seconds that have any."""
     horizon_s: float
 
     def run(self) -> list[ImuEstimate] | CalibrationRefusedError:
@@ -218,7 +220,9 @@ class GroundWork(Work, frozen=True, kw_only=True):
         first, last = self.slots[0], self.slots[-1]
         rejected = last - first + 1 - len(self.slots)
         try:
-            return imu_estimates(self.imus, self.batches, end_s=last + 1.0, horizon_s=self.horizon_s, rejected=rejected)
+            return imu_estimates(
+                self.imus, self.batches, self.raw, end_s=last + 1.0, horizon_s=self.horizon_s, rejected=rejected
+            )
         except CalibrationRefusedError as error:
             return error
 
@@ -231,12 +235,12 @@ class GroundWindows(WindowSource):
         self._horizon_s, self._min_good, self._max_slots = settings.horizon_s, settings.min_slots, settings.max_slots
         self._least = min(MIN_BATCHES, self._min_good)
         self._stretch = Stretch(self._min_good, self._max_slots)
-        self._imus: dict[str, tuple[ImuInput, BatchSource]] = {}
+        self._imus: dict[str, tuple[ImuInput, BatchSource, BatchSource]] = {}
         self._next = 0
 
-    def set_imu(self, imu: ImuInput, batches: BatchSource) -> None:
+    def set_imu(self, imu: ImuInput, batches: BatchSource, raw: BatchSource) -> None:
         """Add an IMU or replace it."""
-        self._imus[imu.name] = imu, batches
+        self._imus[imu.name] = imu, batches, raw
 
     def set_pose(self, kind: str, batches: BatchSource) -> None:
         """Do nothing: the seconds of the pose are asked for with the window."""
@@ -276,9 +280,11 @@ class GroundWindows(WindowSource):
 
     def work(self, slots: Sequence[int], since_s: float | None) -> GroundWork:
         """Pack up the estimate of these seconds."""
+        imus, sources, raw = zip(*self._imus.values(), strict=True) if self._imus else ((), (), ())
         return GroundWork(
-            imus=[imu for imu, _ in self._imus.values()],
-            batches=[[source.batches[slot] for slot in slots] for _, source in self._imus.values()],
+            imus=list(imus),
+            batches=[[source.batches[slot] for slot in slots] for source in sources],
+            raw=[[source.batches[slot] for slot in slots if slot in source.batches] for source in raw],
             slots=slots,
             horizon_s=self._horizon_s,
             since_s=since_s,

@@ -93,6 +93,14 @@ class RollingCollector:
         if source.add(sample):
             self._evaluate()
 
+    def add_raw(self, name: str, t_s: float, row: tuple[float, ...], temperature_degc: float | None) -> None:
+        """Add a mean in floats (gyro in rad/s, accelerometer in m/s^2) of an IMU whose stream is integers.
+
+        Stillness is judged by the stream alone. Of a window the means count where they know the gyros better.
+        """
+        if name in self.imus:
+            self.imus[name].add_raw(t_s, row, temperature_degc)
+
     def add_tilt(self, sample: TiltSample) -> None:
         """Add one reading of the gradienter; dropped when none is expected."""
         if self._field is not None:
@@ -131,6 +139,8 @@ class RollingCollector:
             self._now_s = now_s
             for source in self._sources():
                 source.batches.close_before(now_s - _CLOSE_S)
+            for imu in self.imus.values():
+                imu.raw.close_before(now_s - _CLOSE_S)
             if self._field is not None:
                 self._field.batches.close_before(now_s - _CLOSE_S)
         self._evaluate()
@@ -144,12 +154,12 @@ class RollingCollector:
         if known is None:
             self.imus[name] = source = ImuSource(imu, self._keep, may_move=self._windows.may_move)
             source.batches.believed = lambda slot, degc: self.thermometers.believed(name, slot, degc)
-            self._windows.set_imu(imu, source.batches)
+            self._windows.set_imu(imu, source.batches, source.raw)
             # It has no share in the seconds so far.
             self._break()
         else:
             known.replace(imu)
-            self._windows.set_imu(imu, known.batches)
+            self._windows.set_imu(imu, known.batches, known.raw)
             self.reset("another stream", name)
 
     def expect(self, *, gradienter: bool, compass: bool) -> None:

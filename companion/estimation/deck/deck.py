@@ -156,7 +156,7 @@ class Deck(WindowSource):
         self._newest_s = 0
         self._is_good = True
 
-    def set_imu(self, imu: ImuInput, batches: BatchSource | None = None) -> None:
+    def set_imu(self, imu: ImuInput, batches: BatchSource | None = None, raw: BatchSource | None = None) -> None:
         """Add an IMU, or begin anew with one whose stream is another now."""
         self._streams[imu.name] = Stream(imu, self._gradienter)
         if batches is not None:

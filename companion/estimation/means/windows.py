@@ -37,6 +37,10 @@ from companion.samples import TRIADS, Triad, Vector, rows_of
 WHITE_SHARE: Final = 0.09
 """White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
 _ALLAN_SPANS: Final = 5
+RAW_BATCHES: Final = 10
+"""Seconds with means in floats that say enough of their own scatter."""
+RAW_STEP: Final = 1e-5
+"""Their rounding: five decimals, rad/s and m/s^2."""
 _FLICKER_OF_SLOPE: Final = 0.5
 """Share of the slope's variance by flicker and walk that counts as a hidden warm-up: V(T, H) has them already. With
 none of it 2 sigma cover 82 % of an ADIS16405's accelerometers in the steepest simulated ramp, with half 89 %."""
@@ -287,19 +291,40 @@ def _quantisation(batches: Sequence[Sequence[Batch]], steps: Floats) -> tuple[Fl
 
 
 def imu_estimates(
-    imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float, rejected: int
+    imus: Sequence[ImuInput],
+    batches: Sequence[Sequence[Batch]],
+    raw: Sequence[Sequence[Batch]] = (),
+    *,
+    end_s: float,
+    horizon_s: float,
+    rejected: int,
 ) -> list[ImuEstimate]:
     """Estimate all IMUs from their good batches, which are of the same seconds.
+
+    `raw`: of those seconds, means in floats beside a stream of integers; by them where they know the gyros better.
 
     Raises:
         CalibrationRefusedError: an axis never changes, or most samples were lost.
     """
     if not imus:
         return []
-    for imu, own in zip(imus, batches, strict=True):
-        _refuse_broken(imu, own)
-    found = zip(imus, batches, estimates(imus, batches, end_s=end_s, horizon_s=horizon_s), strict=True)
-    return [ImuEstimate(own, _imu_window(imu, seconds, own, rejected)) for imu, seconds, own in found]
+    for imu, seconds in zip(imus, batches, strict=True):
+        _refuse_broken(imu, seconds)
+    estimated = estimates(imus, batches, end_s=end_s, horizon_s=horizon_s)
+    found = []
+    beside: Sequence[Sequence[Batch]] = raw or [()] * len(imus)
+    for imu, seconds, own, means in zip(imus, batches, estimated, beside, strict=True):
+        if len(means) >= RAW_BATCHES:
+            floats = msgspec.structs.replace(
+                imu, gyro_step_rad_s=RAW_STEP, accel_step_m_s2=RAW_STEP, truncates=False,
+                gyro_grid_rad_s=0.0, accel_grid_m_s2=0.0,
+            )  # fmt: skip
+            (better,) = estimates([floats], [means], end_s=end_s, horizon_s=horizon_s)
+            if better.use_variance[:3].sum() < own.use_variance[:3].sum():
+                found.append(ImuEstimate(better, _imu_window(floats, means, better, rejected)))
+                continue
+        found.append(ImuEstimate(own, _imu_window(imu, seconds, own, rejected)))
+    return found
 
 
 def _imu_window(imu: ImuInput, batches: Sequence[Batch], found: Estimate, rejected: int) -> ImuWindow:

@@ -12,6 +12,7 @@ import pytest
 
 from companion.autopilot.telemetry.ekf_bias import LOOK_EVERY_S, MISSES, EkfBias
 from companion.autopilot.telemetry.imu_stream import ImuStream
+from companion.autopilot.telemetry.px4_console import Px4Console
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.links.mavlink.link import MavlinkLink
 from companion.samples import ImuSample
@@ -68,7 +69,7 @@ async def aboard(
     link = MavlinkLink()
     Wire(link, double, seed=1, loss=loss, duplicate=loss)
     vehicle = Vehicle(link)
-    ekf_bias = EkfBias(link, vehicle)
+    ekf_bias = EkfBias(Px4Console(link, vehicle), vehicle)
     found = Aboard(double, ekf_bias, None)  # type: ignore[arg-type]
     found.stream = ImuStream(
         link, vehicle, instance, found.samples.append, rate_hz=rate_hz, ekf_bias=ekf_bias,

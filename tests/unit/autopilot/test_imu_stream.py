@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.telemetry.ekf_bias import EkfBias
 from companion.autopilot.telemetry.imu_stream import ImuStream
+from companion.autopilot.telemetry.px4_console import Px4Console
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.links.mavlink.link import MavlinkLink
 from companion.samples import ImuSample
@@ -43,7 +44,7 @@ async def aboard(
     link = MavlinkLink()
     vehicle = Vehicle(link)
     heard = Heard()
-    ekf_bias = EkfBias(link, vehicle)
+    ekf_bias = EkfBias(Px4Console(link, vehicle), vehicle)
     ekf_bias.settled.set()  # nobody asks for it
     stream = ImuStream(
         link, vehicle, instance, heard.samples.append, rate_hz=rate_hz, ekf_bias=ekf_bias, on_kind_change=heard.kind

@@ -153,7 +153,7 @@ class OfPairs(Deck):
         super().__init__(gradienter, compass)
         self.off = self.sigma * np.random.default_rng([seed, 8]).standard_normal(6)
 
-    def set_imu(self, imu: ImuInput, batches: BatchSource | None = None) -> None:
+    def set_imu(self, imu: ImuInput, batches: BatchSource | None = None, raw: BatchSource | None = None) -> None:
         super().set_imu(msgspec.structs.replace(imu, rotation=self.rotation))
 
     def take_imu(self, name: str, batch: Batch, times: Array, rows: Array) -> None:
