@@ -208,7 +208,7 @@ def main() -> None:
             time.sleep(0.1)
         wanted = (folder / "sim.log").read_text()
         wanted = wanted.replace(f"udpin:{udp}", f"udpin:127.0.0.1:{relay.daemon_port}")
-        wanted += '\n[calibration]\nat_arm = "gate"\n[push]\ndither = true\n'
+        wanted += '\n[calibration]\nat_arm = "gate"\n'
         page_port = free_port()
         wanted += f'[web]\nbind = "127.0.0.1:{page_port}"\n'
         wanted += '\n[[imu]]\nname = "fc2"\nsource = "autopilot"\ninstance = 2\nprofile = "icm42688p"\n'

@@ -242,8 +242,6 @@ class Push(Section, frozen=True):
     """What is sent to the autopilot."""
 
     parameters: bool = True
-    dither: bool = False
-    """Whether offsets may be stepped for a minute, and put back, where an IMU's integers tell nothing otherwise."""
     attitude: Literal["off", "yaw", "full"] = "off"
     attitude_rate_hz: Annotated[float, Meta(gt=0, le=50)] = 30.0
     stop_rivals: bool = False

@@ -18,6 +18,7 @@ from companion.errors import ConfigError
 
 KEYS: Final[dict[str, str]] = {
     "calibration.fleet_prior": "0.2: delete the line (calibration.prior, of the aircraft's own power-ups, stays)",
+    "push.dither": "0.2: delete the line (floats tell every IMU: on ArduPilot install the script of companion lua)",
 }
 """Removed configuration keys without list indexes ("imu.port"), each with its version and its remedy."""
 

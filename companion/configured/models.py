@@ -54,7 +54,6 @@ def settings(config: Config) -> Settings:
         max_s=wanted.max_s,
         target_gyro_sigma_rad_s=wanted.target_gyro_sigma_deg_h * DEG_H,
         target_accel_sigma_m_s2=wanted.target_accel_sigma_mg * MG,
-        dither=config.push.dither and config.push.parameters,
     )
 
 

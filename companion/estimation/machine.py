@@ -13,7 +13,6 @@ class State(enum.Enum):
     WAITING = "waiting"
     COLLECTING = "collecting"
     SOLVING = "solving"
-    DITHERING = "dithering"
     WRITING = "writing"
     VERIFYING = "verifying"
     RESTARTING = "restarting"
@@ -52,7 +51,6 @@ class Event(enum.Enum):
     STILL = "still long enough"
     MOVED = "moved, or not as believed"
     ENOUGH = "measured enough"
-    DITHER = "integers do not tell"
     WRITE = "biases to write"
     NOTHING_TO_WRITE = "nothing to write"
     WRITTEN = "read back"
@@ -65,7 +63,6 @@ class Event(enum.Enum):
 
 RESTING: Final = (State.IDLE, State.DONE, State.FAILED, State.CANCELLED)
 _SHOWN: Final = {
-    State.DITHERING: State.SOLVING,
     State.RESTARTING: State.VERIFYING,
     State.SETTLING: State.VERIFYING,
     State.UNDOING: State.WRITING,
@@ -85,12 +82,10 @@ TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
     (State.WAITING, Event.STILL): State.COLLECTING,
     (State.COLLECTING, Event.MOVED): State.WAITING,
     (State.COLLECTING, Event.ENOUGH): State.SOLVING,
-    (State.SOLVING, Event.DITHER): State.DITHERING,
-    (State.DITHERING, Event.DITHER): State.DITHERING,
     # What was measured can turn out stale (an offset changed under it): measure again.
-    **{(state, Event.MOVED): State.WAITING for state in (State.SOLVING, State.DITHERING)},
-    **{(state, Event.WRITE): State.WRITING for state in (State.SOLVING, State.DITHERING)},
-    **{(state, Event.NOTHING_TO_WRITE): State.DONE for state in (State.SOLVING, State.DITHERING)},
+    (State.SOLVING, Event.MOVED): State.WAITING,
+    (State.SOLVING, Event.WRITE): State.WRITING,
+    (State.SOLVING, Event.NOTHING_TO_WRITE): State.DONE,
     (State.WRITING, Event.WRITTEN): State.VERIFYING,
     # What was written acts on another IMU than believed; it is put back, and now it is known.
     (State.WRITING, Event.MOVED): State.WAITING,

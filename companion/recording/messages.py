@@ -31,6 +31,7 @@ MAVLINK: Final = "/mavlink/in"
 IMU: Final = "/autopilot/imu/"
 """Prefix of `ImuState`; the name of the IMU follows."""
 EKF_BIAS: Final = "/autopilot/ekf_bias"
+RAW_MEAN: Final = "/autopilot/raw_mean"
 PLACE: Final = "/companion/place"
 START: Final = "/companion/start"
 TICK: Final = "/companion/tick"
@@ -64,6 +65,15 @@ class ImuState(msgspec.Struct, frozen=True, kw_only=True):
     """None: not known, so that its samples do not count."""
 
 
+class RawOutput(msgspec.Struct, frozen=True):
+    """A mean in floats beside an IMU's stream of integers, less the offsets in force."""
+
+    imu: str
+    output: tuple[float, float, float, float, float, float]
+    """Gyro in rad/s, accelerometer in m/s^2, vehicle FRD."""
+    temperature_degc: float | None
+
+
 class Measured(msgspec.Struct, frozen=True, kw_only=True):
     """A window of the still stretch was taken.
 
@@ -86,12 +96,11 @@ class Solved(msgspec.Struct, frozen=True, kw_only=True):
     """The gradienter's zero: offset x and y, and sigma, in degrees."""
     otherwise: Otherwise
     expectation: Expectation
-    dithered: bool
-    """True: means came from an offset dither, which no recording holds."""
 
 
 _TYPES: Final[dict[str, Any]] = {
     EKF_BIAS: EkfBiasReading,
+    RAW_MEAN: RawOutput,
     PLACE: Whereabouts,
     START: Start,
     MEASURED: Measured,

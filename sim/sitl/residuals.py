@@ -31,7 +31,7 @@ _QUICK_NAME = {"ardupilot": "simple, param5 = 4", "px4": "quick, param5 = 4"}
 _LEVEL = {"ardupilot": ("AHRS_TRIM_X", "AHRS_TRIM_Y"), "px4": ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF")}
 """What a level calibration sets: rad, degrees."""
 CALIBRATE_WITHIN_S = 420.0
-"""Two IMUs whose offsets are dithered one after the other, on a busy machine."""
+"""Two IMUs, on a busy machine."""
 OWN_TRIES = 3
 """Of the firmware's own gyro calibration: its quarter second of averaging gives another result each time, and one
 may be good by chance."""

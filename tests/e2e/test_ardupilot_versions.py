@@ -20,7 +20,6 @@ from tests.support.virtual_time import run_virtual
 
 RENAMED = re.compile(r"SR\d_|MAV\d?_|SYSID_|ARMING_CHECK|ARMING_SKIPCHK|SERIAL\d_OPTIONS")
 """Names that 4.7 changed."""
-DITHER = "[push]\ndither = true\n"
 
 
 def slow(folder: Path, **more: Any) -> Rig:
@@ -49,19 +48,18 @@ class Traffic:
         self.rig.link.send = noted  # type: ignore[method-assign]
 
 
-@pytest.mark.parametrize("version", ["4.3", "4.7"])
-def test_from_4_3_on_a_calibration_is_right_and_needs_no_name_that_4_7_changed(tmp_path: Path, version: str) -> None:
+@pytest.mark.parametrize("version", ["4.5", "4.7"])
+def test_from_4_5_on_a_calibration_is_right_and_needs_no_name_that_4_7_changed(tmp_path: Path, version: str) -> None:
     async def main() -> None:
-        rig = Rig(tmp_path, max_s=12.0, version=version, more=DITHER, imu_rate_hz=50.0, device_rate_hz=5.0, feed_s=0.4)
+        rig = Rig(tmp_path, max_s=12.0, version=version, script=True, imu_rate_hz=50.0, device_rate_hz=5.0, feed_s=0.4)
         traffic = Traffic(rig)
         async with rig.running():
             await rig.ready()
             result, record = await calibrated(rig, timeout_s=400.0)
             assert result.outcome == "done", result
-            integers = version == "4.3"
             kind = rig.service.devices.imus["fc"].stream.kind
             assert kind is not None
-            assert (kind.message == "HIGHRES_IMU") == (not integers)
+            assert kind.message == ("HIGHRES_IMU" if version == "4.7" else "floats of the script")
             assert list(record.imus[0].written) == [*offset_names(1, "accel"), *offset_names(1, "gyro")]
             left = rig.double.residual(1, rig.now_s)
             assert np.abs(left.gyro_rad_s).max() < 20 * DEG_H

@@ -26,7 +26,7 @@ ALL = [*names("ACC"), *names("GYRO")]
 
 
 def px4_rig(folder: Path, **options: Any) -> Rig:
-    """Quick: few samples, of a part whose noise dithers the integers, and nothing streamed that nobody asked for."""
+    """Quick: few samples, of a part whose noise moves the integers, and nothing streamed that nobody asked for."""
     options["parameters"] = NO_RIVALS | options.get("parameters", {})
     quick: dict[str, Any] = {
         "min_still_s": 4.0,

@@ -27,7 +27,7 @@ from companion.lab.logs.recording import MAGIC
 from companion.lab.replay.engine import TOLERANCE_SIGMAS, Result, replay
 from companion.recording import messages
 from tests.e2e.test_calibration import calibrated
-from tests.e2e.test_dither import UNDITHERED, second_imu_only
+from tests.e2e.test_script_floats import px4, three_imus
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -158,26 +158,42 @@ def test_moved_armed_unplugged_restarted_and_over_several_files(tmp_path: Path) 
         replay([paths[0], *others])
 
 
-@pytest.mark.parametrize("dither", [False, True])
-def test_integers_are_replayed_as_such_but_for_a_dither_which_no_recording_holds(tmp_path: Path, dither: bool) -> None:
+def test_a_window_begins_where_the_recorded_one_began_though_arming_is_not_recorded(tmp_path: Path) -> None:
+    async def during(rig: Rig) -> None:
+        # So that it ends long before the window is full.
+        rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=1.0, target_accel_sigma_m_s2=1.0)
+        await asyncio.sleep(12.0)
+        rig.double.arm()
+        await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.ARMED, 5.0)
+        rig.double.disarm()
+        await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.DISARMED, 5.0)
+        result, _ = await calibrated(rig)
+        assert result.outcome == "done", result
+
+    paths, records = record(tmp_path, during, min_still_s=5.0, max_s=30.0)
+    same(replay(paths), records)
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+@pytest.mark.parametrize("floats", [False, True])
+def test_integers_and_the_floats_in_their_place_are_replayed_as_such(
+    tmp_path: Path, firmware: str, floats: bool
+) -> None:
     async def main() -> list[Record]:
-        rig = second_imu_only(tmp_path, UNDITHERED, dither=dither, max_s=10.0)
+        rig = three_imus(tmp_path, script=floats) if firmware == "ardupilot" else px4(tmp_path, console=floats)
         storage = msgspec.structs.replace(rig.config.storage, recordings_mb=64)
         rig.config = msgspec.structs.replace(rig.config, storage=storage)
         async with rig.running():
-            await rig.until(lambda: rig.service.devices.imus["second"].calibration is not None, 15.0)
-            result, _ = await calibrated(rig)
+            imus = rig.service.devices.imus.values()
+            await rig.until(lambda: all(imu.calibration is not None for imu in imus), 15.0)
+            result, record = await calibrated(rig)
             assert result.outcome == "done", result
+            assert (record.imus[1].gyro_bias_rad_s is not None) == floats
             await asyncio.sleep(1.5)
         return rig.service.calibrating.store.history()
 
     (kept,) = run_virtual(main())
-    result = replay(ring(tmp_path))
-    (found,) = result.calibrations
-    if dither:
-        assert found.not_recomputed == "its means came from an offset dither"
-    else:
-        same(result, [kept])
+    same(replay(ring(tmp_path)), [kept])
 
 
 def rewritten(path: Path, to: Path, change: Callable[[str, bytes], bytes | None], **options: Any) -> Path:

@@ -78,8 +78,9 @@ def test_without_the_script_the_quiet_ones_are_left_alone_and_the_words_name_it(
         async with three_imus(tmp_path, script=False, max_s=12.0).running() as rig:
             await rig.until(lambda: messages(rig) == ["HIGHRES_IMU", "SCALED_IMU2", "SCALED_IMU3"], 15.0)
             _, record = await calibrated(rig, What.GYROS)
-            assert [imu.name for imu in record.imus] == ["fc1"]
-            assert "companion lua" in " ".join(record.warnings), record.warnings
+            assert [imu.name for imu in record.imus if imu.gyro_bias_rad_s is not None] == ["fc1"]
+            for imu in record.imus[1:]:
+                assert "companion lua" in " ".join(imu.warnings), imu.warnings
             written = {write.name for write in rig.double.writes}
             assert not written & {*offset_names(2, "gyro"), *offset_names(3, "gyro")}
 
@@ -152,10 +153,8 @@ def test_px4s_console_tells_the_second_imu_without_a_write_before_the_result(tmp
     async def main() -> None:
         async with px4(tmp_path, console=True).running() as rig:
             await rig.until(lambda: messages(rig) == ["HIGHRES_IMU+bias", "SCALED_IMU2"], 30.0)
-            _, record = await calibrated(rig, What.BOTH)
-            print(record.state, record.reason, record.warnings, [imu.warnings for imu in record.imus])
+            await calibrated(rig, What.BOTH)
             left = rig.px4.residual(2, rig.now_s)
-            print(left.gyro_rad_s / DEG_H, left.accel_m_s2 / MG, record.imus[1].gyro_sigma_use_rad_s)
             assert np.abs(left.gyro_rad_s).max() / DEG_H < 6.0
             assert np.abs(left.accel_m_s2).max() / MG < 0.15
 

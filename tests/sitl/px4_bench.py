@@ -25,7 +25,7 @@ ITS_OWN = frozenset(
 priority is -1, which means 50, until PX4's background calibration saves the slot: it then writes the 50. The
 barometer's offset is calibrated by GNSS after a start (SENS_BARO_AUTOCAL)."""
 GYRO_DEG_H = (500.0, -700.0, 1000.0)
-"""Case D: integers tell it without dither."""
+"""Case D: integers tell it."""
 ACCEL_MG = (1.0, -2.0, 3.0)
 QUICK = "\n[calibration]\nmin_still_s = 20\nmax_s = 40\n"
 SAVED_S = 4.0

@@ -28,20 +28,13 @@ LEFT_MG = {("ardupilot", 1): 0.02, ("px4", 1): 0.05, ("px4", 2): 0.03}
 """rms over the axes; PX4's first simulated IMU suffers from another 16 bits (autopilots 9.3.2: 10.9 deg/h, 24 ug)."""
 
 
-def dither(craft: Craft) -> str:
-    """Case A lies in the dead band of PX4's integers: only offset dither tells its gyro bias (autopilots 9.3.2)."""
-    if craft.firmware == "ardupilot":
-        return ""
-    return "[push]\ndither = true\n"
-
-
 @pytest.mark.only("sitl")
 def test_one_calibration_leaves_what_noise_and_gradienter_leave(autopilot: Autopilot, tmp_path: Path) -> None:
     async def main(craft: Craft) -> None:
         assert isinstance(craft, SitlCraft)
         await craft.restart_clean()
         await hush(craft)
-        async with companion_daemon(craft.vehicle, tmp_path, more=LONG + dither(craft)) as daemon:
+        async with companion_daemon(craft.vehicle, tmp_path, more=LONG) as daemon:
             record = await daemon.calibrate(CALIBRATE_WITHIN_S)
         assert record["state"] == "done", record["reason"]
         print("\n" + HEADER)

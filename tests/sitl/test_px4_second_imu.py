@@ -1,4 +1,4 @@
-"""The second IMU of a real PX4: its integers hide the gyro bias, and its console tells the raw means (autopilots 10)."""
+"""The second IMU of a real PX4: its integers hide the gyro bias, its console tells raw means (autopilots 10)."""
 
 from __future__ import annotations
 

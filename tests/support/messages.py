@@ -72,7 +72,7 @@ _REMEDY = re.compile(
 )
 """Words of a remedy. A text that has one is understood without docs/messages.md."""
 _PROGRESS = re.compile(
-    r"(?:working|writing|watching|waiting|reading|putting|checking|restarting|dithering|comparing|measuring|turned)\b"
+    r"(?:working|writing|watching|waiting|reading|putting|checking|restarting|comparing|measuring|turned)\b"
 )
 """Beginnings of a text that says what is being done."""
 _UNITS = {"deg", "mg", "min", "Hz", "imu", "gyro", "accel", "http", "IMU", "baud", "is"}

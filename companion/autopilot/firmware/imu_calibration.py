@@ -101,7 +101,7 @@ class Range:
 
 # Wide enough for whatever an autopilot may have had before, which an undo restores; far too narrow for nonsense.
 _GYRO_RAD_S: Final = MAX_GYRO_OFFSET_RAD_S + MAX_GYRO_RESIDUAL_RAD_S + 0.05
-"""An offset from which a calibration still comes to a plausible one, and a far step or a dither beyond it."""
+"""An offset from which a calibration still comes to a plausible one, and a far step beyond it."""
 _ACCEL_M_S2: Final = MAX_ACCEL_OFFSET_M_S2 + MAX_ACCEL_RESIDUAL_M_S2 + 0.4
 GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
 ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")

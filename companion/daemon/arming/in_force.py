@@ -72,7 +72,7 @@ class _TriadState:
     in_doubt: tuple[str, Held] | None = None
     """Held back, why, and what was measured: while the output stays there, measuring again would give the same."""
     judged: bool = True
-    """False: no calibration can settle it, as its integer readings tell nothing and must not be dithered."""
+    """False: no calibration can settle it, as its integer readings tell nothing."""
 
 
 class InForce:
@@ -320,7 +320,7 @@ class InForce:
 
     def _leave_out(self, key: Key, state: _TriadState) -> None:
         state.present = None
-        if not self._config.push.dither and state.held is Why.NEVER and state.judged and len(self._judged) > 1:
+        if state.held is Why.NEVER and state.judged and len(self._judged) > 1:
             logger.warning("%s %s cannot be known from its integer readings and is not judged", key[1], key[0])
             state.judged = False
 

@@ -37,7 +37,6 @@ COUNTDOWN_KEPT_S: Final = 2.0
 OLDEST_ANSWER_S: Final = 1.5
 """Age beyond which an answer, which the loop has not renewed, is not given."""
 _STEPS: Final[dict[State, str]] = {
-    State.DITHERING: "dithering offsets",
     State.WRITING: "writing offsets",
     State.VERIFYING: "checking new offsets",
     State.RESTARTING: "restarting autopilot",

@@ -26,7 +26,6 @@ from companion.daemon.calibrating.estimator import Estimator, EstimatorInputs
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
-from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.effect import TELEMETRY
 from companion.daemon.offsets.plan import (
     Plan,
@@ -76,12 +75,11 @@ class CalibrationParts(NamedTuple):
     core: Core
     imus: Mapping[str, AutopilotImu]
     measuring: Measuring
-    ditherer: Ditherer
     estimator: Estimator
     memory: BiasMemory
     offsets: Offsets
-    on_solved: Listeners[Window, Window, EstimatorInputs, What, Expectation]
-    """Listeners to estimates: measured window, used window, other inputs, request, earlier biases."""
+    on_solved: Listeners[EstimatorInputs, What, Expectation]
+    """Listeners to estimates: inputs besides the window, request, earlier biases."""
 
 
 class CalibrationRun(Job):
@@ -119,8 +117,6 @@ class CalibrationRun(Job):
         """Clear the results of all phases."""
         self.measured: Window | None = None
         """Window of telemetry under the offsets in force."""
-        self.window: Window | None = None
-        """The measured window, or a dithered one."""
         self.solution: Solution | None = None
         """The estimate: residuals in the output of the autopilot's IMUs, whole biases of others."""
         self.whole: dict[str, Pair] = {}
@@ -191,13 +187,11 @@ class CalibrationRun(Job):
     # --- the phases
 
     async def _measure(self) -> None:
-        """Wait until it is still and average; a dither betters integer means where that is allowed."""
+        """Wait until it is still and average."""
         while True:
-            self.measured = window = await self._measuring.measure(self)
+            self.measured = await self._measuring.measure(self)
             if await self._path.offsets_still_hold():
-                self.window = await self._parts.ditherer.refine(window, self, self.log)
-                if self.window is window or await self._path.offsets_still_hold():
-                    return
+                return
             # The window holds telemetry under other offsets than those now in force.
             self._machine.on(Event.MOVED)
 
@@ -208,15 +202,14 @@ class CalibrationRun(Job):
         the offsets in force were right once, and a gradienter that has moved would spoil them without anybody looking.
         """
         assert self.measured is not None
-        assert self.window is not None
         core, memory, unix_s = self._core, self._parts.memory, self.log.started_at.timestamp()
         estimator = self._parts.estimator
-        solution, given = await estimator.solve(self.window, self.what)
+        solution, given = await estimator.solve(self.measured, self.what)
         self.alignment, self.solution = estimator.alignment.used, solution
         for name, words in memory.forgotten().items():
             self.log.warn(name, words)
         expectation: Expectation = await core.offload(memory.expectation, solution, unix_s)
-        self._parts.on_solved.tell(self.measured, self.window, given, self.what, expectation)
+        self._parts.on_solved.tell(given, self.what, expectation)
         self.device_ids = memory.device_ids()
         whole = memory.whole(solution)
         weighed: Weighed = await core.offload(weigh, solution, whole, expectation)
@@ -286,13 +279,13 @@ class CalibrationRun(Job):
     async def _write_and_settle(self) -> None:
         """Write the plan, watch its effect in the telemetry, and wait until the autopilot uses it."""
         assert self.plan is not None
-        assert self.window is not None
+        assert self.measured is not None
         if not self.plan.changes:
             self.check_cancelled()
             self._machine.on(Event.NOTHING_TO_WRITE)
             return
-        self.plan = await self._path.write(self, self.plan, self.window, self.log, self._watching)
-        await self._path.settle(self, self.plan, self.window, self.log)
+        self.plan = await self._path.write(self, self.plan, self.measured, self.log, self._watching)
+        await self._path.settle(self, self.plan, self.measured, self.log)
 
     def _watching(self, words: str) -> None:
         """Show progress while the telemetry is watched, and tell who asked that it moves."""

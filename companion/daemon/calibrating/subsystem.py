@@ -21,7 +21,6 @@ from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job, Undone
-from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.alignment import AlignmentInForce, ByHand, FacesInForce
 from companion.daemon.stands.all_sides import SidesTask
@@ -31,7 +30,6 @@ from companion.daemon.stands.session import PoseSession, PoseTask
 from companion.daemon.stands.writes import AlignmentWrites
 from companion.errors import CalibrationRefusedError, RequestRefusedError
 from companion.estimation.alignment.poses import HEADINGS, AlignmentRequest
-from companion.estimation.means.windows import Window
 from companion.estimation.request import What
 from companion.estimation.solution.prior import Expectation
 from companion.formats import Object
@@ -66,12 +64,11 @@ class Calibrating(Subsystem):
         self.faces = FacesInForce(core, imus)
         own = OwnAttitude(core.vehicle, wanted=config.compass is None)
         self.estimator = Estimator(core, self.alignment, self.faces, own)
-        self.on_solved: Listeners[Window, Window, EstimatorInputs, What, Expectation] = Listeners()
-        ditherer = Ditherer(core, imus, offsets.writer, offsets.ledger)
+        self.on_solved: Listeners[EstimatorInputs, What, Expectation] = Listeners()
         self.stands = PoseSession(core, imus, measuring, AlignmentWrites(core, imus, offsets, own))
         self.by_hand = ByHand(core, imus)
         self._into_autopilot = IntoAutopilot(core, imus, measuring, self.memory, offsets)
-        parts = CalibrationParts(core, imus, measuring, ditherer, self.estimator, self.memory, offsets, self.on_solved)
+        parts = CalibrationParts(core, imus, measuring, self.estimator, self.memory, offsets, self.on_solved)
         self.manager = CalibrationManager(parts, self.store, self.by_hand)
 
     def load(self) -> None:  # noqa: D102 - as in the base class

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 from companion.autopilot.firmware.firmwares import part_of, read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.autopilot.firmware.imu_messages import StreamKind
+from companion.autopilot.firmware.imu_messages import Six, StreamKind
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.telemetry.ekf_bias import EkfBias
 from companion.autopilot.telemetry.imu_status import RawMean
@@ -55,6 +55,8 @@ class AutopilotImu:
         self.on_sample: Listeners[ImuSample] = Listeners()
         self.on_counting: Listeners[ImuSample] = Listeners()
         """Listeners to samples that count, before the collector."""
+        self.on_raw: Listeners[float, Six, float | None] = Listeners()
+        """Told of every mean of raw readings: time, output less the offsets in force, temperature in deg C."""
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
         """Listeners to readings: the one before, unless we have written since, and the present one."""
         self.on_change: Listeners[[]] = Listeners()
@@ -174,7 +176,9 @@ class AutopilotImu:
             self._stale.set()
             return
         output = known.output(raw.gyro_rad_s, raw.accel_m_s2, raw.temperature_degc)
-        self._collector.add_raw(self.name, raw.t_s, tuple(output.tolist()), raw.temperature_degc)
+        row: Six = tuple(output.tolist())
+        self._collector.add_raw(self.name, raw.t_s, row, raw.temperature_degc)
+        self.on_raw.tell(raw.t_s, row, raw.temperature_degc)
 
     def _on_sample(self, sample: ImuSample) -> None:
         if self.on_sample:

@@ -233,7 +233,7 @@ def _resolution(kind: StreamKind | None, triad: Triad) -> float:
 def _as_at_end(triad: Triad, sides: BeforeAfter, before: Vector, after: Vector) -> tuple[Vector, Vector, Array]:
     """Convert both means to the temperature at the end of the first window; returns one sigma of that too, (3,)."""
     first, second = sides.before.warming, sides.after.warming
-    if first is None or sides.before.dithered:
+    if first is None:
         return before, after, np.zeros(3)
     slope, sigma = first.goes_on(triad)
     later = np.zeros(3) if second is None else second.ahead(triad)

@@ -96,7 +96,7 @@ class Ledger:
         return self._open
 
     @contextlib.asynccontextmanager
-    async def transaction(self, changes: ChangeSet, *, stepwise: bool = False) -> AsyncIterator[None]:
+    async def transaction(self, changes: ChangeSet) -> AsyncIterator[None]:
         """Enclose a write; an unfinished write is handled here and nowhere else.
 
         The old values are on disk before the block begins. The block reports its end by `done` or `undone`. A writer's
@@ -105,8 +105,6 @@ class Ledger:
 
         Args:
             changes: changes of the block, as far as they are known beforehand.
-            stepwise: the block writes these values more than once, so that a write which has restored what it found
-                has not restored the values kept here.
 
         Raises:
             AutopilotError: an earlier write is open still, or another companion writes here; do not write.
@@ -120,7 +118,7 @@ class Ledger:
         try:
             yield
         except (WriteFailedError, NothingWrittenError) as error:
-            if not (error.left_changed or stepwise):
+            if not error.left_changed:
                 with contextlib.suppress(StorageError):
                     await self.unchanged()
             raise

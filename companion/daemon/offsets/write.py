@@ -1,7 +1,7 @@
 """The write path: journal, write with read-back, effect in the telemetry; after any failure the old values again.
 
-Calibrations, alignments and temperature curves write through `WritePath`. An undo, a dither and PX4's far values
-restore what they found, and use the journal's transaction alone.
+Calibrations, alignments and temperature curves write through `WritePath`. An undo and PX4's far values restore
+what they found, and use the journal's transaction alone.
 """
 
 from __future__ import annotations
@@ -316,15 +316,13 @@ class WritePath:
 
 def _note_verdicts(plan: Plan, target: Target, verdicts: Sequence[Verdict], log: WriteLog) -> list[str]:
     """Enter the outcomes of one IMU's parameters; returns what is wrong, in words."""
-    dithered = target.solution.dithered
-    hidden = () if dithered else tuple(name for verdict in verdicts for name in verdict.hidden)
+    hidden = tuple(name for verdict in verdicts for name in verdict.hidden)
     if hidden:
         log.warn(target.name, f"so small a change does not show in the telemetry: {', '.join(hidden)}")
     for verdict in verdicts:
         log.warn(target.name, *verdict.problems)
         # A vector whose step as a whole was seen is in use; an axis that hardly changed cannot show more.
-        # Where the integers show no step at all, the dither has shown that they follow these parameters.
-        seen = verdict.ok and (not verdict.hidden or dithered)
+        seen = verdict.ok and not verdict.hidden
         for axis in verdict.axes:
             plan.mark(log, [axis.parameter], "verified" if seen else verdict.outcome(axis.parameter))
     return [f"imu {target.name}: {in_short(verdict)}" for verdict in verdicts if not verdict.ok]

@@ -16,7 +16,7 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from companion.autopilot.firmware.imu_messages import EkfBiasReading
+from companion.autopilot.firmware.imu_messages import EkfBiasReading, Six
 from companion.commands import Record
 from companion.component.service import JobResult
 from companion.configured import models
@@ -44,7 +44,7 @@ from companion.recording.files import (
     is_available,
     unused_path,
 )
-from companion.recording.messages import ImuState, Measured, Message, Solved
+from companion.recording.messages import ImuState, Measured, Message, RawOutput, Solved
 from companion.recording.tape import KeyFilter, Tape
 
 logger = logging.getLogger(__name__)
@@ -110,6 +110,7 @@ class Recorder(Subsystem):
             sensor.on_bytes.add(lambda name, data, t_s: self.tape.put(messages.SERIAL + name, t_s, data or b""))
         for imu in devices.imus.values():
             imu.on_change.add(partial(self._on_imu, imu))
+            imu.on_raw.add(partial(self._on_raw, imu.name))
         devices.ekf_bias.on_read.add(self._on_ekf_bias)
         calibrating.measuring.on_measured.add(self._on_measured)
         calibrating.on_solved.add(self._on_solved)
@@ -139,6 +140,9 @@ class Recorder(Subsystem):
         )
         self.tape.put_state(messages.IMU + imu.name, _now_s(), messages.encode(state))
 
+    def _on_raw(self, name: str, t_s: float, output: Six, degc: float | None) -> None:
+        self.tape.put(messages.RAW_MEAN, t_s, messages.encode(RawOutput(name, output, degc)))
+
     def _on_ekf_bias(self, reading: EkfBiasReading) -> None:
         self.tape.put_state(messages.EKF_BIAS, _now_s(), messages.encode(reading))
 
@@ -150,9 +154,7 @@ class Recorder(Subsystem):
         )
         self.tape.put(messages.MEASURED, _now_s(), messages.encode(measured))
 
-    def _on_solved(
-        self, measured: Window, refined: Window, given: EstimatorInputs, what: What, expectation: Expectation
-    ) -> None:
+    def _on_solved(self, given: EstimatorInputs, what: What, expectation: Expectation) -> None:
         used = self._alignment.used
         solved = Solved(
             where=given.where,
@@ -160,7 +162,6 @@ class Recorder(Subsystem):
             alignment=None if used is None else (*used.offset_deg, used.sigma_deg),
             otherwise=given.otherwise,
             expectation=expectation,
-            dithered=refined is not measured,
         )
         self.tape.put(messages.SOLVED, _now_s(), messages.encode(solved))
 

@@ -90,8 +90,6 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     target_gyro_sigma_rad_s: float
     target_accel_sigma_m_s2: float
     horizon_s: float = 180.0
-    dither: bool = False
-    """True: undecided integers are measured by a dither afterwards, and are not waited for."""
 
     @property
     def min_slots(self) -> int:
@@ -121,4 +119,4 @@ def _room(settings: Settings, own: Estimate) -> Floats:
     target = np.repeat([settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2], 3)
     stays = own.use_variance - own.white_variance
     room = np.maximum(np.square(target) - stays, WHITE_SHARE * stays)
-    return np.where(own.undecided & np.isfinite(target) & (not settings.dither), -1.0, room)
+    return np.where(own.undecided & np.isfinite(target), -1.0, room)

@@ -38,7 +38,7 @@ FROZEN_S: Final = 20
 _SWAYS_RAD_S: Final = 0.3 * DEG
 """Least scatter of the rates of roll and pitch in that time."""
 _SAME: Final = 1e-9
-_DITHERED: Final = 1.5
+_SPREAD: Final = 1.5
 """Integers spread over so many steps by the swaying hide nothing."""
 _UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
 _LEAST_ACCEL_M_S2: Final = 0.1 * MG
@@ -273,7 +273,7 @@ def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:
     steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
     means = np.array([one.mean for one in seconds])
     spread = np.sqrt(means.var(axis=0) + np.mean([one.variance for one in seconds], axis=0))
-    hidden = np.where(spread < _DITHERED * steps, np.square(steps / 2.0), 0.0)
+    hidden = np.where(spread < _SPREAD * steps, np.square(steps / 2.0), 0.0)
     hidden = hidden + np.mean([one.shared_variance for one in seconds], axis=0)
     turn = np.square(imu.rotation)
     return np.concatenate([turn @ hidden[:3], turn @ hidden[3:]])

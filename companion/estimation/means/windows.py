@@ -113,8 +113,6 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     """Warnings of a drift, unless a curve of the temperature explains it."""
     hidden: dict[Triad, Hidden] = {}
     """Triads whose noise spreads the integers too little for a mean."""
-    dithered: bool = False
-    """The means come from a dither, in which the telemetry followed every step of the offsets."""
     named: bool = True
     """The part is known."""
     covariance: NDArray[np.float64] | None = None
@@ -367,14 +365,13 @@ def _hidden(imu: ImuInput, own: Estimate) -> dict[Triad, Hidden]:
             axes = _axes(useless_axes if useless else undecided)
             what = "not known: bias and" if useless else "half a step unknown:"
             found[part] = Hidden(
-                f"{part} {imu.name} {axes}: {what} noise smaller than its telemetry's steps of {step}; push.dither ="
-                " true measures it",
+                f"{part} {imu.name} {axes}: {what} noise smaller than its telemetry's steps of {step}: no"
+                " floats (ArduPilot: companion lua; PX4: its console)",
                 useless,
             )
         elif edge_rms > EDGE_RMS:
             found[part] = Hidden(
-                f"{part} {imu.name}: the sensor has coarse steps of its own ({grid}) below"
-                " the integers, sigma widened; push.dither = true takes them away",
+                f"{part} {imu.name}: the sensor has coarse steps of its own ({grid}) below the integers, sigma widened",
                 useless=False,
             )
     return found

@@ -95,13 +95,13 @@ def wandering(slots: NDArray[np.int64], left: Floats, white: Floats) -> tuple[Fl
     return np.where(walks, 0.0, flicker), np.where(walks, walk, 0.0)
 
 
-def hidden_by_steps(step: float, variance: float, *, dithered: bool = True) -> float:
+def hidden_by_steps(step: float, variance: float, *, enough: bool = True) -> float:
     """By how much the mean of readings rounded to `step` (0 for floats) may be off, either way.
 
     (q / pi) exp(-2 pi^2 sigma^2 / q^2), the first harmonic (method 2.5), by the variance with rounding and
-    all; at most half a step, as where the readings show too few values to tell their noise (not `dithered`).
+    all; at most half a step, as where the readings show too few values to tell their noise (not `enough`).
     """
-    if step <= 0.0 or not dithered:
+    if step <= 0.0 or not enough:
         return max(step, 0.0) / 2.0
     noise = max(variance / step**2 - 1.0 / 12.0, 0.0)
     return step * min(0.5, math.exp(-2.0 * math.pi**2 * noise) / math.pi)

@@ -63,7 +63,6 @@ class ImuSolution:
     k_s: float = 0.0
     warming: Warming | None = None
     when_warm: WhenWarm | None = None
-    dithered: bool = False
     """The telemetry was seen to follow this IMU's offsets step by step."""
     prior: Prior | None = None
     effective: Effective | None = None
@@ -288,7 +287,7 @@ def _estimate(
     if own is None:
         own = np.diag(np.square([*imu.gyro_sigma_use_rad_s, *imu.accel_sigma_use_m_s2]))
     covariance = shared.covariance + own
-    path = None if imu.warming is None or imu.dithered else imu.warming.path
+    path = None if imu.warming is None else imu.warming.path
     unseen = np.zeros(6) if imu.warming is None else imu.warming.unseen(powered_s)
     wide = "" if imu.warming is None else imu.warming.in_words(imu.name, powered_s, np.diag(covariance))
     return ImuSolution(
@@ -303,9 +302,7 @@ def _estimate(
         k_s=0.0 if imu.warming is None else imu.warming.rate_k_s,
         warnings=(*imu.warnings, *dict.fromkeys(of.words for triad, of in imu.hidden.items() if triad in asked)),
         drifting=imu.drifting if gyro is None or not wide else (*imu.drifting, wide),
-        # A dither's means come after the window.
-        warming=None if imu.dithered else imu.warming,
-        dithered=imu.dithered,
+        warming=imu.warming,
     )
 
 

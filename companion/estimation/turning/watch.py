@@ -275,7 +275,7 @@ def _by_compass(headings: list[Batch]) -> Turn | None:
         np.array([getattr(batch, name) for batch in headings]) for name in ("white", "low", "high", "distinct")
     )
     step = max(float(np.where(distinct == 2, high - low, 0.0).max()), float(decimal(low, high)[0]))
-    hidden = hidden_by_steps(step, float(white.mean()), dithered=not few_distinct(distinct)[0])
+    hidden = hidden_by_steps(step, float(white.mean()), enough=not few_distinct(distinct)[0])
     # Few seconds say little about their own noise; the readings within them say more.
     least = math.sqrt(float(np.mean([batch.white[0] / batch.n for batch in headings])))
     found = fit_slope(slots, turned, white=least, hidden=hidden)

@@ -116,6 +116,9 @@ class Replay:
                 _change(collector, before, state)
         elif topic == messages.TICK:
             collector.tick(t_s)
+        elif topic == messages.RAW_MEAN:
+            raw = decode(topic, data)
+            collector.add_raw(raw.imu, t_s, raw.output, raw.temperature_degc)
         elif topic == messages.PLACE:
             self._where = decode(topic, data)
         elif topic == messages.MEASURED:
@@ -161,9 +164,6 @@ class Replay:
     def _solve(self, detail: Solved) -> None:
         """Estimate from the latest window what the daemon estimated from it."""
         self._solution, self._where = None, detail.where
-        if detail.dithered:
-            self._not_recomputed = "its means came from an offset dither"
-            return
         if self._measured is None:
             self._not_recomputed = _BEFORE
             return

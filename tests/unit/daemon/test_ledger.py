@@ -77,9 +77,9 @@ def opened(folder: Path, disk: Disk | None = None) -> Ledger:
     return ledger
 
 
-async def end_of(ledger: Ledger, block: Block, *, stepwise: bool = False) -> BaseException | None:
+async def end_of(ledger: Ledger, block: Block) -> BaseException | None:
     async def write() -> None:
-        async with ledger.transaction(OLD, stepwise=stepwise):
+        async with ledger.transaction(OLD):
             await block(ledger)
 
     (found,) = await asyncio.gather(write(), return_exceptions=True)
@@ -87,32 +87,28 @@ async def end_of(ledger: Ledger, block: Block, *, stepwise: bool = False) -> Bas
 
 
 @pytest.mark.parametrize(
-    ("block", "stepwise", "over"),
+    ("block", "over"),
     [
-        (raises(ALL_BACK), False, True),
-        (raises(NOTHING), False, True),
-        (raises(HALF_BACK), False, False),
-        (raises(ALL_BACK), True, False),
-        (raises(NOTHING), True, False),
-        (raises(AutopilotError("no heartbeat")), False, False),
-        (raises(StorageError("full")), False, False),
-        (raises(asyncio.CancelledError()), False, False),
-        (raises(TornDown()), False, False),
-        (wordless, False, False),
-        (done_and_then, False, True),
-        (undone_and_then, False, True),
+        (raises(ALL_BACK), True),
+        (raises(NOTHING), True),
+        (raises(HALF_BACK), False),
+        (raises(AutopilotError("no heartbeat")), False),
+        (raises(StorageError("full")), False),
+        (raises(asyncio.CancelledError()), False),
+        (raises(TornDown()), False),
+        (wordless, False),
+        (done_and_then, True),
+        (undone_and_then, True),
     ],
     ids=[
-        "old values back", "nothing written", "left changed", "a step put back", "a step not written", "another error",
+        "old values back", "nothing written", "left changed", "another error",
         "the disk", "cancelled", "torn down", "no word", "an error after done", "an error after undone",
     ],
 )  # fmt: skip
-def test_a_write_is_over_when_it_is_known_to_be_and_else_the_menders(
-    tmp_path: Path, block: Block, stepwise: bool, over: bool
-) -> None:
+def test_a_write_is_over_when_it_is_known_to_be_and_else_the_menders(tmp_path: Path, block: Block, over: bool) -> None:
     async def main() -> None:
         ledger = opened(tmp_path)
-        await end_of(ledger, block, stepwise=stepwise)
+        await end_of(ledger, block)
         assert ledger.pending is not over
         assert on_disk(tmp_path) == (None if over else OLD)
         if not over:

@@ -20,9 +20,7 @@ def test_every_state_can_be_reached_and_left() -> None:
 
 def test_nothing_is_written_without_having_been_solved() -> None:
     into_writing = {(old, event) for (old, event), new in TRANSITIONS.items() if new is State.WRITING}
-    assert into_writing == {(state, Event.WRITE) for state in (State.SOLVING, State.DITHERING)}
-    into_dithering = {old for (old, _), new in TRANSITIONS.items() if new is State.DITHERING}
-    assert into_dithering == {State.SOLVING, State.DITHERING}
+    assert into_writing == {(State.SOLVING, Event.WRITE)}
     assert {old for (old, event), new in TRANSITIONS.items() if new is State.UNDOING} == set(RESTING)
 
 
@@ -34,7 +32,7 @@ def test_users_see_the_words_that_other_programs_rely_on() -> None:
 
 def test_nothing_counts_as_right_from_the_first_write_until_it_is_concluded() -> None:
     into_rest = {State.WAITING, State.DONE, State.FAILED, State.CANCELLED}
-    for old in (State.DITHERING, State.WRITING, State.VERIFYING, State.RESTARTING, State.SETTLING, State.UNDOING):
+    for old in (State.WRITING, State.VERIFYING, State.RESTARTING, State.SETTLING, State.UNDOING):
         assert old.is_writing
         assert all(new.is_writing or new in into_rest for (state, _), new in TRANSITIONS.items() if state is old)
     assert not any(state.is_writing for state in (*RESTING, State.WAITING, State.COLLECTING, State.SOLVING))
