@@ -158,22 +158,6 @@ def test_moved_armed_unplugged_restarted_and_over_several_files(tmp_path: Path) 
         replay([paths[0], *others])
 
 
-def test_a_window_begins_where_the_recorded_one_began_though_arming_is_not_recorded(tmp_path: Path) -> None:
-    async def during(rig: Rig) -> None:
-        # So that it ends long before the window is full.
-        rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=1.0, target_accel_sigma_m_s2=1.0)
-        await asyncio.sleep(12.0)
-        rig.double.arm()
-        await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.ARMED, 5.0)
-        rig.double.disarm()
-        await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.DISARMED, 5.0)
-        result, _ = await calibrated(rig)
-        assert result.outcome == "done", result
-
-    paths, records = record(tmp_path, during, min_still_s=5.0, max_s=30.0)
-    same(replay(paths), records)
-
-
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
 @pytest.mark.parametrize("floats", [False, True])
 def test_integers_and_the_floats_in_their_place_are_replayed_as_such(

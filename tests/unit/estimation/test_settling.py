@@ -148,17 +148,6 @@ def test_an_aircraft_that_stands_still_waits_no_longer() -> None:
     assert lagging.words == at_once.words
 
 
-def test_a_knock_in_a_still_stretch_costs_no_more_seconds_than_before() -> None:
-    knock = Knock(start_s=20.3)
-    at_once = fly([knock], device_lag_s=0.43, known=AT_ONCE, until_s=40.0)
-    lagging = fly([knock], device_lag_s=0.43, known=(0.43, SIGMA_DEG), until_s=40.0)
-    assert [t_s for t_s, _ in lagging.windows] == [t_s for t_s, _ in at_once.windows]
-    for (_, one), (_, other) in zip(lagging.windows, at_once.windows, strict=True):
-        assert encode(one.imus) == encode(other.imus)
-    errors = [lagging.error_deg(k) for k in range(len(lagging.windows))]
-    assert max(errors) < 0.1 * SIGMA_DEG
-
-
 def turned(lag_s: float) -> tuple[float, float]:
     """Error of the mean heading after a turn of 20 degrees seen through a filter of 2 s, and when it was there."""
     feed = Feeder(RollingCollector(settings(), [imu()], compass=dataclasses.replace(HEADING, lag_s=lag_s)))
