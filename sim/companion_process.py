@@ -9,7 +9,6 @@ import signal
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self
 
 READY_WITHIN_S: Final = 40.0
@@ -49,9 +48,7 @@ class CompanionProcess:
             )
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         assert self._process is not None
         if self._process.returncode is None:
             self._process.terminate()
@@ -67,11 +64,7 @@ class CompanionProcess:
         self._process.send_signal(number)
 
     async def ended(self, within_s: float) -> int:
-        """Wait for its end; the exit code, negative if a signal killed it.
-
-        Raises:
-            TimeoutError: it goes on.
-        """
+        """Wait for its end; the exit code, negative if a signal killed it."""
         assert self._process is not None
         async with asyncio.timeout(within_s):
             return await self._process.wait()
@@ -85,12 +78,7 @@ class CompanionProcess:
         return json.loads(output) if asking.returncode == 0 else None
 
     async def ready(self, within_s: float = READY_WITHIN_S) -> None:
-        """Wait until the daemon answers and knows that the aircraft is disarmed.
-
-        Raises:
-            RuntimeError: it ended; its log is in the message.
-            TimeoutError: it did not become ready.
-        """
+        """Wait until the daemon answers and knows that the aircraft is disarmed."""
         assert self._process is not None
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + within_s
@@ -121,11 +109,7 @@ class CompanionProcess:
         return record
 
     async def ask(self, *words: str) -> Record:
-        """Run a command with --json; what it prints.
-
-        Raises:
-            RuntimeError: it printed nothing.
-        """
+        """Run a command with --json; what it prints."""
         process = await asyncio.create_subprocess_exec(
             *self.command(*words, "--json"), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL
         )
@@ -136,11 +120,7 @@ class CompanionProcess:
         return answer
 
     async def calibrate(self, within_s: float, *, progress: int | None = None) -> Record:
-        """`companion calibrate --wait --json`, its progress on our stderr, or where `progress` says; the record.
-
-        Raises:
-            RuntimeError: it printed none.
-        """
+        """`companion calibrate --wait --json`, its progress on our stderr, or where `progress` says; the record."""
         words = ("calibrate", "--wait", "--timeout", str(within_s), "--json")
         process = await asyncio.create_subprocess_exec(
             *self.command(*words), stdout=asyncio.subprocess.PIPE, stderr=progress

@@ -126,11 +126,7 @@ def _models(scenario: Scenario) -> dict[str, ImuModel]:
 
 
 async def _set_up(companion: CompanionProcess, scenario: Scenario, udp: int) -> None:
-    """Let `companion setup` write the configuration, told which parts the IMUs are.
-
-    Raises:
-        RuntimeError: it failed.
-    """
+    """Let `companion setup` write the configuration, told which parts the IMUs are."""
     parts = [word for name, model in _models(scenario).items() for word in ("--part", f"{name}={model.spec.name}")]
     print(f"\nSetting up (half a minute at most): companion setup --yes {' '.join(parts)}", flush=True)
     ports = [str(companion.folder / name) for name in scenario.ports]
@@ -149,11 +145,7 @@ async def _cancel(task: asyncio.Task[None]) -> None:
 
 
 async def _read(station: Station, name: str) -> float:
-    """A parameter's value.
-
-    Raises:
-        RuntimeError: it does not come, however often it is asked for.
-    """
+    """A parameter's value."""
     for _ in range(READ_TRIES):
         if values := await station.read_parameter(name):
             return values[0]
@@ -161,11 +153,7 @@ async def _read(station: Station, name: str) -> float:
 
 
 async def _observe(station: Station) -> Array:
-    """Mean of the autopilot's HIGHRES_IMU: three rates (rad/s), three specific forces (m/s^2), FRD.
-
-    Raises:
-        RuntimeError: it does not come.
-    """
+    """Mean of the autopilot's HIGHRES_IMU: three rates (rad/s), three specific forces (m/s^2), FRD."""
     message_id: int = mavlink.MAVLINK_MSG_ID_HIGHRES_IMU
     await station.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / OBSERVE_HZ)
     station.heard.clear()

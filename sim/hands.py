@@ -46,9 +46,6 @@ SIDES: Final = {
 _SIDE = "|".join(SIDES)
 _MISSING = re.compile(rf"(?:between ({_SIDE}) and ({_SIDE})|({_SIDE})): ")
 _TURN = re.compile(r"turn it (?:by|on by) (\d+) deg")
-_PLACE = {"level": "level", "on its LEFT side": "left side down", "on its RIGHT side": "right side down",
-          "nose DOWN": "nose down", "nose UP": "nose up", "on its BACK": "on its back"}  # fmt: skip
-"""In ArduPilot's words: how it asks for each side."""
 
 
 class Hands:
@@ -111,10 +108,7 @@ class Hands:
         return tremor.end_s
 
     def follow(self, words: str, t_s: float) -> bool:
-        """Do what companion or ArduPilot asks for; whether these words ask for anything.
-
-        Understood are what `companion align` shows and tells ground stations, and ArduPilot's six positions.
-        """
+        """Do what `companion align` asks for; whether these words ask for anything."""
         if (missing := _MISSING.search(words)) is not None:
             up = np.mean([_up(*SIDES[name]) for name in missing.groups() if name is not None], axis=0)
             up /= np.linalg.norm(up)
@@ -123,8 +117,6 @@ class Hands:
             self.turn(t_s, float(asked[1]))
         elif "turn it the same way to its first marks" in words:
             self.turn(t_s, math.copysign(360.0, self._turned_deg) - self._turned_deg)
-        elif words.startswith("Place vehicle"):
-            self.hold(t_s, *next(SIDES[side] for how, side in _PLACE.items() if how in words))
         else:
             return False
         return True

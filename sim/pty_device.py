@@ -11,7 +11,6 @@ import select
 import termios
 import tty
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from sim.aircraft import VirtualAircraft
@@ -48,9 +47,7 @@ class PtyDevice:
         self._serving = asyncio.create_task(self._serve(), name=f"sim device {self.path.name}")
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         if self._serving is not None:
             self._serving.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -81,11 +78,7 @@ class PtyDevice:
         self.path.unlink(missing_ok=True)
 
     def replug(self) -> None:
-        """Put it (back) in: a new pseudo-terminal under the same path; the device starts anew.
-
-        Raises:
-            FileExistsError: the path is something other than a symlink.
-        """
+        """Put it (back) in: a new pseudo-terminal under the same path; the device starts anew."""
         if self._master is not None:
             return
         if self.path.exists() and not self.path.is_symlink():

@@ -70,7 +70,6 @@ def demo(
     seed: int = 0,
     unix_s: float = DEMO_UNIX_S,
     motions: Sequence[Motion] = (),
-    law: Law = "axis",
     gyr_cal_at_boot: bool = False,
     firmware: Firmware = "ardupilot",
     part: str = "icm42688p",
@@ -95,7 +94,6 @@ def demo(
         seed: of all noise.
         unix_s: the date at the beginning.
         motions: what happens to it.
-        law: of the gradienter.
         gyr_cal_at_boot: the autopilot's default INS_GYR_CAL = 1, with which it has already found most of the gyro bias
             (and has swallowed the Earth's rotation). The demonstration starts without, to have something to show.
         firmware: whose manners the autopilot has.
@@ -105,8 +103,8 @@ def demo(
         accel_scale: relative scale errors of the accelerometers of its first two IMUs.
         board_deg: roll and pitch by which the flight controller does not sit straight in the aircraft.
         gradienter_offset_deg: what the gradienter shows too much, x and y.
-        devices: families of IMU, gradienter and compass, by their names in `sim.families`; law and errors are those of
-            the usual ones, any other has none.
+        devices: families of IMU, gradienter and compass, by their names in `sim.families`; errors are those of the
+            usual ones, any other has none.
         warms: the air's temperature in degC, by how many kelvin the aircraft gets warmer by itself, and with which time
             constant in s; then each IMU has a curve of its own over temperature, by the seed.
         power_up: the same aircraft on another day: each has then other biases, about those usual ones.
@@ -160,7 +158,7 @@ def demo(
     if isinstance(compass, HMR3300):
         compass.heading_error_deg = 0.8
     if isinstance(gradienter, Gradienter) and tilt == DEMO_DEVICES[1]:
-        gradienter = Gradienter(aircraft, seed=seed, law=law, offset_deg=gradienter_offset_deg)
+        gradienter = Gradienter(aircraft, seed=seed, offset_deg=gradienter_offset_deg)
     return Scenario(
         aircraft=aircraft,
         flight_controller_imus=flight_controller,

@@ -32,7 +32,6 @@ FIRMWARE_COMMANDS = {
     "ardupilot": "a real ArduPilot SITL binary on this aircraft, and the devices",
     "px4": "a real PX4 SITL binary on this aircraft, and the devices",
     "residuals": "what each calibration leaves in a real autopilot, as a table",
-    "first-hour": "from a bare real autopilot to calibrated accelerometers, as a tape of all that is said",
 }
 """Of `sim.sitl.cli`."""
 
@@ -87,7 +86,7 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument(
                 "--gyr-cal", action="store_true", help="INS_GYR_CAL = 1: ArduPilot calibrates its gyros at boot"
             )
-        command.add_argument("--hands", action="store_true", help=f"move the aircraft by lines typed here: {HELP}")
+        add_hands(command)
         command.add_argument(
             "--zero", type=float, nargs=2, metavar=("X", "Y"), default=GRADIENTER_OFFSET_DEG,
             help="what the gradienter shows too much, degrees (default 0.003 -0.002)",
@@ -103,7 +102,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def add_world_options(command: argparse.ArgumentParser) -> None:
-    """--pose, --seed, --law, --motion and --turn."""
+    """--pose, --seed, --motion and --turn."""
     command.add_argument(
         "--pose",
         type=float,
@@ -113,12 +112,6 @@ def add_world_options(command: argparse.ArgumentParser) -> None:
         help="degrees: nose up +, right side down +, clockwise from true north (default 5 -3 40)",
     )
     command.add_argument("--seed", type=int, default=0, help="the same seed gives the same noise (default 0)")
-    command.add_argument(
-        "--law",
-        choices=("axis", "slope", "euler"),
-        default="axis",
-        help="what the gradienter's two readings mean (default axis)",
-    )
     command.add_argument(
         "--motion", choices=MOTIONS, default="still",
         help="what happens to it all the time: a slow turn; a sea with that turn; a running engine with both",
@@ -130,6 +123,18 @@ def add_world_options(command: argparse.ArgumentParser) -> None:
         default=TURN_DEG_S,
         help=f"how fast that turn is (default {TURN_DEG_S:g})",
     )
+
+
+def add_hands(command: argparse.ArgumentParser) -> None:
+    """--hands."""
+    command.add_argument("--hands", action="store_true", help=f"move the aircraft by lines typed here: {HELP}")
+
+
+def hands_of(arguments: argparse.Namespace, scenario: Scenario) -> Hands | None:
+    """Somebody who obeys typed lines, where --hands wants one."""
+    if not arguments.hands:
+        return None
+    return Hands(scenario.aircraft, placement_deg=PLACEMENT_DEG, propped_deg=PROPPED_DEG, seed=arguments.seed)
 
 
 def address(text: str) -> tuple[str, int]:
@@ -212,8 +217,12 @@ async def serve(
     ground: tuple[str, int] | None = None,
     started: asyncio.Event | None = None,
     hands: Hands | None = None,
+    beside: Coroutine[None, None, None] | None = None,
 ) -> None:
-    """Serve until cancelled: devices if there is a directory, the autopilot if there is an address to send to."""
+    """Serve until cancelled: devices if there is a directory, the autopilot if there is an address to send to.
+
+    `beside` runs with them; its end is theirs.
+    """
     async with contextlib.AsyncExitStack() as stack:
         scenario.aircraft.begin(asyncio.get_running_loop().time())
         running: list[asyncio.Task[None]] = []
@@ -231,6 +240,8 @@ async def serve(
         if hands is not None:
             told = take_lines(hands, scenario.aircraft, lambda words: print(f"# {words}", flush=True))
             running.append(asyncio.create_task(told, name="hands"))
+        if beside is not None:
+            running.append(asyncio.create_task(beside, name="beside"))
         if started is not None:
             started.set()
         try:
@@ -251,7 +262,6 @@ def main(argv: Sequence[str]) -> int:
         seed=arguments.seed,
         unix_s=time.time(),
         motions=motions_of(arguments.motion, seed=arguments.seed, turn_deg_s=arguments.turn),
-        law=arguments.law,
         gradienter_offset_deg=(arguments.zero[0], arguments.zero[1]),
         gyr_cal_at_boot=autopilot and arguments.gyr_cal,
         firmware=arguments.firmware if autopilot else "ardupilot",
@@ -274,11 +284,7 @@ def main(argv: Sequence[str]) -> int:
     if arguments.motion != "still":
         text += '# What it stands on moves: it waits, and says so, unless [vehicle] says platform = "deck"\n'
     text += configuration(scenario, directory=directory, udp=udp)
-    hands = (
-        Hands(scenario.aircraft, placement_deg=PLACEMENT_DEG, propped_deg=PROPPED_DEG, seed=arguments.seed)
-        if arguments.hands
-        else None
-    )
+    hands = hands_of(arguments, scenario)
     try:
         ground = arguments.ground if autopilot else None
         return asyncio.run(
@@ -307,24 +313,20 @@ async def run_until_stopped(
         serve: serves until cancelled, and sets the event when everything is up. What it raises is raised here.
         text: truth and configuration, asked for when everything is up.
     """
-    loop = asyncio.get_running_loop()
-    stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
     started = asyncio.Event()
     serving = asyncio.create_task(serve(started))
-    waiting = asyncio.create_task(stop.wait())
-    ready = asyncio.create_task(started.wait())
-    await asyncio.wait({serving, ready, waiting}, return_when=asyncio.FIRST_COMPLETED)
-    if started.is_set():
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, serving.cancel)
+
+    async def announce() -> None:
+        await started.wait()
         print("# Ready. Save these lines as companion.toml and run: companion run -c companion.toml")
         print("# Ctrl-C ends the simulation.")
         print(text(), flush=True)
-    await asyncio.wait({serving, waiting}, return_when=asyncio.FIRST_COMPLETED)
-    failed = serving.done()
-    for task in (serving, waiting, ready):
-        task.cancel()
-    results = await asyncio.gather(serving, waiting, ready, return_exceptions=True)
-    if failed and isinstance(results[0], BaseException):
-        raise results[0]
+
+    announcing = asyncio.create_task(announce())
+    with contextlib.suppress(asyncio.CancelledError):
+        await serving
+    announcing.cancel()
+    await asyncio.gather(announcing, return_exceptions=True)
     return 0

@@ -66,12 +66,7 @@ class UdpEnd(asyncio.DatagramProtocol):
 
 
 async def open_udp(end: End, *, target: tuple[str, int] | None = None, listen: tuple[str, int] | None = None) -> UdpEnd:
-    """Put an end on UDP: send to `target` from any free port, or listen and answer whoever spoke last.
-
-    Raises:
-        OSError: the address cannot be used.
-        ValueError: neither or both of target and listen.
-    """
+    """Put an end on UDP: send to `target` from any free port, or listen and answer whoever spoke last."""
     if (target is None) == (listen is None):
         raise ValueError("give either a target to send to or an address to listen on")
     loop = asyncio.get_running_loop()

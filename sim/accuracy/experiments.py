@@ -85,7 +85,6 @@ class WhiteRun:
     sigma: Array
     plain: Array
     """Error of the plain mean of the same readings, which attains the bound."""
-    plain_sigma: Array
 
 
 def white(seed: int, number: int) -> WhiteRun:
@@ -95,17 +94,15 @@ def white(seed: int, number: int) -> WhiteRun:
     standing = stand("white_only", posture, site, (seed, 1, number))
     taken = ImuInput(name="imu", rotation=standing.imu.mounting, profile=noise_profile("icm42688p"))
     times, rows = samples(standing, SPANS_S[-1])
-    found: list[tuple[Array, Array, Array, Array]] = []
+    found: list[tuple[Array, Array, Array]] = []
     for window in collected(standing, taken, times, rows, SPANS_S):
         truth = standing.bias(window.start_s, window.end_s)
         bound = standing.imu.white / np.sqrt(window.end_s - window.start_s)
         imu = solved(standing, window).imus[0]
         inside = standing.in_vehicle(whole_seconds(times, rows, window))
         still = inside.mean(axis=0) - standing.in_vehicle(standing.imu.expected(window.start_s))
-        each = (biases(imu) - truth, sigmas_stat(imu), still, plain_mean(inside)[1])
-        found.append((each[0] / bound, each[1] / bound, each[2] / bound, each[3] / bound))
-    error, sigma, plain, plain_sigma = np.array(found).transpose(1, 0, 2)
-    return WhiteRun(error, sigma, plain, plain_sigma)
+        found.append(((biases(imu) - truth) / bound, sigmas_stat(imu) / bound, still / bound))
+    return WhiteRun(*np.array(found).transpose(1, 0, 2))
 
 
 # ------------------------------------------------------------------------------------------------------------ floors
@@ -188,8 +185,6 @@ class IntegerRun:
     """sigma_stat; 0.5 and more where the readings do not tell."""
     plain: Array
     """Error of the plain mean with the Earth and the pose taken off."""
-    half: Array
-    """Likewise, of the mean half a step away from zero."""
 
 
 def integers(noise_lsb: float, seed: int, number: int) -> IntegerRun:
@@ -221,12 +216,11 @@ def integers(noise_lsb: float, seed: int, number: int) -> IntegerRun:
     window = collected(standing, taken, times, rows, (SPANS_S[0], SPANS_S[-1]))[-1]
     inside = whole_seconds(times, rows, window)
     plain = inside.mean(axis=0) - standing.imu.expected(window.start_s)
-    half = plain + np.sign(inside.mean(axis=0)) * steps / 2.0
     try:
         imu = solved(standing, window).imus[0]
     except CalibrationRefusedError:  # gyros and accelerometers
-        return IntegerRun(np.full(6, np.nan), np.full(6, np.nan), plain / steps, half / steps)
-    return IntegerRun((biases(imu) - bias) / steps, sigmas_stat(imu) / steps, plain / steps, half / steps)
+        return IntegerRun(np.full(6, np.nan), np.full(6, np.nan), plain / steps)
+    return IntegerRun((biases(imu) - bias) / steps, sigmas_stat(imu) / steps, plain / steps)
 
 
 def predicted(noise: AxisNoise, mean_s: float, horizon_s: float) -> float:

@@ -182,9 +182,6 @@ def collected(
     """The windows after so many seconds each (ascending), fed sample by sample in the order of time.
 
     Gradienter and compass are read without an error of their own; what a reference is wrong by comes in `solved`.
-
-    Raises:
-        CalibrationRefusedError: as `RollingCollector.window`.
     """
     wanted = Settings(
         min_still_s=float(spans_s[0]),
@@ -263,11 +260,7 @@ EXACT: Final = References()
 
 
 def solved(standing: Stand, window: Window, references: References = EXACT) -> Solution:
-    """The solution of one window.
-
-    Raises:
-        CalibrationRefusedError: as `solve`.
-    """
+    """The solution of one window."""
     return solve(window, local(standing.site), *_models(standing, references), What.BOTH)
 
 

@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from sim.accuracy import by_hand_table, deck_tables, mid_warm_up, temperature, turning, warmup_table
-from sim.accuracy.by_hand import BY_HAND, by_hand
+from sim.accuracy import by_hand, deck, mid_warm_up, temperature, turning, warmup
 from sim.accuracy.experiments import (
     FIELD_HEADING_DEG,
     FIELD_TILT_DEG,
@@ -28,7 +27,6 @@ from sim.accuracy.experiments import (
 )
 from sim.accuracy.figures import Claim, Figure, Section, beside, covered, rms
 from sim.accuracy.stand import NEXT_S, POSTURES
-from sim.accuracy.warmup import WARMING, cases, warm
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
 from sim.imu_model import DEG_H, PARTS, UG
 
@@ -72,9 +70,9 @@ def report(
                 found[name] = make(parts)
     if "warm-up" in only:
         each = max(runs // 100, 1)
-        progress(f"warm-up: {each} stands of each of {len(WARMING)} parts in {len(cases())} cases")
-        heated = [(part, case, seed, number) for part in WARMING for case in cases() for number in range(each)]
-        found["warm-up"] = warmup_table.section(many(warm, heated, jobs), each)
+        progress(f"warm-up: {each} stands of each of {len(warmup.WARMING)} parts in {len(warmup.cases())} cases")
+        heated = [(part, case, seed, k) for part in warmup.WARMING for case in warmup.cases() for k in range(each)]
+        found["warm-up"] = warmup.section(many(warmup.warm, heated, jobs), each)
     if "integers" in only:
         each = max(runs // 20, 4)
         progress(f"integers: {each} stands of each of {len(NOISE_LSB)} noises")
@@ -85,16 +83,16 @@ def report(
     if "deck" in only:
         voyages, stands = max(runs // 10, 4), max(runs // 40, 4)
         progress(f"deck: {voyages} voyages, {stands} stands")
-        found["deck"] = deck_tables.deck(voyages, stands, seed, jobs)
+        found["deck"] = deck.section(voyages, stands, seed, jobs)
     if "turning" in only:
         each = max(runs // 32, 2)
         progress(f"turning: {each} stands of each of {len(turning.RATES_DEG_S)} rates")
         found["turning"] = turning.section(each, seed, jobs)
     if "by-hand" in only:
         each = max(runs // 10, 1)
-        progress(f"by hand: {each} aircraft of each of {len(BY_HAND)} parts")
-        boards = [(part, seed, number) for part in BY_HAND for number in range(each)]
-        found["by-hand"] = by_hand_table.section(many(by_hand, boards, jobs), each)
+        progress(f"by hand: {each} aircraft of each of {len(by_hand.BY_HAND)} parts")
+        boards = [(part, seed, number) for part in by_hand.BY_HAND for number in range(each)]
+        found["by-hand"] = by_hand.section(many(by_hand.by_hand, boards, jobs), each)
     found |= _by_temperature(runs, seed, only, jobs, progress)
     return found
 
@@ -118,40 +116,26 @@ def _by_temperature(
 
 
 def _percent(figure: Figure) -> str:
-    return f"{100.0 * figure.value:6.1f} %"
+    return f"{100.0 * figure.value:.1f} %"
 
 
 def _white(runs: list[WhiteRun]) -> Section:
     error, sigma = np.array([run.error for run in runs]), np.array([run.sigma for run in runs])
-    plain, plain_sigma = np.array([run.plain for run in runs]), np.array([run.plain_sigma for run in runs])
-    lines = [
-        "rms error over the Cramer-Rao bound N / sqrt(T); beside: over the plain mean of the same readings",
-        "",
-        "        gyro                 accelerometer             beside   sigma_stat covers    plain mean",
-        "         x     y     z         x     y     z     all  the mean  1 sigma  2 sigma     all  2 sigma",
-    ]
+    plain = np.array([run.plain for run in runs])
+    lines = ["window  rms over bound  over the plain mean  2 sigma of sigma_stat cover"]
     claims = []
     for index, span in enumerate(SPANS_S):
-        axes = [rms(error[:, index, axis]) for axis in range(6)]
         whole, efficient = rms(error[:, index]), beside(error[:, index], plain[:, index])
-        by_axis = [beside(error[:, index, axis], plain[:, index, axis]) for axis in range(6)]
-        once, twice = (covered(error[:, index], sigma[:, index], times) for times in (1.0, 2.0))
-        simple = rms(plain[:, index])
-        simple_twice = covered(plain[:, index], plain_sigma[:, index], 2.0)
-        lines.append(
-            f"{span:3d} s"
-            + "".join(f"{axis.value:{10 if at == 3 else 6}.3f}" for at, axis in enumerate(axes))
-            + f"{whole.value:8.3f}{efficient.value:10.3f} {_percent(once)} {_percent(twice)}"
-            + f"{simple.value:8.3f} {_percent(simple_twice)}"
-        )
-        worst = max(by_axis)
+        worst = max(beside(error[:, index, axis], plain[:, index, axis]) for axis in range(6))
+        twice = covered(error[:, index], sigma[:, index], 2.0)
+        lines.append(f"{span:3d} s{whole.value:17.3f}{efficient.value:21.3f}{_percent(twice):>29}")
         claims.append(Claim(f"white noise, {span} s: worst axis over the bound", "", worst, 1.05))
         claims.append(Claim(f"white noise, {span} s: 2 sigma of sigma_stat cover", "%", twice.times(100.0), 97.0, 94.0))
     lines += [
         "",
-        f"Standard errors: one axis {axes[0].error:.3f}, all {whole.error:.3f},",
-        f"beside the mean {efficient.error:.4f}, coverage {100.0 * twice.error:.2f} %.",
-        "The plain mean attains the bound; beside it the luck of the readings falls out.",
+        f"Standard errors: rms {whole.error:.3f}, beside the mean {efficient.error:.4f},",
+        f"coverage {100.0 * twice.error:.2f} %. The bound is N / sqrt(T), which the plain mean attains;",
+        "beside it the luck of the readings falls out.",
     ]
     return Section(f"White noise only, perfect references ({len(runs)} stands)", lines, claims)
 
@@ -166,10 +150,9 @@ def _upright(runs: list[FloorRun]) -> list[FloorRun]:
 
 def _floors(parts: dict[str, list[FloorRun]]) -> Section:
     lines = [
-        f"rms error against the mean bias of the next {NEXT_S:.0f} s; bound: N / sqrt(T); V: V(T, {NEXT_S:.0f} s)",
+        f"rms error against the mean bias of the next {NEXT_S:.0f} s, and over sqrt V(T, {NEXT_S:.0f} s)",
         "",
-        f"{'':65}sigma_use covers      plain mean",
-        f"{'':27}bound sqrt V    rms   +-  worst    /V  1 sigma  2 sigma     rms  2 sigma",
+        f"{'':34}rms    /V  2 sigma cover  plain mean, covers",
     ]
     claims = []
     for part, runs in parts.items():
@@ -180,25 +163,20 @@ def _floors(parts: dict[str, list[FloorRun]]) -> Section:
             for index, span in enumerate(SPANS_S):
                 ideal = _stack(runs, "ideal")[:, index, :3] if gyro else _stack(level, "ideal")[:, index, 3:5]
                 found = rms(ideal).times(1.0 / scale)
-                worst = max(rms(ideal[:, axis]).value / scale for axis in range(ideal.shape[1]))
-                bound, use = noise.white / np.sqrt(span) / scale, predicted(noise, span, NEXT_S) / scale
+                use = predicted(noise, span, NEXT_S) / scale
                 error, sigma = _stack(runs, "error")[:, index, columns], _stack(runs, "sigma")[:, index, columns]
-                once, twice = (covered(error, sigma, times) for times in (1.0, 2.0))
-                words = f"{part if gyro and not index else '':10}{f'{triad}, {unit}' if not index else '':11}"
-                line = (
-                    f"{words}{span:3d} s{bound:7.1f}{use:7.1f}{found.value:7.1f}{found.error:5.1f}{worst:7.1f}"
-                    f"{found.value / use:6.2f} {_percent(once)} {_percent(twice)}"
-                )
+                words = f"{part if gyro and not index else '':10}{f'{triad}, {unit}' if not index else '':13}"
+                line = f"{words}{span:3d} s{found.value:9.1f}{found.value / use:6.2f}"
+                line += f"{_percent(covered(error, sigma, 2.0)):>15}"
                 if gyro:
                     plain, plain_sigma = _stack(runs, "plain")[:, index, :3], _stack(runs, "plain_sigma")[:, index, :3]
-                    simple, simple_twice = rms(plain).times(1.0 / scale), covered(plain, plain_sigma, 2.0)
-                    line += f"{simple.value:8.1f} {_percent(simple_twice)}"
+                    line += f"{rms(plain).value / scale:12.1f}{_percent(covered(plain, plain_sigma, 2.0)):>8}"
                 lines.append(line)
                 if part == "icm42688p" and gyro and span == SPANS_S[-1]:
                     claims.append(Claim("ICM-42688-P gyro, 60 s, next 180 s: rms", "deg/h", found, 5.5))
     lines += [
         "",
-        "rms and worst axis: perfect references; of accelerometers the two horizontal ones, upright stands.",
+        "rms: perfect references; of accelerometers the two horizontal ones, upright stands.",
         f"Coverage: all axes, {_REFERENCES}, gravity 30 mGal off.",
         "The plain mean takes the Earth for at rest and its sigma for s / sqrt(n).",
     ]
@@ -211,7 +189,7 @@ def _tilt(parts: dict[str, list[FloorRun]]) -> Section:
     lines = [
         "horizontal accelerometers of an ICM-42688-P after 60 s, against the bias of the next 180 s; ug",
         "",
-        "tilt reference       its own error     rms    +-   over it   mean of |error|",
+        "tilt reference       its own error     rms   over it   mean of |error|",
     ]
     claims = []
     tilted = _stack(runs, "tilted")
@@ -221,9 +199,7 @@ def _tilt(parts: dict[str, list[FloorRun]]) -> Section:
         apart = np.abs(tilted[:, index]).mean(axis=(1, 2)) / UG
         size = Figure(float(apart.mean()), float(apart.std(ddof=1)) / float(np.sqrt(len(apart))))
         over = found.times(1.0 / own)
-        lines.append(
-            f"{name:20}{own:14.1f}{found.value:8.1f}{found.error:6.1f}{over.value:10.3f}{size.value:18.1f}"
-        )  # fmt: skip
+        lines.append(f"{name:20}{own:14.1f}{found.value:8.1f}{over.value:10.3f}{size.value:18.1f}")
         if name.startswith("at most"):
             claims.append(Claim("tilt at most 10 arcsec off: mean of |error|", "ug", size, min(PAPER_LEFT_UG)))
         else:
@@ -238,52 +214,39 @@ def _tilt(parts: dict[str, list[FloorRun]]) -> Section:
 
 def _integers(noises: dict[float, list[IntegerRun]]) -> Section:
     lines = [
-        "steps of 1 mrad/s = 206 deg/h and 1 mg; noise in steps a reading; 60 s at 100 Hz; sigma_stat covers",
+        "steps of 1 mrad/s = 206 deg/h and 1 mg; noise in steps a reading; 60 s at 100 Hz",
         "",
-        "              by share                gyro, deg/h      accel, mg         covers    plain mean, deg/h",
-        "noise refused  1/2 step measured     rms    max     rms    max  1 sigma  2 sigma    rms   max +1/2",
+        "                by share               gyro, deg/h      accel, mg   2 sigma  plain mean",
+        "noise  refused  1/2 step  measured      rms    max     rms    max    cover  rms, deg/h",
     ]
     claims = []
     for noise, runs in noises.items():
         error, sigma = np.array([run.error for run in runs]), np.array([run.sigma for run in runs])
-        plain, half = np.array([run.plain for run in runs]), np.array([run.half for run in runs])
         refused = np.isnan(error)
         coarse = ~refused & (sigma >= _HALF_A_STEP)
         measured = np.where(refused | coarse, np.nan, error)
         shares = [float(one.mean()) for one in (refused, coarse, ~refused & ~coarse)]
-        words = f"{noise:5.1f}" + "".join(f"{100.0 * share:7.1f} %" for share in shares)
-        simple = (
-            f"{rms(plain).value * _LSB_DEG_H:7.0f}{float(np.abs(plain).max()) * _LSB_DEG_H:6.0f}"
-            f"{rms(half).value * _LSB_DEG_H:5.0f}"
-        )
+        words = f"{noise:5.1f}" + "".join(f"{100.0 * share:8.1f} %" for share in shares)
         if shares[2] > 0.0:
             gyro, accel = measured[:, :3], measured[:, 3:]
-            once, twice = (covered(measured, sigma, times) for times in (1.0, 2.0))
             largest = (float(np.nanmax(np.abs(gyro))) * _LSB_DEG_H, float(np.nanmax(np.abs(accel))))
-            words += (
-                f"{rms(gyro).value * _LSB_DEG_H:8.1f}{largest[0]:7.1f}{rms(accel).value:8.3f}{largest[1]:7.3f}"
-                f" {_percent(once)} {_percent(twice)}"
-            )
+            words += f"{rms(gyro).value * _LSB_DEG_H:9.1f}{largest[0]:7.1f}{rms(accel).value:8.3f}{largest[1]:7.3f}"
+            words += f"{_percent(covered(measured, sigma, 2.0)):>9}"
             if 0.3 <= noise <= 1.0:
-                claims.append(
-                    Claim(f"integers, noise {noise:g}: largest gyro error", "deg/h", Figure(largest[0], 0.0), 15.0)
-                )
-                claims.append(
-                    Claim(f"integers, noise {noise:g}: largest accel error", "mg", Figure(largest[1], 0.0), 0.15)
-                )
+                for what, size, unit, limit in (("gyro", largest[0], "deg/h", 15.0), ("accel", largest[1], "mg", 0.15)):
+                    claims.append(
+                        Claim(f"integers, noise {noise:g}: largest {what} error", unit, Figure(size, 0.0), limit)
+                    )
         else:
-            words += f"{'-':>8}{'-':>7}{'-':>8}{'-':>7}{'-':>9}{'-':>9}"
+            words += f"{'-':>9}{'-':>7}{'-':>8}{'-':>7}{'-':>9}"
         if coarse.any():
-            kept = covered(np.where(coarse, error, np.nan), sigma, 1.0)
-            claims.append(
-                Claim(f"integers, noise {noise:g}: half a step covers", "%", kept.times(100.0), 100.0, 99.9)
-            )  # fmt: skip
-        lines.append(words + simple)
+            kept = covered(np.where(coarse, error, np.nan), sigma, 1.0).times(100.0)
+            claims.append(Claim(f"integers, noise {noise:g}: half a step covers", "%", kept, 100.0, 99.9))
+        lines.append(words + f"{rms(np.array([run.plain for run in runs])).value * _LSB_DEG_H:11.0f}")
     lines += [
         "",
         "Refused: around zero, where nothing is known but that the bias is small. Half a step: sigma says so,",
-        "and every error lies within one sigma. The plain means, and those half a step further from zero",
-        "(+1/2, rms), have the Earth and the pose taken off.",
+        "and every error lies within one sigma. The plain mean has the Earth and the pose taken off.",
     ]
     count = len(next(iter(noises.values())))
     return Section(f"Integers cut toward zero ({count} stands of six axes each)", lines, claims)

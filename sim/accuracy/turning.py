@@ -149,11 +149,7 @@ class Platform:
         self.collector = RollingCollector(wanted, [taken], self.level, self.model if self.compass is not None else None)
 
     def errors(self, now_s: float) -> tuple[Array, Array]:
-        """Gyro errors of a calibration now, against the window's bias, and its sigma_use.
-
-        Raises:
-            CalibrationRefusedError: as it says.
-        """
+        """Gyro errors of a calibration now, against the window's bias, and its sigma_use."""
         window = self.collector.window(now_s)
         solution = solve(window, self.local, self.level, self.model if self.compass else None, What.BOTH)
         (found,) = solution.imus

@@ -77,11 +77,7 @@ class Buzzer:
 
 
 def notes_of(text: str) -> tuple[Note, ...]:
-    """The notes of a tune.
-
-    Raises:
-        ValueError: something in it that no firmware plays.
-    """
+    """The notes of a tune."""
     tempo, octave, length, sounding = 120, 4, 4, 7.0 / 8.0
     found: list[Note] = []
     rest = text.upper().replace(" ", "")

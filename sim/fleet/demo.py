@@ -131,11 +131,7 @@ async def _child(log: Path, *command: str) -> AsyncIterator[asyncio.subprocess.P
 
 
 async def _watch(process: asyncio.subprocess.Process, log: Path) -> None:
-    """Raise once a child has ended.
-
-    Raises:
-        RuntimeError: the end of its log is in the message.
-    """
+    """Raise once a child has ended."""
     await process.wait()
     said = await asyncio.to_thread(log.read_text, errors="replace")
     raise RuntimeError(f"{log.stem} has ended: {said[-500:].strip()}")

@@ -9,7 +9,6 @@ import math
 import socket
 import struct
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -17,10 +16,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim.flying.truth import FlyingAircraft, State
 from sim.flying.vehicle import FlyingVehicle
 from sim.scenario import Scenario
-from sim.sitl.ardupilot import AXES, ArduPilotLinks, common_arguments
+from sim.sitl.ardupilot import AXES, ArduPilot
 from sim.sitl.ground import GroundStation
-from sim.sitl.ports import LOOPBACK, free_udp_port, port_free
-from sim.sitl.process import BinaryError, FirmwareProcess, check_binary
+from sim.sitl.ports import LOOPBACK, port_free
+from sim.sitl.process import BinaryError, FirmwareProcess
 
 RIDER_PORT = 9012
 """Where a SITL that is told of one slave waits for it (SIM_JSON_Master.cpp); it cannot be told another."""
@@ -72,9 +71,7 @@ class Rider:
         self._knocking = asyncio.create_task(self._knock(), name="rider")
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         assert self._socket is not None
         assert self._knocking is not None
         self._knocking.cancel()
@@ -161,67 +158,37 @@ def flying_parameters(scenario: Scenario, wind: tuple[float, float]) -> dict[str
     return table
 
 
-class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
-    """An `arducopter` or `arduplane` with its own physics.
+class FlyingArduPilot(ArduPilot, FlyingVehicle):
+    """An `arducopter` or `arduplane` (by the binary's name) with its own physics.
 
     Args:
-        binary: the firmware; one whose name has "plane" in it is one.
+        binary: the firmware.
         scenario: whose aircraft is a `FlyingAircraft`.
         folder: for the binary's files.
         companion: where SERIAL1 sends to.
         wind: speed in m/s and where from in degrees.
-
-    Raises:
-        BinaryError: the binary is missing or not executable.
     """
 
-    firmware = "ardupilot"
+    backend: Rider
 
     def __init__(
-        self,
-        binary: Path,
-        scenario: Scenario,
-        folder: Path,
-        *,
-        companion: tuple[str, int],
-        wind: tuple[float, float] = (0.0, 0.0),
+        self, binary: Path, scenario: Scenario, folder: Path, *, companion: tuple[str, int], wind: tuple[float, float]
     ) -> None:
-        super().__init__(scenario, folder)
-        self._binary = check_binary(binary)
-        self.is_plane = "plane" in self._binary.name
+        self.is_plane = "plane" in binary.name
+        parameters = flying_parameters(scenario, wind) | (PLANE if self.is_plane else COPTER)
+        super().__init__(binary, scenario, folder, parameters=parameters, companion=companion)
         self.modes = PLANE_MODES if self.is_plane else COPTER_MODES
-        self._parameters = flying_parameters(scenario, wind) | (PLANE if self.is_plane else COPTER)
-        self._companion, self._ground = companion, (LOOPBACK, free_udp_port())
-        self.system_id = 1
-        self.rider = Rider(self.truth)
+        self.backend = Rider(self.truth)
         self.sticks_us = [MIDDLE_US, MIDDLE_US, LOWEST_US, MIDDLE_US]
-        """Roll, pitch, throttle, yaw; sent to it while it flies."""
-
-    @property
-    def backend_boots(self) -> int:
-        """Starts seen."""
-        return self.rider.boots
 
     async def _open(self, stack: contextlib.AsyncExitStack) -> FirmwareProcess:
         if not port_free(RIDER_PORT, socket.SOCK_DGRAM):
             raise BinaryError(f"UDP port {RIDER_PORT} is taken, by another flight? One at a time")
-        await stack.enter_async_context(self.rider)
-        self.scripts.mkdir(exist_ok=True)
-        ours = self.folder / "flying.parm"
-        ours.write_text("".join(f"{name} {value:.9g}\n" for name, value in self._parameters.items()), encoding="ascii")
-        arguments = common_arguments(
-            self._binary, self.aircraft, [ours],
-            system_id=self.system_id, ground=self._ground, companion=self._companion,
-        )  # fmt: skip
-        model = "plane" if self.is_plane else "quad"
-        return FirmwareProcess([*arguments, "--model", model, "--slave", "1"], self.folder)
+        await stack.enter_async_context(self.backend)
+        return self._process_of("--model", "plane" if self.is_plane else "quad", "--slave", "1")
 
     async def take_off(self, ground: GroundStation, height_m: float) -> None:
-        """Armed as pilots do, with all its checks, and up.
-
-        Raises:
-            TimeoutError: it does not arm, or does not climb; with what it says.
-        """
+        """Armed as pilots do, with all its checks, and up."""
         await self.mode(ground, "takeoff" if self.is_plane else "guided")
         await self.arm(ground)
         if not self.is_plane:
@@ -235,11 +202,7 @@ class FlyingArduPilot(ArduPilotLinks, FlyingVehicle):
         await ground.put_all({f"SIM_MAG{number}_ORIENT": 1.0 for number in (1, 2, 3)})  # ROTATION_YAW_45
 
     async def hold(self, ground: GroundStation) -> None:
-        """Loiter, sticks in the middle; a plane circles clockwise from here (Guided).
-
-        Raises:
-            TimeoutError: it does not.
-        """
+        """Loiter, sticks in the middle; a plane circles clockwise from here (Guided)."""
         if not self.is_plane:
             await self.mode(ground, "hold")
             return

@@ -49,16 +49,11 @@ def parser() -> argparse.ArgumentParser:
         help=f"how long it flies on after the fault (default {WATCHED_S:g})",
     )  # fmt: skip
     command.add_argument("--dir", type=Path, help="keep all files here (default: a new folder)")
-    command.add_argument("--words", action="store_true", help="show what the firmware said from the fault on")
     return command
 
 
 def plans_of(arguments: argparse.Namespace) -> list[Plan]:
-    """What the options ask for, the flights of one fault and set-up together; each seed has a wind of its own.
-
-    Raises:
-        BinaryError: that firmware cannot do it.
-    """
+    """What the options ask for, the flights of one fault and set-up together; each seed has a wind of its own."""
     plans = []
     px4 = "px4" in arguments.binary.name
     if any((set_up == "px4") is not px4 for set_up in arguments.set_up):
@@ -82,11 +77,7 @@ def plans_of(arguments: argparse.Namespace) -> list[Plan]:
 
 
 async def fly(plan: Plan, folder: Path) -> tuple[Record, Figures]:
-    """One flight and its figures.
-
-    Raises:
-        BinaryError, RuntimeError, TimeoutError: it did not come about.
-    """
+    """One flight and its figures."""
     async with flying(plan, folder, time.time()) as flight:
         await flight.set_up()
         await flight.calibrate()
@@ -106,7 +97,7 @@ def main(argv: Sequence[str]) -> int:
     worst = 0
     print(HEADER, flush=True)
     for (fault, set_up), same in itertools.groupby(plans, lambda plan: (plan.fault, plan.set_up)):
-        flights = [flown(plan, folder, words=arguments.words) for plan in same]
+        flights = [flown(plan, folder) for plan in same]
         if len(flights) > 1:
             print(summary(fault, set_up, flights), flush=True)
         worst = max(worst, *(2 if found is None else bool(found.wrong) for found in flights))
@@ -114,7 +105,7 @@ def main(argv: Sequence[str]) -> int:
     return worst
 
 
-def flown(plan: Plan, folder: Path, *, words: bool) -> Figures | None:
+def flown(plan: Plan, folder: Path) -> Figures | None:
     """One flight, with its line of the table; None if it did not come about, which is said."""
     plan = replace(plan, stored=folder / f"set-up-{plan.set_up}")
     try:
@@ -123,8 +114,4 @@ def flown(plan: Plan, folder: Path, *, words: bool) -> Figures | None:
         print(f"{plan.fault:16}{plan.set_up:9}did not come about: {error}", file=sys.stderr, flush=True)
         return None
     print(row(record, found), flush=True)
-    if words:
-        for event in record.events:
-            if event.own_s > record.struck_s - 5.0:
-                print(f"  {event.own_s - record.struck_s:+6.1f} s  {event.kind}: {event.words}", flush=True)
     return found

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim.devices import SerialDevice
-from sim.flying.vehicle import FlyingVehicle
-from sim.imu_model import ImuModel
-from sim.sitl.ground import GroundStation
-from sim.sitl.lossy_link import LossyLink
+if TYPE_CHECKING:
+    from sim.flying.flight import Flight
+
 
 DRIFT_DEG_S = 3.0
 LIE_DEG = 40.0
@@ -24,49 +22,24 @@ RESTARTED_S = 1.0
 """What a service manager waits before it starts it anew."""
 
 
-class Aloft(Protocol):
-    """What a fault can get at."""
-
-    vehicle: FlyingVehicle
-    ground: GroundStation
-    link: LossyLink
-
-    @property
-    def compass(self) -> SerialDevice:
-        """The companion's."""
-
-    @property
-    def serial_imu(self) -> ImuModel:
-        """The companion's."""
-
-    def signal(self, number: signal.Signals) -> None:
-        """To the daemon."""
-
-    async def start_daemon(self) -> None:
-        """Start it anew."""
-
-    def in_background(self, work: Coroutine[Any, Any, None]) -> None:
-        """Goes on until the end of the flight."""
-
-
-async def _kill(on: Aloft) -> None:
+async def _kill(on: Flight) -> None:
     on.signal(signal.SIGKILL)
 
 
-async def _stop(on: Aloft) -> None:
+async def _stop(on: Flight) -> None:
     on.signal(signal.SIGSTOP)
 
 
-async def _cut(on: Aloft) -> None:
+async def _cut(on: Flight) -> None:
     on.link.loss = 1.0
 
 
-async def _gyro_drifts(on: Aloft) -> None:
+async def _gyro_drifts(on: Flight) -> None:
     gyro, accel = on.serial_imu.true_bias(on.vehicle.now_s)
     on.serial_imu.turn_on(gyro + np.radians([0.0, 0.0, DRIFT_DEG_S]), accel)
 
 
-async def _compass_drifts(on: Aloft) -> None:
+async def _compass_drifts(on: Flight) -> None:
     async def drift() -> None:
         while True:
             _turn_compass(on, DRIFT_DEG_S * STEP_S)
@@ -75,17 +48,17 @@ async def _compass_drifts(on: Aloft) -> None:
     on.in_background(drift())
 
 
-async def _compass_lies(on: Aloft) -> None:
+async def _compass_lies(on: Flight) -> None:
     _turn_compass(on, LIE_DEG)
 
 
-def _turn_compass(on: Aloft, degrees: float) -> None:
+def _turn_compass(on: Flight, degrees: float) -> None:
     device: Any = on.compass
     device.heading_error_deg += degrees
 
 
-def _killed_for(seconds: float) -> Callable[[Aloft], Awaitable[None]]:
-    async def strike(on: Aloft) -> None:
+def _killed_for(seconds: float) -> Callable[[Flight], Awaitable[None]]:
+    async def strike(on: Flight) -> None:
         on.signal(signal.SIGKILL)
 
         async def comes_back() -> None:
@@ -97,12 +70,12 @@ def _killed_for(seconds: float) -> Callable[[Aloft], Awaitable[None]]:
     return strike
 
 
-async def _own_compass_lies(on: Aloft) -> None:
+async def _own_compass_lies(on: Flight) -> None:
     await on.vehicle.lie_with_own_compass(on.ground)
     on.signal(signal.SIGKILL)
 
 
-async def _nothing(on: Aloft) -> None:
+async def _nothing(on: Flight) -> None:
     pass
 
 
@@ -111,7 +84,7 @@ class Fault:
     """Something that happens in the air."""
 
     words: str
-    strike: Callable[[Aloft], Awaitable[None]]
+    strike: Callable[[Flight], Awaitable[None]]
 
 
 FAULTS = {

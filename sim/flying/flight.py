@@ -129,9 +129,6 @@ class Flight:
         """As `companion autopilot-setup` says, from a ground station, and a restart of the autopilot.
 
         Nothing is to be done to one that has stored it already.
-
-        Raises:
-            RuntimeError: the companion is not content.
         """
         shown, stored = await self.daemon.ask("autopilot-setup"), self.plan.stored
         only_one = self.plan.set_up == "today"
@@ -158,23 +155,14 @@ class Flight:
             raise RuntimeError(f"autopilot-setup: {shown}")
 
     async def calibrate(self) -> None:
-        """Calibrate, and wait until the heading is pushed.
-
-        Raises:
-            RuntimeError: it failed.
-            TimeoutError: nothing is pushed.
-        """
+        """Calibrate, and wait until the heading is pushed."""
         record = await self.daemon.calibrate(CALIBRATED_WITHIN_S, progress=asyncio.subprocess.DEVNULL)
         if record["state"] != "done":
             raise RuntimeError(f"calibration: {record['reason']}")
         await self.pushed()
 
     async def pushed(self) -> None:
-        """Wait until the heading is pushed, and in use again where another has been.
-
-        Raises:
-            TimeoutError: it is not; with what the companion says.
-        """
+        """Wait until the heading is pushed, and in use again where another has been."""
         attitude: dict[str, Any] = {}
         try:
             async with asyncio.timeout(PUSHED_WITHIN_S):
@@ -188,12 +176,7 @@ class Flight:
         return [each.text for each in self.ground.all(mavlink.MAVLink_statustext_message, since_s=self._since_s)]
 
     async def fly(self) -> Record:
-        """Take off, hold, let the fault happen, and watch; the record.
-
-        Raises:
-            RuntimeError: this machine is too slow.
-            TimeoutError: it does not take off, or the heading is not pushed when the fault is to happen.
-        """
+        """Take off, hold, let the fault happen, and watch; the record."""
         vehicle, ground, record = self.vehicle, self.ground, self.record
         await vehicle.ask_streams(ground)
         self.in_background(vehicle.steer(ground))
@@ -281,12 +264,7 @@ def events_of(ground: GroundStation, since_s: float, own: Callable[[float], floa
 
 @contextlib.asynccontextmanager
 async def flying(plan: Plan, folder: Path, unix_s: float) -> AsyncIterator[Flight]:
-    """Everything running on the ground: firmware, devices, daemon; nothing set up.
-
-    Raises:
-        BinaryError: the firmware cannot be run.
-        TimeoutError: something did not come up.
-    """
+    """Everything running on the ground: firmware, devices, daemon; nothing set up."""
     site = site_at(40.0, 116.0, 50.0, unix_s)
     aircraft = FlyingAircraft(site, heading_deg=plan.heading_deg, unix_s=unix_s)
     scenario = demo(seed=plan.seed, unix_s=unix_s, aircraft=aircraft)

@@ -24,11 +24,10 @@ from sim.imu_model import Bias
 from sim.scenario import Scenario
 from sim.sitl.ground import GroundStation
 from sim.sitl.ports import LOOPBACK
-from sim.sitl.process import BinaryError, FirmwareProcess, check_binary
-from sim.sitl.px4 import MEASURING_PARAMETERS, UDP_COMPANION, UDP_GROUND_LOCAL, free_instance
+from sim.sitl.process import BinaryError, FirmwareProcess
+from sim.sitl.px4 import Px4
 from sim.udp import open_udp
 
-MODEL = "sihsim_quadx"
 MAGNETOMETER = {"cs_mag_hdg", "cs_mag_3d"}
 AUTO, LOITER = 4, 3
 """A main mode and its sub mode."""
@@ -119,7 +118,7 @@ def source_changes(flags: str) -> list[Event]:
     return found
 
 
-class FlyingPx4(FlyingVehicle):
+class FlyingPx4(Px4, FlyingVehicle):
     """A `px4` of SITL that simulates itself, in wind with gusts.
 
     Args:
@@ -128,58 +127,30 @@ class FlyingPx4(FlyingVehicle):
         folder: for the binary's files.
         wind: speed in m/s and where from in degrees.
         seed: of the gusts.
-
-    Raises:
-        BinaryError: binary or folder is missing, or no instance is free.
     """
 
-    firmware = "px4"
+    model = "sihsim_quadx"
+    backend: Truth
 
     def __init__(
-        self,
-        binary: Path,
-        scenario: Scenario,
-        folder: Path,
-        *,
-        wind: tuple[float, float] = (0.0, 0.0),
-        seed: int = 0,
+        self, binary: Path, scenario: Scenario, folder: Path, *, wind: tuple[float, float], seed: int = 0
     ) -> None:
-        super().__init__(scenario, folder)
-        self._binary = check_binary(binary)
-        self.modes = {"hold": AUTO << 16 | LOITER << 24}
-        self.instance = free_instance()
-        self.system_id = self.instance + 1
         from_rad = math.radians(wind[1])
         self._wind = {"SIH_WIND_N": -wind[0] * math.cos(from_rad), "SIH_WIND_E": -wind[0] * math.sin(from_rad)}
+        parameters = self._wind | {"SDLOG_BACKEND": 0.0, "COM_LOW_BAT_ACT": 0.0}
+        super().__init__(binary, scenario, folder, parameters=parameters)
+        site = self.aircraft.site
+        self._environment |= {
+            "PX4_HOME_LAT": f"{site.latitude_deg}",
+            "PX4_HOME_LON": f"{site.longitude_deg}",
+            "PX4_HOME_ALT": f"{site.height_m}",
+            "PX4_HOME_YAW": f"{math.remainder(self.aircraft.angles_rad(0.0)[2], math.tau):.4f}",  # SIH_LOC_YAW0, in rad
+        }
+        self.modes = {"hold": AUTO << 16 | LOITER << 24}
         self._gust_m_s, self._dice = GUST_SHARE * wind[0], random.Random(seed)
-        self._told = Truth(self.truth, self.system_id)
+        self.backend = Truth(self.truth, self.system_id)
         self._flags = self.folder / "flags.txt"
         self.sticks_us = []
-
-    @property
-    def companion_port(self) -> int:
-        """Where it sends to."""
-        return UDP_COMPANION + self.instance
-
-    @property
-    def url(self) -> str:
-        """The companion listens where the onboard link sends to."""
-        return f"udpin:{LOOPBACK}:{self.companion_port}"
-
-    @property
-    def ground_target(self) -> tuple[str, int]:
-        """Where its ground link listens."""
-        return LOOPBACK, UDP_GROUND_LOCAL + self.instance
-
-    @property
-    def backend_boots(self) -> int:
-        """Starts seen."""
-        return self._told.boots
-
-    @property
-    def stored(self) -> tuple[str, ...]:
-        """Parameters and their backup."""
-        return "parameters.bson", "parameters_backup.bson"
 
     def true_bias(self, instance: int, t_s: float) -> Bias:
         """SIH's IMU has noise, and no bias."""
@@ -187,35 +158,12 @@ class FlyingPx4(FlyingVehicle):
 
     async def _open(self, stack: contextlib.AsyncExitStack) -> FirmwareProcess:
         self.truth.begin(asyncio.get_running_loop().time())
-        end = await open_udp(self._told, listen=(LOOPBACK, _UDP_TRUTH + self.instance))
+        end = await open_udp(self.backend, listen=(LOOPBACK, _UDP_TRUTH + self.instance))
         stack.callback(end.close)
-        etc = self._binary.parent.parent / "etc"
-        return FirmwareProcess(
-            [str(self._binary), "-d", "-i", str(self.instance), "-w", str(self.folder), str(etc)], self.folder
-        )
-
-    async def power_on(self) -> None:
-        """Start it with what it has stored; when that is nothing, with our parameters."""
-        site = self.aircraft.site
-        environment = {
-            "PX4_SIM_MODEL": MODEL,
-            "PX4_HOME_LAT": f"{site.latitude_deg}",
-            "PX4_HOME_LON": f"{site.longitude_deg}",
-            "PX4_HOME_ALT": f"{site.height_m}",
-            "PX4_HOME_YAW": f"{math.remainder(self.aircraft.angles_rad(0.0)[2], math.tau):.4f}",  # SIH_LOC_YAW0, in rad
-        }
-        if not (self.folder / self.stored[0]).exists():
-            values = MEASURING_PARAMETERS | self._wind | {"SDLOG_BACKEND": 0.0, "COM_LOW_BAT_ACT": 0.0}
-            environment |= {f"PX4_PARAM_{name}": f"{value:g}" for name, value in values.items()}
-        self.process.environment = environment
-        await super().power_on()
+        return self._process_of()
 
     async def take_off(self, ground: GroundStation, height_m: float) -> None:
-        """Armed with all its checks, and up to MIS_TAKEOFF_ALT.
-
-        Raises:
-            TimeoutError: it does not arm, or does not climb; with what it says.
-        """
+        """Armed with all its checks, and up to MIS_TAKEOFF_ALT."""
         await ground.put("MIS_TAKEOFF_ALT", height_m)
         await ground.command(mavlink.MAV_CMD_NAV_TAKEOFF, *[0.0] * 3, *[math.nan] * 4)
         await self.arm(ground)
@@ -247,11 +195,7 @@ class FlyingPx4(FlyingVehicle):
         return source_changes(self._flags.read_text(errors="replace"))
 
     async def hold(self, ground: GroundStation) -> None:
-        """It holds by itself once it is up.
-
-        Raises:
-            TimeoutError: it does not.
-        """
+        """It holds by itself once it is up."""
         await self.until_mode(ground, "hold")
 
     async def turn(self, ground: GroundStation, degrees: float) -> None:
@@ -268,9 +212,5 @@ class FlyingPx4(FlyingVehicle):
             await asyncio.sleep(GUST_EVERY_S)
 
     async def lie_with_own_compass(self, ground: GroundStation) -> None:
-        """SIH's cannot be turned.
-
-        Raises:
-            BinaryError: always.
-        """
+        """SIH's cannot be turned."""
         raise BinaryError("the compass of PX4's simulation cannot be turned")

@@ -73,38 +73,22 @@ class FlyingVehicle(FirmwareVehicle):
             await ground.stream(number, 25.0)
 
     async def arm(self, ground: GroundStation) -> None:
-        """Ask until it arms, with all its checks.
-
-        Raises:
-            TimeoutError: it does not; with what it says.
-        """
+        """Ask until it arms, with all its checks."""
         await _until_accepted(ground, lambda: ground.arm(wait_s=2.0), ARM_WITHIN_S, "it does not arm")
 
     @abstractmethod
     async def take_off(self, ground: GroundStation, height_m: float) -> None:
-        """Arm, with all its checks, and climb.
-
-        Raises:
-            TimeoutError: it does not; with what it says.
-        """
+        """Arm, with all its checks, and climb."""
 
     async def mode(self, ground: GroundStation, name: str) -> None:
-        """Ask until it changes its mode.
-
-        Raises:
-            TimeoutError: it does not; with what it says.
-        """
+        """Ask until it changes its mode."""
         words = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, *self.mode_parameters(self.modes[name])
         ask = functools.partial(ground.command, mavlink.MAV_CMD_DO_SET_MODE, *words)
         await _until_accepted(ground, ask, MODE_WITHIN_S, f"no mode {name}")
         await self.until_mode(ground, name)
 
     async def until_mode(self, ground: GroundStation, name: str) -> None:
-        """Wait until it says that it is in a mode.
-
-        Raises:
-            TimeoutError: it is not.
-        """
+        """Wait until it says that it is in a mode."""
         since_s = asyncio.get_running_loop().time()
         await ground.wait_for(
             lambda: any(beat.custom_mode == self.modes[name] for beat in ground.vehicle_heartbeats(since_s)),
@@ -121,11 +105,7 @@ class FlyingVehicle(FirmwareVehicle):
 
     @abstractmethod
     async def lie_with_own_compass(self, ground: GroundStation) -> None:
-        """Its own compasses are turned by 45 deg as of now.
-
-        Raises:
-            BinaryError: they cannot be.
-        """
+        """Its own compasses are turned by 45 deg as of now."""
 
     @abstractmethod
     async def hold(self, ground: GroundStation) -> None:

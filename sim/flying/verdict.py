@@ -110,11 +110,7 @@ def _yaw_errors_deg(record: Record) -> tuple[Array, Array]:
 
 
 def figures(record: Record) -> Figures:
-    """The figures of a flight.
-
-    Raises:
-        ValueError: truth or estimate are missing before or after the fault.
-    """
+    """The figures of a flight."""
     own_s, errors = _yaw_errors_deg(record)
     struck = record.struck_s
     if not (own_s > struck).any() or not (own_s < struck).any() or not len(record.place):

@@ -14,11 +14,21 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sim.aircraft import Pose
-from sim.hands import HELP, PLACEMENT_DEG, PROPPED_DEG, Hands
+from sim.hands import Hands
 from sim.imu_model import PARTS
-from sim.scenario import FIRST_ACCEL_MG, FIRST_GYRO_DEG_H, GRADIENTER_OFFSET_DEG, Scenario, demo
+from sim.scenario import FIRST_GYRO_DEG_H, Scenario, demo
 from sim.sea import motions_of
-from sim.serve import FIRMWARE_COMMANDS, add_world_options, address, configuration, describe, run_until_stopped, serve
+from sim.serve import (
+    FIRMWARE_COMMANDS,
+    add_hands,
+    add_world_options,
+    address,
+    configuration,
+    describe,
+    hands_of,
+    run_until_stopped,
+    serve,
+)
 from sim.sitl.ardupilot import ArduPilotSitl
 from sim.sitl.process import BinaryError
 from sim.sitl.px4 import Px4Sitl
@@ -29,7 +39,7 @@ COMPANION_UDP, GROUND_UDP = "127.0.0.1:14540", "127.0.0.1:14550"
 
 
 def parser() -> argparse.ArgumentParser:
-    """Arguments of the three commands."""
+    """Arguments of the commands."""
     top = argparse.ArgumentParser(prog="python -m sim", description="A real firmware on the virtual aircraft.")
     commands = top.add_subparsers(dest="command", required=True)
     for name, text in FIRMWARE_COMMANDS.items():
@@ -37,15 +47,10 @@ def parser() -> argparse.ArgumentParser:
         command.add_argument("--binary", type=Path, required=True, help="the firmware: arducopter, arduplane or px4")
         _add_aircraft(command)
         if name in SERVING:
-            command.add_argument("--hands", action="store_true", help=f"move the aircraft by lines typed here: {HELP}")
+            add_hands(command)
             command.add_argument(
                 "--dir", type=Path, help="folder for the ports and the firmware's files (default: a new one)"
             )
-        if name != "px4":
-            command.add_argument(
-                "--defaults", type=Path, action="append", default=[], metavar="FILE",
-                help="ArduPilot parameter file, read before ours; may be repeated",
-            )  # fmt: skip
         if name == "ardupilot":
             for option, default, who in (
                 ("--udp", COMPANION_UDP, "companion"),
@@ -57,24 +62,7 @@ def parser() -> argparse.ArgumentParser:
                 )  # fmt: skip
         if name != "ardupilot":
             command.add_argument("--etc", type=Path, help="PX4's etc folder (default: ../etc of the binary)")
-    for name in ("residuals", "first-hour"):
-        commands.choices[name].add_argument(
-            "--firmware", choices=("ardupilot", "px4"), help="which one the binary is (default: by its name)"
-        )
-    hour = commands.choices["first-hour"]
-    hour.add_argument("--own", action="store_true", help="the firmware's own six positions and level instead")
-    hour.set_defaults(
-        pose=(4.0, -3.0, 40.0), accel_bias=(20.0, -20.0, 20.0), accel_scale=(0.5, -0.5, 0.5), board=(0.8, -0.6)
-    )
     residuals = commands.choices["residuals"]
-    residuals.add_argument(
-        "--observe", type=float, default=60.0, metavar="SECONDS", help="length of each look (default 60)"
-    )
-    residuals.add_argument(
-        "--config", type=Path, action="append", default=[], metavar="FILE",
-        help="further lines of the companion's configuration, such as [calibration], instead of a minute of standing"
-        " still, or a deck where it sways; may be repeated",
-    )  # fmt: skip
     residuals.add_argument(
         "--listen", type=float, default=0.0, metavar="SECONDS",
         help="how long the companion hears the sensors before it is asked (default 0)",
@@ -92,24 +80,8 @@ def _add_aircraft(command: argparse.ArgumentParser) -> None:
         help="of the flight controller's first IMU in deg/h (default %(default)s)",
     )  # fmt: skip
     command.add_argument(
-        "--accel-bias", type=float, nargs=3, metavar=("X", "Y", "Z"), default=FIRST_ACCEL_MG,
-        help="likewise, in mg (default %(default)s)",
-    )  # fmt: skip
-    command.add_argument(
-        "--accel-scale", type=float, nargs=3, metavar=("X", "Y", "Z"), default=(0.0, 0.0, 0.0),
-        help="scale errors of its accelerometers, in %% (default none)",
-    )  # fmt: skip
-    command.add_argument(
-        "--board", type=float, nargs=2, metavar=("ROLL", "PITCH"), default=(0.0, 0.0),
-        help="how its board sits in the aircraft, in degrees (default straight)",
-    )  # fmt: skip
-    command.add_argument(
         "--part", choices=sorted(PARTS), default="icm42688p", help="what that IMU is (default icm42688p)"
     )
-    command.add_argument(
-        "--gradienter-offset", type=float, nargs=2, metavar=("X", "Y"), default=GRADIENTER_OFFSET_DEG,
-        help="what the gradienter shows too much, in degrees (default %(default)s)",
-    )  # fmt: skip
     command.add_argument(
         "--gyr-cal", action="store_true", help="ArduPilot calibrates its gyros at every boot (INS_GYR_CAL = 1)"
     )
@@ -123,37 +95,17 @@ def scenario_of(arguments: argparse.Namespace) -> Scenario:
         seed=arguments.seed,
         unix_s=time.time(),
         motions=motions_of(arguments.motion, seed=arguments.seed, turn_deg_s=arguments.turn),
-        law=arguments.law,
         part=arguments.part,
         gyro_deg_h=arguments.gyro_bias,
-        accel_mg=arguments.accel_bias,
-        accel_scale=[value / 100.0 for value in arguments.accel_scale],
-        board_deg=tuple(arguments.board),
-        gradienter_offset_deg=tuple(arguments.gradienter_offset),
     )
 
 
 def vehicle_of(arguments: argparse.Namespace, scenario: Scenario, folder: Path) -> SitlVehicle:
-    """The firmware that the options name, not started.
-
-    Raises:
-        BinaryError: it is missing or cannot be executed.
-    """
-    firmware = arguments.command
-    if firmware not in SERVING:
-        firmware = arguments.firmware or ("px4" if arguments.binary.name.startswith("px4") else "ardupilot")
-    if firmware == "px4":
+    """The firmware that the options name, not started."""
+    if arguments.command == "px4" or (arguments.command == "residuals" and arguments.binary.name.startswith("px4")):
         return Px4Sitl(arguments.binary, scenario, folder, etc=arguments.etc)
-    serving = arguments.command == "ardupilot"
-    return ArduPilotSitl(
-        arguments.binary,
-        scenario,
-        folder,
-        defaults=arguments.defaults,
-        gyr_cal=arguments.gyr_cal,
-        companion=arguments.udp if serving else None,
-        ground=arguments.ground if serving else None,
-    )
+    links = {"companion": arguments.udp, "ground": arguments.ground} if arguments.command == "ardupilot" else {}
+    return ArduPilotSitl(arguments.binary, scenario, folder, gyr_cal=arguments.gyr_cal, **links)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -167,21 +119,14 @@ def main(argv: Sequence[str]) -> int:
         if arguments.command == "residuals":
             from sim.sitl.residuals import DECK, STILL, report
 
-            more = "".join(path.read_text(encoding="utf-8") for path in arguments.config)
-            more = more or (DECK if arguments.motion in ("sea", "engine") else STILL)
+            more = DECK if arguments.motion in ("sea", "engine") else STILL
             return asyncio.run(
                 report(
-                    vehicle, folder, arguments.observe, more, listen_s=arguments.listen,
+                    vehicle, folder, more, listen_s=arguments.listen,
                     own=not arguments.companion_only, companion=not arguments.own_only,
                 )
             )  # fmt: skip
-        if arguments.command == "first-hour":
-            from sim.sitl.first_hour import first_hour
-
-            return asyncio.run(first_hour(vehicle, folder, own=arguments.own, seed=arguments.seed))
-        hands = None
-        if arguments.hands:
-            hands = Hands(scenario.aircraft, placement_deg=PLACEMENT_DEG, propped_deg=PROPPED_DEG, seed=arguments.seed)
+        hands = hands_of(arguments, scenario)
         return asyncio.run(
             run_until_stopped(
                 lambda started: _serve(vehicle, scenario, folder, started, hands),
@@ -203,28 +148,9 @@ def main(argv: Sequence[str]) -> int:
 async def _serve(
     vehicle: SitlVehicle, scenario: Scenario, folder: Path, started: asyncio.Event, hands: Hands | None
 ) -> None:
-    """Firmware and devices until cancelled.
-
-    Raises:
-        BinaryError: the firmware ended.
-    """
+    """Firmware and devices until cancelled."""
     async with vehicle:
-        up = asyncio.Event()
-        tasks = [
-            asyncio.create_task(serve(scenario, directory=folder, started=up, hands=hands), name="devices"),
-            asyncio.create_task(vehicle.process.wait(), name="firmware"),
-        ]
-        try:
-            waiting = asyncio.create_task(up.wait())
-            await asyncio.wait({*tasks, waiting}, return_when=asyncio.FIRST_COMPLETED)
-            waiting.cancel()
-            if up.is_set():
-                started.set()
-            await asyncio.gather(*tasks)
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+        await serve(scenario, directory=folder, started=started, hands=hands, beside=vehicle.process.wait())
 
 
 def _words(vehicle: SitlVehicle, scenario: Scenario, folder: Path) -> str:

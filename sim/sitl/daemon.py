@@ -30,11 +30,7 @@ def daemon_configuration(vehicle: FirmwareVehicle, folder: Path, more: str = "",
 
 @contextlib.asynccontextmanager
 async def devices(scenario: Scenario, folder: Path) -> AsyncIterator[Path]:
-    """`imu`, `gradienter` and `compass` of the aircraft as ports in a folder, which exists.
-
-    Raises:
-        TimeoutError: they did not come up.
-    """
+    """`imu`, `gradienter` and `compass` of the aircraft as ports in a folder, which exists."""
     up = asyncio.Event()
     serving = asyncio.create_task(serve(scenario, directory=folder, started=up), name="devices")
     try:
@@ -57,10 +53,6 @@ async def companion_daemon(
         folder: for the ports, the configuration, the log and the companion's storage; exists.
         more: further lines of its configuration.
         url: of its link to the vehicle, where something lies between (None: the vehicle's own).
-
-    Raises:
-        RuntimeError: it ended; its log is in the message.
-        TimeoutError: it did not become ready.
     """
     (folder / "companion.toml").write_text(daemon_configuration(vehicle, folder, more, url), encoding="utf-8")
     async with devices(vehicle.scenario, folder), CompanionProcess(folder) as daemon:

@@ -73,11 +73,7 @@ class GroundStation(Station):
             await asyncio.sleep(1.0)
 
     async def wait_for(self, condition: Callable[[], bool], within_s: float, what: str) -> None:
-        """Wait for something to become true.
-
-        Raises:
-            TimeoutError: it did not.
-        """
+        """Wait for something to become true."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + within_s
         while not condition():
@@ -86,11 +82,7 @@ class GroundStation(Station):
             await asyncio.sleep(0.01)
 
     async def wait_message(self, kind: type[M], within_s: float, *, since_s: float = 0.0) -> M:
-        """The newest message of a kind that came after `since_s` (loop time).
-
-        Raises:
-            TimeoutError: none came.
-        """
+        """The newest message of a kind that came after `since_s` (loop time)."""
         await self.wait_for(lambda: bool(self.all(kind, since_s=since_s)), within_s, kind.__name__)
         return self.all(kind, since_s=since_s)[-1]
 
@@ -105,11 +97,7 @@ class GroundStation(Station):
     # Parameters.
 
     async def get(self, name: str) -> float:
-        """A parameter by name.
-
-        Raises:
-            KeyError: the firmware says there is none, or says nothing.
-        """
+        """A parameter by name."""
         loop = asyncio.get_running_loop()
         for _ in range(TRIES):
             since_s = loop.time()
@@ -124,11 +112,7 @@ class GroundStation(Station):
         raise KeyError(name)
 
     async def put(self, name: str, value: float) -> float:
-        """Set a parameter and return what the firmware says it is now.
-
-        Raises:
-            KeyError: it has none of that name, or does not answer.
-        """
+        """Set a parameter and return what the firmware says it is now."""
         if name not in self._types:
             await self.get(name)
         loop = asyncio.get_running_loop()
@@ -155,11 +139,7 @@ class GroundStation(Station):
             await self.put(name, value)
 
     async def whole_list(self, within_s: float = 60.0) -> dict[str, float]:
-        """Every parameter that the autopilot lists; what gets lost on the way is asked for by its number.
-
-        Raises:
-            TimeoutError: the list stays incomplete.
-        """
+        """Every parameter that the autopilot lists; what gets lost on the way is asked for by its number."""
         loop = asyncio.get_running_loop()
         since_s, deadline_s = loop.time(), loop.time() + within_s
         self.send(mavlink.MAVLink_param_request_list_message(self.vehicle, 1))
@@ -245,11 +225,7 @@ class GroundStation(Station):
         return self.all(kind, since_s=since_s)
 
     async def imu(self, kind: type[mavlink.MAVLink_message], seconds: float, *, rate_hz: float = 100.0) -> Array:
-        """Readings (n, 6) of an IMU message: rates in rad/s, specific forces in m/s^2. The stream stays on.
-
-        Raises:
-            RuntimeError: fewer than a quarter of what was asked for came.
-        """
+        """Readings (n, 6) of an IMU message: rates in rad/s, specific forces in m/s^2. The stream stays on."""
         result = await self.stream(kind.id, rate_hz)
         await asyncio.sleep(0.1)
         seen = await self.collect(kind, seconds)

@@ -7,7 +7,6 @@ import contextlib
 import math
 import socket
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Self, cast
 
 import numpy as np
@@ -73,8 +72,6 @@ class HilBackend:
         """Frames sent, since the last boot."""
         self.unanswered = 0
         """Frames that got no answer in time although the firmware had answered before."""
-        self.late = 0
-        """How often the machine was too slow to keep up."""
         self.armed = False
         """What the firmware's outputs say."""
 
@@ -89,19 +86,13 @@ class HilBackend:
         return self._locked
 
     async def __aenter__(self) -> Self:
-        """Listen.
-
-        Raises:
-            OSError: the port is taken.
-        """
+        """Listen."""
         self._aircraft.begin(asyncio.get_running_loop().time())
         self._server = await asyncio.start_server(self._connected, "127.0.0.1", self._wanted_port)
         self.port = self._server.sockets[0].getsockname()[1]
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         if self._server is not None:
             self._server.close()
         if self._driving is not None:
@@ -153,7 +144,6 @@ class HilBackend:
                 behind_s = loop.time() - due_s
                 if behind_s > MAX_BEHIND_S:
                     due_s += behind_s
-                    self.late += 1
                 await asyncio.sleep(max(-behind_s, 0.0))
         except OSError:  # the firmware has gone; the reader sees it too
             return

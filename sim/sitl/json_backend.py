@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from types import TracebackType
 from typing import Self
 
 from sim.aircraft import VirtualAircraft
@@ -46,31 +45,14 @@ class JsonBackend:
         """Firmware starts seen."""
         self.frames = 0
         """Frames sent, since the last boot."""
-        self.resent = 0
-        """Answers sent again because the firmware asked again."""
-        self.lost = 0
-        """Frame numbers that never came; more than 0 means that the physics did not see what the firmware did."""
-        self.ignored = 0
-        """Packets that were none, and repeats of an answered one."""
-        self.pwm_us: tuple[int, ...] = ()
-        """Servo outputs of the last frame."""
 
     @property
     def physics_s(self) -> float:
         """The firmware's simulated time since its boot."""
         return self._physics_s
 
-    @property
-    def jumps(self) -> int:
-        """How often the machine was too slow to keep up."""
-        return self.blocks.jumps
-
     async def __aenter__(self) -> Self:
-        """Bind the port.
-
-        Raises:
-            OSError: the port is taken.
-        """
+        """Bind the port."""
         self._loop = asyncio.get_running_loop()
         self._aircraft.begin(self._loop.time())
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -84,9 +66,7 @@ class JsonBackend:
         self._loop.add_reader(self._socket.fileno(), self._readable)
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         if self._socket is not None and self._loop is not None:
             self._loop.remove_reader(self._socket.fileno())
             self._socket.close()
@@ -108,14 +88,11 @@ class JsonBackend:
         """The answer to a packet, empty if it deserves none; never raises."""
         packet = decode_servos(data)
         if packet is None:
-            self.ignored += 1
             return b""
         if peer != self._peer or packet.frame_count < self._count:
             self._begin(peer)
         elif packet.frame_count == self._count:
             return self._again()
-        elif self._count >= 0:
-            self.lost += packet.frame_count - self._count - 1
         return self._frame(packet)
 
     def _begin(self, peer: tuple[str, int]) -> None:
@@ -130,16 +107,14 @@ class JsonBackend:
         assert self._loop is not None
         now_s = self._loop.time()
         if now_s - self._last_s < _ASKS_AGAIN_S:
-            self.ignored += 1
             return b""
         self._last_s = now_s
-        self.resent += 1
         return self._last
 
     def _frame(self, packet: ServoPacket) -> bytes:
         assert self._loop is not None
         interval_s = 1.0 / packet.frame_rate_hz
-        self._count, self.pwm_us = packet.frame_count, packet.pwm_us
+        self._count = packet.frame_count
         self._physics_s += interval_s
         self._last_s = self._loop.time()
         now_s = self._aircraft.time_at(self._last_s)

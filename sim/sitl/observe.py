@@ -37,9 +37,6 @@ async def mean_reading(vehicle: SitlVehicle, ground: GroundStation, instance: in
     ArduPilot's first IMU comes in floats (HIGHRES_IMU). Everything else comes in integers cut off towards zero; of
     those the most likely mean under Gaussian noise is taken. PX4's HIGHRES_IMU is not used: it has the estimator's
     bias taken out.
-
-    Raises:
-        RuntimeError: the messages do not come.
     """
     if vehicle.firmware == "ardupilot" and instance == 1:
         rows = await ground.imu(mavlink.MAVLink_highres_imu_message, seconds)
@@ -64,11 +61,7 @@ async def mean_reading(vehicle: SitlVehicle, ground: GroundStation, instance: in
 
 
 async def residual(vehicle: SitlVehicle, ground: GroundStation, instance: int, seconds: float) -> Array:
-    """What an IMU reads more than the truth of the aircraft, after its offsets; the same six numbers.
-
-    Raises:
-        RuntimeError: the messages do not come.
-    """
+    """What an IMU reads more than the truth of the aircraft, after its offsets; the same six numbers."""
     aircraft, begun_s = vehicle.aircraft, vehicle.now_s
     ahead = np.concatenate(aircraft.truth(begun_s + np.linspace(0.0, min(seconds, 30.0), 301)), axis=1)
     if (np.ptp(ahead, axis=0) > SWAYS_STEPS * STEP).any():

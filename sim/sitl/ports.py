@@ -20,11 +20,7 @@ def free_udp_port() -> int:
 
 
 def free_tcp_window(size: int) -> int:
-    """The first of `size` consecutive TCP ports that are free.
-
-    Raises:
-        OSError: no such window was found.
-    """
+    """The first of `size` consecutive TCP ports that are free."""
     for _ in range(50):
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
             probe.bind((LOOPBACK, 0))

@@ -23,11 +23,7 @@ class BinaryError(RuntimeError):
 
 
 def check_binary(path: Path, option: str = "--binary") -> Path:
-    """The absolute path of something that can be executed.
-
-    Raises:
-        BinaryError: it is missing or not executable.
-    """
+    """The absolute path of something that can be executed."""
     path = path.expanduser()
     found = path if path.parent != Path() or path.exists() else Path(shutil.which(str(path)) or path)
     if not found.is_file():
@@ -64,12 +60,7 @@ class FirmwareProcess:
         return self._process is not None and self._process.returncode is None
 
     async def start(self) -> None:
-        """Start it.
-
-        Raises:
-            BinaryError: the system refuses to run it.
-            RuntimeError: it runs already.
-        """
+        """Start it."""
         if self.running:
             raise RuntimeError(f"{self.command[0]} runs already")
         with self.log.open("ab") as log:
@@ -101,21 +92,13 @@ class FirmwareProcess:
         self._process = None
 
     async def wait(self) -> None:
-        """Until it ends by itself.
-
-        Raises:
-            BinaryError: always then, with the last lines of its log.
-        """
+        """Wait until it ends, and raise a BinaryError with the last lines of its log."""
         assert self._process is not None
         code = await self._process.wait()
         raise BinaryError(self._obituary(code))
 
     async def until(self, condition: Callable[[], bool], within_s: float, what: str) -> None:
-        """Wait for something while it lives.
-
-        Raises:
-            BinaryError: it died, or `within_s` passed; with the last lines of its log.
-        """
+        """Wait for something; a BinaryError if it dies before, or `within_s` passes."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + within_s
         while not condition():

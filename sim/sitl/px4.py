@@ -6,16 +6,15 @@ import contextlib
 import socket
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from sim.imu_model import Bias, ImuModel
+from sim.imu_model import Bias
 from sim.scenario import Scenario
 from sim.sitl.hil_backend import HilBackend
 from sim.sitl.ports import LOOPBACK, ports_free, unlocked
 from sim.sitl.process import BinaryError, FirmwareProcess, check_binary
-from sim.sitl.samples import SampleBlocks
-from sim.sitl.vehicle import SitlVehicle
+from sim.sitl.vehicle import FirmwareVehicle, SitlVehicle
 
-MODEL = "none_iris"
 INSTANCES = 10
 """Beyond ten, the firmware gives several vehicles the same companion port."""
 _TCP_SIMULATOR = 4560
@@ -42,19 +41,15 @@ def ports_of(instance: int) -> list[tuple[int, socket.SocketKind]]:
 
 
 def free_instance() -> int:
-    """The first instance whose ports and lock are free.
-
-    Raises:
-        BinaryError: ten are running.
-    """
+    """The first instance whose ports and lock are free."""
     for instance in range(INSTANCES):
         if unlocked(Path(f"/tmp/px4_lock-{instance}")) and ports_free(ports_of(instance)):  # noqa: S108 - PX4's own
             return instance
     raise BinaryError(f"px4: instances 0 to {INSTANCES - 1} are all taken; end one")
 
 
-class Px4Sitl(SitlVehicle):
-    """A `px4` of SITL on a scenario's aircraft.
+class Px4(FirmwareVehicle):
+    """An instance of PX4: its ports, its files and its start.
 
     Links: the firmware sends to 127.0.0.1 port 14540 plus its instance (companion), and to 14550 until a ground
     station has spoken to `ground_target`, then to that one.
@@ -66,13 +61,11 @@ class Px4Sitl(SitlVehicle):
         folder: see `FirmwareVehicle`.
         parameters: set at the first boot, besides `MEASURING_PARAMETERS`.
         instance: of the firmware; None: the first that is free.
-
-    Raises:
-        BinaryError: binary or folder is missing, or no instance is free.
     """
 
     firmware = "px4"
-    instances = (1, 2)
+    stored = ("parameters.bson", "parameters_backup.bson")
+    model: str
 
     def __init__(
         self,
@@ -90,46 +83,43 @@ class Px4Sitl(SitlVehicle):
         if not (self._etc / "init.d-posix" / "rcS").is_file():
             raise BinaryError(f"--etc: found no init.d-posix/rcS in {self._etc}; give the etc folder of the build")
         self._parameters = MEASURING_PARAMETERS | dict(parameters or {})
+        self._environment = {"PX4_SIM_MODEL": self.model, "PX4_SIM_HOST_ADDR": LOOPBACK}
         self.instance = free_instance() if instance is None else instance
         self.system_id = self.instance + 1
-        self.backend = HilBackend(
-            scenario.aircraft, scenario.flight_controller_imus[:2], port=_TCP_SIMULATOR + self.instance
-        )
+        self.companion_port = UDP_COMPANION + self.instance
+        self.url = f"udpin:{LOOPBACK}:{self.companion_port}"
+        self.ground_target = LOOPBACK, UDP_GROUND_LOCAL + self.instance
 
-    @property
-    def url(self) -> str:
-        """The companion listens where the onboard link sends to."""
-        return f"udpin:{LOOPBACK}:{UDP_COMPANION + self.instance}"
+    def _process_of(self) -> FirmwareProcess:
+        command = [str(self._binary), "-d", "-i", str(self.instance), "-w", str(self.folder), str(self._etc)]
+        return FirmwareProcess(command, self.folder)
 
-    @property
-    def ground_target(self) -> tuple[str, int]:
-        """Where the firmware's ground link listens; it answers whoever speaks to it first."""
-        return LOOPBACK, UDP_GROUND_LOCAL + self.instance
+    async def power_on(self) -> None:
+        """Start the binary with what it has stored; when that is nothing, with our parameters."""
+        first: dict[str, str] = {}
+        if not (self.folder / self.stored[0]).exists():
+            first = {f"PX4_PARAM_{name}": f"{value:g}" for name, value in self._parameters.items()}
+        self.process.environment = self._environment | first
+        await super().power_on()
+
+
+class Px4Sitl(Px4, SitlVehicle):
+    """A `px4` of SITL on a scenario's aircraft; its first two IMUs are sensor 0 and sensor 1."""
+
+    model = "none_iris"
+    backend: HilBackend
+    instances = (1, 2)
+
+    def __init__(self, binary: Path, scenario: Scenario, folder: Path, **more: Any) -> None:
+        super().__init__(binary, scenario, folder, **more)
+        self.imus = scenario.flight_controller_imus[:2]
+        self.backend = HilBackend(scenario.aircraft, self.imus, port=_TCP_SIMULATOR + self.instance)
+        self.samples = self.backend.blocks
 
     @property
     def physics_s(self) -> float:
         """The firmware's simulated time since its boot."""
         return self.backend.physics_s if self.backend.locked else 0.0
-
-    @property
-    def backend_boots(self) -> int:
-        """Connections seen."""
-        return self.backend.boots
-
-    @property
-    def stored(self) -> tuple[str, ...]:
-        """Parameters and their backup."""
-        return "parameters.bson", "parameters_backup.bson"
-
-    @property
-    def samples(self) -> SampleBlocks:
-        """The back end's."""
-        return self.backend.blocks
-
-    @property
-    def imus(self) -> tuple[ImuModel, ...]:
-        """Sensor 0 and sensor 1."""
-        return self.scenario.flight_controller_imus[:2]
 
     def true_bias(self, instance: int, t_s: float) -> Bias:
         """Each sensor has its own model."""
@@ -137,14 +127,4 @@ class Px4Sitl(SitlVehicle):
 
     async def _open(self, stack: contextlib.AsyncExitStack) -> FirmwareProcess:
         await stack.enter_async_context(self.backend)
-        return FirmwareProcess(
-            [str(self._binary), "-d", "-i", str(self.instance), "-w", str(self.folder), str(self._etc)], self.folder
-        )
-
-    async def power_on(self) -> None:
-        """Start the binary with what it has stored; when that is nothing, with our parameters."""
-        environment = {"PX4_SIM_MODEL": MODEL, "PX4_SIM_HOST_ADDR": LOOPBACK}
-        if not (self.folder / self.stored[0]).exists():
-            environment |= {f"PX4_PARAM_{name}": f"{value:g}" for name, value in self._parameters.items()}
-        self.process.environment = environment
-        await super().power_on()
+        return self._process_of()

@@ -20,6 +20,8 @@ from sim.sitl.observe import residual
 from sim.sitl.vehicle import FirmwareVehicle, SitlVehicle
 from sim.udp import open_udp
 
+OBSERVE_S = 60.0
+"""Length of each look."""
 SETTLE_S = 40.0
 """After a start: the estimator has its position and the first transients are over."""
 OWN_CALIBRATION_S = 60.0
@@ -116,7 +118,7 @@ async def own_calibration(vehicle: FirmwareVehicle, ground: GroundStation, *para
 
 
 async def report(
-    vehicle: SitlVehicle, folder: Path, observe_s: float, more: str, *, listen_s: float = 0.0, own: bool = True,
+    vehicle: SitlVehicle, folder: Path, more: str, *, listen_s: float = 0.0, own: bool = True,
     companion: bool = True,
 ) -> int:  # fmt: skip
     """Start the firmware, calibrate it in every way, print the table; the exit code (1: the companion failed).
@@ -124,7 +126,6 @@ async def report(
     Args:
         vehicle: not running yet.
         folder: for the companion's files; exists.
-        observe_s: length of each look.
         more: further lines of the companion's configuration.
         listen_s: how long the companion hears the sensors before it is asked.
         own: whether the firmware's own calibrations are wanted in the table.
@@ -132,24 +133,22 @@ async def report(
     """
     async with vehicle, ground_station(vehicle) as ground:
         p = vehicle.aircraft.pose
-        print(f"pitch {p.pitch_deg:g}, roll {p.roll_deg:g}, heading {p.heading_deg:g} deg; looks of {observe_s:g} s")
+        print(f"pitch {p.pitch_deg:g}, roll {p.roll_deg:g}, heading {p.heading_deg:g} deg; looks of {OBSERVE_S:g} s")
         print(HEADER, flush=True)
         for instance in vehicle.instances:
             bias = vehicle.true_bias(instance, vehicle.now_s)
             print(Row("(the true bias)", instance, np.concatenate(bias)), flush=True)
         await asyncio.sleep(SETTLE_S)
         if own:
-            await _look(vehicle, ground, "as it came", observe_s)
-            await _own_calibrations(vehicle, ground, observe_s)
+            await _look(vehicle, ground, "as it came")
+            await _own_calibrations(vehicle, ground)
         if own and companion:
             await vehicle.factory_reset()
             await asyncio.sleep(SETTLE_S)
-        return await _companion(vehicle, ground, folder, observe_s, more, listen_s) if companion else 0
+        return await _companion(vehicle, ground, folder, more, listen_s) if companion else 0
 
 
-async def _companion(
-    vehicle: SitlVehicle, ground: GroundStation, folder: Path, observe_s: float, more: str, listen_s: float
-) -> int:
+async def _companion(vehicle: SitlVehicle, ground: GroundStation, folder: Path, more: str, listen_s: float) -> int:
     try:
         async with companion_daemon(vehicle, folder, more=more) as daemon:
             await vehicle.sleep(listen_s)
@@ -161,22 +160,22 @@ async def _companion(
     for imu in record["imus"]:
         print(f"imu {imu['name']}: {imu['samples']} samples; {'; '.join(imu['warnings'])}", file=sys.stderr)
     print("; ".join([record["reason"], *record["warnings"]]), file=sys.stderr)
-    await _look(vehicle, ground, f"companion ({outcome})", observe_s)
+    await _look(vehicle, ground, f"companion ({outcome})")
     if record["state"] != "done":
         print(f"companion: {record['state']}: {record['reason']}", file=sys.stderr)
         return 1
     await vehicle.power_cycle()
     await asyncio.sleep(SETTLE_S)
-    await _look(vehicle, ground, "companion, after a power cycle", observe_s)
+    await _look(vehicle, ground, "companion, after a power cycle")
     return 0
 
 
-async def _own_calibrations(vehicle: SitlVehicle, ground: GroundStation, observe_s: float) -> None:
+async def _own_calibrations(vehicle: SitlVehicle, ground: GroundStation) -> None:
     for number in range(1, OWN_TRIES + 1):
         print(f"  {await own_calibration(vehicle, ground, *GYROS)}")
-        await _look(vehicle, ground, f"own gyro calibration (param1 = 1), no. {number}", observe_s / OWN_TRIES)
+        await _look(vehicle, ground, f"own gyro calibration (param1 = 1), no. {number}", OBSERVE_S / OWN_TRIES)
     print(f"  {await own_calibration(vehicle, ground, *QUICK)}")
-    await _look(vehicle, ground, f"own accelerometer calibration ({_QUICK_NAME[vehicle.firmware]})", observe_s)
+    await _look(vehicle, ground, f"own accelerometer calibration ({_QUICK_NAME[vehicle.firmware]})")
     names = _LEVEL[vehicle.firmware]
     before = [await ground.get(name) for name in names]
     print(f"  {await own_calibration(vehicle, ground, *LEVEL)}")
@@ -184,7 +183,7 @@ async def _own_calibrations(vehicle: SitlVehicle, ground: GroundStation, observe
         print(f"  own level calibration (param5 = 2): {name} {was:.4f}, now {await ground.get(name):.4f}", flush=True)
 
 
-async def _look(vehicle: SitlVehicle, ground: GroundStation, what: str, seconds: float) -> None:
+async def _look(vehicle: SitlVehicle, ground: GroundStation, what: str, seconds: float = OBSERVE_S) -> None:
     for instance in vehicle.instances:
         loop = asyncio.get_running_loop()
         begun_s, physics_s = loop.time(), vehicle.physics_s

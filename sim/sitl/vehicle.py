@@ -7,8 +7,7 @@ import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 from sim.imu_model import Bias, ImuModel
 from sim.motions import Motion
@@ -24,6 +23,13 @@ SLOWEST = 10.0
 """Seconds of the wall for one of the firmware's, at most."""
 
 
+class Backend(Protocol):
+    """Gives a firmware its physics, or follows them."""
+
+    boots: int
+    """Starts seen, also those that the firmware did by itself."""
+
+
 class FirmwareVehicle(ABC):
     """A firmware binary and a scenario's aircraft, whosever the physics. An async context manager on a real event loop.
 
@@ -36,23 +42,19 @@ class FirmwareVehicle(ABC):
     instances: tuple[int, ...] = (1,)
     """The IMUs to calibrate and look at: those whose telemetry lets one tell a mean to some deg/h."""
     process: FirmwareProcess
+    backend: Backend
     system_id: int
+    url: str
+    """Where the companion listens, in the words of its configuration."""
+    ground_target: tuple[str, int]
+    """Where the firmware sends what is for the ground station."""
+    stored: tuple[str, ...]
+    """Names of the files in which its parameters live."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         self.scenario, self.folder = scenario, folder
         self.aircraft = scenario.aircraft
-        self.starts = 0
         self._stack = contextlib.AsyncExitStack()
-
-    @property
-    @abstractmethod
-    def url(self) -> str:
-        """Where the companion listens, in the words of its configuration."""
-
-    @property
-    @abstractmethod
-    def ground_target(self) -> tuple[str, int]:
-        """Where the firmware sends what is for the ground station."""
 
     @property
     @abstractmethod
@@ -68,12 +70,7 @@ class FirmwareVehicle(ABC):
         """Open the back end and make the process, not started."""
 
     async def __aenter__(self) -> Self:
-        """Start back end and binary, and wait until its simulated time passes.
-
-        Raises:
-            BinaryError: it cannot be run, or died, or does not ask for physics.
-            OSError: a port is taken.
-        """
+        """Start back end and binary, and wait until its simulated time passes."""
         self.folder.mkdir(parents=True, exist_ok=True)
         try:
             self.process = await self._open(self._stack)
@@ -84,22 +81,15 @@ class FirmwareVehicle(ABC):
             raise
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         await self._stack.aclose()
 
     async def power_on(self) -> None:
-        """Start the binary with what it has stored.
-
-        Raises:
-            BinaryError: it cannot be run, or died, or does not ask for physics.
-        """
-        boots = self.backend_boots
+        """Start the binary with what it has stored."""
+        boots = self.backend.boots
         await self.process.start()
-        self.starts += 1
         await self.process.until(
-            lambda: self.backend_boots > boots and self.physics_s > 1.0, BOOT_S, "a second of simulated flight"
+            lambda: self.backend.boots > boots and self.physics_s > 1.0, BOOT_S, "a second of simulated flight"
         )
 
     async def power_off(self) -> None:
@@ -119,25 +109,11 @@ class FirmwareVehicle(ABC):
             (self.folder / name).unlink(missing_ok=True)
         await self.power_on()
 
-    @property
-    @abstractmethod
-    def stored(self) -> tuple[str, ...]:
-        """Names of the files in which its parameters live."""
-
-    @property
-    @abstractmethod
-    def backend_boots(self) -> int:
-        """Starts the back end has seen, also those the firmware did by itself."""
-
     async def sleep(self, seconds: float) -> None:
-        """Let so much time pass on the firmware's clock, which a busy machine lets run slower than the wall's.
-
-        Raises:
-            TimeoutError: it has all but stopped.
-        """
-        begun_s, starts = self.physics_s, self.backend_boots
+        """Let so much time pass on the firmware's clock, which a busy machine lets run slower than the wall's."""
+        begun_s, starts = self.physics_s, self.backend.boots
         async with asyncio.timeout(SLOWEST * seconds + 1.0):
-            while self.backend_boots == starts and self.physics_s - begun_s < seconds:
+            while self.backend.boots == starts and self.physics_s - begun_s < seconds:
                 await asyncio.sleep(0.05)
 
     @property
@@ -149,15 +125,10 @@ class FirmwareVehicle(ABC):
 class SitlVehicle(FirmwareVehicle):
     """A firmware on our physics: it lives on the scenario's aircraft, and its IMUs read what ours read."""
 
-    @property
-    @abstractmethod
-    def samples(self) -> SampleBlocks:
-        """What the back end sends."""
-
-    @property
-    @abstractmethod
-    def imus(self) -> tuple[ImuModel, ...]:
-        """The models behind the back end."""
+    samples: SampleBlocks
+    """What the back end sends."""
+    imus: tuple[ImuModel, ...]
+    """The models behind the back end."""
 
     def move(self, motions: Sequence[Motion]) -> None:
         """Let something happen to the aircraft; start at least 0.1 s from now (aircraft time, see `now_s`)."""

@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import os
+import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.hands import AHEAD_S, PLACEMENT_DEG, PROPPED_DEG, Hands
-from sim.sitl.by_hand import SETTLE_S, attitude_error_deg, judged, stand
-from sim.sitl.cli import parser, scenario_of, vehicle_of
-from sim.sitl.first_hour import Tape
-from sim.sitl.residuals import ground_station
+from sim.aircraft import Pose
+from sim.companion_process import CompanionProcess
+from sim.earth import Array
+from sim.hands import AHEAD_S, PLACEMENT_DEG, PROPPED_DEG, SIDES, Hands
+from sim.imu_model import MG
+from sim.scenario import demo
+from sim.sitl.ardupilot import ArduPilotSitl
+from sim.sitl.ground import GroundStation
+from sim.sitl.observe import mean_reading
+from sim.sitl.px4 import Px4Sitl
+from sim.sitl.residuals import SETTLE_S, ground_station
+from sim.sitl.vehicle import SitlVehicle
 from tests.sitl.craft import BINARIES, missing
 
 LEVEL_MG, SCALE_PERCENT, LEVEL_DEG = 0.5, 0.03, 0.08
@@ -26,48 +36,117 @@ TRIM = {
     "ardupilot-sitl": ["AHRS_TRIM_X", "AHRS_TRIM_Y"],
     "px4-sitl": ["SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF"],
 }
+OBSERVED_S = 4.0
+STILL_AFTER_S = 1.5
+"""From the end of a movement until every filter has forgotten it."""
+STORED_S = 4.0
+"""By then PX4 has stored what was set."""
+
+
+class Accelerometer(NamedTuple):
+    """Errors of an accelerometer's output in its own axes; `level_mg`: when level, up being -1 g on z."""
+
+    level_mg: Array
+    scale_percent: Array
+
+
+class Bench:
+    """One firmware, hands that hold its aircraft, and a ground station that judges its telemetry by the truth."""
+
+    def __init__(self, vehicle: SitlVehicle, ground: GroundStation, folder: Path) -> None:
+        self.vehicle, self.ground = vehicle, ground
+        self.hands = Hands(vehicle.aircraft, placement_deg=PLACEMENT_DEG, propped_deg=PROPPED_DEG, seed=1, takes_s=2.0)
+        self.companion = CompanionProcess(folder)
+
+    async def type(self, *words: str) -> None:
+        """Run a command of the companion to its end, and move the aircraft as it asks."""
+        process = await asyncio.create_subprocess_exec(
+            *self.companion.command(*words), env=os.environ | {"PYTHONUNBUFFERED": "1"},
+            stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
+        )  # fmt: skip
+        assert process.stdout is not None
+        obeyed, printed = "", []
+        while line := (await process.stdout.readline()).decode():
+            printed.append(line)
+            if "waiting for it to move" in line and line != obeyed:
+                obeyed = line
+                self.hands.follow(line, self.vehicle.now_s + AHEAD_S)
+        assert await process.wait() == 0, f"companion {' '.join(words)}: {''.join(printed)}"
+
+    async def values(self, names: list[str]) -> list[float]:
+        """Parameters by name."""
+        return [await self.ground.get(name) for name in names]
+
+    async def stand(self, until_s: float) -> None:
+        """Wait until it stands, in aircraft time, and a little longer."""
+        await self.vehicle.sleep(max(until_s - self.vehicle.now_s, 0.0) + STILL_AFTER_S)
+
+    async def judged(self) -> Accelerometer:
+        """Fit output = A force + bias to telemetry and truth on six sides; the aircraft ends on its spot."""
+        outputs, forces = [], []
+        for pitch, roll in SIDES.values():
+            await self.stand(self.hands.hold(self.vehicle.now_s + AHEAD_S, pitch, roll))
+            begun_s = self.vehicle.now_s
+            outputs.append((await mean_reading(self.vehicle, self.ground, 1, OBSERVED_S))[3:])
+            forces.append(self.vehicle.aircraft.truth_at(begun_s).force_m_s2)
+        await self.stand(self.hands.back(self.vehicle.now_s + AHEAD_S))
+        both = np.column_stack([np.array(forces), np.ones(len(forces))])
+        found, *_ = np.linalg.lstsq(both, np.array(outputs), rcond=None)
+        scale_percent = 100.0 * (np.linalg.norm(found[:3], axis=0) - 1.0)
+        return Accelerometer(found[3] / MG + np.array([0.0, 0.0, -10.0]) * scale_percent, scale_percent)
+
+    async def attitude_error_deg(self) -> Array:
+        """Roll and pitch of ATTITUDE after a restart, less the truth."""
+        await self.vehicle.sleep(STORED_S)
+        await self.vehicle.power_cycle()
+        await self.vehicle.sleep(SETTLE_S)
+        await self.ground.stream(mavlink.MAVLINK_MSG_ID_ATTITUDE, 20.0)
+        seen = await self.ground.collect(mavlink.MAVLink_attitude_message, OBSERVED_S)
+        assert seen
+        told_rad = np.mean([(message.roll, message.pitch) for message in seen], axis=0)
+        off = told_rad - np.array(self.vehicle.aircraft.angles_rad(self.vehicle.now_s)[:2])
+        return np.asarray(np.degrees((off + np.pi) % (2.0 * np.pi) - np.pi))
 
 
 @pytest.mark.sitl
 @pytest.mark.parametrize("kind", list(NAMES))
 def test_a_bare_board_is_right_after_stands_by_hand_and_as_it_was_after_undo(kind: str, tmp_path: Path) -> None:
-    """20 mg, 0.5 %, a board that sits askew, a spot that slopes by 5 deg: as in the tape of a first hour."""
+    """20 mg, 0.5 %, a board that sits askew, a spot that slopes by 5 deg."""
     reason = missing(kind)
     if reason is not None:
         pytest.skip(reason)
 
     async def main() -> None:
-        arguments = parser().parse_args(["first-hour", "--binary", os.environ[BINARIES[kind]]])
-        vehicle = vehicle_of(arguments, scenario_of(arguments), tmp_path / "firmware")
+        scenario = demo(
+            pose=Pose(4.0, -3.0, 40.0), unix_s=time.time(), accel_mg=(20.0, -20.0, 20.0),
+            accel_scale=(0.005, -0.005, 0.005), board_deg=(0.8, -0.6),
+        )  # fmt: skip
+        what = Path(os.environ[BINARIES[kind]]), scenario, tmp_path / "firmware"
+        vehicle = Px4Sitl(*what) if kind == "px4-sitl" else ArduPilotSitl(*what)
         async with vehicle, ground_station(vehicle) as ground:
             await vehicle.sleep(SETTLE_S)
-            tape = Tape(vehicle, ground, tmp_path)
-            tape.hands = Hands(
-                vehicle.aircraft, placement_deg=PLACEMENT_DEG, propped_deg=PROPPED_DEG, seed=1, takes_s=2.0
-            )
-
-            async def values(names: list[str]) -> list[float]:
-                return [await ground.get(name) for name in names]
-
-            before, level = await values(NAMES[kind]), await values(TRIM[kind])
-            assert await tape.setup() == 0
-            async with tape.daemon():
-                assert await tape.type("align", "faces", "--write") == 0
-                left = await judged(vehicle, ground, tape.hands)
+            bench = Bench(vehicle, ground, tmp_path)
+            before, level = await bench.values(NAMES[kind]), await bench.values(TRIM[kind])
+            await bench.type("setup", "--yes", "--udp", vehicle.url.rsplit(":", 1)[1])
+            async with bench.companion as daemon:
+                await daemon.ready()
+                await bench.type("align", "faces", "--write")
+                left = await bench.judged()
                 assert np.abs(left.level_mg).max() < LEVEL_MG, left
                 if kind == "px4-sitl":  # starts without scales that are within 1 % of 1
-                    assert await tape.type("undo") == 0
-                    assert await values(NAMES[kind]) == before
-                    assert await tape.type("align", "faces", "--write") == 0
-                    await stand(vehicle, tape.hands.back(vehicle.now_s + AHEAD_S))
+                    await bench.type("undo")
+                    assert await bench.values(NAMES[kind]) == before
+                    await bench.type("align", "faces", "--write")
+                    await bench.stand(bench.hands.back(vehicle.now_s + AHEAD_S))
                 else:
                     assert np.abs(left.scale_percent).max() < SCALE_PERCENT, left
-                written = await values(NAMES[kind])
-                assert await tape.type("align", "turn", "--level") == 0
-            assert np.abs(await attitude_error_deg(vehicle, ground)).max() < LEVEL_DEG
-            async with tape.daemon():
-                assert await tape.type("undo") == 0
-            assert await values(TRIM[kind]) == level
-            assert await values(NAMES[kind]) == written
+                written = await bench.values(NAMES[kind])
+                await bench.type("align", "turn", "--level")
+            assert np.abs(await bench.attitude_error_deg()).max() < LEVEL_DEG
+            async with bench.companion as daemon:
+                await daemon.ready()
+                await bench.type("undo")
+            assert await bench.values(TRIM[kind]) == level
+            assert await bench.values(NAMES[kind]) == written
 
     asyncio.run(main())

@@ -12,12 +12,11 @@ import pytest
 
 from companion.estimation.means.windows import ImuInput
 from companion.estimation.noise.allan import noise_profile
-from sim.accuracy import cli, deck_tables, tables, turning, warmup_table
+from sim.accuracy import cli, deck, tables, turning, warmup
 from sim.accuracy.experiments import predicted
 from sim.accuracy.figures import Claim, Figure, beside, covered, rms
 from sim.accuracy.stand import EXACT, POSTURES, biases, collected, samples, sites, solved, stand
 from sim.accuracy.tables import report
-from sim.accuracy.warmup import WARMING
 from sim.aircraft import VirtualAircraft
 from sim.imu_model import DEG_H, MG, PARTS, ImuModel
 from tests.support.extent import extent
@@ -141,11 +140,10 @@ def test_the_command_prints_tables_and_claims(capsys: pytest.CaptureFixture[str]
 def test_all_sections_are_made_of_the_same_stands(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "FLOORED", ("icm42688p",))
     monkeypatch.setattr(tables, "NOISE_LSB", (0.5,))
-    monkeypatch.setattr(deck_tables, "SPANS_S", (120,))
-    monkeypatch.setattr(deck_tables, "STILL_S", (60,))
+    monkeypatch.setattr(deck, "SPANS_S", (120,))
+    monkeypatch.setattr(deck, "STILL_S", (60,))
     monkeypatch.setattr(turning, "RATES_DEG_S", extent(whole=turning.RATES_DEG_S, a_slice=(0.0, 0.4)))
-    for module in (tables, warmup_table):
-        monkeypatch.setattr(module, "WARMING", extent(whole=WARMING, a_slice=WARMING[:1]))
+    monkeypatch.setattr(warmup, "WARMING", extent(whole=warmup.WARMING, a_slice=warmup.WARMING[:1]))
     said: list[str] = []
     found = report(2, 7, cli.SECTIONS, 1, said.append)
     assert tuple(found) == cli.SECTIONS

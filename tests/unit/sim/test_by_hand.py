@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim.accuracy import by_hand_table
-from sim.accuracy.by_hand import BY_HAND, TURNS, HandRun, by_hand
+from sim.accuracy.by_hand import BY_HAND, TURNS, HandRun, by_hand, section
 from sim.accuracy.figures import rms
 from sim.imu_model import MG
 from tests.support.extent import extent
@@ -20,8 +19,7 @@ def runs() -> list[HandRun]:
 
 
 def test_every_claim_holds_in_small(runs: list[HandRun]) -> None:
-    section = by_hand_table.section(runs, EACH)
-    assert not [str(claim) for claim in section.claims if not claim.holds]
+    assert not [str(claim) for claim in section(runs, EACH).claims if not claim.holds]
 
 
 def test_errors_are_within_what_is_said_of_them(runs: list[HandRun]) -> None:

@@ -40,7 +40,7 @@ def executable(path: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("command", ["ardupilot", "px4", "residuals", "first-hour"])
+@pytest.mark.parametrize("command", ["ardupilot", "px4", "residuals"])
 def test_a_missing_binary_is_one_line_that_names_it(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--binary", "/nowhere/firmware"]) == 1
     said = capsys.readouterr()
