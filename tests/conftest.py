@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import gc
+import inspect
 import json
 import os
 import re
@@ -18,6 +19,7 @@ import pytest
 
 from tests.support.extent import LONG
 from tests.support.outside import Outside
+from tests.support.virtual_time import run_virtual
 
 # How long an example takes says something of the machine, not of the code. Every day the examples are the same for
 # everybody: a suite is green or red, and no matter of dice. Those of `make long` are new every time.
@@ -172,6 +174,16 @@ def _choose(config: pytest.Config, items: list[pytest.Item], wanted: Callable[[A
         (chosen if wanted(item) else others).append(item)
     items[:] = chosen
     config.hook.pytest_deselected(items=others)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a test that is a coroutine on virtual time."""
+    test = pyfuncitem.obj
+    if not inspect.iscoroutinefunction(test):
+        return None
+    run_virtual(test(**{name: pyfuncitem.funcargs[name] for name in inspect.signature(test).parameters}))
+    return True
 
 
 @pytest.hookimpl(trylast=True)

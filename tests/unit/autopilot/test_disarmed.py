@@ -16,7 +16,6 @@ from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.errors import NotDisarmedError
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
-from tests.support.virtual_time import run_virtual
 
 X = "INS_GYROFFS_X"
 
@@ -157,107 +156,92 @@ def unanswered(autopilot: ScriptedAutopilot) -> Callable[[object], bool]:
     return lambda message: message.get_type() != "TIMESYNC"  # type: ignore[attr-defined]
 
 
-def test_neither_acknowledgement_nor_heartbeat_is_an_answer_and_why_nothing_is_written_is_said() -> None:
-    async def main() -> None:
-        autopilot = ScriptedAutopilot(parameters={X: 0.0})
-        async with aboard(autopilot) as (client, _):
-            autopilot.on_message = unanswered(autopilot)
-            with pytest.raises(NotDisarmedError, match=r"not written: ArduPilot.* does not answer whether it is armed"):
-                await client.write(X, 0.5)
-            assert autopilot.sets == []
-            questions = [each for each in autopilot.requests if each.get_type() == "TIMESYNC"]
-            assert len({question.ts1 for question in questions}) == len(questions) > 20
-            autopilot.on_message = lambda _message: True
-            assert await client.write(X, 0.5) == 0.5
-
-    run_virtual(main())
+async def test_neither_acknowledgement_nor_heartbeat_is_an_answer_and_why_nothing_is_written_is_said() -> None:
+    autopilot = ScriptedAutopilot(parameters={X: 0.0})
+    async with aboard(autopilot) as (client, _):
+        autopilot.on_message = unanswered(autopilot)
+        with pytest.raises(NotDisarmedError, match=r"not written: ArduPilot.* does not answer whether it is armed"):
+            await client.write(X, 0.5)
+        assert autopilot.sets == []
+        questions = [each for each in autopilot.requests if each.get_type() == "TIMESYNC"]
+        assert len({question.ts1 for question in questions}) == len(questions) > 20
+        autopilot.on_message = lambda _message: True
+        assert await client.write(X, 0.5) == 0.5
 
 
-def test_a_heartbeat_that_can_only_be_waited_for_is_waited_for() -> None:
-    async def main() -> None:
-        autopilot = ScriptedAutopilot(parameters={X: 0.0})
-        autopilot.result_of = lambda _message: mavlink.MAV_RESULT_UNSUPPORTED
-        autopilot.on_message = lambda message: message.get_type() != "COMMAND_LONG"
-        async with aboard(autopilot) as (client, _):
-            loop = asyncio.get_running_loop()
-            for late_s in (0.05, 0.3, 0.6):
-                await asyncio.sleep(late_s)
-                began_s = loop.time()
-                await client.write(X, 0.5)
-                assert loop.time() - began_s < 1.2
-            assert {armed for _, _, armed in autopilot.sets} == {False}
-
-    run_virtual(main())
+async def test_a_heartbeat_that_can_only_be_waited_for_is_waited_for() -> None:
+    autopilot = ScriptedAutopilot(parameters={X: 0.0})
+    autopilot.result_of = lambda _message: mavlink.MAV_RESULT_UNSUPPORTED
+    autopilot.on_message = lambda message: message.get_type() != "COMMAND_LONG"
+    async with aboard(autopilot) as (client, _):
+        loop = asyncio.get_running_loop()
+        for late_s in (0.05, 0.3, 0.6):
+            await asyncio.sleep(late_s)
+            began_s = loop.time()
+            await client.write(X, 0.5)
+            assert loop.time() - began_s < 1.2
+        assert {armed for _, _, armed in autopilot.sets} == {False}
 
 
 @pytest.mark.parametrize("pause_s", [0.05, 0.5])
-def test_a_process_that_stands_still_between_the_proof_and_the_write_does_not_write(pause_s: float) -> None:
-    async def main() -> None:
-        autopilot = ScriptedAutopilot(parameters={X: 0.0})
-        async with aboard(autopilot) as (client, link):
-            send, stopped = link.send, False
+async def test_a_process_that_stands_still_between_the_proof_and_the_write_does_not_write(pause_s: float) -> None:
+    autopilot = ScriptedAutopilot(parameters={X: 0.0})
+    async with aboard(autopilot) as (client, link):
+        send, stopped = link.send, False
 
-            def stop(message: mavlink.MAVLink_message, *allowed: Callable[[], bool]) -> bool:
-                nonlocal stopped
-                if message.get_type() == "PARAM_SET" and not stopped:
-                    stopped = True
-                    asyncio.get_running_loop()._jumping.now_s += pause_s  # type: ignore[attr-defined]
-                    autopilot.armed = pause_s > 0.1
-                return send(message, *allowed)
+        def stop(message: mavlink.MAVLink_message, *allowed: Callable[[], bool]) -> bool:
+            nonlocal stopped
+            if message.get_type() == "PARAM_SET" and not stopped:
+                stopped = True
+                asyncio.get_running_loop()._jumping.now_s += pause_s  # type: ignore[attr-defined]
+                autopilot.armed = pause_s > 0.1
+            return send(message, *allowed)
 
-            link.send = stop  # type: ignore[method-assign]
-            if pause_s < 0.1:
+        link.send = stop  # type: ignore[method-assign]
+        if pause_s < 0.1:
+            await client.write(X, 0.5)
+        else:
+            with pytest.raises(NotDisarmedError, match="the aircraft is armed"):
                 await client.write(X, 0.5)
-            else:
-                with pytest.raises(NotDisarmedError, match="the aircraft is armed"):
-                    await client.write(X, 0.5)
-            assert [armed for _, _, armed in autopilot.sets] == [False] * (pause_s < 0.1)
-
-    run_virtual(main())
+        assert [armed for _, _, armed in autopilot.sets] == [False] * (pause_s < 0.1)
 
 
-def test_what_has_arrived_is_read_before_anything_is_written() -> None:
-    async def main() -> None:
-        autopilot = ScriptedAutopilot(parameters={X: 0.0})
-        async with aboard(autopilot) as (client, link):
-            armed = mavlink.MAVLink_heartbeat_message(2, 3, mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 0, 3, 3)
-            waiting = [armed.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))]
-            transmit = link._transmit
+async def test_what_has_arrived_is_read_before_anything_is_written() -> None:
+    autopilot = ScriptedAutopilot(parameters={X: 0.0})
+    async with aboard(autopilot) as (client, link):
+        armed = mavlink.MAVLink_heartbeat_message(2, 3, mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 0, 3, 3)
+        waiting = [armed.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))]
+        transmit = link._transmit
 
-            def settled() -> bool:
-                while waiting and any(each.get_type() == "TIMESYNC" for each in autopilot.requests):
-                    link.receive(waiting.pop(), asyncio.get_running_loop().time())
-                return True
-
-            link.attach(transmit, settled)
-            with pytest.raises(NotDisarmedError, match="armed"):
-                await client.write(X, 0.5)
-            assert autopilot.sets == []
-            link.attach(transmit, lambda: False)
-            await asyncio.sleep(4.0)
-            with pytest.raises(NotDisarmedError):
-                await client.write(X, 0.5)
-            assert autopilot.sets == [], "more came than could be read, or something still waited to leave"
-
-    run_virtual(main())
-
-
-def test_heartbeats_are_asked_for_more_often_before_the_first_write_and_again_when_that_was_lost() -> None:
-    async def main() -> None:
-        autopilot = ScriptedAutopilot(parameters={X: 0.0})
-        lost: list[object] = []
-
-        def lose_the_first(message: object) -> bool:
-            wanted = getattr(message, "command", 0) == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL and message.param1 == 0  # type: ignore[attr-defined]
-            if wanted and len(lost) < 2:
-                lost.append(message)
-                return False
+        def settled() -> bool:
+            while waiting and any(each.get_type() == "TIMESYNC" for each in autopilot.requests):
+                link.receive(waiting.pop(), asyncio.get_running_loop().time())
             return True
 
-        autopilot.on_message = lose_the_first
-        async with aboard(autopilot):
-            assert lost
-            await asyncio.sleep(10.0)
-            assert autopilot.heartbeat_s == pytest.approx(0.2)
+        link.attach(transmit, settled)
+        with pytest.raises(NotDisarmedError, match="armed"):
+            await client.write(X, 0.5)
+        assert autopilot.sets == []
+        link.attach(transmit, lambda: False)
+        await asyncio.sleep(4.0)
+        with pytest.raises(NotDisarmedError):
+            await client.write(X, 0.5)
+        assert autopilot.sets == [], "more came than could be read, or something still waited to leave"
 
-    run_virtual(main())
+
+async def test_heartbeats_are_asked_for_more_often_before_the_first_write_and_again_when_that_was_lost() -> None:
+    autopilot = ScriptedAutopilot(parameters={X: 0.0})
+    lost: list[object] = []
+
+    def lose_the_first(message: object) -> bool:
+        wanted = getattr(message, "command", 0) == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL and message.param1 == 0  # type: ignore[attr-defined]
+        if wanted and len(lost) < 2:
+            lost.append(message)
+            return False
+        return True
+
+    autopilot.on_message = lose_the_first
+    async with aboard(autopilot):
+        assert lost
+        await asyncio.sleep(10.0)
+        assert autopilot.heartbeat_s == pytest.approx(0.2)

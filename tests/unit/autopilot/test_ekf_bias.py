@@ -19,7 +19,6 @@ from companion.samples import ImuSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.px4.double import PX4Double
-from tests.support.virtual_time import run_virtual
 from tests.support.wire import Wire
 
 UNITS = np.array([DEG_H] * 3 + [MG] * 3)
@@ -90,119 +89,95 @@ async def aboard(
         vehicle.close()
 
 
-def test_the_first_imu_comes_in_floats_and_is_right_to_two_deg_h() -> None:
-    async def main() -> None:
-        async with aboard() as found:
-            assert found.kinds[-1] == "HIGHRES_IMU+bias"
-            assert found.stream.kind is not None
-            assert not found.stream.kind.truncates
-            found.samples.clear()
-            await asyncio.sleep(40.0)
-            assert 3900 < len(found.samples) < 4100
-            error = found.error(1)  # 40 s of this noise: 2.1 deg/h, 0.011 mg
-            assert np.abs(error[:3]).max() < 7.0
-            assert np.abs(error[3:]).max() < 0.04
-            sigmas = np.sqrt(found.samples[-1].shared_variance or ()) / UNITS
-            assert 0.2 < sigmas[:3].max() < 4.0
-            assert 0.001 < sigmas[3:].max() < 0.03
-            assert found.samples[-1].temperature_degc == pytest.approx(25.0)
-
-    run_virtual(main())
+async def test_the_first_imu_comes_in_floats_and_is_right_to_two_deg_h() -> None:
+    async with aboard() as found:
+        assert found.kinds[-1] == "HIGHRES_IMU+bias"
+        assert found.stream.kind is not None
+        assert not found.stream.kind.truncates
+        found.samples.clear()
+        await asyncio.sleep(40.0)
+        assert 3900 < len(found.samples) < 4100
+        error = found.error(1)  # 40 s of this noise: 2.1 deg/h, 0.011 mg
+        assert np.abs(error[:3]).max() < 7.0
+        assert np.abs(error[3:]).max() < 0.04
+        sigmas = np.sqrt(found.samples[-1].shared_variance or ()) / UNITS
+        assert 0.2 < sigmas[:3].max() < 4.0
+        assert 0.001 < sigmas[3:].max() < 0.03
+        assert found.samples[-1].temperature_degc == pytest.approx(25.0)
 
 
-def test_floats_go_with_the_imu_that_flies() -> None:
-    async def main() -> None:
-        async with aboard(1, primary=1) as found:
-            assert found.kinds == ["SCALED_IMU"]
-            found.double.primary_imu = 0
-            await asyncio.sleep(30.0)
-            assert found.kinds == ["SCALED_IMU", "HIGHRES_IMU+bias"]
-            found.double.primary_imu = 1
-            await asyncio.sleep(2.0 * LOOK_EVERY_S + 1.0)
-            assert found.kinds[2:] == ["SCALED_IMU"]
-        async with aboard(2, primary=1) as found:
-            assert found.kinds[-1] == "HIGHRES_IMU+bias"
-            found.samples.clear()
-            await asyncio.sleep(20.0)
-            assert np.abs(found.error(2)[:3]).max() < 5.0
-
-    run_virtual(main())
+async def test_floats_go_with_the_imu_that_flies() -> None:
+    async with aboard(1, primary=1) as found:
+        assert found.kinds == ["SCALED_IMU"]
+        found.double.primary_imu = 0
+        await asyncio.sleep(30.0)
+        assert found.kinds == ["SCALED_IMU", "HIGHRES_IMU+bias"]
+        found.double.primary_imu = 1
+        await asyncio.sleep(2.0 * LOOK_EVERY_S + 1.0)
+        assert found.kinds[2:] == ["SCALED_IMU"]
+    async with aboard(2, primary=1) as found:
+        assert found.kinds[-1] == "HIGHRES_IMU+bias"
+        found.samples.clear()
+        await asyncio.sleep(20.0)
+        assert np.abs(found.error(2)[:3]).max() < 5.0
 
 
-def test_while_offsets_are_written_it_is_the_integers() -> None:
-    async def main() -> None:
-        async with aboard() as found:
-            typed = found.double.shell.typed
-            with found.ekf_bias.held():
-                typed.clear()
-                await asyncio.sleep(30.0)
-                assert found.kinds[-1] == "SCALED_IMU"
-            await asyncio.sleep(55.0)
-            assert found.kinds[-1] == "SCALED_IMU"  # the autopilot's estimator is not settled yet
-            assert typed == []
-            await asyncio.sleep(15.0)
-            assert found.kinds[-1] == "HIGHRES_IMU+bias"
-
-    run_virtual(main())
-
-
-def test_a_line_that_loses_and_doubles_messages_takes_longer_and_tells_nothing_wrong() -> None:
-    async def main() -> None:
-        async with aboard(loss=0.07) as found:
-            await asyncio.sleep(60.0)
-            assert found.kinds[-1] == "HIGHRES_IMU+bias"
-            found.samples.clear()
-            await asyncio.sleep(60.0)
-            assert np.abs(found.error(1)[:3]).max() < 7.0
-
-    run_virtual(main())
-
-
-def test_a_bias_that_jumps_is_not_put_back_until_it_is_steady_again() -> None:
-    async def main() -> None:
-        async with aboard() as found:
-            found.double.vehicle_imus[0].model.turn_on([0.01] * 3, [0.02] * 3)
-            await asyncio.sleep(20.0)
-            assert found.kinds == ["HIGHRES_IMU+bias", "SCALED_IMU", "HIGHRES_IMU+bias"]
-
-    run_virtual(main())
-
-
-def test_it_types_nothing_but_looks_and_nothing_into_an_armed_autopilot() -> None:
-    async def main() -> None:
-        async with aboard() as found:
-            typed = found.double.shell.typed
-            assert {line.split()[0] for line in typed} == {"listener"}
-            found.double.arm()
-            await asyncio.sleep(1.0)
+async def test_while_offsets_are_written_it_is_the_integers() -> None:
+    async with aboard() as found:
+        typed = found.double.shell.typed
+        with found.ekf_bias.held():
             typed.clear()
-            await asyncio.sleep(60.0)
-            assert typed == []
+            await asyncio.sleep(30.0)
             assert found.kinds[-1] == "SCALED_IMU"
-            found.double.disarm()
-            await asyncio.sleep(20.0)
-            assert found.kinds[-1] == "HIGHRES_IMU+bias"
-
-    run_virtual(main())
-
-
-def test_a_board_without_listener_is_asked_now_and_then_and_gives_integers() -> None:
-    async def main() -> None:
-        async with aboard(console=False, rate_hz=10.0) as found:
-            await asyncio.sleep(90.0)
-            assert found.kinds == ["SCALED_IMU"]
-            assert len(found.double.shell.typed) == MISSES + 1
-
-    run_virtual(main())
+        await asyncio.sleep(55.0)
+        assert found.kinds[-1] == "SCALED_IMU"  # the autopilot's estimator is not settled yet
+        assert typed == []
+        await asyncio.sleep(15.0)
+        assert found.kinds[-1] == "HIGHRES_IMU+bias"
 
 
-def test_after_a_restart_it_begins_anew() -> None:
-    async def main() -> None:
-        async with aboard() as found:
-            found.double.reboot()
-            await asyncio.sleep(5.0)
-            assert not found.ekf_bias.known_of(1)
-            await asyncio.sleep(35.0)
-            assert found.kinds[-1] == "HIGHRES_IMU+bias"
+async def test_a_line_that_loses_and_doubles_messages_takes_longer_and_tells_nothing_wrong() -> None:
+    async with aboard(loss=0.07) as found:
+        await asyncio.sleep(60.0)
+        assert found.kinds[-1] == "HIGHRES_IMU+bias"
+        found.samples.clear()
+        await asyncio.sleep(60.0)
+        assert np.abs(found.error(1)[:3]).max() < 7.0
 
-    run_virtual(main())
+
+async def test_a_bias_that_jumps_is_not_put_back_until_it_is_steady_again() -> None:
+    async with aboard() as found:
+        found.double.vehicle_imus[0].model.turn_on([0.01] * 3, [0.02] * 3)
+        await asyncio.sleep(20.0)
+        assert found.kinds == ["HIGHRES_IMU+bias", "SCALED_IMU", "HIGHRES_IMU+bias"]
+
+
+async def test_it_types_nothing_but_looks_and_nothing_into_an_armed_autopilot() -> None:
+    async with aboard() as found:
+        typed = found.double.shell.typed
+        assert {line.split()[0] for line in typed} == {"listener"}
+        found.double.arm()
+        await asyncio.sleep(1.0)
+        typed.clear()
+        await asyncio.sleep(60.0)
+        assert typed == []
+        assert found.kinds[-1] == "SCALED_IMU"
+        found.double.disarm()
+        await asyncio.sleep(20.0)
+        assert found.kinds[-1] == "HIGHRES_IMU+bias"
+
+
+async def test_a_board_without_listener_is_asked_now_and_then_and_gives_integers() -> None:
+    async with aboard(console=False, rate_hz=10.0) as found:
+        await asyncio.sleep(90.0)
+        assert found.kinds == ["SCALED_IMU"]
+        assert len(found.double.shell.typed) == MISSES + 1
+
+
+async def test_after_a_restart_it_begins_anew() -> None:
+    async with aboard() as found:
+        found.double.reboot()
+        await asyncio.sleep(5.0)
+        assert not found.ekf_bias.known_of(1)
+        await asyncio.sleep(35.0)
+        assert found.kinds[-1] == "HIGHRES_IMU+bias"

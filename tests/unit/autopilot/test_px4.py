@@ -65,46 +65,37 @@ def names(sensor: str, slot: int) -> tuple[str, str, str]:
 
 
 @pytest.mark.parametrize("capabilities", [2 | 16, 2], ids=["by the capability bit", "by who it is"])
-def test_integers_are_read_byte_by_byte(capabilities: int) -> None:
-    async def main() -> None:
-        values: dict[str, float] = {
-            "CAL_GYRO0_ID": ICM,
-            "CAL_GYRO1_ID": 16777217,
-            "CAL_GYRO0_ROT": -1,
-            "SENS_BOARD_ROT": 2,
-        }
-        async with aboard(ScriptedPx4(parameters=values, capabilities=capabilities)) as stage:
-            for name, value in values.items():
-                assert await stage.client.read(name) == value
-            assert await stage.client.read("CAL_ACC0_XSCALE") == 1.0
-
-    run_virtual(main())
+async def test_integers_are_read_byte_by_byte(capabilities: int) -> None:
+    values: dict[str, float] = {
+        "CAL_GYRO0_ID": ICM,
+        "CAL_GYRO1_ID": 16777217,
+        "CAL_GYRO0_ROT": -1,
+        "SENS_BOARD_ROT": 2,
+    }
+    async with aboard(ScriptedPx4(parameters=values, capabilities=capabilities)) as stage:
+        for name, value in values.items():
+            assert await stage.client.read(name) == value
+        assert await stage.client.read("CAL_ACC0_XSCALE") == 1.0
 
 
 @pytest.mark.parametrize("value", [0, 1, -1, 7, 16777217, 2**31 - 1, -(2**31)])
-def test_integers_are_written_byte_by_byte_with_their_own_type(value: int) -> None:
-    async def main() -> None:
-        async with aboard(ScriptedPx4(parameters={"CAL_GYRO0_ID": 5})) as stage:
-            assert await stage.client.write("CAL_GYRO0_ID", value) == value
-            assert stage.px4.parameters["CAL_GYRO0_ID"] == value
-            assert stage.px4.wrong_types == []
-            sent = [message for message in stage.px4.requests if message.get_type() == "PARAM_SET"]
-            assert {message.param_type for message in sent} == {INT32}
-            await stage.client.write("CAL_GYRO0_XOFF", 0.25)
-            assert stage.px4.sets[-1][:2] == ("CAL_GYRO0_XOFF", 0.25)
-
-    run_virtual(main())
+async def test_integers_are_written_byte_by_byte_with_their_own_type(value: int) -> None:
+    async with aboard(ScriptedPx4(parameters={"CAL_GYRO0_ID": 5})) as stage:
+        assert await stage.client.write("CAL_GYRO0_ID", value) == value
+        assert stage.px4.parameters["CAL_GYRO0_ID"] == value
+        assert stage.px4.wrong_types == []
+        sent = [message for message in stage.px4.requests if message.get_type() == "PARAM_SET"]
+        assert {message.param_type for message in sent} == {INT32}
+        await stage.client.write("CAL_GYRO0_XOFF", 0.25)
+        assert stage.px4.sets[-1][:2] == ("CAL_GYRO0_XOFF", 0.25)
 
 
 @pytest.mark.parametrize("value", [0.5, math.nan, math.inf, 2.0**31])
-def test_what_is_no_whole_number_is_not_written_to_an_integer(value: float) -> None:
-    async def main() -> None:
-        async with aboard(ScriptedPx4()) as stage:
-            with pytest.raises(ParameterRefusedError, match="not a whole number"):
-                await stage.client.write("CAL_GYRO0_ID", value)
-            assert stage.px4.sets == []
-
-    run_virtual(main())
+async def test_what_is_no_whole_number_is_not_written_to_an_integer(value: float) -> None:
+    async with aboard(ScriptedPx4()) as stage:
+        with pytest.raises(ParameterRefusedError, match="not a whole number"):
+            await stage.client.write("CAL_GYRO0_ID", value)
+        assert stage.px4.sets == []
 
 
 # --- slots
@@ -257,55 +248,46 @@ def in_use(px4: ScriptedPx4, sensor: str) -> list[float]:
     return list(px4.used[sensor, px4.devices[0]])
 
 
-def test_plain_writes_of_small_changes_are_ignored() -> None:
-    async def main() -> None:
-        async with aboard(ScriptedPx4()) as stage:
-            found = await read_calibration(stage.client, 1)
-            plain = [Change(c.parameter, c.before, c.after) for c in small_changes(found)]
-            await stage.writer.apply(plain)
-            await asyncio.sleep(3.0)
-            assert in_use(stage.px4, "GYRO") == [0.0, 0.0, 0.0]
-            assert in_use(stage.px4, "ACC") == [0.0, 0.0, 0.0]
-
-    run_virtual(main())
+async def test_plain_writes_of_small_changes_are_ignored() -> None:
+    async with aboard(ScriptedPx4()) as stage:
+        found = await read_calibration(stage.client, 1)
+        plain = [Change(c.parameter, c.before, c.after) for c in small_changes(found)]
+        await stage.writer.apply(plain)
+        await asyncio.sleep(3.0)
+        assert in_use(stage.px4, "GYRO") == [0.0, 0.0, 0.0]
+        assert in_use(stage.px4, "ACC") == [0.0, 0.0, 0.0]
 
 
-def test_small_changes_get_in_by_way_of_a_far_value_and_back_out_the_same_way() -> None:
-    async def main() -> None:
-        async with aboard(ScriptedPx4()) as stage:
-            changes = small_changes(await read_calibration(stage.client, 1))
-            await stage.writer.apply(changes)
-            await asyncio.sleep(1.5)
-            after = {c.parameter: c.after for c in changes}
-            assert in_use(stage.px4, "GYRO") == [after[name] for name in names("GYRO", 0)]
-            assert in_use(stage.px4, "ACC") == [after[name] for name in names("ACC", 0)]
-            await stage.writer.undo(changes)
-            await asyncio.sleep(1.5)
-            assert in_use(stage.px4, "GYRO") == [0.0, 0.0, 0.0]
-            assert in_use(stage.px4, "ACC") == [0.0, 0.0, 0.0]
-            assert all(stage.px4.parameters[name] == 0.0 for name in after)
-
-    run_virtual(main())
+async def test_small_changes_get_in_by_way_of_a_far_value_and_back_out_the_same_way() -> None:
+    async with aboard(ScriptedPx4()) as stage:
+        changes = small_changes(await read_calibration(stage.client, 1))
+        await stage.writer.apply(changes)
+        await asyncio.sleep(1.5)
+        after = {c.parameter: c.after for c in changes}
+        assert in_use(stage.px4, "GYRO") == [after[name] for name in names("GYRO", 0)]
+        assert in_use(stage.px4, "ACC") == [after[name] for name in names("ACC", 0)]
+        await stage.writer.undo(changes)
+        await asyncio.sleep(1.5)
+        assert in_use(stage.px4, "GYRO") == [0.0, 0.0, 0.0]
+        assert in_use(stage.px4, "ACC") == [0.0, 0.0, 0.0]
+        assert all(stage.px4.parameters[name] == 0.0 for name in after)
 
 
 @pytest.mark.parametrize("since_s", [0.0, 0.3, 0.6, 0.9, 1.2])
-def test_whenever_px4_looked_at_its_parameters_last_the_small_change_gets_in(since_s: float) -> None:
-    async def main() -> None:
-        async with aboard(ScriptedPx4()) as stage:
-            changes = small_changes(await read_calibration(stage.client, 1))
-            stage.px4.changed()  # another parameter: it looks at once, and then not for a second
-            await asyncio.sleep(0.005 + since_s)
-            await stage.writer.apply(changes)
-            await asyncio.sleep(1.5)
-            after = {c.parameter: c.after for c in changes}
-            assert in_use(stage.px4, "GYRO") == [after[name] for name in names("GYRO", 0)]
-            assert in_use(stage.px4, "ACC") == [after[name] for name in names("ACC", 0)]
-
-    run_virtual(main())
+async def test_whenever_px4_looked_at_its_parameters_last_the_small_change_gets_in(since_s: float) -> None:
+    async with aboard(ScriptedPx4()) as stage:
+        changes = small_changes(await read_calibration(stage.client, 1))
+        stage.px4.changed()  # another parameter: it looks at once, and then not for a second
+        await asyncio.sleep(0.005 + since_s)
+        await stage.writer.apply(changes)
+        await asyncio.sleep(1.5)
+        after = {c.parameter: c.after for c in changes}
+        assert in_use(stage.px4, "GYRO") == [after[name] for name in names("GYRO", 0)]
+        assert in_use(stage.px4, "ACC") == [after[name] for name in names("ACC", 0)]
 
 
 @pytest.mark.parametrize("number", range(1, 9))
-def test_a_write_that_fails_anywhere_leaves_the_old_values_in_use(number: int) -> None:
+async def test_a_write_that_fails_anywhere_leaves_the_old_values_in_use(number: int) -> None:
     count = 0
 
     def refuse(name: str, value: float) -> float | None:
@@ -319,71 +301,61 @@ def test_a_write_that_fails_anywhere_leaves_the_old_values_in_use(number: int) -
     px4 = ScriptedPx4(parameters={"CAL_GYRO0_YOFF": 0.004, "CAL_ACC0_ZOFF": 0.3})
     px4.on_set = refuse
     before = dict(px4.parameters)
-
-    async def main() -> None:
-        async with aboard(px4) as stage:
-            changes = small_changes(await read_calibration(stage.client, 1))
-            with pytest.raises(WriteFailedError) as caught:
-                await stage.writer.apply(changes)
-            assert caught.value.left_changed == ()
-            await asyncio.sleep(1.5)
-            assert px4.parameters == before
-            assert in_use(px4, "GYRO") == [0.0, f32(0.004), 0.0]
-            assert in_use(px4, "ACC") == [0.0, 0.0, f32(0.3)]
-
-    run_virtual(main())
+    async with aboard(px4) as stage:
+        changes = small_changes(await read_calibration(stage.client, 1))
+        with pytest.raises(WriteFailedError) as caught:
+            await stage.writer.apply(changes)
+        assert caught.value.left_changed == ()
+        await asyncio.sleep(1.5)
+        assert px4.parameters == before
+        assert in_use(px4, "GYRO") == [0.0, f32(0.004), 0.0]
+        assert in_use(px4, "ACC") == [0.0, 0.0, f32(0.3)]
 
 
-def test_what_is_seen_on_the_way_may_put_everything_back() -> None:
-    async def main() -> None:
-        async with aboard(ScriptedPx4()) as stage:
-            changes = small_changes(await read_calibration(stage.client, 1))
-            seen: list[list[float]] = []
+async def test_what_is_seen_on_the_way_may_put_everything_back() -> None:
+    async with aboard(ScriptedPx4()) as stage:
+        changes = small_changes(await read_calibration(stage.client, 1))
+        seen: list[list[float]] = []
 
-            class Probe:
-                def mark(self, parameter: str) -> None:
-                    pass
+        class Probe:
+            def mark(self, parameter: str) -> None:
+                pass
 
-                async def verify(self, parameter: str) -> str | None:
-                    await asyncio.sleep(0.1)
-                    seen.append(in_use(stage.px4, "GYRO"))
-                    return "it acts on another IMU" if parameter.startswith("CAL_GYRO") else None
+            async def verify(self, parameter: str) -> str | None:
+                await asyncio.sleep(0.1)
+                seen.append(in_use(stage.px4, "GYRO"))
+                return "it acts on another IMU" if parameter.startswith("CAL_GYRO") else None
 
-            with pytest.raises(WriteFailedError, match="not as believed: it acts on another IMU") as caught:
-                await stage.writer.apply(changes, Probe())
-            assert caught.value.kind == "not as believed"
-            assert max(seen[-1]) == pytest.approx(0.0228)
-            await asyncio.sleep(1.5)
-            assert in_use(stage.px4, "GYRO") == [0.0, 0.0, 0.0]
-
-    run_virtual(main())
+        with pytest.raises(WriteFailedError, match="not as believed: it acts on another IMU") as caught:
+            await stage.writer.apply(changes, Probe())
+        assert caught.value.kind == "not as believed"
+        assert max(seen[-1]) == pytest.approx(0.0228)
+        await asyncio.sleep(1.5)
+        assert in_use(stage.px4, "GYRO") == [0.0, 0.0, 0.0]
 
 
-def test_armed_between_the_two_steps_nothing_more_is_written_until_it_is_disarmed() -> None:
-    async def main() -> None:
-        async with aboard(ScriptedPx4()) as stage:
-            changes = small_changes(await read_calibration(stage.client, 1))
+async def test_armed_between_the_two_steps_nothing_more_is_written_until_it_is_disarmed() -> None:
+    async with aboard(ScriptedPx4()) as stage:
+        changes = small_changes(await read_calibration(stage.client, 1))
 
-            class Arms:
-                def mark(self, parameter: str) -> None:
-                    pass
+        class Arms:
+            def mark(self, parameter: str) -> None:
+                pass
 
-                async def verify(self, parameter: str) -> str | None:
-                    stage.px4.armed = True
-                    await asyncio.sleep(1.5)
-                    return None
+            async def verify(self, parameter: str) -> str | None:
+                stage.px4.armed = True
+                await asyncio.sleep(1.5)
+                return None
 
-            with pytest.raises(WriteFailedError) as caught:
-                await stage.writer.apply(changes, Arms())
-            assert caught.value.kind == "armed in the middle"
-            assert set(caught.value.left_changed) == {"CAL_ACC0_ZOFF"}
-            assert not any(armed for _, _, armed in stage.px4.sets)
-            with pytest.raises(NotDisarmedError):
-                await stage.writer.restore(changes)
-            stage.px4.armed = False
-            await asyncio.sleep(4.5)  # 3 s after the last armed heartbeat it counts as disarmed
+        with pytest.raises(WriteFailedError) as caught:
+            await stage.writer.apply(changes, Arms())
+        assert caught.value.kind == "armed in the middle"
+        assert set(caught.value.left_changed) == {"CAL_ACC0_ZOFF"}
+        assert not any(armed for _, _, armed in stage.px4.sets)
+        with pytest.raises(NotDisarmedError):
             await stage.writer.restore(changes)
-            await asyncio.sleep(1.5)
-            assert in_use(stage.px4, "GYRO") == [0.0, 0.0, 0.0]
-
-    run_virtual(main())
+        stage.px4.armed = False
+        await asyncio.sleep(4.5)  # 3 s after the last armed heartbeat it counts as disarmed
+        await stage.writer.restore(changes)
+        await asyncio.sleep(1.5)
+        assert in_use(stage.px4, "GYRO") == [0.0, 0.0, 0.0]

@@ -26,7 +26,6 @@ from tests.support.component import (
     bench,
     command_message,
 )
-from tests.support.virtual_time import run_virtual
 from tests.unit.config.test_config import GOOD
 
 
@@ -79,46 +78,37 @@ def test_everybody_may_unless_the_configuration_says_otherwise() -> None:
     ("command", "params", "name"),
     [(CALIBRATE, (0,), "Calibration"), (PREFLIGHT, (1,), "Calibration"), (CANCEL, (), "Cancel"), (UNDO, (), "Undo")],
 )
-def test_who_is_not_named_is_denied_with_the_reason(
+async def test_who_is_not_named_is_denied_with_the_reason(
     command: int, params: tuple[float, ...], name: str, int_: bool
 ) -> None:
-    async def main() -> None:
-        async with allowing("254", "255:1-189") as b:
-            b.ground.command(command, *params, int_=int_)
-            await asyncio.sleep(1)
-            assert b.ground.acks() == [DENIED]
-            assert b.ground.texts() == [f"{name} refused: 255/190 not in mavlink.allow"]
-            assert len(b.ground.texts()[0]) <= 50
-            assert b.service.started == []
-
-    run_virtual(main())
+    async with allowing("254", "255:1-189") as b:
+        b.ground.command(command, *params, int_=int_)
+        await asyncio.sleep(1)
+        assert b.ground.acks() == [DENIED]
+        assert b.ground.texts() == [f"{name} refused: 255/190 not in mavlink.allow"]
+        assert len(b.ground.texts()[0]) <= 50
+        assert b.service.started == []
 
 
-def test_who_is_named_may() -> None:
-    async def main() -> None:
-        async with allowing("255:190") as b:
-            b.ground.command(CALIBRATE, 0)
-            await asyncio.sleep(0.5)
-            assert len(b.service.started) == 1
-            b.ground.command(CANCEL)
-            await asyncio.sleep(1)
-            assert b.ground.finals(CANCEL) == [ACCEPTED]
-
-    run_virtual(main())
+async def test_who_is_named_may() -> None:
+    async with allowing("255:190") as b:
+        b.ground.command(CALIBRATE, 0)
+        await asyncio.sleep(0.5)
+        assert len(b.service.started) == 1
+        b.ground.command(CANCEL)
+        await asyncio.sleep(1)
+        assert b.ground.finals(CANCEL) == [ACCEPTED]
 
 
-def test_a_stranger_cannot_cancel_what_another_has_started() -> None:
-    async def main() -> None:
-        async with allowing("255") as b:
-            b.ground.command(CALIBRATE, 0)
-            await asyncio.sleep(0.5)
-            stranger = Ground(77, 190)
-            b.link.receive(stranger.pack(command_message(CANCEL)), asyncio.get_running_loop().time())
-            await asyncio.sleep(1)
-            assert not b.service.jobs[0].finished.done()
-            assert b.component.permission.refused == {(77, 190): 1}
-
-    run_virtual(main())
+async def test_a_stranger_cannot_cancel_what_another_has_started() -> None:
+    async with allowing("255") as b:
+        b.ground.command(CALIBRATE, 0)
+        await asyncio.sleep(0.5)
+        stranger = Ground(77, 190)
+        b.link.receive(stranger.pack(command_message(CANCEL)), asyncio.get_running_loop().time())
+        await asyncio.sleep(1)
+        assert not b.service.jobs[0].finished.done()
+        assert b.component.permission.refused == {(77, 190): 1}
 
 
 def push(b: Bench) -> float:
@@ -129,41 +119,32 @@ def set_push(ground: Ground, value: float) -> bytes:
     return ground.pack(mavlink.MAVLink_param_set_message(1, 191, b"CMP_PUSH", value, 9))
 
 
-def test_a_parameter_is_answered_with_the_value_that_stays() -> None:
-    async def main() -> None:
-        async with allowing("254") as b:
-            b.ground.send_raw(set_push(b.ground, 0.0))
-            await asyncio.sleep(1)
-            assert push(b) == 1.0
-            values = [m.param_value for _, m in b.ground.received if isinstance(m, mavlink.MAVLink_param_value_message)]
-            assert values == [1.0]
-            assert b.ground.texts() == ["CMP_PUSH not set: 255/190 not in mavlink.allow"]
-
-    run_virtual(main())
+async def test_a_parameter_is_answered_with_the_value_that_stays() -> None:
+    async with allowing("254") as b:
+        b.ground.send_raw(set_push(b.ground, 0.0))
+        await asyncio.sleep(1)
+        assert push(b) == 1.0
+        values = [m.param_value for _, m in b.ground.received if isinstance(m, mavlink.MAVLink_param_value_message)]
+        assert values == [1.0]
+        assert b.ground.texts() == ["CMP_PUSH not set: 255/190 not in mavlink.allow"]
 
 
-def test_reading_is_everybodys() -> None:
-    async def main() -> None:
-        async with allowing() as b:
-            b.ground.send(mavlink.MAVLink_param_request_read_message(1, 191, b"CMP_PUSH", -1))
-            b.ground.command(512, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-            await asyncio.sleep(1)
-            names = [m.get_type() for _, m in b.ground.received]
-            assert "PARAM_VALUE" in names
-            assert "AUTOPILOT_VERSION" in names
-            assert b.ground.acks() == [ACCEPTED]
-
-    run_virtual(main())
+async def test_reading_is_everybodys() -> None:
+    async with allowing() as b:
+        b.ground.send(mavlink.MAVLink_param_request_read_message(1, 191, b"CMP_PUSH", -1))
+        b.ground.command(512, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+        await asyncio.sleep(1)
+        names = [m.get_type() for _, m in b.ground.received]
+        assert "PARAM_VALUE" in names
+        assert "AUTOPILOT_VERSION" in names
+        assert b.ground.acks() == [ACCEPTED]
 
 
-def test_nobody_sets_a_parameter_under_our_own_ids() -> None:
-    async def main() -> None:
-        async with allowing("*") as b:
-            b.link.receive(set_push(Ground(1, 191), 0.0), asyncio.get_running_loop().time())
-            await asyncio.sleep(1)
-            assert push(b) == 1.0
-
-    run_virtual(main())
+async def test_nobody_sets_a_parameter_under_our_own_ids() -> None:
+    async with allowing("*") as b:
+        b.link.receive(set_push(Ground(1, 191), 0.0), asyncio.get_running_loop().time())
+        await asyncio.sleep(1)
+        assert push(b) == 1.0
 
 
 def test_a_refusal_is_logged_once_for_each_sender_and_strangers_are_bounded(caplog: pytest.LogCaptureFixture) -> None:

@@ -17,7 +17,6 @@ from companion.component.statustext import GOES_ON, Severity, StatusText, Weight
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.component import Ground, ScriptedGate, bench
 from tests.support.messages import FILLED, all_messages
-from tests.support.virtual_time import run_virtual
 
 
 def said(ground: Ground) -> list[tuple[int, str]]:
@@ -41,17 +40,13 @@ def put_together(lines: list[str]) -> str:
 
 
 @pytest.mark.parametrize("length", [1, 49, 50, 51, 99, 100, 101, 149, 150, 199])
-def test_texts_of_every_length_arrive_whole(length: int) -> None:
+async def test_texts_of_every_length_arrive_whole(length: int) -> None:
     text = ("some words: and more, " * 10)[:length].strip()
-
-    async def main() -> None:
-        async with bench() as b:
-            b.texts.say(Severity.INFO, text)
-            await asyncio.sleep(3)
-            assert put_together(texts(b.ground)) == text
-            assert (len(texts(b.ground)) == 1) == (length <= 50)
-
-    run_virtual(main())
+    async with bench() as b:
+        b.texts.say(Severity.INFO, text)
+        await asyncio.sleep(3)
+        assert put_together(texts(b.ground)) == text
+        assert (len(texts(b.ground)) == 1) == (length <= 50)
 
 
 @settings(max_examples=300)
@@ -129,17 +124,14 @@ def sent_to_script(text: str) -> str:
         ),
     ],
 )
-def test_what_is_heard_is_one_line_that_ends_at_a_pause(severity: Severity, text: str, heard: str | None) -> None:
-    async def main() -> None:
-        async with bench() as b:
-            b.texts.say(severity, text)
-            await asyncio.sleep(5)
-            assert said(b.ground)[0] == (severity, heard or text)
-            assert [at for at, _ in said(b.ground)[1:]] == [Severity.INFO] * (len(said(b.ground)) - 1)
-            assert put_together(texts(b.ground)) == text
-            assert [one.text for one in b.texts.spoken] == [heard or text]
-
-    run_virtual(main())
+async def test_what_is_heard_is_one_line_that_ends_at_a_pause(severity: Severity, text: str, heard: str | None) -> None:
+    async with bench() as b:
+        b.texts.say(severity, text)
+        await asyncio.sleep(5)
+        assert said(b.ground)[0] == (severity, heard or text)
+        assert [at for at, _ in said(b.ground)[1:]] == [Severity.INFO] * (len(said(b.ground)) - 1)
+        assert put_together(texts(b.ground)) == text
+        assert [one.text for one in b.texts.spoken] == [heard or text]
 
 
 def test_a_text_too_long_loses_its_tail_and_says_so() -> None:
@@ -162,122 +154,98 @@ def test_text_becomes_plain_ascii(text: str, expected: str) -> None:
     assert to_ascii(text) == expected
 
 
-def test_a_request_cancelled_and_made_again_at_once_is_heard_to_start_again() -> None:
-    async def main() -> None:
-        async with bench() as b:
-            story = ["Calibration started", "Calibration cancelled", "Calibration started", "Calibration cancelled"]
-            for text in story:
-                weight = Weight.RESULT if text.endswith("cancelled") else Weight.NEWS
-                assert b.texts.say(Severity.NOTICE, text, weight)
-                await asyncio.sleep(0.3)
-            await asyncio.sleep(1.0)
-            assert texts(b.ground) == story
-
-    run_virtual(main())
+async def test_a_request_cancelled_and_made_again_at_once_is_heard_to_start_again() -> None:
+    async with bench() as b:
+        story = ["Calibration started", "Calibration cancelled", "Calibration started", "Calibration cancelled"]
+        for text in story:
+            weight = Weight.RESULT if text.endswith("cancelled") else Weight.NEWS
+            assert b.texts.say(Severity.NOTICE, text, weight)
+            await asyncio.sleep(0.3)
+        await asyncio.sleep(1.0)
+        assert texts(b.ground) == story
 
 
-def test_repeats_within_seconds_are_said_once() -> None:
-    async def main() -> None:
-        async with bench() as b:
-            said = []
-            for _ in range(9):
-                said.append(b.texts.say(Severity.INFO, "again"))
-                await asyncio.sleep(1)
-            assert said == [True, False, False] * 3
-            assert b.ground.texts() == ["again"] * 3
-            assert b.texts.say(Severity.WARNING, "again"), "another severity is another text"
-
-    run_virtual(main())
-
-
-def test_lines_per_second_are_bounded_and_nothing_within_the_bounds_is_lost() -> None:
-    async def main() -> None:
-        async with bench() as b:
-            for i in range(16):
-                b.texts.say(Severity.INFO, f"text {i}")
-            await asyncio.sleep(10)
-            assert b.ground.texts() == [f"text {i}" for i in range(16)]
-            times = b.ground.times("STATUSTEXT")
-            assert times[7] - times[0] < 0.1
-            for count, said_s in enumerate(times, start=1):
-                assert count <= 8 + 2 * (said_s - times[0]) + 0.1, "more than the burst and two a second"
-            assert times[-1] - times[0] < 4.1
-
-    run_virtual(main())
-
-
-def test_a_flood_of_news_and_refusals_cannot_push_out_a_result() -> None:
-    async def main() -> None:
-        async with bench() as b:
-            for i in range(1000):
-                b.texts.say(Severity.INFO, f"news {i}")
-            b.texts.say(Severity.NOTICE, "the result", Weight.RESULT)
-            for i in range(1000):
-                b.texts.say(Severity.WARNING, f"refused {i}", Weight.REFUSAL)
-            waiting = b.texts._waiting.values()
-            assert sum(len(texts) for texts in waiting) == 16
-            await asyncio.sleep(30)
-            texts = b.ground.texts()
-            assert texts[0] == "the result"
-            assert texts[1:] == [f"refused {i}" for i in range(985, 1000)]
-            assert len(b.texts._said_s) <= 32
-
-    run_virtual(main())
-
-
-def test_news_do_not_push_out_refusals() -> None:
-    async def main() -> None:
-        async with bench() as b:
-            for i in range(16):
-                assert b.texts.say(Severity.WARNING, f"refused {i}", Weight.REFUSAL)
-            assert not b.texts.say(Severity.INFO, "news")
-            await asyncio.sleep(30)
-            assert b.ground.texts() == [f"refused {i}" for i in range(16)]
-
-    run_virtual(main())
-
-
-def test_what_waited_for_a_link_until_it_was_stale_is_not_said_but_results_are() -> None:
-    async def main() -> None:
-        link, ground = MavlinkLink(), Ground()
-        texts = StatusText(link)
-        texts.say(Severity.INFO, "old news")
-        texts.say(Severity.NOTICE, "result", Weight.RESULT)
-        assert texts.step(1000.0) == math.inf
-        await asyncio.sleep(60)
-        texts.say(Severity.INFO, "fresh news")
-        link.attach(lambda data: ground.receive(data, 0.0))
-        assert texts.step(1060.0) == math.inf
-        assert ground.texts() == ["result", "fresh news"]
-
-    run_virtual(main())
-
-
-def test_nothing_to_say_is_not_said() -> None:
-    async def main() -> None:
-        async with bench() as b:
-            assert not b.texts.say(Severity.INFO, " \n ")
+async def test_repeats_within_seconds_are_said_once() -> None:
+    async with bench() as b:
+        said = []
+        for _ in range(9):
+            said.append(b.texts.say(Severity.INFO, "again"))
             await asyncio.sleep(1)
-            assert b.ground.texts() == []
+        assert said == [True, False, False] * 3
+        assert b.ground.texts() == ["again"] * 3
+        assert b.texts.say(Severity.WARNING, "again"), "another severity is another text"
 
-    run_virtual(main())
+
+async def test_lines_per_second_are_bounded_and_nothing_within_the_bounds_is_lost() -> None:
+    async with bench() as b:
+        for i in range(16):
+            b.texts.say(Severity.INFO, f"text {i}")
+        await asyncio.sleep(10)
+        assert b.ground.texts() == [f"text {i}" for i in range(16)]
+        times = b.ground.times("STATUSTEXT")
+        assert times[7] - times[0] < 0.1
+        for count, said_s in enumerate(times, start=1):
+            assert count <= 8 + 2 * (said_s - times[0]) + 0.1, "more than the burst and two a second"
+        assert times[-1] - times[0] < 4.1
 
 
-def test_a_full_transport_delays_texts_and_values_but_loses_none() -> None:
-    async def main() -> None:
-        parameters = [Parameter(name, 0, 0, 9) for name in ("CMP_A", "CMP_B", "CMP_C")]
-        async with bench(parameters=parameters) as b:
-            await asyncio.sleep(0.1)
-            transmit = b.link._transmit
-            b.link.attach(lambda data: False)
-            b.texts.say(Severity.NOTICE, "x", Weight.RESULT)
-            for name in ("CMP_A", "CMP_B", "CMP_C"):
-                b.component.parameters.set(name, 5)
-            await asyncio.sleep(5)
-            assert b.ground.texts() == []
-            b.link.attach(transmit)
-            await asyncio.sleep(1)
-            assert texts(b.ground) == ["x"]
-            assert len(b.ground.times("PARAM_VALUE")) == 3
+async def test_a_flood_of_news_and_refusals_cannot_push_out_a_result() -> None:
+    async with bench() as b:
+        for i in range(1000):
+            b.texts.say(Severity.INFO, f"news {i}")
+        b.texts.say(Severity.NOTICE, "the result", Weight.RESULT)
+        for i in range(1000):
+            b.texts.say(Severity.WARNING, f"refused {i}", Weight.REFUSAL)
+        waiting = b.texts._waiting.values()
+        assert sum(len(texts) for texts in waiting) == 16
+        await asyncio.sleep(30)
+        texts = b.ground.texts()
+        assert texts[0] == "the result"
+        assert texts[1:] == [f"refused {i}" for i in range(985, 1000)]
+        assert len(b.texts._said_s) <= 32
 
-    run_virtual(main())
+
+async def test_news_do_not_push_out_refusals() -> None:
+    async with bench() as b:
+        for i in range(16):
+            assert b.texts.say(Severity.WARNING, f"refused {i}", Weight.REFUSAL)
+        assert not b.texts.say(Severity.INFO, "news")
+        await asyncio.sleep(30)
+        assert b.ground.texts() == [f"refused {i}" for i in range(16)]
+
+
+async def test_what_waited_for_a_link_until_it_was_stale_is_not_said_but_results_are() -> None:
+    link, ground = MavlinkLink(), Ground()
+    texts = StatusText(link)
+    texts.say(Severity.INFO, "old news")
+    texts.say(Severity.NOTICE, "result", Weight.RESULT)
+    assert texts.step(1000.0) == math.inf
+    await asyncio.sleep(60)
+    texts.say(Severity.INFO, "fresh news")
+    link.attach(lambda data: ground.receive(data, 0.0))
+    assert texts.step(1060.0) == math.inf
+    assert ground.texts() == ["result", "fresh news"]
+
+
+async def test_nothing_to_say_is_not_said() -> None:
+    async with bench() as b:
+        assert not b.texts.say(Severity.INFO, " \n ")
+        await asyncio.sleep(1)
+        assert b.ground.texts() == []
+
+
+async def test_a_full_transport_delays_texts_and_values_but_loses_none() -> None:
+    parameters = [Parameter(name, 0, 0, 9) for name in ("CMP_A", "CMP_B", "CMP_C")]
+    async with bench(parameters=parameters) as b:
+        await asyncio.sleep(0.1)
+        transmit = b.link._transmit
+        b.link.attach(lambda data: False)
+        b.texts.say(Severity.NOTICE, "x", Weight.RESULT)
+        for name in ("CMP_A", "CMP_B", "CMP_C"):
+            b.component.parameters.set(name, 5)
+        await asyncio.sleep(5)
+        assert b.ground.texts() == []
+        b.link.attach(transmit)
+        await asyncio.sleep(1)
+        assert texts(b.ground) == ["x"]
+        assert len(b.ground.times("PARAM_VALUE")) == 3

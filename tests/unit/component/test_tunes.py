@@ -13,7 +13,6 @@ from companion.component.tunes import APART_S, STALE_S, Tune, Tunes
 from companion.links.mavlink.link import MavlinkLink
 from sim.firmware.buzzer import Played, notes_of
 from tests.support.component import Ground
-from tests.support.virtual_time import run_virtual
 from tests.support.wire import Wire
 
 BEAT_S = 0.5
@@ -56,63 +55,54 @@ class Bench:
         ]
 
 
-def test_it_is_sent_to_the_autopilot_at_once_and_the_next_when_the_first_is_over() -> None:
-    async def main() -> None:
-        bench = Bench()
-        await bench.run(1.0)
-        bench.tunes.play(Tune.HOLD_STILL)
-        await bench.run(0.2)
-        bench.tunes.play(Tune.NEXT)
-        bench.tunes.play(Tune.WRONG)
-        await bench.run(3.0)
-        (first_s, first), (second_s, second) = bench.played
-        assert (first, second) == (Tune.HOLD_STILL.value, Tune.WRONG.value)  # only the latest waits
-        assert second_s - first_s == pytest.approx(APART_S, abs=0.05)
-        targets = {
-            (message.target_system, message.target_component)
-            for _, message in bench.autopilot.received
-            if isinstance(message, mavlink.MAVLink_play_tune_message)
-        }
-        assert targets == {(7, 1)}
-
-    run_virtual(main())
+async def test_it_is_sent_to_the_autopilot_at_once_and_the_next_when_the_first_is_over() -> None:
+    bench = Bench()
+    await bench.run(1.0)
+    bench.tunes.play(Tune.HOLD_STILL)
+    await bench.run(0.2)
+    bench.tunes.play(Tune.NEXT)
+    bench.tunes.play(Tune.WRONG)
+    await bench.run(3.0)
+    (first_s, first), (second_s, second) = bench.played
+    assert (first, second) == (Tune.HOLD_STILL.value, Tune.WRONG.value)  # only the latest waits
+    assert second_s - first_s == pytest.approx(APART_S, abs=0.05)
+    targets = {
+        (message.target_system, message.target_component)
+        for _, message in bench.autopilot.received
+        if isinstance(message, mavlink.MAVLink_play_tune_message)
+    }
+    assert targets == {(7, 1)}
 
 
-def test_nothing_is_played_armed_nor_unknown_nor_unwanted_nor_afterwards() -> None:
-    async def main() -> None:
-        bench = Bench()
-        bench.tunes.play(Tune.NEXT)
-        await bench.run(0.0)
-        bench.tunes.step(asyncio.get_running_loop().time())  # before its first heartbeat
-        bench.armed = True
-        await bench.run(1.0)
-        bench.tunes.play(Tune.NEXT)
-        await bench.run(1.0)
-        bench.armed = False
-        await bench.run(6.0)
-        bench.wanted = False
-        bench.tunes.play(Tune.NEXT)
-        await bench.run(1.0)
-        bench.wanted = True
-        await asyncio.sleep(2.5)  # the heartbeats have ended
-        bench.tunes.play(Tune.NEXT)
-        bench.tunes.step(asyncio.get_running_loop().time())
-        await bench.run(2.0)
-        assert bench.played == []
-
-    run_virtual(main())
+async def test_nothing_is_played_armed_nor_unknown_nor_unwanted_nor_afterwards() -> None:
+    bench = Bench()
+    bench.tunes.play(Tune.NEXT)
+    await bench.run(0.0)
+    bench.tunes.step(asyncio.get_running_loop().time())  # before its first heartbeat
+    bench.armed = True
+    await bench.run(1.0)
+    bench.tunes.play(Tune.NEXT)
+    await bench.run(1.0)
+    bench.armed = False
+    await bench.run(6.0)
+    bench.wanted = False
+    bench.tunes.play(Tune.NEXT)
+    await bench.run(1.0)
+    bench.wanted = True
+    await asyncio.sleep(2.5)  # the heartbeats have ended
+    bench.tunes.play(Tune.NEXT)
+    bench.tunes.step(asyncio.get_running_loop().time())
+    await bench.run(2.0)
+    assert bench.played == []
 
 
-def test_one_that_had_to_wait_too_long_is_no_news() -> None:
-    async def main() -> None:
-        bench = Bench()
-        await bench.run(1.0)
-        bench.tunes.play(Tune.FAILED)
-        await asyncio.sleep(STALE_S)  # the loop of the component stood still
-        await bench.run(1.0)
-        assert bench.played == []
-
-    run_virtual(main())
+async def test_one_that_had_to_wait_too_long_is_no_news() -> None:
+    bench = Bench()
+    await bench.run(1.0)
+    bench.tunes.play(Tune.FAILED)
+    await asyncio.sleep(STALE_S)  # the loop of the component stood still
+    await bench.run(1.0)
+    assert bench.played == []
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from sim.ardupilot.double import ArduPilotDouble
 from sim.imu_model import ImuModel
 from sim.px4.double import PX4Double
 from tests.support.component import Ground
-from tests.support.virtual_time import run_virtual
 from tests.support.wire import Wire
 
 NAN = math.nan
@@ -82,16 +81,13 @@ async def line(kind: type[Any], parameters: dict[str, float]) -> AsyncIterator[L
         wire.unplug()
 
 
-def test_ekf3_has_no_heading_until_the_first_message_and_then_that_one() -> None:
-    async def main() -> None:
-        async with line(ArduPilotDouble, ARDUPILOT) as on:
-            assert on.wrong_deg() == pytest.approx(-TRUE_DEG, abs=0.5)
-            await on.stream(TRUE_DEG + 25.0, 1.0)
-            assert on.wrong_deg() == pytest.approx(25.0, abs=0.5)
-            await on.stream(TRUE_DEG, 12.0)
-            assert abs(on.wrong_deg()) < 0.5
-
-    run_virtual(main())
+async def test_ekf3_has_no_heading_until_the_first_message_and_then_that_one() -> None:
+    async with line(ArduPilotDouble, ARDUPILOT) as on:
+        assert on.wrong_deg() == pytest.approx(-TRUE_DEG, abs=0.5)
+        await on.stream(TRUE_DEG + 25.0, 1.0)
+        assert on.wrong_deg() == pytest.approx(25.0, abs=0.5)
+        await on.stream(TRUE_DEG, 12.0)
+        assert abs(on.wrong_deg()) < 0.5
 
 
 @pytest.mark.parametrize(
@@ -102,101 +98,80 @@ def test_ekf3_has_no_heading_until_the_first_message_and_then_that_one() -> None
         ({"variance": -1.0}, "angle"),
     ],
 )
-def test_ardupilot_rejects_what_is_not_a_number(fields: dict[str, Any], reason: str) -> None:
-    async def main() -> None:
-        async with line(ArduPilotDouble, ARDUPILOT) as on:
-            await on.stream(90.0, 1.0, **fields)
-            assert on.double.external_nav.consumed == 0
-            assert on.double.external_nav.rejected[reason] == 30
-            assert on.wrong_deg() == pytest.approx(-TRUE_DEG, abs=0.5)
-
-    run_virtual(main())
+async def test_ardupilot_rejects_what_is_not_a_number(fields: dict[str, Any], reason: str) -> None:
+    async with line(ArduPilotDouble, ARDUPILOT) as on:
+        await on.stream(90.0, 1.0, **fields)
+        assert on.double.external_nav.consumed == 0
+        assert on.double.external_nav.rejected[reason] == 30
+        assert on.wrong_deg() == pytest.approx(-TRUE_DEG, abs=0.5)
 
 
-def test_ardupilot_adds_the_variances_with_a_floor() -> None:
-    async def main() -> None:
-        async with line(ArduPilotDouble, ARDUPILOT) as on:
-            await on.stream(TRUE_DEG, 0.2, variance=1e-4)
-            assert on.double.external_nav.sigma_rad == pytest.approx(0.2)
-            await on.stream(TRUE_DEG, 0.2, variance=0.09, roll_variance=0.16)
-            assert on.double.external_nav.sigma_rad == pytest.approx(0.5)
-
-    run_virtual(main())
+async def test_ardupilot_adds_the_variances_with_a_floor() -> None:
+    async with line(ArduPilotDouble, ARDUPILOT) as on:
+        await on.stream(TRUE_DEG, 0.2, variance=1e-4)
+        assert on.double.external_nav.sigma_rad == pytest.approx(0.2)
+        await on.stream(TRUE_DEG, 0.2, variance=0.09, roll_variance=0.16)
+        assert on.double.external_nav.sigma_rad == pytest.approx(0.5)
 
 
-def test_px4_takes_its_parameter_unsquared_for_the_least_variance() -> None:
-    async def main() -> None:
-        async with line(PX4Double, PX4) as on:
-            await on.stream(TRUE_DEG, 0.2, variance=1e-4)
-            assert math.degrees(on.double.vision.sigma_rad) == pytest.approx(12.8, abs=0.05)
-            await on.stream(TRUE_DEG, 0.2, variance=0.09)
-            assert on.double.vision.sigma_rad == pytest.approx(0.3)
-
-    run_virtual(main())
+async def test_px4_takes_its_parameter_unsquared_for_the_least_variance() -> None:
+    async with line(PX4Double, PX4) as on:
+        await on.stream(TRUE_DEG, 0.2, variance=1e-4)
+        assert math.degrees(on.double.vision.sigma_rad) == pytest.approx(12.8, abs=0.05)
+        await on.stream(TRUE_DEG, 0.2, variance=0.09)
+        assert on.double.vision.sigma_rad == pytest.approx(0.3)
 
 
-def test_ardupilot_drops_what_comes_within_20_ms_by_its_stamp() -> None:
-    async def main() -> None:
-        async with line(ArduPilotDouble, ARDUPILOT) as on:
-            for k in range(40):
-                on.send(TRUE_DEG, usec=1_000_000 + 10_000 * k)
-                await asyncio.sleep(0.01)
-            assert on.double.external_nav.consumed == 20
-            assert on.double.external_nav.rejected["too soon"] == 20
-
-    run_virtual(main())
+async def test_ardupilot_drops_what_comes_within_20_ms_by_its_stamp() -> None:
+    async with line(ArduPilotDouble, ARDUPILOT) as on:
+        for k in range(40):
+            on.send(TRUE_DEG, usec=1_000_000 + 10_000 * k)
+            await asyncio.sleep(0.01)
+        assert on.double.external_nav.consumed == 20
+        assert on.double.external_nav.rejected["too soon"] == 20
 
 
 @pytest.mark.parametrize("missing", ["VISO_TYPE", "EK3_SRC1_YAW"])
-def test_without_either_parameter_nothing_is_taken_and_they_count_from_the_boot_on(missing: str) -> None:
-    async def main() -> None:
-        async with line(ArduPilotDouble, ARDUPILOT | {missing: 0.0 if missing == "VISO_TYPE" else 1.0}) as on:
-            before = on.wrong_deg()
-            on.double.set_parameter(missing, ARDUPILOT[missing])
-            await on.stream(TRUE_DEG + 60.0, 1.0)
-            assert on.wrong_deg() == pytest.approx(before, abs=0.5)
-            on.double.reboot(0.5)
-            await asyncio.sleep(1.0)
-            await on.stream(TRUE_DEG + 60.0, 1.0)
-            assert on.wrong_deg() == pytest.approx(60.0, abs=0.5)
-
-    run_virtual(main())
+async def test_without_either_parameter_nothing_is_taken_and_they_count_from_the_boot_on(missing: str) -> None:
+    async with line(ArduPilotDouble, ARDUPILOT | {missing: 0.0 if missing == "VISO_TYPE" else 1.0}) as on:
+        before = on.wrong_deg()
+        on.double.set_parameter(missing, ARDUPILOT[missing])
+        await on.stream(TRUE_DEG + 60.0, 1.0)
+        assert on.wrong_deg() == pytest.approx(before, abs=0.5)
+        on.double.reboot(0.5)
+        await asyncio.sleep(1.0)
+        await on.stream(TRUE_DEG + 60.0, 1.0)
+        assert on.wrong_deg() == pytest.approx(60.0, abs=0.5)
 
 
-def test_ekf2_begins_with_the_stream_follows_it_and_ends_without() -> None:
-    async def main() -> None:
-        async with line(PX4Double, PX4) as on:
-            vision = on.double.vision
-            on.send(TRUE_DEG, position=(NAN,) * 3)
-            await asyncio.sleep(0.3)  # too long a gap to begin with
-            on.send(TRUE_DEG, position=(NAN,) * 3)
-            await asyncio.sleep(0.05)
-            assert not vision.active
-            await on.stream(TRUE_DEG + 5.0, 12.0, position=(NAN,) * 3)
-            assert vision.active
-            assert on.wrong_deg() == pytest.approx(5.0, abs=0.5)
-            await asyncio.sleep(0.5)
-            on.wrong_deg()
-            assert not vision.active
-            await asyncio.sleep(60.0)  # the magnetometer goes on
-            assert abs(on.wrong_deg()) < 0.5
-
-    run_virtual(main())
+async def test_ekf2_begins_with_the_stream_follows_it_and_ends_without() -> None:
+    async with line(PX4Double, PX4) as on:
+        vision = on.double.vision
+        on.send(TRUE_DEG, position=(NAN,) * 3)
+        await asyncio.sleep(0.3)  # too long a gap to begin with
+        on.send(TRUE_DEG, position=(NAN,) * 3)
+        await asyncio.sleep(0.05)
+        assert not vision.active
+        await on.stream(TRUE_DEG + 5.0, 12.0, position=(NAN,) * 3)
+        assert vision.active
+        assert on.wrong_deg() == pytest.approx(5.0, abs=0.5)
+        await asyncio.sleep(0.5)
+        on.wrong_deg()
+        assert not vision.active
+        await asyncio.sleep(60.0)  # the magnetometer goes on
+        assert abs(on.wrong_deg()) < 0.5
 
 
-def test_ekf2_resets_by_the_counter_and_by_failing_and_only_with_its_bit() -> None:
-    async def main() -> None:
-        async with line(PX4Double, PX4) as on:
-            await on.stream(TRUE_DEG, 2.0)
-            await on.stream(TRUE_DEG + 90.0, 0.1, counter=1)
-            assert on.wrong_deg() == pytest.approx(90.0, abs=0.5)
-            await on.stream(TRUE_DEG - 90.0, 0.5, counter=1)
-            assert on.wrong_deg() == pytest.approx(90.0, abs=0.5)  # outside the gate, not yet failed
-            await on.stream(TRUE_DEG - 90.0, 1.0, counter=1)
-            assert on.wrong_deg() == pytest.approx(-90.0, abs=0.5)
-        async with line(PX4Double, PX4 | {"EKF2_EV_CTRL": 7}) as on:
-            await on.stream(TRUE_DEG + 5.0, 5.0)
-            assert not on.double.vision.active
-            assert abs(on.wrong_deg()) < 0.5
-
-    run_virtual(main())
+async def test_ekf2_resets_by_the_counter_and_by_failing_and_only_with_its_bit() -> None:
+    async with line(PX4Double, PX4) as on:
+        await on.stream(TRUE_DEG, 2.0)
+        await on.stream(TRUE_DEG + 90.0, 0.1, counter=1)
+        assert on.wrong_deg() == pytest.approx(90.0, abs=0.5)
+        await on.stream(TRUE_DEG - 90.0, 0.5, counter=1)
+        assert on.wrong_deg() == pytest.approx(90.0, abs=0.5)  # outside the gate, not yet failed
+        await on.stream(TRUE_DEG - 90.0, 1.0, counter=1)
+        assert on.wrong_deg() == pytest.approx(-90.0, abs=0.5)
+    async with line(PX4Double, PX4 | {"EKF2_EV_CTRL": 7}) as on:
+        await on.stream(TRUE_DEG + 5.0, 5.0)
+        assert not on.double.vision.active
+        assert abs(on.wrong_deg()) < 0.5

@@ -10,7 +10,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.station import Station
 from tests.support.px4_stage import ARM, PX4Stage, now_s
-from tests.support.virtual_time import run_virtual
 
 ASK = mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST
 ON = {"COM_ARM_AUTH_REQ": 1, "COM_ARM_AUTH_ID": 1}
@@ -69,92 +68,77 @@ async def arm(stage: PX4Stage, *, force: float = 0.0) -> tuple[int, float]:
     return result, now_s() - begun_s
 
 
-def test_the_request_goes_out_on_all_links_to_the_authorizer_component_0_with_all_params_0() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_ID": 77}) as stage:
-            await arm(stage)
-            for station in (stage.companion, stage.ground):
-                request = requests(station)[0][1]
-                assert (request.get_srcSystem(), request.get_srcComponent()) == (1, 1)
-                assert (request.target_system, request.target_component, request.confirmation) == (77, 0, 0)
-                assert {getattr(request, f"param{n}") for n in range(1, 8)} == {0.0}
-
-    run_virtual(main())
+async def test_the_request_goes_out_on_all_links_to_the_authorizer_component_0_with_all_params_0() -> None:
+    async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_ID": 77}) as stage:
+        await arm(stage)
+        for station in (stage.companion, stage.ground):
+            request = requests(station)[0][1]
+            assert (request.get_srcSystem(), request.get_srcComponent()) == (1, 1)
+            assert (request.target_system, request.target_component, request.confirmation) == (77, 0, 0)
+            assert {getattr(request, f"param{n}") for n in range(1, 8)} == {0.0}
 
 
-def test_no_answer_denies_after_two_timeouts_with_two_requests() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            result, took_s = await arm(stage)
-            assert result == 1
-            assert took_s == pytest.approx(2.05, abs=0.07)
-            first, second = firsts(stage.companion)
-            assert second - first == pytest.approx(1.0, abs=0.01)
-            await asyncio.sleep(1.0)
-            texts = stage.ground.texts()
-            assert [text for text in texts if text.startswith("Arm auth")] == ["Arm auth: No response"] * 2
-            assert "".join(texts).endswith("Arming denied: Resolve system health failures first\t")
-            assert texts[-2:] == ["Arming denied: Resolve system health failures firs", "t\t"]
-            assert stage.double.authorization.requests == 2
-
-    run_virtual(main())
+async def test_no_answer_denies_after_two_timeouts_with_two_requests() -> None:
+    async with PX4Stage(parameters=ON) as stage:
+        result, took_s = await arm(stage)
+        assert result == 1
+        assert took_s == pytest.approx(2.05, abs=0.07)
+        first, second = firsts(stage.companion)
+        assert second - first == pytest.approx(1.0, abs=0.01)
+        await asyncio.sleep(1.0)
+        texts = stage.ground.texts()
+        assert [text for text in texts if text.startswith("Arm auth")] == ["Arm auth: No response"] * 2
+        assert "".join(texts).endswith("Arming denied: Resolve system health failures first\t")
+        assert texts[-2:] == ["Arming denied: Resolve system health failures firs", "t\t"]
+        assert stage.double.authorization.requests == 2
 
 
-def test_a_request_is_repeated_three_times_every_half_second_until_that_system_answers() -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_TO": 5.0}) as stage:
-            stage.ground.send(mavlink.MAVLink_command_long_message(1, 1, ARM, 0, 1, 0, 0, 0, 0, 0, 0))
-            await asyncio.sleep(4.0)
-            for station, expected in ((stage.ground, [0.5, 0.5, 0.5]), (stage.companion, [1.0, 0.5, 0.5])):
-                asked = requests(station)
-                assert [m.confirmation for _, m in asked] == [0, 1, 2, 3]
-                gaps = [b - a for (a, _), (b, _) in itertools.pairwise(asked)]
-                assert gaps == pytest.approx(expected, abs=0.01)  # 1.02, 0.52, 0.52 on a port of the real one
-        async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_TO": 5.0}) as stage:
-            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED)
-            assert (await arm(stage))[0] == 0
-            await asyncio.sleep(3.0)
-            assert len(requests(stage.companion)) == 1
-            authorizer.stop()
-
-    run_virtual(main())
+async def test_a_request_is_repeated_three_times_every_half_second_until_that_system_answers() -> None:
+    async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_TO": 5.0}) as stage:
+        stage.ground.send(mavlink.MAVLink_command_long_message(1, 1, ARM, 0, 1, 0, 0, 0, 0, 0, 0))
+        await asyncio.sleep(4.0)
+        for station, expected in ((stage.ground, [0.5, 0.5, 0.5]), (stage.companion, [1.0, 0.5, 0.5])):
+            asked = requests(station)
+            assert [m.confirmation for _, m in asked] == [0, 1, 2, 3]
+            gaps = [b - a for (a, _), (b, _) in itertools.pairwise(asked)]
+            assert gaps == pytest.approx(expected, abs=0.01)  # 1.02, 0.52, 0.52 on a port of the real one
+    async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_TO": 5.0}) as stage:
+        authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED)
+        assert (await arm(stage))[0] == 0
+        await asyncio.sleep(3.0)
+        assert len(requests(stage.companion)) == 1
+        authorizer.stop()
 
 
 @pytest.mark.parametrize("target", [(1, 1), (1, 0)])
-def test_accepted_arms_within_milliseconds_of_the_answer_and_says_for_how_long(target: tuple[int, int]) -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, target=target)
-            result, took_s = await arm(stage)
-            assert result == 0
-            assert 0.1 < took_s < 0.125  # 109 to 117 ms in the real one
-            assert stage.double.armed
-            await asyncio.sleep(0.2)
-            assert "Arm auth: Authorized for the next 5 seconds" in stage.ground.texts()
-            # Within the window nobody is asked again, after it they are.
-            stage.double.disarm()
-            assert (await arm(stage))[0] == 0
-            assert len(firsts(stage.companion)) == 1
-            stage.double.disarm()
-            await asyncio.sleep(5.0)
-            assert (await arm(stage))[0] == 0
-            assert len(firsts(stage.companion)) == 2
-            authorizer.stop()
-
-    run_virtual(main())
+async def test_accepted_arms_within_milliseconds_of_the_answer_and_says_for_how_long(target: tuple[int, int]) -> None:
+    async with PX4Stage(parameters=ON) as stage:
+        authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, target=target)
+        result, took_s = await arm(stage)
+        assert result == 0
+        assert 0.1 < took_s < 0.125  # 109 to 117 ms in the real one
+        assert stage.double.armed
+        await asyncio.sleep(0.2)
+        assert "Arm auth: Authorized for the next 5 seconds" in stage.ground.texts()
+        # Within the window nobody is asked again, after it they are.
+        stage.double.disarm()
+        assert (await arm(stage))[0] == 0
+        assert len(firsts(stage.companion)) == 1
+        stage.double.disarm()
+        await asyncio.sleep(5.0)
+        assert (await arm(stage))[0] == 0
+        assert len(firsts(stage.companion)) == 2
+        authorizer.stop()
 
 
 @pytest.mark.parametrize("target", [(0, 0), (2, 1), (1, 191)])
-def test_an_answer_whose_target_is_not_the_vehicle_is_ignored(target: tuple[int, int]) -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, target=target)
-            assert (await arm(stage))[0] == 1
-            await asyncio.sleep(0.5)
-            assert "Arm auth: No response" in stage.ground.texts()
-            authorizer.stop()
-
-    run_virtual(main())
+async def test_an_answer_whose_target_is_not_the_vehicle_is_ignored(target: tuple[int, int]) -> None:
+    async with PX4Stage(parameters=ON) as stage:
+        authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, target=target)
+        assert (await arm(stage))[0] == 1
+        await asyncio.sleep(0.5)
+        assert "Arm auth: No response" in stage.ground.texts()
+        authorizer.stop()
 
 
 @pytest.mark.parametrize(
@@ -171,34 +155,28 @@ def test_an_answer_whose_target_is_not_the_vehicle_is_ignored(target: tuple[int,
         (4, 0, "Arm auth: Denied"),
     ],
 )
-def test_a_denial_denies_and_says_the_reason_in_progress(result: int, progress: int, text: str | None) -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            authorizer = Authorizer(stage, result, progress=progress, param2=7)
-            acknowledged, took_s = await arm(stage)
-            assert acknowledged == 1
-            assert 0.1 < took_s < 0.3  # 110 to 220 ms in the real one
-            assert not stage.double.armed
-            await asyncio.sleep(0.5)
-            said = [said for said in stage.ground.texts() if said.startswith("Arm auth")]
-            assert said == ([] if text is None else [text[:50]] * 2)
-            assert authorizer.answers == 2  # both requests of the attempt
-            authorizer.stop()
-
-    run_virtual(main())
+async def test_a_denial_denies_and_says_the_reason_in_progress(result: int, progress: int, text: str | None) -> None:
+    async with PX4Stage(parameters=ON) as stage:
+        authorizer = Authorizer(stage, result, progress=progress, param2=7)
+        acknowledged, took_s = await arm(stage)
+        assert acknowledged == 1
+        assert 0.1 < took_s < 0.3  # 110 to 220 ms in the real one
+        assert not stage.double.armed
+        await asyncio.sleep(0.5)
+        said = [said for said in stage.ground.texts() if said.startswith("Arm auth")]
+        assert said == ([] if text is None else [text[:50]] * 2)
+        assert authorizer.answers == 2  # both requests of the attempt
+        authorizer.stop()
 
 
 @pytest.mark.parametrize(("accepted_s", "armed"), [(0.6, True), (1.6, True), (2.4, False)])
-def test_in_progress_does_not_extend_the_time_out(accepted_s: float, armed: bool) -> None:
-    async def main() -> None:
-        async with PX4Stage(parameters=ON) as stage:
-            working = Authorizer(stage, mavlink.MAV_RESULT_IN_PROGRESS, after_s=0.02)
-            loop = asyncio.get_running_loop()
-            done = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, after_s=100.0)
-            loop.call_later(accepted_s, done.answer)
-            result, _ = await arm(stage)
-            assert (result == 0) is armed
-            working.stop()
-            done.stop()
-
-    run_virtual(main())
+async def test_in_progress_does_not_extend_the_time_out(accepted_s: float, armed: bool) -> None:
+    async with PX4Stage(parameters=ON) as stage:
+        working = Authorizer(stage, mavlink.MAV_RESULT_IN_PROGRESS, after_s=0.02)
+        loop = asyncio.get_running_loop()
+        done = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, after_s=100.0)
+        loop.call_later(accepted_s, done.answer)
+        result, _ = await arm(stage)
+        assert (result == 0) is armed
+        working.stop()
+        done.stop()
