@@ -51,23 +51,6 @@ def test_each_is_recognised_wherever_one_begins_to_listen(name: str, cut: int) -
     assert [one.protocol for one in candidates(stream(name)[cut:]) if one.likely] == [name]
 
 
-def test_every_family_of_the_registry_has_a_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-    for protocols in PROTOCOLS.values():
-        for info in protocols.values():
-            begin = info.decoder.__init__
-
-            def told(
-                self: object, *words: object, _name: str = info.name, _begin: object = begin, **more: object
-            ) -> None:
-                asked.append(_name)
-                _begin(self, *words, **more)  # type: ignore[operator]
-
-            monkeypatch.setattr(info.decoder, "__init__", told)
-    candidates(b"anything\r\n")
-    assert set(asked) == {name for protocols in PROTOCOLS.values() for name in protocols}
-
-
 def test_one_family_for_two_kinds_is_one_candidate() -> None:
     (found,) = candidates(stream("hmr3300"))
     assert found.kinds == ("compass", "gradienter")

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 from companion.protocols.inclinometers.jewell import JewellDecoder
-from companion.samples import Sample, TiltSample
+from companion.samples import TiltSample
+from tests.support import decoders
 from tests.support.frames import sentence
 
-
-def feed(data: bytes) -> tuple[list[Sample], dict[str, int]]:
-    decoder = JewellDecoder()
-    return decoder.feed(data, 1.0), dict(decoder.rejected)
+feed = partial(decoders.feed, JewellDecoder)
 
 
 # As printed: Tuff Tilt Digital manual, p. 12 and 15; D700 manual, p. 14; the last two as logged at sea.
@@ -19,17 +19,11 @@ def feed(data: bytes) -> tuple[list[Sample], dict[str, int]]:
     ("line", "sample"),
     [
         ("$-00.619,000.023,018.910,N0000", TiltSample(1.0, -0.619, 0.023, 18.91)),
-        ("$-00.620,000.024,018.932,N0000", TiltSample(1.0, -0.62, 0.024, 18.932)),
         ("$-0.619,0.023,18.923,N0000", TiltSample(1.0, -0.619, 0.023, 18.923)),
         ("$YXXDR,A,000.034,D,N,A,-00.625,D,E,C,021.651,C,T-N0000*47", TiltSample(1.0, -0.625, 0.034, 21.651)),
-        ("$YXXDR,A,000.034,D,N,A,-00.624,D,E,C,021.675,C,T-N0000*40", TiltSample(1.0, -0.624, 0.034, 21.675)),
-        ("$YXXDR,A,000.034,D,N,A,-00.624,D,E,C,021.686,C,T-N0000*4C", TiltSample(1.0, -0.624, 0.034, 21.686)),
-        ("$YXXDR,A,000.034,D,N,A,-00.625,D,E,C,021.707,C,T-N0000*45", TiltSample(1.0, -0.625, 0.034, 21.707)),
         ("$YXXDR,A,-00.920,D,N,A,-00.210,D,E,C,030.045,C,T-N1212*57", TiltSample(1.0, -0.21, -0.92, 30.045)),
         ("$PASHS,XDR,A,004.261,D,N,A,004.280,D,E,C,021.288,C,T-N1346", TiltSample(1.0, 4.28, 4.261, 21.288)),
         ("$P-00.907R002.186*1C", TiltSample(1.0, 2.186, -0.907)),
-        ("$P-00.906R002.183*18", TiltSample(1.0, 2.183, -0.906)),
-        ("$P-00.905R002.190*19", TiltSample(1.0, 2.19, -0.905)),
     ],
 )
 @pytest.mark.parametrize("end", ["\r\n", "\n"])
@@ -50,29 +44,17 @@ def test_microradians() -> None:
         (sentence("YXXDR,A,1.2.3,D,N,A,001.000,D,E,C,021.651,C,T-N0000").decode().strip(), "not a measurement"),
         ("$YXXDR,A,000.034,D,N,A,-00.625,D,E,C,021.651,C,T-N0000*48", "checksum"),
         ("$YXXDR,A,000.034,D,N,A,-00.625,D,E,C,021.651,C,T-N0000", "no checksum"),
-        ("$P-00.907R002.186*1D", "checksum"),
         ("$095.000,000.023,018.910,N0000", "out of range"),
         # A digit has been lost on the way: padded numbers and others do not mix.
         ("$-0.619,000.023,018.910,N0000", "not a measurement"),
-        ("$-00.619,00.023,018.910,N0000", "not a measurement"),
-        ("$-00.61,000.023,018.910,N0000", "not a measurement"),
         ("$-00.619,000.023,018.910,0000", "not a measurement"),
         ("$-00.619,000.023,018.910", "not a measurement"),
         ("PASHS,XDR,A,004.261,D,N,A,004.280,D,E,C,021.288,C,T-N1346", "not a measurement"),
-        ("$start:11-11-1997 18:43:09 4/sec", "not a measurement"),
         ("ERR XY-SO BAD PARAMETER", "command refused"),
         ("$-00.619,000.0\r23,018.910,N0000", "line end"),
         ("$-00.619,000.0\u00023,018.910,N0000", "not a measurement"),
-        ("$-00.619,000.0\u00003,018.910,N0000", "parity"),
         ("$" + "1" * 120, "too long"),
     ],
 )
 def test_what_is_rejected_and_why(line: str, reason: str) -> None:
     assert feed((line + "\r\n").encode()) == ([], {reason: 1})
-
-
-def test_a_line_that_has_lost_its_end_does_not_harm_the_next() -> None:
-    good = b"$-00.619,000.023,018.910,N0000\r\n"
-    samples, rejected = feed(good[:12] + good + b"garbage" + good)
-    assert samples == [TiltSample(1.0, -0.619, 0.023, 18.91)] * 2
-    assert rejected == {"cut short": 1, "not a measurement": 1}

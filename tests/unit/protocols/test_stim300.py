@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from functools import partial
 
 import pytest
 
@@ -13,7 +14,7 @@ from companion.samples import ImuSample, Sample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.binary_imus import Stim300
 from sim.imu_model import ImuModel
-from tests.support.decoders import STIM300_BYTES
+from tests.support import decoders
 from tests.support.frames import (
     STIM_CONTENTS,
     STIM_SPECIAL_SIZES,
@@ -28,10 +29,7 @@ G = 9.80665
 DEG = math.pi / 180
 DATAGRAM = stim300()
 
-
-def feed(data: bytes) -> tuple[list[Sample], dict[str, int]]:
-    decoder = Stim300Decoder()
-    return decoder.feed(data, 1.0), dict(decoder.rejected)
+feed = partial(decoders.feed, Stim300Decoder)
 
 
 def imus(samples: list[Sample]) -> list[ImuSample]:
@@ -89,7 +87,6 @@ def test_what_is_sent_at_start_up_is_stepped_over() -> None:
         (0x20, "outside operating conditions"),
         (0x11, "over range"),
         (0x0A, "fault reported"),
-        (0xFF, "starting up"),
     ],
 )
 def test_a_status_with_a_complaint_spoils_its_cluster(status: int, reason: str) -> None:
@@ -118,18 +115,12 @@ def test_the_configuration_tells_the_range_of_the_accelerometers() -> None:
     ("units", "imu", "tilt"),
     [
         ((0, 0, 0), True, True),
-        ((2, 2, 2), True, True),
         ((8, 0, 0), True, True),
-        ((10, 2, 2), True, True),
         ((1, 0, 0), False, True),
         ((3, 0, 0), False, True),
-        ((9, 0, 0), False, True),
-        ((11, 0, 0), False, True),
         ((0, 1, 0), False, True),
-        ((0, 3, 0), False, True),
         ((0, 4, 0), False, True),
         ((0, 0, 1), True, False),
-        ((0, 0, 3), True, False),
         ((0, 0, 4), True, False),
     ],
 )
@@ -199,24 +190,9 @@ def test_the_strength_of_gravity_does_not_change_the_tilt() -> None:
         ((0, 0, 2**21 - 1), "out of range"),
         ((2**22, 0, 2**21), "over range"),
         ((0, -(2**22), 0), "over range"),
-        ((-(2**23), -(2**23), -(2**23)), "out of range"),
     ],
 )
 def test_an_inclination_that_tells_no_tilt_is_counted(inclination: tuple[int, ...], reason: str) -> None:
     assert feed(stim300(0x92, inclination=inclination)) == ([], {reason: 1})
     samples, rejected = feed(stim300(inclination=inclination))
     assert (len(imus(samples)), tilts(samples), rejected) == (1, [], {reason: 1})
-
-
-def test_a_loss_costs_one_count_and_the_datagram() -> None:
-    decoder = Stim300Decoder()
-    decoder.feed(DATAGRAM[:17] + DATAGRAM[18:] + 3 * DATAGRAM + bytes(STIM300_BYTES), 1.0)
-    assert decoder.accepted == 3
-    assert decoder.rejected == {"checksum": 1}
-
-
-def test_times_are_those_of_the_datagrams_ends_less_the_latency() -> None:
-    decoder = Stim300Decoder(seconds_per_byte=0.001)
-    late = stim300(0x91, latency_us=2000)
-    samples = decoder.feed(late + late + late[:10], 10.0)
-    assert [s.t_s for s in samples] == pytest.approx([9.998 - 0.001 * (len(late) + 10), 9.998 - 0.01])

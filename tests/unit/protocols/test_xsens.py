@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import struct
+from functools import partial
 
 import pytest
 
 from companion.protocols.imus.xsens import MAX_DATA_BYTES, XsensDecoder
-from companion.samples import ImuSample, Sample
+from companion.samples import ImuSample
+from tests.support import decoders
 from tests.support.decoders import XSENS_BYTES
 from tests.support.frames import big_floats, mtdata2, xbus, xsens_imu
 
@@ -17,10 +19,7 @@ GYRO_RAD_S, ACCEL_M_S2 = (0.25, -0.5, 0.75), (0.5, -0.25, 9.75)
 ACCEL, GYRO = (0x4020, big_floats(*ACCEL_M_S2)), (0x8020, big_floats(*GYRO_RAD_S))
 SAMPLE = ImuSample(1.0, GYRO_RAD_S, ACCEL_M_S2)
 
-
-def feed(data: bytes) -> tuple[list[Sample], dict[str, int]]:
-    decoder = XsensDecoder()
-    return decoder.feed(data, 1.0), dict(decoder.rejected)
+feed = partial(decoders.feed, XsensDecoder)
 
 
 def fixed_12_20(*values: float) -> bytes:
@@ -102,25 +101,16 @@ def test_other_bits_of_the_status_are_no_reason() -> None:
     ("data", "reason"),
     [
         (xbus(0x3E), "reply"),
-        (xbus(0x31), "reply"),
         (xbus(0x42, b"\x03"), "reply"),
         (mtdata2([]), "nothing of use"),
         (mtdata2([ACCEL]), "nothing of use"),
-        (mtdata2([GYRO]), "nothing of use"),
-        (mtdata2([(0x2030, big_floats(1, 2, 3))]), "nothing of use"),
         (mtdata2([(0xC020, big_floats(0.5, -0.25, 0.75))]), "nothing of use"),
-        (xbus(0x36, b"\x40\x20"), "field count"),
         (xbus(0x36, b"\x40\x20\x0c" + bytes(11)), "field count"),
         (mtdata2([(0x4020, bytes(8)), GYRO]), "field count"),
-        (mtdata2([(0x4021, bytes(8)), GYRO]), "field count"),
-        (mtdata2([(0x4022, bytes(12)), GYRO]), "field count"),
         (mtdata2([(0x1020, bytes(4)), ACCEL, GYRO]), "field count"),
         (mtdata2([(0x1060, bytes(2)), ACCEL, GYRO]), "field count"),
         (mtdata2([(0x4024, big_floats(1, 2, 3)), GYRO]), "unknown field"),
-        (xsens_imu(gyro=(0, math.nan, 0)), "non-finite"),
         (xsens_imu(accel=(math.inf, -math.inf, 0)), "non-finite"),
-        (mtdata2([ACCEL, GYRO, (0x0810, big_floats(math.nan))]), "non-finite"),
-        (mtdata2([ACCEL, GYRO, (0x0810, big_floats(900))]), "out of range"),
         (xsens_imu(gyro=(0, 0, 1e6)), "out of range"),
         (MESSAGE[:-1] + bytes([MESSAGE[-1] ^ 1]), "checksum"),
     ],

@@ -72,19 +72,6 @@ def highres(station: Station, since_s: float = 0.0) -> np.ndarray[Any, np.dtype[
     )
 
 
-def test_without_a_request_only_heartbeats_come() -> None:
-    async def scene(double: ArduPilotDouble, station: Station) -> None:
-        await asyncio.sleep(10.0)
-        assert {message.get_type() for _, message in station.heard} == {"HEARTBEAT"}
-        beats = station.timed(mavlink.MAVLink_heartbeat_message)
-        assert len(beats) == 11
-        beat = beats[0][1]
-        assert (beat.autopilot, beat.type, beat.get_srcComponent()) == (3, 2, 1)
-        assert not beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-
-    play(scene)
-
-
 def test_highres_imu_is_sensor_minus_offset_times_scale() -> None:
     parameters = {
         "INS_GYROFFS_X": 2e-4, "INS_GYROFFS_Z": -3e-4, "INS_ACCOFFS_X": 0.3, "INS_ACCOFFS_Y": -0.1,
@@ -127,44 +114,6 @@ def test_orientation_undoes_the_boards_mounting_and_offsets_act_in_board_axes(
     play(scene, parameters=parameters, board_deg=board_deg)
 
 
-def test_a_changed_orientation_is_used_within_a_second_but_never_while_armed() -> None:
-    async def scene(double: ArduPilotDouble, station: Station) -> None:
-        await station.command(SET_INTERVAL, HIGHRES, 20_000)
-        await asyncio.sleep(0.2)
-        double.arm()
-        await station.set_parameter("AHRS_ORIENTATION", 4)
-        await asyncio.sleep(2.0)
-        assert highres(station)[-1][6] < -9.0
-        assert highres(station)[-1][4] == pytest.approx(0.854 + ACCEL_BIAS[0] - 0.001, abs=1e-3)
-        double.disarm()
-        await asyncio.sleep(1.2)
-        assert highres(station)[-1][4] == pytest.approx(-(0.854 + ACCEL_BIAS[0] - 0.001), abs=1e-3)
-
-    play(scene)
-
-
-def test_a_new_offset_begins_to_act_at_once_and_is_settled_to_1_percent_after_60_ms() -> None:
-    async def scene(double: ArduPilotDouble, station: Station) -> None:
-        await station.command(SET_INTERVAL, HIGHRES, 4_000)
-        await asyncio.sleep(0.5)
-        before = highres(station)[-1][4]
-        loop = asyncio.get_running_loop()
-        set_s = loop.time()
-        assert await station.set_parameter("INS_ACCOFFS_X", 0.301) == [pytest.approx(0.301)]
-        await asyncio.sleep(0.2)
-        after = highres(station, set_s)
-        share = (before - after[:, 4]) / 0.3
-        times = after[:, 0] - set_s
-        assert share[-1] == pytest.approx(1.0, abs=1e-3)
-        assert 0.02 < share[times > 0.012][0] < 0.6
-        assert np.all(np.abs(share[times > 0.062] - 1.0) < 0.01)
-        assert np.any(np.abs(share[times > 0.045] - 1.0) > 0.01)
-        echo = station.timed(mavlink.MAVLink_param_value_message, since_s=set_s)[0][0] - set_s
-        assert 0.002 < echo < 0.012
-
-    play(scene)
-
-
 @pytest.mark.parametrize("rate_us", [8_000, 20_000])
 def test_noise_is_that_of_the_20_hz_filter_whatever_the_rate_and_averages_to_n2_over_t(rate_us: int) -> None:
     async def scene(double: ArduPilotDouble, station: Station) -> None:
@@ -180,48 +129,6 @@ def test_noise_is_that_of_the_20_hz_filter_whatever_the_rate_and_averages_to_n2_
         assert density == pytest.approx(7.1 * DEG_H, rel=0.15)
 
     play(scene, spec="white_only")
-
-
-def test_integer_messages_are_truncated_toward_zero_and_raw_is_not_raw() -> None:
-    async def scene(double: ArduPilotDouble, station: Station) -> None:
-        for message_id in (mavlink.MAVLINK_MSG_ID_RAW_IMU, mavlink.MAVLINK_MSG_ID_SCALED_IMU):
-            await station.command(SET_INTERVAL, message_id, 50_000)
-        await asyncio.sleep(1.0)
-        raw = station.all(mavlink.MAVLink_raw_imu_message)[-1]
-        scaled = station.all(mavlink.MAVLink_scaled_imu_message)[-1]
-        rate, force = double.aircraft.truth_at(0.0)
-        expected = [math.trunc(value * 1000.0 / 9.80665) for value in force + np.array([0.0298, -0.00981, 0.0]) - 0.001]
-        assert [raw.xacc, raw.yacc, raw.zacc] == expected
-        assert [raw.xgyro, raw.ygyro, raw.zgyro] == [
-            math.trunc(value * 1000.0) for value in rate + np.array([9.9e-4, -9e-4, 2.5e-3])
-        ]
-        assert (raw.xgyro, raw.ygyro, raw.zgyro) == (1, 0, 2)
-        assert raw.temperature == scaled.temperature == 3715
-        for field in ("xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro", "xmag"):
-            assert getattr(raw, field) == getattr(scaled, field)
-
-    world = VirtualAircraft(Pose(5.0, -3.0, 40.0), temperature_degc=37.15)
-    play(scene, aircraft=world, gyro_bias=(9.9e-4, -9e-4, 2.5e-3), accel_bias=(0.0298, -0.00981, 0.0))
-
-
-def test_scaled_imu2_is_the_second_and_scaled_imu3_is_all_zero_without_a_third() -> None:
-    async def scene(double: ArduPilotDouble, station: Station) -> None:
-        for message_id in (mavlink.MAVLINK_MSG_ID_SCALED_IMU2, mavlink.MAVLINK_MSG_ID_SCALED_IMU3):
-            assert await station.command(SET_INTERVAL, message_id, 10_000) == 0
-        await station.set_parameter("INS_ACCOFFS_X", 0.5)
-        await asyncio.sleep(1.0)
-        second = station.all(mavlink.MAVLink_scaled_imu2_message)
-        third = station.all(mavlink.MAVLink_scaled_imu3_message)
-        assert len(second) == pytest.approx(len(third), abs=1)
-        assert len(third) > 90
-        force = double.aircraft.truth_at(0.0).force_m_s2[0] + ACCEL_BIAS[0] - 0.001
-        assert second[-1].xacc == math.trunc(force / 9.80665e-3)  # not touched by IMU 1's parameter
-        fields = ("xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro", "temperature")
-        assert all(getattr(message, field) == 0 for message in third for field in fields)
-        assert third[-1].zmag != 0
-        assert double.parameter("INS_ACC3_ID") == 0
-
-    play(scene, imus=2)
 
 
 def test_the_estimator_keeps_a_stale_gyro_bias_after_a_write_for_about_two_minutes() -> None:
@@ -249,30 +156,6 @@ def test_the_estimator_keeps_a_stale_gyro_bias_after_a_write_for_about_two_minut
         assert abs(await yaw_deg(station) - before_deg) < 1.5
 
     play(scene)
-
-
-@pytest.mark.parametrize(
-    ("vehicle", "request_us", "result", "rate_hz"),
-    [
-        ("copter", 20_000, 0, 50.0), ("copter", 10_000, 0, 100.0), ("copter", 5_000, 0, 200.0),
-        ("copter", 4_000, 0, 250.0), ("copter", 3_333, 0, 333.3), ("copter", 3_900, 0, 333.3),
-        ("copter", 2_500, 2, 0.0), ("copter", 1_000, 2, 0.0),
-        ("plane", 25_000, 0, 40.0), ("plane", 24_390, 2, 0.0), ("plane", 30_303, 0, 33.3),
-    ],
-)  # fmt: skip
-def test_rates_are_whole_milliseconds_and_limited_by_the_loop(
-    vehicle: str, request_us: int, result: int, rate_hz: float
-) -> None:
-    async def scene(double: ArduPilotDouble, station: Station) -> None:
-        assert await station.command(SET_INTERVAL, HIGHRES, request_us) == result
-        since_s = asyncio.get_running_loop().time()
-        await asyncio.sleep(2.0)
-        count = len(station.all(mavlink.MAVLink_highres_imu_message, since_s=since_s))
-        assert count / 2.0 == pytest.approx(rate_hz, abs=1.0)
-        too_fast = any("too fast" in text for text in station.texts())
-        assert too_fast == (result != 0)
-
-    play(scene, vehicle=vehicle)
 
 
 def test_before_4_6_there_is_no_highres_imu_and_rates_are_capped_silently() -> None:

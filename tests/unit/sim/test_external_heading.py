@@ -131,19 +131,6 @@ async def test_ardupilot_drops_what_comes_within_20_ms_by_its_stamp() -> None:
         assert on.double.external_nav.rejected["too soon"] == 20
 
 
-@pytest.mark.parametrize("missing", ["VISO_TYPE", "EK3_SRC1_YAW"])
-async def test_without_either_parameter_nothing_is_taken_and_they_count_from_the_boot_on(missing: str) -> None:
-    async with line(ArduPilotDouble, ARDUPILOT | {missing: 0.0 if missing == "VISO_TYPE" else 1.0}) as on:
-        before = on.wrong_deg()
-        on.double.set_parameter(missing, ARDUPILOT[missing])
-        await on.stream(TRUE_DEG + 60.0, 1.0)
-        assert on.wrong_deg() == pytest.approx(before, abs=0.5)
-        on.double.reboot(0.5)
-        await asyncio.sleep(1.0)
-        await on.stream(TRUE_DEG + 60.0, 1.0)
-        assert on.wrong_deg() == pytest.approx(60.0, abs=0.5)
-
-
 async def test_ekf2_begins_with_the_stream_follows_it_and_ends_without() -> None:
     async with line(PX4Double, PX4) as on:
         vision = on.double.vision

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.flying.ardupilot import state_of
 from sim.flying.px4 import Truth, source_changes
-from sim.flying.truth import BEHIND_S, FlyingAircraft, State
+from sim.flying.truth import FlyingAircraft, State
 from sim.flying.verdict import Event, Record, figures, row
 from sim.imu_model import ImuModel
 from sim.scenario import site_at
@@ -46,14 +46,6 @@ def test_an_imu_integrates_to_the_attitude_however_slow_the_firmware_is(speed: f
     assert turned == pytest.approx(seen, abs=2e-3)
     assert seen == pytest.approx(0.75 * speed, abs=0.01)
     assert readings[:, 5] == pytest.approx(-9.80665, abs=1e-3)
-
-
-def test_what_is_measured_is_a_little_old() -> None:
-    aircraft = turning(1.0, 1.0)
-    assert aircraft.angles_rad(3.0)[2] == pytest.approx(3.0 - BEHIND_S, abs=2e-3)
-    assert aircraft.late == 0
-    aircraft.angles_rad(5.0)
-    assert aircraft.late == 1
 
 
 def test_what_arrives_late_is_not_lost_to_an_imu() -> None:

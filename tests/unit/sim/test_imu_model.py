@@ -64,18 +64,6 @@ def test_the_bias_does_not_depend_on_who_asks_when_and_how() -> None:
         assert row == pytest.approx(asked_late.expected(t_s), abs=1e-15)
 
 
-def test_readings_average_to_truth_plus_bias() -> None:
-    aircraft = VirtualAircraft(Pose(5.0, -3.0, 40.0))
-    imu = ImuModel(
-        aircraft, "icm42688p", seed=3, gyro_bias_rad_s=(5e-4, -3e-4, 8e-4), accel_bias_m_s2=(0.01, -0.02, 0.03)
-    )
-    times = np.arange(0.0, 60.0, 0.005)
-    mean = imu.read(times, 0.005).mean(axis=0)
-    truth, bias = aircraft.truth_at(0.0), imu.mean_bias(0.0, 60.0)
-    assert mean[:3] == pytest.approx(truth.rate_rad_s + bias.gyro_rad_s, abs=4.0 * imu.white[0] / math.sqrt(60.0))
-    assert mean[3:] == pytest.approx(truth.force_m_s2 + bias.accel_m_s2, abs=4.0 * imu.white[3] / math.sqrt(60.0))
-
-
 def test_temperature_moves_the_bias_from_its_reference() -> None:
     imu = ImuModel(VirtualAircraft(temperature_degc=lambda t_s: 25.0 + t_s / 100.0), "white_only")
     assert imu.true_bias(500.0).gyro_rad_s == pytest.approx([0.0, 0.0, 0.0])

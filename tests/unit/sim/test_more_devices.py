@@ -17,7 +17,7 @@ from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.binary_imus import WIT_Z_UP, WitMotionImu
 from sim.compasses import NmeaCompass, Os5000, PniCompass, RionCompass
 from sim.devices import SerialDevice
-from sim.families import COMPASSES, GRADIENTERS, IMUS
+from sim.families import IMUS
 from sim.gradienters import BeiInclinometer, Jewell, RionInclinometer
 from sim.imu_model import ImuModel
 from tests.support.decoders import make_decoder
@@ -201,22 +201,3 @@ def test_the_mean_of_what_is_decoded_is_the_truth_in_the_device_s_axes(
     assert gyro == pytest.approx(expected[:3] * signs, abs=2e-5)
     assert accel == pytest.approx(expected[3:] * signs, abs=2e-4)
     assert np.sign(accel[2]) == -signs[2]
-
-
-def test_a_stim300_as_a_gradienter_tells_the_tilt_and_is_older_by_its_latency() -> None:
-    device = GRADIENTERS["stim300"](VirtualAircraft(POSE), seed=4)
-    tilts = [sample for sample in decoded(device, "imu", 1.0)[0] if isinstance(sample, TiltSample)]
-    assert np.mean([tilt.y_deg for tilt in tilts]) == pytest.approx(5.0, abs=1e-3)
-    assert np.mean([tilt.x_deg for tilt in tilts]) == pytest.approx(-2.98859, abs=1e-3)
-    frame = device.frames_until(1.1)[-1]
-    assert frame.complete_s - frame.sampled_s == pytest.approx(506e-6 + device.line_time_s(len(frame.data)))
-
-
-def test_the_families_name_their_protocols() -> None:
-    for made in (GRADIENTERS, COMPASSES):
-        for name, make in made.items():
-            device = make(aircraft(), seed=1)
-            assert device.protocol == name
-            device.power_on(0.0)
-            # Those that only answer: to the question that the companion asks them.
-            assert device.frames_until(1.0) or device.command({"rion": RION_READ, "pni": PNI_READ}[name], 1.0)

@@ -4,73 +4,10 @@ from __future__ import annotations
 
 import asyncio
 
-import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.imu_model import DEG_H, MG
-from tests.support.px4_stage import ARM, CALIBRATE, LATEST_S, PX4Stage, now_s
-
-CASE_B_ACCEL = np.array([30.0, -30.0, 30.0]) * MG
-
-
-async def test_a_command_to_another_component_is_never_carried_out() -> None:
-    async with PX4Stage() as stage:
-        for target in ((1, 191), (1, 42), (2, 1)):
-            assert await stage.ground.command(CALIBRATE, 1, target=target, wait_s=0.5) == -1
-            assert await stage.ground.command(ARM, 1, target=target, wait_s=0.5) == -1
-        assert not stage.double.armed
-        assert not stage.double.calibrating
-        assert await stage.ground.command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, target=(0, 0)) == 0
-
-
-async def test_a_gyro_calibration_is_acknowledged_at_once_and_reported_in_texts() -> None:
-    async with PX4Stage(gyro_bias=np.radians([1.0, 1.0, 1.0]), spec="white_only") as stage:
-        begun_s = now_s()
-        assert await stage.ground.command(CALIBRATE, 1) == 0
-        assert now_s() - begun_s < 0.05
-        assert await stage.ground.command(CALIBRATE, 1) == 1  # busy
-        while "[cal] calibration done: gyro" not in stage.ground.texts():
-            await asyncio.sleep(0.01)
-            assert now_s() - begun_s < 5.0
-        texts = stage.ground.texts()
-        assert texts[0] == "[cal] calibration started: 2 gyro"
-        assert "[cal] progress <50>" in texts
-        await asyncio.sleep(LATEST_S)
-        error = stage.double.residual(1, now_s()).gyro_rad_s / DEG_H
-        assert np.abs(error).max() < 60.0
-        assert stage.acks(CALIBRATE, stage.ground) == [0, 1]  # there is no final acknowledgement
-
-
-async def test_a_gyro_calibration_says_done_and_changes_nothing_below_0_01_rad_s() -> None:
-    bias = np.array([1080.0, -1080.0, 1080.0]) * DEG_H
-    async with PX4Stage(gyro_bias=bias, spec="white_only") as stage:
-        assert await stage.ground.command(CALIBRATE, 1) == 0
-        await asyncio.sleep(3.0)
-        assert "[cal] calibration done: gyro" in stage.ground.texts()
-        assert [stage.double.parameter(f"CAL_GYRO0_{axis}OFF") for axis in "XYZ"] == [0.0, 0.0, 0.0]
-        assert stage.double.residual(1, now_s()).gyro_rad_s == pytest.approx(bias)
-
-
-async def test_texts_go_only_where_a_heartbeat_of_type_gcs_is_heard() -> None:
-    async with PX4Stage() as stage:
-        stage.double.say(mavlink.MAV_SEVERITY_INFO, "hello")
-        await asyncio.sleep(1.0)
-        assert stage.ground.texts() == ["hello"]
-        assert stage.companion.texts() == []
-        stage.companion.heartbeat(mavlink.MAV_TYPE_GCS)
-        await asyncio.sleep(0.5)
-        assert stage.companion.texts() == ["hello"]  # it waited, and is not 5 s old
-        await asyncio.sleep(3.0)
-        stage.double.say(mavlink.MAV_SEVERITY_INFO, "later")
-        await asyncio.sleep(6.0)
-        stage.companion.heartbeat(mavlink.MAV_TYPE_GCS)
-        await asyncio.sleep(0.5)
-        assert stage.companion.texts() == ["hello"]
-        long = "x" * 120
-        stage.double.say(mavlink.MAV_SEVERITY_INFO, long)
-        await asyncio.sleep(0.5)
-        assert "".join(stage.ground.texts()[-3:]) == long
+from tests.support.px4_stage import PX4Stage
 
 
 @pytest.mark.parametrize(("forward_1", "forward_0", "passes"), [(0, 1, False), (1, 0, False), (1, 1, True)])

@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.earth import STANDARD_GRAVITY_M_S2
-from sim.imu_model import DEG_H, MG
-from tests.support.px4_stage import ACCEL_BIAS, GYRO_BIAS, INTERVAL, LATEST_S, POSE, REQUEST, PX4Stage, now_s
+from sim.imu_model import MG
+from tests.support.px4_stage import INTERVAL, LATEST_S, POSE, REQUEST, PX4Stage, now_s
 
 HIGHRES, SCALED, SCALED2, SCALED3, RAW = 105, 26, 116, 129, 27
-MILLI_G = STANDARD_GRAVITY_M_S2 / 1000.0
 BIG_ACCEL = np.array([30.0, -30.0, 30.0]) * MG
 
 
@@ -35,19 +33,6 @@ async def stream(stage: PX4Stage, message_id: int, rate_hz: float, over_s: float
     return heard
 
 
-async def test_scaled_imu_is_the_corrected_sensor_truncated_toward_zero() -> None:
-    parameters = {"CAL_GYRO0_XOFF": 0.0123, "CAL_ACC0_YOFF": -0.2}
-    async with PX4Stage(parameters=parameters) as stage:
-        await asyncio.sleep(30.0)  # whatever the estimator has learned does not matter
-        heard = await stream(stage, SCALED, 50, 1.0, mavlink.MAVLink_scaled_imu_message)
-        truth = stage.aircraft.truth_at(0.0)
-        rate = (truth.rate_rad_s + GYRO_BIAS - [0.0123, 0.0, 0.0]) * 1000.0
-        force = (truth.force_m_s2 + ACCEL_BIAS + [0.0, 0.2, 0.0]) / MILLI_G
-        assert np.all(gyro_of(heard) == np.trunc(rate))
-        assert np.all(accel_of(heard) == np.trunc(force))
-        assert gyro_of(heard)[0].tolist() == [-11.0, 0.0, 0.0]  # -11.77, -0.32, 0.78
-
-
 async def test_noise_of_the_outputs_is_that_of_a_mean_over_the_interval_and_independent() -> None:
     async with PX4Stage(spec="white_only") as stage:
         heard = await stream(stage, HIGHRES, 250, 20.0, mavlink.MAVLink_highres_imu_message)
@@ -57,44 +42,6 @@ async def test_noise_of_the_outputs_is_that_of_a_mean_over_the_interval_and_inde
         centred = values - values.mean(axis=0)
         correlation = (centred[1:] * centred[:-1]).mean(axis=0) / centred.var(axis=0)
         assert np.abs(correlation).max() < 0.06
-
-
-async def test_highres_imu_gyro_tends_to_the_true_rate_whatever_the_calibration() -> None:
-    async with PX4Stage(parameters={"CAL_GYRO0_XOFF": -0.05}) as stage:
-        heard = await stream(stage, HIGHRES, 50, 10.0, mavlink.MAVLink_highres_imu_message)
-        earth = stage.aircraft.truth_at(0.0).rate_rad_s
-        assert gyro_of(heard[-50:]).mean(axis=0) == pytest.approx(earth, abs=4.0 * DEG_H)  # it wanders
-        assert heard[-1].id == 0
-
-
-async def test_scaled_imu_2_and_3_are_acknowledged_but_never_arrive_with_one_imu() -> None:
-    async with PX4Stage() as stage:
-        assert await stream(stage, SCALED2, 50, 1.0, mavlink.MAVLink_scaled_imu2_message) == []
-        assert await stream(stage, SCALED3, 50, 1.0, mavlink.MAVLink_scaled_imu3_message) == []
-    async with PX4Stage(imus=3) as stage:
-        assert len(await stream(stage, SCALED2, 50, 1.0, mavlink.MAVLink_scaled_imu2_message)) > 40
-        assert len(await stream(stage, SCALED3, 50, 1.0, mavlink.MAVLink_scaled_imu3_message)) > 40
-
-
-async def test_raw_imu_does_not_exist_and_heartbeats_cannot_be_had_faster() -> None:
-    async with PX4Stage() as stage:
-        assert await stage.companion.command(INTERVAL, RAW, 20000) == 4
-        assert await stage.companion.command(INTERVAL, 0, 200000) == 4
-        assert await stage.companion.command(INTERVAL, SCALED, 20000, 1.0) == 4
-        begun = len(stage.companion.all(mavlink.MAVLink_heartbeat_message))
-        await asyncio.sleep(10.0)
-        assert len(stage.companion.all(mavlink.MAVLink_heartbeat_message)) - begun == pytest.approx(10, abs=1)
-
-
-@pytest.mark.parametrize(
-    ("asked_hz", "seen_hz"), [(50, 50), (100, 100), (200, 125), (250, 250), (400, 250), (1000, 250)]
-)
-async def test_rates_are_quantised_by_the_250_hz_of_the_sensor(asked_hz: int, seen_hz: int) -> None:
-    async with PX4Stage() as stage:
-        heard = await stream(stage, SCALED, asked_hz, 10.0, mavlink.MAVLink_scaled_imu_message)
-        assert len(heard) / 10.0 == pytest.approx(seen_hz, rel=0.02)
-        times = [m.time_boot_ms for m in heard]
-        assert len(set(times)) == len(times)
 
 
 async def test_the_attitude_has_swallowed_the_accelerometer_bias_and_keeps_it_until_a_reboot() -> None:

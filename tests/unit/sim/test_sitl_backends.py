@@ -64,17 +64,6 @@ def test_a_json_frame_is_the_truth_of_the_tilted_aircraft_between_newlines() -> 
     assert frame["position"] == frame["velocity"] == [0, 0, 0]
 
 
-def test_noise_in_frames_has_the_density_of_the_part_at_any_rate() -> None:
-    aircraft = VirtualAircraft(TILTED)
-    for rate in (1000.0, 250.0):
-        imu = ImuModel(aircraft, "white_only", seed=3)
-        blocks = SampleBlocks(aircraft, [imu])
-        rows = np.array([blocks.next(1 / rate, n / rate).readings[0] for n in range(20_000)])
-        # ICM-42688-P: 2.8 mdps and 70 ug per root hertz, one-sided (autopilots 9.3).
-        np.testing.assert_allclose(rows[:, :3].std(axis=0), np.radians(2.8e-3) * np.sqrt(rate / 2), rtol=0.03)
-        np.testing.assert_allclose(rows[:, 3:].std(axis=0), 70e-6 * 9.80665 * np.sqrt(rate / 2), rtol=0.03)
-
-
 def test_samples_follow_the_wall_clock_within_a_fifth_and_jump_when_far_behind() -> None:
     aircraft = VirtualAircraft(TILTED, motions=[Turn(start_s=1.0, duration_s=1.0, heading_deg=90.0)])
     blocks = SampleBlocks(aircraft, [ImuModel(aircraft, "perfect")])

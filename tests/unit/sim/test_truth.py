@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -41,21 +40,6 @@ def test_gravity_at_the_poles_the_equator_and_in_beijing() -> None:
     assert normal_gravity_m_s2(40.0, 50.0) == pytest.approx(9.801543, abs=5e-7)
     fall_per_100_m = (normal_gravity_m_s2(45.0, 0.0) - normal_gravity_m_s2(45.0, 100.0)) / 9.80665e-6
     assert fall_per_100_m == pytest.approx(31.5, abs=0.1)  # micro-g
-
-
-def test_earth_rate_in_the_body_at_the_reference_pose() -> None:
-    aircraft = VirtualAircraft(Pose(5.0, -3.0, 40.0), Site(40.0, 116.0, 50.0))
-    rate = np.degrees(aircraft.truth_at(0.0).rate_rad_s) * 3600.0
-    assert rate == pytest.approx([9.64, -6.93, -9.24], abs=0.005)
-
-
-def test_a_level_aircraft_feels_gravity_upwards_and_a_nose_up_one_forwards() -> None:
-    level = VirtualAircraft(Pose())
-    assert level.truth_at(0.0).force_m_s2 == pytest.approx([0.0, 0.0, -level.site.gravity_m_s2], abs=1e-12)
-    nose_up = VirtualAircraft(Pose(pitch_deg=10.0)).truth_at(0.0).force_m_s2
-    assert nose_up[0] == pytest.approx(9.80154257 * math.sin(math.radians(10.0)), abs=1e-6)
-    right_down = VirtualAircraft(Pose(roll_deg=10.0)).truth_at(0.0).force_m_s2
-    assert right_down[1] == pytest.approx(-9.80154257 * math.sin(math.radians(10.0)), abs=1e-6)
 
 
 MOTIONS: list[Motion] = [
