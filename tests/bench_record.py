@@ -33,7 +33,7 @@ from tests.support.virtual_time import run_virtual
 
 LIMIT_MS: Final = 50.0
 _SOLVE: Final = "Estimator.solve.<locals>.<lambda>"
-_KEEP: Final = "CalibrationManager._keep.<locals>.save"
+_KEEP: Final = "RecordStore.save"
 SETTINGS: Final = """
 [push]
 parameters = false
@@ -42,8 +42,7 @@ min_still_s = 5
 max_s = 6
 at_arm = "off"
 """
-FILES: Final = (12_000, 6_000)
-"""Bytes of a trace and of a record."""
+RECORD_BYTES: Final = 6_000
 
 
 @contextlib.contextmanager
@@ -114,12 +113,11 @@ async def _calibrated(
 
 
 def disk_alone_s(folder: Path) -> float:
-    """Median of writing both files as the storage does."""
+    """Return the median time of writing a record as the storage does."""
     took = []
     for number in range(9):
         begun_s = time.perf_counter()
-        for size in FILES:
-            write_atomically(folder / f"{number}-{size}", os.urandom(size))
+        write_atomically(folder / f"{number}", os.urandom(RECORD_BYTES))
         took.append(time.perf_counter() - begun_s)
     return statistics.median(took)
 
@@ -166,9 +164,9 @@ def table(calibrations: int) -> None:
     for words, took_ms in (("serial IMU, gradienter, compass", own_ms),
                            ("the same and an autopilot's IMU, whose offsets are read again", both_ms)):  # fmt: skip
         print(f"{words:60} {took_ms[0]:6.1f} {statistics.median(took_ms):7.1f} {took_ms[-1]:6.1f}")
-    print(f"{'floor: the disk alone, for a record and its trace':60} {'':6} {disk_ms:7.1f}")
+    print(f"{'floor: the disk alone, for a record':60} {'':6} {disk_ms:7.1f}")
     print(f"{'processor time of it: biases':60} {1e3 * processor[_SOLVE]:6.1f}")
-    print(f"{'processor time of it: record, trace and files':60} {1e3 * processor[_KEEP]:6.1f}")
+    print(f"{'processor time of it: record and file':60} {1e3 * processor[_KEEP]:6.1f}")
     median_ms = statistics.median(own_ms)
     print(f"limit {LIMIT_MS:g} ms: median {median_ms:.1f} ms, {'held' if median_ms <= LIMIT_MS else 'NOT HELD'}; "
           f"load average {os.getloadavg()[0]:.1f}")  # fmt: skip

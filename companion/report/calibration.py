@@ -9,7 +9,6 @@ from typing import Final
 
 import msgspec
 
-from companion.estimation.collector.trace import Trace, VerdictTrace
 from companion.estimation.records.record import ArmingRecord, ImuRecord, Outcome, Record, outcome_word
 from companion.physics.units import UNITS
 from companion.report.markup import Child, Markup, cell, join, number, row, tag
@@ -29,7 +28,6 @@ from companion.report.page import (
 )
 from companion.samples import TRIADS, Triad
 
-MOST_EVENTS: Final = 15
 _ARMED: Final = attrgetter("armed_at", "state", "reason")
 _OUTCOMES: Final[dict[Outcome, tuple[str, str]]] = {
     "verified": ("ok", "read back, and seen in the telemetry"),
@@ -44,9 +42,6 @@ class Material(msgspec.Struct, frozen=True, kw_only=True):
 
     number: int
     record: Record
-    trace: Trace | None
-    no_trace: str
-    """Why there is no trace; empty where there is one."""
     earlier: Sequence[tuple[int, Record]]
     """Calibrations of the same aircraft, oldest first, this one last."""
     armings: Sequence[ArmingRecord]
@@ -71,7 +66,6 @@ def calibration_page(material: Material, now: datetime.datetime) -> str:
         _written(record),
         join(tag("h2", "Armed with it"), arming_items(map(_ARMED, material.armings))) if material.armings else None,
         _pose(record),
-        tag("section", tag("h2", "Was it still?"), *_stillness(material.trace, material.no_trace)),
         _drift(material),
     )
 
@@ -223,49 +217,6 @@ def _angle(value: float | None, sigma: float | None, sign: str) -> Markup:
         return join(number(value, f"{sign}.2f"), " deg")
     shown, width = with_sigma(value, sigma, 1.0, sign)
     return join(shown, " ± ", width, " deg")
-
-
-def _stillness(trace: Trace | None, no_trace: str) -> list[Child]:
-    """Say how much of the time was still, and what moved or failed when."""
-    if trace is None:
-        return [card("", f"Not shown: {no_trace}")]
-    if not trace.second:
-        return [card("", "Not one second was judged: no sensor sent anything.")]
-    parts: list[Child] = []
-    if trace.cut:
-        parts.append(card("caution", f"Only the last {len(trace.second)} s are kept; what came before is missing."))
-    if trace.measured is None:
-        words = f"{sum(trace.good)} of {len(trace.second)} s were still for all sensors. No result came of them."
-    else:
-        first, last = trace.measured
-        used = sum(good for second, good in zip(trace.second, trace.good, strict=True) if first <= second < last)
-        words = f"The result is the mean of {used} still seconds, from {first} s to {last} s"
-        words += f"; {last - first - used} in between were left out." if last - first > used else "."
-    events = sorted(run for verdict in trace.verdicts for run in disturbances(trace, verdict))
-    items = [
-        tag("li", tag("strong", f"{first} s: " if first == last else f"{first} s to {last + 1} s: "), said)
-        for first, last, said in events[:MOST_EVENTS]
-    ]
-    more = len(events) - MOST_EVENTS
-    items += [tag("li", f"and {more} more")] if more > 0 else []
-    return [*parts, tag("p", words), tag("ul", *items) if items else None]
-
-
-def disturbances(trace: Trace, verdict: VerdictTrace) -> list[tuple[int, int, str]]:
-    """List the seconds in a row in which one source moved or failed: first, last, and the words of the first."""
-    found: list[tuple[int, int, str]] = []
-    before: tuple[int, bool] | None = None
-    for second, words, fault in zip(trace.second, verdict.words, verdict.fault, strict=True):
-        if not words:
-            continue
-        if before == (second - 1, fault):
-            first, _, said = found[-1]
-            # The words of the first second, without its length.
-            found[-1] = first, second, said.replace(" silent for a second", " silent")
-        else:
-            found.append((second, second, words))
-        before = second, fault
-    return found
 
 
 def _drift(material: Material) -> Markup:

@@ -38,12 +38,6 @@ def material(directory: Path, wanted: int | None) -> Material:
         armings = BoundedList(directory / "armings.json", ArmingRecord, keep=0).all()
     except StorageError as error:
         damaged.append(str(error))
-    trace, why = None, "this record has no trace of its seconds (it is older, or its trace made room)."
-    try:
-        trace = store.trace(entry)
-    except StorageError as error:
-        why = f"{error}."
-        damaged.append(str(error))
     earlier = [
         (one.number, one.record)
         for one in entries
@@ -52,8 +46,6 @@ def material(directory: Path, wanted: int | None) -> Material:
     return Material(
         number=entry.number,
         record=record,
-        trace=trace,
-        no_trace="" if trace is not None else why,
         earlier=earlier[-MAX_EARLIER:],
         armings=[arming for arming in armings if arming.calibration == record.started_at],
         damaged=damaged,

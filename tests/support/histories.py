@@ -1,4 +1,4 @@
-"""Records and traces of an aircraft whose biases are known: what pages are made of."""
+"""Records of an aircraft whose biases are known: what pages are made of."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from companion.estimation.collector.trace import Trace, VerdictTrace
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp, kept
 from companion.estimation.records.record import (
     ArmingRecord,
@@ -116,39 +115,6 @@ def record(
     )
 
 
-def white_trace(
-    of: Record,
-    seconds: int = 40,
-    *,
-    moved: bool = False,
-) -> Trace:
-    """A trace of every second; `moved`: it never stood still for long."""
-    second = tuple(range(-5, seconds + 5))
-    shaken = [moved and k % 9 in (3, 4) for k in range(len(second))]
-    words = tuple("gyro fc moves 0.31 deg/s, max 0.10" if shake else None for shake in shaken)
-    names = [imu.name for imu in of.imus] or ["fc", "own"]
-    still: tuple[str | None, ...] = (None,) * len(second)
-    silent = tuple("no data from gradienter for 3 s" if moved and 20 < k < 26 else None for k in range(len(second)))
-    sources = [("imu", name, words if name == "fc" else still) for name in names]
-    sources += [("gradienter", "gradienter", silent), ("compass", "compass", still)]
-    return Trace(
-        started_at=of.started_at,
-        second=second,
-        good=tuple(not shake and hush is None for shake, hush in zip(shaken, silent, strict=True)),
-        measured=None if moved else (-4, seconds),
-        cut=False,
-        verdicts=tuple(
-            VerdictTrace(
-                kind=kind,  # type: ignore[arg-type]
-                name=name,
-                words=said,
-                fault=tuple(word is not None and word.startswith("no data") for word in said),
-            )
-            for kind, name, said in sources
-        ),
-    )
-
-
 def arming(of: Record, *, good: bool = True) -> ArmingRecord:
     """An arming three minutes after that calibration began."""
     at = datetime.datetime.fromisoformat(of.started_at) + datetime.timedelta(minutes=3)
@@ -181,7 +147,7 @@ def a_season(directory: Path, number: int = 30) -> list[Record]:
             made = record(k, state="cancelled", reason="cancelled by companion cancel")
         else:
             made = record(k, temperature_degc=round(float(rng.uniform(8.0, 31.0)), 2))
-        store.save(made, white_trace(made, moved=made.state != "done"))
+        store.save(made)
         records.append(made)
         if k % 2 == 0:
             armings.append(arming(made, good=made.state == "done"))

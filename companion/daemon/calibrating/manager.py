@@ -227,7 +227,7 @@ class CalibrationManager:
             result = JobResult("failed", f"internal error: {error!r}; the log has the details")
         if isinstance(job, CalibrationRun):
             job.product = record = job.make_record(result)
-            await self._keep(record, job)
+            await self._keep(record)
         else:
             await self._by_hand.keep(job, result)
         self._core.collector.retarget(self._core.wanted.settings)
@@ -282,23 +282,12 @@ class CalibrationManager:
 
     # --- records
 
-    async def _keep(self, record: Record, run: CalibrationRun) -> None:
-        """Save a record and the readings behind it; report a failure."""
+    async def _keep(self, record: Record) -> None:
+        """Save a record; report a failure."""
         self.last = record
-        seen = self._core.collector.snapshot(run.begun_s, run.measured_s)
-
-        def save() -> None:
-            try:
-                trace = seen.trace(record.started_at)
-            except Exception:
-                # Readings for a later look must not cost the record.
-                logger.exception("the readings of this calibration cannot be kept")
-                trace = None
-            self._store.save(record, trace)
-
         try:
             if record.is_worth_keeping:
-                await self._core.offload(save)
+                await self._core.offload(self._store.save, record)
         except StorageError as error:
             logger.error("%s", error)  # noqa: TRY400 - the traceback tells nothing more
             self._core.say(Severity.WARNING, f"Record not kept: {error}")

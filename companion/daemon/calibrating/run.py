@@ -311,11 +311,6 @@ class CalibrationRun(Job):
 
     # --- the record
 
-    @property
-    def measured_s(self) -> tuple[float, float] | None:
-        """Start and end of the window behind the estimate, loop time."""
-        return (self.measured.start_s, self.measured.end_s) if self.solution and self.measured else None
-
     def make_record(self, result: JobResult) -> Record:
         """Build the record; after a failure it holds what was known until then."""
         record = record_of(

@@ -17,7 +17,6 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.intake import ImuSource, PoseKind, PoseSource, Source
 from companion.estimation.collector.measurement import MIN_BATCHES, GroundWindows, Measurement, WindowSource, Work
 from companion.estimation.collector.outlook import Glance, Obstacle, Settings, Status
-from companion.estimation.collector.trace import Snapshot, TraceLog
 from companion.estimation.means.pose import CompassModel, FieldHeading, GradienterModel
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.seconds.batch import Batch
@@ -67,7 +66,6 @@ class RollingCollector:
         self._turns = TurnWatch(settings.max_slots)
         self._next: int | None = None
         self._now_s = -math.inf
-        self._trace = TraceLog()
         self._restarts = 0
         self.on_second: list[Callable[[], object]] = []
         """Called when every source has closed a second, from within the call that closed it: they only take note."""
@@ -294,10 +292,6 @@ class RollingCollector:
             turn=self.turn,
         )
 
-    def snapshot(self, started_s: float, measured_s: tuple[float, float] | None) -> Snapshot:
-        """Return the verdicts since `started_s`, or since the window `measured_s` (start, end) began; cheap."""
-        return self._trace.snapshot(started_s, measured_s)
-
     # ------------------------------------------------------------------------------------------------- inside
 
     def _sources(self) -> list[Source]:
@@ -360,7 +354,6 @@ class RollingCollector:
         for source in sources:  # the IMUs first: they say whether it moved
             good = source.judge(slot, moved=moved) and good
             moved = moved or (source.kind == "imu" and not source.verdict.still and not source.verdict.fault)
-        self._trace.add(slot, sources, good=good)
         if not self._windows.add(slot, good=good):
             self._break()
         if not self._watch_turn(slot, good=good):

@@ -89,7 +89,6 @@ def by_temperature(
     *,
     power_up: PowerUp | None,
     now_degc: float | None = None,
-    started_at: str = "",
 ) -> ByTemperature:
     """Build the summary of one IMU from its points and curves.
 
@@ -100,13 +99,12 @@ def by_temperature(
         accel: the accelerometers' curve.
         power_up: the present one; None: unknown.
         now_degc: the temperature; None: that of the last window of this power-up.
-        started_at: the calibration that counts as now, in a look back; empty: the last window of this power-up.
     """
     groups = by_power_up([point for point in points if point.temperature_degc is not None and point.gyro is not None])
     seen = [_window(point, k) for k, group in enumerate(groups) for point in group]
     same = (k for k, group in enumerate(groups) for p in group if power_up is not None and p.power_up.is_same(power_up))
     today = next(same, None)
-    of_today = [one for one in seen if one.power_up == today and started_at in ("", one.started_at)]
+    of_today = [one for one in seen if one.power_up == today]
     last = max(of_today, key=lambda one: one.at_unix_s, default=None)
     degc = now_degc if now_degc is not None or last is None else last.degc
     degcs = [one.degc for one in seen]

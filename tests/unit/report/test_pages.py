@@ -21,7 +21,7 @@ from companion.report.page import unix_s
 from companion.report.source import material
 from companion.samples import Vector
 from companion.storage.records import RecordStore
-from tests.support.histories import a_season, arming, imu_record, record, white_trace
+from tests.support.histories import a_season, arming, imu_record, record
 
 NOW = datetime.datetime(2026, 6, 1, 12, 0, tzinfo=datetime.UTC)
 LARGEST = 500_000
@@ -80,7 +80,7 @@ def _calibration(folder: Path, wanted: int | None = None) -> str:
 
 def test_the_figures_are_those_of_the_record(tmp_path: Path) -> None:
     one = record()
-    RecordStore(tmp_path).save(one, white_trace(one))
+    RecordStore(tmp_path).save(one)
     found = Page(_calibration(tmp_path))
     for imu in one.imus:
         for triad, unit, columns in (
@@ -112,7 +112,7 @@ def test_a_page_needs_nothing_else_and_stays_small(tmp_path: Path) -> None:
     store = RecordStore(tmp_path)
     for k in range(230):
         one = record(k, imus=tuple(imu_record(name, k) for name in names), warnings=tuple(["x" * 5000] * 100))
-        store.save(one, white_trace(one, 590) if k == 229 else None)
+        store.save(one)
     content = calibration_page(material(tmp_path, None), NOW)
     assert len(content.encode()) < LARGEST
     found = Page(content)
@@ -138,12 +138,8 @@ def test_nothing_from_a_file_becomes_a_tag(tmp_path: Path) -> None:
     assert one.site is not None
     one = msgspec.structs.replace(one, imus=(imu,), site=msgspec.structs.replace(one.site, source=evil), undone_at=evil)
     failed = record(1, state="failed", reason=evil)
-    trace = white_trace(one, moved=True)
-    verdicts = tuple(
-        msgspec.structs.replace(verdict, name=evil, words=(evil,) * len(trace.second)) for verdict in trace.verdicts
-    )
     store = RecordStore(tmp_path)
-    store.save(one, msgspec.structs.replace(trace, verdicts=verdicts))
+    store.save(one)
     store.save(failed)
     guilty = msgspec.structs.replace(arming(one), reason=evil)
     (tmp_path / "armings.json").write_bytes(msgspec.json.encode([guilty]))
@@ -166,26 +162,11 @@ def test_a_failure_says_why(tmp_path: Path) -> None:
     failed = record(
         state="failed", reason="not finished in the time given: hold still: gyro fc moves 0.31 deg/s, max 0.10"
     )
-    RecordStore(tmp_path).save(failed, white_trace(failed, moved=True))
+    RecordStore(tmp_path).save(failed)
     found = Page(_calibration(tmp_path))
     assert "FAILED" in found.text
     assert failed.reason in found.text
     assert "Nothing was written to the autopilot" in found.text
-    assert "16 s to 21 s:" in found.text
-    assert "no data from gradienter for 3 s" in found.text
-    assert "35 of 50 s were still for all sensors. No result came of them." in found.text
-
-
-def test_a_record_without_its_seconds_still_gives_a_page_that_says_so(tmp_path: Path) -> None:
-    store = RecordStore(tmp_path)
-    store.save(record(0))
-    store.save(record(1), white_trace(record(1)))
-    (tmp_path / "records" / "000002.trace.json.gz").write_bytes(b"cut")
-    old, broken = Page(_calibration(tmp_path, 1)), Page(_calibration(tmp_path, 2))
-    assert old.text.count("Not shown: this record has no trace of its seconds") == 1
-    assert "fc.gyro.bias.x" in old.exact
-    assert "000002.trace.json.gz: not a readable trace" in broken.text
-    assert "fc.gyro.bias.x" in broken.exact
 
 
 def test_a_clock_that_went_back_is_said_and_order_is_used(tmp_path: Path) -> None:
@@ -277,7 +258,7 @@ def test_whatever_a_record_holds_gives_pages(
         records.append((k, record(k, imus=(imu,), started_at=at, reason=words)))
     last = records[-1][1]
     one = calibration.Material(
-        number=2, record=last, trace=white_trace(last, 12), no_trace="", earlier=records, armings=[],
+        number=2, record=last, earlier=records, armings=[],
         damaged=[words],
     )  # fmt: skip
     drawn = [held for tag, held in Page(calibration_page(one, NOW)).tags if tag in {"path", "rect", "circle", "text"}]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import os
 import signal
 import subprocess
@@ -14,7 +13,6 @@ import msgspec
 import pytest
 
 from companion.errors import StorageError
-from companion.estimation.collector.trace import Trace
 from companion.estimation.records.record import GyroPrior, ImuRecord, Prior, Record, WrittenParameter, to_json
 from companion.storage import records as records_module
 from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
@@ -163,39 +161,6 @@ def test_a_record_that_was_changed_is_passed_over_and_one_from_before_there_were
     assert next(store.entries()).problem.endswith("damaged, or changed by hand")
 
 
-def _trace(record: Record) -> Trace:
-    return Trace(
-        started_at=record.started_at, second=(-1, 0), good=(True, False), measured=None, cut=False, verdicts=()
-    )
-
-
-def test_what_was_seen_lies_beside_its_record_and_goes_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(records_module, "KEEP", 4)
-    monkeypatch.setattr(records_module, "KEEP_TRACES", 2)
-    store = RecordStore(tmp_path)
-    for n in range(6):
-        record = _record(str(n))
-        store.save(record, _trace(record) if n != 4 else None)
-    entries = list(store.entries())
-    assert [entry.number for entry in entries] == [6, 5, 4, 3]
-    assert [store.trace(entry) for entry in entries] == [_trace(_record("5")), None, None, None]
-    assert len(list((tmp_path / "records").iterdir())) == 4 + 1
-    assert [record.reason for record in store.history()] == ["5", "4", "3", "2"]
-
-
-@pytest.mark.parametrize("damage", ["cut", "garbage", "empty", "bomb"])
-def test_a_damaged_trace_is_named(tmp_path: Path, damage: str) -> None:
-    store = RecordStore(tmp_path)
-    record = _record("good")
-    store.save(record, _trace(record))
-    path = tmp_path / "records" / "000001.trace.json.gz"
-    whole = path.read_bytes()
-    bomb = gzip.compress(b" " * (records_module.MAX_TRACE_BYTES + 1))
-    path.write_bytes({"cut": whole[:-20], "garbage": b"\x00\xff" * 40, "empty": b"", "bomb": bomb}[damage])
-    (entry,) = store.entries()
-    assert entry.record == record
-    with pytest.raises(StorageError, match=r"000001\.trace\.json\.gz: not a readable trace"):
-        store.trace(entry)
 
 
 def test_a_storage_directory_below_a_missing_folder_is_refused(tmp_path: Path) -> None:
