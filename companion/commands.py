@@ -251,7 +251,7 @@ class Undo(Command, frozen=True, tag="undo"):
 class AutopilotSetup(Command, frozen=True, tag="autopilot-setup"):
     """The parameters that the autopilot needs."""
 
-    help = "what the autopilot needs set: heading, gate, offsets, port"
+    help = "what the autopilot needs set: heading, gate, offsets"
 
 
 class History(Command, frozen=True, tag="history"):

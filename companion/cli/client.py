@@ -135,8 +135,6 @@ def setup_lines(answer: Object) -> list[str]:
     how = gate["problem"] or "the autopilot asks before it arms"
     lines.append(f"gate: {how}" if gate["at_arm"] == "gate" else f"gate: not wanted; for at_arm = gate: {how}")
     lines += [f"rival: {words}" for words in answer["rivals"]] or ["rivals: none: nothing overwrites the offsets"]
-    if answer["port"]:
-        lines += ["port:", *map(_row, answer["port"])]
     return lines
 
 

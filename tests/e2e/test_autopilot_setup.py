@@ -42,19 +42,6 @@ GATE: dict[Firmware, str] = {
     "px4": "set COM_ARM_AUTH_REQ 1",
 }
 RIVAL: dict[Firmware, str] = {"ardupilot": "INS_GYR_CAL", "px4": "IMU_GYRO_CAL_EN"}
-PORTS: dict[Firmware, dict[str, float]] = {
-    "ardupilot": {"SERIAL2_PROTOCOL": 1.0, "SERIAL2_BAUD": 921.0},
-    "px4": {"MAV_1_CONFIG": 102.0, "MAV_1_FORWARD": 0.0},
-}
-PORT: dict[Firmware, dict[str, tuple[float, float]]] = {
-    "ardupilot": {
-        "SERIAL1_PROTOCOL": (2, 2),
-        "SERIAL1_BAUD": (57, 57),
-        "SERIAL2_PROTOCOL": (1, 2),
-        "SERIAL2_BAUD": (921, 921),
-    },
-    "px4": {"MAV_1_CONFIG": (102, 102), "MAV_1_FORWARD": (0, 1)},
-}
 
 
 async def ask(rig: Rig) -> dict[str, Any]:
@@ -76,7 +63,7 @@ def test_what_is_to_be_set_is_said_and_nothing_is_written(tmp_path: Path, firmwa
             firmware=firmware,
             calibrated=False,
             used=False,
-            parameters={**BEFORE[firmware], **PORTS[firmware], RIVAL[firmware]: 1.0},
+            parameters={**BEFORE[firmware], RIVAL[firmware]: 1.0},
         ) as flying:
             rig = flying.rig
             shown = await ask(rig)
@@ -88,8 +75,6 @@ def test_what_is_to_be_set_is_said_and_nothing_is_written(tmp_path: Path, firmwa
             assert lines[0] == f"heading: not applied: {shown['reason']}"
             assert any(line.startswith(f"gate: not wanted; for at_arm = gate: {GATE[firmware]}") for line in lines)
             assert any(line.startswith(f"rival: {RIVAL[firmware]} = 1: ") for line in lines)
-            rows = {row["parameter"]: (row["now"], row["wanted"]) for row in shown["port"]}
-            assert rows == PORT[firmware]
             assert {name: rig.autopilot.parameter(name) for name in BEFORE[firmware]} == pytest.approx(BEFORE[firmware])
             await follow(rig)
             assert (await ask(rig))["state"] == "applied"

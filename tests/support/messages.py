@@ -32,7 +32,7 @@ NOT_FOR_PEOPLE = {
     # Expressions and templates of other tools.
     "compile", "Formatter", "JournalFormatter", "OneLineFormatter",
     # Reasons beside the parameters that `companion autopilot-setup` prints.
-    "HeadingSetting", "PortRow",
+    "HeadingSetting",
     # Names of tasks.
     "create_task", "Thread",
     # Words to a database.

@@ -27,7 +27,6 @@ from companion.autopilot.firmware.base import (
     Firmware,
     HeadingSetting,
     Net,
-    PortRow,
     RivalKind,
 )
 from companion.autopilot.firmware.imu_calibration import (
@@ -65,9 +64,6 @@ _EXTNAV, _COMPASS, _GYROS = 6.0, 1.0, 0.0
 _HEADING_SCRIPT: Final = "CMPG_HEADING"
 _GATE_SCRIPT: Final = "CMPG_ENABLE"
 """Parameters of the script (companion/lua): they exist while it runs."""
-
-_MAVLINK_1, _MAVLINK_2 = 1, 2
-_SERIALS: Final = range(1, 9)
 
 _ARDUPILOT_ONLY_DEG: Final = {41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0.0)}
 """PITCH_7, ROLL_45, ROLL_315 (ArduPilot's rotations.h)."""
@@ -206,19 +202,7 @@ class ArduPilot(Firmware):
             return "the arming script does not run (see: companion lua)"
         return "set CMPG_ENABLE 1" if enabled == 0 else None
 
-    # --- ports: no message tells on which one a component is heard, so all with MAVLink are shown
-
-    port_names = tuple(f"SERIAL{number}_{what}" for number in _SERIALS for what in ("PROTOCOL", "BAUD"))
-
-    def port_rows(self, found: Mapping[str, float], baud: int | None) -> list[PortRow]:
-        rows: list[PortRow] = []
-        for number in _SERIALS:
-            protocol, speed = f"SERIAL{number}_PROTOCOL", f"SERIAL{number}_BAUD"
-            if found.get(protocol) in (_MAVLINK_1, _MAVLINK_2):
-                rows.append(PortRow(protocol, found[protocol], _MAVLINK_2, "MAVLink 2"))
-                if speed in found:
-                    rows.append(PortRow(speed, found[speed], found[speed], "its speed, in thousands"))
-        return rows
+    # --- ports
 
     def port_needs(self, baud: int) -> str | None:
         return f"SERIALn_PROTOCOL = 2, SERIALn_BAUD = {baud // 1000}"

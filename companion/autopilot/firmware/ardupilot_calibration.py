@@ -26,7 +26,6 @@ from typing import Final, Literal
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.base import GyroCalibration, GyroOutcome, GyroParameters, OwnGyroCalibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, ImuParameters, Thermal, vector_changes
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import LiveParameters, Parameters, read_integer
@@ -209,10 +208,48 @@ async def thermal_changes(
 # --- gyros
 
 
-class GyrosAtRest(OwnGyroCalibration):
-    """Gyro calibration by command; see the top of this file."""
+@dataclasses.dataclass(frozen=True, slots=True)
+class GyroParameters:
+    """Every parameter that the firmware's own gyro calibration writes."""
+
+    values: Mapping[str, float]
+    gyros: tuple[int, ...]
+    """Instances with a gyro behind them."""
+    tcal: tuple[str, ...]
+    """Switches of temperature calibrations that are on: there the calibration changes what an offset means."""
+
+    def changed_in(self, after: GyroParameters) -> dict[str, tuple[float, float]]:
+        """Return what differs later: values before and after, by name."""
+        return {
+            name: (old, after.values[name])
+            for name, old in self.values.items()
+            if name in after.values and not same_float32(old, after.values[name])
+        }
+
+
+GyroOutcome = Literal["reset", "not converged", "unanswered", "not run"]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class GyroCalibration:
+    """End of the firmware's own gyro calibration.
+
+    "reset": converged, the EKF's gyro bias is reset. "not converged": the firmware stored its best guess, did not
+    reset the EKF, and refuses to arm ("Gyros not calibrated") until a gyro calibration succeeds or it restarts.
+    "unanswered": it ran, and the answer was lost. "not run": refused or lost, nothing has changed.
+    """
+
+    outcome: GyroOutcome
+    words: str
+    """For people; empty for "reset"."""
+    after: GyroParameters
+
+
+class GyrosAtRest:
+    """Gyro calibration by command; raises AutopilotError where no answer comes."""
 
     async def read(self, parameters: LiveParameters) -> GyroParameters:
+        """Read every parameter that it writes, of all instances."""
         vehicle = parameters.vehicle
         boots = vehicle.boots
         instances = {number: parameters_of(number) for number in INSTANCES}
@@ -235,6 +272,12 @@ class GyrosAtRest(OwnGyroCalibration):
     async def run(
         self, parameters: LiveParameters, before: GyroParameters, go_on: Callable[[str], None]
     ) -> GyroCalibration:
+        """Let the firmware calibrate, once; `before` was read just now, `go_on` is called with the progress in words.
+
+        Raises:
+            NotDisarmedError: not disarmed when the command was about to leave: nothing was done.
+            AutopilotError: no answer any more, or a restart; any of its parameters may have changed.
+        """
         vehicle = parameters.vehicle
         loop = asyncio.get_running_loop()
         boots = vehicle.boots
@@ -279,6 +322,7 @@ class GyrosAtRest(OwnGyroCalibration):
             answer.cancel()
 
     async def wait_until_over(self, parameters: LiveParameters, before: Mapping[str, float]) -> None:
+        """After an interruption, wait until one that may have been started has ended, or never ran."""
         # Old offsets, or zeros, tell nothing while it may run: it stores its result at its end.
         vehicle = parameters.vehicle
         loop = asyncio.get_running_loop()
@@ -295,6 +339,7 @@ class GyrosAtRest(OwnGyroCalibration):
         await asyncio.sleep(_AFTERWARDS_S)
 
     async def runs_at_start(self, parameters: Parameters) -> str | None:
+        """Return the parameter by which it runs at every start, or None."""
         return AT_START if await parameters.read_optional(AT_START) else None
 
 

@@ -7,14 +7,15 @@ every question, with "no" or a reason in words; nothing is measured or written t
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Literal, NamedTuple, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Literal
 
+from companion.autopilot.firmware.ardupilot_calibration import GyrosAtRest
 from companion.autopilot.firmware.imu_calibration import Acts, ImuCalibration, Range, Rival
 from companion.autopilot.firmware.imu_messages import ImuMessage
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.reading import FirmwareName, LiveParameters, Parameters, read_integer
+from companion.autopilot.parameters.reading import FirmwareName, Parameters, read_integer
 from companion.autopilot.parameters.wire import same_float32
 from companion.config.sections import Profile
 from companion.errors import AutopilotError, AutopilotRebootedError
@@ -62,75 +63,6 @@ NETS: Final[dict[Net, str]] = {
     "autopilot": "if our heading ends, the autopilot goes back to its magnetometer",
     "none": "if our heading ends there is none: fly only where you can land by hand",
 }
-
-
-class PortRow(NamedTuple):
-    """One parameter of the companion's port, as it is and as it should be."""
-
-    parameter: str
-    now: float
-    wanted: float
-    why: str
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class GyroParameters:
-    """Every parameter that the firmware's own gyro calibration writes."""
-
-    values: Mapping[str, float]
-    gyros: tuple[int, ...]
-    """Instances with a gyro behind them."""
-    tcal: tuple[str, ...]
-    """Switches of temperature calibrations that are on: there the calibration changes what an offset means."""
-
-    def changed_in(self, after: GyroParameters) -> dict[str, tuple[float, float]]:
-        """Return what differs later: values before and after, by name."""
-        return {
-            name: (old, after.values[name])
-            for name, old in self.values.items()
-            if name in after.values and not same_float32(old, after.values[name])
-        }
-
-
-GyroOutcome = Literal["reset", "not converged", "unanswered", "not run"]
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class GyroCalibration:
-    """End of the firmware's own gyro calibration.
-
-    "reset": converged, the EKF's gyro bias is reset. "not converged": the firmware stored its best guess, did not
-    reset the EKF, and refuses to arm ("Gyros not calibrated") until a gyro calibration succeeds or it restarts.
-    "unanswered": it ran, and the answer was lost. "not run": refused or lost, nothing has changed.
-    """
-
-    outcome: GyroOutcome
-    words: str
-    """For people; empty for "reset"."""
-    after: GyroParameters
-
-
-class OwnGyroCalibration(Protocol):
-    """A firmware's own calibration of its gyros; all of it raises AutopilotError where no answer comes."""
-
-    async def read(self, parameters: LiveParameters) -> GyroParameters:
-        """Read every parameter that it writes, of all instances."""
-
-    async def run(
-        self, parameters: LiveParameters, before: GyroParameters, go_on: Callable[[str], None]
-    ) -> GyroCalibration:
-        """Let the firmware calibrate, once; `before` was read just now, `go_on` is called with the progress in words.
-
-        Raises:
-            NotDisarmedError: not disarmed when the command was about to leave: nothing was done.
-            AutopilotError: no answer any more, or a restart; any of its parameters may have changed.
-        """
-
-    async def wait_until_over(self, parameters: LiveParameters, before: Mapping[str, float]) -> None:
-        """After an interruption, wait until one that may have been started has ended, or never ran."""
-
-    async def runs_at_start(self, parameters: Parameters) -> str | None:
-        """Return the parameter by which it runs at every start, or None."""
 
 
 class Firmware:
@@ -232,7 +164,7 @@ class Firmware:
         """Return the tilt that the EKF may keep from before these changes until a restart; 0: none owes one."""
         return 0.0
 
-    gyro_calibration: OwnGyroCalibration | None = None
+    gyro_calibration: GyrosAtRest | None = None
     """Own gyro calibration, where that resets the EKF's gyro bias and AHRS shows that bias."""
 
     why_no_thermal_write: str | None = None
@@ -328,13 +260,6 @@ class Firmware:
         return "this autopilot has no gate that is known here"
 
     # --- the port, and ground stations behind it
-
-    port_names: tuple[str, ...] = ()
-    """Parameters of the ports that the companion may be on; some releases and boards lack some."""
-
-    def port_rows(self, found: Mapping[str, float], baud: int | None) -> list[PortRow]:
-        """List the parameters of the companion's port; `baud`: of our serial line, None without one."""
-        return []
 
     def port_needs(self, baud: int) -> str | None:
         """Return the settings that the autopilot's end of a serial line needs; None: not known."""

@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.base import Firmware, HeadingSetting, Net, PortRow, RivalKind
+from companion.autopilot.firmware.base import Firmware, HeadingSetting, Net, RivalKind
 from companion.autopilot.firmware.imu_calibration import (
     ACCEL_SCALE_RANGE,
     DEGC_RANGE,
@@ -84,7 +84,6 @@ _MAGNETOMETER: Final = 1 << 10
 """Bit 10 of EKF2_SENS_EN."""
 SHORTEST_TIMEOUT_S: Final = 0.5
 """COM_ARM_AUTH_TO that leaves time for our answer."""
-_TELEM2: Final = 102
 _LINKS: Final = 3
 
 
@@ -261,20 +260,7 @@ class PX4(Firmware):
         ]
         return f"set {', '.join(wrong)}" if wrong else None
 
-    # --- ports: no message tells on which one a component is heard; MAV_1, on TELEM 2, is meant for it
-
-    port_names = ("MAV_1_CONFIG", "SER_TEL2_BAUD", "MAV_1_FORWARD")
-
-    def port_rows(self, found: Mapping[str, float], baud: int | None) -> list[PortRow]:
-        config, speed, forward = self.port_names
-        rows: list[PortRow] = []
-        if config in found:
-            rows.append(PortRow(config, found[config], _TELEM2, "MAVLink on TELEM 2"))
-        if baud is not None and found.get(config) == _TELEM2 and speed in found:
-            rows.append(PortRow(speed, found[speed], baud, "as in mavlink.url"))
-        if forward in found:
-            rows.append(PortRow(forward, found[forward], 1, "ground stations reach the companion"))
-        return rows
+    # --- ports
 
     def port_needs(self, baud: int) -> str | None:
         return f"MAV_1_CONFIG = 102, SER_TEL2_BAUD = {baud}"

@@ -50,7 +50,6 @@ class Heading(Subsystem):
     async def _answer_setup(self, _request: AutopilotSetup, _face: str) -> AsyncIterator[Object]:
         firmware = self._core.vehicle.kind
         found = await self._core.parameters.read_many(firmware.heading_names(), optional=True)
-        port = await self._core.parameters.read_many(firmware.port_names, optional=True)
         changes = firmware.heading_changes(found)
         gate = await firmware.find_gate_problem(self._core.parameters, self._core.vehicle.system_id, 0.0)
         sends, todo = (
@@ -90,7 +89,6 @@ class Heading(Subsystem):
             "risks": list(firmware.heading_risks) if concerned else [],
             "gate": {"at_arm": self._core.wanted.at_arm, "problem": gate},
             "rivals": [rival.words for rival in await firmware.read_rivals(self._core.parameters)],
-            "port": [row._asdict() for row in firmware.port_rows(port, models.baud_of(self._core.config.mavlink.url))],
         }
 
     def status(self) -> Object:  # noqa: D102

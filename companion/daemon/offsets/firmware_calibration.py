@@ -22,7 +22,7 @@ from typing import Final
 
 import msgspec
 
-from companion.autopilot.firmware.base import GyroOutcome, GyroParameters, OwnGyroCalibration
+from companion.autopilot.firmware.ardupilot_calibration import GyroOutcome, GyroParameters, GyrosAtRest
 from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.vehicle.ekf import SETTLED_RAD_S, EkfWatch
 from companion.autopilot.vehicle.parameter_client import ParameterClient
@@ -136,7 +136,7 @@ class FirmwareCalibration:
 
     async def _restore(
         self,
-        own: OwnGyroCalibration,
+        own: GyrosAtRest,
         changes: Sequence[Change],
         before: GyroParameters,
         boots: int,

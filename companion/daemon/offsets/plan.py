@@ -11,7 +11,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.autopilot.firmware.base import GyroOutcome
+from companion.autopilot.firmware.ardupilot_calibration import GyroOutcome
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
 from companion.autopilot.firmware.imu_messages import StreamKind
 from companion.autopilot.firmware.px4 import warnings_about

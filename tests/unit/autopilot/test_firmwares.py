@@ -8,10 +8,8 @@ from typing import get_args
 
 import pytest
 
-from companion.autopilot.firmware.ardupilot import ArduPilot
 from companion.autopilot.firmware.base import Firmware
 from companion.autopilot.firmware.firmwares import FIRMWARES, OTHER, UNHEARD, firmware_named, firmware_with, port_needs
-from companion.autopilot.firmware.px4 import PX4
 from companion.autopilot.parameters.reading import FirmwareName
 from companion.errors import AutopilotError
 
@@ -47,23 +45,6 @@ def test_an_unknown_one_has_nothing_to_measure_or_to_write(firmware: Firmware) -
 
 
 # --- the companion's port
-
-
-def test_px4_telem2_is_to_run_at_our_speed_and_to_forward() -> None:
-    found = {"MAV_1_CONFIG": 102.0, "SER_TEL2_BAUD": 57600.0, "MAV_1_FORWARD": 0.0}
-    assert found.keys() == set(PX4.port_names)
-    rows = {row.parameter: row.wanted for row in PX4().port_rows(found, 921600)}
-    assert rows == {"MAV_1_CONFIG": 102, "SER_TEL2_BAUD": 921600, "MAV_1_FORWARD": 1}
-    # By UDP, or on another port, the speed of TELEM 2 is nobody's business.
-    assert "SER_TEL2_BAUD" not in {row.parameter for row in PX4().port_rows(found, None)}
-    assert "SER_TEL2_BAUD" not in {row.parameter for row in PX4().port_rows(found | {"MAV_1_CONFIG": 0.0}, 921600)}
-
-
-def test_ardupilots_mavlink_ports_are_named_and_others_not() -> None:
-    found = {"SERIAL1_PROTOCOL": 2.0, "SERIAL1_BAUD": 57.0, "SERIAL2_PROTOCOL": 1.0, "SERIAL3_PROTOCOL": 5.0}
-    assert found.keys() < set(ArduPilot.port_names)
-    rows = {row.parameter: (row.now, row.wanted) for row in ArduPilot().port_rows(found, 921600)}
-    assert rows == {"SERIAL1_PROTOCOL": (2, 2), "SERIAL1_BAUD": (57, 57), "SERIAL2_PROTOCOL": (1, 2)}
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,7 @@ from typing import cast
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmware.ardupilot_calibration import TIMEOUT_S, GyrosAtRest
-from companion.autopilot.firmware.base import GyroParameters
+from companion.autopilot.firmware.ardupilot_calibration import TIMEOUT_S, GyroParameters, GyrosAtRest
 from companion.autopilot.parameters.reading import LiveParameters
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.errors import NotDisarmedError
