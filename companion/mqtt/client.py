@@ -138,12 +138,7 @@ class MqttLink:
             "good": since_s is not None and not refused_now,
             "summary": words,
             "connected": since_s is not None,
-            "connected_since": None if since_s is None else self._since.isoformat(timespec="seconds"),
-            "connected_s": None if since_s is None else round(since_s, 1),
-            "connections": self.connections,
             "last_error": self.last_error,
-            "retry_in_s": None if retry_s is None else round(retry_s, 1),
-            "dropped": self.outbox.dropped,
         }
 
     async def run(self) -> None:

@@ -10,21 +10,24 @@ import asyncio
 import datetime
 import logging
 import math
+import re
 from collections import deque
 from collections.abc import Awaitable, Callable
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from companion.config.sections import Fleet
+import msgspec
+
+from companion.config.sections import Fleet, Location
 from companion.errors import CompanionError
-from companion.formats import Object, utc_now
+from companion.formats import Object, decode, utc_now
 from companion.links.system.waiting import comes
-from companion.mqtt import fleet_wire as wire
 from companion.mqtt.client import Incoming, MqttLink
 from companion.mqtt.daemon import Daemon
 from companion.mqtt.fleet_sources import Look, Sources, utc
-from companion.storage.fleet_items import Clock, FleetItems, Kept, Mark, SourceItems
+from companion.storage.fleet_items import Clock, FleetItems, Kept, Mark, SourceItems, Waiting
+from companion.storage.state import UNREADABLE
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +47,28 @@ CURVES_EVERY_S: Final = 6 * 3600.0
 INBOX: Final = 64
 AIRCRAFT, CURVE = "aircraft", "curve/"
 """Marks: the last aircraft, and the curve that was told last."""
+
+FORMAT_VERSION: Final = 1
+MOST_RANGES: Final = 256
+MOST_SEQUENCE: Final = 2**53
+
+_Sequence = Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
+
+_ROUNDED: Final[dict[str, int]] = {
+    "latitude_deg": 2,
+    "longitude_deg": 2,
+    "height_m": -2,
+    "gravity_m_s2": 3,
+    "declination_deg": 1,
+    "field_gauss": 3,
+    "field_expected_gauss": 3,
+    "inclination_deg": 1,
+    "inclination_expected_deg": 1,
+}
+"""Figures that give away a place (gravity and the field do, too), and the decimals that leave it a kilometre."""
+_WORKED_OUT: Final[dict[str, object]] = {"covariance": None, "effective": None}
+"""Figures whose digits give away the gravity and the latitude behind them, and their substitutes."""
+_EARTHS: Final = re.compile(r"(the Earth's) [\d.]+")
 
 
 class AircraftFleet:
@@ -212,14 +237,14 @@ class AircraftFleet:
         heard = bool(self._inbox)
         while self._inbox:
             message = self._inbox.popleft()
-            said = wire.parse(message.payload)
+            said = parse(message.payload)
             for kept in self._kept:
                 if said is not None and message.topic in _heard(kept.aircraft):
                     await self._heed(kept.aircraft, said, confirmed=message.topic.endswith("/confirmed"))
         if heard:
             await self._count()
 
-    async def _heed(self, aircraft: str, said: wire.Said, *, confirmed: bool) -> None:
+    async def _heed(self, aircraft: str, said: Said, *, confirmed: bool) -> None:
         if confirmed:
             if await self._offload(self._items.confirm, aircraft, said.epoch, said.sequences, utc(utc_now())):
                 self._under_way = {one for one in self._under_way if one[0] != aircraft or not said.names(one[1])}
@@ -252,10 +277,16 @@ class AircraftFleet:
         for kept in news:
             for topic in _heard(kept.aircraft):
                 await link.hear(topic)
-            hello = f"fleet/{kept.aircraft}/hello"
-            name = self._settings.name if kept.aircraft == self._of else None
-            link.outbox.keep(hello, wire.hello(kept, name, utc(utc_now())))
-            link.outbox.send_again(hello)  # though it be the same as before
+            hello = {
+                "format_version": FORMAT_VERSION,
+                "aircraft": kept.aircraft,
+                "name": self._settings.name if kept.aircraft == self._of else None,
+                "epoch": kept.epoch,
+                "first": kept.first,
+                "last": kept.last,
+                "at": utc(utc_now()),
+            }
+            link.outbox.keep(f"fleet/{kept.aircraft}/hello", msgspec.json.encode(hello), again=True)
             self._greeted[kept.aircraft], self._hello_s = kept.last, now_s
 
     def _begin_again(self) -> None:
@@ -281,7 +312,7 @@ class AircraftFleet:
             batch = await self._offload(self._items.waiting, 0, WINDOW)
         for waiting in batch:
             topic = f"fleet/{waiting.aircraft}/item"
-            link.outbox.answer(topic, wire.item(waiting, self._settings.location), droppable=True)
+            link.outbox.answer(topic, encode_item(waiting, self._settings.location), droppable=True)
         self._under_way = {(waiting.aircraft, waiting.sequence) for waiting in batch}
         self._sent = batch[-1].number if batch else 0
         self._expires_s = now_s + self._wait_s
@@ -290,3 +321,63 @@ class AircraftFleet:
 def _heard(aircraft: str) -> tuple[str, str]:
     """Return the topics on which a collector answers an aircraft."""
     return f"fleet/{aircraft}/confirmed", f"fleet/{aircraft}/wanted"
+
+
+# --- payloads: docs/fleet/asyncapi.yaml
+
+
+class Said(msgspec.Struct, frozen=True):
+    """Sequences that a collector has, or wants."""
+
+    epoch: str
+    sequences: Annotated[list[tuple[_Sequence, _Sequence]], msgspec.Meta(max_length=MOST_RANGES)]
+
+    def names(self, sequence: int) -> bool:
+        """Return whether a sequence is among them."""
+        return any(first <= sequence <= last for first, last in self.sequences)
+
+
+def parse(payload: bytes) -> Said | None:
+    """Read what a collector says; None: it is something else, or of a newer version. Never raises."""
+    try:
+        said: Said = decode(payload, Said, FORMAT_VERSION)
+    except UNREADABLE:
+        return None
+    return said if all(first <= last for first, last in said.sequences) else None
+
+
+def encode_item(waiting: Waiting, location: Location) -> bytes:
+    """Encode the payload of an item, with the place as exact as configured."""
+    told = waiting.item
+    try:
+        body = msgspec.json.decode(told.body)
+    except UNREADABLE:
+        body = {}  # the disk has spoilt it
+    return msgspec.json.encode(
+        {
+            "format_version": FORMAT_VERSION,
+            "aircraft": waiting.aircraft,
+            "epoch": waiting.epoch,
+            "sequence": waiting.sequence,
+            "kind": told.kind,
+            "at": told.at,
+            "clock": told.clock,
+            "body": body if location == "full" else _less_place(body, location),
+        }
+    )
+
+
+def _less_place(value: Any, location: Location, key: str = "") -> Any:
+    if isinstance(value, list):
+        return [_less_place(each, location, key) for each in value]
+    if isinstance(value, dict):
+        return {
+            name: _WORKED_OUT[name] if name in _WORKED_OUT else _less_place(each, location, name)
+            for name, each in value.items()
+        }
+    if isinstance(value, str):
+        return _EARTHS.sub(r"\1 ?", value)
+    if key in _ROUNDED:
+        return None if location == "off" or value is None else round(value, _ROUNDED[key])
+    # Two digits of a sigma are what it is worth; more would tell the latitude, as above.
+    return float(f"{value:.2g}") if "sigma" in key and isinstance(value, float) else value

@@ -56,9 +56,9 @@ class Outbox:
     def __len__(self) -> int:
         return len(self._unsent) + len(self._answers) + len(self._passing)
 
-    def keep(self, topic: str, payload: bytes) -> None:
-        """Have the broker keep a payload; an empty one has it forget the topic."""
-        if self._kept.get(topic) != payload:
+    def keep(self, topic: str, payload: bytes, *, again: bool = False) -> None:
+        """Have the broker keep a payload; an empty one has it forget the topic. `again`: send it though it is kept."""
+        if again or self._kept.get(topic) != payload:
             self._kept[topic] = payload
             self._unsent[topic] = None
             self._tell()
@@ -66,12 +66,6 @@ class Outbox:
     def kept(self, topic: str) -> bytes | None:
         """Return the payload that the broker keeps under a topic."""
         return self._kept.get(topic)
-
-    def send_again(self, topic: str) -> None:
-        """Send the kept payload once more, after somebody else has overwritten it."""
-        if topic in self._kept:
-            self._unsent[topic] = None
-            self._tell()
 
     def answer(self, topic: str, payload: bytes, *, droppable: bool) -> None:
         """Send an answer once."""

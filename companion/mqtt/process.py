@@ -20,7 +20,6 @@ from companion.mqtt.client import Incoming, MqttLink
 from companion.mqtt.daemon import Ask, Daemon
 from companion.mqtt.fleet import AircraftFleet
 from companion.mqtt.requests import Requests
-from companion.mqtt.topics import OFFLINE, ONLINE, Pace, Topics, summary
 
 logger = logging.getLogger(__name__)
 _json: Final = msgspec.json.encode
@@ -34,6 +33,14 @@ PROGRESS_S: Final = 0.5
 AFTER_FAULT_S: Final = 30.0
 ANSWER_AT_END_S: Final = 0.5
 FLUSH_S: Final = 1.0
+
+ONLINE = b"online"
+OFFLINE = b"offline"
+LEAST_S: Final = 1.0
+SLOW_S: Final = 10.0
+_COPIED = ("state", "reason", "progress", "waiting_for", "warnings", "fault", "putting_back", "last")
+_ARMING = ("at_arm", "verdict", "words", "state", "in_force")
+_VEHICLE = ("system_id", "firmware", "armed", "summary")
 
 
 class MqttProcess:
@@ -127,11 +134,11 @@ class MqttProcess:
             on_message=self._on_message,
         )
         self._requests = Requests(self.daemon.ask, self._respond, self._on_retained)
-        publisher = _Publisher(self.daemon, link, topics)
+        self._pace, self._progress, self._progress_s = Pace(), b"", -math.inf
         running = asyncio.get_running_loop().create_task(link.run(), name="mqtt link")
         try:
             while self._base() == base:
-                publisher.publish()
+                self._publish(link, topics)
                 if running.done():
                     running.result()
                 await self._news()
@@ -142,13 +149,36 @@ class MqttProcess:
         except asyncio.CancelledError:
             await self._requests.close(ANSWER_AT_END_S)
             await self.daemon.refresh()
-            publisher.publish()
+            self._publish(link, topics)
             link.outbox.keep(topics.status, OFFLINE)
             raise
         finally:
             await link.flush(FLUSH_S)
             running.cancel()
             await asyncio.wait([running], timeout=FLUSH_S)
+
+    def _publish(self, link: MqttLink, topics: Topics) -> None:
+        """Put into the outbox what has changed since the last call."""
+        daemon, outbox = self.daemon, link.outbox
+        outbox.keep(topics.status, ONLINE if daemon.alive else OFFLINE)
+        if daemon.status is None:
+            return
+        now_s = asyncio.get_running_loop().time()
+        if daemon.record is not None:
+            outbox.keep(topics.record, _json(daemon.record))
+        state = summary(daemon.status)
+        if self._pace.is_due(state, now_s):
+            outbox.keep(topics.state, _json(state))
+        if not link.connected:
+            return
+        job = daemon.status["job"]
+        progress = b"" if job is None else _json(job)
+        busy = daemon.status["progress"] is not None
+        if progress != self._progress and (now_s - self._progress_s >= PROGRESS_S or not busy):
+            outbox.pass_on(topics.progress, progress)
+            self._progress, self._progress_s = progress, now_s
+        if daemon.pose is not None:
+            outbox.pass_on(topics.attitude, _json(daemon.pose))
 
     # --- messages received
 
@@ -158,7 +188,7 @@ class MqttProcess:
         if message.topic == self.topics.status:
             if message.payload != ONLINE and self.link.outbox.kept(message.topic) == ONLINE:
                 # The last will of an earlier connection, come late.
-                self.link.outbox.send_again(message.topic)
+                self.link.outbox.keep(message.topic, ONLINE, again=True)
         elif message.topic.startswith(self.topics.request):
             command = message.topic.removeprefix(self.topics.request)
             self._requests.accept(command, message.payload, retained=message.retained)
@@ -178,32 +208,65 @@ class MqttProcess:
             self.link.outbox.answer(self.topics.response + command, _json(response), droppable=droppable)
 
 
-class _Publisher:
-    """Puts into the outbox what has changed since the last call."""
+def summary(status: Object) -> Object:
+    """Return the part of the status that is published as the state: no figures that change all the time."""
+    return {
+        **{key: status[key] for key in _COPIED},
+        "vehicle": {key: status["vehicle"][key] for key in _VEHICLE},
+        "arming": {key: status["arming"][key] for key in _ARMING},
+        "devices": [
+            {
+                "name": device["name"],
+                "kind": device["kind"],
+                "good": device["good"],
+                "problem": None if device["good"] else device["summary"],
+            }
+            for device in status["devices"]
+        ],
+    }
 
-    def __init__(self, daemon: Daemon, link: MqttLink, topics: Topics) -> None:
-        self._daemon, self._link, self._topics = daemon, link, topics
-        self._pace = Pace()
-        self._progress, self._progress_s = b"", -math.inf
 
-    def publish(self) -> None:
-        daemon, outbox, topics = self._daemon, self._link.outbox, self._topics
-        outbox.keep(topics.status, ONLINE if daemon.alive else OFFLINE)
-        if daemon.status is None:
-            return
-        now_s = asyncio.get_running_loop().time()
-        if daemon.record is not None:
-            outbox.keep(topics.record, _json(daemon.record))
-        state = summary(daemon.status)
-        if self._pace.is_due(state, now_s):
-            outbox.keep(topics.state, _json(state))
-        if not self._link.connected:
-            return
-        job = daemon.status["job"]
-        progress = b"" if job is None else _json(job)
-        busy = daemon.status["progress"] is not None
-        if progress != self._progress and (now_s - self._progress_s >= PROGRESS_S or not busy):
-            outbox.pass_on(topics.progress, progress)
-            self._progress, self._progress_s = progress, now_s
-        if daemon.pose is not None:
-            outbox.pass_on(topics.attitude, _json(daemon.pose))
+class Pace:
+    """Says when a state is worth a message.
+
+    At once when the state itself changes, within a second when anything else does; every ten seconds when only words
+    change that tell how long ago something was.
+    """
+
+    def __init__(self) -> None:
+        self._said: Object | None = None
+        self._said_s = 0.0
+
+    def is_due(self, state: Object, now_s: float) -> bool:
+        """Return whether to send a state now; then it counts as sent."""
+        said = self._said
+        if said == state:
+            return False
+        due = (
+            said is None
+            or said["state"] != state["state"]
+            or now_s - self._said_s >= (SLOW_S if _lasting(said) == _lasting(state) else LEAST_S)
+        )
+        if due:
+            self._said, self._said_s = state, now_s
+        return due
+
+
+def _lasting(state: Object) -> Object:
+    return {**state, "arming": {**state["arming"], "in_force": None, "words": None}}
+
+
+class Topics:
+    """All topics under one base, such as "companion/1"."""
+
+    def __init__(self, base: str) -> None:
+        self.base = base
+        self.status = f"{base}/status"
+        self.state = f"{base}/state"
+        self.record = f"{base}/calibration/state"
+        self.progress = f"{base}/calibration/progress"
+        self.attitude = f"{base}/attitude"
+        self.kept = (self.status, self.state, self.record)
+        """Topics that the broker keeps."""
+        self.request, self.response = f"{base}/request/", f"{base}/response/"
+        """Topics of a request and its response, without the name of the command."""

@@ -15,8 +15,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from companion.errors import StorageError
-from companion.mqtt import fleet_wire as wire
-from companion.storage.fleet_items import FILE, FleetItems, Item, Mark, SourceItems
+from companion.mqtt import fleet as wire
+from companion.storage.fleet_items import FILE, FleetItems, Item, Mark, SourceItems, Waiting
 from tests.support.extent import extent
 from tests.support.fleet import CRANE, HERON
 

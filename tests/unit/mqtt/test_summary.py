@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from companion.mqtt.topics import LEAST_S, SLOW_S, Pace, summary
+from companion.mqtt.process import LEAST_S, SLOW_S, Pace, summary
 
 
 def status(**more: Any) -> dict[str, Any]:

@@ -14,7 +14,6 @@ import pytest
 
 from companion.errors import StorageError
 from companion.estimation.records.record import GyroPrior, ImuRecord, Prior, Record, WrittenParameter, to_json
-from companion.storage import records as records_module
 from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.records import RecordStore
 from companion.storage.state import only_daemon, write_atomically
@@ -159,8 +158,6 @@ def test_a_record_that_was_changed_is_passed_over_and_one_from_before_there_were
     path.write_bytes(path.read_bytes().replace(b'"duration_s":12.0', b'"duration_s":19.0'))
     assert [record.reason for record in store.history()] == ["of before"]
     assert next(store.entries()).problem.endswith("damaged, or changed by hand")
-
-
 
 
 def test_a_storage_directory_below_a_missing_folder_is_refused(tmp_path: Path) -> None:
