@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from sim.flying.flight import Flight
-
+from sim.devices import SerialDevice
+from sim.flying.vehicle import FlyingVehicle
+from sim.imu_model import ImuModel
+from sim.sitl.ground import GroundStation
+from sim.sitl.lossy_link import LossyLink
 
 DRIFT_DEG_S = 3.0
 LIE_DEG = 40.0
@@ -22,24 +24,49 @@ RESTARTED_S = 1.0
 """What a service manager waits before it starts it anew."""
 
 
-async def _kill(on: Flight) -> None:
+class Aloft(Protocol):
+    """What a fault can get at."""
+
+    vehicle: FlyingVehicle
+    ground: GroundStation
+    link: LossyLink
+
+    @property
+    def compass(self) -> SerialDevice:
+        """The companion's."""
+
+    @property
+    def serial_imu(self) -> ImuModel:
+        """The companion's."""
+
+    def signal(self, number: signal.Signals) -> None:
+        """To the daemon."""
+
+    async def start_daemon(self) -> None:
+        """Start it anew."""
+
+    def in_background(self, work: Coroutine[Any, Any, None]) -> None:
+        """Goes on until the end of the flight."""
+
+
+async def _kill(on: Aloft) -> None:
     on.signal(signal.SIGKILL)
 
 
-async def _stop(on: Flight) -> None:
+async def _stop(on: Aloft) -> None:
     on.signal(signal.SIGSTOP)
 
 
-async def _cut(on: Flight) -> None:
+async def _cut(on: Aloft) -> None:
     on.link.loss = 1.0
 
 
-async def _gyro_drifts(on: Flight) -> None:
+async def _gyro_drifts(on: Aloft) -> None:
     gyro, accel = on.serial_imu.true_bias(on.vehicle.now_s)
     on.serial_imu.turn_on(gyro + np.radians([0.0, 0.0, DRIFT_DEG_S]), accel)
 
 
-async def _compass_drifts(on: Flight) -> None:
+async def _compass_drifts(on: Aloft) -> None:
     async def drift() -> None:
         while True:
             _turn_compass(on, DRIFT_DEG_S * STEP_S)
@@ -48,7 +75,7 @@ async def _compass_drifts(on: Flight) -> None:
     on.in_background(drift())
 
 
-async def _compass_lies(on: Flight) -> None:
+async def _compass_lies(on: Aloft) -> None:
     _turn_compass(on, LIE_DEG)
 
 
@@ -57,8 +84,8 @@ def _turn_compass(on: Flight, degrees: float) -> None:
     device.heading_error_deg += degrees
 
 
-def _killed_for(seconds: float) -> Callable[[Flight], Awaitable[None]]:
-    async def strike(on: Flight) -> None:
+def _killed_for(seconds: float) -> Callable[[Aloft], Awaitable[None]]:
+    async def strike(on: Aloft) -> None:
         on.signal(signal.SIGKILL)
 
         async def comes_back() -> None:
@@ -70,12 +97,12 @@ def _killed_for(seconds: float) -> Callable[[Flight], Awaitable[None]]:
     return strike
 
 
-async def _own_compass_lies(on: Flight) -> None:
+async def _own_compass_lies(on: Aloft) -> None:
     await on.vehicle.lie_with_own_compass(on.ground)
     on.signal(signal.SIGKILL)
 
 
-async def _nothing(on: Flight) -> None:
+async def _nothing(on: Aloft) -> None:
     pass
 
 
@@ -84,7 +111,7 @@ class Fault:
     """Something that happens in the air."""
 
     words: str
-    strike: Callable[[Flight], Awaitable[None]]
+    strike: Callable[[Aloft], Awaitable[None]]
 
 
 FAULTS = {

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from companion.errors import StorageError
 from companion.mqtt import fleet as wire
-from companion.storage.fleet_items import FILE, FleetItems, Item, Mark, SourceItems, Waiting
+from companion.storage.fleet_items import FILE, FleetItems, Item, Mark, SourceItems
 from tests.support.extent import extent
 from tests.support.fleet import CRANE, HERON
 
