@@ -79,7 +79,7 @@ async def _compass_lies(on: Aloft) -> None:
     _turn_compass(on, LIE_DEG)
 
 
-def _turn_compass(on: Flight, degrees: float) -> None:
+def _turn_compass(on: Aloft, degrees: float) -> None:
     device: Any = on.compass
     device.heading_error_deg += degrees
 
