@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.protocols.decoding.clock import LATE_S, SPAN_S, DeviceClock, SampleTimes
+from companion.protocols.decoding.clock import LATE, LATE_S, SPAN_S, DeviceClock, SampleTimes
 from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
 from companion.samples import ImuSample, MagSample, TiltSample
@@ -247,3 +248,20 @@ def test_a_full_line_is_none_of_that_even_after_a_stall(stall_s: float) -> None:
         at = upto
     assert decoder.seconds_per_byte == spb
     assert ends_s[-1] < t_s + 0.001
+
+
+def test_late_samples_are_counted() -> None:
+    times = SampleTimes()
+    for k in range(100):
+        times.place([imu(100.0 + 0.1 * k, 0.1 * k)], 100.0 + 0.1 * k)
+    assert times.place([imu(114.0, 10.0)], 114.0) == []
+    assert times.dropped == {LATE: 1}
+
+
+def test_times_of_pose_sensors_do_not_go_back() -> None:
+    decoder = InclinometerXyDecoder(10 / 2400)
+    pair = b"X=+00.430\r\nY=-00.084\r\n"
+    times = []
+    for k in range(30):
+        times += [sample.t_s for sample in decoder.receive(pair * (5 if k == 20 else 1), 100.0 + 0.1 * k)]
+    assert all(a <= b for a, b in pairwise(times))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from functools import partial
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from companion.protocols.imus.witmotion import WitMotionDecoder
 from companion.samples import ImuSample, TiltSample
 from tests.support import decoders
-from tests.support.frames import wit, wit_imu
+from tests.support.frames import sum8, wit, wit_imu
 
 NEXT = wit(0x50)
 """A frame that gives nothing, so that the one before is believed."""
@@ -115,3 +116,11 @@ def test_bluetooth_packets_are_not_read() -> None:
     decoder = WitMotionDecoder()
     assert decoder.feed((b"\x55\x61" + bytes(18)) * 5, 1.0) == []
     assert decoder.feed(bytes.fromhex("5571 3A00 6801 6900 7A00") + bytes(10), 1.0) == []
+
+
+def test_the_data_sheets_wrong_sums_are_rejected() -> None:
+    """WT901 p. 13 adds 0x53 for a 0x54 frame, and p. 10 0x51 for a 0x50 frame."""
+    for kind, added in ((0x54, 0x53), (0x50, 0x51)):
+        body = bytes([0x55, kind]) + struct.pack("<4h", 360, 105, 122, 0)
+        wrong = body + bytes([(sum8(body) - kind + added) % 256])
+        assert feed(wrong + NEXT + NEXT) == ([], {"checksum": 1})
