@@ -83,7 +83,8 @@ class Settling:
     def __init__(self, lag_s: float, sigma_deg: float) -> None:
         self.left_s = 0
         """Seconds until its readings count again, as of the last second judged."""
-        self._tail_s = math.ceil(lag_s * math.log(max(OFF_DEG / (_SHARE * sigma_deg), 1.0)))
+        # Without a lag nothing follows, however exact the sensor is said to be.
+        self._tail_s = math.ceil(lag_s * math.log(max(OFF_DEG / (_SHARE * sigma_deg), 1.0))) if lag_s > 0.0 else 0
         self._moved: int | None = None
         """Last second in which the aircraft moved."""
 
