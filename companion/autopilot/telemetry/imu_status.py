@@ -19,7 +19,8 @@ from companion.autopilot.telemetry.ekf_bias import EkfBias
 from companion.autopilot.telemetry.px4_console import ID, VECTOR, Px4Console
 from companion.samples import Vector
 
-PAUSE_S: Final = 0.05
+PAUSE_S: Final = 0.2
+"""Each answer costs the autopilot a task, and a console on the same port its calm."""
 SLOW_PAUSE_S: Final = 0.9
 """On a line of 57600 baud, of which 1100 bytes an answer are then a fifth."""
 _IDLE_S: Final = 0.5

@@ -67,7 +67,7 @@ def test_every_imu_tells_its_bias_whatever_its_offsets_are() -> None:
             await asyncio.sleep(30.0)
             for instance in (1, 2):
                 own = [raw for raw in found.heard if raw.instance == instance]
-                assert len(own) > 60
+                assert len(own) > 35
                 imu = found.double.vehicle_imus[instance - 1]
                 assert {(raw.gyro_id, raw.accel_id) for raw in own} == {(imu.device_id, imu.device_id)}
                 # The truth: what the sensor reads, turned by the board's rotation and nothing else.
@@ -87,7 +87,7 @@ def test_a_publication_counts_once() -> None:
         async with aboard((1,)) as found:
             await asyncio.sleep(10.0)
             stamps = [raw.boot_us for raw in found.heard]
-            assert len(stamps) == len(set(stamps)) > 30
+            assert len(stamps) == len(set(stamps)) > 20
 
     run_virtual(main())
 
