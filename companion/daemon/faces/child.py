@@ -72,7 +72,13 @@ class Child:
             return await self._watch(process)
         finally:
             self._report = self.process_id = None
-            await _end(process)
+            ending = asyncio.ensure_future(_end(process))
+            try:
+                await asyncio.shield(ending)
+            except asyncio.CancelledError:
+                # The daemon stops while a failed child is being ended: a child half ended would live on.
+                await ending
+                raise
 
     async def _watch(self, process: Process) -> str:
         reading = asyncio.get_running_loop().create_task(self._read(process))

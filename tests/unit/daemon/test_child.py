@@ -51,10 +51,12 @@ async def _until(condition: Callable[[], bool]) -> None:
 
 
 async def _runs(folder: Path, then: Callable[[Child], bool]) -> Child:
-    """Run a child until the condition holds, then stop it."""
+    """Run a child until the condition holds, then stop it, and ask again while it is being ended."""
     child = Child("test", MODULE, _settings(folder))
     task = asyncio.create_task(child.run())
     await _until(lambda: then(child))
+    task.cancel()
+    await asyncio.sleep(0.05)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
     return child
