@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
-import faulthandler
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,7 +28,6 @@ from companion.cli.terminal import (
     within,
 )
 from companion.errors import CompanionError, StorageError
-from companion.links.system import logs
 
 if TYPE_CHECKING:
     from companion.installation.install import Step
@@ -99,17 +98,10 @@ async def run(options: argparse.Namespace) -> int:
     """`companion run`; without a configuration a page asks for it first."""
     if not hasattr(options, "config") and not config_path(options).exists():
         await _first_run(config_path(options))
-    config = load_config(options, profiles=True, forgiving=True)
-    # Where the whole process stands still the watchdog's SIGABRT is the only witness: let it say where that was.
-    faulthandler.enable()
-    logs.set_up("debug" if options.verbose else config.log.level)
-    from companion.daemon.process import footprint
-
-    footprint.prepare()
-    from companion.daemon.process import run as process
-
-    await process.run(config)
-    return DONE
+    load_config(options, profiles=True, forgiving=True)
+    # In the place of this process, whose command line and page the daemon needs no memory for.
+    daemon = [sys.executable, "-m", "companion.daemon", str(config_path(options)), *(["-v"] if options.verbose else [])]
+    os.execv(sys.executable, daemon)  # noqa: S606
 
 
 async def _first_run(path: Path) -> None:

@@ -19,8 +19,8 @@ WATCHDOG_S = 2.0
 # One task waits for ever; the limits are short so that the test is.
 HANGING = """
 import asyncio, sys
-from companion.cli import main
 from companion.daemon.process import supervisor
+from companion.daemon.process.run import main
 from companion.component.component import Component
 from companion.links.serial import bytestream
 
@@ -31,7 +31,7 @@ async def for_ever(*_):
     await asyncio.Event().wait()
 
 {patch}
-sys.exit(main())
+sys.exit(main(sys.argv[2]))  # -c FILE run
 """
 
 NOTHING_THERE = """

@@ -1,6 +1,6 @@
-"""Run the companion as its command line does, up to its first heartbeat; then say on stdout what was imported, and end.
+"""Run the daemon's process up to its first heartbeat; then say on stdout what was imported, and end.
 
-For processes: `python -m tests.support.first_heartbeat` is not meant, but `python -c CODE ... run`, with this CODE.
+For processes: `python -m tests.support.first_heartbeat` is not meant, but `python -c CODE FILE`, with this CODE.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from pathlib import Path
 
 CODE = """
 import os, sys
+from companion.daemon.process import footprint
+footprint.prepare()
 from companion.links.mavlink.link import MavlinkLink
 
 def first(self, message):
@@ -23,14 +25,14 @@ def first(self, message):
 
 MavlinkLink.send = lambda self, *what: (before.update(sys.modules), first(self, *what))
 before = set()
-from companion.cli import main
-sys.exit(main())
+from companion.daemon.process.run import main
+sys.exit(main(*sys.argv[1:]))
 """
 
 
 def modules_at_first_heartbeat(config: Path, environment: Mapping[str, str]) -> tuple[set[str], str]:
     """Names of all modules that were loaded by then, and what Python has written on stderr."""
-    command = [sys.executable, "-X", "importtime", "-c", CODE, "-c", str(config), "run"]
+    command = [sys.executable, "-X", "importtime", "-c", CODE, str(config)]
     ended = subprocess.run(command, env=dict(environment), capture_output=True, text=True, timeout=60.0, check=False)
     if not ended.stdout:
         raise RuntimeError(f"the companion sent no heartbeat:\n{ended.stderr[-2000:]}")

@@ -6,17 +6,25 @@ SIGHUP is ignored: a companion run by hand goes on when its terminal closes.
 from __future__ import annotations
 
 import asyncio
+import faulthandler
 import logging
 import signal
+import sys
 from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
+from companion import config
 from companion.config.sections import Config
 from companion.daemon.process import footprint
 from companion.daemon.process.service import Service
 from companion.daemon.process.supervisor import Supervisor
-from companion.errors import CompanionError
+from companion.errors import CompanionError, ConfigError
+from companion.links.system import logs
 from companion.links.system.service_manager import ServiceManager
+from companion.printable import printable
+from companion.storage.profiles import saved_profile
 
 logger = logging.getLogger(__name__)
 
@@ -24,11 +32,30 @@ SETTLED_AFTER_S: Final = 3.0
 """Time after which lazily imported modules (MQTT, recording, the page) are there."""
 
 
-async def run(config: Config) -> None:
-    """Run the daemon until SIGTERM or SIGINT; raise CompanionError where it cannot start."""
+def main(path: str, *verbose: str) -> int:
+    """Run the daemon with a configuration file until SIGTERM or SIGINT; return the command line's exit code."""
+    # The watchdog's SIGABRT may be the only witness of a process that hangs: let it print where.
+    faulthandler.enable()
+    logs.set_up("debug" if verbose else "info")
+    try:
+        wanted = config.load(Path(path), partial(saved_profile, forgiving=True))
+        if not verbose:
+            logging.getLogger().setLevel(wanted.log.level.upper())
+        asyncio.run(_run(wanted))
+    except ConfigError as error:
+        sys.stderr.write(printable(f"{error}") + "\n")
+        return 2
+    except CompanionError as error:
+        sys.stderr.write(printable(f"companion: {error}") + "\n")
+        return 1
+    return 0
+
+
+async def _run(wanted: Config) -> None:
+    """Raises CompanionError where the daemon cannot start."""
     manager = ServiceManager.from_environment()
     try:
-        await _Process(Service(config), manager).run()
+        await _Process(Service(wanted), manager).run()
     except BaseExceptionGroup as group:
         if (known := group.subgroup(CompanionError)) is None:
             raise
