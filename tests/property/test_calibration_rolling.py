@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.collector.outlook import Status
+from companion.estimation.collector.outlook import CollectorStatus
 from companion.estimation.collector.rolling import RollingCollector
 from companion.estimation.noise.robust import huber_mean
 from companion.estimation.seconds.batch import BatchSource
@@ -64,7 +64,7 @@ def test_nothing_that_arrives_raises(events: list[object]) -> None:
 def check(collector: RollingCollector, now_s: float) -> None:
     collector.tick(now_s)
     status = collector.status(now_s)
-    assert isinstance(status, Status)
+    assert isinstance(status, CollectorStatus)
     assert 0.0 <= status.progress <= 1.0
     assert status.waiting_for is None or (status.waiting_for and "\n" not in status.waiting_for)
     assert not status.enough or status.waiting_for is None

@@ -17,7 +17,7 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.job import Job
 from companion.errors import AutopilotError, CalibrationRefusedError
-from companion.estimation.collector.outlook import Status
+from companion.estimation.collector.outlook import CollectorStatus
 from companion.estimation.machine import Event, State
 from companion.estimation.means.windows import Window
 from companion.links.system.listeners import Listeners
@@ -49,7 +49,7 @@ class Measuring:
         self._said, self._said_s = "", -math.inf
         self._upsets = {name: imu.upsets for name, imu in self._imus.items()}
 
-    async def read_state(self, job: Job, if_armed: str | None) -> tuple[Status, str | None, int | None]:
+    async def read_state(self, job: Job, if_armed: str | None) -> tuple[CollectorStatus, str | None, int | None]:
         """Return the collector's status, the reason to wait, and the seconds to hold still where that is all.
 
         `if_armed`: reason of the failure if it was armed since the job began; None: it goes on once disarmed.

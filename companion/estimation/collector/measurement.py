@@ -6,6 +6,7 @@ that is due can be packed up and worked out in another thread.
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -14,7 +15,14 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.collector.outlook import Progress, Settings, expected_s, is_enough
+from companion.estimation.collector.outlook import (
+    CollectorObstacle,
+    CollectorStatus,
+    Settings,
+    Stillness,
+    expected_s,
+    is_enough,
+)
 from companion.estimation.means.pose import FieldWindow, heading_window, tilt_window
 from companion.estimation.means.windows import ImuEstimate, ImuInput, Window, imu_estimates
 from companion.estimation.seconds.batch import Batch, BatchSource
@@ -25,18 +33,17 @@ MIN_BATCHES: Final = 5
 """Seconds of a window that was asked for with `since_s`: fewer say nothing about their own scatter."""
 
 
-class Work(msgspec.Struct, frozen=True, kw_only=True):
-    """An estimate that is due; `run` touches nothing that changes, and may be called in another thread."""
+class Work(NamedTuple):
+    """An estimate that is due."""
 
     slots: Sequence[int]
-    """The seconds of the window, ascending."""
+    """Seconds of the window, ascending."""
     since_s: float | None
-    """The window's own beginning, where it is not that of all seconds."""
+    """Earliest beginning that was asked for; None: that of all seconds."""
     generation: int
-
-    def run(self) -> Any:
-        """Return the estimate, or the `CalibrationRefusedError` that says why there is none."""
-        raise NotImplementedError
+    run: Callable[[], Any]
+    """Returns the estimate, or the `CalibrationRefusedError` that says why there is none. It touches nothing that
+    changes, so another thread may call it."""
 
 
 class Measurement(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,6 +52,7 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     slots: Sequence[int]
     """Good seconds, ascending, at least one."""
     estimate: Callable[[], Any]
+    """Returns the estimates of the IMUs, or the whole window, or a `CalibrationRefusedError`."""
     settling: str | None = None
     """Reason why a pose sensor's mean has to wait."""
     tilt: list[Batch] | None = None
@@ -68,6 +76,8 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
         estimates = self.estimate()
         if isinstance(estimates, CalibrationRefusedError):
             raise estimates
+        if isinstance(estimates, Window):
+            return estimates
         if self.settling is not None:
             raise CalibrationRefusedError(self.settling)
         for name, batches in (("gradienter", self.tilt), ("compass", self.heading)):
@@ -87,19 +97,6 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-class Stillness(NamedTuple):
-    """Stillness until now."""
-
-    still_s: int
-    """Seconds that count so far."""
-    steady_s: int
-    """Seconds that count without a bad one until now."""
-    good_now: bool
-    """True if the latest second counts."""
-    hold_still_s: int = 0
-    """Seconds to stand still yet before a window is possible."""
-
-
 class WindowSource(ABC):
     """The seconds that count, and the newest estimates: of all of them, and of one other window."""
 
@@ -115,8 +112,7 @@ class WindowSource(ABC):
     def set_imu(self, imu: ImuInput, batches: BatchSource, raw: BatchSource) -> None:
         """Add an IMU with its seconds and those of means beside it, or begin anew: its stream is another now."""
 
-    @abstractmethod
-    def set_pose(self, kind: str, batches: BatchSource) -> None:
+    def set_pose(self, kind: str, batches: BatchSource) -> None:  # noqa: B027 - not every source of windows needs it
         """Add the seconds of the gradienter or the compass."""
 
     def forget(self, imu: str | None) -> None:
@@ -153,8 +149,8 @@ class WindowSource(ABC):
         """Pack up the estimate of these seconds."""
 
     @abstractmethod
-    def progress(self, settings: Settings, *, waits: bool) -> Progress:
-        """Return how far the newest estimate is from good enough; `waits`: something is in the way."""
+    def status(self, settings: Settings, *, waits: bool) -> CollectorStatus:
+        """Return the progress of the newest estimate towards good enough; `waits`: something is in the way."""
 
     def clear(self) -> None:
         """Drop all estimates, also those that are being worked out."""
@@ -206,27 +202,6 @@ class WindowSource(ABC):
         return estimate
 
 
-class GroundWork(Work, frozen=True, kw_only=True):
-    """Estimate of a still window."""
-
-    imus: list[ImuInput]
-    batches: list[list[Batch]]
-    raw: list[list[Batch]]
-    """Means in floats beside a stream of integers, of those of the seconds that have any."""
-    horizon_s: float
-
-    def run(self) -> list[ImuEstimate] | CalibrationRefusedError:
-        """Work it out."""
-        first, last = self.slots[0], self.slots[-1]
-        rejected = last - first + 1 - len(self.slots)
-        try:
-            return imu_estimates(
-                self.imus, self.batches, self.raw, end_s=last + 1.0, horizon_s=self.horizon_s, rejected=rejected
-            )
-        except CalibrationRefusedError as error:
-            return error
-
-
 class GroundWindows(WindowSource):
     """The still stretch of an aircraft on the ground."""
 
@@ -241,9 +216,6 @@ class GroundWindows(WindowSource):
     def set_imu(self, imu: ImuInput, batches: BatchSource, raw: BatchSource) -> None:
         """Add an IMU or replace it."""
         self._imus[imu.name] = imu, batches, raw
-
-    def set_pose(self, kind: str, batches: BatchSource) -> None:
-        """Do nothing: the seconds of the pose are asked for with the window."""
 
     def new_stretch(self) -> None:
         """Begin to count anew."""
@@ -260,7 +232,12 @@ class GroundWindows(WindowSource):
         """The stretch under way."""
         stretch = self._stretch
         left_s = 0 if stretch.begun else self._min_good - stretch.good
-        return Stillness(stretch.good, stretch.steady, stretch.good_now, left_s)
+        return Stillness(
+            still_s=float(stretch.good),
+            steady_s=float(stretch.steady),
+            good_now=stretch.good_now,
+            hold_still_s=left_s,
+        )
 
     def good_slots(self, since_s: float | None) -> list[int]:
         """Return the good seconds of the stretch under way that lie wholly after `since_s`."""
@@ -278,28 +255,41 @@ class GroundWindows(WindowSource):
             raise CalibrationRefusedError(f"still for {len(slots)} s only, needs {needed} s")
         return slots
 
-    def work(self, slots: Sequence[int], since_s: float | None) -> GroundWork:
+    def work(self, slots: Sequence[int], since_s: float | None) -> Work:
         """Pack up the estimate of these seconds."""
         imus, sources, raw = zip(*self._imus.values(), strict=True) if self._imus else ((), (), ())
-        return GroundWork(
-            imus=list(imus),
-            batches=[[source.batches[slot] for slot in slots] for source in sources],
-            raw=[[source.batches[slot] for slot in slots if slot in source.batches] for source in raw],
-            slots=slots,
-            horizon_s=self._horizon_s,
-            since_s=since_s,
-            generation=self.generation,
-        )
+        batches = [[source.batches[slot] for slot in slots] for source in sources]
+        beside = [[source.batches[slot] for slot in slots if slot in source.batches] for source in raw]
+        run = functools.partial(_estimates, slots, imus, batches, beside, self._horizon_s)
+        return Work(slots, since_s, self.generation, run)
 
-    def progress(self, settings: Settings, *, waits: bool) -> Progress:
-        """Return how far the stretch is, by an estimate that may be a second old."""
-        stretch, words = self._stretch, f"still for {self._stretch.good} s"
+    def status(self, settings: Settings, *, waits: bool) -> CollectorStatus:
+        """Return the progress of the stretch, by an estimate that may be a second old."""
+        stretch = self._stretch
+        share = 0.0 if stretch.start is None else stretch.good / self._max_slots
+        status = CollectorStatus(
+            still_s=float(stretch.good), enough=False, progress=share, measuring=f"still for {stretch.good} s"
+        )
         if not stretch.begun or waits:
-            share = 0.0 if stretch.start is None else stretch.good / self._max_slots
-            return Progress(enough=False, share=share, words=words)
+            return status
         estimates = self.estimate_later(self.slots(None), None, late=1)()
         if isinstance(estimates, CalibrationRefusedError):
-            return Progress(enough=False, share=0.0, words=words, refused=str(estimates))
-        enough = stretch.full or is_enough(settings, estimates)
+            return msgspec.structs.replace(status, progress=0.0, obstacle=CollectorObstacle(str(estimates)))
         needed = max(expected_s(settings, estimates), stretch.good + 1)
-        return Progress(enough=enough, share=1.0 if enough else stretch.good / needed, words=words)
+        enough = stretch.full or is_enough(settings, estimates)
+        return msgspec.structs.replace(status, enough=enough, progress=1.0 if enough else stretch.good / needed)
+
+
+def _estimates(
+    slots: Sequence[int],
+    imus: Sequence[ImuInput],
+    batches: Sequence[Sequence[Batch]],
+    raw: Sequence[Sequence[Batch]],
+    horizon_s: float,
+) -> list[ImuEstimate] | CalibrationRefusedError:
+    """Estimate a still window; `raw`: means in floats beside a stream of integers, of the seconds that have any."""
+    end_s, rejected = slots[-1] + 1.0, slots[-1] - slots[0] + 1 - len(slots)
+    try:
+        return imu_estimates(imus, batches, raw, end_s=end_s, horizon_s=horizon_s, rejected=rejected)
+    except CalibrationRefusedError as error:
+        return error

@@ -16,7 +16,7 @@ from companion.physics.frames import Floats
 _NO_ROOM: Final = 1e-300
 
 
-class Obstacle(msgspec.Struct, frozen=True):
+class CollectorObstacle(msgspec.Struct, frozen=True):
     """Reason why nothing can be measured now."""
 
     words: str
@@ -26,30 +26,18 @@ class Obstacle(msgspec.Struct, frozen=True):
     """Seconds to stand still yet, where nothing else is missing."""
 
 
-class Progress(msgspec.Struct, frozen=True):
-    """Progress of an estimate towards good enough."""
-
-    enough: bool
-    share: float
-    words: str
-    left: str = ""
-    """Part of the words that says how much longer it takes."""
-    refused: str = ""
-    """Reason why the readings give no estimate."""
-
-
-class Status(msgspec.Struct, frozen=True, kw_only=True):
-    """State of the collector."""
+class CollectorStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """State of the collector, with the progress of the estimate."""
 
     still_s: float
     """Good seconds, common to all sources, of the stretch under way."""
-    obstacle: Obstacle | None
+    obstacle: CollectorObstacle | None = None
     """None when still long enough and nothing is in the way."""
     enough: bool
     """The stop rule is met: `window` gives a result that more seconds would not better."""
     progress: float
     """0..1 towards `enough`; falls to 0 when the stretch breaks."""
-    sources: tuple[SourceStatus, ...]
+    sources: tuple[SourceStatus, ...] = ()
     measuring: str
     """Words for a measurement under way."""
     left: str = ""
@@ -61,14 +49,19 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
         return None if self.obstacle is None else self.obstacle.words
 
 
-class Glance(msgspec.Struct, frozen=True, kw_only=True):
-    """State of the stillness, without any estimate."""
+class Stillness(msgspec.Struct, frozen=True, kw_only=True):
+    """Stillness until now, without any estimate."""
 
-    obstacle: Obstacle | None
-    """A movement now, or a source that is silent or stuck."""
     still_s: float
+    """Seconds that count so far."""
     steady_s: float
-    """Good seconds without a bad one until now."""
+    """Seconds that count without a bad one until now."""
+    good_now: bool
+    """True if the latest second counts."""
+    hold_still_s: int = 0
+    """Seconds to stand still yet before a window is possible."""
+    obstacle: CollectorObstacle | None = None
+    """A movement now, or a source that is silent or stuck."""
 
     @property
     def moving(self) -> bool:

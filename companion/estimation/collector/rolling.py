@@ -16,7 +16,7 @@ import msgspec
 from companion.errors import CalibrationRefusedError
 from companion.estimation.collector.intake import ImuSource, PoseKind, PoseSource, Source
 from companion.estimation.collector.measurement import MIN_BATCHES, GroundWindows, Measurement, WindowSource, Work
-from companion.estimation.collector.outlook import Glance, Obstacle, Settings, Status
+from companion.estimation.collector.outlook import CollectorObstacle, CollectorStatus, Settings, Stillness
 from companion.estimation.means.pose import CompassModel, FieldHeading, GradienterModel
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.seconds.batch import Batch
@@ -225,10 +225,9 @@ class RollingCollector:
         """Return the last whole second of the gradienter."""
         return None if self._tilt is None else self._tilt.newest
 
-    def glance(self, now_s: float) -> Glance:
-        """Return how still it is at `now_s`; costs a small part of what `status` does."""
-        still = self._windows.stillness
-        return Glance(obstacle=self._obstacle(now_s), still_s=float(still.still_s), steady_s=float(still.steady_s))
+    def glance(self, now_s: float) -> Stillness:
+        """Return the stillness at `now_s`; costs a small part of what `status` does."""
+        return msgspec.structs.replace(self._windows.stillness, obstacle=self._obstacle(now_s))
 
     def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:
         """Return what `window` would have to work out now, for another thread; None when there is nothing.
@@ -241,21 +240,18 @@ class RollingCollector:
         """Keep the result of such work, unless it comes too late."""
         self._windows.accept(work, found)
 
-    def status(self, now_s: float) -> Status:
+    def status(self, now_s: float) -> CollectorStatus:
         """Return the state at `now_s` (the samples' clock). Its figures may be those of the second before."""
-        obstacle = self._waiting_for(now_s)
-        found = self._windows.progress(self._settings, waits=obstacle is not None)
-        if obstacle is None and found.refused:
-            obstacle = Obstacle(found.refused)
+        waits = self._waiting_for(now_s)
+        found = self._windows.status(self._settings, waits=waits is not None)
+        obstacle = waits or found.obstacle
         enough = found.enough and obstacle is None
-        return Status(
-            still_s=float(self._windows.stillness.still_s),
+        return msgspec.structs.replace(
+            found,
             obstacle=obstacle,
             enough=enough,
-            progress=min(found.share, 1.0 if enough else 0.99),
+            progress=min(found.progress, 1.0 if enough else 0.99),
             sources=tuple(source.status(now_s) for source in self._sources()),
-            measuring=found.words,
-            left=found.left,
         )
 
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:
@@ -374,32 +370,32 @@ class RollingCollector:
         imus = {name: source.batches.batches[slot] for name, source in self.imus.items()}
         return self._turns.add_second(slot, imus, heading, good=good)
 
-    def _obstacle(self, now_s: float) -> Obstacle | None:
+    def _obstacle(self, now_s: float) -> CollectorObstacle | None:
         """Return a silent source or the reason why the latest second was not still; None when nothing is in the way."""
         sources = self._sources()
         if (silence := next(filter(None, (source.silence(now_s) for source in sources)), None)) is not None:
-            return Obstacle(silence)
+            return CollectorObstacle(silence)
         if self._turns.words and not any(verdict.words for verdict in self._others()):
-            return Obstacle(self._turns.words, moving=True)
+            return CollectorObstacle(self._turns.words, moving=True)
         if self._windows.stillness.good_now:
             return None
         said = next((source.verdict for source in sources if source.verdict.words), None)
         if said is None:
             least_s = self._settings.min_slots
-            return Obstacle(f"hold still {least_s} s", moving=True, hold_still_s=least_s)
+            return CollectorObstacle(f"hold still {least_s} s", moving=True, hold_still_s=least_s)
         moving = not any(source.verdict.fault for source in sources if source.verdict.words)
         if said.fault:
-            return Obstacle(said.words, moving)
-        return Obstacle(f"hold still: {said.words}", moving)
+            return CollectorObstacle(said.words, moving)
+        return CollectorObstacle(f"hold still: {said.words}", moving)
 
-    def _waiting_for(self, now_s: float) -> Obstacle | None:
+    def _waiting_for(self, now_s: float) -> CollectorObstacle | None:
         if (moves := self._obstacle(now_s)) is not None:
             return moves
         left_s = self._windows.stillness.hold_still_s
         settles = self._settles(self._windows.good_slots(None), left_s)
         if settles is not None:
-            return Obstacle(settles)
-        return Obstacle(f"hold still {left_s} s more", hold_still_s=left_s) if left_s else None
+            return CollectorObstacle(settles)
+        return CollectorObstacle(f"hold still {left_s} s more", hold_still_s=left_s) if left_s else None
 
     def _settles(self, slots: list[int], left_s: int) -> str | None:
         """Say how long the mean of a pose sensor over these seconds and the next `left_s` has to wait, if at all."""

@@ -15,9 +15,17 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from companion.errors import CalibrationRefusedError
-from companion.estimation.collector.measurement import Measurement, Stillness, WindowSource
-from companion.estimation.collector.outlook import Progress, Settings
-from companion.estimation.deck.estimate import MAX_S, MIN_LOOK_S, MIN_S, DeckFound, DeckWork, ImuSecond, TriadVariances
+from companion.estimation.collector.measurement import Measurement, WindowSource, Work
+from companion.estimation.collector.outlook import CollectorStatus, Settings, Stillness
+from companion.estimation.deck.estimate import (
+    MAX_S,
+    MIN_LOOK_S,
+    MIN_S,
+    DeckFound,
+    DeckWindow,
+    ImuSecond,
+    TriadVariances,
+)
 from companion.estimation.deck.smoother import passage
 from companion.estimation.deck.waves import Fluid, Level, level
 from companion.estimation.means.pose import CompassModel, GradienterModel
@@ -36,14 +44,8 @@ _SETTLED_LAGS: Final = 10.0
 _KEPT_SHOWN: Final = 4
 """Seconds that wait for the gradienter's readings."""
 _FALLS: Final = 2.5
-"""Power of the time with which the white part of a variance falls, until estimates show it: that of a slope through
-waves or white noise falls with the third, a sensor's own white noise with the first."""
-_FALLS_LEAST: Final = 1.0
-_FALLS_MOST: Final = 3.0
-_APART: Final = 1.15
-"""Ratio of the lengths of two windows that show the power."""
-_LONG: Final = 4.0
-"""Ratio of the lengths of two windows that show a power below `_FALLS`."""
+"""Power of the time with which the white part of a variance falls: a slope's through waves falls with the third, a
+sensor's own white noise with the first."""
 _IN_MINUTES_S: Final = 90.0
 
 
@@ -120,24 +122,8 @@ class Stream:
         return np.hstack([rows[:, :3] @ imu.rotation.T, rows[:, 3:] @ imu.rotation.T])
 
 
-class DeckMeasurement(Measurement, frozen=True, kw_only=True):
-    """Parts of a deck's window: the estimate holds the pose too."""
-
-    def window(self) -> Window:
-        """Work it out, unless that is done.
-
-        Raises:
-            CalibrationRefusedError: the readings give no estimate.
-        """
-        found = self.estimate()
-        if isinstance(found, CalibrationRefusedError):
-            raise found
-        window: Window = found.window
-        return window
-
-
 class Deck(WindowSource):
-    """Collects what `DeckWork` needs. Pure: time comes in with the samples."""
+    """Collects what `DeckWindow` needs. Pure: time comes in with the samples."""
 
     may_move = True
 
@@ -149,8 +135,6 @@ class Deck(WindowSource):
         self._streams: dict[str, Stream] = {}
         self._headings: dict[int, float] = {}
         self._tilts: dict[int, tuple[Floats, Floats]] = {}
-        self._first: tuple[int, DeckFound] | None = None
-        """First estimate of all seconds, and of how many, to see how fast sigma falls."""
         self._reference_deg: tuple[float, float] | None = None
         """Tilt at which the last accelerometer means were given, to compare those after a write with."""
         self._newest_s = 0
@@ -175,11 +159,6 @@ class Deck(WindowSource):
             self._headings.clear()
         self._is_good = True
         self.clear()
-
-    def clear(self) -> None:
-        """Drop all estimates."""
-        super().clear()
-        self._first = None
 
     def new_stretch(self) -> None:
         """Do nothing: a movement ends nothing here."""
@@ -217,7 +196,8 @@ class Deck(WindowSource):
     @property
     def stillness(self) -> Stillness:
         """Every second counts."""
-        return Stillness(self.seconds, self.seconds, self._is_good)
+        seconds = float(self.seconds)
+        return Stillness(still_s=seconds, steady_s=seconds, good_now=self._is_good)
 
     def common(self, since_s: float | None = None) -> range:
         """Return the seconds of all IMUs that begin after `since_s`, up to the last end by `EVERY_S`."""
@@ -239,10 +219,10 @@ class Deck(WindowSource):
             raise CalibrationRefusedError(self._at_least(needed))
         return slots
 
-    def work(self, slots: Sequence[int], since_s: float | None = None) -> DeckWork:
+    def work(self, slots: Sequence[int], since_s: float | None = None) -> Work:
         """Pack up the estimate of these seconds."""
         streams = self._streams.values()
-        return DeckWork(
+        estimate = DeckWindow(
             imus=[stream.imu for stream in streams],
             seconds=[[one for one in stream.seconds if one.slot in slots] for stream in streams],
             levels=[{slot: one for slot, one in stream.levels.items() if slot in slots} for stream in streams],
@@ -252,11 +232,10 @@ class Deck(WindowSource):
             compass=self._compass,
             horizon_s=self._horizon_s,
             reference_deg=None if since_s is None else self._reference_deg,
-            since_s=since_s,
-            generation=self.generation,
         )
+        return Work(slots, since_s, self.generation, estimate.run)
 
-    def accept(self, work: Any, found: Any) -> bool:
+    def accept(self, work: Work, found: Any) -> bool:
         """Keep what the work has found; return False if it comes too late."""
         if not super().accept(work, found):
             return False
@@ -264,37 +243,39 @@ class Deck(WindowSource):
             if (tilt := found.window.tilt) is not None:
                 self._reference_deg = tilt.x_deg, tilt.y_deg
             self._newest_s = len(work.slots)
-            self._first = self._first or (self._newest_s, found)
         return True
 
-    def measurement(self, since_s: float | None) -> DeckMeasurement:
-        """Return what a window is made of."""
+    def measurement(self, since_s: float | None) -> Measurement:
+        """Return the estimate of a window, which holds the pose too."""
         slots = self.slots(since_s)
-        return DeckMeasurement(slots=slots, estimate=self.estimate_later(slots, since_s))
+        estimate = self.estimate_later(slots, since_s)
 
-    def progress(self, settings: Settings, *, waits: bool) -> Progress:
-        """Return how far the newest estimate is from good enough."""
-        found = self.known(0, None)
-        if found is None or self.seconds < MIN_S:
+        def window() -> Window | CalibrationRefusedError:
+            found: DeckFound | CalibrationRefusedError = estimate()
+            return found.window if isinstance(found, DeckFound) else found
+
+        return Measurement(slots=slots, estimate=window)
+
+    def status(self, settings: Settings, *, waits: bool) -> CollectorStatus:
+        """Return the progress of the newest estimate towards good enough."""
+        found, seconds = self.known(0, None), self.seconds
+        status = functools.partial(CollectorStatus, still_s=float(seconds))
+        if found is None or seconds < MIN_S:
             left = self._at_least(MIN_S)
-            return Progress(enough=False, share=min(self.seconds / MIN_S, 1.0) / 4.0, words=left, left=left)
+            return status(enough=False, progress=min(seconds / MIN_S, 1.0) / 4.0, measuring=left, left=left)
         if isinstance(found, CalibrationRefusedError):
-            return Progress(enough=False, share=0.0, words=str(found))
-        first_s, first = self._first or (self._newest_s, found)
+            return status(enough=False, progress=0.0, measuring=str(found))
         targets = settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2
-        aims = [
-            aim((first_s, first.known[at]), (self._newest_s, known), targets[at % 2])
-            for at, known in enumerate(found.known)
-        ]
+        aims = [aim(self._newest_s, known, targets[at % 2]) for at, known in enumerate(found.known)]
         if all(each.sigma <= each.goal for each in aims):
-            return Progress(enough=True, share=1.0, words="sigma is good enough")
-        if self.seconds >= MAX_S:
-            return Progress(enough=True, share=1.0, words=f"measured for {MAX_S // 60} min")
+            return status(enough=True, progress=1.0, measuring="sigma is good enough")
+        if seconds >= MAX_S:
+            return status(enough=True, progress=1.0, measuring=f"measured for {MAX_S // 60} min")
         at, last = max(enumerate(aims), key=lambda each: each[1].whole_s)
-        left_s = max(last.whole_s - self.seconds, 1)
+        left_s = max(last.whole_s - seconds, 1)
         left, unit = more(left_s), UNITS[TRIADS[at % 2]]
-        share = self.seconds / (self.seconds + left_s)
-        return Progress(enough=False, share=share, words=f"{left}: {last.in_words(unit.si, unit.name)}", left=left)
+        words = f"{left}: {last.in_words(unit.si, unit.name)}"
+        return status(enough=False, progress=seconds / (seconds + left_s), measuring=words, left=left)
 
     def _at_least(self, needed: int) -> str:
         return f"at least {max(needed - self.seconds, 1)} s more"
@@ -313,20 +294,14 @@ class Aim(NamedTuple):
         return f"{_figure(self.sigma / unit)} {name}, goal {_figure(self.goal / unit)}"
 
 
-def aim(first: tuple[int, TriadVariances], newest: tuple[int, TriadVariances], target: float) -> Aim:
-    """Return the aim of a triad by the first and the newest estimate, each with its number of seconds."""
-    (first_s, was), (newest_s, known) = first, newest
+def aim(span_s: int, known: TriadVariances, target: float) -> Aim:
+    """Return the aim of a triad by the newest estimate, from a window of so many seconds."""
     floor = known.use - known.white
     goal = max(target**2, floor * (1.0 + WHITE_SHARE))
-    whole_s = float(newest_s)
+    whole_s = float(span_s)
     if known.use > goal:
-        falls = _FALLS
-        if newest_s > first_s * _APART and known.white > 0.0:
-            fell = math.log(max(was.white, known.white) / known.white) / math.log(newest_s / first_s)
-            # While a turn is short, a bias hides behind the compass' error: that fall is slower at first than later.
-            falls = min(max(fell, _FALLS_LEAST if newest_s > _LONG * first_s else _FALLS), _FALLS_MOST)
         wanted = (goal - floor) / known.white
-        whole_s = min(newest_s * wanted ** (-1.0 / falls), MAX_S) if wanted > 0.0 else MAX_S
+        whole_s = min(span_s * wanted ** (-1.0 / _FALLS), MAX_S) if wanted > 0.0 else MAX_S
     return Aim(math.sqrt(known.use), math.sqrt(goal), whole_s)
 
 

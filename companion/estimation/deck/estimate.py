@@ -5,6 +5,7 @@ An IMU's means are those it would have at rest: at the gradienter's mean tilt, u
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
@@ -13,7 +14,6 @@ import numpy as np
 
 from companion.config.sections import AllanModel
 from companion.errors import CalibrationRefusedError
-from companion.estimation.collector.measurement import Work
 from companion.estimation.deck.smoother import Believed, Found, Passage, smooth
 from companion.estimation.deck.waves import Compared, Level, compare
 from companion.estimation.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
@@ -81,13 +81,16 @@ class ImuSecond(NamedTuple):
     shared_variance: Floats
 
 
-class DeckWork(Work, frozen=True, kw_only=True):
-    """Estimate of a window on a deck."""
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DeckWindow:
+    """Readings of a window on a deck, and its estimate."""
 
     imus: Sequence[ImuInput]
     seconds: Sequence[Sequence[ImuSecond]]
     levels: Sequence[Mapping[int, Level]]
     headings: Mapping[int, float]
+    slots: Sequence[int]
+    """Seconds of the window, ascending."""
     gradienter: GradienterModel | None
     compass: CompassModel | None
     horizon_s: float

@@ -13,7 +13,7 @@ import pytest
 from companion.component.statustext import LINE_BYTES
 from companion.errors import CalibrationRefusedError
 from companion.estimation.deck.deck import Aim, Deck, aim, more
-from companion.estimation.deck.estimate import DeckFound, TriadVariances
+from companion.estimation.deck.estimate import DeckFound
 from companion.estimation.deck.smoother import passage
 from companion.estimation.deck.waves import Fluid, Level, fit_waves, whitened
 from companion.estimation.means.pose import CompassModel, GradienterModel
@@ -185,21 +185,21 @@ def test_the_time_that_is_said_is_the_time_it_takes(
     deck = Deck(*AROUND)
     deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["icm42688p"]))
     feed(deck, ImuModel(aircraft, "icm42688p", seed=5), 212, np.random.default_rng(5), 1.0)
-    past: list[tuple[int, TriadVariances]] = []
+    past: list[int] = []
     said: list[Aim] = []
     for end in range(60, 211, 30 if least_s > 100 else 15):
         found = deck.work(range(1, 1 + end)).run()
         assert isinstance(found, DeckFound)
-        past.append((end, found.known[0]))
-        said.append(aim(past[0], past[-1], goal_deg_h * DEG_H))
+        past.append(end)
+        said.append(aim(end, found.known[0], goal_deg_h * DEG_H))
         if said[-1].sigma <= said[-1].goal:
             break
-    done_s = past[-1][0]
+    done_s = past[-1]
     assert said[-1].sigma <= said[-1].goal
     assert done_s >= least_s
-    for each, one in zip(past, said[:-1], strict=False):
-        left_s = done_s - each[0]
-        assert left_s / factor - 15.0 <= one.whole_s - each[0] <= left_s * factor + 15.0, (each[0], one, done_s)
+    for end, one in zip(past, said[:-1], strict=False):
+        left_s = done_s - end
+        assert left_s / factor - 15.0 <= one.whole_s - end <= left_s * factor + 15.0, (end, one, done_s)
 
 
 def test_it_fits_into_one_statustext() -> None:
