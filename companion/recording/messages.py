@@ -18,7 +18,7 @@ from companion.estimation.means.windows import ImuInput
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.site import Whereabouts
 from companion.estimation.solution.truth import Otherwise
-from companion.estimation.turning.watch import Turn
+from companion.estimation.turning.turn import Turn
 
 FORMAT_VERSION: Final = "4"
 METADATA: Final = "companion"

@@ -27,7 +27,7 @@ from companion.estimation.means.pose import FieldWindow, heading_window, tilt_wi
 from companion.estimation.means.windows import ImuEstimate, ImuInput, Window, imu_estimates
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.estimation.stillness.stretch import Stretch
-from companion.estimation.turning.watch import Turn
+from companion.estimation.turning.turn import Turn
 
 MIN_BATCHES: Final = 5
 """Seconds of a window that was asked for with `since_s`: fewer say nothing about their own scatter."""

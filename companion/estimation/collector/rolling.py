@@ -22,7 +22,8 @@ from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.seconds.batch import Batch
 from companion.estimation.seconds.counting import TurnCounter
 from companion.estimation.stillness.gates import Verdict
-from companion.estimation.turning.watch import Turn, TurnWatch
+from companion.estimation.turning.turn import Turn
+from companion.estimation.turning.watch import TurnWatch
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
 if TYPE_CHECKING:

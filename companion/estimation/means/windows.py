@@ -29,7 +29,7 @@ from companion.estimation.noise.allan import (
 )
 from companion.estimation.noise.robust import RAMP_BATCHES, huber_line, is_ramp, robust_mean
 from companion.estimation.seconds.batch import Batch
-from companion.estimation.turning.watch import Turn
+from companion.estimation.turning.turn import Turn
 from companion.physics.frames import Floats, vector
 from companion.physics.units import DEG_H, MG
 from companion.samples import TRIADS, Triad, Vector, rows_of

@@ -33,7 +33,7 @@ from companion.estimation.records.record import AccelPrior, GyroPrior, Prior, Wh
 from companion.estimation.solution.doubt import Doubt, Witness, contradictions
 from companion.estimation.solution.prior import Expectation, ExpectedImu
 from companion.estimation.solution.solve import ImuSolution, Pair, Shared, Solution, moved
-from companion.estimation.turning.watch import CHANCE_SIGMAS, Turn
+from companion.estimation.turning.turn import CHANCE_SIGMAS, Turn
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG, UNITS
 from companion.samples import TRIADS, Triad, rows_of

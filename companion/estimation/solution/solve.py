@@ -28,7 +28,7 @@ from companion.estimation.request import What
 from companion.estimation.solution.site import LocalEarth, Remedies
 from companion.estimation.solution.truth import NOTHING, Otherwise, Truth, truth_of
 from companion.estimation.stillness.plausible import implausible
-from companion.estimation.turning.watch import Turn
+from companion.estimation.turning.turn import Turn
 from companion.physics.frames import Array, Matrix, roll_pitch_from_up, skew
 from companion.physics.units import DEG
 from companion.samples import Triad

@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
-from typing import Final
+from typing import Final, NamedTuple
 
-import msgspec
 import numpy as np
 
 from companion.config.sections import AllanModel, NoiseProfile
 from companion.estimation.noise.allan import floor_variance
 from companion.estimation.noise.slope import FEWEST, Slope, fit_slope, hidden_by_steps
 from companion.estimation.seconds.batch import Batch
+from companion.estimation.turning.turn import SIGNIFICANT, Turn
 from companion.physics.frames import Array, Floats, Matrix
 from companion.physics.units import DEG, DEG_H
 
@@ -44,50 +43,25 @@ HINT_SIGMAS: Final = 2.0
 STEP_SIGMAS: Final = 5.0
 STEP_CHI_SQUARE: Final = 12.0
 """Gain of a step over a cubic, a warm-up, from which it is sure."""
-SIGNIFICANT: Final = 4.0
-"""Sigmas; rates are judged every second: 3 would be exceeded by chance in one still minute of a hundred."""
 ACROSS_SHARE: Final = 0.25
 """Share of a turn about the vertical that an error of the vertical, some degrees, shows in the level plane."""
 
 
-class GyroChange(msgspec.Struct, frozen=True, kw_only=True):
-    """Rate of one gyro triad above its level at rest."""
+class GyroEvidence(NamedTuple):
+    """Evidence of one IMU about a turn of the platform."""
 
-    down_rad_s: float
-    """About the vertical, clockwise seen from above."""
-    variance: float
-    noise: float
-    """Part of the variance that neither warm-up nor tilt explains."""
-    is_vouched: bool
-    """A compass has seen that nothing turned when the level was measured."""
-    is_across: bool
-    """Part of the change lies in the level plane, as no turn of the ground does: the sensor has changed."""
-
-    def contradicts(self, rate_rad_s: float, sigma_rad_s: float) -> bool:
-        """Whether another estimate of the platform's rate differs significantly."""
-        return abs(self.down_rad_s - rate_rad_s) > SIGNIFICANT * math.hypot(math.sqrt(self.variance), sigma_rad_s)
-
-
-class Step(msgspec.Struct, frozen=True, kw_only=True):
-    """Most likely step of the rate about the vertical within the window."""
-
-    first: int
-    """First second after it."""
-    is_sure: bool
-    """Neither the part's noise nor a warm-up explains it."""
-    off_rad_s: float
-    """Error that the step leaves in the mean of the window."""
-
-
-class Look(msgspec.Struct, frozen=True, kw_only=True):
-    """Evidence of one IMU about a turn."""
-
-    change: GyroChange | None
+    turn: Turn | None
+    """Rate about the vertical above the level at rest; None without a level."""
+    has_changed: bool
+    """Part of that rate lies in the level plane, as no turn of the ground does: the sensor itself has changed."""
     tilting_rad_s: Array
     """Rotation of the direction of gravity: (3,) horizontal, vehicle FRD."""
     tilting_variance: float
     """Variance of each component."""
-    step: Step | None
+    began: int | None
+    """First second after a step of the rate that neither the part's noise nor a warm-up explains."""
+    step_rad_s: float
+    """Error that the likeliest step leaves in the mean of the window; 0 where it is chance."""
     white: float
     """White noise N about the vertical."""
 
@@ -164,7 +138,7 @@ class ImuLevel:
         """Variance of the platform's rate during the level."""
         return sum(second[_TURNED] for second in self._level) / len(self._level) if self._level else math.nan
 
-    def look(self) -> Look | None:
+    def evidence(self) -> GyroEvidence | None:
         """Compare the window with the level, if there is one, and with gravity; None while it is too short."""
         if len(self._window) < FEWEST:
             return None
@@ -182,36 +156,32 @@ class ImuLevel:
             walk=self._least[2],
             hidden=np.array([hidden_by_steps(self._steps[k // 3], float(self._variance[k])) for k in range(6)]),
         )
-        change = self._change(window, slope, down)
         if shows_noise:
             self._white[:3] = slope.white[:3].max()
         white = float(np.sqrt(np.square(down) @ np.square(slope.white[:3])))
-        step = None
+        began, step_rad_s = None, 0.0
         if self._steps[0] == 0.0 and len(window) >= RESTED_S + LEVEL_S:
-            step = _step(window[:, _SLOT], window[:, _RATES] @ down, white, self._gyro)
+            began, step_rad_s = _step(window[:, _SLOT], window[:, _RATES] @ down, white, self._gyro)
+        turn, has_changed = self._turn(window, slope, down)
         up, moves = -down, slope.per_s[3:] / _length(force)
-        return Look(
-            change=change,
-            # d up / dt = -rate x up, so that the level part of the rate is (d up / dt) x up.
-            tilting_rad_s=np.cross(moves - up * (up @ moves), up),
-            tilting_variance=float(slope.variance[3:].max()) / _length(force) ** 2,
-            step=step,
-            white=white,
-        )
+        # d up / dt = -rate x up, so that the level part of the rate is (d up / dt) x up.
+        tilting = np.cross(moves - up * (up @ moves), up)
+        tilting_variance = float(slope.variance[3:].max()) / _length(force) ** 2
+        return GyroEvidence(turn, has_changed, tilting, tilting_variance, began, step_rad_s, white)
 
-    def _change(self, window: Floats, slope: Slope, down: Array) -> GyroChange | None:
+    def _turn(self, window: Floats, slope: Slope, down: Array) -> tuple[Turn | None, bool]:
+        """Return the rate above the level about the vertical, and whether another part is above it too."""
         count, weight = len(window), len(self._level)
         if weight < LEVEL_S:
-            return None
+            return None, False
         level = np.array(self._level).mean(axis=0)
         now = window.mean(axis=0)
         off = now[_RATES] - level[_RATES]
         unseen = float(np.nan_to_num(level[_TURNED]))
         age_s = float(now[_SLOT] - level[_SLOT])
         gap_s = max(age_s - (count + weight) / 2.0, 0.0)
-        variance = np.square(slope.white[:3]) * (1.0 / count + 1.0 / weight)
-        variance = variance + floor_variance(self._gyro.flicker, self._gyro.walk, weight, count + 2.0 * gap_s)
-        noise = float(np.square(down) @ variance) + unseen
+        noise = np.square(slope.white[:3]) * (1.0 / count + 1.0 / weight)
+        noise = noise + floor_variance(self._gyro.flicker, self._gyro.walk, weight, count + 2.0 * gap_s)
         # Warm-up: as fast as the rates show, or as the thermometer says.
         ramp = np.abs(slope.per_s[:3])
         ramp = np.where(ramp > RAMP_SIGMAS * np.sqrt(slope.variance[:3]), ramp, 0.0)
@@ -223,53 +193,40 @@ class ImuLevel:
         hidden = 0.5 * self._steps[0]
         leaned = _length(down + level[4:7] / _length(level[4:7]))
         felt = (PER_G_RAD_S + EARTH_RAD_S) * leaned
-        variance = variance + np.square(2.0 * ramp * min(age_s, WARMING_S)) + warmed**2 + hidden**2 + felt**2
+        variance = noise + np.square(2.0 * ramp * min(age_s, WARMING_S)) + warmed**2 + hidden**2 + felt**2
         along = float(off @ down)
-        across = off - along * down
+        across = np.abs(off - along * down)
         # The heading may be another one: the Earth's rate then points elsewhere in the level plane.
         limit = SIGNIFICANT * np.sqrt(variance + EARTH_RAD_S**2) + ACROSS_SHARE * abs(along)
-        return GyroChange(
-            down_rad_s=along,
-            variance=float(np.square(down) @ variance) + unseen,
-            noise=noise,
+        turn = Turn(
+            rate_rad_s=along,
+            sigma_rad_s=math.sqrt(np.square(down) @ variance + unseen),
+            noise_rad_s=math.sqrt(np.square(down) @ noise + unseen),
+            by="gyros",
             is_vouched=math.isfinite(level[_TURNED]),
-            is_across=bool((np.abs(across) > limit).any()),
         )
+        return turn, bool((across > limit).any())
 
 
 def _length(vector: Floats) -> float:
     return math.sqrt(vector @ vector)
 
 
-def _step(slots: Floats, values: Floats, white: float, model: AllanModel) -> Step | None:
-    """Find the likeliest step in (m,) means of a second, m >= `RESTED_S` + `LEVEL_S`; None where it is chance."""
+def _step(slots: Floats, values: Floats, white: float, model: AllanModel) -> tuple[int | None, float]:
+    """Find the likeliest step in (m,) means of a second, m >= `RESTED_S` + `LEVEL_S`; for `GyroEvidence`."""
     count = len(values)
     values = values - values.mean()
     before = np.arange(RESTED_S, count - LEVEL_S + 1)
     after = count - before
-    sums = np.cumsum(values)[before - 1]
-    jump = -sums * (1.0 / after + 1.0 / before)
+    jump = -np.cumsum(values)[before - 1] * (1.0 / after + 1.0 / before)
     chance = white**2 * (1.0 / before + 1.0 / after)
     best = int(np.argmax(np.square(jump) / chance))
     first, last = float(before[best]), float(after[best])
     sigma = math.sqrt(chance[best] + floor_variance(model.flicker, model.walk, first, last))
     if abs(jump[best]) <= HINT_SIGMAS * sigma:
-        return None
+        return None, 0.0
     time = (slots - slots[0]) / (slots[-1] - slots[0])
     basis, _ = np.linalg.qr(np.vander(time, 4))
     better = jump[best] ** 2 / chance[best] - np.square(values @ basis).sum() / white**2
-    return Step(
-        first=int(slots[before[best]]),
-        is_sure=bool(abs(jump[best]) > STEP_SIGMAS * sigma and better > STEP_CHI_SQUARE),
-        off_rad_s=float(jump[best]) * last / count,
-    )
-
-
-def common_change(changes: Iterable[GyroChange]) -> GyroChange | None:
-    """Return what the gyros show of the platform: the most precise one, unless another stays at its level."""
-    believed = [one for one in changes if not one.is_across]
-    if not believed:
-        return None
-    best = min(believed, key=lambda one: one.variance)
-    rivals = [one for one in believed if one.contradicts(best.down_rad_s, math.sqrt(best.variance))]
-    return min([best, *rivals], key=lambda one: abs(one.down_rad_s) / math.sqrt(one.variance))
+    is_sure = abs(jump[best]) > STEP_SIGMAS * sigma and better > STEP_CHI_SQUARE
+    return int(slots[before[best]]) if is_sure else None, abs(float(jump[best])) * last / count

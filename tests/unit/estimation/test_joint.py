@@ -16,7 +16,7 @@ from companion.estimation.solution.doubt import points
 from companion.estimation.solution.joint import Weighed, Whole, weigh
 from companion.estimation.solution.prior import Expectation, ExpectedImu, Prediction
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution
-from companion.estimation.turning.watch import Turn
+from companion.estimation.turning.turn import Turn
 from companion.samples import Triad
 from tests.prior_study import BY_READING, DEG, DEG_H, MG, G, imu_solution, shared_errors, solution
 

@@ -16,7 +16,7 @@ from companion.estimation.noise.slope import fit_slope
 from companion.estimation.request import What
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import solve
-from companion.estimation.turning.watch import Turn
+from companion.estimation.turning.turn import Turn
 from companion.physics.units import DEG, DEG_H
 from sim.accuracy import turning
 from tests.support.extent import extent

@@ -1,0 +1,145 @@
+"""Angular rate of the platform under a standing aircraft: a quantity with a sigma, not an assumption.
+
+A significant rate blocks a calibration. A smaller one is not subtracted, since the ground does not turn, but belongs to
+the sigma of every gyro. So does the slope of gravity, for the level axes; the gates refuse a larger tilt.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final, Literal
+
+import msgspec
+import numpy as np
+
+from companion.estimation.noise.slope import FEWEST, fit_slope, hidden_by_steps, plain_slope
+from companion.estimation.seconds.batch import Batch, decimal, few_distinct
+from companion.physics.frames import Array, Matrix
+from companion.physics.units import DEG
+from companion.samples import Vector
+
+LEAST_RAD_S: Final = 0.005 * DEG
+"""A smaller rate never blocks: a compass warms up and wanders by some tenths of a degree in a minute."""
+LEAST_BY_GYROS_RAD_S: Final = 0.01 * DEG
+"""A smaller rate never blocks without compass: a gyro that warms up unevenly shows as much."""
+SIGNIFICANT: Final = 4.0
+"""Sigmas; rates are judged every second: 3 would be exceeded by chance in one still minute of a hundred."""
+CHANCE_SIGMAS: Final = 2.0
+EVEN: Final = 0.25
+"""Share of the rate that each half of the headings must show; after a jump one half does not."""
+
+
+class Turn(msgspec.Struct, frozen=True, kw_only=True):
+    """Angular rate of the platform during a window."""
+
+    rate_rad_s: float = 0.0
+    """About the vertical, clockwise seen from above; never subtracted."""
+    sigma_rad_s: float = 0.0
+    noise_rad_s: float = 0.0
+    """Sigma of the gyros without warm-up."""
+    by: Literal["compass", "gyros", "compass and gyros", "earlier calibrations"] | None = None
+    """None: nothing measures it, and the platform counts as fixed to the Earth."""
+    tilting_rad_s: Vector = (0.0, 0.0, 0.0)
+    """Level part, vehicle FRD."""
+    tilting_sigma_rad_s: float = 0.0
+    step_rad_s: float = 0.0
+    """Error of the window's mean where a turn may have begun within it."""
+    is_vouched: bool = True
+    """A compass has seen the level of the gyros at rest; else that level may hold a turn."""
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the platform turns about the vertical."""
+        least = LEAST_BY_GYROS_RAD_S if self.by == "gyros" else LEAST_RAD_S
+        return abs(self.rate_rad_s) > max(SIGNIFICANT * self.sigma_rad_s, least)
+
+    @property
+    def in_words(self) -> str:
+        """'turns 0.15 deg/s to the left'."""
+        size = abs(self.rate_rad_s) / DEG
+        digits = max(1, 1 - math.floor(math.log10(size))) if size > 0.0 else 2
+        return f"turns {size:.{digits}f} deg/s to the {'right' if self.rate_rad_s > 0.0 else 'left'}"
+
+    @property
+    def is_chance(self) -> bool:
+        """Whether a platform at rest may well show such a rate."""
+        return abs(self.rate_rad_s) <= CHANCE_SIGMAS * self.sigma_rad_s
+
+    @property
+    def is_told(self) -> bool:
+        """Whether the rate is measured; else the ground counts as fixed to the Earth."""
+        return self.by is not None and self.is_vouched
+
+    @property
+    def at_most_rad_s(self) -> float:
+        """Rate about the vertical that is hardly exceeded."""
+        return abs(self.rate_rad_s) + 2.0 * self.sigma_rad_s
+
+    @property
+    def variance(self) -> float:
+        """Variance of the error in a gyro about the vertical, (rad/s)^2.
+
+        Without compass the ground counts as fixed unless the gyros show more than chance.
+        """
+        if self.is_told:
+            return self.rate_rad_s**2 + self.sigma_rad_s**2 + self.step_rad_s**2
+        known = self.rate_rad_s if abs(self.rate_rad_s) > self.noise_rad_s else 0.0
+        return known**2 + self.step_rad_s**2
+
+    def covariance(self, up: Array) -> Matrix:
+        """Covariance of the error in every gyro, (3, 3) vehicle FRD; `up` (3,) is the vertical there."""
+        level = np.eye(3) - np.outer(up, up)
+        tilting = level @ np.array(self.tilting_rad_s)
+        return np.outer(up, up) * self.variance + np.outer(tilting, tilting) + level * self.tilting_sigma_rad_s**2
+
+    def contradicts(self, other: Turn) -> bool:
+        """Whether another estimate of the platform's rate differs significantly."""
+        return abs(self.rate_rad_s - other.rate_rad_s) > SIGNIFICANT * math.hypot(self.sigma_rad_s, other.sigma_rad_s)
+
+
+def by_compass(headings: Sequence[Batch]) -> Turn | None:
+    """Estimate the rate by the slope of the heading; never significant where it jumps instead of turning."""
+    if len(headings) < FEWEST:
+        return None
+    slots = np.array([batch.slot for batch in headings], dtype=np.int64)
+    turned = np.unwrap(np.array([batch.mean for batch in headings]), period=360.0, axis=0)
+    white, low, high, distinct = (
+        np.array([getattr(batch, name) for batch in headings]) for name in ("white", "low", "high", "distinct")
+    )
+    step = max(float(np.where(distinct == 2, high - low, 0.0).max()), float(decimal(low, high)[0]))
+    hidden = hidden_by_steps(step, float(white.mean()), enough=not few_distinct(distinct)[0])
+    # Few seconds say little about their own noise; the readings within them say more.
+    least = math.sqrt(float(np.mean([batch.white[0] / batch.n for batch in headings])))
+    found = fit_slope(slots, turned, white=least, hidden=hidden)
+    rate, sigma = float(found.per_s[0]), math.sqrt(float(found.variance[0]))
+    half = len(slots) // 2
+    parts = [plain_slope(slots[part], turned[part, 0]) for part in (slice(None, -half), slice(half, None))]
+    if not all(part * rate > EVEN * rate**2 for part in parts):
+        sigma = max(sigma, abs(rate) / SIGNIFICANT)
+    return Turn(rate_rad_s=rate * DEG, sigma_rad_s=sigma * DEG, by="compass")
+
+
+def by_gyros(turns: Sequence[Turn]) -> Turn | None:
+    """Return the most precise rate of several IMUs, unless another IMU stays at its level."""
+    if not turns:
+        return None
+    best = min(turns, key=lambda one: one.sigma_rad_s)
+    rivals = [one for one in turns if one.contradicts(best)]
+    return min([best, *rivals], key=lambda one: abs(one.rate_rad_s) / one.sigma_rad_s)
+
+
+def by_both(gyros: Turn | None, seen: Turn | None) -> Turn:
+    """Combine gyros and compass; where they contradict, gyros at their level are right."""
+    if gyros is None or seen is None:
+        return gyros or seen or Turn()
+    if not gyros.is_vouched:
+        return seen
+    if gyros.contradicts(seen):
+        return gyros if abs(gyros.rate_rad_s) <= SIGNIFICANT * gyros.sigma_rad_s else seen
+    share = seen.sigma_rad_s**2 / (gyros.sigma_rad_s**2 + seen.sigma_rad_s**2)
+    return Turn(
+        rate_rad_s=share * gyros.rate_rad_s + (1.0 - share) * seen.rate_rad_s,
+        sigma_rad_s=math.sqrt(share) * gyros.sigma_rad_s,
+        by="compass and gyros",
+    )
