@@ -12,7 +12,7 @@ MOST_BYTES: Final = 2 * 1024 * 1024
 """The most bytes among them: 15 s of an IMU at 1 kHz have 1.4 MB."""
 
 
-class Batch(NamedTuple):
+class TapeBatch(NamedTuple):
     """Messages for the disk, and the states in force before the first of them."""
 
     since_s: float
@@ -49,9 +49,9 @@ class Tape:
         """Take no more messages."""
         self.is_on, self.lost, self._bytes, self._waiting = False, 0, 0, []
 
-    def drain(self, now_s: float) -> Batch:
+    def drain(self, now_s: float) -> TapeBatch:
         """Give all that waits."""
-        batch = Batch(self._since_s, self._states_before, self._waiting)
+        batch = TapeBatch(self._since_s, self._states_before, self._waiting)
         self._since_s, self._states_before = now_s, list(self._states.values())
         self._waiting, self._bytes = [], 0
         return batch

@@ -13,7 +13,7 @@ from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import ImuInput, integer_steps
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.estimation.seconds.counting import Counted, TurnCounter
-from companion.estimation.stillness.gates import STILL, ImuGate, PoseGate, Verdict
+from companion.estimation.stillness.gates import STILL, ImuGate, PoseGate, GateVerdict
 from companion.estimation.stillness.stretch import Settling
 from companion.physics.frames import Array
 from companion.samples import ImuSample
@@ -63,7 +63,7 @@ class Source:
     ) -> None:
         self.kind, self.name, self.batches, self.gate = kind, name, batches, gate
         self._may_move = may_move
-        self.verdict = Verdict(still=False)
+        self.verdict = GateVerdict(still=False)
         self.settling: Settling | None = None
         self.unsettled: deque[int] = deque(maxlen=0)
         """Seconds in which its readings still followed a movement; good for the others, not for a mean of its own."""
@@ -88,7 +88,7 @@ class Source:
         if batch is None:
             # Before the first whole second there is nothing to complain about.
             words = f"{self.label} was silent for a second" if batches else ""
-            self.verdict = Verdict(still=False, words=words, fault=True)
+            self.verdict = GateVerdict(still=False, words=words, fault=True)
         elif batch.slot == slot:
             verdict = self.gate.judge(batch)
             self.verdict = STILL if self._may_move and not verdict.fault else verdict
@@ -103,7 +103,7 @@ class Source:
     def forget(self) -> None:
         """Drop the seconds so far."""
         self.batches.forget()
-        self.verdict = Verdict(still=False)
+        self.verdict = GateVerdict(still=False)
         if isinstance(self.gate, ImuGate):
             self.gate.forget_level()
 

@@ -21,7 +21,7 @@ from companion.estimation.means.pose import CompassModel, FieldHeading, Gradient
 from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.seconds.batch import Batch
 from companion.estimation.seconds.counting import TurnCounter
-from companion.estimation.stillness.gates import Verdict
+from companion.estimation.stillness.gates import GateVerdict
 from companion.estimation.turning.turn import Turn
 from companion.estimation.turning.watch import TurnWatch
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
@@ -294,7 +294,7 @@ class RollingCollector:
     def _sources(self) -> list[Source]:
         return [*self.imus.values(), *(source for source in (self._tilt, self._heading) if source is not None)]
 
-    def _others(self) -> list[Verdict]:
+    def _others(self) -> list[GateVerdict]:
         """Return the verdicts on all sources but the compass."""
         return [source.verdict for source in self._sources() if source is not self._heading]
 

@@ -76,8 +76,7 @@ _FEW_LEVELS: Final = 4
 _TIMES_EACH: Final = 4
 """Least readings a level: few samples are never the same, and no steps."""
 _COARSE_S: Final = 3
-_ROUNDED: Final = 0.05
-"""Share of a step: the last digit of a log in other units."""
+"""Seconds of few levels that show a coarse stream."""
 _RECENT: Final = 10
 _REFERENCE: Final = 5
 _CHANCE: Final = 3.0
@@ -85,8 +84,8 @@ _STATIONARY: Final = 2.0
 """Largest ratio of noise at rest to its usual variance."""
 
 
-class Verdict(msgspec.Struct, frozen=True):
-    """Verdict of one gate on one second; `words` name the device and are empty when still."""
+class GateVerdict(msgspec.Struct, frozen=True):
+    """GateVerdict of one gate on one second; `words` name the device and are empty when still."""
 
     still: bool
     words: str = ""
@@ -96,20 +95,20 @@ class Verdict(msgspec.Struct, frozen=True):
     """Words without figures, for counting; those of a fault in full."""
 
 
-STILL: Final = Verdict(still=True)
+STILL: Final = GateVerdict(still=True)
 
 
-def _words(what: str, found: float, allowed: float, unit: str, hint: str = "") -> Verdict:
+def _words(what: str, found: float, allowed: float, unit: str, hint: str = "") -> GateVerdict:
     """'gyro fc moves 0.31 deg/s, max 0.10' and a hint, with as many digits as the difference takes."""
     for digits in (2, 3, 4):
         left, right = f"{found:.{digits}f}", f"{allowed:.{digits}f}"
         if left != right:
             break
-    return Verdict(still=False, words=f"{what} {left} {unit}, max {right}{hint}", what=what)
+    return GateVerdict(still=False, words=f"{what} {left} {unit}, max {right}{hint}", what=what)
 
 
-def _fault(words: str) -> Verdict:
-    return Verdict(still=False, words=words, fault=True, what=words)
+def _fault(words: str) -> GateVerdict:
+    return GateVerdict(still=False, words=words, fault=True, what=words)
 
 
 def _slow_part(batch: Batch, channels: slice, gate: float, bounds: tuple[float, float]) -> tuple[float, float]:
@@ -144,8 +143,7 @@ class ImuGate:
         self._white = profile.gyro.white, profile.accel.white
         self._is_float = np.repeat(steps, 3) == 0.0
         self._few_levels_s = np.zeros(6, dtype=np.int64)
-        """Seconds of few levels a step apart since the last one of many, for each channel."""
-        self._step = np.zeros(6)
+        """Seconds of few levels since the last one of many, for each channel."""
         self._coarse_slot = [-math.inf, -math.inf]
         """Latest second in which the gyro, or the accelerometer, changed in coarse steps."""
         self._whites: deque[Floats] = deque(maxlen=_RECENT)
@@ -170,7 +168,7 @@ class ImuGate:
         if len(self._start) < _REFERENCE:
             self._start.append(batch.mean[3:])
 
-    def judge(self, batch: Batch) -> Verdict:
+    def judge(self, batch: Batch) -> GateVerdict:
         """Judge whether this IMU was still; learn its noise on the way."""
         if (broken := self._broken(batch)) is not None:
             return broken
@@ -178,7 +176,7 @@ class ImuGate:
         self._own.add(batch)
         return self._moving(batch) or self._displaced(batch) or STILL
 
-    def _broken(self, batch: Batch) -> Verdict | None:
+    def _broken(self, batch: Batch) -> GateVerdict | None:
         name = self._name
         if batch.n < MIN_IMU_SAMPLES:
             return _fault(f"imu {name} sends {batch.n} Hz, needs {MIN_IMU_SAMPLES}")
@@ -201,23 +199,16 @@ class ImuGate:
         """Find a coarse stream of floats: some logs round, some parts have few digits.
 
         Where noise is smaller than a step, a second without any change and one that toggles between two values are
-        both rest. One second of few values may be that of a freeze; several with multiples of one step are not.
+        both rest. One second of few values may be that of a freeze; several are not.
         """
         levels = batch.distinct
         few = (levels >= 2) & (levels <= _FEW_LEVELS) & (levels * _TIMES_EACH <= batch.n)
-        size = (batch.high - batch.low) / np.maximum(levels - 1, 1)
-        step = np.where(self._few_levels_s > 0, self._step, size)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.maximum(size, step) / np.minimum(size, step)
-            fits = np.abs(ratio - np.rint(ratio)) <= _ROUNDED
-        self._few_levels_s = np.where(few, np.where(fits, self._few_levels_s + 1, 1), self._few_levels_s)
-        self._few_levels_s[levels > _FEW_LEVELS] = 0
-        self._step = np.where(few, np.where(fits, np.minimum(size, step), size), self._step)
+        self._few_levels_s = np.where(levels > _FEW_LEVELS, 0, self._few_levels_s + few)
         for number, (_, triad, *_) in enumerate(_TRIADS):
             if (few & (self._few_levels_s >= _COARSE_S))[triad].any():
                 self._coarse_slot[number] = batch.slot
 
-    def _moving(self, batch: Batch) -> Verdict | None:
+    def _moving(self, batch: Batch) -> GateVerdict | None:
         for number, (part, triad, motion, vibration, unit, unit_name) in enumerate(_TRIADS):
             # What unfiltered white noise of the profile's density makes of one sample at this rate.
             own, noise = self._own.known[number], self._white[number] * math.sqrt(batch.n)
@@ -238,7 +229,7 @@ class ImuGate:
         self._noise = np.mean(self._whites, axis=0)
         return None
 
-    def _displaced(self, batch: Batch) -> Verdict | None:
+    def _displaced(self, batch: Batch) -> GateVerdict | None:
         name, rate, force = self._name, batch.mean[:3], batch.mean[3:]
         size, turns = math.sqrt(force @ force), float(np.abs(rate).max())
         if not abs(size - GRAVITY_M_S2) <= GRAVITY_GATE_M_S2:
@@ -289,7 +280,7 @@ class PoseGate:
         if len(self._start) < _REFERENCE:
             self._start.append(batch.mean)
 
-    def judge(self, batch: Batch) -> Verdict:
+    def judge(self, batch: Batch) -> GateVerdict:
         """Judge whether this sensor was still."""
         every = slice(None)
         found, allowed = _slow_part(batch, every, self._motion_deg, (0.0, self._motion_deg**2))

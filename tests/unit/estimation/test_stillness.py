@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
-from companion.estimation.stillness.gates import ImuGate, PoseGate, Verdict
+from companion.estimation.stillness.gates import ImuGate, PoseGate, GateVerdict
 from companion.estimation.stillness.stretch import Stretch
 from companion.physics.units import DEG, MG
 
@@ -42,7 +42,7 @@ class Imu:
     def rows(self, motion: Floats | float = 0.0) -> Floats:
         return np.asarray(REST + motion + self.rng.normal(size=(self.rate_hz, 6)) * self.sigma)
 
-    def second(self, motion: Floats | float = 0.0, *, accept: bool = True) -> Verdict:
+    def second(self, motion: Floats | float = 0.0, *, accept: bool = True) -> GateVerdict:
         batch = batch_of(self.rows(motion))
         verdict = self.gate.judge(batch)
         if verdict.still and accept:
