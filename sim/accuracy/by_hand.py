@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from companion.estimation.alignment.align import turned
-from companion.estimation.alignment.align_model import Ground, ImuStand, Stand
+from companion.estimation.alignment.align_model import Ground, ImuStand, StandMeans
 from companion.estimation.alignment.faces import Face, Sides, faces, mounting
 from companion.estimation.collector.outlook import Settings
 from companion.estimation.collector.rolling import RollingCollector
@@ -80,7 +80,7 @@ class _Stood:
     def face(self) -> Face:
         return Face(np.array(self.window.accel_m_s2), np.array(self.window.accel_sigma_use_m_s2))
 
-    def on_spot(self, turned: Counted, before: Stand | None) -> Stand:
+    def on_spot(self, turned: Counted, before: StandMeans | None) -> StandMeans:
         window, heading_rad = self.window, turned.angle_rad + (0.0 if before is None else before.heading_rad)
         means = ImuStand(
             "imu",
@@ -90,7 +90,7 @@ class _Stood:
             np.array(window.gyro_sigma_use_rad_s),
         )
         is_turned = before is not None
-        return Stand((means,), None, (1.0, 1.0), heading_rad, turned.sigma_rad, on_spot=True, counted=is_turned)
+        return StandMeans((means,), None, (1.0, 1.0), heading_rad, turned.sigma_rad, on_spot=True, counted=is_turned)
 
 
 class _Spot:
@@ -100,9 +100,9 @@ class _Spot:
         self.stood: list[_Stood] = []
         self.counter = TurnCounter()
 
-    def chosen(self, headings: int) -> list[Stand]:
+    def chosen(self, headings: int) -> list[StandMeans]:
         """As `align turn` asks: there, turned by half a turn, and on to the first; or by quarters all round."""
-        found: list[Stand] = []
+        found: list[StandMeans] = []
         counter = copy.deepcopy(self.counter)  # which lets go of what was before a stand
         chosen = self.stood[::2] if headings == 2 else self.stood
         for before, now in zip([None, *chosen], chosen, strict=False):

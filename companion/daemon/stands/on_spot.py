@@ -18,7 +18,7 @@ from companion.daemon.stands.alignment import AlignmentInForce, FacesInForce
 from companion.daemon.stands.session import ARMED, PoseTask, SessionState
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align import Alignment, ImuAlignment, align, in_words, turned
-from companion.estimation.alignment.align_model import Ground, ImuStand, Stand
+from companion.estimation.alignment.align_model import Ground, ImuStand, StandMeans
 from companion.estimation.alignment.faces import mounting
 from companion.estimation.alignment.poses import (
     BY_EYE_SIGMA_DEG,
@@ -60,7 +60,7 @@ class SpotTask(PoseTask):
     """An alignment on one spot, with its estimate."""
 
     result: Alignment
-    stands: Sequence[Stand] = ()
+    stands: Sequence[StandMeans] = ()
 
     def __init__(self, core: Core, request: AlignmentRequest) -> None:
         self._core, self._request = core, request
@@ -104,7 +104,7 @@ class SpotTask(PoseTask):
             noise_deg = (1.0, 1.0) if tilt is None else (tilt.x_sigma_deg, tilt.y_sigma_deg)
             x_sigma_deg, y_sigma_deg = (math.hypot(READING_SIGMA_DEG, each) for each in noise_deg)
             stands.append(
-                Stand(
+                StandMeans(
                     imus=tuple(_imu_stand(imus[name]) for name in names),
                     tilt_deg=None if tilt is None else (tilt.x_deg - zero_deg[0], tilt.y_deg - zero_deg[1]),
                     tilt_sigma_deg=(x_sigma_deg, y_sigma_deg),

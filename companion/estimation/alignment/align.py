@@ -40,8 +40,8 @@ from companion.estimation.alignment.align_model import (
     LeastSquares,
     Model,
     Priors,
-    Row,
-    Stand,
+    ResidualLabel,
+    StandMeans,
     fit,
 )
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
@@ -95,7 +95,7 @@ class ImuAlignment:
 class Complaint:
     """The residual that fits worst: in its own sigmas, and in SI units."""
 
-    row: Row
+    label: ResidualLabel
     sigmas: float
     size: float
 
@@ -124,7 +124,7 @@ class Alignment:
 
 
 def align(
-    law: Law, vehicle_from_sensor: Matrix, stands: Sequence[Stand], ground: Ground, priors: Priors | None = None
+    law: Law, vehicle_from_sensor: Matrix, stands: Sequence[StandMeans], ground: Ground, priors: Priors | None = None
 ) -> Alignment:
     """Estimate all unknowns from all stands, at least one; `vehicle_from_sensor` is the gradienter's mounting.
 
@@ -149,7 +149,7 @@ def align(
     freedom = int((found.residual.size - np.count_nonzero(model.sigma)) - sum(model.sigma[model.damped] > 0.0))
     # A stand's placement is checked where the other stands predict it: the rest is its redundancy.
     checked = any(
-        row.group == "spot" and share > 0.1 for row, share in zip(model.labels, found.redundancy, strict=True)
+        group == "spot" and share > 0.1 for (group, *_), share in zip(model.labels, found.redundancy, strict=True)
     )
     covariance = widened_by(chi_square, freedom) * found.covariance
     return Alignment(
@@ -165,7 +165,7 @@ def align(
     )
 
 
-def turned(stands: Sequence[Stand], ground: Ground) -> Alignment:
+def turned(stands: Sequence[StandMeans], ground: Ground) -> Alignment:
     """Estimate level bias and slope from two or four headings on one spot, without a gradienter.
 
     Raises:
@@ -195,12 +195,12 @@ _UNKNOWN: Final = "the stands do not fit what is known of the sensors ({by}): be
 
 def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:
     """Say why the stands do not fit together, and what to do, in one line; `gradienter`: whether there was one."""
-    row, size = complaint.row, complaint.size
-    words = _COMPLAINTS.get(row.group, _UNKNOWN)
-    if row.group == "accelerometer" and not gradienter:
+    group, stand, name = complaint.label
+    words = _COMPLAINTS.get(group, _UNKNOWN)
+    if group == "accelerometer" and not gradienter:
         words = _LOOSE
     by = f"{complaint.sigmas:.0f} sigma"
-    return words.format(stand=row.stand, name=row.name, by=by, deg=size / DEG, mg=size / MG)
+    return words.format(stand=stand, name=name, by=by, deg=complaint.size / DEG, mg=complaint.size / MG)
 
 
 def widened_by(chi_square: float, freedom: int) -> float:
@@ -211,7 +211,7 @@ def widened_by(chi_square: float, freedom: int) -> float:
     return ratio if ratio > chi_square_ratio(freedom, _NINETY_NINE) else 1.0
 
 
-def _first_attitude(law: Law, mounting: Matrix, stand: Stand) -> Matrix:
+def _first_attitude(law: Law, mounting: Matrix, stand: StandMeans) -> Matrix:
     if stand.tilt_deg is not None:
         up = mounting @ up_in_sensor(law, *stand.tilt_deg)
     else:
@@ -226,13 +226,13 @@ def _worst(found: LeastSquares, model: Model) -> Complaint | None:
     residual, redundancy, labels = found.residual, found.redundancy, model.labels
     usable = redundancy > _LEAST_REDUNDANCY
     w = np.where(usable, residual / np.sqrt(np.where(usable, redundancy, 1.0)), 0.0)
-    beyond = np.abs(w) / np.array([SPOT_W_LIMIT if row.group == "spot" else W_LIMIT for row in labels])
+    beyond = np.abs(w) / np.array([SPOT_W_LIMIT if group == "spot" else W_LIMIT for group, *_ in labels])
     k = int(np.argmax(beyond))
     if beyond[k] <= 1.0:
         return None
     # All axes of that reading together: one axis alone depends on how the aircraft is turned.
-    alone = labels[k].group in ("zero", "prior")
-    axes = [k] if alone else [j for j, row in enumerate(labels) if row == labels[k] and usable[j]]
+    alone = labels[k][0] in ("zero", "prior")
+    axes = [k] if alone else [j for j, label in enumerate(labels) if label == labels[k] and usable[j]]
     size = float(np.linalg.norm(residual[axes] * model.row_sigma[axes] / redundancy[axes]))
     return Complaint(labels[k], abs(float(w[k])), size)
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final, Literal
 
 import numpy as np
@@ -34,6 +34,8 @@ from companion.physics.units import DEG, MG
 
 LEVEL: Final = np.array([0.0, 0.0, -1.0])
 Group = Literal["gradienter", "accelerometer", "gyro", "compass", "turn", "spot", "zero", "prior", "nothing"]
+ResidualLabel = tuple[Group, int, str]
+"""Group of a residual, its stand (from 1; 0: none), and its IMU, if any."""
 
 _ANYHOW_RAD: Final = 1.0
 """Damping of unknowns that only the readings determine: keeps the equations solvable."""
@@ -111,7 +113,7 @@ class ImuStand:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Stand:
+class StandMeans:
     """Means of one still window."""
 
     imus: tuple[ImuStand, ...]
@@ -155,15 +157,6 @@ class Priors:
     """Scale error of the gyros that count turns, common to all of them."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Row:
-    """Label of a residual: its group, stand (from 1; 0: none) and IMU, if any."""
-
-    group: Group
-    stand: int = 0
-    name: str = ""
-
-
 MISALIGNMENT, PART_SCALE, PART_SHEAR, ACCEL_BIAS, GYRO_BIAS = range(5)
 """Unknowns of an IMU, three figures each: x, y, z, and of the shear xy, xz, yz."""
 
@@ -180,7 +173,7 @@ class Model:
     def __init__(
         self,
         mounting: tuple[Law, Matrix],
-        stands: Sequence[Stand],
+        stands: Sequence[StandMeans],
         ground: Ground,
         priors: Priors,
         attitudes: Sequence[Matrix],
@@ -215,33 +208,33 @@ class Model:
         self.damped = [*range(2, 4), *range(self.turn.stop, self._first_imu)]
         """Unknowns that only the readings determine."""
 
-        each = [(k, name) for k in numbers for name in names]
-        self.labels = [
-            *(Row("gradienter", k + 1) for k in self._tilted for _ in range(2)),
-            *(Row("accelerometer", k + 1, name) for k, name in each for _ in range(3)),
-            *(Row("gyro", k + 1, name) for k, name in each for _ in range(3)),
-            *(Row("compass", k + 1) for k in self._headed),
-            *(Row("turn", k + 1) for k in self._turned),
-            *(Row("spot", k + 1) for k in self._on_spot for _ in range(2)),
-            *(Row(self._prior_group(int(part))) for part in np.flatnonzero(self.sigma)),
-        ]
-        """Labels of the residuals and of the priors."""
-        heading_sigma = np.array([stand.heading_sigma_rad for stand in stands])
-        self.row_sigma = np.concatenate(
-            [
-                np.array([stands[k].tilt_sigma_deg for k in self._tilted]).ravel() * DEG,
-                np.array([[imu.accel_sigma_m_s2 for imu in stand.imus] for stand in stands]).ravel(),
-                np.array([[imu.gyro_sigma_rad_s for imu in stand.imus] for stand in stands]).ravel(),
-                heading_sigma[self._headed],
-                heading_sigma[self._turned],
-                np.full(2 * len(self._on_spot), priors.placement_deg * DEG),
-                self.sigma[self.sigma > 0.0],
-            ]
-        )
-        """Sigma of every row of `labels`, SI units."""
+        self.labels: list[ResidualLabel] = []
+        """Labels of the residuals, in their order, and of the priors."""
+        sigmas: list[float] = []
 
-    def _prior_group(self, part: int) -> Group:
-        return "zero" if part < self.offset.stop else "nothing" if part in self.damped else "prior"
+        def add(group: Group, k: int, sigma: Iterable[float], name: str = "") -> None:
+            for each in sigma:
+                self.labels.append((group, k + 1, name))
+                sigmas.append(each)
+
+        for k in self._tilted:
+            add("gradienter", k, np.array(stands[k].tilt_sigma_deg) * DEG)
+        imus = [(k, imu) for k in numbers for imu in stands[k].imus]
+        for k, imu in imus:
+            add("accelerometer", k, imu.accel_sigma_m_s2, imu.name)
+        for k, imu in imus:
+            add("gyro", k, imu.gyro_sigma_rad_s, imu.name)
+        for k in self._headed:
+            add("compass", k, [stands[k].heading_sigma_rad])
+        for k in self._turned:
+            add("turn", k, [stands[k].heading_sigma_rad])
+        for k in self._on_spot:
+            add("spot", k, [priors.placement_deg * DEG] * 2)
+        for part in np.flatnonzero(self.sigma).tolist():
+            group: Group = "zero" if part < self.offset.stop else "nothing" if part in self.damped else "prior"
+            add(group, -1, [self.sigma[part]])
+        self.row_sigma = np.array(sigmas)
+        """Sigma of every row of `labels`, SI units."""
 
     def imu(self, imu: int, part: int) -> slice:
         """Place of one part of an IMU, counted from 0."""

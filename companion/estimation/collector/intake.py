@@ -13,7 +13,7 @@ from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.windows import ImuInput, integer_steps
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.estimation.seconds.counting import Counted, TurnCounter
-from companion.estimation.stillness.gates import STILL, ImuGate, PoseGate, GateVerdict
+from companion.estimation.stillness.gates import STILL, GateVerdict, ImuGate, PoseGate
 from companion.estimation.stillness.stretch import Settling
 from companion.physics.frames import Array
 from companion.samples import ImuSample

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align import Alignment, align, in_words
-from companion.estimation.alignment.align_model import Ground, ImuStand, Priors, Stand
+from companion.estimation.alignment.align_model import Ground, ImuStand, Priors, StandMeans
 from companion.physics.frames import rotation_matrix
 from companion.physics.gradienter import Law
 from companion.physics.units import DEG, DEG_H, MG
@@ -52,7 +52,7 @@ class World:
     def noise(self, sigma: float, size: int) -> Floats:
         return np.zeros(size) if self.rng is None else self.rng.normal(0.0, sigma, size)
 
-    def stand(self, body: Floats, *, on_spot: bool = True, in_range: bool = True) -> Stand:
+    def stand(self, body: Floats, *, on_spot: bool = True, in_range: bool = True) -> StandMeans:
         roll, pitch, heading = angles_of(body)
         aircraft = VirtualAircraft(Pose(pitch / DEG, roll / DEG, heading / DEG), SITE)
         truth = aircraft.truth_at(0.0)
@@ -61,7 +61,7 @@ class World:
         force = self.stretch @ self.imu_from_gradienter @ truth.force_m_s2 + self.accel_bias
         # Where the nose points up a heading says nothing.
         heading_sigma = self.heading_deg if abs(pitch) < 70 * DEG else 90.0
-        return Stand(
+        return StandMeans(
             imus=(
                 ImuStand(
                     "fc",
@@ -78,7 +78,7 @@ class World:
             on_spot=on_spot,
         )
 
-    def align(self, stands: list[Stand], priors: Priors | None = None) -> Alignment:
+    def align(self, stands: list[StandMeans], priors: Priors | None = None) -> Alignment:
         return align(self.law, rotation_matrix(self.mounting_deg), stands, GROUND, priors)
 
 
@@ -177,7 +177,7 @@ def test_everything_is_found_from_headings_and_tilts(law: Law, mounting_deg: tup
 
 def placed(
     world: World, headings_deg: list[float], slope_deg: tuple[float, float], placement_deg: float
-) -> list[Stand]:
+) -> list[StandMeans]:
     """Stands on one spot, each missing it a little."""
     stands = []
     for body in on_spot(headings_deg, slope_deg):
@@ -232,7 +232,7 @@ def test_a_spot_that_moved_is_noticed(headings: list[float], bumped: int) -> Non
         if found.complaint is None:
             missed += 1
         else:
-            assert found.complaint.row.group == "spot"
+            assert found.complaint.label[0] == "spot"
             assert "the spot moved" in in_words(found.complaint)
             assert 0.1 < found.complaint.size / DEG < 0.6
     # Between the second and the third of four quarters the tip looks half like a zero.
@@ -248,7 +248,7 @@ def test_without_the_way_back_only_a_gross_movement_shows_and_it_is_said_that_no
     world.zero_deg = np.array([6.0, 0.0])
     gross = world.align([world.stand(before[0]), world.stand(on_spot([180.0], (0.5, -0.4))[0])])
     assert gross.complaint is not None
-    assert gross.complaint.row.group == "zero"
+    assert gross.complaint.label[0] == "zero"
     assert "stand level on its base" in in_words(gross.complaint)
 
 
@@ -265,7 +265,7 @@ def test_a_wrong_law_and_a_wrong_mounting_are_noticed() -> None:
 def test_readings_that_cannot_belong_together_are_refused() -> None:
     world = World("axis")
     stand = world.stand(attitude(0.0, 0.0))
-    broken = Stand(stand.imus, (80.0, 80.0), stand.tilt_sigma_deg, 0.0, 0.1, on_spot=True)
+    broken = StandMeans(stand.imus, (80.0, 80.0), stand.tilt_sigma_deg, 0.0, 0.1, on_spot=True)
     with pytest.raises(CalibrationRefusedError, match="belong together"):
         align("axis", np.eye(3), [broken], GROUND)
 
@@ -283,7 +283,9 @@ def test_without_a_north_the_horizontal_part_of_the_earths_rate_stays_open() -> 
         north_deg = seed * 6.0
         stands = [world.stand(body) for body in on_spot([north_deg, north_deg + 180.0, north_deg], (0.0, 0.0))]
         shifted = [
-            Stand(s.imus, s.tilt_deg, s.tilt_sigma_deg, s.heading_rad - math.radians(north_deg), 0.05, on_spot=True)
+            StandMeans(
+                s.imus, s.tilt_deg, s.tilt_sigma_deg, s.heading_rad - math.radians(north_deg), 0.05, on_spot=True
+            )
             for s in stands
         ]
         imu = align("slope", np.eye(3), shifted, open_ground).imus[0]

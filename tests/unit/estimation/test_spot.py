@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.estimation.alignment.align import Alignment, Complaint, in_words, turned
-from companion.estimation.alignment.align_model import Ground, ImuStand, Row, Stand
+from companion.estimation.alignment.align_model import Ground, ImuStand, StandMeans
 from companion.estimation.alignment.faces import Face, Sides, faces, mounting
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG, DEG_H, MG
@@ -55,7 +55,9 @@ def model(aircraft: VirtualAircraft, board_deg: tuple[float, float, float] = BOA
     )
 
 
-def on_spot(slope_deg: tuple[float, float], headings_deg: tuple[float, ...], *, counted: float = 1.0) -> list[Stand]:
+def on_spot(
+    slope_deg: tuple[float, float], headings_deg: tuple[float, ...], *, counted: float = 1.0
+) -> list[StandMeans]:
     """Stands without noise; headings counted by a gyro whose scale is `counted`."""
     aircraft = VirtualAircraft(Pose(slope_deg[0], slope_deg[1], 70.0), SITE)
     hands, imu, stands, t_s = Hands(aircraft), model(aircraft), [], 0.0
@@ -66,11 +68,11 @@ def on_spot(slope_deg: tuple[float, float], headings_deg: tuple[float, ...], *, 
         means = ImuStand("fc", read[3:], np.full(3, SIGMA), read[:3], np.full(3, 5.0 * DEG_H))
         sigma_rad = (0.15 if k else 0.01) * DEG
         turned_rad = heading * counted * DEG
-        stands.append(Stand((means,), None, (1.0, 1.0), turned_rad, sigma_rad, on_spot=True, counted=k > 0))
+        stands.append(StandMeans((means,), None, (1.0, 1.0), turned_rad, sigma_rad, on_spot=True, counted=k > 0))
     return stands
 
 
-def solved(stands: list[Stand]) -> Alignment:
+def solved(stands: list[StandMeans]) -> Alignment:
     across = 7.292115e-5 * math.cos(47.0 * DEG)
     rate = np.array([0.0, 0.0, -7.292115e-5 * math.sin(47.0 * DEG)])
     return turned(stands, Ground(G, 3e-4, rate, np.diag([across**2 / 2.0, across**2 / 2.0, 1e-18])))
@@ -177,7 +179,7 @@ def test_the_covariance_of_the_tilt_is_that_of_what_it_is_made_of() -> None:
 
 
 def test_without_a_gradienter_none_is_blamed() -> None:
-    loose = Complaint(Row("accelerometer", 2, "fc"), 7.0, 3.0 * MG)
+    loose = Complaint(("accelerometer", 2, "fc"), 7.0, 3.0 * MG)
     assert "gradienter" in in_words(loose)
     assert in_words(loose, gradienter=False).startswith(
         "stand 2: imu fc is off by 3.0 mg (7 sigma): is something loose"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
-from companion.estimation.stillness.gates import ImuGate, PoseGate, GateVerdict
+from companion.estimation.stillness.gates import GateVerdict, ImuGate, PoseGate
 from companion.estimation.stillness.stretch import Stretch
 from companion.physics.units import DEG, MG
 
