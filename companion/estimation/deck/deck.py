@@ -296,13 +296,14 @@ class Aim(NamedTuple):
 
 def aim(span_s: int, known: TriadVariances, target: float) -> Aim:
     """Return the aim of a triad by the newest estimate, from a window of so many seconds."""
-    floor = known.use - known.white
+    use, white = known
+    floor = use - white
     goal = max(target**2, floor * (1.0 + WHITE_SHARE))
     whole_s = float(span_s)
-    if known.use > goal:
-        wanted = (goal - floor) / known.white
+    if use > goal:
+        wanted = (goal - floor) / white
         whole_s = min(span_s * wanted ** (-1.0 / _FALLS), MAX_S) if wanted > 0.0 else MAX_S
-    return Aim(math.sqrt(known.use), math.sqrt(goal), whole_s)
+    return Aim(math.sqrt(use), math.sqrt(goal), whole_s)
 
 
 def more(left_s: float) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from companion.config.sections import AllanModel
 from companion.errors import CalibrationRefusedError
 from companion.estimation.deck.smoother import Believed, Found, Passage, smooth
-from companion.estimation.deck.waves import Compared, Level, compare
+from companion.estimation.deck.waves import Level, compare
 from companion.estimation.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.estimation.means.warming import drifting
 from companion.estimation.means.windows import ImuInput, ImuWindow, Window
@@ -51,12 +51,8 @@ random walk of B / sqrt(T), it is the flicker's part of V(T, H)."""
 _GRAVITY_M_S2: Final = 9.8
 
 
-class TriadVariances(NamedTuple):
-    """Largest variances of the axes of a triad."""
-
-    use: float
-    white: float
-    """The part that more seconds take away."""
+TriadVariances = tuple[float, float]
+"""Largest variance of the axes of a triad, and the part of it that more seconds take away."""
 
 
 class DeckFound(NamedTuple):
@@ -209,20 +205,20 @@ class DeckWindow:
         )
         # A slope, weighed most in its middle, misses some of a bias that walks: no averaging takes that away.
         walked = _MIDDLE * followed_walk(gyro, span_s) ** 2 * span_s
-        gyros = TriadVariances(float(use[:3].max() ** 2), max(float(np.diag(gyro_own).max()) - walked, 0.0))
-        return window, (gyros, TriadVariances(float(use[3:].max() ** 2), float(np.diag(own).max()))), found
+        gyros = float(use[:3].max() ** 2), max(float(np.diag(gyro_own).max()) - walked, 0.0)
+        return window, (gyros, (float(use[3:].max() ** 2), float(np.diag(own).max()))), found
 
     def _believed(
         self,
         imu: ImuInput,
         seconds: Sequence[ImuSecond],
         reference: tuple[float, float] | None,
-        compared: Compared | None,
+        compared: tuple[Array, Matrix] | None,
     ) -> Believed:
         gradienter, compass = self.gradienter, self.compass
         accel, accel_sigma = np.zeros(3), _UNKNOWN_ACCEL_M_S2
         if gradienter is not None and compared is not None and reference is not None:
-            off = np.array(reference) - compared.difference_deg
+            off = np.array(reference) - compared[0]
             accel = _GRAVITY_M_S2 * (gradienter.up(*off.tolist()) - gradienter.up(*reference))
             accel_sigma = _LEAST_ACCEL_M_S2
         model = imu.profile.gyro
@@ -256,7 +252,10 @@ def followed_walk(gyro: AllanModel, span_s: float) -> float:
 
 
 def _felt(
-    found: Found, gradienter: GradienterModel | None, reference: tuple[float, float] | None, compared: Compared | None
+    found: Found,
+    gradienter: GradienterModel | None,
+    reference: tuple[float, float] | None,
+    compared: tuple[Array, Matrix] | None,
 ) -> tuple[Array, Matrix]:
     """Return the accelerometers' mean at rest at the reference's tilt, (3,), and its covariance (3, 3)."""
     size = found.force_m_s2
@@ -264,10 +263,10 @@ def _felt(
         up = -found.body_to_ned[:, 2].mean(axis=0)
         up /= np.linalg.norm(up)
         return size * up, np.outer(up, up) * found.force_sigma_m_s2**2
-    x, y = (np.array(reference) - compared.difference_deg).tolist()
+    x, y = (np.array(reference) - compared[0]).tolist()
     right, up = gradienter.up(*reference), gradienter.up(x, y)
     by_reading = size * DEG * gradienter.vehicle_from_sensor @ up_jacobian(gradienter.law, x, y)
-    covariance = by_reading @ compared.covariance_deg2 @ by_reading.T
+    covariance = by_reading @ compared[1] @ by_reading.T
     return size * up / float(up @ right), covariance + np.outer(right, right) * found.force_sigma_m_s2**2
 
 

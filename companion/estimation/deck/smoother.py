@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.estimation.deck.waves import Wander, Waves, fit_waves, whitened
+from companion.estimation.deck.waves import Waves, fit_waves, whitened
 from companion.physics.frames import (
     Array,
     Floats,
@@ -223,21 +223,20 @@ class _System:
 
     def solve(self, noise: tuple[Waves, Waves] | None, believed: Believed, unknowns: int) -> _Answer:
         """Least squares, weighted by the noise; without it, by a guess."""
-        wander = Wander(believed.gyro_white**2 * self.step_s, believed.gyro_walk**2 * self.step_s**3)
+        wander = believed.gyro_white**2 * self.step_s, believed.gyro_walk**2 * self.step_s**3
         level, heading = noise or (Waves(np.zeros(0), 0.02**2), Waves(np.zeros(0), 0.01**2))
-        pairs = [
-            np.column_stack([columns, readings]) for columns, readings in zip(self.columns, self.readings, strict=True)
-        ]
-        width = pairs[0].shape[1]
-        both = whitened(np.hstack(pairs[:2]), level, wander)
-        rows = np.vstack([both[:, :width], both[:, width:], whitened(pairs[2], heading, wander)])
+        # (3, n, unknowns + 4): the readings are the last column.
+        pairs = np.concatenate([self.columns, self.readings[..., None]], axis=2)
+        both = whitened(np.hstack([pairs[0], pairs[1]]), level, wander)
+        rows = np.vstack([*np.hsplit(both, 2), whitened(pairs[2], heading, wander)])
         rows = rows[~np.isnan(rows[:, -1])]
         regressors, earth = rows[:, :unknowns], rows[:, _UNKNOWNS:-1]
         information = regressors.T @ regressors
-        information[range(_ACCEL.start, _ACCEL.stop), range(_ACCEL.start, _ACCEL.stop)] += believed.accel_sigma_m_s2**-2
-        information[range(_COMPASS.start, _COMPASS.stop), range(_COMPASS.start, _COMPASS.stop)] += (
-            max(believed.compass_sigma_rad, 1e-6) ** -2
-        )
+        diagonal = np.diag_indices(unknowns)
+        priors = np.zeros(_UNKNOWNS)
+        priors[_ACCEL] = believed.accel_sigma_m_s2**-2
+        priors[_COMPASS] = max(believed.compass_sigma_rad, 1e-6) ** -2
+        information[diagonal] += priors[:unknowns]
         # Units from rad/s^2 to rad: scaled, so that nothing is lost.
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
         covariance = np.linalg.inv(information * np.outer(scale, scale) + 1e-12 * np.eye(unknowns)) * np.outer(
@@ -252,10 +251,7 @@ class _System:
 
     def noise(self, answer: _Answer) -> tuple[Waves, Waves]:
         """Fit the residuals as waves: the two levels together, the heading."""
-        left = [
-            readings - columns[:, :_UNKNOWNS] @ answer.values
-            for columns, readings in zip(self.columns, self.readings, strict=True)
-        ]
+        left = self.readings - self.columns[..., :_UNKNOWNS] @ answer.values
         heading = left[2][np.isfinite(left[2])]
         if len(heading) == 0:
             heading = np.zeros(1)
@@ -273,7 +269,7 @@ def _mean_up(up: Floats, spans: Floats, white: float) -> tuple[float, float]:
     height = np.cumsum(np.cumsum(up * spans)) * step
     line = np.column_stack([np.ones(len(ends)), ends, ends * ends / 2.0])
     left = height - line @ np.linalg.lstsq(line, height, rcond=None)[0]
-    rows = whitened(np.column_stack([line, height]), fit_waves([left]), Wander(rate=white**2 * step**3))
+    rows = whitened(np.column_stack([line, height]), fit_waves([left]), (0.0, white**2 * step**3))
     covariance = np.linalg.inv(rows[:, :3].T @ rows[:, :3])
     return float(covariance[2] @ (rows[:, :3].T @ rows[:, 3])), math.sqrt(covariance[2, 2])
 

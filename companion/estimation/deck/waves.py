@@ -64,17 +64,12 @@ def fit_waves(series: list[Floats]) -> Waves:
     return best
 
 
-class Wander(NamedTuple):
-    """Non-stationary part, from one row to the next; both are zero at the last row."""
+def whitened(columns: Floats, waves: Waves, wander: tuple[float, float] = (0.0, 0.0)) -> Floats:
+    """Whiten columns (n, c), readings and regressors, to unit variance; a row of NaN is a gap.
 
-    angle: float = 0.0
-    """Variance of the step of a random walk: the gyros' white noise."""
-    rate: float = 0.0
-    """Variance of the step of a random walk whose sum this is: their bias, sought at its last value."""
-
-
-def whitened(columns: Floats, waves: Waves, wander: Wander = Wander()) -> Floats:  # noqa: B008 - it never changes
-    """Whiten columns (n, c), readings and regressors, of waves and wander to unit variance; a row of NaN is a gap."""
+    `wander`: variances of the steps, from one row to the next, of a random walk of angle (the gyros' white noise), and
+    of one of rate (their bias, sought at its last value), whose sum joins the first. Both are zero at the last row.
+    """
     order = max(len(waves.terms), 1)
     angle, rate, size = order, order + 1, order + 2
     move = np.zeros((size, size))
@@ -85,7 +80,7 @@ def whitened(columns: Floats, waves: Waves, wander: Wander = Wander()) -> Floats
     kick[0, 0] = waves.variance
     covariance = np.zeros((size, size))
     covariance[:order, :order] = _stationary(move[:order, :order], kick[:order, :order])
-    kick[angle, angle], kick[rate, rate] = wander.angle, wander.rate
+    kick[angle, angle], kick[rate, rate] = wander
     state = np.zeros((size, columns.shape[1]))
     found = np.full_like(columns, math.nan)
     turned = np.ascontiguousarray(move.T)
@@ -124,13 +119,6 @@ class Level(msgspec.Struct, frozen=True):
     """Gradienter minus what it would show by the accelerometer."""
     slope: Floats
     """Slope of what it would show, degrees a second."""
-
-
-class Compared(NamedTuple):
-    """Gradienter minus what it would show by the accelerometers, over many seconds."""
-
-    difference_deg: Array
-    covariance_deg2: Matrix
 
 
 class Fluid:
@@ -180,8 +168,11 @@ def level(times_s: Floats, shown_deg: Floats, tilt_times_s: Floats, tilts_deg: F
     )
 
 
-def compare(levels: Sequence[Level]) -> Compared:
-    """Return the difference over a window, weighted by the waves that are left in it."""
+def compare(levels: Sequence[Level]) -> tuple[Array, Matrix]:
+    """Return gradienter minus what it would show by the accelerometers over a window, and its covariance; degrees.
+
+    Weighted by the waves that are left in it.
+    """
     difference = np.array([one.difference for one in levels])
     slope = np.array([one.slope for one in levels])
     one, nothing = np.ones(len(levels)), np.zeros(len(levels))
@@ -202,4 +193,4 @@ def compare(levels: Sequence[Level]) -> Compared:
         waves = fit_waves([column - column.mean() for column in left.T])
     spent = 3 + len(waves.terms)
     widened = len(rows) / max(len(rows) - spent, len(rows) / 4.0)
-    return Compared(np.array([x, y]), np.asarray(covariance[:2, :2] * widened))
+    return np.array([x, y]), np.asarray(covariance[:2, :2] * widened)
