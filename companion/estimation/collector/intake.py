@@ -148,7 +148,7 @@ class ImuSource(Source):
 
     def __init__(self, imu: ImuInput, keep: int, *, may_move: bool) -> None:
         batches = BatchSource(LIMITS_IMU, keep, steps=integer_steps(imu))
-        super().__init__("imu", imu.name, batches, _gate(imu, sways=may_move), may_move=may_move)
+        super().__init__("imu", imu.name, batches, _gate(imu), may_move=may_move)
         self.imu = imu
         self.raw = BatchSource(LIMITS_IMU, keep)
         """Means that come beside a stream of integers, in floats."""
@@ -162,7 +162,7 @@ class ImuSource(Source):
 
     def replace(self, imu: ImuInput) -> None:
         """Set the new kind of the stream."""
-        self.imu, self.gate = imu, _gate(imu, sways=self._may_move)
+        self.imu, self.gate = imu, _gate(imu)
         self.batches.steps = integer_steps(imu)
 
     def add_raw(self, t_s: float, row: tuple[float, ...], temperature_degc: float | None) -> None:
@@ -222,8 +222,8 @@ class ImuSource(Source):
         return self.counter.counted(start_s, end_s, bias_rad_s, self.imu.rotation, cut_rad_s)
 
 
-def _gate(imu: ImuInput, *, sways: bool) -> ImuGate:
-    return ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2), sways=sways)
+def _gate(imu: ImuInput) -> ImuGate:
+    return ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2))
 
 
 class PoseSource(Source):

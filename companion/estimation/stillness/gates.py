@@ -60,8 +60,8 @@ HEADING_STEP_DEG: Final = 3.0
 
 MIN_IMU_SAMPLES: Final = 4
 MAX_IMU_GAP_S: Final = 0.5
-_NO_END: Final = (60.0 * DEG,) * 3 + (14.0,) * 3
-"""No part's range ends below: readings of integers that pile up there are those of a sway that turns back."""
+_LEAST_RANGE: Final = (60.0 * DEG,) * 3 + (14.0,) * 3
+"""No part's range ends below: integers that pile up there are those of a sway that turns back or comes to rest."""
 STUCK_SAMPLES: Final = 10
 """Fewer may well be equal by chance on a quiet sensor with coarse steps."""
 STUCK_S: Final = 60
@@ -125,8 +125,7 @@ def _slow_part(batch: Batch, channels: slice, gate: float, bounds: tuple[float, 
 class ImuGate:
     """Gate of one IMU: six channels, gyro in rad/s, then accelerometer in m/s^2, in any fixed axes.
 
-    `steps`: resolution of a stream of integers, 0 for floats; `own`: its noise, where already learned; `sways`: on a
-    deck, where integers pile up when a sway turns back.
+    `steps`: resolution of a stream of integers, 0 for floats; `own`: its noise, where already learned.
     """
 
     def __init__(
@@ -135,10 +134,8 @@ class ImuGate:
         profile: NoiseProfile,
         steps: tuple[float, float] = (0.0, 0.0),
         own: OwnNoise | None = None,
-        *,
-        sways: bool = False,
     ) -> None:
-        self._name, self._sways = name, sways
+        self._name = name
         self._own = own or OwnNoise((profile.gyro.white, profile.accel.white))
         self._white = profile.gyro.white, profile.accel.white
         self._is_float = np.repeat(steps, 3) == 0.0
@@ -182,12 +179,8 @@ class ImuGate:
             return _fault(f"imu {name} sends {batch.n} Hz, needs {MIN_IMU_SAMPLES}")
         if batch.largest_gap_s > MAX_IMU_GAP_S:
             return _fault(f"imu {name} was silent for {batch.largest_gap_s:.1f} s > {MAX_IMU_GAP_S}")
-        if batch.clipped:
-            within = (np.maximum(np.abs(batch.low), np.abs(batch.high)) < _NO_END).all()
-            # Integers pile up at one end too in the second in which it comes to rest.
-            ends = self._moving(batch) if within else None
-            if ends is not None or not (within and self._sways):
-                return ends or _fault(f"imu {name} hits the end of its range")
+        if batch.clipped and (np.maximum(np.abs(batch.low), np.abs(batch.high)) >= _LEAST_RANGE).any():
+            return _fault(f"imu {name} hits the end of its range")
         if batch.n >= STUCK_SAMPLES:
             constant = (batch.distinct == 1) & self._is_float
             for (part, triad, *_), coarse_slot in zip(_TRIADS, self._coarse_slot, strict=True):
