@@ -101,21 +101,15 @@ def doubtful(config: Config) -> list[str]:
     return found
 
 
-def imu_input(imu: Imu, kind: StreamKind | None, grid: tuple[float, float] = (0.0, 0.0)) -> ImuInput:
-    """One IMU as the collector takes it; an autopilot's telemetry, of that `kind`, is in the vehicle's axes already.
-
-    `grid`: the sensor's own steps behind that, rad/s and m/s^2, where they are known to be coarse.
-    """
-    integers = kind is not None and kind.truncates
+def imu_input(imu: Imu, kind: StreamKind | None) -> ImuInput:
+    """One IMU as the collector takes it; an autopilot's telemetry, of that `kind`, is in the vehicle's axes already."""
     return ImuInput(
         name=imu.name,
         rotation=rotation_matrix(imu.mounting if imu.source == "serial" else "ROTATION_NONE"),
         profile=noise_profile(imu.profile),
         gyro_step_rad_s=kind.gyro_step_rad_s if kind else 0.0,
         accel_step_m_s2=kind.accel_step_m_s2 if kind else 0.0,
-        truncates=integers,
-        gyro_grid_rad_s=grid[0] if integers else 0.0,
-        accel_grid_m_s2=grid[1] if integers else 0.0,
+        truncates=kind is not None and kind.truncates,
         clock_from_start=imu.protocol is None or PROTOCOLS["imu"][imu.protocol].decoder.clock_from_start,
     )
 

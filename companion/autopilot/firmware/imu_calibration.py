@@ -182,9 +182,6 @@ class ImuCalibration:
     """Three accelerometer offsets of exactly zero mean "not calibrated"."""
     far_step: FarStep | None = None
     """Detour by which small changes come into use; None where the firmware needs none."""
-    gyro_grid_rad_s: float = 0.0
-    """Steps of the sensor's own readings behind the telemetry, where they are known and coarse; else 0."""
-    accel_grid_m_s2: float = 0.0
     scale_unused_within: float = 0.0
     """Scales whose vector is no farther than this from 1 are not in use after a start."""
     accel_offset_may_be_unused: bool = False

@@ -65,12 +65,6 @@ GATED_TILT_DEG: Final = 0.3
 """Tilt kept from before a write above which a restart is owed; a smaller one is what EKF2 shows of the biases of an
 uncalibrated sensor (autopilots 9.3)."""
 
-SIMULATED_GYRO_GRID_RAD_S: Final = math.radians(2000.0 / 32768.0) / 4.0
-SIMULATED_ACCEL_GRID_M_S2: Final = 1e3 * MG / 2048.0 / 4.0
-"""PX4's simulator passes one of its IMUs through 16 bits, and telemetry is the mean of three such readings with weights
-1, 2, 1: the floats of its HIGHRES_IMU are a quarter of a step apart. A real sensor's telemetry is the mean of many
-readings with noise of their own: no steps are left there."""
-
 _INTERNAL: Final = -1
 _SIMULATION_BUS: Final = 4
 _MAYBE_INTERNAL_BUSES: Final = (1, 2)
@@ -180,8 +174,6 @@ class PX4(Firmware):
             orientation=orientation,
             thermal=await _read_thermal(parameters, gyro.device_id),
             far_step=_far_step(orientation),
-            gyro_grid_rad_s=SIMULATED_GYRO_GRID_RAD_S if gyro.bus == _SIMULATION_BUS else 0.0,
-            accel_grid_m_s2=SIMULATED_ACCEL_GRID_M_S2 if accel.bus == _SIMULATION_BUS else 0.0,
             scale_unused_within=MARGIN * IGNORED_STEP,
             accel_offset_may_be_unused=_too_small_to_apply_at_boot(offset)
             and not memory.in_use(names.accel_offset, offset, boots),

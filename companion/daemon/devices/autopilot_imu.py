@@ -69,8 +69,6 @@ class AutopilotImu:
         self._pause_s = 0.0
         self._stale = asyncio.Event()
         self._stale.set()
-        self._grid = (0.0, 0.0)
-        """The sensor's own steps, rad/s and m/s^2; 0 where they do not matter."""
         self.stream = ImuStream(
             core.link,
             core.vehicle,
@@ -137,9 +135,7 @@ class AutopilotImu:
         known, self._known = self._known, fresh
         self.calibration, self.problem, self.failures = fresh, "", 0
         part = part_of(self._vehicle.firmware, fresh.gyro_id, fresh.accel_id)
-        is_other_part = self._profiles.found(self.name, part)
-        if is_other_part or self._grid != (fresh.gyro_grid_rad_s, fresh.accel_grid_m_s2):
-            self._grid = (fresh.gyro_grid_rad_s, fresh.accel_grid_m_s2)
+        if self._profiles.found(self.name, part):
             self._kind_changed(self.stream.kind)
         self.on_read.tell(known, fresh)
         now_s = asyncio.get_running_loop().time()
@@ -189,7 +185,7 @@ class AutopilotImu:
             self._collector.add_imu(self.name, sample)
 
     def _kind_changed(self, kind: StreamKind | None) -> None:
-        self.input = models.imu_input(self._profiles.imu(self.name), kind, self._grid)
+        self.input = models.imu_input(self._profiles.imu(self.name), kind)
         self._collector.set_imu(self.input)
         self.on_change.tell()
 

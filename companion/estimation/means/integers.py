@@ -160,12 +160,10 @@ class _State:
         self.inverse = np.where(known, np.stack([1.0 / aa, np.zeros_like(aa), np.zeros_like(aa)]), inverse)
 
 
-def shape_variance(found: Fit, edge_rms: Floats) -> Floats:
-    """Variance (c,) of the mean by edges that are displaced by `edge_rms` (c,), and at least by `EDGE_RMS`, LSB."""
+def shape_variance(found: Fit) -> Floats:
+    """Variance (c,) of the mean, LSB^2, by edges that are displaced by `EDGE_RMS`."""
     sensitivity = np.square(np.diff(found.influence, axis=0) * found.density[1:-1]).sum(axis=0)
-    # The edges of a grid below may also all be displaced alike, and the mean with them.
-    sensitivity = np.where(edge_rms > EDGE_RMS, np.maximum(sensitivity, 1.0), sensitivity)
-    return np.asarray(np.square(np.maximum(edge_rms, EDGE_RMS)) * sensitivity)
+    return np.asarray(EDGE_RMS**2 * sensitivity)
 
 
 class IntegerColumns(msgspec.Struct, frozen=True):
@@ -186,13 +184,10 @@ class IntegerColumns(msgspec.Struct, frozen=True):
     """Zero is among the readings, too: the mean could be anything within a step of it."""
 
 
-def integer_columns(
-    batches: Sequence[Sequence[Batch]], steps: Floats, truncates: NDArray[np.bool_], edges: Floats
-) -> IntegerColumns:
+def integer_columns(batches: Sequence[Sequence[Batch]], steps: Floats, truncates: NDArray[np.bool_]) -> IntegerColumns:
     """Estimate the means of all truncated streams from their good batches, which are of the same seconds.
 
-    Of all columns of all streams, (c,) each: their steps, whether they are truncated, and the known rms displacement
-    of the integers' edges, in steps.
+    Of all columns of all streams, (c,) each: their steps, and whether they are truncated.
     """
     of = truncates & (steps > 0.0)
     width = len(steps)
@@ -210,11 +205,11 @@ def integer_columns(
         part = slice(each * index, each * (index + 1))
         if of[part].any():
             # One triad of a stream may be floats; its columns are estimated with any step and not used.
-            _estimate(own, np.where(of[part], steps[part], 1.0), edges[part], result, part)
+            _estimate(own, np.where(of[part], steps[part], 1.0), result, part)
     return result
 
 
-def _estimate(batches: Sequence[Batch], steps: Floats, edges: Floats, result: IntegerColumns, part: slice) -> None:
+def _estimate(batches: Sequence[Batch], steps: Floats, result: IntegerColumns, part: slice) -> None:
     """Estimate one stream's `part` of the columns, from good seconds, at least one."""
     sizes = np.array([batch.n for batch in batches], dtype=np.float64)
     plain = np.array([batch.mean for batch in batches]) / steps
@@ -248,7 +243,7 @@ def _estimate(batches: Sequence[Batch], steps: Floats, edges: Floats, result: In
     unknown = np.where(has_zero, NEAR_ZERO, HALF_STEP)
     result.values[:, part] = np.where(known, values, half_off) * steps
     result.least[part] = np.where(of & known, second, 0.0) * steps
-    result.hidden[part] = np.where(known, np.sqrt(shape_variance(found, edges) + np.square(by_sigma)), unknown) * steps
+    result.hidden[part] = np.where(known, np.sqrt(shape_variance(found) + np.square(by_sigma)), unknown) * steps
     result.unknown[part] = of & ~own.identified
     result.useless[part] = of & ~known & has_zero
 

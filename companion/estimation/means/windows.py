@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from companion.config.sections import NoiseProfile
 from companion.errors import CalibrationRefusedError
-from companion.estimation.means.integers import EDGE_RMS, integer_columns
+from companion.estimation.means.integers import integer_columns
 from companion.estimation.means.pose import FieldWindow, HeadingWindow, TiltWindow
 from companion.estimation.means.warming import Lines, Warming, drifting, warming
 from companion.estimation.noise.allan import (
@@ -64,9 +64,6 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
     accel_step_m_s2: float = 0.0
     truncates: bool = False
     """True: the stream truncates toward zero instead of rounding."""
-    gyro_grid_rad_s: float = 0.0
-    """Steps of its own that the sensor's readings had before they became integers of the stream; 0: much finer."""
-    accel_grid_m_s2: float = 0.0
     clock_from_start: bool = False
     """True: the time in its samples (`t_device_s`) counts from the switch-on of the device."""
 
@@ -77,13 +74,6 @@ def integer_steps(imu: ImuInput) -> Floats | None:
         return None
     steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
     return np.where(steps > 0.0, steps, 1.0)
-
-
-def _edges(imu: ImuInput) -> tuple[float, float]:
-    """Return the rms displacement of the integers' edges, in steps, by a grid below: anywhere between two lines."""
-    pairs = ((imu.gyro_grid_rad_s, imu.gyro_step_rad_s), (imu.accel_grid_m_s2, imu.accel_step_m_s2))
-    gyro, accel = (grid / step / math.sqrt(12.0) if step > 0.0 else 0.0 for grid, step in pairs)
-    return gyro, accel
 
 
 class Hidden(msgspec.Struct, frozen=True):
@@ -189,8 +179,7 @@ def estimates(
     values = _columns([[batch.mean for batch in item] for item in batches])
     seconds = float(len(slots))
     steps = np.repeat([step for imu in imus for step in (imu.gyro_step_rad_s, imu.accel_step_m_s2)], 3)
-    edges = np.repeat([_edges(imu) for imu in imus], 3)
-    whole = integer_columns(batches, steps, np.repeat([imu.truncates for imu in imus], 6), edges)
+    whole = integer_columns(batches, steps, np.repeat([imu.truncates for imu in imus], 6))
     values = np.where(whole.of, whole.values, values)
     flicker = np.repeat([model.flicker for model in models], 3)
     walk = np.repeat([model.walk for model in models], 3)
@@ -313,10 +302,7 @@ def imu_estimates(
     beside: Sequence[Sequence[Batch]] = raw or [()] * len(imus)
     for imu, seconds, own, means in zip(imus, batches, estimated, beside, strict=True):
         if len(means) >= RAW_BATCHES:
-            floats = msgspec.structs.replace(
-                imu, gyro_step_rad_s=RAW_STEP, accel_step_m_s2=RAW_STEP, truncates=False,
-                gyro_grid_rad_s=0.0, accel_grid_m_s2=0.0,
-            )  # fmt: skip
+            floats = msgspec.structs.replace(imu, gyro_step_rad_s=RAW_STEP, accel_step_m_s2=RAW_STEP, truncates=False)
             (better,) = estimates([floats], [means], end_s=end_s, horizon_s=horizon_s)
             if better.use_variance[:3].sum() < own.use_variance[:3].sum():
                 found.append(ImuEstimate(better, _imu_window(floats, means, better, rejected)))
@@ -357,8 +343,7 @@ def _turned(rotation: Floats, variance: Floats) -> Vector:
 def _hidden(imu: ImuInput, own: Estimate) -> dict[Triad, Hidden]:
     found: dict[Triad, Hidden] = {}
     steps = f"{imu.gyro_step_rad_s / DEG_H:.0f} deg/h", f"{imu.accel_step_m_s2 / MG:.1f} mg"
-    grids = f"{imu.gyro_grid_rad_s / DEG_H:.3g} deg/h", f"{imu.accel_grid_m_s2 / MG:.3g} mg"
-    for part, step, grid, edge_rms in zip(TRIADS, steps, grids, _edges(imu), strict=True):
+    for part, step in zip(TRIADS, steps, strict=True):
         undecided, useless_axes = own.undecided[rows_of(part)], own.useless[rows_of(part)]
         if undecided.any():
             useless = bool(useless_axes.any())
@@ -368,11 +353,6 @@ def _hidden(imu: ImuInput, own: Estimate) -> dict[Triad, Hidden]:
                 f"{part} {imu.name} {axes}: {what} noise smaller than its telemetry's steps of {step}: no"
                 " floats (ArduPilot: companion lua; PX4: its console)",
                 useless,
-            )
-        elif edge_rms > EDGE_RMS:
-            found[part] = Hidden(
-                f"{part} {imu.name}: the sensor has coarse steps of its own ({grid}) below the integers, sigma widened",
-                useless=False,
             )
     return found
 

@@ -192,13 +192,6 @@ def test_level_offsets_are_inside_the_rotation(device: int, changed: dict[str, f
     np.testing.assert_allclose(found.orientation, expected, atol=1e-7)
 
 
-def test_a_sensor_on_the_simulations_bus_is_known_to_have_coarse_steps_and_a_real_one_not() -> None:
-    simulated, real = read(ScriptedPx4(devices=(SIM,))), read(ScriptedPx4(devices=(ICM,)))
-    assert (real.gyro_grid_rad_s, real.accel_grid_m_s2) == (0.0, 0.0)
-    assert simulated.gyro_grid_rad_s == pytest.approx(math.radians(2000.0) / 131072.0)  # 16 bits, weights 1 2 1
-    assert simulated.accel_grid_m_s2 == pytest.approx(9.80665 / 8192.0)
-
-
 # --- rivals, and what is odd
 
 
