@@ -6,10 +6,9 @@ when every source was still in it. Method 2.4, 3.1 and 3.2.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgspec
 
@@ -22,12 +21,10 @@ from companion.estimation.means.windows import ImuInput, Window
 from companion.estimation.seconds.batch import Batch
 from companion.estimation.seconds.counting import TurnCounter
 from companion.estimation.stillness.gates import GateVerdict
+from companion.estimation.temperature.thermometer import Thermometers
 from companion.estimation.turning.turn import Turn
 from companion.estimation.turning.watch import TurnWatch
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
-
-if TYPE_CHECKING:
-    from companion.estimation.temperature.thermometer import Thermometers
 
 _GRACE_S: Final = 1.0
 """Time for which a second waits after its end for a silent source: the latency of a busy telemetry link."""
@@ -65,6 +62,7 @@ class RollingCollector:
         self._heading = None if compass is None else self._pose_source("compass")
         self._field = None if compass is None else FieldHeading(compass, gradienter, self._keep)
         self._turns = TurnWatch(settings.max_slots)
+        self.thermometers = Thermometers()
         self._next: int | None = None
         self._now_s = -math.inf
         self._restarts = 0
@@ -72,13 +70,6 @@ class RollingCollector:
         """Called when every source has closed a second, from within the call that closed it: they only take note."""
         for imu in imus:
             self.set_imu(imu)
-
-    @functools.cached_property
-    def thermometers(self) -> Thermometers:
-        """Thermometers of the IMUs; not wanted before the first second."""
-        from companion.estimation.temperature.thermometer import Thermometers
-
-        return Thermometers()
 
     # ------------------------------------------------------------------------------------------------- samples in
 
@@ -88,7 +79,7 @@ class RollingCollector:
         if source is None:
             return
         if source.has_restarted(sample):
-            self._forget(name)
+            self.reset("restarted", name)
         if source.add(sample):
             self._evaluate()
 
@@ -190,7 +181,12 @@ class RollingCollector:
 
         The second under way is forgotten too. The stretch begins again; learned noise stays.
         """
-        self._forget(imu)
+        self._windows.forget(imu)
+        for source in self._sources():
+            if imu is None or (source.kind == "imu" and source.name == imu):
+                source.forget()
+        self._turns.forget(imu)
+        self._break()
 
     def count_turns(self, *, wanted: bool) -> None:
         """Start or stop to keep what turns on a spot are counted by."""
@@ -297,14 +293,6 @@ class RollingCollector:
     def _others(self) -> list[GateVerdict]:
         """Return the verdicts on all sources but the compass."""
         return [source.verdict for source in self._sources() if source is not self._heading]
-
-    def _forget(self, imu: str | None) -> None:
-        self._windows.forget(imu)
-        for source in self._sources():
-            if imu is None or (source.kind == "imu" and source.name == imu):
-                source.forget()
-        self._turns.forget(imu)
-        self._break()
 
     def _break(self) -> None:
         self._windows.new_stretch()
