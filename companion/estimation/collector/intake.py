@@ -52,17 +52,8 @@ class Source:
     hint = ""
     """Reason for silence, where it is known."""
 
-    def __init__(
-        self,
-        kind: Kind,
-        name: str,
-        batches: BatchSource,
-        gate: ImuGate | PoseGate,
-        *,
-        may_move: bool,
-    ) -> None:
+    def __init__(self, kind: Kind, name: str, batches: BatchSource, gate: ImuGate | PoseGate) -> None:
         self.kind, self.name, self.batches, self.gate = kind, name, batches, gate
-        self._may_move = may_move
         self.verdict = GateVerdict(still=False)
         self.settling: Settling | None = None
         self.unsettled: deque[int] = deque(maxlen=0)
@@ -78,8 +69,11 @@ class Source:
         """The last whole second."""
         return next(reversed(self.batches.batches.values()), None)
 
-    def judge(self, slot: int, *, moved: bool = False) -> bool:
-        """Return whether this source was still in a second in which, by the IMUs, the aircraft `moved`."""
+    def judge(self, slot: int, *, moved: bool, may_move: bool) -> bool:
+        """Return whether this source was still in a second in which, by the IMUs, the aircraft `moved`.
+
+        `may_move`: only a fault of the source counts against it.
+        """
         # A slow pose sensor's last batch counts for a short while.
         first, batches = slot if self.kind == "imu" else slot - _CARRY, self.batches.batches
         batch = next((batches[at] for at in range(slot, first - 1, -1) if at in batches), None)
@@ -91,7 +85,7 @@ class Source:
             self.verdict = GateVerdict(still=False, words=words, fault=True)
         elif batch.slot == slot:
             verdict = self.gate.judge(batch)
-            self.verdict = STILL if self._may_move and not verdict.fault else verdict
+            self.verdict = STILL if may_move and not verdict.fault else verdict
         return self.verdict.still
 
     def accept(self, slot: int) -> None:
@@ -146,9 +140,9 @@ class Source:
 class ImuSource(Source):
     """The stream of one IMU, with what is known of its device."""
 
-    def __init__(self, imu: ImuInput, keep: int, *, may_move: bool) -> None:
+    def __init__(self, imu: ImuInput, keep: int) -> None:
         batches = BatchSource(LIMITS_IMU, keep, steps=integer_steps(imu))
-        super().__init__("imu", imu.name, batches, _gate(imu), may_move=may_move)
+        super().__init__("imu", imu.name, batches, _gate(imu))
         self.imu = imu
         self.raw = BatchSource(LIMITS_IMU, keep)
         """Means that come beside a stream of integers, in floats."""
@@ -229,9 +223,9 @@ def _gate(imu: ImuInput) -> ImuGate:
 class PoseSource(Source):
     """The two channels of a gradienter, or the heading of a compass, in degrees."""
 
-    def __init__(self, model: GradienterModel | CompassModel | None, kind: PoseKind, keep: int, *, may_move: bool):
+    def __init__(self, model: GradienterModel | CompassModel | None, kind: PoseKind, keep: int) -> None:
         circle = kind == "compass"
         batches = BatchSource(_LIMITS_HEADING if circle else _LIMITS_TILT, keep, circle=circle)
-        super().__init__(kind, kind, batches, PoseGate(kind), may_move=may_move)
+        super().__init__(kind, kind, batches, PoseGate(kind))
         self.settling = None if model is None else Settling(model.lag_s, model.sigma_deg)
         self.unsettled = deque(maxlen=keep)

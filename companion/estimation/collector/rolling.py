@@ -142,7 +142,7 @@ class RollingCollector:
         name, known = imu.name, self.imus.get(imu.name)
         self._turns.set_imu(name, imu.rotation, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2))
         if known is None:
-            self.imus[name] = source = ImuSource(imu, self._keep, may_move=self._windows.may_move)
+            self.imus[name] = source = ImuSource(imu, self._keep)
             source.batches.believed = lambda slot, degc: self.thermometers.believed(name, slot, degc)
             self._windows.set_imu(imu, source.batches, source.raw)
             # It has no share in the seconds so far.
@@ -164,7 +164,7 @@ class RollingCollector:
 
     def _pose_source(self, kind: PoseKind) -> PoseSource:
         model = self._compass if kind == "compass" else self._gradienter
-        source = PoseSource(model, kind, self._keep, may_move=self._windows.may_move)
+        source = PoseSource(model, kind, self._keep)
         self._windows.set_pose(kind, source.batches)
         return source
 
@@ -337,7 +337,7 @@ class RollingCollector:
         # Every gate sees every second: one that is skipped learns nothing.
         good, moved = True, False
         for source in sources:  # the IMUs first: they say whether it moved
-            good = source.judge(slot, moved=moved) and good
+            good = source.judge(slot, moved=moved, may_move=self._windows.may_move) and good
             moved = moved or (source.kind == "imu" and not source.verdict.still and not source.verdict.fault)
         if not self._windows.add(slot, good=good):
             self._break()

@@ -88,19 +88,8 @@ class Stream:
         step_s = float(np.median(np.diff(whole[:, 0]).tolist()))
         second = rates[2:] - 2.0 * rates[1:-1] + rates[:-2]
         white2 = float(np.square(second).mean()) / 6.0 * step_s if len(second) else 0.0
-        self.seconds.append(
-            ImuSecond(
-                slot=batch.slot,
-                passage=passage(whole[:, 0], rates, whole[:, 4:]),
-                samples=batch.n,
-                mean=batch.mean,
-                variance=batch.variance,
-                temperature_degc=batch.temperature_degc,
-                white2=white2,
-                shared_variance=batch.shared_variance,
-            )
-        )
-        while self.levels and next(iter(self.levels)) < self.seconds[0].slot:
+        self.seconds.append(ImuSecond(batch, passage(whole[:, 0], rates, whole[:, 4:]), white2))
+        while self.levels and next(iter(self.levels)) < self.seconds[0].batch.slot:
             del self.levels[next(iter(self.levels))]
         return True
 
@@ -201,7 +190,9 @@ class Deck(WindowSource):
 
     def common(self, since_s: float | None = None) -> range:
         """Return the seconds of all IMUs that begin after `since_s`, up to the last end by `EVERY_S`."""
-        ends = [(one.seconds[0].slot, one.seconds[-1].slot) for one in self._streams.values() if one.seconds]
+        ends = [
+            (one.seconds[0].batch.slot, one.seconds[-1].batch.slot) for one in self._streams.values() if one.seconds
+        ]
         if not ends or len(ends) < len(self._streams):
             return range(0)
         begin, now = max(first for first, _ in ends), min(last for _, last in ends) + 1
@@ -224,7 +215,7 @@ class Deck(WindowSource):
         streams = self._streams.values()
         estimate = DeckWindow(
             imus=[stream.imu for stream in streams],
-            seconds=[[one for one in stream.seconds if one.slot in slots] for stream in streams],
+            seconds=[[one for one in stream.seconds if one.batch.slot in slots] for stream in streams],
             levels=[{slot: one for slot, one in stream.levels.items() if slot in slots} for stream in streams],
             headings={slot: heading for slot, heading in self._headings.items() if slot in slots},
             slots=slots,

@@ -20,6 +20,7 @@ from companion.estimation.means.pose import CompassModel, GradienterModel, Headi
 from companion.estimation.means.warming import drifting
 from companion.estimation.means.windows import ImuInput, ImuWindow, Window
 from companion.estimation.noise.allan import floor_variance, slope_variance
+from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import Array, Floats, Matrix, body_from_ned, vector
 from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG, MG
@@ -64,17 +65,13 @@ class DeckFound(NamedTuple):
 
 
 class ImuSecond(NamedTuple):
-    """Summary of one second of one IMU; arrays as in `Batch`, in the sensor's axes."""
+    """One second of one IMU."""
 
-    slot: int
+    batch: Batch
+    """In the sensor's axes."""
     passage: Passage
-    samples: int
-    mean: Floats
-    variance: Floats
-    temperature_degc: float | None
     white2: float
     """N^2 of the gyros, from second differences of neighbouring samples; the mean of the axes."""
-    shared_variance: Floats
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -117,7 +114,7 @@ class DeckWindow:
             self._imu(imu, seconds, levels, headings, reference)
             for imu, seconds, levels in zip(self.imus, self.seconds, all_levels, strict=True)
         ]
-        last = found[0][2] if found else None
+        last = found[0][2]
         window = Window(
             start_s=float(self.slots[0]),
             end_s=self.slots[-1] + 1.0,
@@ -127,8 +124,8 @@ class DeckWindow:
             else TiltWindow(
                 x_deg=reference[0], y_deg=reference[1], x_sigma_deg=0.0, y_sigma_deg=0.0, temperature_degc=None
             ),
-            heading=None if self.compass is None or last is None else self._heading(last, self.compass),
-            turn_rad_s=None if last is None else vector(last.turn_rad_s),
+            heading=None if self.compass is None else self._heading(last, self.compass),
+            turn_rad_s=vector(last.turn_rad_s),
         )
         return DeckFound(window, tuple(known for _, triads, _ in found for known in triads))
 
@@ -138,11 +135,11 @@ class DeckWindow:
         Raises:
             CalibrationRefusedError: it still does.
         """
-        if not self.imus or not readings:
+        if not readings:
             return set()
         slots, values = np.array(list(readings)), np.array(list(readings.values()))
         changes = np.abs(np.diff(values, axis=0)).max(axis=1) > _SAME
-        rates = {one.slot: one.mean[:3] @ self.imus[0].rotation.T for one in self.seconds[0]}
+        rates = {one.batch.slot: one.batch.mean[:3] @ self.imus[0].rotation.T for one in self.seconds[0]}
         found: set[int] = set()
         for run in np.split(slots, np.flatnonzero(changes) + 1):
             swayed = [rates[slot][:2] for slot in run if slot in rates]
@@ -184,10 +181,10 @@ class DeckWindow:
         covariance[3:, 3:] = own + np.diag(accel_floor)
         use = np.sqrt(np.diag(covariance))
         heading_rad = math.atan2(found.body_to_ned[-1, 1, 0], found.body_to_ned[-1, 0, 0])
-        temperatures = [one.temperature_degc for one in seconds if one.temperature_degc is not None]
+        temperatures = [one.batch.temperature_degc for one in seconds if one.batch.temperature_degc is not None]
         window = ImuWindow(
             name=imu.name,
-            samples=sum(one.samples for one in seconds),
+            samples=sum(one.batch.n for one in seconds),
             duration_s=span_s,
             gyro_rad_s=vector(found.gyro_rad_s),
             accel_m_s2=vector(direction),
@@ -273,9 +270,9 @@ def _felt(
 def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:
     """Return the variance (6,) that integers hide where the swaying does not spread them, and that of shared errors."""
     steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
-    means = np.array([one.mean for one in seconds])
-    spread = np.sqrt(means.var(axis=0) + np.mean([one.variance for one in seconds], axis=0))
+    means = np.array([one.batch.mean for one in seconds])
+    spread = np.sqrt(means.var(axis=0) + np.mean([one.batch.variance for one in seconds], axis=0))
     hidden = np.where(spread < _SPREAD * steps, np.square(steps / 2.0), 0.0)
-    hidden = hidden + np.mean([one.shared_variance for one in seconds], axis=0)
+    hidden = hidden + np.mean([one.batch.shared_variance for one in seconds], axis=0)
     turn = np.square(imu.rotation)
     return np.concatenate([turn @ hidden[:3], turn @ hidden[3:]])
