@@ -126,7 +126,6 @@ class Deck(WindowSource):
         self._tilts: dict[int, tuple[Floats, Floats]] = {}
         self._reference_deg: tuple[float, float] | None = None
         """Tilt at which the last accelerometer means were given, to compare those after a write with."""
-        self._newest_s = 0
         self._is_good = True
 
     def set_imu(self, imu: ImuInput, batches: BatchSource | None = None, raw: BatchSource | None = None) -> None:
@@ -230,10 +229,8 @@ class Deck(WindowSource):
         """Keep what the work has found; return False if it comes too late."""
         if not super().accept(work, found):
             return False
-        if work.since_s is None and isinstance(found, DeckFound):
-            if (tilt := found.window.tilt) is not None:
-                self._reference_deg = tilt.x_deg, tilt.y_deg
-            self._newest_s = len(work.slots)
+        if work.since_s is None and isinstance(found, DeckFound) and (tilt := found.window.tilt) is not None:
+            self._reference_deg = tilt.x_deg, tilt.y_deg
         return True
 
     def measurement(self, since_s: float | None) -> Measurement:
@@ -257,7 +254,8 @@ class Deck(WindowSource):
         if isinstance(found, CalibrationRefusedError):
             return status(enough=False, progress=0.0, measuring=str(found))
         targets = settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2
-        aims = [aim(self._newest_s, known, targets[at % 2]) for at, known in enumerate(found.known)]
+        span_s = found.window.end_s - found.window.start_s
+        aims = [aim(span_s, known, targets[at % 2]) for at, known in enumerate(found.known)]
         if all(each.sigma <= each.goal for each in aims):
             return status(enough=True, progress=1.0, measuring="sigma is good enough")
         if seconds >= MAX_S:
@@ -285,12 +283,12 @@ class Aim(NamedTuple):
         return f"{_figure(self.sigma / unit)} {name}, goal {_figure(self.goal / unit)}"
 
 
-def aim(span_s: int, known: TriadVariances, target: float) -> Aim:
+def aim(span_s: float, known: TriadVariances, target: float) -> Aim:
     """Return the aim of a triad by the newest estimate, from a window of so many seconds."""
     use, white = known
     floor = use - white
     goal = max(target**2, floor * (1.0 + WHITE_SHARE))
-    whole_s = float(span_s)
+    whole_s = span_s
     if use > goal:
         wanted = (goal - floor) / white
         whole_s = min(span_s * wanted ** (-1.0 / _FALLS), MAX_S) if wanted > 0.0 else MAX_S
