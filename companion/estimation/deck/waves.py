@@ -67,8 +67,9 @@ def fit_waves(series: list[Floats]) -> Waves:
 def whitened(columns: Floats, waves: Waves, wander: tuple[float, float] = (0.0, 0.0)) -> Floats:
     """Whiten columns (n, c), readings and regressors, to unit variance; a row of NaN is a gap.
 
-    `wander`: variances of the steps, from one row to the next, of a random walk of angle (the gyros' white noise), and
-    of one of rate (their bias, sought at its last value), whose sum joins the first. Both are zero at the last row.
+    `wander`: variances of the steps of two random walks, from one row to the next; both walks are zero at the last
+    row. The first is one of angle: the gyros' white noise. The second is one of rate, whose sum joins the first: the
+    gyros' bias, sought at its last value.
     """
     order = max(len(waves.terms), 1)
     angle, rate, size = order, order + 1, order + 2

@@ -189,7 +189,7 @@ def _missing(stamps: Floats) -> int | None:
 
 
 def _is_clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
-    """Whether some channel's lowest or highest value is by far its commonest.
+    """True if some channel's lowest or highest value is by far its commonest.
 
     Noise thins out towards its ends; a pile at an end is the end of the range. Few distinct values prove nothing: a
     quantised stream of a still sensor looks like that. Of 50 integers the lowest is now and then the commonest by

@@ -90,7 +90,7 @@ class GateVerdict(msgspec.Struct, frozen=True):
     still: bool
     words: str = ""
     fault: bool = False
-    """Whether the device, not the aircraft, blocks the calibration."""
+    """True if the device, not the aircraft, blocks the calibration."""
     what: str = ""
     """Words without figures, for counting; those of a fault in full."""
 

@@ -130,7 +130,7 @@ class OwnNoise:
             self._learn()
 
     def _is_motion(self, batch: Batch) -> bool:
-        """Whether a second alone has more than any sensor's noise."""
+        """True if a second alone has more than any sensor's noise."""
         most2 = _BEYOND**2 * self._most2
         if self._seconds:
             before = self._seconds[-1]

@@ -60,12 +60,12 @@ class Stretch:
 
     @property
     def good_now(self) -> bool:
-        """Whether the latest second was good."""
+        """True if the latest second was good."""
         return bool(self.flags) and self.flags[-1]
 
     @property
     def full(self) -> bool:
-        """Whether it fills the longest window."""
+        """True if it fills the longest window."""
         return len(self.flags) == self.flags.maxlen
 
 

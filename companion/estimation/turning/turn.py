@@ -50,7 +50,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def is_significant(self) -> bool:
-        """Whether the platform turns about the vertical."""
+        """True if the platform turns about the vertical."""
         least = LEAST_BY_GYROS_RAD_S if self.by == "gyros" else LEAST_RAD_S
         return abs(self.rate_rad_s) > max(SIGNIFICANT * self.sigma_rad_s, least)
 
@@ -63,12 +63,12 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def is_chance(self) -> bool:
-        """Whether a platform at rest may well show such a rate."""
+        """True if a platform at rest may well show such a rate."""
         return abs(self.rate_rad_s) <= CHANCE_SIGMAS * self.sigma_rad_s
 
     @property
     def is_told(self) -> bool:
-        """Whether the rate is measured; else the ground counts as fixed to the Earth."""
+        """True if the rate is measured; else the ground counts as fixed to the Earth."""
         return self.by is not None and self.is_vouched
 
     @property
@@ -94,7 +94,7 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
         return np.outer(up, up) * self.variance + np.outer(tilting, tilting) + level * self.tilting_sigma_rad_s**2
 
     def contradicts(self, other: Turn) -> bool:
-        """Whether another estimate of the platform's rate differs significantly."""
+        """Return whether another estimate of the platform's rate differs significantly."""
         return abs(self.rate_rad_s - other.rate_rad_s) > SIGNIFICANT * math.hypot(self.sigma_rad_s, other.sigma_rad_s)
 
 
