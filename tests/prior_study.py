@@ -18,7 +18,7 @@ from companion.config.sections import AllanModel
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp
 from companion.estimation.records.record import Pose, PoseSigma, Site
 from companion.estimation.solution.joint import Weighed, weigh
-from companion.estimation.solution.prior import Expectation, ExpectedImu, Now, PoseEffect, expect, pose_effect
+from companion.estimation.solution.prior import Expectation, ExpectedImu, PoseEffect, expect, pose_effect
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution
 from companion.samples import TRIADS
 
@@ -190,12 +190,12 @@ def one_trial(
         covariance = shared.covariance + np.diag(np.full(6, (claimed * unit) ** 2))
         gyro, accel = (reading, np.zeros(3)) if case.triad == "gyro" else (np.zeros(3), reading)
         found.append(imu_solution(f"imu{k}", gyro, accel, stat, covariance))
-        now = Now(
+        now = Point(
+            started_at="",
             unix_s=86400.0 * case.power_ups,
             power_up=PowerUp(host="today", since_unix_s=None),
             temperature_degc=today_degc,
             up=axes(LEVEL),
-            gravity_m_s2=G,
             zero="today's",
         )
         expected.append(

@@ -12,7 +12,7 @@ from companion.estimation.means.windows import ImuInput
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import by_power_up, kept
 from companion.estimation.solution.joint import at_end, with_warm
-from companion.estimation.solution.prior import ExpectedImu, curve_of, follow
+from companion.estimation.solution.prior import ExpectedImu, curve_of
 from companion.estimation.temperature.curve import settling
 from sim.accuracy.figures import Claim, Section, covered, rms
 from sim.accuracy.stand import POSTURES, References, collected, samples, sites, solved, stand
@@ -75,7 +75,7 @@ def mid_warm_up(part: str, rate_k_min: float, seed: int, number: int) -> MidRun:
         path = None if plain.warming is None else plain.warming.path
         said, known = plain, ExpectedImu(name="imu")
         if curve is not None and path is not None:
-            known = ExpectedImu(name="imu", along={"gyro": follow(curve, path, settles, profile.gyro)})
+            known = ExpectedImu(name="imu", along={"gyro": curve.along(path, settles, profile.gyro)})
             said, shift, followed = at_end(plain, known, solution.shared)
             end = end + shift[:3]
             said = with_warm(said, (end, None), known, followed)

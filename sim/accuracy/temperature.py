@@ -15,7 +15,7 @@ import numpy as np
 
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp, kept
-from companion.estimation.solution.prior import Now, expect, pose_effect
+from companion.estimation.solution.prior import expect, pose_effect
 from sim.accuracy.figures import Claim, Section, covered, rms
 from sim.earth import Array
 from sim.imu_model import DEG_H, PARTS, AxisNoise
@@ -137,13 +137,12 @@ def power_up(part: str, seed: int, number: int) -> PowerUpRun:
         known = kept((*known, *aircraft.seen(aircraft.day(), day)))
     today = aircraft.day()
     truth = today.bias[0]
-    now = Now(
+    now = Point(
+        started_at="",
         unix_s=86400.0 * DAYS,
         power_up=PowerUp(host="today", since_unix_s=86400.0 * DAYS),
         temperature_degc=float(today.degc[0]),
         up=_UP,
-        gravity_m_s2=9.8,
-        zero=None,
     )
     expected = expect(known, "gyro", now, pose_effect(None), noise_profile(part).gyro)
     assert expected is not None

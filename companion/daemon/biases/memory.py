@@ -31,16 +31,14 @@ from companion.estimation.solution.joint import Weighed, Whole, weigh
 from companion.estimation.solution.prior import (
     Expectation,
     ExpectedImu,
-    Now,
     Prediction,
     curve_of,
     expect,
     expect_today,
-    follow,
     pose_effect,
 )
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution, moved
-from companion.estimation.temperature.curve import Along, Curve, WarmUpTime, settling
+from companion.estimation.temperature.curve import Along, Curve, settling
 from companion.formats import Object
 from companion.physics.frames import Array, vector
 from companion.samples import TRIADS, Triad, Vector
@@ -63,12 +61,12 @@ class Curves:
         self._profiles, self._imus = core.profiles, imus
         self._names = {imu.name for imu in core.config.imu}
         self._of: dict[tuple[str, Triad], Curve | None] = {}
-        self._settling: dict[str, WarmUpTime | None] = {}
+        self._settling: dict[str, tuple[float, float] | None] = {}
 
     def follow(self, known: Mapping[str, KnownImu]) -> None:
         """Fit the curves anew; blocking."""
         of: dict[tuple[str, Triad], Curve | None] = {}
-        settles: dict[str, WarmUpTime | None] = {}
+        settles: dict[str, tuple[float, float] | None] = {}
         for name in known.keys() & self._names:
             seen, profile = known[name].points, noise_profile(self._profiles.of(name))
             of |= {(name, triad): curve_of(seen, triad, profile.of(triad)) for triad in TRIADS}
@@ -91,11 +89,13 @@ class Curves:
         if curve is None or path is None:
             return None
         profile = noise_profile(self._profiles.of(name))
-        found = follow(curve, path, self._settling.get(name), profile.of(triad))
+        found = curve.along(path, self._settling.get(name), profile.of(triad))
         start, _, end = path.degc
-        return found.less(
-            self.taken_off(name, triad, path.mean_degc, end), self.taken_off(name, triad, start, end) / path.span_s
-        )
+        shift, slope = (self.taken_off(name, triad, degc, end) for degc in (path.mean_degc, start))
+        if not shift.any() and not slope.any():
+            return found
+        left = {"shift": vector(found.shift - shift), "slope": vector(found.slope - slope / path.span_s)}
+        return msgspec.structs.replace(found, warm=None, **left)
 
     def drift(
         self, name: str, triad: Triad, degc: float | None, now_degc: float | None
@@ -211,13 +211,13 @@ class BiasMemory:
         effect = pose_effect(self.identities.aligned(name))
         if not self._config.calibration.prior:
             return ExpectedImu(name=name, effect=effect)
-        now = Now(
+        now = Point(
+            started_at="",
             unix_s=unix_s,
             power_up=self.identities.power_up(name, unix_s),
             temperature_degc=imu.temperature_degc,
             k_s=imu.k_s,
             up=vector(shared.up),
-            gravity_m_s2=shared.gravity_m_s2,
             zero=self.identities.zero(),
         )
         earlier, session = self._points(name), self.identities.session(name)

@@ -105,6 +105,12 @@ class Point(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False
         """Return one triad."""
         return self.gyro if triad == "gyro" else self.accel
 
+    def measured(self, triad: Triad) -> MeasuredBias:
+        """Return one triad that is known to have been measured."""
+        found = self.of(triad)
+        assert found is not None
+        return found
+
     def as_chosen(self, *, gyro: bool = True) -> Point:
         """Mark a contradiction as decided for: its calibration was requested and is in force; `gyro`: gyros too."""
         rates = _as_chosen(self.gyro) if gyro else self.gyro

@@ -36,7 +36,7 @@ from companion.estimation.solution.solve import ImuSolution, Pair, Shared, Solut
 from companion.estimation.turning.turn import CHANCE_SIGMAS, Turn
 from companion.physics.frames import Array, vector
 from companion.physics.units import DEG, UNITS
-from companion.samples import TRIADS, Triad, rows_of
+from companion.samples import TRIADS, Triad, Vector, rows_of
 
 Whole = Mapping[str, Pair]
 """Whole gyro and accelerometer bias by IMU, by the readings alone, (3,) each, vehicle FRD."""
@@ -131,17 +131,16 @@ def at_end(
 
 def with_warm(imu: ImuSolution, whole: Pair, expected: ExpectedImu | None, followed: Collection[Triad]) -> ImuSolution:
     """Add the biases that are predicted for when the IMU is warm, from the `whole` biases now."""
-    figures: dict[Triad, tuple[Array, Array]] = {}
+    figures: dict[Triad, tuple[Vector, Vector]] = {}
     words, degc = [], 0.0
     for triad, now in zip(TRIADS, whole, strict=True):
         along = None if expected is None or triad not in followed else expected.along.get(triad)
-        warm = None if along is None else along.warm
-        if warm is None or now is None:
+        if along is None or along.warm is None or now is None:
             continue
-        change, degc = np.array(warm.change), warm.degc
+        degc, change, variance = along.warm[0], np.array(along.warm[1]), np.array(along.warm[2])
         present = np.diag(imu.covariance)[rows_of(triad)]
-        sigma = np.sqrt(present + np.array(warm.variance))
-        figures[triad] = now + change, sigma
+        sigma = np.sqrt(present + variance)
+        figures[triad] = vector(now + change), vector(sigma)
         worst = int(np.abs(change).argmax())
         if abs(change[worst]) > _WORTH_SAYING * np.sqrt(present[worst]):
             unit, name, digits = UNITS[triad]
@@ -152,12 +151,13 @@ def with_warm(imu: ImuSolution, whole: Pair, expected: ExpectedImu | None, follo
             )
     if "gyro" not in figures:
         return imu
+    (gyro, of_gyro), (accel, of_accel) = figures["gyro"], figures.get("accel", (None, None))
     when = WhenWarm(
         degc=round(degc, 1),
-        gyro_bias_rad_s=vector(figures["gyro"][0]),
-        gyro_sigma_rad_s=vector(figures["gyro"][1]),
-        accel_bias_m_s2=vector(figures["accel"][0]) if "accel" in figures else None,
-        accel_sigma_m_s2=vector(figures["accel"][1]) if "accel" in figures else None,
+        gyro_bias_rad_s=gyro,
+        gyro_sigma_rad_s=of_gyro,
+        accel_bias_m_s2=accel,
+        accel_sigma_m_s2=of_accel,
         words=tuple(words),
     )
     return dataclasses.replace(imu, when_warm=when, drifting=tuple(words))

@@ -25,21 +25,10 @@ import numpy as np
 
 from companion.config.sections import AllanModel
 from companion.estimation.alignment.align_model import Priors
-from companion.estimation.means.warming import Path
-from companion.estimation.noise.allan import floor_variance
 from companion.estimation.records.align_record import Determined, ImuAlignmentRecord
-from companion.estimation.records.history import GUARDS_FROM, WEIGHS_FROM, MeasuredBias, Point, PowerUp, believed
+from companion.estimation.records.history import GUARDS_FROM, WEIGHS_FROM, Point, believed
 from companion.estimation.records.record import Effective
-from companion.estimation.temperature.curve import (
-    CATALOGUE_PER_K,
-    WARM_AFTER,
-    Along,
-    Curve,
-    Node,
-    PowerUpNodes,
-    WarmUpTime,
-    fit,
-)
+from companion.estimation.temperature.curve import CATALOGUE_PER_K, Along, Curve, PowerUpNodes, fit, in_run_variance
 from companion.physics.frames import Array, Floats, Matrix, skew, symmetric, vector
 from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG, MG, G
@@ -59,8 +48,6 @@ _KNOWN: Final = 0.5
 _UNEXPLAINED: Final = 0.1
 """Largest unexplained share of the changes within power-ups. With the IMU's own thermometer it is 0.05 and less (except
 for one simulated aircraft in some hundreds); with that of the air, a heater or a processor 0.1 to 1 and more."""
-_IN_RUN_MEAN_S: Final = 30.0
-_SHORTEST_GAP_S: Final = 180.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -165,20 +152,13 @@ class Expectation(msgspec.Struct, frozen=True, kw_only=True):
     """True if the sigma of the gradienter's zero was measured or configured, and is no cautious guess."""
 
 
-class Now(msgspec.Struct, frozen=True, kw_only=True):
-    """Present state of one IMU."""
-
-    unix_s: float
-    power_up: PowerUp
-    temperature_degc: float | None
-    k_s: float = 0.0
-    up: Vector
-    gravity_m_s2: float
-    zero: str | None
+_ASSUMED: Final = pose_effect(None)
 
 
-def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, model: AllanModel) -> Prediction | None:
-    """Predict today's bias from the earlier power-ups; None: they are too few."""
+def expect(
+    points: Sequence[Point], triad: Triad, now: Point, effect: PoseEffect, model: AllanModel
+) -> Prediction | None:
+    """Predict the bias in the present state, `now`, from the earlier power-ups; None: they are too few."""
     groups = [
         group for group in believed(points, triad) if not any(point.power_up.is_same(now.power_up) for point in group)
     ]
@@ -186,26 +166,19 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
         return None
     # Where a temperature is missing, all count as measured at the same one.
     by_degc = now.temperature_degc is not None and _have_temperatures(groups)
-    nodes, poses, shared = [], [], []
+    nodes, poses = [], []
     for group in groups:
-        found = [_of(point, triad) for point in group]
-        biases, pose = _here(group, triad, now, effect)
-        zero = group[-1].zero_sigma_rad * now.gravity_m_s2 if triad == "accel" else 0.0
-        states = [(point.temperature_degc or 0.0, point.k_s) if by_degc else (0.0, 0.0) for point in group]
-        each = zip(states, biases, found, strict=True)
-        nodes.append(
-            PowerUpNodes(
-                [Node(degc, vector(bias), _white(one), k_s) for (degc, k_s), bias, one in each],
-                common_variance=float(np.square(pose).mean()) + zero**2,
-            )
-        )
+        bias, pose, white = _here(group, triad, now.up, effect)
+        zero = group[-1].zero_sigma_rad * G if triad == "accel" else 0.0
+        states = _states(group) if by_degc else np.zeros((len(group), 2))
+        nodes.append(PowerUpNodes(states, bias, white, float(np.square(pose).mean()) + zero**2))
         poses.append(pose.mean(axis=0))
-        shared += [one.sigma_shared for one in found]
-    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad])
+    curve = fit(nodes, in_run_variance(model), CATALOGUE_PER_K[triad])
     assert curve is not None
     degc = now.temperature_degc or 0.0
     value, variance = curve.at(degc, now.k_s) if by_degc else curve.at(0.0)
     # An error that all power-ups share, of one attitude or one place, does not average out.
+    shared = [point.measured(triad).sigma_shared for group in groups for point in group]
     together = np.square(curve.shares @ np.array(poses)) + np.max(np.square(shared), axis=0)
     same, other = _zeros([group[-1] for group in groups], curve.shares, now.zero) if triad == "accel" else (0.0, 0.0)
     return Prediction(
@@ -221,7 +194,7 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
 
 
 def expect_today(
-    last: Point, triad: Triad, now: Now, effect: PoseEffect, model: AllanModel, curve: Curve | None = None
+    last: Point, triad: Triad, now: Point, effect: PoseEffect, model: AllanModel, curve: Curve | None = None
 ) -> Prediction | None:
     """Predict the bias from an earlier calibration in this power-up; None: it did not measure this triad.
 
@@ -230,20 +203,22 @@ def expect_today(
     found = last.of(triad)
     if found is None:
         return None
-    bias, pose = _here([last], triad, now, effect)
+    (bias,), (pose,), _ = _here([last], triad, now.up, effect)
     then_degc, now_degc = last.temperature_degc, now.temperature_degc
+    change = np.zeros(3)
     if then_degc is None or now_degc is None:
-        change, of_change = np.zeros(3), np.full(3, (CATALOGUE_PER_K[triad] * TEMPERATURE_SIGMA_K) ** 2)
+        of_change = np.full(3, (CATALOGUE_PER_K[triad] * TEMPERATURE_SIGMA_K) ** 2)
     elif curve is None:
-        change, of_change = np.zeros(3), np.full(3, (CATALOGUE_PER_K[triad] * (now_degc - then_degc)) ** 2)
+        of_change = np.full(3, (CATALOGUE_PER_K[triad] * (now_degc - then_degc)) ** 2)
     else:
         change, of_change = curve.change((then_degc, last.k_s), (now_degc, now.k_s))
-    drift = _in_run(model, max(abs(now.unix_s - last.unix_s), _SHORTEST_GAP_S))
-    variance = np.square(found.sigma_use) + np.square(found.sigma_shared) + np.square(pose[0]) + of_change + drift
+    drift = in_run_variance(model, abs(now.unix_s - last.unix_s))
     same = triad == "accel" and last.zero == now.zero
     return Prediction(
-        value=vector(bias[0] + change),
-        variance=vector(variance),
+        value=vector(bias + change),
+        variance=vector(
+            np.square(found.sigma_use) + np.square(found.sigma_shared) + np.square(pose) + of_change + drift
+        ),
         limit=GATE_SIGMAS,
         power_ups=1,
         weighs=False,
@@ -260,16 +235,11 @@ def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve 
     groups = believed(points, triad)
     if len(groups) < WEIGHS_FROM or not _have_temperatures(groups):
         return None
-    nodes, assumed = [], pose_effect(None)
+    nodes = []
     for group in groups:
-        of_group = []
-        for point in group:
-            found = _of(point, triad)
-            _, sigma = assumed.change(G, np.array(point.up), np.array(group[0].up))
-            variance = _white(found) + (float(np.square(sigma).mean()) if triad == "accel" else 0.0)
-            of_group.append(Node(point.temperature_degc or 0.0, found.bias, variance, point.k_s))
-        nodes.append(PowerUpNodes(of_group))
-    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad], may_be_mean=False)
+        bias, pose, white = _here(group, triad, group[0].up, _ASSUMED)
+        nodes.append(PowerUpNodes(_states(group), bias, white + np.square(pose).mean(axis=1)))
+    curve = fit(nodes, in_run_variance(model), CATALOGUE_PER_K[triad], may_be_mean=False)
     assert curve is not None
     low, high = curve.span_degc
     _, of_kelvin = curve.change((low, 0.0), (low + 1.0, 0.0))
@@ -277,40 +247,23 @@ def curve_of(points: Sequence[Point], triad: Triad, model: AllanModel) -> Curve 
     return curve if known and curve.unexplained < _UNEXPLAINED else None
 
 
-def follow(curve: Curve, path: Path, settles: WarmUpTime | None, model: AllanModel) -> Along:
-    """Predict by a curve the bias over a window, and when the IMU is warm."""
-    wander = 0.0 if settles is None else _in_run(model, max(WARM_AFTER * settles.tau_s, _SHORTEST_GAP_S))
-    return curve.along(path.states, path.span_s, path.variance, settles, wander)
-
-
-def _of(point: Point, triad: Triad) -> MeasuredBias:
-    found = point.of(triad)
-    assert found is not None  # `believed` returns only these
-    return found
-
-
-def _white(found: MeasuredBias) -> float:
-    return float(np.square(found.sigma_stat).mean())
-
-
 def _have_temperatures(groups: Sequence[Sequence[Point]]) -> bool:
     return all(point.temperature_degc is not None for group in groups for point in group)
 
 
-def _in_run(model: AllanModel, gap_s: float = _SHORTEST_GAP_S) -> float:
-    """Give the variance by which a bias wanders within a power-up."""
-    return float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * gap_s))
+def _states(group: Sequence[Point]) -> Floats:
+    return np.array([(point.temperature_degc, point.k_s) for point in group], dtype=np.float64)
 
 
-def _here(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect) -> tuple[Floats, Floats]:
-    """Convert biases to today's attitude, and give one sigma of the conversion; each (points, 3)."""
-    bias = np.array([_of(point, triad).bias for point in points])
-    pose = np.zeros_like(bias)
+def _here(points: Sequence[Point], triad: Triad, up: Vector, effect: PoseEffect) -> tuple[Floats, Floats, Floats]:
+    """Convert biases to the attitude `up`; also give one sigma of that, (points, 3), and the white variance."""
+    found = [point.measured(triad) for point in points]
+    bias, pose = np.array([one.bias for one in found]), np.zeros((len(points), 3))
     if triad == "accel":
         for k, point in enumerate(points):
-            change, pose[k] = effect.change(now.gravity_m_s2, np.array(now.up), np.array(point.up))
+            change, pose[k] = effect.change(G, np.array(up), np.array(point.up))
             bias[k] += change
-    return bias, pose
+    return bias, pose, np.square([one.sigma_stat for one in found]).mean(axis=1)
 
 
 def _zeros(points: Sequence[Point], share: Floats, today: str | None) -> tuple[float, float]:

@@ -6,7 +6,7 @@ The bias of power-up s at the temperature T is
 
 Each power-up has an offset o_s of its own, scattered about a mean with the variance tau^2 (run to run); the cubic is
 common to all. The die is as warm as its thermometer was `lag` before: that is why heating and cooling differ. The fit
-is generalised least squares over means of still seconds at one temperature (`Node`). The coefficients have a prior as
+is generalised least squares over means of still seconds at one temperature. The coefficients have a prior as
 wide as the catalogue's parts move, so the model is uncertain at temperatures that were not seen.
 
 Each power-up is predicted from the others at its first node. The errors choose the lag, choose between cubic and mean,
@@ -22,11 +22,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
 
+from companion.config.sections import AllanModel
+from companion.estimation.means.warming import Path
+from companion.estimation.noise.allan import floor_variance
 from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.physics.statistics import MAD_TO_SIGMA
 from companion.physics.units import DEG_H, MG
@@ -57,8 +60,10 @@ _SLOWED_K_S: Final = 0.25 / 60.0
 """Least slowing of a warm-up that tells where it ends."""
 _TAU_SIGMA: Final = 0.05
 """Least sigma of tau as a share of it: boards have more than one time constant."""
-WARM_AFTER: Final = 5.0
+_WARM_AFTER: Final = 5.0
 """Time constants after which a board is warm."""
+_IN_RUN_MEAN_S: Final = 30.0
+_SHORTEST_GAP_S: Final = 180.0
 _END_LESS_MEAN: Final = (-1.0 / 6.0, -4.0 / 6.0, 5.0 / 6.0)
 """Weights of start, middle and end: the end less the mean by Simpson's rule."""
 CATALOGUE_SCATTER: Final[dict[Triad, float]] = {"gyro": 70.0 * DEG_H, "accel": 2.0 * MG}
@@ -69,32 +74,17 @@ State = tuple[float, float]
 """Temperature and its rate, degC and K/s."""
 
 
-class Node(msgspec.Struct, frozen=True):
-    """Still seconds of one power-up at about one temperature; vehicle FRD, rad/s or m/s^2."""
+class PowerUpNodes(NamedTuple):
+    """Still seconds of one power-up, a row for each temperature; vehicle FRD, rad/s or m/s^2."""
 
-    degc: float
-    bias: Vector
-    variance: float
-    """Variance of the white noise, mean over the axes."""
-    k_s: float = 0.0
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class PowerUpNodes:
-    """Nodes of one power-up."""
-
-    nodes: Sequence[Node]
+    states: Floats
+    """(n, 2): temperature in degC and its rate in K/s."""
+    bias: Floats
+    """(n, 3)."""
+    variance: Floats
+    """(n,): variance of the white noise, mean over the axes."""
     common_variance: float = 0.0
-    """Variance of an error that all nodes share; it lowers the weight."""
-
-
-class Warm(msgspec.Struct, frozen=True, kw_only=True):
-    """Prediction for the time when the board is warm; vehicle FRD, rad/s or m/s^2."""
-
-    degc: float
-    change: Vector
-    """Change of the bias from the end of the window."""
-    variance: Vector
+    """Variance of an error that all rows share; it lowers the weight."""
 
 
 class Along(msgspec.Struct, frozen=True, kw_only=True):
@@ -105,22 +95,9 @@ class Along(msgspec.Struct, frozen=True, kw_only=True):
     shift_variance: Vector
     slope: Vector
     slope_variance: Vector
-    warm: Warm | None = None
-    """None: the end of the warm-up is unknown, or beyond the temperatures seen."""
-
-    def less(self, shift: Array, slope: Array) -> Along:
-        """Subtract what the autopilot compensates by temperature: then no change until warm is predicted."""
-        if not shift.any() and not slope.any():
-            return self
-        left = {"shift": vector(self.shift - shift), "slope": vector(self.slope - slope)}
-        return msgspec.structs.replace(self, warm=None, **left)
-
-
-class WarmUpTime(msgspec.Struct, frozen=True):
-    """Time constant of a board's warm-up, and one sigma."""
-
-    tau_s: float
-    sigma_s: float
+    warm: tuple[float, Vector, Vector] | None = None
+    """Temperature of the warm board in degC, change of the bias from the window's end to there, and its variance.
+    None: the end of the warm-up is unknown, or beyond the temperatures seen."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -173,40 +150,25 @@ class Curve:
         variance = float(x @ self.covariance @ x) * self.of_changes + (self.per_kelvin * outside_k) ** 2
         return x @ self.coefficients, variance
 
-    def along(
-        self,
-        states: tuple[State, State, State],
-        span_s: float,
-        end_variance: float,
-        settles: WarmUpTime | None,
-        wander: float = 0.0,
-    ) -> Along:
-        """Predict the bias within a window.
-
-        Args:
-            states: at the window's beginning, in its middle and at its end.
-            span_s: length of the window.
-            end_variance: K^2, of the temperature's end less its mean.
-            settles: time constant of the board, where it is known.
-            wander: variance by which the bias wanders until the board is warm.
-        """
-        start, (middle_degc, k_s), end = states
-        shift, shift_variance = self.moves(zip(_END_LESS_MEAN, states, strict=True))
+    def along(self, path: Path, tau_s: tuple[float, float] | None, model: AllanModel) -> Along:
+        """Predict the bias within a window; `tau_s`: time constant of the board and one sigma, where it is known."""
+        start, (middle_degc, k_s), end = path.states
+        shift, shift_variance = self.moves(zip(_END_LESS_MEAN, path.states, strict=True))
         slope, slope_variance = self.change(start, end)
-        by_end = np.square(self._per_k(end[0])) * end_variance
+        by_end = np.square(self._per_k(end[0])) * path.variance
         # A line goes by half of its change from its middle to its end.
-        of_rate = (2.0 / span_s) ** 2
+        of_rate = (2.0 / path.span_s) ** 2
         warm = None
-        if settles is not None and self.beyond_k(degc := middle_degc + settles.tau_s * k_s) == 0.0:
+        if tau_s is not None and self.beyond_k(degc := middle_degc + tau_s[0] * k_s) == 0.0:
             change, variance = self.change(end, (degc, 0.0))
-            of_degc = (settles.sigma_s * k_s) ** 2 + settles.tau_s**2 * end_variance * of_rate
-            variance = variance + wander + np.square(self._per_k(degc)) * of_degc
-            warm = Warm(degc=degc, change=vector(change), variance=vector(variance))
+            of_degc = (tau_s[1] * k_s) ** 2 + tau_s[0] ** 2 * path.variance * of_rate
+            wander = in_run_variance(model, _WARM_AFTER * tau_s[0])
+            warm = degc, vector(change), vector(variance + wander + np.square(self._per_k(degc)) * of_degc)
         return Along(
             shift=vector(shift),
             shift_variance=vector(shift_variance + by_end),
-            slope=vector(slope / span_s),
-            slope_variance=vector(slope_variance / span_s**2 + by_end * of_rate),
+            slope=vector(slope / path.span_s),
+            slope_variance=vector(slope_variance / path.span_s**2 + by_end * of_rate),
             warm=warm,
         )
 
@@ -222,8 +184,8 @@ class Curve:
         return np.asarray(d**power + straight_on)
 
 
-def settling(power_ups: Iterable[Sequence[State]]) -> WarmUpTime | None:
-    """Estimate the time constant of a board from the states of earlier power-ups; None: too few tell it.
+def settling(power_ups: Iterable[Sequence[State]]) -> tuple[float, float] | None:
+    """Estimate the time constant of a board and one sigma, s, from earlier power-ups; None: too few tell it.
 
     From where it rose fastest to the last state a board has gained tau times what it has slowed down.
     """
@@ -237,7 +199,12 @@ def settling(power_ups: Iterable[Sequence[State]]) -> WarmUpTime | None:
         return None
     tau = float(np.median(found))
     scatter = MAD_TO_SIGMA * float(np.median(np.abs(np.subtract(found, tau))))
-    return WarmUpTime(tau, math.hypot(scatter, _TAU_SIGMA * tau))
+    return tau, math.hypot(scatter, _TAU_SIGMA * tau)
+
+
+def in_run_variance(model: AllanModel, gap_s: float = 0.0) -> float:
+    """Give the variance by which a bias wanders within a power-up, over at least three minutes."""
+    return float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * max(gap_s, _SHORTEST_GAP_S)))
 
 
 def fit(
@@ -257,13 +224,13 @@ def fit(
     """
     if len(power_ups) < FEWEST:
         return None
-    nodes = [node for one in power_ups for node in one.nodes]
-    span = min(node.degc for node in nodes), max(node.degc for node in nodes)
+    degc, k_s = np.concatenate([one.states for one in power_ups]).T
+    span = float(degc.min()), float(degc.max())
     in_run_variance = max(in_run_variance, _LITTLE * per_kelvin**2)
     mean = _Fit(power_ups, 0, 0.0, in_run_variance, per_kelvin).curve(span) if may_be_mean else None
     if mean is not None and span[0] == span[1]:
         return mean
-    lags_s = LAGS_S if any(node.k_s for node in nodes) else LAGS_S[:1]
+    lags_s = LAGS_S if k_s.any() else LAGS_S[:1]
     curves = (_Fit(power_ups, _CUBIC, lag_s, in_run_variance, per_kelvin).curve(span) for lag_s in lags_s)
     curve = min(curves, key=lambda one: one.mean_square_error)
     return curve if mean is None or curve.mean_square_error < _BETTER * mean.mean_square_error else mean
@@ -279,10 +246,9 @@ class _Fit:
         self._base = np.diag([0.0, *(1.0 / np.square(per_kelvin * _PRIOR_K[:order]))])
         rows = []
         for one in power_ups:
-            degc = np.array([node.degc - lag_s * node.k_s for node in one.nodes])
+            degc = one.states[:, 0] - lag_s * one.states[:, 1]
             terms = ((degc - REFERENCE_DEGC) / UNIT_K)[:, None] ** np.arange(order + 1)
-            bias = np.array([node.bias for node in one.nodes])
-            variance = np.array([node.variance for node in one.nodes]) + in_run_variance
+            bias, variance = one.bias, one.variance + in_run_variance
             share = 1.0 / variance
             mean, mean_bias = share @ terms / share.sum(), share @ bias / share.sum()
             about = (terms - mean) * share[:, None]

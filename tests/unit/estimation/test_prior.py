@@ -14,7 +14,6 @@ from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.align_record import Determined, ImuAlignmentRecord
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp, believed, by_power_up
 from companion.estimation.solution.prior import (
-    Now,
     Prediction,
     curve_of,
     expect,
@@ -66,13 +65,13 @@ def point(
     )
 
 
-def now(temperature: float | None = 25.0, up: Sequence[float] | Array = LEVEL, run: str = "today") -> Now:
-    return Now(
+def now(temperature: float | None = 25.0, up: Sequence[float] | Array = LEVEL, run: str = "today") -> Point:
+    return Point(
+        started_at="",
         unix_s=1e6,
         power_up=PowerUp(host=run, since_unix_s=None),
         temperature_degc=temperature,
         up=(up[0], up[1], up[2]),
-        gravity_m_s2=G,
         zero="zero",
     )
 
@@ -81,7 +80,7 @@ def some(count: int, seed: int = 1, scale: float = 50.0 * DEG_H) -> Array:
     return np.random.default_rng(seed).normal(0.0, scale, (count, 3))
 
 
-def found(points: Sequence[Point], at: Now | None = None, triad: Triad = "gyro") -> Prediction:
+def found(points: Sequence[Point], at: Point | None = None, triad: Triad = "gyro") -> Prediction:
     result = expect(points, triad, at or now(), ASSUMED, STEADY)
     assert result is not None
     return result

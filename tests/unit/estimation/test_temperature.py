@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import kept
 from companion.estimation.solution.prior import curve_of
-from companion.estimation.temperature.curve import Curve, Node, PowerUpNodes, fit, settling
+from companion.estimation.temperature.curve import Curve, PowerUpNodes, fit, settling
 from sim.accuracy.mid_warm_up import RATES_K_MIN, SPANS_S, mid_warm_up
 from sim.accuracy.temperature import Aircraft
 from sim.imu_model import DEG_H, PARTS
@@ -23,8 +23,7 @@ PER_K = 54.0
 
 def power_up(bias: Array, degc: Array, *, noise: float = 1.0, k_s: Array | None = None) -> PowerUpNodes:
     rates = np.zeros(len(degc)) if k_s is None else k_s
-    rows = zip(degc.tolist(), bias, rates.tolist(), strict=True)
-    return PowerUpNodes([Node(t, (one[0], one[1], one[2]), noise**2, rate) for t, one, rate in rows])
+    return PowerUpNodes(np.column_stack([degc, rates]), bias, np.full(len(degc), noise**2))
 
 
 def part(
@@ -46,16 +45,16 @@ def test_it_is_the_generalised_least_squares_of_all_nodes_with_an_offset_a_power
     curve = fit(nodes, 4.0, PER_K)
     assert curve is not None
     assert curve.order == 3
-    rows = [(k, node) for k, one in enumerate(nodes) for node in one.nodes]
-    of = np.array([k for k, _ in rows])
+    degc, bias = (np.concatenate(each) for each in zip(*((one.states[:, 0], one.bias) for one in nodes), strict=True))
+    of = np.repeat(np.arange(len(nodes)), [len(one.bias) for one in nodes])
     # One more power-up scatters by `scatter`: what it wanders by and Student's factor are in that.
     freedom = 3.0 * 5.0
     tau2 = curve.scatter.min() / (freedom / (freedom - 2.0)) - 4.0
-    whole = np.where(of[:, None] == of, tau2, 0.0) + np.diag(np.full(len(rows), 1.0 + 4.0))
-    x = np.array([[((node.degc - 35.0) / 20.0) ** power for power in range(4)] for _, node in rows])
+    whole = np.where(of[:, None] == of, tau2, 0.0) + np.diag(np.full(len(of), 1.0 + 4.0))
+    x = ((degc - 35.0) / 20.0)[:, None] ** np.arange(4)
     prior = np.diag([0.0, *np.square(PER_K * np.array([20.0, 10.0, 5.0])) ** -1.0])
     inverse = np.linalg.inv(whole)
-    expected = np.linalg.solve(x.T @ inverse @ x + prior, x.T @ inverse @ np.array([node.bias for _, node in rows]))
+    expected = np.linalg.solve(x.T @ inverse @ x + prior, x.T @ inverse @ bias)
     said, _ = curve.at(21.0)
     np.testing.assert_allclose(said, (-0.7) ** np.arange(4.0) @ expected, rtol=1e-5)
 
@@ -99,7 +98,7 @@ def test_one_more_power_up_lies_where_it_says(count: int) -> None:
         nodes, offsets = part(random, 30.0, shape, count + 1)
         curve = fit(nodes[:-1], 1.0, PER_K)
         assert curve is not None
-        degc = nodes[-1].nodes[0].degc
+        degc = float(nodes[-1].states[0, 0])
         truth = offsets[-1] + np.polyval([*shape[::-1], 0.0], degc - 35.0)
         said, variance = curve.at(degc)
         errors.append(truth - said)
@@ -209,8 +208,8 @@ def test_how_slowly_a_board_warms_up_is_told_by_power_ups_that_ended_anywhere() 
         days.append(list(zip(degc.tolist(), ((air + 15.0 - degc) / 300.0).tolist(), strict=True)))
     found = settling(days)
     assert found is not None
-    assert found.tau_s == pytest.approx(300.0)
-    assert 0.0 < found.sigma_s < 30.0
+    assert found[0] == pytest.approx(300.0)
+    assert 0.0 < found[1] < 30.0
     assert settling(days[:2]) is None
     # One that was warm already tells nothing.
     assert settling([*days[:2], [(30.0, 0.0), (30.1, 0.0)]]) is None
