@@ -27,13 +27,11 @@ WMM_VALID_YEARS: Final = (2025.0, 2030.0)
 GAUSS_PER_NT: Final = 1e-5
 CompassUse = Literal["good", "poor", "none"]
 
-_LEAST_HORIZONTAL_NT: Final = 1.0
-
 
 def gravity_m_s2(latitude_deg: float, height_m: float) -> float:
-    """Normal gravity by Somigliana's formula, with height (WGS 84; method 3.6).
+    """Return normal gravity by Somigliana's formula (WGS 84; method 3.6).
 
-    The latitude is geodetic, the height above the ellipsoid; sea level serves (its 100 m at most are 31 micro-g).
+    The height is above the ellipsoid; sea level serves (its 100 m at most are 31 micro-g).
     """
     s2 = math.sin(latitude_deg * DEG) ** 2
     surface = 9.7803253359 * (1 + 0.00193185265241 * s2) / math.sqrt(1 - 0.00669437999014 * s2)
@@ -42,19 +40,14 @@ def gravity_m_s2(latitude_deg: float, height_m: float) -> float:
 
 
 def earth_rate_ned_rad_s(latitude_deg: float) -> Array:
-    """The Earth's rotation in NED, shape (3,): (W cos L, 0, -W sin L)."""
+    """Return the Earth's rotation in NED, (3,)."""
     latitude_rad = latitude_deg * DEG
     return np.array([EARTH_RATE_RAD_S * math.cos(latitude_rad), 0.0, -EARTH_RATE_RAD_S * math.sin(latitude_rad)])
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class MagneticField:
-    """The Earth's field at a place by WMM2025, with the model's own one-sigma errors.
-
-    The errors are those of the model's report, crust and sun included: 138 nT in strength, 0.20 degrees in
-    inclination, and in declination sqrt(0.26^2 + (5417 nT / H)^2) degrees, which grows towards the magnetic poles
-    (`GeoMagResult.calculate_uncertainty` of pygeomag has them).
-    """
+    """Field of the Earth at a place by WMM2025; the sigmas are the model's own, crust and sun included."""
 
     declination_deg: float
     """East positive: true heading = magnetic heading + declination."""
@@ -69,21 +62,20 @@ class MagneticField:
 
     @property
     def horizontal_gauss(self) -> float:
-        """What turns a compass."""
+        """Horizontal part, which turns a compass."""
         return self.strength_gauss * math.cos(self.inclination_deg * DEG)
 
     @property
     def down_gauss(self) -> float:
-        """The vertical part, down positive."""
+        """Vertical part, down positive."""
         return self.strength_gauss * math.sin(self.inclination_deg * DEG)
 
 
 def magnetic_field(latitude_deg: float, longitude_deg: float, height_m: float, date: datetime.date) -> MagneticField:
-    """The field of the world magnetic model WMM2025.
+    """Compute the field of the world magnetic model WMM2025.
 
-    The paper takes the compass heading as true; omitting the declination costs W cos L sin D (method 1.3).
-    Outside the years of the model its nearest year is used: the secular change is a few tenths of a degree a year,
-    so an old model beats none; `WMM_VALID_YEARS` lets the caller say so.
+    Outside the years of the model its nearest year is used: the field changes by a few tenths of a degree a year, so an
+    old model beats none. `WMM_VALID_YEARS` lets the caller say so.
     """
     start = datetime.date(date.year, 1, 1)
     year = date.year + (date - start).days / 365.25
@@ -91,8 +83,8 @@ def magnetic_field(latitude_deg: float, longitude_deg: float, height_m: float, d
     result = _world_magnetic_model().calculate(
         glat=latitude_deg, glon=longitude_deg, alt=height_m / 1000.0, time=min(max(year, first), last)
     )
-    # At the very pole the declination's error has no end.
-    result.h = max(result.h, _LEAST_HORIZONTAL_NT)
+    # At the very pole the declination's error is infinite.
+    result.h = max(result.h, 1.0)
     errors = result.calculate_uncertainty()
     return MagneticField(
         declination_deg=float(result.d),

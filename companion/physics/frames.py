@@ -23,11 +23,10 @@ Array = Floats
 
 
 def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Matrix:
-    """The direction cosine matrix C_n^b, 3x3: a vector's NED components to its FRD components.
+    """Return the direction cosine matrix C_n^b, 3x3: a vector's NED components to its FRD components.
 
-    Equation (5) of the paper, in FRD/NED, with its first row mended: the printed T11 and T12 have the wrong sign on
-    their second terms, which leaves the matrix without orthogonality, and row 2 must carry cos(theta), not the
-    cosine of the latitude (method 1.3).
+    Equation (5) of the paper with its errata mended: the second terms of T11 and T12 have the wrong sign, and row 2
+    has the cosine of the latitude for cos(theta) (method 1.3).
     """
     sr, cr = math.sin(roll_rad), math.cos(roll_rad)
     st, ct = math.sin(pitch_rad), math.cos(pitch_rad)
@@ -42,13 +41,7 @@ def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Matrix:
 
 
 def rotation_matrix(mounting: str | tuple[float, float, float]) -> Matrix:
-    """The 3x3 matrix from a sensor's axes to the vehicle's FRD axes.
-
-    Of a MAVLink rotation name, or of (roll, pitch, yaw) in degrees.
-
-    Raises:
-        KeyError: no rotation of that name (the configuration checks names before they come here).
-    """
+    """Return the 3x3 matrix from a sensor's axes to the vehicle's, by a MAVLink rotation or roll, pitch, yaw in deg."""
     angles_deg = ROTATIONS_DEG[mounting] if isinstance(mounting, str) else mounting
     matrix = body_from_ned(*(angle * DEG for angle in angles_deg)).T
     if all(angle % 90.0 == 0.0 for angle in angles_deg):
@@ -57,13 +50,13 @@ def rotation_matrix(mounting: str | tuple[float, float, float]) -> Matrix:
 
 
 def vector(values: Array) -> Vector:
-    """Three axes as plain numbers."""
+    """Return three axes as plain numbers."""
     x, y, z = values.tolist()
     return x, y, z
 
 
 def skew(vectors: Floats) -> Floats:
-    """The cross-product matrices [v x], (..., 3, 3), of (..., 3)."""
+    """Return the cross-product matrices [v x], (..., 3, 3), of (..., 3)."""
     found = np.zeros((*vectors.shape, 3))
     x, y, z = np.moveaxis(vectors, -1, 0)
     found[..., 0, 1], found[..., 0, 2], found[..., 1, 2] = -z, y, -x
@@ -79,13 +72,13 @@ def symmetric(beside: Floats) -> Floats:
 
 
 def symmetric_by(vector: Array) -> Matrix:
-    """How `symmetric(beside) @ vector` changes with xy, xz and yz, 3x3."""
+    """Return the derivative of `symmetric(beside) @ vector` by xy, xz and yz, 3x3."""
     x, y, z = vector
     return np.array([[y, z, 0.0], [x, 0.0, z], [0.0, x, y]])
 
 
 def rotations(vectors: Floats) -> Floats:
-    """Matrices (..., 3, 3) of rotation vectors (..., 3) in rad (Rodrigues)."""
+    """Return the matrices (..., 3, 3) of rotation vectors (..., 3) in rad (Rodrigues)."""
     angle2 = np.einsum("...i,...i->...", vectors, vectors)
     angle = np.sqrt(angle2)
     small = angle < 1e-4
@@ -97,7 +90,7 @@ def rotations(vectors: Floats) -> Floats:
 
 
 def running_products(turns: Floats) -> Floats:
-    """(n, 3, 3): the first, the first two, ... of (n, 3, 3) multiplied, in a few calls (Hillis and Steele's scan)."""
+    """Return the products of the first, the first two, ... of (n, 3, 3), in a few calls (Hillis and Steele's scan)."""
     found, step = turns.copy(), 1
     while step < len(found):
         found[step:] = found[:-step] @ found[step:]
@@ -106,10 +99,10 @@ def running_products(turns: Floats) -> Floats:
 
 
 def wrap_deg(angle_deg: float) -> float:
-    """An angle brought into [-180, 180)."""
+    """Return an angle in [-180, 180)."""
     return (angle_deg + 180.0) % 360.0 - 180.0
 
 
 def roll_pitch_from_up(up: Array) -> tuple[float, float]:
-    """Roll gamma and pitch theta in radians of the body in whose FRD axes `up` (shape (3,)) points up."""
+    """Return roll gamma and pitch theta in radians of a body in whose axes `up`, (3,), points up."""
     return math.atan2(-up[1], -up[2]), math.atan2(up[0], math.hypot(up[1], up[2]))

@@ -1,9 +1,8 @@
-"""What a gradienter's two readings mean.
+"""Laws of a gradienter's two readings.
 
-Equation (1) of the paper, gamma = arcsin(sin qx / cos theta) with theta = qy, holds only for a sensor of which each
-output is the elevation of its own axis. A liquid cell reads the slope of the liquid's surface instead, and many
-modern devices give Euler angles; the wrong law costs 0.15 degrees (2.6 mg) at 10/10 degrees (method 1.2).
-So the law is a property of the sensor:
+Equation (1) of the paper holds only for a sensor of which each output is the elevation of its own axis. A liquid cell
+reads the slope of the liquid's surface, and many modern devices give Euler angles. The wrong law costs 0.15 degrees
+(2.6 mg) at 10/10 degrees (method 1.2). So the law is a property of the sensor:
 
 | law     | outputs for (theta, gamma)                       | recovered by                                     |
 |---------|--------------------------------------------------|--------------------------------------------------|
@@ -28,7 +27,7 @@ Law = Literal["axis", "slope", "euler"]
 
 
 def attitude_from_readings(law: Law, x_deg: float, y_deg: float) -> tuple[float, float]:
-    """Pitch theta and roll gamma in radians from the two readings in degrees.
+    """Return pitch theta and roll gamma in radians.
 
     Raises:
         ValueError: the readings cannot belong together ("axis" needs |qx| + |qy| <= 90 degrees).
@@ -48,10 +47,7 @@ def attitude_from_readings(law: Law, x_deg: float, y_deg: float) -> tuple[float,
 
 
 def up_in_sensor(law: Law, x_deg: float, y_deg: float) -> Array:
-    """The direction of specific force at rest (up) in the sensor's own FRD axes, shape (3,), unit length.
-
-    This is f^b / g of method 1.2: (sin theta, -sin gamma cos theta, -cos gamma cos theta). Turning it by
-    the mounting gives the same direction in the vehicle's axes, whatever the mounting.
+    """Return the direction of specific force at rest (up) in the sensor's own FRD axes, (3,), unit length.
 
     Raises:
         ValueError: as `attitude_from_readings`.
@@ -61,10 +57,7 @@ def up_in_sensor(law: Law, x_deg: float, y_deg: float) -> Array:
 
 
 def readings_from_up(law: Law, up: Floats) -> Floats:
-    """The two readings (qx, qy) in degrees that a gradienter of this law gives, (..., 2); undoes `up_in_sensor`.
-
-    `up`: specific force in the sensor's own FRD axes, (..., 3), of any length.
-    """
+    """Return the two readings in degrees, (..., 2), by specific force in the sensor's axes, (..., 3), of any length."""
     x, y, z = np.moveaxis(up / np.linalg.norm(up, axis=-1, keepdims=True), -1, 0)
     if law == "axis":
         return np.asarray(np.stack([np.arcsin(-y), np.arcsin(x)], axis=-1) / DEG)
@@ -74,10 +67,7 @@ def readings_from_up(law: Law, up: Floats) -> Floats:
 
 
 def up_jacobian(law: Law, x_deg: float, y_deg: float) -> Matrix:
-    """The Jacobian d up / d (qx, qy), shape (3, 2), per radian of reading; analytic for each law.
-
-    For "axis" this is method 2.1's d b_a / d q divided by -g, in FRD: up = (sin qy, -sin qx, -c) with
-    c = sqrt(1 - sin^2 qx - sin^2 qy).
+    """Return the Jacobian d up / d (qx, qy), (3, 2), per radian of reading.
 
     Raises:
         ValueError: as `attitude_from_readings`.

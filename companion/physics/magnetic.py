@@ -1,4 +1,4 @@
-"""What a magnetic field vector says of the heading, and how far it may be wrong.
+"""Heading by a magnetic field vector, and the error that a disturbance makes.
 
 `up` is the unit vector of specific force at rest, `field` the field vector in any unit, both of shape (3,) and in the
 same axes: forward, right, down of the vehicle or of the sensor. Method 3.5.
@@ -19,20 +19,17 @@ BOUND_OF_TWO: Final = 3.043
 with one unknown size: Student's t with two degrees of freedom, 4.303 / sqrt(2). A direction that is uniform on the
 sphere gives the same, 0.95 / sqrt(1 - 0.95^2)."""
 BOUND_OF_ONE: Final = 12.71
-"""The same where only one component is known: Student's t with one degree of freedom."""
+"""Bound where only one component is known: Student's t with one degree of freedom."""
+_VERTICAL: Final = 1e-9
 
 
 def horizontal(vector: Array, up: Array) -> Array:
-    """The part of a vector that lies across up, shape (3,)."""
+    """Return the part of a vector across up, (3,)."""
     return vector - (vector @ up) * up
 
 
 def heading_rad(field: Array, up: Array) -> float:
-    """Heading of the first axis from magnetic north, clockwise, in (-pi, pi].
-
-    For up = (sin theta, -sin gamma cos theta, -cos gamma cos theta) this is the usual tilt compensation:
-    Xh = mx cos theta + my sin gamma sin theta + mz cos gamma sin theta, Yh = my cos gamma - mz sin gamma,
-    heading = atan2(-Yh, Xh).
+    """Return the heading of the first axis from magnetic north, clockwise, in (-pi, pi], with tilt compensation.
 
     Raises:
         ValueError: the first axis or the field is vertical: there is no heading.
@@ -45,7 +42,7 @@ def heading_rad(field: Array, up: Array) -> float:
 
 
 def heading_by_up(field: Array, up: Array) -> Array:
-    """The gradient of `heading_rad` by `up` (for changes across up), shape (3,): minus tan I along magnetic east.
+    """Return the gradient of `heading_rad` by `up` (for changes across up), (3,): minus tan I along magnetic east.
 
     A wrong tilt lets the vertical field look like a horizontal one: tan I times the tilt error about magnetic north
     (2.5 times at 68 degrees); tan theta times that about the heading comes from the definition of a heading.
@@ -61,12 +58,12 @@ def heading_by_up(field: Array, up: Array) -> Array:
 
 
 def inclination_rad(field: Array, up: Array) -> float:
-    """How far the field points below the horizon, in [-pi/2, pi/2]."""
+    """Return the angle of the field below the horizon, in [-pi/2, pi/2]."""
     return math.atan2(-float(field @ up), float(np.linalg.norm(horizontal(field, up))))
 
 
 def inclination_by_up(field: Array, up: Array) -> Array:
-    """The gradient of `inclination_rad` by `up` (for changes across up), shape (3,): minus magnetic north.
+    """Return the gradient of `inclination_rad` by `up` (for changes across up), (3,): minus magnetic north.
 
     Raises:
         ValueError: as `heading_rad`.
@@ -79,17 +76,13 @@ def inclination_by_up(field: Array, up: Array) -> Array:
 
 
 def deflection_bound_deg(unseen_gauss: float, horizontal_gauss: float) -> float:
-    """How far a field across the meridian turns a compass; 180 where it may be as strong as what is measured.
+    """Return the turn of a compass by an unseen field across the meridian; 180 where it may be as strong as the field.
 
-    With `horizontal_gauss` as measured this is exact, sin(error) = unseen / measured; for small errors it is
-    dB / (F cos I) (method 3.5).
+    `horizontal_gauss` is the measured field (method 3.5).
     """
     if unseen_gauss >= horizontal_gauss:
         return 180.0
     return math.asin(unseen_gauss / horizontal_gauss) / DEG
-
-
-_VERTICAL: Final = 1e-9
 
 
 def _horizontal_axes(up: Array) -> tuple[Array, Array]:

@@ -1,7 +1,7 @@
-"""How fast a reading turns: a line through its seconds, with a sigma that holds for real sensors.
+"""Slope of a line through the seconds of a reading, with a sigma that holds for real sensors.
 
-A line's slope is uncertain by the white noise of the seconds, by slow wander, which the readings' own Allan deviation
-shows, and by coarse steps, which may hide a slope altogether (method 2.6).
+The slope is uncertain by the white noise of the seconds, by slow wander, which the readings' own Allan deviation shows,
+and by coarse steps, which may hide a slope (method 2.6).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ FEWEST: Final = 3
 """Seconds: two always lie on a line."""
 _SPANS: Final = 5
 _WALKS: Final = 2.5
-"""So many times the Allan variance that white noise has, which has that once in forty: the readings walk."""
+"""Allan variance over that of white noise from which the readings walk; white noise exceeds it once in forty."""
 _LINE_TAKES: Final = 1.6
-"""So many times the Allan variance at T/5 had a random walk before the line was taken off."""
+"""Allan variance of a random walk at T/5 over what is left once a line is subtracted."""
 
 
 class Slope(msgspec.Struct, frozen=True):
@@ -49,10 +49,9 @@ def fit_slope(
     walk: Floats | float = 0.0,
     hidden: Floats | float = 0.0,
 ) -> Slope:
-    """The slope of every column of one mean a second, (m, c) at m >= `FEWEST` ascending slots.
+    """Fit the slope of every column of one mean a second, (m, c) at m >= `FEWEST` ascending slots.
 
-    White noise N, flicker B and walk K are the least ones, (c,) or one for all; so much may coarse steps hide, either
-    way, of what is between them.
+    White noise N, flicker B and walk K are lower limits, (c,) or one for all; `hidden`: rounding error, either way.
     """
     length_s = float(slots[-1] - slots[0] + 1)
     time = slots - np.add.reduce(slots) / len(slots)
@@ -78,9 +77,9 @@ def plain_slope(times: NDArray[np.int64], values: Floats) -> float:
 
 
 def wandering(slots: NDArray[np.int64], left: Floats, white: Floats) -> tuple[Floats, Floats]:
-    """B and K of every column of what a line left, as far as the Allan deviation at T/5 shows more than white noise.
+    """Estimate B or K of every column of the residuals, by the excess of the Allan deviation at T/5 over white noise.
 
-    One of the two, widened for few spans. A walk that does not show in one window is in no sigma: 0.1 N a root second
+    Widened for few spans. A walk that does not show in one window is in no sigma: 0.1 N a root second
     doubles the error of a minute's slope, and its Allan variance is half of the white noise's.
     """
     span = int(slots[-1] - slots[0] + 1) // _SPANS
@@ -96,10 +95,9 @@ def wandering(slots: NDArray[np.int64], left: Floats, white: Floats) -> tuple[Fl
 
 
 def hidden_by_steps(step: float, variance: float, *, enough: bool = True) -> float:
-    """By how much the mean of readings rounded to `step` (0 for floats) may be off, either way.
+    """Bound the error, either way, of the mean of readings rounded to `step` (0 for floats), by their variance.
 
-    (q / pi) exp(-2 pi^2 sigma^2 / q^2), the first harmonic (method 2.5), by the variance with rounding and
-    all; at most half a step, as where the readings show too few values to tell their noise (not `enough`).
+    (q / pi) exp(-2 pi^2 sigma^2 / q^2) (method 2.5), at most half a step; that if too few values show (not `enough`).
     """
     if step <= 0.0 or not enough:
         return max(step, 0.0) / 2.0
