@@ -286,7 +286,7 @@ class Temperature(Command, frozen=True, tag="temperature"):
     ] = False
 
 
-class Record(Command, frozen=True, tag="record"):
+class RecordInputs(Command, frozen=True, tag="record"):
     """Record all inputs to a file, or end a recording."""
 
     help = "record everything to a file until Ctrl-C (the last hour is kept anyway)"
@@ -309,7 +309,7 @@ class Answer(Command, frozen=True, tag="answer"):
 ALL: Final = {
     kind.name(): kind
     for kind in (
-        Status, Calibrate, Align, Cancel, Undo, AutopilotSetup, History, Temperature, Monitor, Record, Answer
+        Status, Calibrate, Align, Cancel, Undo, AutopilotSetup, History, Temperature, Monitor, RecordInputs, Answer
     )
 }  # fmt: skip
 """The commands by name."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from companion.config.sections import AllanModel
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp
-from companion.estimation.records.record import Pose, PoseSigma, Site
+from companion.estimation.records.record import Pose, PoseSigma, SiteRecord
 from companion.estimation.solution.joint import Weighed, weigh
 from companion.estimation.solution.prior import Expectation, ExpectedImu, PoseEffect, expect, pose_effect
 from companion.estimation.solution.solve import ImuSolution, Shared, Solution
@@ -33,7 +33,7 @@ STEADY = AllanModel(0.0, 1e-9, 0.0)
 # Right side down lowers the right side's share of gravity, nose up raises the front's; FRD, level, method 2.1.
 BY_READING = -G * np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
 _POSE = Pose(theta_deg=0.0, gamma_deg=0.0, psi_deg=0.0, sigma_deg=PoseSigma(theta=None, gamma=None, psi=None))
-_SITE = Site(latitude_deg=40.0, height_m=0.0, gravity_m_s2=G, declination_deg=None, source="study")
+_SITE = SiteRecord(latitude_deg=40.0, height_m=0.0, gravity_m_s2=G, declination_deg=None, source="study")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -109,7 +109,7 @@ def _parser() -> Parser:
         (commands.History, client.history),
         (commands.Temperature, client.temperature),
         (commands.Monitor, monitor.monitor),
-        (commands.Record, client.record),
+        (commands.RecordInputs, client.record),
     ):
         add_fields(add(kind.name(), command, kind.help), kind, commands.Interface.COMMAND_LINE)
     add("web-token", local.web_token, "where the page is, and the token that its buttons need")

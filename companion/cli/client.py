@@ -166,7 +166,7 @@ async def align(options: argparse.Namespace) -> int:
 
 
 async def record(options: argparse.Namespace) -> int:
-    wanted, stop = request_of(options, commands.Record), {"command": "record", "stop": True}
+    wanted, stop = request_of(options, commands.RecordInputs), {"command": "record", "stop": True}
     if "file" in wanted:
         wanted["file"] = str(Path.cwd() / wanted["file"])
     reply = await request(options, wanted, stop, in_place=True)

@@ -22,7 +22,7 @@ def alignment_in(directory: Path) -> StateFile[align_record.AlignmentRecord]:
 def faces_in(directory: Path) -> StateFile[align_record.FacesRecord]:
     """Return the measurement of all sides, `faces.json` in a storage directory."""
     kind, newest = align_record.FacesRecord, align_record.FORMAT_VERSION
-    return StateFile(directory / "faces.json", kind, align_record.check_faces, newest)
+    return StateFile(directory / "faces.json", kind, align_record.check, newest)
 
 
 class Done(msgspec.Struct, frozen=True, kw_only=True):

@@ -17,7 +17,7 @@ from companion.estimation.records.record import (
     Pose,
     PoseSigma,
     Record,
-    Site,
+    SiteRecord,
     WrittenParameter,
 )
 from companion.physics.frames import Array
@@ -107,7 +107,9 @@ def record(
         pose=Pose(theta_deg=5.02, gamma_deg=-2.98, psi_deg=40.3, sigma_deg=PoseSigma(theta=0.005, gamma=0.005, psi=1.1))
         if known
         else None,
-        site=Site(latitude_deg=40.0, height_m=50.0, gravity_m_s2=9.80154, declination_deg=-7.11, source="configuration")
+        site=SiteRecord(
+            latitude_deg=40.0, height_m=50.0, gravity_m_s2=9.80154, declination_deg=-7.11, source="configuration"
+        )
         if known
         else None,
         imus=imus,

@@ -33,11 +33,9 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.record import ImuRecord, Record
 from companion.estimation.records.validity import (
-    Finding,
     Held,
-    Limits,
+    Objection,
     Present,
-    Seen,
     Why,
     held_of,
     judge,
@@ -89,10 +87,7 @@ class InForce:
         self._core, self._config, self._manager = core, core.config, manager
         config = core.config
         self._imus, self._estimator, self._memory = imus, estimator, memory
-        wanted, settings = config.calibration, models.settings(config)
-        self._limits = Limits(
-            max_age_s=60.0 * wanted.max_age_min, max_temperature_change_k=wanted.max_temperature_change_degc
-        )
+        settings = models.settings(config)
         self._floors: dict[Triad, float] = {
             "gyro": settings.target_gyro_sigma_rad_s,
             "accel": settings.target_accel_sigma_m_s2,
@@ -119,9 +114,9 @@ class InForce:
         """Biases that an automatic calibration determines."""
         return What.BOTH if self._config.gradienter is not None else What.GYROS
 
-    def findings(self, now_s: float) -> list[Finding]:
+    def findings(self, now_s: float) -> list[Objection]:
         """List everything that speaks against what is in force; empty while it is good. Computes little."""
-        found: list[Finding] = []
+        found: list[Objection] = []
         for (name, triad), state in self._triads.items():
             held = state.held
             if not state.judged:
@@ -130,13 +125,15 @@ class InForce:
                 if any(finding.why is held for finding in found):
                     continue
                 since = held is Why.NEVER and self.earlier is not None
-                against = [Finding(held, "not confirmed since start" if since else held.value)]
+                against = [Objection(held, "not confirmed since start" if since else held.value)]
             else:
                 model = noise_profile(self._core.profiles.of(name)).of(triad)
                 degc = self.temperatures_degc.get(name)
                 drift = self._memory.curves.drift(name, triad, held.temperature_degc, degc)
-                seen = Seen(now_s=now_s, temperature_degc=degc, present=state.present, drift=drift)
-                against = judge(triad, name, held, model, self._limits, seen)
+                against = judge(
+                    (name, triad), held, model, self._config.calibration,
+                    now_s=now_s, temperature_degc=degc, present=state.present, drift=drift,
+                )  # fmt: skip
             found += [one for one in against if state.in_doubt is None or one.why in _NOT_IN_DOUBT]
         return found
 
@@ -330,7 +327,7 @@ class InForce:
             return False
         measured = state.in_doubt[1]
         is_right = isinstance(state.held, Held) and worst_axis(state.held, present) is None
-        is_long_ago = end_s - measured.confirmed_s > self._limits.max_age_s
+        is_long_ago = end_s - measured.confirmed_s > 60.0 * self._config.calibration.max_age_min
         if is_right or is_long_ago or worst_axis(measured, present) is not None:
             state.in_doubt = None
         return state.in_doubt is not None

@@ -90,7 +90,7 @@ class Curves:
             return None
         profile = noise_profile(self._profiles.of(name))
         found = curve.along(path, self._settling.get(name), profile.of(triad))
-        start, _, end = path.degc
+        (start, _), _, (end, _) = path.states
         shift, slope = (self.taken_off(name, triad, degc, end) for degc in (path.mean_degc, start))
         if not shift.any() and not slope.any():
             return found

@@ -17,7 +17,7 @@ from typing import Final, TypeVar
 import msgspec
 
 from companion.autopilot.firmware.imu_messages import EkfBiasReading, Six
-from companion.commands import Record
+from companion.commands import RecordInputs
 from companion.component.service import JobResult
 from companion.configured import models
 from companion.daemon.calibrating.estimator import EstimatorInputs
@@ -281,7 +281,7 @@ class Recorder(Subsystem):
     def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
         return {"record": self._answer}
 
-    async def _answer(self, request: Record, _face: str) -> AsyncIterator[Object]:
+    async def _answer(self, request: RecordInputs, _face: str) -> AsyncIterator[Object]:
         if request.stop:
             if (recording := self._on_request) is None:
                 raise StorageError("nothing is being recorded on request")

@@ -17,9 +17,9 @@ import numpy as np
 
 from companion.estimation.noise.allan import WARM_UP_K
 from companion.estimation.seconds.batch import Batch
-from companion.physics.frames import Floats, Matrix, vector
+from companion.physics.frames import Floats, Matrix
 from companion.physics.units import DEG_H, MG
-from companion.samples import Triad, Vector, rows_of
+from companion.samples import Triad, rows_of
 
 QUICKEST_S: Final = 60.0
 """Shortest time constant of a warm-up; boards take 1 to 20 min."""
@@ -35,6 +35,10 @@ _BENT_SIGMAS: Final = 3.0
 """Curvature over its sigma from which the temperature is taken for a parabola."""
 _STEPS_K: Final = (1.0, 0.5, 0.25, 0.1, 0.05, 0.01)
 """Resolutions of thermometers."""
+
+
+State = tuple[float, float]
+"""Temperature and its rate, degC and K/s."""
 
 
 class Lines(NamedTuple):
@@ -60,7 +64,7 @@ class Lines(NamedTuple):
 class Path(msgspec.Struct, frozen=True, kw_only=True):
     """Temperature through a window: a line or a parabola."""
 
-    degc: Vector
+    states: tuple[State, State, State]
     """At the beginning, in the middle and at the end."""
     span_s: float
     variance: float
@@ -69,15 +73,8 @@ class Path(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def mean_degc(self) -> float:
         """Mean over the window."""
-        start, middle, end = self.degc
+        (start, _), (middle, _), (end, _) = self.states
         return (start + 4.0 * middle + end) / 6.0
-
-    @property
-    def states(self) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
-        """Temperature in degC and its rate in K/s at the three times of `degc`."""
-        start, middle, end = self.degc
-        mean, change = (end - start) / self.span_s, 2.0 * (end - 2.0 * middle + start) / self.span_s
-        return (start, mean - change), (middle, mean), (end, mean + change)
 
 
 class Warming(msgspec.Struct, frozen=True, kw_only=True):
@@ -162,9 +159,11 @@ def temperature_path(batches: Sequence[Batch]) -> Path | None:
     is_bent = bent is not None and abs(bent[0][2]) > _BENT_SIGMAS * math.sqrt(bent[1][2])
     (level, k_s, bend), (_, of_k_s, of_bend) = bent if bent is not None and is_bent else line
     half_s = (batches[-1].slot + 1.0 - batches[0].slot) / 2.0
-    at = np.array([-half_s, 0.0, half_s])
+    start, middle, end = (
+        (float(level + k_s * at_s + bend * at_s**2), float(k_s + 2.0 * bend * at_s)) for at_s in (-half_s, 0.0, half_s)
+    )
     return Path(
-        degc=vector(level + k_s * at + bend * at**2),
+        states=(start, middle, end),
         span_s=2.0 * half_s,
         variance=float(of_k_s * half_s**2 + of_bend * (2.0 / 3.0 * half_s**2) ** 2),
     )

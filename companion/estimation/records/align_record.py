@@ -19,8 +19,10 @@ from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import Vector
 
 FORMAT_VERSION = 1
-MOST_DEG = 90.0
+_MOST_DEG = 90.0
 """Limit of a gradienter's zero and of its sigma."""
+SAME_START_S = 30.0
+"""Drift between two clocks in weeks; a restart moves the start by at least the time that it had been on."""
 
 Pair = tuple[float, float]
 Kind = Literal["zero", "tilts"]
@@ -106,21 +108,6 @@ class AlignmentRecord(SpotRecord, frozen=True, kw_only=True):
     imus: tuple[ImuAlignmentRecord, ...]
 
 
-def check(record: AlignmentRecord) -> None:
-    """Verify that a record can be used.
-
-    Raises:
-        msgspec.ValidationError: figures that no gradienter has.
-    """
-    figures = [*record.offset_deg, record.sigma_deg]
-    if not np.abs(figures).max() < MOST_DEG or record.sigma_deg <= 0.0:
-        raise msgspec.ValidationError(f"offset and sigma {figures} cannot be")
-
-
-SAME_START_S = 30.0
-"""Drift between two clocks in weeks; a restart moves the start by at least the time that it had been on."""
-
-
 class FaceRecord(msgspec.Struct, frozen=True, kw_only=True):
     """One stand: up in the aircraft's axes, forward, right, down."""
 
@@ -174,18 +161,6 @@ class FacesRecord(msgspec.Struct, frozen=True, kw_only=True):
     warnings: tuple[str, ...] = ()
 
 
-def check_faces(record: FacesRecord) -> None:
-    """Verify that a record can be used.
-
-    Raises:
-        msgspec.ValidationError: figures that no accelerometer has.
-    """
-    for imu in record.imus:
-        for found, most in ((imu.accel_bias_mg, 1e4), (imu.accel_scale, 0.5)):
-            if not np.abs([*found.value, *found.sigma]).max() < most or min(found.sigma) <= 0.0:
-                raise msgspec.ValidationError(f"bias or scale of {imu.name} cannot be")
-
-
 class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
     """One IMU, turned on a spot without a gradienter."""
 
@@ -216,6 +191,22 @@ class TurnRecord(SpotRecord, frozen=True, kw_only=True):
 
 
 HandRecord = AlignmentRecord | FacesRecord | TurnRecord
+
+
+def check(record: AlignmentRecord | FacesRecord) -> None:
+    """Verify that a record can be used.
+
+    Raises:
+        msgspec.ValidationError: figures that no sensor has.
+    """
+    if isinstance(record, FacesRecord):
+        found = [(imu.accel_bias_mg.value, imu.accel_bias_mg.sigma, 1e4) for imu in record.imus]
+        found += [(imu.accel_scale.value, imu.accel_scale.sigma, 0.5) for imu in record.imus]
+    else:
+        found = [((*record.offset_deg, 0.0), (record.sigma_deg,) * 3, _MOST_DEG)]
+    for value, sigma, most in found:
+        if not np.abs([*value, *sigma]).max() < most or min(sigma) <= 0.0:
+            raise msgspec.ValidationError(f"{value} with a sigma of {sigma} cannot be")
 
 
 def stand_record(stand: StandMeans, attitude: Matrix, seconds: float, configured: Pair) -> StandRecord:

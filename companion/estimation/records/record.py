@@ -48,7 +48,7 @@ class Pose(msgspec.Struct, frozen=True, kw_only=True):
     heading_from: HeadingFrom | None = None
 
 
-class Site(msgspec.Struct, frozen=True, kw_only=True):
+class SiteRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Place of the aircraft, and its source."""
 
     latitude_deg: float | None
@@ -320,7 +320,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     """UTC, ISO 8601; the host's clock, which on a field computer may be wrong."""
     duration_s: float
     pose: Pose | None
-    site: Site | None
+    site: SiteRecord | None
     imus: tuple[ImuRecord, ...]
     system_id: int | None = None
     """MAVLink system of the vehicle; None while it had not been heard."""

@@ -17,12 +17,12 @@ from __future__ import annotations
 import enum
 import functools
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
 
-from companion.config.sections import AllanModel
+from companion.config.sections import AllanModel, Calibration
 from companion.estimation.noise.allan import floor_variance
 from companion.estimation.records.record import ImuRecord
 from companion.physics.units import UNITS
@@ -52,13 +52,6 @@ class Why(enum.Enum):
     OLD = "calibration too old"
     TEMPERATURE = "temperature changed"
     RESIDUAL = "biases moved"
-
-
-class Limits(msgspec.Struct, frozen=True, kw_only=True):
-    """Limits that a pilot may set."""
-
-    max_age_s: float
-    max_temperature_change_k: float
 
 
 class Held(msgspec.Struct, frozen=True, kw_only=True):
@@ -111,19 +104,7 @@ class Present(msgspec.Struct, frozen=True, kw_only=True):
     """Both as in `Held`."""
 
 
-class Seen(msgspec.Struct, frozen=True, kw_only=True):
-    """Present time, temperature and window."""
-
-    now_s: float
-    """Time on the clock of `Held`."""
-    temperature_degc: float | None = None
-    present: Present | None = None
-    """Still window, if there is one."""
-    drift: tuple[Vector, Vector] | None = None
-    """Change of the bias with the temperature since `Held`, and its variance; None: unknown."""
-
-
-class Finding(msgspec.Struct, frozen=True):
+class Objection(NamedTuple):
     """One reason against the calibration; `words` fit one line at the flight line."""
 
     why: Why
@@ -141,15 +122,36 @@ def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
     return float(horizons_s[drift <= (DRIFT_SIGMAS * min(sigma)) ** 2].max(initial=1.0))
 
 
-def judge(triad: Triad, name: str, held: Held, model: AllanModel, limits: Limits, seen: Seen) -> list[Finding]:
-    """List the reasons against one triad's calibration; empty while it is good."""
-    present, drift, temperature_degc = seen.present, seen.drift, seen.temperature_degc
+def judge(
+    key: tuple[str, Triad],
+    held: Held,
+    model: AllanModel,
+    limits: Calibration,
+    *,
+    now_s: float,
+    temperature_degc: float | None = None,
+    present: Present | None = None,
+    drift: tuple[Vector, Vector] | None = None,
+) -> list[Objection]:
+    """List the reasons against one triad's calibration; empty while it is good.
+
+    Args:
+        key: name of the IMU, and the triad.
+        held: the calibration.
+        model: noise of the sensor.
+        limits: largest age and change of temperature.
+        now_s: time on the clock of `held`.
+        temperature_degc: temperature now.
+        present: still window, if there is one.
+        drift: change of the bias with the temperature since `held`, and its variance; None: unknown.
+    """
+    name, triad = key
     (unit, words, _), digits = UNITS[triad], _DIGITS[triad]
-    found: list[Finding] = []
+    found: list[Objection] = []
     if not held.seen:
-        found.append(Finding(Why.UNSEEN, f"{triad} {name}: new offsets not seen to work"))
+        found.append(Objection(Why.UNSEEN, f"{triad} {name}: new offsets not seen to work"))
     if present is not None and (worst := worst_axis(held, present)) is not None:
-        found.append(Finding(Why.RESIDUAL, f"{triad} {name} is off by {worst / unit:.{digits}f} {words}"))
+        found.append(Objection(Why.RESIDUAL, f"{triad} {name} is off by {worst / unit:.{digits}f} {words}"))
     if held.temperature_degc is not None and temperature_degc is not None:
         change = temperature_degc - held.temperature_degc
         warmer = "warmer" if change > 0 else "colder"
@@ -157,17 +159,16 @@ def judge(triad: Triad, name: str, held: Held, model: AllanModel, limits: Limits
             moved = max(math.sqrt(mean**2 + variance) for mean, variance in zip(*drift, strict=True))
             if moved > DRIFT_SIGMAS * max(held.sigma):
                 off = f"{triad} {name}: about {moved / unit:.{digits}f} {words} off"
-                found.append(Finding(Why.TEMPERATURE, f"{off}, {abs(change):.0f} K {warmer}"))
-        elif abs(change) > limits.max_temperature_change_k:
-            found.append(Finding(Why.TEMPERATURE, f"imu {name}: {abs(change):.0f} K {warmer} than calibrated"))
-    limit_s = min(limits.max_age_s, age_limit_s(model, held.sigma, held.averaged_s))
-    if (age_s := seen.now_s - held.confirmed_s) > limit_s:
-        found.append(Finding(Why.OLD, f"calibrated {age_s / 60:.0f} min ago, limit {limit_s / 60:.0f}"))
+                found.append(Objection(Why.TEMPERATURE, f"{off}, {abs(change):.0f} K {warmer}"))
+        elif abs(change) > limits.max_temperature_change_degc:
+            found.append(Objection(Why.TEMPERATURE, f"imu {name}: {abs(change):.0f} K {warmer} than calibrated"))
+    limit_s = min(60.0 * limits.max_age_min, age_limit_s(model, held.sigma, held.averaged_s))
+    if (age_s := now_s - held.confirmed_s) > limit_s:
+        found.append(Objection(Why.OLD, f"calibrated {age_s / 60:.0f} min ago, limit {limit_s / 60:.0f}"))
     return found
 
 
 def _off(present: Present, expected: Vector, then: Vector, sigmas: float, floor: float = 0.0) -> list[float]:
-    """Give the differences of the axes beyond so many sigmas of both sides."""
     return [
         residual - wanted
         for residual, wanted, was, now in zip(present.residual, expected, then, present.sigma, strict=True)

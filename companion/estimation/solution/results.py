@@ -6,7 +6,6 @@ import datetime
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
-import msgspec
 import numpy as np
 
 from companion.estimation.records.record import ImuRecord, PlatformTurn, Record
@@ -30,32 +29,24 @@ def record_of(
 
     `reason` None: the figures in words. `imus`: their records, where the plain ones of the solution are not all.
     """
-    record = Record(
+    imus = imu_records(solution, {}) if imus is None else tuple(imus)
+    told = solution is not None and solution.turn.is_told
+    return Record(
         state=state,
-        reason="nothing measured" if reason is None else reason,
-        warnings=tuple(warnings),
+        reason=in_words(solution, imus) if reason is None else reason,
+        warnings=tuple(warnings) if solution is None else (*solution.warnings, *unseen_turn(solution), *warnings),
         started_at=started_at.isoformat(timespec="milliseconds"),
         duration_s=round(duration_s, 3),
-        pose=None,
-        site=None,
-        imus=(),
-    )
-    if solution is None:
-        return record
-    imus = imu_records(solution, {}) if imus is None else tuple(imus)
-    turn, told = solution.turn, solution.turn.is_told
-    return msgspec.structs.replace(
-        record,
-        reason=in_words(solution, imus) if reason is None else reason,
-        warnings=(*solution.warnings, *unseen_turn(solution), *warnings),
-        pose=solution.pose,
-        site=solution.site,
-        magnetic=solution.magnetic,
-        standing=PlatformTurn(
+        pose=None if solution is None else solution.pose,
+        site=None if solution is None else solution.site,
+        magnetic=None if solution is None else solution.magnetic,
+        standing=None
+        if solution is None
+        else PlatformTurn(
             platform=solution.platform,
-            turn_deg_s=round(turn.rate_rad_s / DEG, 6) if told else None,
-            turn_sigma_deg_s=round(turn.sigma_rad_s / DEG, 6) if told else None,
-            told_by=turn.by if told else None,
+            turn_deg_s=round(solution.turn.rate_rad_s / DEG, 6) if told else None,
+            turn_sigma_deg_s=round(solution.turn.sigma_rad_s / DEG, 6) if told else None,
+            told_by=solution.turn.by if told else None,
         ),
         imus=imus,
     )

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.estimation.records.record import Site
+from companion.estimation.records.record import SiteRecord
 from companion.physics import earth
 from companion.physics.frames import Array, Matrix
 
@@ -69,7 +69,7 @@ class Whereabouts:
 class LocalEarth:
     """Gravity, Earth rate (NED) and declination at the site, each with its sigma, and what was missing."""
 
-    site: Site
+    site: SiteRecord
     gravity_m_s2: float
     gravity_sigma_m_s2: float
     rate_ned_rad_s: Array
@@ -117,7 +117,7 @@ def local_earth(where: Whereabouts, remedies: Remedies = IN_CONFIGURATION) -> Lo
             field = earth.magnetic_field(where.latitude_deg, where.longitude_deg, where.height_m or 0.0, where.date)
     declination_deg = None if field is None else field.declination_deg
     return LocalEarth(
-        site=Site(
+        site=SiteRecord(
             latitude_deg=where.latitude_deg,
             height_m=where.height_m,
             gravity_m_s2=gravity,

@@ -23,7 +23,7 @@ from companion.errors import CalibrationRefusedError
 from companion.estimation.means.pose import CompassModel, GradienterModel
 from companion.estimation.means.warming import Warming
 from companion.estimation.means.windows import Hidden, ImuWindow, Window
-from companion.estimation.records.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site, WhenWarm
+from companion.estimation.records.record import Effective, Magnetic, Pose, PoseSigma, Prior, SiteRecord, WhenWarm
 from companion.estimation.request import What
 from companion.estimation.solution.site import LocalEarth, Remedies
 from companion.estimation.solution.truth import NOTHING, Otherwise, Truth, truth_of
@@ -127,7 +127,7 @@ class Solution:
     """The biases of all IMUs from one still stretch."""
 
     pose: Pose
-    site: Site
+    site: SiteRecord
     imus: tuple[ImuSolution, ...]
     warnings: tuple[str, ...]
     shared: Shared
@@ -293,7 +293,7 @@ def _estimate(
     return ImuSolution(
         name=imu.name,
         samples=imu.samples,
-        temperature_degc=imu.temperature_degc if path is None else path.degc[2],
+        temperature_degc=imu.temperature_degc if path is None else path.states[2][0],
         gyro_rad_s=gyro,
         accel_m_s2=accel,
         sigma_stat=np.array([*imu.gyro_sigma_stat_rad_s, *imu.accel_sigma_stat_m_s2]),

@@ -28,7 +28,7 @@ import msgspec
 import numpy as np
 
 from companion.config.sections import AllanModel
-from companion.estimation.means.warming import Path
+from companion.estimation.means.warming import Path, State
 from companion.estimation.noise.allan import floor_variance
 from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.physics.statistics import MAD_TO_SIGMA
@@ -70,8 +70,6 @@ CATALOGUE_SCATTER: Final[dict[Triad, float]] = {"gyro": 70.0 * DEG_H, "accel": 2
 """Run-to-run scatter of method 1.3."""
 CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2 * MG}
 """Slope over temperature of a BMI088, the worse one of method 2.1."""
-State = tuple[float, float]
-"""Temperature and its rate, degC and K/s."""
 
 
 class PowerUpNodes(NamedTuple):

@@ -1,8 +1,7 @@
 """Check of the IMUs' thermometers, second by second.
 
-One that is in another unit, jumps or is stuck is not believed: then the IMU counts as one without a thermometer. A
-constant reading with coarse steps is no fault: a board comes to rest at some temperature, many parts show steps of 1 K
-or 1/8 K, and a heater holds its IMU warm.
+One that is in another unit or jumps is not believed: then the IMU counts as one without a thermometer. A constant
+reading is no fault: a board comes to rest at some temperature, and a heater holds its IMU warm.
 """
 
 from __future__ import annotations
@@ -21,18 +20,12 @@ JUMP_K: Final = 5.0
 """Change within a second that no board makes."""
 _JUMPS: Final = 2
 _WITHIN_S: Final = 600
-_SAME_K: Final = 1e-6
-_STUCK_S: Final = 3 * 3600
-_FINE_K: Final = 0.006
-"""Least distance of a reading with fine steps from eighths and tenths of a kelvin, rounded to hundredths."""
 
 
 @dataclasses.dataclass(slots=True)
 class _Shown:
     slot: int
     """Second of the latest reading, or the first second."""
-    since: int
-    """Second since which it has shown this value."""
     degc: float | None = None
     jumps: deque[int] = dataclasses.field(default_factory=lambda: deque(maxlen=_JUMPS))
     wrong: str = ""
@@ -49,18 +42,19 @@ class Thermometers:
         """Add the reading of one second; return it if it can be believed."""
         one = self._of.get(name)
         if one is None or slot < one.slot:
-            one = self._of[name] = _Shown(slot, since=slot)
+            one = self._of[name] = _Shown(slot)
         if degc is None or not math.isfinite(degc):
             one.none = slot - one.slot >= _NONE_AFTER_S
             return None
-        change_k = 0.0 if one.degc is None else abs(degc - one.degc)
-        if one.degc is None or change_k > _SAME_K:
-            one.since = slot
-        jumped = change_k > JUMP_K and slot - one.slot <= _ADJACENT_S
+        jumped = one.degc is not None and abs(degc - one.degc) > JUMP_K and slot - one.slot <= _ADJACENT_S
         if jumped:
             one.jumps.append(slot)
-        one.slot, one.degc, one.none = slot, degc, False
-        one.wrong = _fault(one, degc)
+        one.slot, one.degc, one.none, one.wrong = slot, degc, False, ""
+        if not LOWEST_DEGC <= degc <= HIGHEST_DEGC:
+            allowed = f"{LOWEST_DEGC:g} to {HIGHEST_DEGC:g} degC"
+            one.wrong = f"shows {degc:.2f}, allowed {allowed}: in another unit?"
+        elif len(one.jumps) == _JUMPS and slot - one.jumps[0] <= _WITHIN_S:
+            one.wrong = f"jumps: more than {JUMP_K:g} K within a second, again and again"
         return None if one.wrong or jumped else degc
 
     def trouble(self, name: str) -> str:
@@ -71,13 +65,3 @@ class Thermometers:
     def has_none(self, name: str) -> bool:
         """Return True for an IMU whose messages carry no temperature."""
         return name in self._of and self._of[name].none
-
-
-def _fault(one: _Shown, degc: float) -> str:
-    if not LOWEST_DEGC <= degc <= HIGHEST_DEGC:
-        return f"shows {degc:.2f}, allowed {LOWEST_DEGC:g} to {HIGHEST_DEGC:g} degC: in another unit?"
-    if len(one.jumps) == _JUMPS and one.slot - one.jumps[0] <= _WITHIN_S:
-        return f"jumps: more than {JUMP_K:g} K within a second, again and again"
-    fine = all(abs(degc * steps - round(degc * steps)) > _FINE_K * steps for steps in (8, 10))
-    lasts_s = one.slot - one.since
-    return f"is stuck at {degc:.2f} degC for {lasts_s / 3600.0:.0f} h" if fine and lasts_s >= _STUCK_S else ""

@@ -50,23 +50,6 @@ def test_a_bad_one_is_named_with_what_was_found_and_not_believed(degc: Degc, wor
     assert thermometers.trouble("own") == ""
 
 
-@pytest.mark.parametrize("degc", [lambda t_s: 31.25, lambda t_s: 62.12, lambda t_s: 45.0 + 0.01 * (t_s % 3)])
-def test_a_calm_coarse_or_heated_one_is_believed(degc: Degc) -> None:
-    # Steps of 1/8 K, as hundredths; fine steps of a heated one. All for longer than a stuck one takes.
-    thermometers, found = shown(4 * 3600, fc=degc)
-    assert thermometers.trouble("fc") == ""
-    assert found["fc"][-1] == degc(4 * 3600 - 1)
-
-
-def test_one_alone_is_stuck_after_hours_and_good_again_when_it_moves() -> None:
-    thermometers, _ = shown(3 * 3600, fc=lambda t_s: 31.27)
-    assert thermometers.trouble("fc") == ""
-    assert thermometers.believed("fc", 3 * 3600, 31.27) is None
-    assert "is stuck at 31.27 degC for 3 h" in thermometers.trouble("fc")
-    assert thermometers.believed("fc", 3 * 3600 + 1, 31.28) == 31.28
-    assert thermometers.trouble("fc") == ""
-
-
 def test_jumps_are_forgiven_after_ten_minutes() -> None:
     thermometers, found = shown(800, fc=lambda t_s: warm(t_s) + (40.0 if t_s == 100 else 0.0))
     assert found["fc"][100:102] == [None, None]

@@ -9,14 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.config.sections import AllanModel
+from companion.config.sections import AllanModel, Calibration
 from companion.estimation.noise.allan import PROFILES
 from companion.estimation.records.validity import (
     DRIFT_SIGMAS,
     Held,
-    Limits,
     Present,
-    Seen,
     Why,
     age_limit_s,
     judge,
@@ -28,7 +26,7 @@ from tests.support.allan import use_variance
 from tests.support.histories import imu_record
 
 GYRO = PROFILES["icm42688p"].gyro
-LIMITS = Limits(max_age_s=1800.0, max_temperature_change_k=3.0)
+LIMITS = Calibration(max_age_min=30.0, max_temperature_change_degc=3.0)
 SIGMA = (5.0 * DEG_H,) * 3
 HELD = Held(
     calibrated_s=0.0,
@@ -51,9 +49,10 @@ def whys(
     present: Present | None = None,
     drift: tuple[Vector, Vector] | None = None,
 ) -> set[Why]:
-    seen = Seen(now_s=now_s, temperature_degc=temperature_degc, present=present, drift=drift)
-    found = judge("gyro", "fc", held, GYRO, LIMITS, seen)
-    return {finding.why for finding in found}
+    found = judge(
+        ("fc", "gyro"), held, GYRO, LIMITS, now_s=now_s, temperature_degc=temperature_degc, present=present, drift=drift
+    )
+    return {objection.why for objection in found}
 
 
 def output(x_deg_h: float) -> Present:
@@ -91,9 +90,9 @@ def test_where_the_curve_over_temperature_is_known_it_says_how_far_the_bias_is_o
     assert by(8.0, 4.0) == set()
     assert by(-9.0, 5.0) == {Why.TEMPERATURE}
     assert by(0.0, 11.0) == {Why.TEMPERATURE}
-    seen = Seen(now_s=10.0, temperature_degc=20.0, drift=((90.0 * DEG_H, 0.0, 0.0), (0.0,) * 3))
-    (finding,) = judge("gyro", "fc", HELD, GYRO, LIMITS, seen)
-    assert finding.words == "gyro fc: about 90 deg/h off, 5 K colder"
+    drift = (90.0 * DEG_H, 0.0, 0.0), (0.0,) * 3
+    (objection,) = judge(("fc", "gyro"), HELD, GYRO, LIMITS, now_s=10.0, temperature_degc=20.0, drift=drift)
+    assert objection.words == "gyro fc: about 90 deg/h off, 5 K colder"
 
 
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=lambda profile: profile.name)
