@@ -167,10 +167,10 @@ def shape_variance(found: Fit) -> Floats:
 
 
 class IntegerColumns(msgspec.Struct, frozen=True):
-    """Figures of the truncated columns among those of all streams; (c,) or (m, c), SI units."""
+    """Figures of the truncated columns of one stream; (c,) or (m, c), SI units. Those of other columns are neutral."""
 
     of: NDArray[np.bool_]
-    """True: the column is truncated; the other figures of the rest are neutral."""
+    """True: the column is truncated."""
     values: Floats
     """(m, c) mean of every second."""
     huber_c: Floats
@@ -184,33 +184,17 @@ class IntegerColumns(msgspec.Struct, frozen=True):
     """Zero is among the readings, too: the mean could be anything within a step of it."""
 
 
-def integer_columns(batches: Sequence[Sequence[Batch]], steps: Floats, truncates: NDArray[np.bool_]) -> IntegerColumns:
-    """Estimate the means of all truncated streams from their good batches, which are of the same seconds.
+def integer_columns(batches: Sequence[Batch], steps: Floats, *, truncates: bool) -> IntegerColumns:
+    """Estimate the means of a stream from its good seconds, at least one.
 
-    Of all columns of all streams, (c,) each: their steps, and whether they are truncated.
+    `steps`, (c,), is the step of each column, 0 for floats.
     """
-    of = truncates & (steps > 0.0)
-    width = len(steps)
-    result = IntegerColumns(
-        of=of,
-        values=np.zeros((len(batches[0]), width)),
-        huber_c=np.where(of, HUBER_C, FLOAT_HUBER_C),
-        least=np.zeros(width),
-        hidden=np.zeros(width),
-        unknown=np.zeros(width, dtype=np.bool_),
-        useless=np.zeros(width, dtype=np.bool_),
-    )
-    each = width // len(batches)
-    for index, own in enumerate(batches):
-        part = slice(each * index, each * (index + 1))
-        if of[part].any():
-            # One triad of a stream may be floats; its columns are estimated with any step and not used.
-            _estimate(own, np.where(of[part], steps[part], 1.0), result, part)
-    return result
-
-
-def _estimate(batches: Sequence[Batch], steps: Floats, result: IntegerColumns, part: slice) -> None:
-    """Estimate one stream's `part` of the columns, from good seconds, at least one."""
+    of = (steps > 0.0) & truncates
+    if not of.any():
+        neutral = np.zeros(len(steps))
+        return IntegerColumns(of, neutral, np.full(len(steps), FLOAT_HUBER_C), neutral, neutral, of, of)
+    # One triad of a stream may be floats; its columns are estimated with any step and not used.
+    steps = np.where(of, steps, 1.0)
     sizes = np.array([batch.n for batch in batches], dtype=np.float64)
     plain = np.array([batch.mean for batch in batches]) / steps
     start, tables = _aligned(batches, plain, steps)
@@ -236,16 +220,20 @@ def _estimate(batches: Sequence[Batch], steps: Floats, result: IntegerColumns, p
     if borrows:
         other = fit(bounds, pooled, sigma * (1.0 + BORROWED_RMS))
         by_sigma = np.where(sigma > 0.0, other.mean - found.mean, 0.0)
-    known, of = found.identified, result.of[part]
+    known = found.identified
     integers = start + np.arange(tables.shape[1], dtype=np.int64)[:, None]
     has_zero = ((integers == 0) & (pooled > 0.0)).any(axis=0)
     half_off = plain + HALF_STEP * np.sign(plain.mean(axis=0))
     unknown = np.where(has_zero, NEAR_ZERO, HALF_STEP)
-    result.values[:, part] = np.where(known, values, half_off) * steps
-    result.least[part] = np.where(of & known, second, 0.0) * steps
-    result.hidden[part] = np.where(known, np.sqrt(shape_variance(found) + np.square(by_sigma)), unknown) * steps
-    result.unknown[part] = of & ~own.identified
-    result.useless[part] = of & ~known & has_zero
+    return IntegerColumns(
+        of=of,
+        values=np.where(known, values, half_off) * steps,
+        huber_c=np.where(of, HUBER_C, FLOAT_HUBER_C),
+        least=np.where(of & known, second, 0.0) * steps,
+        hidden=np.where(known, np.sqrt(shape_variance(found) + np.square(by_sigma)), unknown) * steps,
+        unknown=of & ~own.identified,
+        useless=of & ~known & has_zero,
+    )
 
 
 def _borrowed(own: Fit, pooled: Floats) -> Floats:

@@ -166,28 +166,23 @@ class ImuEstimate(msgspec.Struct, frozen=True):
     window: ImuWindow
 
 
-def estimates(
-    imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float
-) -> list[Estimate]:
-    """Estimate every IMU over the same good seconds, at least 2.
+def estimate(imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_s: float) -> Estimate:
+    """Estimate one IMU over its good seconds, at least 2.
 
-    All columns of all IMUs go through each step at once: numpy's cost is by the call, not by the column. A ramp is
-    evaluated at the end of the window, `end_s`, and never later; `horizon_s` is H of V(T, H).
+    A ramp is evaluated at the end of the window, `end_s`, and never later; `horizon_s` is H of V(T, H).
     """
-    models = [model for imu in imus for model in (imu.profile.gyro, imu.profile.accel)]
-    slots = np.array([batch.slot for batch in batches[0]], dtype=np.int64)
-    values = _columns([[batch.mean for batch in item] for item in batches])
+    models = imu.profile.gyro, imu.profile.accel
+    slots = np.array([batch.slot for batch in batches], dtype=np.int64)
     seconds = float(len(slots))
-    steps = np.repeat([step for imu in imus for step in (imu.gyro_step_rad_s, imu.accel_step_m_s2)], 3)
-    whole = integer_columns(batches, steps, np.repeat([imu.truncates for imu in imus], 6))
-    values = np.where(whole.of, whole.values, values)
+    steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
+    whole = integer_columns(batches, steps, truncates=imu.truncates)
+    values = np.where(whole.of, whole.values, [batch.mean for batch in batches])
     flicker = np.repeat([model.flicker for model in models], 3)
     walk = np.repeat([model.walk for model in models], 3)
     # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
-    named = np.repeat([imu.profile.is_named for imu in imus], 6)
-    wander = np.where(named, slope_variance(flicker, walk, end_s - slots[0]), 0.0)
-    mean, leverage = robust_mean(values, whole.huber_c, whole.least), np.full(len(steps), 1.0 / seconds)
-    slope, hidden, level = np.zeros(len(steps)), np.full(len(steps), np.nan), values
+    wander = slope_variance(flicker, walk, end_s - slots[0]) if imu.profile.is_named else np.zeros(6)
+    mean, leverage = robust_mean(values, whole.huber_c, whole.least), np.full(6, 1.0 / seconds)
+    slope, hidden, level = np.zeros(6), np.full(6, np.nan), values
     if len(slots) >= RAMP_BATCHES:
         times = slots.astype(np.float64) + 0.5
         line = huber_line(times, values, end_s, whole.huber_c, whole.least)
@@ -200,51 +195,34 @@ def estimates(
     flicker = _flicker(slots, level, measured, flicker)
     quantum, half_step = _quantisation(batches, steps)
     quantum, half_step = np.where(whole.of, whole.hidden, quantum), np.where(whole.of, whole.unknown, half_step)
-    shared = _columns([[batch.shared_variance for batch in item] for item in batches])
-    quantum = np.sqrt(np.square(quantum) + shared.mean(axis=0))
+    quantum = np.sqrt(np.square(quantum) + np.mean([batch.shared_variance for batch in batches], axis=0))
     # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
     # by anything from nothing to slope * H / 2.
     going_on = np.square(slope * horizon_s / 2.0) / 3.0
-    stat = np.square(measured) * leverage + np.square(quantum)
     white_part = np.square(white) * leverage
     rest = floor_variance(flicker, walk, seconds, horizon_s) + np.square(quantum)
-    use = white_part + rest + going_on
-    spread = max(float(np.square(slots - slots.mean()).sum()), 1.0)
-    by_steps = 3.0 * np.square(quantum / (end_s - slots[0]))
-    no_line = np.isnan(hidden)
-    lines = Lines(
-        hidden=np.nan_to_num(hidden),
-        hidden_variance=np.where(
-            no_line,
-            np.inf,
-            np.where(slope != 0.0, 0.0, np.square(white) / spread + _FLICKER_OF_SLOPE * wander + by_steps),
+    # Variance of a slope, infinite where there is no line.
+    of_line = np.square(white) / max(float(np.square(slots - slots.mean()).sum()), 1.0)
+    of_line = of_line + 3.0 * np.square(quantum / (end_s - slots[0])) + np.where(np.isnan(hidden), np.inf, 0.0)
+    return Estimate(
+        mean=mean,
+        stat_variance=np.square(measured) * leverage + np.square(quantum),
+        use_variance=white_part + rest + going_on,
+        white_variance=white_part,
+        white=white,
+        flicker=flicker,
+        walk=walk,
+        lines=Lines(
+            hidden=np.nan_to_num(hidden),
+            hidden_variance=np.where(slope != 0.0, 0.0, of_line + _FLICKER_OF_SLOPE * wander),
+            ramp=slope,
+            variance=of_line + wander,
+            level_variance=np.square(white) / seconds + rest,
         ),
-        ramp=slope,
-        variance=np.where(no_line, np.inf, np.square(white) / spread + wander + by_steps),
-        level_variance=np.square(white) / seconds + rest,
+        half_step=half_step,
+        undecided=whole.unknown,
+        useless=whole.useless,
     )
-    return [
-        Estimate(
-            mean=mean[part],
-            stat_variance=stat[part],
-            use_variance=use[part],
-            white_variance=white_part[part],
-            white=white[part],
-            flicker=flicker[part],
-            walk=walk[part],
-            lines=Lines(*(each[part] for each in lines)),
-            half_step=half_step[part],
-            undecided=whole.unknown[part],
-            useless=whole.useless[part],
-        )
-        for part in (slice(at, at + 6) for at in range(0, 6 * len(imus), 6))
-    ]
-
-
-def _columns(values: list[list[Floats]]) -> Floats:
-    """Reshape (imus, seconds, 6) to (seconds, 6 * imus)."""
-    stacked = np.array(values)
-    return np.asarray(stacked.transpose(1, 0, 2).reshape(stacked.shape[1], -1))
 
 
 def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: Floats) -> Floats:
@@ -258,20 +236,20 @@ def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: F
     return np.maximum(np.sqrt(more) / FLOOR_OF_FLICKER, profile)
 
 
-def _quantisation(batches: Sequence[Sequence[Batch]], steps: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _quantisation(batches: Sequence[Batch], steps: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Return one sigma a column that rounding may hide, and where there are fewer than 3 distinct values.
 
     Half a step for fewer than 3 distinct values; else the bound that noise of sigma leaves, (q / pi) exp(-2 pi^2
     sigma^2 / q^2) (method 2.2 and 2.5).
     """
-    low = _columns([[batch.low for batch in item] for item in batches]).min(axis=0)
-    high = _columns([[batch.high for batch in item] for item in batches]).max(axis=0)
-    distinct = np.array([[batch.distinct for batch in item] for item in batches]).max(axis=1).ravel()
+    low = np.min([batch.low for batch in batches], axis=0)
+    high = np.max([batch.high for batch in batches], axis=0)
+    distinct = np.max([batch.distinct for batch in batches], axis=0)
     known = steps > 0.0
     few = np.where(known, high - low < 1.5 * steps, distinct < 3)
     # A stream of floats may carry coarse steps all the same: then the step is what lies between its two values.
     half = np.where(known, steps, high - low) / 2.0
-    variance = _columns([[batch.variance for batch in item] for item in batches]).mean(axis=0)
+    variance = np.mean([batch.variance for batch in batches], axis=0)
     divisor = np.where(known, steps, 1.0)
     bound = steps / math.pi * np.exp(-2.0 * math.pi**2 * variance / np.square(divisor))
     return np.where(few, half, bound), few
@@ -293,17 +271,15 @@ def imu_estimates(
     Raises:
         CalibrationRefusedError: an axis never changes, or most samples were lost.
     """
-    if not imus:
-        return []
     for imu, seconds in zip(imus, batches, strict=True):
         _refuse_broken(imu, seconds)
-    estimated = estimates(imus, batches, end_s=end_s, horizon_s=horizon_s)
     found = []
     beside: Sequence[Sequence[Batch]] = raw or [()] * len(imus)
-    for imu, seconds, own, means in zip(imus, batches, estimated, beside, strict=True):
+    for imu, seconds, means in zip(imus, batches, beside, strict=True):
+        own = estimate(imu, seconds, end_s=end_s, horizon_s=horizon_s)
         if len(means) >= RAW_BATCHES:
             floats = msgspec.structs.replace(imu, gyro_step_rad_s=RAW_STEP, accel_step_m_s2=RAW_STEP, truncates=False)
-            (better,) = estimates([floats], [means], end_s=end_s, horizon_s=horizon_s)
+            better = estimate(floats, means, end_s=end_s, horizon_s=horizon_s)
             if better.use_variance[:3].sum() < own.use_variance[:3].sum():
                 found.append(ImuEstimate(better, _imu_window(floats, means, better, rejected)))
                 continue

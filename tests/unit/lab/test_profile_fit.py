@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from companion.config.sections import AllanModel, NoiseProfile
 from companion.errors import CalibrationRefusedError
-from companion.estimation.means.windows import ImuInput, estimates
+from companion.estimation.means.windows import ImuInput, estimate
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.seconds.batch import Batch, BatchSource
 from companion.lab.profile import LearnedNoise, Rest, fit_profile, rests, seconds_of
@@ -143,7 +143,7 @@ class Misses:
         if not whole:
             return
         imu = ImuInput(name="", rotation=np.eye(3), profile=profile)
-        found = estimates([imu] * len(past), past, end_s=past[0][-1].slot + 1.0, horizon_s=float(next_s))
+        found = [estimate(imu, each, end_s=each[-1].slot + 1.0, horizon_s=float(next_s)) for each in past]
         means = np.array([[batch.mean for batch in each] for each in coming])
         self.miss = np.vstack([self.miss, np.array([each.mean for each in found]) - means.mean(axis=1)])
         self.use = np.vstack([self.use, np.array([each.use_variance for each in found])])
