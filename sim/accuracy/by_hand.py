@@ -203,8 +203,8 @@ class _Aircraft:
 def _ground(site: Site) -> Ground:
     """With no north."""
     earth = local(site)
-    rate = earth.rate_in_body(np.eye(3), heading_known=False)
-    return Ground(earth.gravity_m_s2, earth.gravity_sigma_m_s2, rate.mean, rate.covariance)
+    rate, of_rate = earth.rate_in_body(np.eye(3), heading_known=False)
+    return Ground(earth.gravity_m_s2, earth.gravity_sigma_m_s2, rate, of_rate)
 
 
 def by_hand(part: str, seed: int, number: int) -> HandRun:

@@ -289,12 +289,12 @@ def readable(windows: Sequence[Window], among: Mapping[str, AutopilotImu] | None
 
 def ground(local: LocalEarth, compass: CompassModel | None) -> Ground:
     """Return gravity and the Earth's rate; without a compass headings count from the first stand, of any direction."""
-    rate = local.rate_in_body(np.eye(3), heading_known=compass is not None)
-    covariance = rate.covariance.copy()
+    rate, of_rate = local.rate_in_body(np.eye(3), heading_known=compass is not None)
+    covariance = of_rate.copy()
     if compass is not None and compass.magnetic:
         east = local.rate_ned_rad_s[0] * local.declination_sigma_deg * DEG
         covariance[1, 1] += east**2
-    return Ground(local.gravity_m_s2, local.gravity_sigma_m_s2, rate.mean, covariance)
+    return Ground(local.gravity_m_s2, local.gravity_sigma_m_s2, rate, covariance)
 
 
 def _level_sigma_m_s2(found: Alignment) -> float:

@@ -154,7 +154,7 @@ def _thinned(group: Sequence[Point]) -> Sequence[Point]:
     left = list(group)
     while len(left) > KEEP_POINTS:
         # Windows that nobody calibrated from go first, what somebody has decided for last.
-        ranks = [(any(_is_chosen(p, t) for t in ("gyro", "accel")), bool(p.started_at)) for p in left[:-1]]
+        ranks = [(any(of is not None and of.chosen for of in (p.gyro, p.accel)), bool(p.started_at)) for p in left[:-1]]
         steps = [abs((b.temperature_degc or 0.0) - (a.temperature_degc or 0.0)) for a, b in itertools.pairwise(left)]
         del left[min(range(len(steps)), key=lambda k: (ranks[k], steps[k]))]
     return left
@@ -166,22 +166,12 @@ def believed(points: Sequence[Point], triad: Triad) -> list[list[Point]]:
     Outliers are left out. `NEW_AFTER` of them in a row, or a chosen one, are none: then all before them is left out.
     """
     measured = [point for point in points if point.of(triad) is not None]
-    start = max((k for k, point in enumerate(measured) if _is_chosen(point, triad)), default=0)
+    start = max((k for k, point in enumerate(measured) if point.measured(triad).chosen), default=0)
     groups = by_power_up(measured[start:])
-    trusted = [[point for point in group if not _is_suspect(point, triad)] for group in groups]
+    trusted = [[point for point in group if not point.measured(triad).is_outlier] for group in groups]
     first = row = end = 0
     for k, group in enumerate(trusted):
         row = 0 if group else row + 1
         if row >= NEW_AFTER:
             first, end = k + 1 - row, k + 1
     return [*groups[first:end], *(group for group in trusted[end:] if group)]
-
-
-def _is_suspect(point: Point, triad: Triad) -> bool:
-    found = point.of(triad)
-    return found is not None and found.is_outlier
-
-
-def _is_chosen(point: Point, triad: Triad) -> bool:
-    found = point.of(triad)
-    return found is not None and found.chosen

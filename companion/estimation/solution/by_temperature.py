@@ -90,15 +90,9 @@ def by_temperature(
     power_up: PowerUp | None,
     now_degc: float | None = None,
 ) -> ByTemperature:
-    """Build the summary of one IMU from its points and curves.
+    """Build the summary of one IMU from its points and the curves of gyros and accelerometers.
 
-    Args:
-        name: of the IMU.
-        points: all points kept of the IMU.
-        curve: the gyros' curve.
-        accel: the accelerometers' curve.
-        power_up: the present one; None: unknown.
-        now_degc: the temperature; None: that of the last window of this power-up.
+    `power_up`: the present one; None: unknown. `now_degc` None: temperature of the last window of this power-up.
     """
     groups = by_power_up([point for point in points if point.temperature_degc is not None and point.gyro is not None])
     seen = [_window(point, k) for k, group in enumerate(groups) for point in group]

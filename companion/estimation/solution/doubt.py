@@ -28,13 +28,12 @@ TELLS: Final = 9.0
 AGREES: Final = 11.34
 """Chi square of three axes that is passed by chance once in a hundred: beyond it nobody is warned yet, but what may
 well be of another sensor takes no part."""
-_IN_SHORT: Final[dict[Cause, str]] = {
+_OF_ALL: Final[dict[Cause, str]] = {
     "gradienter": "gradienter or its zero moved",
     "gravity": "gravity differs",
     "turn": "it turns",
-    "imu": "unlike before",
-    "unclear": "unlike before",
 }
+"""Causes that concern a triad of all IMUs, in a few words."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -106,25 +105,21 @@ class Doubt:
     @property
     def of_all(self) -> bool:
         """Return True if it concerns this triad of all IMUs, not only of those named."""
-        return self.cause not in ("imu", "unclear")
+        return self.cause in _OF_ALL
 
     @property
     def in_short(self) -> str:
         """The cause in a few words."""
-        return _IN_SHORT[self.cause]
+        return _OF_ALL.get(self.cause, "unlike before")
 
 
 def contradictions(
     earlier: Sequence[Witness], today: Sequence[Witness], imus: int, up: Array, by_reading: Matrix | None
 ) -> list[Doubt]:
-    """Find all contradictions; empty while all is well.
+    """Find all contradictions to predictions from earlier power-ups and from this one; empty while all is well.
 
-    Args:
-        earlier: against predictions from earlier power-ups.
-        today: against those from this power-up, which say most: older ones count only where these are silent.
-        imus: number of IMUs of the solution.
-        up: unit vector in the vehicle's axes.
-        by_reading: d (accelerometer bias) / d (gradienter's readings), (3, 2).
+    Those from this power-up are the most exact: earlier ones count only where they are silent. `imus`: number of IMUs.
+    `by_reading`: d (accelerometer bias) / d (gradienter's readings), (3, 2).
     """
     gravity: tuple[Cause, Matrix] = ("gravity", up[:, None])
     causes: dict[Triad, list[tuple[Cause, Matrix]]] = {

@@ -31,14 +31,6 @@ _MEAN_GRAVITY_M_S2: Final = 9.7976
 _GRAVITY_SIGMA_M_S2: Final = 0.0155
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Uncertain:
-    """A vector that is known up to a covariance: `mean` shape (3,), `covariance` shape (3, 3)."""
-
-    mean: Array
-    covariance: Matrix
-
-
 @dataclasses.dataclass(frozen=True, slots=True)
 class Remedies:
     """Words for what is missing: for a configuration, or for a command that asks for an estimate."""
@@ -81,14 +73,14 @@ class LocalEarth:
     """The Earth's magnetic field by its model; None without position and date."""
     remedies: Remedies = IN_CONFIGURATION
 
-    def rate_in_body(self, body_from_ned: Matrix, *, heading_known: bool) -> Uncertain:
-        """Turn the rate into body axes; of an unknown heading the horizontal part has zero mean and any direction."""
+    def rate_in_body(self, body_from_ned: Matrix, *, heading_known: bool) -> tuple[Array, Matrix]:
+        """Return the rate in body axes and its covariance; the horizontal part of an unknown heading is zero mean."""
         mean, covariance = self.rate_ned_rad_s, self.rate_ned_covariance
         if not heading_known:
             mean_square_north = mean[0] ** 2 + covariance[0, 0]
             mean = np.array([0.0, 0.0, mean[2]])
             covariance = np.diag([mean_square_north / 2, mean_square_north / 2, covariance[2, 2]])
-        return Uncertain(body_from_ned @ mean, body_from_ned @ covariance @ body_from_ned.T)
+        return body_from_ned @ mean, body_from_ned @ covariance @ body_from_ned.T
 
 
 def local_earth(where: Whereabouts, remedies: Remedies = IN_CONFIGURATION) -> LocalEarth:

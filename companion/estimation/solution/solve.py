@@ -181,7 +181,7 @@ def solve(
     truth = truth_of(window, gradienter, compass, local, warnings, otherwise)
     unknown_heading = None
     if compass is None and truth.heading_rad is None:
-        unknown_heading = local.rate_in_body(np.eye(3), heading_known=False).covariance
+        _, unknown_heading = local.rate_in_body(np.eye(3), heading_known=False)
     warnings += wide_gyros(window.imus, unknown_heading, local.remedies)
     believed = window.imus if any_bias else tuple(believable(imu, truth.up, local) for imu in window.imus)
     sailing = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)
@@ -242,14 +242,12 @@ def _pose(truth: Truth) -> Pose:
 def _shared(truth: Truth, local: LocalEarth, turn: Turn, zero_sigma_rad: float, turn_rad_s: Array) -> Shared:
     """Give the errors of one attitude, gravity, Earth's rate and turn of the platform, common to all; method 2.1.
 
-    An attitude error eps makes db_a = eps x f and db_g = eps x w = -[w x] eps; the cross term is kept, since one tilt
-    error makes both. What remains unknown of the Earth's rate (latitude, or a heading never measured) comes in with
-    its own covariance, and so does what the platform may turn by itself.
+    An attitude error eps makes db_a = eps x f and db_g = eps x w = -[w x] eps; one tilt error makes both.
     """
-    rate, up = truth.earth_rate(local), truth.up
-    jacobian = np.vstack([-skew(rate.mean + turn_rad_s), -skew(local.gravity_m_s2 * up)])
+    (rate, of_rate), up = truth.earth_rate(local), truth.up
+    jacobian = np.vstack([-skew(rate + turn_rad_s), -skew(local.gravity_m_s2 * up)])
     covariance = jacobian @ truth.attitude_covariance_rad2 @ jacobian.T
-    covariance[:3, :3] += rate.covariance + turn.covariance(up)
+    covariance[:3, :3] += of_rate + turn.covariance(up)
     covariance[3:, 3:] += np.outer(up, up) * local.gravity_sigma_m_s2**2
     return Shared(
         up=up,
@@ -309,7 +307,7 @@ def _estimate(
 def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
     """Give the Earth's rate in the gyro means: all of it, or the part that turning left."""
     if imu.by_earth is None or truth.heading_rad is None:
-        return truth.earth_rate(local).mean
+        return truth.earth_rate(local)[0]
     c, s = math.cos(truth.heading_rad), math.sin(truth.heading_rad)
     north, east, down = local.rate_ned_rad_s.tolist()
     return np.asarray(imu.by_earth @ np.array([c * north + s * east, c * east - s * north, down]))

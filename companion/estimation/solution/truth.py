@@ -24,7 +24,7 @@ from companion.estimation.means.windows import ImuWindow, Window
 from companion.estimation.noise.allan import floor_variance
 from companion.estimation.records.record import HeadingFrom, Magnetic, TiltFrom
 from companion.estimation.solution import magnetic
-from companion.estimation.solution.site import LocalEarth, Uncertain
+from companion.estimation.solution.site import LocalEarth
 from companion.estimation.temperature.curve import CATALOGUE_PER_K, CATALOGUE_SCATTER
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, symmetric_by
 from companion.physics.gradienter import up_jacobian
@@ -84,16 +84,29 @@ class Truth:
         gamma, theta = roll_pitch_from_up(self.up)
         return body_from_ned(gamma, theta, self.heading_rad or 0.0)
 
-    def earth_rate(self, local: LocalEarth) -> Uncertain:
-        """Give the Earth's rate in the vehicle's axes."""
+    def earth_rate(self, local: LocalEarth) -> tuple[Array, Matrix]:
+        """Give the Earth's rate in the vehicle's axes, and its covariance."""
         return local.rate_in_body(self.body_from_ned, heading_known=self.heading_rad is not None)
+
+    def with_heading(self, own: OwnHeading, warnings: list[str]) -> Truth:
+        """Add the autopilot's heading."""
+        warnings.append(
+            f"no compass: heading {own.heading_deg:.0f} deg by the autopilot, good to {own.sigma_deg:.0f} deg"
+        )
+        sigma_rad = own.sigma_deg * DEG
+        return dataclasses.replace(
+            self,
+            attitude_covariance_rad2=self.attitude_covariance_rad2 + np.outer(self.up, self.up) * sigma_rad**2,
+            heading_rad=own.heading_deg * DEG,
+            heading_from="autopilot",
+            heading_sigma_rad=sigma_rad,
+        )
 
 
 def attitude_error_jacobian(up: Array) -> Matrix:
-    """Give the derivative of the attitude by `up`, at a fixed heading: eps = jacobian @ d up, shape (3, 3).
+    """Give the derivative of the attitude by `up`, at a fixed heading: eps = jacobian @ d up, (3, 3).
 
-    C_hat = (I - [eps x]) C. Roll turns about the body's x axis, pitch about the horizontal axis
-    (0, cos gamma, -sin gamma); with gamma = atan2(-u_y, -u_z) and sin theta = u_x.
+    Roll turns about the body's x axis, pitch about the horizontal axis (0, cos gamma, -sin gamma).
     """
     gamma, theta = roll_pitch_from_up(up)
     horizontal = np.hypot(up[1], up[2])
@@ -132,7 +145,7 @@ def truth_of(
     jacobian = attitude_error_jacobian(up)
     without = Truth(up, up_covariance, jacobian @ up_covariance @ jacobian.T, by_reading, reading_sigma, tilt_from)
     if compass is None or window.heading is None:
-        return without if otherwise.heading is None else _with_own_heading(without, otherwise.heading, warnings)
+        return without if otherwise.heading is None else without.with_heading(otherwise.heading, warnings)
     tilt_covariance = None if tilt_from is None else up_covariance
     may_turn_deg = window.turn.at_most_rad_s / DEG * (window.end_s - window.start_s)
     found = magnetic.assess(window.heading, window.field, compass, local, up, tilt_covariance, may_turn_deg)
@@ -150,18 +163,6 @@ def truth_of(
         heading_from="compass",
         heading_sigma_rad=math.sqrt(found.sigma_rad**2 + found.heading_by_up @ up_covariance @ found.heading_by_up),
         magnetic=found.magnetic,
-    )
-
-
-def _with_own_heading(without: Truth, own: OwnHeading, warnings: list[str]) -> Truth:
-    sigma_rad = own.sigma_deg * DEG
-    warnings.append(f"no compass: heading {own.heading_deg:.0f} deg by the autopilot, good to {own.sigma_deg:.0f} deg")
-    return dataclasses.replace(
-        without,
-        attitude_covariance_rad2=without.attitude_covariance_rad2 + np.outer(without.up, without.up) * sigma_rad**2,
-        heading_rad=own.heading_deg * DEG,
-        heading_from="autopilot",
-        heading_sigma_rad=sigma_rad,
     )
 
 
