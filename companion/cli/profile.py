@@ -18,7 +18,7 @@ from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
     from companion.config.sections import NoiseProfile
-    from companion.estimation.noise.allan_fit import AxisFit
+    from companion.estimation.noise.allan import AxisFit
     from companion.lab.logs.log import StillLog
     from companion.lab.profile import LearnedNoise, Rests
 

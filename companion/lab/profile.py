@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from companion.config.sections import AllanModel, NoiseProfile
 from companion.errors import CalibrationRefusedError
-from companion.estimation.noise.allan_fit import AxisFit, curve, fit_axis
+from companion.estimation.noise.allan import AxisFit, curve, fit_axis
 from companion.estimation.seconds.batch import Batch, summary
 from companion.estimation.stillness.gates import ImuGate
 from companion.estimation.stillness.own_noise import learned_of

@@ -31,7 +31,7 @@ from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import LiveParameters, Parameters, read_integer
 from companion.autopilot.parameters.wire import same_float32
 from companion.errors import AutopilotError, AutopilotRebootedError, NotDisarmedError
-from companion.estimation.temperature.polynomial import ZERO, Polynomial
+from companion.estimation.temperature.curve import ZERO, Polynomial
 from companion.physics.frames import vector
 from companion.samples import Vector
 

@@ -19,7 +19,7 @@ from companion.autopilot.parameters.reading import FirmwareName, Parameters, rea
 from companion.autopilot.parameters.wire import same_float32
 from companion.config.sections import Profile
 from companion.errors import AutopilotError, AutopilotRebootedError
-from companion.estimation.temperature.polynomial import Polynomial
+from companion.estimation.temperature.curve import Polynomial
 from companion.links.mavlink.link import Message
 from companion.physics.frames import Matrix
 

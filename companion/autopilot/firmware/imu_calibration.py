@@ -23,7 +23,7 @@ from companion.autopilot.parameters.reading import SCALES
 from companion.autopilot.parameters.wire import float32, same_float32
 from companion.errors import CalibrationRefusedError
 from companion.estimation.solution.solve import ImuSolution
-from companion.estimation.temperature.polynomial import NOTHING, Polynomial
+from companion.estimation.temperature.curve import NOTHING, Polynomial
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, MG
 from companion.samples import Triad, Vector

@@ -38,7 +38,7 @@ from companion.autopilot.firmware.px4_slots import PREFIX, SLOTS, Slot, SlotMemo
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.reading import SCALES, FirmwareName, Parameters, read_integer, read_vector
 from companion.errors import AutopilotError
-from companion.estimation.temperature.polynomial import NOTHING, Polynomial
+from companion.estimation.temperature.curve import NOTHING, Polynomial
 from companion.physics.frames import Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix, vector
 from companion.physics.units import MG
 from companion.rotations import ROTATION_NAMES

@@ -22,8 +22,7 @@ from companion.daemon.stands.measuring import Measuring
 from companion.errors import CalibrationRefusedError
 from companion.estimation.machine import Event
 from companion.estimation.means.windows import Window
-from companion.estimation.temperature.curve import Curve
-from companion.estimation.temperature.polynomial import Polynomial, of_curve
+from companion.estimation.temperature.curve import Curve, Polynomial, of_curve
 from companion.storage.changes import BY_TEMPERATURE
 
 

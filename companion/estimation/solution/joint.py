@@ -70,10 +70,11 @@ class Weighed:
 
 def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed:
     """Check a solution against earlier calibrations, and let them take part where they may."""
-    shared, expected = solution.shared, {each.name: each for each in expectation.imus}
-    ends = [at_end(imu, expected.get(imu.name), shared) for imu in solution.imus]
+    shared, by_name = solution.shared, {each.name: each for each in expectation.imus}
+    expected = [by_name.get(imu.name) or ExpectedImu(name=imu.name) for imu in solution.imus]
+    ends = [at_end(imu, known, shared) for imu, known in zip(solution.imus, expected, strict=True)]
     whole = {imu.name: moved(whole[imu.name], shift) for imu, shift, _ in ends if imu.name in whole}
-    imus = tuple(_with_effect(imu, expected.get(imu.name), shared) for imu, _, _ in ends)
+    imus = tuple(_with_effect(imu, known, shared) for (imu, _, _), known in zip(ends, expected, strict=True))
     solution = dataclasses.replace(solution, imus=imus)
     earlier, today = (_witnesses(solution, whole, expected, today=today) for today in (False, True))
     doubts = contradictions(earlier, today, len(imus), shared.up, shared.by_reading)
@@ -87,7 +88,7 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
         prior = _prior([one for one in earlier if one.imu == k], used)
         if imu.name in whole:
             now = moved(whole[imu.name], shift[6 * k : 6 * k + 6])
-            imu = with_warm(imu, now, expected.get(imu.name), followed)
+            imu = with_warm(imu, now, expected[k], followed)
         final.append(dataclasses.replace(imu, prior=prior, warnings=(*imu.warnings, *own)))
     common = [doubt.words for doubt in doubts if doubt.of_all]
     combined = dataclasses.replace(combined, imus=tuple(final), warnings=(*solution.warnings, *common))
@@ -97,14 +98,12 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
 # --- a window that warmed
 
 
-def at_end(
-    imu: ImuSolution, expected: ExpectedImu | None, shared: Shared
-) -> tuple[ImuSolution, Array, tuple[Triad, ...]]:
+def at_end(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> tuple[ImuSolution, Array, tuple[Triad, ...]]:
     """Move an estimate to the end of its window; also give the shift, (6,), and the triads that followed a curve."""
     shift, stat, warm_up = np.zeros(6), imu.sigma_stat.copy(), imu.warm_up_variance.copy()
     covariance, followed = imu.covariance.copy(), list[Triad]()
     for triad, bias in zip(TRIADS, imu.biases, strict=True):
-        along = None if expected is None else expected.along.get(triad)
+        along = expected.along.get(triad)
         if along is None or bias is None or imu.warming is None:
             continue
         lines, half_s, slope = imu.warming.of(triad), imu.warming.half_s, np.array(along.slope)
@@ -129,12 +128,12 @@ def at_end(
     return at_its_end, shift, tuple(followed)
 
 
-def with_warm(imu: ImuSolution, whole: Pair, expected: ExpectedImu | None, followed: Collection[Triad]) -> ImuSolution:
+def with_warm(imu: ImuSolution, whole: Pair, expected: ExpectedImu, followed: Collection[Triad]) -> ImuSolution:
     """Add the biases that are predicted for when the IMU is warm, from the `whole` biases now."""
     figures: dict[Triad, tuple[Vector, Vector]] = {}
     words, degc = [], 0.0
     for triad, now in zip(TRIADS, whole, strict=True):
-        along = None if expected is None or triad not in followed else expected.along.get(triad)
+        along = expected.along.get(triad) if triad in followed else None
         if along is None or along.warm is None or now is None:
             continue
         degc, change, variance = along.warm[0], np.array(along.warm[1]), np.array(along.warm[2])
@@ -166,9 +165,9 @@ def with_warm(imu: ImuSolution, whole: Pair, expected: ExpectedImu | None, follo
 # --- predictions and measurements
 
 
-def _with_effect(imu: ImuSolution, expected: ExpectedImu | None, shared: Shared) -> ImuSolution:
+def _with_effect(imu: ImuSolution, expected: ExpectedImu, shared: Shared) -> ImuSolution:
     """Add what the accelerometers' bias is worth at another attitude."""
-    effect = None if expected is None else expected.effect
+    effect = expected.effect
     if imu.accel_m_s2 is None or effect is None:
         return imu
     figures = shared.gravity_m_s2, shared.up, imu.accel_sigma_use_m_s2
@@ -177,12 +176,12 @@ def _with_effect(imu: ImuSolution, expected: ExpectedImu | None, shared: Shared)
     return dataclasses.replace(imu, effective=effect.effective(*figures), warnings=warnings)
 
 
-def _witnesses(solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu], *, today: bool) -> list[Witness]:
+def _witnesses(solution: Solution, whole: Whole, expected: Sequence[ExpectedImu], *, today: bool) -> list[Witness]:
     """Pair each prediction with its measurement."""
     shared, found = solution.shared, []
     for triad, (k, imu) in itertools.product(TRIADS, enumerate(solution.imus)):
-        said, measured = expected.get(imu.name), whole[imu.name][TRIADS.index(triad)] if imu.name in whole else None
-        known = None if said is None else (said.today if today else said.earlier).get(triad)
+        known = (expected[k].today if today else expected[k].earlier).get(triad)
+        measured = whole[imu.name][TRIADS.index(triad)] if imu.name in whole else None
         if measured is None or known is None:
             continue
         part = rows_of(triad)

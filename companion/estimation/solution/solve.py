@@ -41,11 +41,10 @@ _ON_DECK: Final = "on a deck gyros need a compass: without one a slow turn looks
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ImuSolution:
-    """Residual bias in one IMU's output: mean minus truth, in vehicle FRD, shape (3,); None: not asked for or unknown.
+    """Residual bias in one IMU's output: mean minus truth, in vehicle FRD, (3,); None: not asked for or unknown.
 
-    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of a prediction of the next minutes, without what a
-    warm-up may do in them: that moves the bias under old and new offsets alike, and no comparison must count it.
-    `temperature_degc` is that of the end of the window, `k_s` its rate, K/s.
+    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of a prediction of the next minutes. A warm-up is not in
+    it, as that moves the bias under old and new offsets alike. `temperature_degc` and its rate are those of the end.
     """
 
     name: str
@@ -63,7 +62,6 @@ class ImuSolution:
     k_s: float = 0.0
     warming: Warming | None = None
     when_warm: WhenWarm | None = None
-    """The telemetry was seen to follow this IMU's offsets step by step."""
     prior: Prior | None = None
     effective: Effective | None = None
 
@@ -94,7 +92,7 @@ class ImuSolution:
 
     @property
     def use_covariance(self) -> Matrix:
-        """The warm-up in it: sigma_use is the root of its diagonal."""
+        """Covariance with the warm-up; sigma_use is the root of its diagonal."""
         return self.covariance + np.diag(self.warm_up_variance)
 
 

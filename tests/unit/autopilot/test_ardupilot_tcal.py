@@ -10,7 +10,7 @@ from companion.autopilot.firmware.imu_calibration import whole_bias
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.history import MeasuredBias, Point, PowerUp
 from companion.estimation.solution.prior import curve_of
-from companion.estimation.temperature.polynomial import Polynomial, of_curve
+from companion.estimation.temperature.curve import Polynomial, of_curve
 from tests.unit.autopilot.test_ardupilot import IMU1, read
 
 ON: dict[str, float] = dict.fromkeys(parameters_of(1).tcal.deciding, 0.0) | {

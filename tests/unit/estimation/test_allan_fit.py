@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.estimation.noise.allan_fit import AllanCurve, AxisFit, curve, fit_axis
+from companion.estimation.noise.allan import AllanCurve, AxisFit, curve, fit_axis
 from tests.support.made_noise import FLICKER_OF_FLOOR, slow
 
 Floats = NDArray[np.float64]
