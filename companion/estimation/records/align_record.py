@@ -161,6 +161,22 @@ class FacesRecord(msgspec.Struct, frozen=True, kw_only=True):
     warnings: tuple[str, ...] = ()
 
 
+def check(record: AlignmentRecord | FacesRecord) -> None:
+    """Verify that a record can be used.
+
+    Raises:
+        msgspec.ValidationError: figures that no sensor has.
+    """
+    if isinstance(record, FacesRecord):
+        found = [(imu.accel_bias_mg.value, imu.accel_bias_mg.sigma, 1e4) for imu in record.imus]
+        found += [(imu.accel_scale.value, imu.accel_scale.sigma, 0.5) for imu in record.imus]
+    else:
+        found = [((*record.offset_deg, 0.0), (record.sigma_deg,) * 3, _MOST_DEG)]
+    for value, sigma, most in found:
+        if not np.abs([*value, *sigma]).max() < most or min(sigma) <= 0.0:
+            raise msgspec.ValidationError(f"{value} with a sigma of {sigma} cannot be")
+
+
 class TurnImuRecord(LevelRecord, frozen=True, kw_only=True):
     """One IMU, turned on a spot without a gradienter."""
 
@@ -191,22 +207,6 @@ class TurnRecord(SpotRecord, frozen=True, kw_only=True):
 
 
 HandRecord = AlignmentRecord | FacesRecord | TurnRecord
-
-
-def check(record: AlignmentRecord | FacesRecord) -> None:
-    """Verify that a record can be used.
-
-    Raises:
-        msgspec.ValidationError: figures that no sensor has.
-    """
-    if isinstance(record, FacesRecord):
-        found = [(imu.accel_bias_mg.value, imu.accel_bias_mg.sigma, 1e4) for imu in record.imus]
-        found += [(imu.accel_scale.value, imu.accel_scale.sigma, 0.5) for imu in record.imus]
-    else:
-        found = [((*record.offset_deg, 0.0), (record.sigma_deg,) * 3, _MOST_DEG)]
-    for value, sigma, most in found:
-        if not np.abs([*value, *sigma]).max() < most or min(sigma) <= 0.0:
-            raise msgspec.ValidationError(f"{value} with a sigma of {sigma} cannot be")
 
 
 def stand_record(stand: StandMeans, attitude: Matrix, seconds: float, configured: Pair) -> StandRecord:
