@@ -1,4 +1,4 @@
-"""Allan models against the published table, and against noise that was made without them."""
+"""Allan models against the published table and made noise; N, B and K of recordings against allantools too."""
 
 from __future__ import annotations
 
@@ -11,28 +11,21 @@ from numpy.typing import NDArray
 from companion.config.sections import AllanModel
 from companion.estimation.noise.allan import (
     PROFILES,
+    AllanCurve,
+    AxisFit,
     allan_model,
     allan_variance,
+    curve,
+    fit_axis,
     noise_profile,
     phi,
+    predicted_sigma,
     student_ratio,
 )
 from companion.physics.units import DEG_H, MG
-from tests.support.allan import use_variance
+from tests.support.made_noise import FLICKER_OF_FLOOR, slow
 
 Floats = NDArray[np.float64]
-
-
-def coloured(rng: np.random.Generator, size: int, model: AllanModel) -> Floats:
-    """One value a second: white, 1/f by shaping a spectrum, random walk by summing."""
-    white = rng.normal(0.0, model.white, size)
-    walk = np.cumsum(rng.normal(0.0, model.walk, size))
-    frequency = np.fft.rfftfreq(size, 1.0)
-    # Two-sided PSD B^2 / (2 pi f): the DFT of a unit-rate series has E|X|^2 = size * S(f).
-    density = np.zeros_like(frequency)
-    density[1:] = model.flicker**2 / (2.0 * math.pi * frequency[1:])
-    spectrum = np.sqrt(size * density / 2.0) * (rng.normal(size=len(frequency)) + 1j * rng.normal(size=len(frequency)))
-    return np.asarray(white + walk + np.fft.irfft(spectrum, size))
 
 
 def test_phi_has_its_documented_value_and_is_stable_at_both_ends() -> None:
@@ -65,11 +58,11 @@ def test_v_of_t_and_h_is_the_published_table(
 ) -> None:
     model = allan_model(white, floor)
     for seconds, sigma in zip((10.0, 30.0, 60.0), sigmas, strict=True):
-        assert math.sqrt(use_variance(model, seconds, 180.0)) == pytest.approx(sigma, rel=0.012)
+        assert predicted_sigma(model, seconds, 180.0) == pytest.approx(sigma, rel=0.012)
     times = np.arange(5.0, 1000.0)
-    found = [use_variance(model, float(seconds), 180.0) for seconds in times]
+    found = [predicted_sigma(model, float(seconds), 180.0) for seconds in times]
     assert times[int(np.argmin(found))] == pytest.approx(best_s, rel=0.03)
-    assert math.sqrt(min(found)) == pytest.approx(best_sigma, rel=0.012)
+    assert min(found) == pytest.approx(best_sigma, rel=0.012)
 
 
 @pytest.mark.parametrize("parts", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.1), (2.0, 0.5, 0.03)])
@@ -79,14 +72,14 @@ def test_v_of_t_and_h_predicts_made_noise(parts: tuple[float, float, float]) -> 
     mean_s, horizon_s = 20, 60
     misses: list[float] = []
     for _ in range(12):
-        series = coloured(rng, 1 << 15, model)
+        series = slow(rng, 1 << 15, model.flicker, model.walk, model.white)
         total = np.concatenate([[0.0], np.cumsum(series)])
         start = np.arange(0, len(series) - mean_s - horizon_s, 40)
         past = (total[start + mean_s] - total[start]) / mean_s
         coming = (total[start + mean_s + horizon_s] - total[start + mean_s]) / horizon_s
         misses.append(float(np.mean(np.square(past - coming))))
     # V leaves out the white noise of the future mean: it is about the bias, not about the next reading.
-    expected = use_variance(model, float(mean_s), float(horizon_s)) + model.white**2 / horizon_s
+    expected = predicted_sigma(model, float(mean_s), float(horizon_s)) ** 2 + model.white**2 / horizon_s
     assert float(np.mean(misses)) == pytest.approx(expected, rel=0.08)
 
 
@@ -116,4 +109,71 @@ def test_profiles_carry_the_catalogue() -> None:
     assert icm.gyro.walk**2 * 1000.0 / 3.0 == pytest.approx((3.0 * DEG_H) ** 2)
     assert noise_profile(None) is PROFILES["unknown"]
     for profile in PROFILES.values():
-        assert use_variance(noise_profile(None).gyro, 1e9, 180.0) >= 0.99 * use_variance(profile.gyro, 1e9, 180.0)
+        assert predicted_sigma(noise_profile(None).gyro, 1e9, 180.0) >= 0.995 * predicted_sigma(
+            profile.gyro, 1e9, 180.0
+        )
+
+
+# --- from recordings
+
+
+def curve_of(*stretches: Floats) -> AllanCurve:
+    return curve((np.arange(len(values)), values[:, None]) for values in stretches)
+
+
+def test_the_deviations_are_those_of_allantools() -> None:
+    import allantools  # most of a second, as scipy.stats: not at every collection
+
+    values = slow(np.random.default_rng(1), 3000, 2.0, 0.05, 9.0)
+    found = curve_of(values)
+    taus, deviations, _, _ = allantools.oadev(values, rate=1.0, data_type="freq", taus=list(found.spans))
+    assert list(taus) == list(found.spans)
+    assert found.spans[-1] == 256
+    np.testing.assert_allclose(np.sqrt(found.variance[:, 0]), deviations, rtol=1e-9)
+
+
+def fits(seed: int, runs: int, seconds: int, white: float, floor: float, walk: float) -> list[AxisFit]:
+    rng = np.random.default_rng(seed)
+    made = [slow(rng, seconds, floor * FLICKER_OF_FLOOR, walk, white) for _ in range(runs)]
+    return [fit_axis(curve_of(values), 0) for values in made]
+
+
+@pytest.mark.parametrize(
+    ("white", "floor", "walk"),
+    [(147.0, 27.0, 1.5), (7.1, 3.0, 0.16), (35.6, 2.0, 0.5), (1.0, 0.0, 0.0)],
+    ids=["ADIS16405", "ICM-42688-P", "little flicker", "white only"],
+)  # fmt: skip
+def test_the_figures_come_back_and_their_errors_are_as_said(white: float, floor: float, walk: float) -> None:
+    truth = np.square([white, floor * FLICKER_OF_FLOOR, walk])
+    found = fits(3, 40, 4000, white, floor, walk)
+    off = np.array([np.square(fit.figures) - truth for fit in found])
+    said = np.array([fit.sigmas for fit in found])
+    pulls = off / said
+    # Those that cannot become negative: on average right, and by so much as is said. Of 40, rms is good to 11 %.
+    free = truth > 3.0 * said.mean(axis=0)
+    assert free[0]
+    assert np.abs(pulls[:, free].mean(axis=0)).max() < 0.55
+    assert np.sqrt(np.square(pulls[:, free]).mean(axis=0)) == pytest.approx(1.0, abs=0.35)
+    upper = np.array([fit.upper for fit in found])
+    # One-sided 95 %: of 40, at least 34 (1 % of the draws have fewer).
+    assert ((np.square(upper) >= truth * (1.0 - 1e-9)).sum(axis=0) > 33).all()
+    known = np.array([fit.known for fit in found])
+    assert known[:, 0].all()
+    # What is not there is not told, and what is there by three standard errors is.
+    assert (known[:, truth == 0.0].mean(axis=0) < 0.13).all()
+    assert (known[:, truth > 5.0 * said.mean(axis=0)].mean(axis=0) > 0.9).all()
+
+
+def test_more_sessions_tell_more_and_each_has_its_own_level() -> None:
+    rng = np.random.default_rng(5)
+    parts = [slow(rng, 1800, 3.0 * FLICKER_OF_FLOOR, 0.16, 7.1) + 1000.0 * number for number in range(8)]
+    one, all_of_them = fit_axis(curve_of(parts[0]), 0), fit_axis(curve_of(*parts), 0)
+    assert all_of_them.sigmas[1] < one.sigmas[1] / 2.0
+    assert all_of_them.figures[1] / FLICKER_OF_FLOOR == pytest.approx(3.0, rel=0.15)
+
+
+def test_what_never_changes_cannot_be_fitted() -> None:
+    with pytest.raises(ValueError, match="never change"):
+        fit_axis(curve_of(np.ones(100)), 0)
+    with pytest.raises(ValueError, match="long enough"):
+        curve_of(np.zeros(5))

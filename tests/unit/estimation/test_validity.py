@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import msgspec
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 from companion.config.sections import AllanModel, Calibration
-from companion.estimation.noise.allan import PROFILES
+from companion.estimation.noise.allan import PROFILES, predicted_sigma
 from companion.estimation.records.validity import (
     DRIFT_SIGMAS,
     Held,
@@ -22,7 +21,6 @@ from companion.estimation.records.validity import (
 )
 from companion.physics.units import DEG_H
 from companion.samples import Vector
-from tests.support.allan import use_variance
 from tests.support.histories import imu_record
 
 GYRO = PROFILES["icm42688p"].gyro
@@ -98,9 +96,9 @@ def test_where_the_curve_over_temperature_is_known_it_says_how_far_the_bias_is_o
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=lambda profile: profile.name)
 def test_the_age_limit_is_where_the_expected_wandering_reaches_two_sigma(profile: object) -> None:
     gyro = profile.gyro  # type: ignore[attr-defined]
-    sigma = math.sqrt(use_variance(gyro, 30.0, 180.0))
+    sigma = predicted_sigma(gyro, 30.0, 180.0)
     limit_s = age_limit_s(gyro, (sigma,) * 3, 30.0)
-    wandering = math.sqrt(use_variance(AllanModel(0.0, gyro.flicker, gyro.walk), 30.0, limit_s))
+    wandering = predicted_sigma(AllanModel(0.0, gyro.flicker, gyro.walk), 30.0, limit_s)
     assert wandering == pytest.approx(DRIFT_SIGMAS * sigma, rel=0.02)
     assert limit_s > 180.0  # what was promised for the next 180 s must hold so long
 

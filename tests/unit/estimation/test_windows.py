@@ -14,13 +14,12 @@ from companion.config.sections import AllanModel, NoiseProfile
 from companion.configured.profiles import gyro_sigmas_deg_h
 from companion.estimation.means.pose import heading_window, tilt_window
 from companion.estimation.means.windows import ImuInput, imu_estimates
-from companion.estimation.noise.allan import noise_profile
+from companion.estimation.noise.allan import noise_profile, predicted_sigma
 from companion.estimation.seconds.batch import Batch
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H
-from tests.support.allan import use_variance
+from tests.support.made_noise import slow
 from tests.support.still_aircraft import QUIET, imu
-from tests.unit.estimation.test_allan import coloured
 
 Floats = NDArray[np.float64]
 
@@ -72,10 +71,11 @@ def test_sigma_use_covers_the_next_minutes(model: AllanModel) -> None:
     rng = np.random.default_rng(2)
     seconds, horizon = 30, 90
     source = imu("fc", NoiseProfile("made", model, model))
-    bias_only = AllanModel(0.0, model.flicker, model.walk)
     scaled = []
     for _ in range(120):
-        bias = np.stack([coloured(rng, 4096, bias_only) for _ in range(6)], axis=1)[2000 : 2000 + seconds + horizon]
+        bias = np.stack([slow(rng, 4096, model.flicker, model.walk) for _ in range(6)], axis=1)[
+            2000 : 2000 + seconds + horizon
+        ]
         readings = bias[:seconds] + rng.normal(0.0, model.white, (seconds, 6))
         window = window_of(source, batches_of(readings), float(horizon))
         found = np.array(window.gyro_rad_s + window.accel_m_s2)
@@ -90,7 +90,7 @@ def test_sigma_use_is_v_of_t_and_h_when_the_profile_rules() -> None:
     model = AllanModel(5.0, 4.0, 0.05)
     rng = np.random.default_rng(3)
     window = window_of(imu("fc", NoiseProfile("made", model, model)), batches_of(rng.normal(0.0, 0.5, (40, 6))))
-    expected = math.sqrt(use_variance(model, 40.0, 180.0))
+    expected = predicted_sigma(model, 40.0, 180.0)
     assert window.gyro_sigma_use_rad_s == pytest.approx([expected] * 3)
 
 
@@ -189,11 +189,10 @@ def test_heading_is_averaged_across_north() -> None:
 def test_a_slope_of_the_parts_own_flicker_is_no_warm_up_and_a_real_one_is() -> None:
     rng = np.random.default_rng(9)
     model = AllanModel(0.1, 5.0, 0.05)
-    bias_only = AllanModel(0.0, model.flicker, model.walk)
     source, nobody = imu("fc", NoiseProfile("made", model, model)), imu("fc", noise_profile("unknown"))
     flagged = blind = 0
     for _ in range(60):
-        bias = np.stack([coloured(rng, 4096, bias_only) for _ in range(6)], axis=1)[2000:2060]
+        bias = np.stack([slow(rng, 4096, model.flicker, model.walk) for _ in range(6)], axis=1)[2000:2060]
         readings = bias + rng.normal(0.0, model.white, (60, 6))
         flagged += any("warm-up" in line for line in window_of(source, batches_of(readings)).drifting)
         # Whose part nobody knows, its wander cannot be told from a warm-up.
