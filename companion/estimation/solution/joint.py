@@ -136,7 +136,7 @@ def with_warm(imu: ImuSolution, whole: Pair, expected: ExpectedImu, followed: Co
         along = expected.along.get(triad) if triad in followed else None
         if along is None or along.warm is None or now is None:
             continue
-        degc, change, variance = along.warm[0], np.array(along.warm[1]), np.array(along.warm[2])
+        degc, change, variance = along.warm.degc, np.array(along.warm.change), np.array(along.warm.variance)
         present = np.diag(imu.covariance)[rows_of(triad)]
         sigma = np.sqrt(present + variance)
         figures[triad] = vector(now + change), vector(sigma)

@@ -85,6 +85,14 @@ class PowerUpNodes(NamedTuple):
     """Variance of an error that all rows share; it lowers the weight."""
 
 
+class Warm(msgspec.Struct, frozen=True, kw_only=True):
+    """Prediction for the warm board: change of the bias from the window's end; vehicle FRD, rad/s or m/s^2."""
+
+    degc: float
+    change: Vector
+    variance: Vector
+
+
 class Along(msgspec.Struct, frozen=True, kw_only=True):
     """Prediction of one triad's bias within one window; vehicle FRD, rad/s or m/s^2, and those a second."""
 
@@ -93,9 +101,8 @@ class Along(msgspec.Struct, frozen=True, kw_only=True):
     shift_variance: Vector
     slope: Vector
     slope_variance: Vector
-    warm: tuple[float, Vector, Vector] | None = None
-    """Temperature of the warm board in degC, change of the bias from the window's end to there, and its variance.
-    None: the end of the warm-up is unknown, or beyond the temperatures seen."""
+    warm: Warm | None = None
+    """None: the end of the warm-up is unknown, or beyond the temperatures seen."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +168,8 @@ class Curve:
             change, variance = self.change(end, (degc, 0.0))
             of_degc = (tau_s[1] * k_s) ** 2 + tau_s[0] ** 2 * path.variance * of_rate
             wander = in_run_variance(model, _WARM_AFTER * tau_s[0])
-            warm = degc, vector(change), vector(variance + wander + np.square(self._per_k(degc)) * of_degc)
+            variance = variance + wander + np.square(self._per_k(degc)) * of_degc
+            warm = Warm(degc=degc, change=vector(change), variance=vector(variance))
         return Along(
             shift=vector(shift),
             shift_variance=vector(shift_variance + by_end),
