@@ -38,7 +38,7 @@ from companion.attitude.quaternion import (
     shortest_arc,
     to_matrix,
 )
-from companion.attitude.strapdown import Strapdown, Stretch
+from companion.attitude.strapdown import MotionStep, Strapdown
 from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD, Uncertainty
 from companion.config.sections import AllanModel
 from companion.physics.earth import earth_rate_ned_rad_s
@@ -268,7 +268,7 @@ class AttitudeEstimator:
         for stretch in self._strapdown.integrate(samples):
             self._take(stretch, phase, still=still, airspeed_m_s=airspeed_m_s)
 
-    def _take(self, stretch: Stretch, phase: Phase, *, still: bool, airspeed_m_s: float | None) -> None:
+    def _take(self, stretch: MotionStep, phase: Phase, *, still: bool, airspeed_m_s: float | None) -> None:
         leveller, span_s, force = self._leveller, stretch.span_s, stretch.force_m_s2
         if airspeed_m_s is not None:
             force = self._without_turning(force, stretch, airspeed_m_s)
@@ -291,14 +291,14 @@ class AttitudeEstimator:
         else:
             self._forget_rest()
 
-    def _without_turning(self, force: Triple, stretch: Stretch, airspeed_m_s: float) -> Triple:
+    def _without_turning(self, force: Triple, stretch: MotionStep, airspeed_m_s: float) -> Triple:
         vx, vy, vz = rotate(self._sensor_from_vehicle, (airspeed_m_s, 0.0, 0.0))
         wx, wy, wz = stretch.rate_rad_s
         turning = (wy * vz - wz * vy, wz * vx - wx * vz, wx * vy - wy * vx)
         tx, ty, tz = rotate(stretch.orientation, turning)
         return force[0] - tx, force[1] - ty, force[2] - tz
 
-    def _remember(self, stretch: Stretch) -> None:
+    def _remember(self, stretch: MotionStep) -> None:
         history = self._history
         history.append((stretch.t_s, stretch.orientation))
         while history[0][0] < stretch.t_s - KEPT_S:
@@ -310,7 +310,7 @@ class AttitudeEstimator:
         self._still_s = 0.0
         self._still_angle = (0.0, 0.0, 0.0)
 
-    def _rest(self, stretch: Stretch) -> None:
+    def _rest(self, stretch: MotionStep) -> None:
         span_s = stretch.span_s
         rx, ry, rz = stretch.rate_rad_s
         ax, ay, az = self._still_angle

@@ -35,7 +35,7 @@ LOST_S: Final = 1.0
 """After a longer silence the attitude is lost."""
 
 
-class Stretch(NamedTuple):
+class MotionStep(NamedTuple):
     """Motion in about `STEP_S` seconds."""
 
     t_s: float
@@ -83,9 +83,9 @@ class Strapdown:
         self._unturned: Triple = (0.0, 0.0, 0.0)
         self._turn_s = 0.0
 
-    def integrate(self, samples: Sequence[ImuSample]) -> list[Stretch]:
+    def integrate(self, samples: Sequence[ImuSample]) -> list[MotionStep]:
         """Integrate samples in the order of time, cut into calls in any way; return the stretches they complete."""
-        done: list[Stretch] = []
+        done: list[MotionStep] = []
         for sample in samples:
             if (dt := self._since_last(sample)) is None:
                 continue
@@ -136,12 +136,12 @@ class Strapdown:
         self._velocity = (vx + fx, vy + fy, vz + fz)
         self._unturned, self._turn_s = (0.0, 0.0, 0.0), 0.0
 
-    def _finished(self, t_s: float) -> Stretch:
+    def _finished(self, t_s: float) -> MotionStep:
         """Return the complete stretch and begin the next."""
         (ex, ey, ez), half = self.frame_rate_rad_s, -0.5 * self._span_s
         self.orientation = normalised(multiply((1.0, half * ex, half * ey, half * ez), self.orientation))
         (vx, vy, vz), (ux, uy, uz), mean = self._velocity, self._angle, 1.0 / self._span_s
         force, rate = (vx * mean, vy * mean, vz * mean), (ux * mean, uy * mean, uz * mean)
-        done = Stretch(t_s, self._span_s, force, rate, self._missing_s, self.orientation)
+        done = MotionStep(t_s, self._span_s, force, rate, self._missing_s, self.orientation)
         self._clear()
         return done

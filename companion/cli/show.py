@@ -14,7 +14,7 @@ from companion.formats import Object
 from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
-    from companion.daemon.process.check import Finding
+    from companion.daemon.process.check import CheckLine
     from companion.links.serial.ports import SerialPort
 
 
@@ -202,7 +202,7 @@ def _held_back(imu: Object, triad: str) -> str:
     return "  held back: not written" if triad in imu.get("held_back", ()) else ""
 
 
-def finding_lines(findings: Sequence[Finding]) -> list[str]:
+def finding_lines(findings: Sequence[CheckLine]) -> list[str]:
     """Show the findings of a check, one line each."""
     return _judged([(finding.verdict, finding.name, finding.words) for finding in findings])
 

@@ -29,7 +29,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion import __version__
 from companion.commands import Calibrate, Cancel, Undo
 from companion.component import requests
-from companion.component.service import CalibrationService, Job, Refusal
+from companion.component.service import AcceptedJob, CalibrationService, Refusal
 from companion.component.statustext import Say, Severity, Weight
 from companion.config.sections import Senders
 from companion.estimation.request import What
@@ -86,7 +86,7 @@ class Permission:
 class _Running(NamedTuple):
     key: requests.Key
     request: Calibrate | Undo
-    job: Job
+    job: AcceptedJob
 
 
 class _Final(NamedTuple):
@@ -175,7 +175,7 @@ class CommandServer:
         self._obey(command.key, request, now_s)
 
     def _permit(
-        self, command: requests.Command, request: requests.Request | requests.Refused
+        self, command: requests.ReceivedCommand, request: requests.Request | requests.Refused
     ) -> requests.Request | requests.Refused:
         """The request, or its refusal when its sender may not ask for that."""
         name = _NAMES.get(type(request))
@@ -184,7 +184,7 @@ class CommandServer:
         reason = self._permission.refuses((command.key.system_id, command.key.component_id), name.lower())
         return requests.Refused(mavlink.MAV_RESULT_DENIED, f"{name} refused: {reason}") if reason else request
 
-    def _is_copy(self, command: requests.Command, now_s: float) -> bool:
+    def _is_copy(self, command: requests.ReceivedCommand, now_s: float) -> bool:
         """Whether the network delivered this very packet before."""
         while self._packets and now_s - self._packets[0][0] > SAME_PACKET_S:
             self._packets.popleft()

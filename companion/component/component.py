@@ -28,7 +28,7 @@ READY: Final = "CMP_READY"
 IDLE_BEATS: Final = 5
 
 
-class Component:
+class MavlinkComponent:
     """The companion on the MAVLink network.
 
     Everything is sent from `run`: when that loop stalls, so does the heartbeat, and the network can see it.

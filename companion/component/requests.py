@@ -21,7 +21,7 @@ class Key(NamedTuple):
     command: int
 
 
-class Command(NamedTuple):
+class ReceivedCommand(NamedTuple):
     """A command as it came, whichever message carried it."""
 
     key: Key
@@ -46,7 +46,7 @@ class Refused(NamedTuple):
 Request = Calibrate | Undo | Cancel | SendVersion
 
 
-def from_message(message: CommandMessage) -> Command:
+def from_message(message: CommandMessage) -> ReceivedCommand:
     """The command in a COMMAND_LONG or COMMAND_INT; the latter's x, y, z are parameters 5, 6, 7."""
     key = Key(message.get_srcSystem(), message.get_srcComponent(), message.command)
     if isinstance(message, mavlink.MAVLink_command_int_message):
@@ -54,10 +54,10 @@ def from_message(message: CommandMessage) -> Command:
     else:
         last, confirmation = (message.param5, message.param6, message.param7), message.confirmation
     first = (message.param1, message.param2, message.param3, message.param4)
-    return Command(key, (*first, *last), confirmation, bytes(message.get_msgbuf()))
+    return ReceivedCommand(key, (*first, *last), confirmation, bytes(message.get_msgbuf()))
 
 
-def judge(command: Command) -> Request | Refused:
+def judge(command: ReceivedCommand) -> Request | Refused:
     """What is asked for. Parameters count exactly: NaN, 0.5 and 3 are refused where 0, 1 and 2 are allowed."""
     match command.key.command:
         case mavlink.MAV_CMD_USER_1:

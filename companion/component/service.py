@@ -33,7 +33,7 @@ class JobResult(msgspec.Struct, frozen=True):
     reason: str = ""
 
 
-class Job(Protocol):
+class AcceptedJob(Protocol):
     """A calibration or an undo under way."""
 
     @property
@@ -48,14 +48,14 @@ class Job(Protocol):
 class CalibrationService(Protocol):
     """Who calibrates. Every method returns at once: it neither waits nor computes for long.
 
-    The service itself says (`Component.say`) that a job starts, what it waits for and how it ended, as jobs are
+    The service itself says (`StatusText.say`) that a job starts, what it waits for and how it ended, as jobs are
     asked for by others than MAVLink too. The component says refusals, which only it can tell.
     """
 
-    def start_calibration(self, what: What, requester: str, *, reboot: bool = False) -> Job | Refusal:
+    def start_calibration(self, what: What, requester: str, *, reboot: bool = False) -> AcceptedJob | Refusal:
         """Start measuring, and restart the autopilot when the result is stored if asked to; or say why not."""
 
-    def start_undo(self, requester: str) -> Job | Refusal:
+    def start_undo(self, requester: str) -> AcceptedJob | Refusal:
         """Start putting the previous values back, or say why not."""
 
     def cancel(self, requester: str) -> bool:

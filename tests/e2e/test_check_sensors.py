@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 from companion.config import parse
-from companion.daemon.process.check import Finding, run_check
+from companion.daemon.process.check import CheckLine, run_check
 from sim.uart import Setting
 from tests.e2e.test_commands import companion
 from tests.support.chatter import Chatter, compass_frame, tilt_frame
@@ -53,11 +53,11 @@ async def bench(
         yield one, other
 
 
-async def found(config: str, seconds: float = 3.0) -> list[Finding]:
+async def found(config: str, seconds: float = 3.0) -> list[CheckLine]:
     return await run_check(parse(config, "test.toml"), seconds)
 
 
-def of(findings: list[Finding], *names: str) -> list[Finding]:
+def of(findings: list[CheckLine], *names: str) -> list[CheckLine]:
     return [finding for finding in findings if finding.name in names and finding.remedy]
 
 

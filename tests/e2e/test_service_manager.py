@@ -21,7 +21,7 @@ HANGING = """
 import asyncio, sys
 from companion.daemon.process import supervisor
 from companion.daemon.process.run import main
-from companion.component.component import Component
+from companion.component.component import MavlinkComponent
 from companion.links.serial import bytestream
 
 supervisor.ESTIMATOR_S = supervisor.COMPONENT_S = 3.0
@@ -91,7 +91,7 @@ def test_a_task_that_hangs_starves_the_watchdog_and_is_named(tmp_path: Path) -> 
     name = "MAVLink component"
 
     async def main() -> None:
-        entry = ("-c", HANGING.replace("{patch}", "Component.run = for_ever"))
+        entry = ("-c", HANGING.replace("{patch}", "MavlinkComponent.run = for_ever"))
         async with service(tmp_path, entry=entry) as (_, daemon, manager):
             await manager.until("STATUS", f"HUNG: {name}")
             starved_s = asyncio.get_running_loop().time()

@@ -229,7 +229,7 @@ def test_with_loss_a_press_never_starts_two_jobs_nor_ends_in_two_ways(block: int
 )
 def test_only_exact_parameters_start_something(command: int, parameters: list[float]) -> None:
     message = command_message(command, *parameters)
-    link, heard = MavlinkLink(system_id=9), list[requests.Command]()
+    link, heard = MavlinkLink(system_id=9), list[requests.ReceivedCommand]()
     link.subscribe(
         mavlink.MAVLink_command_long_message, lambda received, _: heard.append(requests.from_message(received))
     )

@@ -10,9 +10,9 @@ from typing import Literal, NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.component.component import Component
+from companion.component.component import MavlinkComponent
 from companion.component.own_parameters import Parameter
-from companion.component.service import ArmAnswer, Job, JobResult, Refusal
+from companion.component.service import AcceptedJob, ArmAnswer, JobResult, Refusal
 from companion.component.statustext import StatusText
 from companion.component.tunes import Tunes
 from companion.config.sections import EVERYBODY, Senders
@@ -140,11 +140,11 @@ class ScriptedService:
         self.error: Exception | None = None
         self.takes_s: float | None = None
 
-    def start_calibration(self, what: What, requester: str, *, reboot: bool = False) -> Job | Refusal:
+    def start_calibration(self, what: What, requester: str, *, reboot: bool = False) -> AcceptedJob | Refusal:
         self.reboots.append(reboot)
         return self._start(what, requester)
 
-    def start_undo(self, requester: str) -> Job | Refusal:
+    def start_undo(self, requester: str) -> AcceptedJob | Refusal:
         return self._start("undo", requester)
 
     def cancel(self, requester: str) -> bool:
@@ -159,7 +159,7 @@ class ScriptedService:
     def jobs(self) -> list[ScriptedJob]:
         return [started.job for started in self.started]
 
-    def _start(self, what: What | Literal["undo"], requester: str) -> Job | Refusal:
+    def _start(self, what: What | Literal["undo"], requester: str) -> AcceptedJob | Refusal:
         if self.error is not None:
             raise self.error
         if self.refusal is not None:
@@ -187,7 +187,7 @@ class ScriptedGate:
 
 class Bench(NamedTuple):
     link: MavlinkLink
-    component: Component
+    component: MavlinkComponent
     service: ScriptedService
     ground: Ground
     wire: Wire
@@ -214,7 +214,7 @@ async def bench(
         link.join((system_id, 1))
     texts = StatusText(link)
     tunes = Tunes(link, Vehicle(MavlinkLink()), lambda: False, texts.woken)
-    component = Component(link, service, gate, texts, tunes, parameters, Senders(tuple(allow)))
+    component = MavlinkComponent(link, service, gate, texts, tunes, parameters, Senders(tuple(allow)))
     wire = Wire(link, ground, seed=seed, loss=loss, duplicate=duplicate)
     task = asyncio.create_task(component.run())
     try:

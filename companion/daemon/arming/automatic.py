@@ -24,8 +24,7 @@ from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.in_force import InForce
-from companion.daemon.calibrating.manager import CalibrationManager
-from companion.daemon.calibrating.why_not import Rung
+from companion.daemon.calibrating.manager import CalibrationManager, Precondition
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import NO_CALIBRATION, Job
@@ -134,7 +133,8 @@ class Automatic:
 
     def _is_possible(self) -> bool:
         """Disarmed, nothing else runs, and the window would not get better by waiting."""
-        if self._manager.why_not((Rung.BUSY, Rung.ARMED, Rung.UNKNOWN)) is not None:
+        needed = (Precondition.IDLE, Precondition.DISARMED, Precondition.ARM_STATE_KNOWN)
+        if self._manager.blocking_reason(needed) is not None:
             return False
         status = self._core.collector.status(asyncio.get_running_loop().time())
         return status.waiting_for is None and status.enough and self._in_force.measured

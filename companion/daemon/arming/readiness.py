@@ -16,8 +16,7 @@ from companion.component.service import ArmAnswer
 from companion.config.sections import AtArm
 from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.in_force import InForce
-from companion.daemon.calibrating.manager import CalibrationManager
-from companion.daemon.calibrating.why_not import Rung
+from companion.daemon.calibrating.manager import CalibrationManager, Precondition
 from companion.daemon.core import Core
 from companion.daemon.offsets.effect import LOOK_S
 from companion.daemon.offsets.reboot import RebootOwed
@@ -48,11 +47,11 @@ _CHECKED_NEXT: Final[dict[Why, str]] = {
     Why.UNSEEN: _STEPS[State.VERIFYING],
 }
 """Findings that the next still window settles without anybody's help."""
-_CLOSED: Final = (Rung.FAULT, Rung.CONFLICT, Rung.SECOND, Rung.UNKNOWN, Rung.PENDING)
-"""Obstacles that close the gate whatever is in force."""
+_NEEDED: Final = tuple(one for one in Precondition if one not in (Precondition.IDLE, Precondition.DISARMED))
+"""Conditions without which the gate stays closed, whatever calibration is active."""
 _WAITS: Final = {
-    Rung.UNKNOWN: "no heartbeat from the autopilot",
-    Rung.PENDING: f"{_STEPS[State.UNDOING]}: wait",
+    Precondition.ARM_STATE_KNOWN: "no heartbeat from the autopilot",
+    Precondition.RESTORED: f"{_STEPS[State.UNDOING]}: wait",
 }
 LATE_S: Final = 2.0
 """Time until the last second of telemetry is complete and judged."""
@@ -150,12 +149,12 @@ class Readiness:
     @property
     def _writing(self) -> bool:
         """Whether a job that may write runs, or an interrupted write is being restored."""
-        return self._manager.why_not((Rung.BUSY, Rung.PENDING)) is not None
+        return self._manager.blocking_reason((Precondition.IDLE, Precondition.RESTORED)) is not None
 
     def _judge(self, now_s: float) -> ArmAnswer:
-        if (obstacle := self._manager.why_not(_CLOSED)) is not None:
-            wait = _WAITS.get(obstacle.rung)
-            return ArmAnswer("refuse", obstacle.words) if wait is None else ArmAnswer("wait", wait)
+        if (unmet := self._manager.blocking_reason(_NEEDED)) is not None:
+            wait = _WAITS.get(unmet[0])
+            return ArmAnswer("refuse", unmet[1]) if wait is None else ArmAnswer("wait", wait)
         if not self._wanted.push:
             return ArmAnswer("refuse", "writing is off (CMP_PUSH): no gate")
         if self._manager.state.is_writing:

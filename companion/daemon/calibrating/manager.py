@@ -6,21 +6,22 @@
 from __future__ import annotations
 
 import asyncio
+import enum
 import logging
 import math
-from collections.abc import Awaitable, Callable, Collection, Coroutine
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterator
 from typing import Final, Literal
 
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.component.tunes import Tune
 from companion.daemon.calibrating.run import CalibrationParts, CalibrationRun
-from companion.daemon.calibrating.why_not import Obstacle, Rung, obstacle
 from companion.daemon.job import Job, JobCancelledError, Undone
+from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.stands.alignment import ByHand
 from companion.errors import CompanionError, StorageError
 from companion.estimation.machine import Event, State
@@ -38,6 +39,51 @@ STARTS_PER_S: Final = 1.0
 """Requests a second that are served for long: nobody presses faster, a script that starts and cancels does."""
 BURST: Final = 10.0
 _SEVERITIES: Final = {"done": Severity.NOTICE, "failed": Severity.ERROR, "cancelled": Severity.NOTICE}
+
+
+class Precondition(enum.Enum):
+    """Conditions for starting a calibration, in the order in which they are reported."""
+
+    STORAGE = enum.auto()
+    """Old values can be kept; otherwise nothing is written."""
+    ONE_AUTOPILOT = enum.auto()
+    IDLE = enum.auto()
+    DISARMED = enum.auto()
+    ARM_STATE_KNOWN = enum.auto()
+    ONE_COMPANION = enum.auto()
+    """No other companion writes to this autopilot."""
+    RESTORED = enum.auto()
+    """No restore of an interrupted write is pending."""
+
+
+REFUSAL_KINDS: Final[dict[Precondition, Literal["armed", "unknown", "busy"]]] = {
+    Precondition.ONE_AUTOPILOT: "unknown",
+    Precondition.IDLE: "busy",
+    Precondition.DISARMED: "armed",
+    Precondition.ARM_STATE_KNOWN: "unknown",
+    Precondition.RESTORED: "busy",
+}
+"""Kind of the refusal where a condition is not met; "other" for those left out."""
+
+
+def blocked(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[tuple[Precondition, str]]:
+    """Yield every condition that is not met, with the reason in words."""
+    if ledger.fault is not None:
+        yield Precondition.STORAGE, ledger.fault
+    if vehicle.conflict is not None:
+        yield Precondition.ONE_AUTOPILOT, vehicle.conflict
+    if job is not None and job.is_running:
+        yield Precondition.IDLE, f"a {job.kind} is running ({job.words or 'waiting'})"
+    if vehicle.arm_state is ArmState.ARMED:
+        yield Precondition.DISARMED, "armed: disarm first"
+    if vehicle.arm_state is ArmState.UNKNOWN:
+        age_s = vehicle.heartbeat_age_s
+        words = "no autopilot heard yet" if age_s is None else f"no heartbeat for {age_s:.0f} s: power? cable?"
+        yield Precondition.ARM_STATE_KNOWN, words
+    if (why := ledger.why_yield()) is not None:
+        yield Precondition.ONE_COMPANION, why
+    if ledger.pending:
+        yield Precondition.RESTORED, "putting old values back first"
 
 
 class CalibrationManager:
@@ -91,9 +137,10 @@ class CalibrationManager:
         """The latest record, if it was good and has not been undone."""
         return self.last if self.last is not None and self.last.state == "done" and not self.last.undone_at else None
 
-    def why_not(self, rungs: Collection[Rung] = tuple(Rung)) -> Obstacle | None:
-        """Return the first of these obstacles to starting something."""
-        return obstacle(self._vehicle, self._recovery.ledger, self.running, rungs)
+    def blocking_reason(self, among: Collection[Precondition] = tuple(Precondition)) -> tuple[Precondition, str] | None:
+        """Return the first of these conditions that is not met, with the reason in words."""
+        unmet = blocked(self._vehicle, self._recovery.ledger, self.running)
+        return next((found for found in unmet if found[0] in among), None)
 
     @property
     def mav_state(self) -> int:
@@ -181,8 +228,8 @@ class CalibrationManager:
         """Refuse what cannot be started; `but` is a running job that does not count."""
         if self._core.only_listening is not None:
             return Refusal("other", self._core.only_listening)
-        if but is None and (found := self.why_not()) is not None:
-            return found.refusal
+        if but is None and (found := self.blocking_reason()) is not None:
+            return Refusal(REFUSAL_KINDS.get(found[0], "other"), found[1])
         if missing is not None:
             return Refusal(kind, missing)
         now_s = asyncio.get_running_loop().time()
@@ -263,7 +310,7 @@ class CalibrationManager:
         if not (job.automatic and result.outcome == "failed" and self._vehicle.arm_state is ArmState.ARMED):
             # A pilot who has just armed has no use for the end of what nobody asked for.
             self._core.say(max(severity, Severity.WARNING) if job.automatic else severity, words, Weight.RESULT)
-            if self.why_not((Rung.PENDING,)) is not None:
+            if self.blocking_reason((Precondition.RESTORED,)) is not None:
                 self._core.say(Severity.WARNING, "Restore pending: disarm and keep the link up", Weight.RESULT)
         if not job.automatic and result.outcome != "cancelled":
             self._core.tunes.play(Tune.DONE if result.outcome == "done" else Tune.FAILED)

@@ -15,9 +15,8 @@ from companion.component.service import Refusal
 from companion.daemon.biases.into_autopilot import IntoAutopilot
 from companion.daemon.biases.memory import BiasMemory
 from companion.daemon.calibrating.estimator import Estimator, EstimatorInputs
-from companion.daemon.calibrating.manager import CalibrationManager
+from companion.daemon.calibrating.manager import CalibrationManager, Precondition
 from companion.daemon.calibrating.run import CalibrationParts
-from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job, Undone
@@ -179,8 +178,8 @@ class Calibrating(Subsystem):
         if asked.action == "show":
             yield {"kind": "result", **self._shown()}
         elif asked.action == "forget":
-            if (busy := self.manager.why_not((Rung.BUSY,))) is not None:
-                raise CalibrationRefusedError(busy.words)
+            if (busy := self.manager.blocking_reason((Precondition.IDLE,))) is not None:
+                raise CalibrationRefusedError(busy[1])
             was = await self.alignment.forget()
             words = "the configuration's zero and sigma are in force" if was else "there was no alignment to forget"
             yield {"kind": "result", "state": "done", "reason": words}

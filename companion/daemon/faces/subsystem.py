@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, get_args
 import msgspec
 
 from companion.commands import ALL, Monitor, Status
-from companion.component.component import Component
+from companion.component.component import MavlinkComponent
 from companion.component.own_parameters import AT_ARM, RESULTS, Parameter
 from companion.component.service import JobResult
 from companion.config.sections import AtArm, Senders
@@ -60,7 +60,7 @@ class Faces(Subsystem):
         child: StartChild | None = None,
     ) -> None:
         self._core, self._devices = core, devices
-        self.component = Component(
+        self.component = MavlinkComponent(
             core.link,
             calibrating.manager,
             arming.readiness,
@@ -147,7 +147,7 @@ class Faces(Subsystem):
 
     def status(self) -> Object:  # noqa: D102 - as in the base class
         return {
-            "headline": msgspec.to_builtins(self._headlines.now()),
+            "headline": self._headlines.now(),
             "vehicle": self._vehicle(),
             **self._mqtt_status(),
             "page": None if self.page is None else _NO_PAGE | self.page.status(),

@@ -101,7 +101,7 @@ def _middle(value: float, step: float) -> float:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Stand:
+class StandingAttitude:
     """Attitude of the standing aircraft at the end of a window."""
 
     t_s: float
@@ -112,9 +112,9 @@ class Stand:
     local: LocalEarth
 
 
-def stand_of(
+def standing_attitude(
     window: Window, where: Whereabouts, gradienter: GradienterModel | None, compass: CompassModel | None
-) -> Stand:
+) -> StandingAttitude:
     """Estimate the stand; blocking. Raise CalibrationRefusedError where the readings contradict each other."""
     local = local_earth(where)
     truth = truth_of(window, gradienter if window.tilt is not None else None, compass, local, [])
@@ -122,7 +122,7 @@ def stand_of(
     covariance = turn.T @ truth.attitude_covariance_rad2 @ turn
     if truth.heading_rad is None:
         covariance[2, 2] += HEADING_UNKNOWN_RAD**2
-    return Stand(window.end_s, turn, covariance, truth.heading_rad is not None, local)
+    return StandingAttitude(window.end_s, turn, covariance, truth.heading_rad is not None, local)
 
 
 def turn_between(ours: Quaternion, theirs: Quaternion) -> Triple:
@@ -263,22 +263,24 @@ class Carrier:
             self.estimator.settle(settings)
             self._wanted = True
 
-    def resume(self, settings: AttitudeSettings, stand: Stand) -> None:
+    def resume(self, settings: AttitudeSettings, stand: StandingAttitude) -> None:
         """Begin in flight."""
         self.estimator, self._local = AttitudeEstimator(settings), stand.local
         self._align(stand)
 
-    async def _stand(self, now_s: float) -> Stand | None:
+    async def _stand(self, now_s: float) -> StandingAttitude | None:
         try:
             window = await self._core.window(since_s=now_s - STOOD_S)
             where = models.whereabouts(self._config, self._vehicle)
-            stand: Stand = await self._offload(stand_of, window, where, self._alignment.model(), self._compass)
+            stand: StandingAttitude = await self._offload(
+                standing_attitude, window, where, self._alignment.model(), self._compass
+            )
         except CalibrationRefusedError as error:
             self.waiting_for = f"waiting for an alignment: {error}"
             return None
         return stand
 
-    def _disagrees(self, stand: Stand) -> bool:
+    def _disagrees(self, stand: StandingAttitude) -> bool:
         now = self.now()
         if now is None:
             return True
@@ -291,7 +293,7 @@ class Carrier:
             return True
         return stand.heading_known and abs(down) > max(HEADING_FLOOR_RAD, DISAGREES_SIGMAS * heading_sigma)
 
-    def _align(self, stand: Stand) -> None:
+    def _align(self, stand: StandingAttitude) -> None:
         assert self.estimator is not None
         before = self.now()
         since = [sample for read in self._recent for sample in read if sample.t_s > stand.t_s]

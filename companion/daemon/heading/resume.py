@@ -20,7 +20,7 @@ from companion.configured import models
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.heading.carrier import Carrier, Stand, settings_of
+from companion.daemon.heading.carrier import Carrier, StandingAttitude, settings_of
 from companion.daemon.heading.health import HEADING_UNKNOWN, THEIR_TILT_DEG, Difference, disagreements
 from companion.estimation.records.record import ImuRecord, Record
 from companion.estimation.solution.site import LocalEarth, Whereabouts, local_earth
@@ -100,7 +100,7 @@ class Resume:
         if settings is None:
             return "no calibration is in force"
         covariance = np.diag([(THEIR_TILT_DEG * DEG) ** 2] * 2 + [HEADING_UNKNOWN_RAD**2])
-        stand = Stand(theirs[0], to_matrix(theirs[1]).T, covariance, heading_known=False, local=local)
+        stand = StandingAttitude(theirs[0], to_matrix(theirs[1]).T, covariance, heading_known=False, local=local)
         self._carrier.resume(settings, stand)
         return None
 

@@ -37,7 +37,7 @@ _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CheckLine:
     """One line of the check: whose, whether all is well, in words, and what to type (empty: nothing)."""
 
     name: str
@@ -64,23 +64,23 @@ def _ports(config: Config) -> dict[str, str]:
     return ports
 
 
-def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> list[Finding]:
+def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> list[CheckLine]:
     """List the system's faults of the configured ports."""
     ports = _ports(config)
     among = list_ports(root)
     fast = {sensor.name for sensor in serial_devices(config) if sensor.kind == "imu"}
     found = [
-        Finding(name, fault.good, str(fault), fault.remedy)
+        CheckLine(name, fault.good, str(fault), fault.remedy)
         for name, port in ports.items()
         for fault in port_faults(port, is_fast=name in fast, ours=ours, among=among, root=root)
     ]
     for first, second, device in same_ports(ports, root):
         words = f"{first} and {second} are one and the same port, {device}: give each its own"
-        found.append(Finding(second, good=False, words=words))
+        found.append(CheckLine(second, good=False, words=words))
     return found
 
 
-async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -> list[Finding]:
+async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -> list[CheckLine]:
     """Explain from its bytes why a sensor gives no good samples; `may_listen`: no daemon has the ports."""
     devices = {device["name"]: device for device in status["devices"]}
     sick = [sensor for sensor in serial_devices(config) if devices.get(sensor.name, {}).get("trouble") in _TO_BE_TRIED]
@@ -96,10 +96,10 @@ async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -
     ]
 
 
-def _explain(sensor: SerialDevice, device: Object, heard: Heard | str | None, *, may_listen: bool) -> list[Finding]:
-    def bad(words: str, remedy: str = "") -> list[Finding]:
+def _explain(sensor: SerialDevice, device: Object, heard: Heard | str | None, *, may_listen: bool) -> list[CheckLine]:
+    def bad(words: str, remedy: str = "") -> list[CheckLine]:
         said = f"{words}: {remedy}" if remedy else words
-        return [Finding(sensor.name, good=False, words=said, remedy=remedy)]
+        return [CheckLine(sensor.name, good=False, words=said, remedy=remedy)]
 
     if isinstance(heard, str):
         return []  # its device's own line has said so
@@ -146,9 +146,9 @@ def _other_protocol(sensor: SerialDevice, protocol: str) -> tuple[str, str]:
 
 async def run_check(
     config: Config, seconds: float, say: Callable[[str], object] = lambda _words: None
-) -> list[Finding]:
+) -> list[CheckLine]:
     """Check everything the configuration names; without a daemon listen to the ports for some seconds."""
-    findings = [Finding("configuration", good=True, words="understood")]
+    findings = [CheckLine("configuration", good=True, words="understood")]
     status: Object | None = None
     ours = {os.getpid()}
     try:
@@ -162,29 +162,29 @@ async def run_check(
     if status is not None:
         ours |= process_behind(config.control.path)
         fault = status["fault"]
-        findings.append(Finding("daemon", good=fault is None, words=fault or f"running, {status['state']}"))
+        findings.append(CheckLine("daemon", good=fault is None, words=fault or f"running, {status['state']}"))
     else:
-        findings.append(Finding("daemon", good=True, words="not running: ports opened by this check"))
+        findings.append(CheckLine("daemon", good=True, words="not running: ports opened by this check"))
         findings.append(_storage(config.storage.path))
         say(f"checking: {seconds:g} s, half a minute more for a sensor not understood")
         # The status that a daemon would have after some seconds; nothing is written anywhere.
         service = Service(config, only_listening=ONLY_CHECKING)
         status = await service.listen(lambda listened_s: listened_s < seconds)
-    findings += [Finding("configuration", good=False, words=words) for words in cannot_work(config)]
-    findings += [Finding("warning", good=True, words=words) for words in doubtful(config)]
+    findings += [CheckLine("configuration", good=False, words=words) for words in cannot_work(config)]
+    findings += [CheckLine("warning", good=True, words=words) for words in doubtful(config)]
     vehicle = status["vehicle"]
     findings.append(_autopilot(config, vehicle))
     if (signing := vehicle["signing"]) is not None:
-        findings.append(Finding("signing", good=signing["good"], words=signing["summary"]))
-    findings += [Finding(device["name"], device["good"], device["summary"]) for device in status["devices"]]
+        findings.append(CheckLine("signing", good=signing["good"], words=signing["summary"]))
+    findings += [CheckLine(device["name"], device["good"], device["summary"]) for device in status["devices"]]
     findings += system_findings(config, list(ours))
     findings += await sensor_findings(config, status, may_listen=not is_running)
-    findings += [Finding("warning", good=True, words=words) for words in status["warnings"]]
+    findings += [CheckLine("warning", good=True, words=words) for words in status["warnings"]]
     ground = status["ground_stations"]
-    findings.append(Finding("ground stations", good=ground["good"], words=ground["summary"]))
+    findings.append(CheckLine("ground stations", good=ground["good"], words=ground["summary"]))
     for name in ("mqtt", "fleet", *(["page"] if is_running else [])):
         if (face := status[name]) is not None:
-            findings.append(Finding(name, good=face["good"], words=face["summary"]))
+            findings.append(CheckLine(name, good=face["good"], words=face["summary"]))
     findings += [_profile(profile) for profile in status["profiles"]]
     if config.push.attitude != "off" and is_running:
         findings.append(await _heading(config))
@@ -195,7 +195,7 @@ async def run_check(
         ("compass", "gyro sigma widened by the Earth's rate"),
     ):
         if getattr(config, kind) is None:
-            findings.append(Finding(kind, good=True, words=f"not configured: {without}"))
+            findings.append(CheckLine(kind, good=True, words=f"not configured: {without}"))
     return findings
 
 
@@ -213,48 +213,48 @@ async def answering_imus(config: Config, imus: Sequence[Imu]) -> dict[str, str |
     return {device["name"]: parts[device["name"]] for device in status["devices"] if device["good"]}
 
 
-def _autopilot(config: Config, vehicle: Object) -> Finding:
+def _autopilot(config: Config, vehicle: Object) -> CheckLine:
     if (age_s := vehicle["heartbeat_age_s"]) is not None:
         if age_s < LOST_S:
-            return Finding("autopilot", good=True, words=vehicle["summary"])
+            return CheckLine("autopilot", good=True, words=vehicle["summary"])
         remedy = "power? cable?"
-        return Finding("autopilot", good=False, words=f"no heartbeat for {age_s:.0f} s: {remedy}", remedy=remedy)
+        return CheckLine("autopilot", good=False, words=f"no heartbeat for {age_s:.0f} s: {remedy}", remedy=remedy)
     baud = baud_of(config.mavlink.url)
     needs = "switched on, and sent there (MAVProxy --out, mavlink-router)?"
     if baud is not None:
         needs = f"{port_needs(None, baud)}; TX to RX"
     remedy = f"{needs}; companion setup looks for it elsewhere"
-    return Finding("autopilot", good=False, words=f"{vehicle['summary']}: {remedy}", remedy=remedy)
+    return CheckLine("autopilot", good=False, words=f"{vehicle['summary']}: {remedy}", remedy=remedy)
 
 
-def _profile(profile: Object) -> Finding:
+def _profile(profile: Object) -> CheckLine:
     name, words = f"profile {profile['imu']}", profile["summary"]
     if profile["name"] not in (None, UNKNOWN):
-        return Finding(name, good=True, words=words)
+        return CheckLine(name, good=True, words=words)
     remedy = f'set profile in [[imu]] "{profile["imu"]}", or companion setup again'
-    return Finding(name, good=True, words=f"{words}: {remedy}", remedy=remedy)
+    return CheckLine(name, good=True, words=f"{words}: {remedy}", remedy=remedy)
 
 
-def _gate(config: Config, setup: Object) -> Finding:
+def _gate(config: Config, setup: Object) -> CheckLine:
     if not config.push.parameters:
-        return Finding("arming", good=False, words="at_arm = gate with push.parameters = false never opens")
+        return CheckLine("arming", good=False, words="at_arm = gate with push.parameters = false never opens")
     if not setup["known"]:
-        return Finding("arming", good=False, words="not known whether the autopilot asks before it arms: try again")
+        return CheckLine("arming", good=False, words="not known whether the autopilot asks before it arms: try again")
     problem = setup["problem"]
-    return Finding("arming", good=problem is None, words=problem or "the autopilot asks before it arms")
+    return CheckLine("arming", good=problem is None, words=problem or "the autopilot asks before it arms")
 
 
-async def _heading(config: Config) -> Finding:
+async def _heading(config: Config) -> CheckLine:
     replies = [reply async for reply in ask(config.control.path, {"command": "autopilot-setup"})]
     reply = replies[-1]
     words = f"{reply['reason']}; {reply['net']['words']}" if reply.get("net") else reply["reason"]
-    return Finding("heading", good=reply.get("state") == "applied", words=words)
+    return CheckLine("heading", good=reply.get("state") == "applied", words=words)
 
 
-def _storage(directory: Path) -> Finding:
+def _storage(directory: Path) -> CheckLine:
     place = directory
     while not place.exists() and place != place.parent:
         place = place.parent
     good = place.is_dir() and os.access(place, os.W_OK)
     words = f"{directory}" + ("" if good else f": cannot be written by this user ({place})")
-    return Finding("storage", good, words)
+    return CheckLine("storage", good, words)

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.component.commands import encode_version
-from companion.component.component import Component
+from companion.component.component import MavlinkComponent
 from companion.component.statustext import Severity, StatusText
 from companion.component.tunes import Tunes
 from companion.config.sections import EVERYBODY, Senders
@@ -129,7 +129,7 @@ async def test_the_first_heartbeat_on_a_late_link_comes_at_once() -> None:
     texts = StatusText(link)
     senders = Senders(EVERYBODY)
     tunes = Tunes(link, Vehicle(link), lambda: False, texts.woken)
-    component = Component(link, ScriptedService(), ScriptedGate(), texts, tunes, (), senders)
+    component = MavlinkComponent(link, ScriptedService(), ScriptedGate(), texts, tunes, (), senders)
     texts.say(Severity.INFO, "waited for the link")
     async with asyncio.TaskGroup() as group:
         task = group.create_task(component.run())

@@ -1,4 +1,4 @@
-"""The ladder of why nothing can be started now: what is told first, and what each asker minds."""
+"""Preconditions of a calibration: the order in which they are reported, and the kinds of refusal."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.daemon.calibrating.why_not import Rung, obstacle
+from companion.daemon.calibrating.manager import REFUSAL_KINDS, Precondition, blocked
 
 
-def found(rungs: Any = tuple(Rung), **what: Any) -> tuple[Rung, str] | None:
+def found(**what: Any) -> tuple[Precondition, str] | None:
     vehicle: Any = SimpleNamespace(
         conflict=what.get("conflict"),
         arm_state=what.get("arm_state", ArmState.DISARMED),
@@ -21,7 +21,7 @@ def found(rungs: Any = tuple(Rung), **what: Any) -> tuple[Rung, str] | None:
         fault=what.get("fault"), pending=what.get("pending", False), why_yield=lambda: what.get("second")
     )
     job: Any = what.get("job")
-    return obstacle(vehicle, ledger, job, rungs)
+    return next(blocked(vehicle, ledger, job), None)
 
 
 RUNNING = SimpleNamespace(kind="calibration", words="hold still 3 s more", is_running=True)
@@ -38,23 +38,30 @@ EVERYTHING: dict[str, Any] = {
 
 
 @pytest.mark.parametrize(
-    ("without", "rung", "words", "kind"),
+    ("without", "unmet", "words", "kind"),
     [
-        ((), Rung.FAULT, "the disk is full", "other"),
-        (("fault",), Rung.CONFLICT, "two autopilots", "unknown"),
-        (("fault", "conflict"), Rung.BUSY, "a calibration is running (hold still 3 s more)", "busy"),
-        (("fault", "conflict", "job"), Rung.UNKNOWN, "no heartbeat for 7 s: power? cable?", "unknown"),
-        (("fault", "conflict", "job", "arm_state"), Rung.SECOND, "second companion", "other"),
-        (("fault", "conflict", "job", "arm_state", "second"), Rung.PENDING, "putting old values back first", "busy"),
+        ((), Precondition.STORAGE, "the disk is full", "other"),
+        (("fault",), Precondition.ONE_AUTOPILOT, "two autopilots", "unknown"),
+        (("fault", "conflict"), Precondition.IDLE, "a calibration is running (hold still 3 s more)", "busy"),
+        (("fault", "conflict", "job"), Precondition.ARM_STATE_KNOWN, "no heartbeat for 7 s: power? cable?", "unknown"),
+        (("fault", "conflict", "job", "arm_state"), Precondition.ONE_COMPANION, "second companion", "other"),
+        (
+            ("fault", "conflict", "job", "arm_state", "second"),
+            Precondition.RESTORED,
+            "putting old values back first",
+            "busy",
+        ),
     ],
 )
-def test_what_nobody_can_wait_for_is_told_first(without: tuple[str, ...], rung: Rung, words: str, kind: str) -> None:
+def test_the_first_unmet_condition_is_reported(
+    without: tuple[str, ...], unmet: Precondition, words: str, kind: str
+) -> None:
     first: Any = found(**{key: value for key, value in EVERYTHING.items() if key not in without})
-    assert (first.rung, first.words) == (rung, words)
-    assert (first.refusal.kind, first.refusal.reason) == (kind, words)
+    assert first == (unmet, words)
+    assert REFUSAL_KINDS.get(unmet, "other") == kind
 
 
-def test_an_armed_aircraft_stands_in_the_way_and_a_job_that_has_ended_does_not() -> None:
+def test_an_armed_aircraft_blocks_and_a_finished_job_does_not() -> None:
     assert found(job=ENDED) is None
-    first: Any = found(job=ENDED, arm_state=ArmState.ARMED, pending=True)
-    assert (first.rung, first.refusal.kind) == (Rung.ARMED, "armed")
+    assert found(job=ENDED, arm_state=ArmState.ARMED, pending=True) == (Precondition.DISARMED, "armed: disarm first")
+    assert REFUSAL_KINDS[Precondition.DISARMED] == "armed"

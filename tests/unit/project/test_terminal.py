@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.cli import main, monitor
-from companion.daemon.process.check import Finding
+from companion.daemon.process.check import CheckLine
 from companion.errors import LinkError
 from companion.ground.heard import Heard, Target
 from companion.links.serial.ports import Holder, SerialPort
@@ -202,9 +202,9 @@ def test_what_is_on_the_ports(
 def test_what_the_check_finds(
     config: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, form: list[str]
 ) -> None:
-    async def run_check(*_: object) -> list[Finding]:
+    async def run_check(*_: object) -> list[CheckLine]:
         logging.getLogger("companion.links").warning("the autopilot says %s", EVIL)
-        return [Finding(EVIL, good=False, words=EVIL), Finding("fine", good=True, words=f"firmware {EVIL}")]
+        return [CheckLine(EVIL, good=False, words=EVIL), CheckLine("fine", good=True, words=f"firmware {EVIL}")]
 
     monkeypatch.setattr("companion.daemon.process.check.run_check", run_check)
     monkeypatch.setattr(logging.getLogger(), "handlers", [])  # as outside of a test
