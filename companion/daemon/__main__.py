@@ -7,6 +7,6 @@ from companion.daemon.process import footprint
 if __name__ == "__main__":
     # Before asyncio and numpy are loaded.
     footprint.prepare()
-    from companion.daemon.process.run import main
+    from companion.daemon.process.supervisor import main
 
     sys.exit(main(*sys.argv[1:]))

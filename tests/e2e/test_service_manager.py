@@ -20,7 +20,7 @@ WATCHDOG_S = 2.0
 HANGING = """
 import asyncio, sys
 from companion.daemon.process import supervisor
-from companion.daemon.process.run import main
+from companion.daemon.process.supervisor import main
 from companion.component.component import MavlinkComponent
 from companion.links.serial import bytestream
 
@@ -111,7 +111,7 @@ def test_where_the_whole_process_stands_still_is_in_the_log(tmp_path: Path) -> N
     """The loop itself is blocked, nobody is fed, and the manager's SIGABRT finds out where."""
 
     async def main() -> None:
-        patch = "import time\ndef block(*_):\n    time.sleep(1000)\nComponent._step = block"
+        patch = "import time\ndef block(*_):\n    time.sleep(1000)\nMavlinkComponent._step = block"
         async with service(tmp_path, entry=("-c", HANGING.replace("{patch}", patch))) as (_, daemon, manager):
             await asyncio.sleep(WATCHDOG_S)
             assert len(manager.times("WATCHDOG")) <= 1

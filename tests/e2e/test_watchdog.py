@@ -6,9 +6,8 @@ import asyncio
 from pathlib import Path
 
 from companion.component.service import Refusal
-from companion.daemon.process.supervisor import Supervisor
+from companion.daemon.process.supervisor import watched_tasks
 from companion.estimation.request import What
-from companion.links.system.service_manager import ServiceManager
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -18,13 +17,14 @@ def test_nobody_is_accused_who_works(tmp_path: Path) -> None:
         rig = Rig(tmp_path, firmware="px4", min_still_s=4.0, max_s=8.0, loss=0.2, at_arm="gate", imu_rate_hz=10.0)
         oldest: dict[str, float] = {}
         async with rig.running() as running:
-            beats = Supervisor(running.service, ServiceManager(None)).beats
+            watched = watched_tasks(running.service)
 
             async def look() -> None:
                 while True:
                     await asyncio.sleep(1.0)
-                    for name, age_s in beats.update(1.0).items():
-                        oldest[name] = max(age_s, oldest.get(name, 0.0))
+                    for each in watched:
+                        if each.overdue(1.0):
+                            oldest[each.name] = max(each.age_s, oldest.get(each.name, 0.0))
 
             looking = asyncio.create_task(look())
             await asyncio.sleep(20.0)

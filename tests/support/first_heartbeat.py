@@ -25,7 +25,7 @@ def first(self, message):
 
 MavlinkLink.send = lambda self, *what: (before.update(sys.modules), first(self, *what))
 before = set()
-from companion.daemon.process.run import main
+from companion.daemon.process.supervisor import main
 sys.exit(main(*sys.argv[1:]))
 """
 

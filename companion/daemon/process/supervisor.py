@@ -1,142 +1,209 @@
-"""Watches the long-lived tasks and feeds the service manager's watchdog while all go on.
+"""The daemon as a process: its signals, and the watchdog of its long-lived tasks.
 
-A task that does not is logged with the place where it waits, before the manager ends the process.
+SIGTERM and SIGINT end it in order, with old values restored and exit code 0. SIGHUP is ignored: a companion run by hand
+goes on when its terminal closes. The service manager's watchdog is fed while all tasks go on; one that does not is
+logged with the place where it waits, before the manager ends the process.
 """
 
 from __future__ import annotations
 
 import asyncio
+import dataclasses
+import faulthandler
 import logging
+import signal
+import sys
 import types
-from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple, Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
 
+from companion import config
 from companion.autopilot.telemetry import imu_stream
+from companion.config.sections import Config
+from companion.daemon.process import footprint
 from companion.daemon.process.service import Service
+from companion.errors import CompanionError, ConfigError
 from companion.links.serial import bytestream
+from companion.links.system import logs
 from companion.links.system.service_manager import ServiceManager
+from companion.printable import printable
+from companion.storage.profiles import saved_profile
 
 logger = logging.getLogger(__name__)
 
+SETTLED_AFTER_S: Final = 3.0
+"""Time after which lazily imported modules (recording, the child processes) are loaded."""
 PERIOD_S: Final = 1.0
 FEEDS_PER_LIMIT: Final = 4.0
-"""A manager that gives less time than the usual is fed so often within it: one feed may be late."""
+"""Feeds of the watchdog within its limit, where that is short: one of them may be late."""
 MARGIN_S: Final = 2.0
 COMPONENT_S: Final = 5.0
 ESTIMATOR_S: Final = 10.0
-
 AUTOMATIC_S: Final = 180.0
-"""Deadline of what may have to read a dozen parameters over a bad radio link, each with all its retries."""
+"""Deadline of a task that may read a dozen parameters over a bad radio link, each with all its retries."""
 
 
-class Turning(Protocol):
-    """Counts its turns."""
-
-    turns: int
-
-
-class Watched(NamedTuple):
-    """A task that must go on."""
+@dataclasses.dataclass(slots=True)
+class WatchedTask:
+    """A task that must go on, by its counted turns: an idle event loop proves nothing of a task that waits for ever."""
 
     name: str
     task: str
     within_s: float
-    who: Turning
+    who: Any
+    """Object that counts its `turns`."""
+    seen: int = 0
+    age_s: float = 0.0
+    """Age of the latest turn in calls of `overdue`: while the whole event loop stands still, no task ages."""
+
+    def overdue(self, passed_s: float) -> bool:
+        """Let time pass; returns whether the task has not gone on for too long."""
+        before, self.seen = self.seen, self.who.turns
+        self.age_s = self.age_s + passed_s if self.seen == before else 0.0
+        return self.age_s > self.within_s
 
 
-class Beats:
-    """Tasks that go on, by their counted turns: a loop that turns proves nothing of a task that waits for ever.
-
-    The age of a turn counts in calls of `update`: while the whole loop stands still nobody ages.
-    """
-
-    def __init__(self, watched: Sequence[Watched]) -> None:
-        self._watched = watched
-        self._last = {each.name: (each.who.turns, 0.0) for each in watched}
-
-    def update(self, since_last_look_s: float) -> dict[str, float]:
-        """Let time pass; the tasks that are overdue, and for how many seconds they have not gone on."""
-        for each in self._watched:
-            turns, (before, age_s) = each.who.turns, self._last[each.name]
-            self._last[each.name] = (turns, age_s + since_last_look_s if turns == before else 0.0)
-        return {each.name: age_s for each in self._watched if (age_s := self._last[each.name][1]) > each.within_s}
-
-
-def watched_of(service: Service) -> list[Watched]:
-    """The tasks of a service that must go on."""
-    component, link, attitude = service.faces.component, service.core.link, service.heading.attitude
-    readiness, automatic = service.arming.readiness, service.arming.automatic
+def watched_tasks(service: Service) -> list[WatchedTask]:
+    """List the tasks of a service that must go on."""
     link_s = bytestream.BEAT_WITHIN_S + MARGIN_S
+    attitude = service.heading.attitude
     return [
-        Watched("MAVLink component", "component", COMPONENT_S, component),
-        Watched("MAVLink connection", "mavlink", link_s, link),
-        Watched("estimator", "readiness", ESTIMATOR_S, readiness),
-        Watched("automatic calibration", "automatic", AUTOMATIC_S, automatic),
-        *([] if attitude is None else [Watched("attitude", "attitude", ESTIMATOR_S, attitude)]),
+        WatchedTask("MAVLink component", "component", COMPONENT_S, service.faces.component),
+        WatchedTask("MAVLink connection", "mavlink", link_s, service.core.link),
+        WatchedTask("estimator", "readiness", ESTIMATOR_S, service.arming.readiness),
+        WatchedTask("automatic calibration", "automatic", AUTOMATIC_S, service.arming.automatic),
+        *([] if attitude is None else [WatchedTask("attitude", "attitude", ESTIMATOR_S, attitude)]),
         *(
-            Watched(f"imu {name}", f"{name} telemetry", imu_stream.BEAT_WITHIN_S, imu.stream)
+            WatchedTask(f"imu {name}", f"{name} telemetry", imu_stream.BEAT_WITHIN_S, imu.stream)
             for name, imu in service.devices.imus.items()
         ),
-        *(Watched(f"sensor {sensor.name}", sensor.name, link_s, sensor.link) for sensor in service.devices.sensors),
+        *(WatchedTask(f"sensor {sensor.name}", sensor.name, link_s, sensor.link) for sensor in service.devices.sensors),
     ]
 
 
+def main(path: str, *verbose: str) -> int:
+    """Run the daemon with a configuration file until SIGTERM or SIGINT; return the command line's exit code."""
+    # The watchdog's SIGABRT may be the only witness of a process that hangs: let it print where.
+    faulthandler.enable()
+    logs.set_up("debug" if verbose else "info")
+    try:
+        wanted = config.load(Path(path), partial(saved_profile, forgiving=True))
+        if not verbose:
+            logging.getLogger().setLevel(wanted.log.level.upper())
+        asyncio.run(run(wanted))
+    except ConfigError as error:
+        sys.stderr.write(printable(f"{error}") + "\n")
+        return 2
+    except CompanionError as error:
+        sys.stderr.write(printable(f"companion: {error}") + "\n")
+        return 1
+    return 0
+
+
+async def run(wanted: Config) -> None:
+    """Run the daemon until SIGTERM or SIGINT; raise CompanionError where it cannot start."""
+    manager = ServiceManager.from_environment()
+    try:
+        await Supervisor(Service(wanted), manager).run()
+    except BaseExceptionGroup as group:
+        if (known := group.subgroup(CompanionError)) is None:
+            raise
+        raise CompanionError("; ".join(map(str, _leaves(known)))) from group
+    finally:
+        manager.close()
+
+
+def _leaves(group: BaseExceptionGroup[Any]) -> Iterator[BaseException]:
+    for error in group.exceptions:
+        if isinstance(error, BaseExceptionGroup):
+            yield from _leaves(error)
+        else:
+            yield error
+
+
 class Supervisor:
-    """Looks after a service's tasks; `run` it beside `Service.run`."""
+    """Runs a service until a signal or a fault, and feeds the watchdog meanwhile."""
 
     def __init__(self, service: Service, manager: ServiceManager) -> None:
         self._service, self._manager = service, manager
-        watched = watched_of(service)
-        self.beats = Beats(watched)
-        self._tasks = {each.name: each.task for each in watched}
-        self.stopping = False
+        self.watched = watched_tasks(service)
+        self._work: asyncio.Task[None] | None = None
+        self._stopping = False
         self._missed: set[str] = set()
         self._status_failed = False
 
-    def stop(self) -> None:
-        """The tasks are being ended from now on."""
-        self.stopping = True
-        self._manager.stopping()
-
     async def run(self) -> None:
-        """Feed the watchdog and keep the status until cancelled."""
+        """Run until a signal or a fault."""
+        loop = asyncio.get_running_loop()
+        self._work = work = loop.create_task(self._service.run(self._manager.ready), name="service")
+        watching = loop.create_task(self._watch(), name="supervisor")
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self._stop, signal.Signals(number).name)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        settling = loop.call_later(SETTLED_AFTER_S, footprint.settle)
+        try:
+            await asyncio.wait([work, watching], return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            settling.cancel()
+            if not work.done() and not self._stopping:
+                work.cancel()
+            await asyncio.wait([work])
+            watching.cancel()
+            await asyncio.wait([watching])
+        for task in (work, watching):
+            if not task.cancelled():
+                task.result()
+        logger.info("stopped")
+
+    def _stop(self, why: str) -> None:
+        if self._work is None or self._stopping:
+            # A second signal must not cut off what the first one is putting in order.
+            logger.warning("%s: stopping already; what was begun is put in order first", why)
+            return
+        logger.info("%s: stopping", why)
+        self._stopping = True
+        self._manager.stopping()
+        self._work.cancel()
+
+    async def _watch(self) -> None:
+        """Feed the watchdog and report the status until cancelled."""
         loop = asyncio.get_running_loop()
         limit_s = self._manager.watchdog_s
         period_s = PERIOD_S if limit_s is None else min(PERIOD_S, limit_s / FEEDS_PER_LIMIT)
         before_s = loop.time()
         while True:
-            # While the loop stood still nobody could report.
-            overdue = self.beats.update(min(loop.time() - before_s, 2.0 * period_s))
+            # While the loop stood still no task could go on.
+            passed_s = min(loop.time() - before_s, 2.0 * period_s)
             before_s = loop.time()
-            if self.stopping:
-                overdue = {}
-            self._tell(overdue)
+            overdue = [each for each in self.watched if each.overdue(passed_s) and not self._stopping]
+            self._report(overdue)
             if not overdue:
                 self._manager.alive()
             self._manager.status(self._words(overdue))
             await asyncio.sleep(period_s)
 
-    def _tell(self, overdue: dict[str, float]) -> None:
-        for name, age_s in overdue.items():
-            if name not in self._missed:
-                self._missed.add(name)
-                fed = "; the watchdog is not fed until it does" if self._manager.watchdog_s is not None else ""
-                where = _where(self._tasks[name])
-                logger.error("watchdog: %s has not gone on for %.0f s (%s)%s", name, age_s, where, fed)
-        for name in self._missed - overdue.keys():
-            self._missed.discard(name)
-            if not self.stopping:
-                logger.warning("watchdog: %s goes on again", name)
+    def _report(self, overdue: Sequence[WatchedTask]) -> None:
+        fed = "; the watchdog is not fed until it does" if self._manager.watchdog_s is not None else ""
+        for each in overdue:
+            if each.name not in self._missed:
+                where = _where(each.task)
+                logger.error("watchdog: %s has not gone on for %.0f s (%s)%s", each.name, each.age_s, where, fed)
+        missed = {each.name for each in overdue}
+        for name in () if self._stopping else self._missed - missed:
+            logger.warning("watchdog: %s goes on again", name)
+        self._missed = missed
 
-    def _words(self, overdue: dict[str, float]) -> str:
+    def _words(self, overdue: Sequence[WatchedTask]) -> str:
         if not self._manager.listens:
             return ""
-        notes = ["stopping"] if self.stopping else []
-        notes += [f"HUNG: {name}" for name in overdue]
+        notes = ["stopping"] if self._stopping else []
+        notes += [f"HUNG: {each.name}" for each in overdue]
         try:
             return "; ".join([*notes, status_line(self._service.status())])
         except Exception:
-            # What merely describes the work must not end it.
+            # A fault in the description must not end the work.
             if not self._status_failed:
                 logger.exception("the status cannot be worked out")
             self._status_failed = True

@@ -1,26 +1,17 @@
-"""Beats: a task is missed when it has been silent too long, and not when the whole loop stood still."""
+"""Watched tasks: one is overdue when it has been silent too long, and not when the whole loop stood still."""
 
 from __future__ import annotations
 
-from companion.daemon.process.supervisor import Beats, Watched
+from types import SimpleNamespace
+
+from companion.daemon.process.supervisor import WatchedTask
 
 
-class Task:
-    turns = 0
-
-
-def test_who_is_silent_is_missed_and_who_comes_back_is_not() -> None:
-    imu, compass = Task(), Task()
-    beats = Beats([Watched("imu", "imu", 3.0, imu), Watched("compass", "compass", 5.0, compass)])
-    for _ in range(4):
-        compass.turns += 1
-        overdue = beats.update(1.0)
-    assert overdue == {"imu": 4.0}
-    imu.turns += 1
-    assert beats.update(1.0) == {}
-
-
-def test_a_task_that_never_began_is_missed_too() -> None:
-    beats = Beats([Watched("imu", "imu", 1.0, Task())])
-    assert beats.update(1.0) == {}
-    assert beats.update(0.5) == {"imu": 1.5}
+def test_a_silent_task_is_overdue_until_it_goes_on() -> None:
+    who = SimpleNamespace(turns=0)
+    imu = WatchedTask("imu", "imu", 3.0, who)
+    assert [imu.overdue(1.0) for _ in range(4)] == [False, False, False, True]
+    assert imu.age_s == 4.0
+    who.turns += 1
+    assert not imu.overdue(1.0)
+    assert imu.age_s == 0.0
