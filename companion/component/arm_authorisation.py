@@ -1,14 +1,13 @@
-"""What an autopilot learns before it arms. PX4 asks, and gets its answer in the same pass of the loop.
+"""Arm authorisation: PX4 asks before it arms, and is answered in the same pass of the loop.
 
-What PX4 sends and takes was seen on the running firmware (autopilots 9.2) and differs from the message definitions:
-the validity goes into result_param2, the reason into progress, and an answer that is not addressed to the vehicle's
-own system id is ignored. An attempt brings two requests, and retransmissions of both; each gets an answer, but people
-are told once.
+PX4's protocol was observed on the firmware (autopilots 9.2) and differs from the message definitions: the validity goes
+into result_param2, the reason into progress, and an answer that is not addressed to the vehicle's own system id is
+ignored. An attempt brings two requests, and retransmissions of both; each is answered, but people are told once.
 
-ArduPilot's arming script (companion/lua/companion_arming.lua) gets the verdict twice a second, from the working loop
-and from nowhere else: it closes the gate when nothing has come for 3 s, so that a loop that hangs closes it too.
-Carried by TUNNEL: unlike PARAM_SET it wears no flash, unlike NAMED_VALUE_FLOAT it is addressed to the autopilot alone,
-so that no radio link carries it on to the ground, and it has room for the reason as text.
+ArduPilot's arming script (companion/lua/companion_arming.lua) gets the verdict twice a second, from the component's
+loop only: the script closes the gate after 3 s without it, so that a loop that hangs closes it too. TUNNEL carries it:
+unlike PARAM_SET it wears no flash, unlike NAMED_VALUE_FLOAT it is addressed to the autopilot alone, and it has room for
+the reason as text.
 Payload: "CMPA", version 1, verdict (0 wait, 1 accept, 2 refuse, 3 nothing is gated any more), then the reason, ASCII.
 """
 
@@ -26,14 +25,14 @@ from companion.links.mavlink.link import MavlinkLink
 from companion.lua import to_script
 
 VALID_S: Final = 10
-"""How long the autopilot may arm on an ACCEPTED without asking again; 0 would expire at once."""
+"""Validity of an ACCEPTED; 0 would expire at once."""
 TOLD_BY_US: Final = 1
-"""MAV_ARM_AUTH_DENIED_REASON_NONE: the autopilot stays silent, since our STATUSTEXT says it better."""
+"""MAV_ARM_AUTH_DENIED_REASON_NONE: the autopilot stays silent; our STATUSTEXT has the reason."""
 REPEAT_S: Final = 0.05
-"""Every answer is given once more so much later. PX4 drops one that carries the very time of its question, as a quick
-one does in SITL's lockstep, and then asks no more; and links lose packets. A second answer changes nothing for it."""
+"""Delay of a second, equal answer: links lose packets, and PX4 drops an answer with the time of its question, as
+happens in SITL's lockstep."""
 ATTEMPT_S: Final = 1.5
-"""A request so long after the first of an attempt, and no retransmission, begins a new one."""
+"""Time after which a request that is no retransmission begins a new attempt."""
 _RESULTS: Final = {
     "accept": mavlink.MAV_RESULT_ACCEPTED,
     "wait": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
@@ -42,7 +41,7 @@ _RESULTS: Final = {
 
 
 class ArmAuthoriser:
-    """Answers MAV_CMD_ARM_AUTHORIZATION_REQUEST of our autopilot; of anybody else it is ignored."""
+    """Answers MAV_CMD_ARM_AUTHORIZATION_REQUEST of our autopilot, and of nobody else."""
 
     def __init__(self, link: MavlinkLink, gate: ArmGate, say: Say) -> None:
         self._link, self._gate, self._say = link, gate, say
@@ -75,7 +74,7 @@ class ArmAuthoriser:
             self._say(Severity.WARNING, words, Weight.REFUSAL)
 
     def _begins_attempt(self, confirmation: int, now_s: float) -> bool:
-        """Whether people have not been told of this attempt yet."""
+        """Return whether a request begins an attempt, of which people have not been told yet."""
         if now_s - self._attempt_s <= ATTEMPT_S or (confirmation > 0 and now_s - self._attempt_s <= 3 * ATTEMPT_S):
             return False
         self._attempt_s = now_s
@@ -85,20 +84,20 @@ class ArmAuthoriser:
 PERIOD_S: Final = 0.5
 MARK: Final = b"CMPA\x01"
 REASON_BYTES: Final = 41 - len("Companion: ")
-"""What ArduPilot shows of an auxiliary authorisation's reason (autopilots 5.3), less what the script puts before it."""
+"""Length of the reason that ArduPilot shows (autopilots 5.3), less the prefix of the script."""
 VERDICTS: Final = {"wait": 0, "accept": 1, "refuse": 2}
 NOT_GATING: Final = 3
 
 
 class ArmingScript:
-    """Speaks to the script while the gate asks for it; `step` must be called at the times it asks for."""
+    """Sends the verdict to ArduPilot's script; `step` must be called at the times it returns."""
 
     def __init__(self, link: MavlinkLink, gate: ArmGate) -> None:
         self._link, self._gate = link, gate
         self._next_s = -math.inf
 
     def step(self, now_s: float) -> float:
-        """Send what is due; returns when something is due next (infinity: nobody asks; heartbeats bring us back)."""
+        """Send what is due; return when to send next (infinity: not needed until the next heartbeat)."""
         autopilot = self._link.autopilot
         if autopilot is None or not self._link.connected or not self._gate.asks_script:
             return math.inf

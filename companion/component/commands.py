@@ -59,26 +59,25 @@ _WORDS = {
     What.ACCELEROMETERS: "accelerometers",
 }
 _NAMES: dict[type, str] = {Calibrate: "Calibration", Undo: "Undo", Cancel: "Cancel"}
-"""What not everybody may ask for."""
+"""Requests that need permission."""
 
 
 class Permission:
-    """Judges and counts; says in the log once for each sender what it was refused."""
+    """Checks senders against `mavlink.allow`, counts refusals, and logs the first one of each sender."""
 
     def __init__(self, senders: Senders) -> None:
         self.senders = senders
         self.refused: Counter[tuple[int, int]] = Counter()
-        """By sender: the first 32."""
+        """Refusals of the first 32 senders."""
 
     def refuses(self, sender: tuple[int, int], what: str) -> str:
-        """Why a sender (system, component) may not ask for this, in a few words; empty when it may."""
+        """Return why a sender (system, component) may not request this; empty when it may."""
         if sender in self.senders:
             return ""
         system, component = sender
         if sender not in self.refused and len(self.refused) < MAX_REMEMBERED:
             logger.warning("mavlink: %s by %d/%d is refused: mavlink.allow does not name it", what, system, component)
-            self.refused[sender] = 0
-        if sender in self.refused:
+        if sender in self.refused or len(self.refused) < MAX_REMEMBERED:
             self.refused[sender] += 1
         return f"{system}/{component} not in mavlink.allow"
 
@@ -97,10 +96,9 @@ class _Final(NamedTuple):
 
 
 class CommandServer:
-    """Takes commands addressed to us and answers them; `step` must be called at the times it asks for.
+    """Handles commands addressed to this component; `step` must be called at the times it returns.
 
-    Commands to other components, and to component 0 (everyone), are none of our business: an ACK of ours would be
-    taken for the autopilot's.
+    Commands to other components and to component 0 (everyone) are ignored: our ACK would be taken for the autopilot's.
     """
 
     def __init__(
@@ -123,7 +121,7 @@ class CommandServer:
         )
 
     def step(self, now_s: float) -> float:
-        """Report on the running job; returns when to report next (infinity: nothing to report)."""
+        """Acknowledge the running job; return when to do so next (infinity: nothing runs)."""
         retry_s = self._send_unsent(now_s)
         running = self._running
         if running is None:
@@ -137,16 +135,17 @@ class CommandServer:
         return min(retry_s, self._next_ack_s)
 
     def close(self, now_s: float) -> None:
-        """Take no more commands; who still waits is told, so that no requester waits for ever."""
+        """Handle no more commands, and answer the one that runs: no requester must wait for ever."""
         for unsubscribe in self._subscriptions:
             unsubscribe()
-        if self._running is not None:
-            if self._running.job.finished.done():
-                self._finish(self._running, now_s)
-            else:
-                self._say(Severity.ERROR, "Failed: the companion stops", Weight.RESULT)
-                self._finally(self._running.key, mavlink.MAV_RESULT_FAILED, now_s)
-                self._running = None
+        if self._running is None:
+            return
+        if self._running.job.finished.done():
+            self._finish(self._running, now_s)
+        else:
+            self._say(Severity.ERROR, "Failed: the companion stops", Weight.RESULT)
+            self._finally(self._running.key, mavlink.MAV_RESULT_FAILED, now_s)
+            self._running = None
 
     def _on_message(self, message: requests.CommandMessage, now_s: float) -> None:
         if (message.target_system, message.target_component) != (self._link.system_id, self._link.component_id):
@@ -177,7 +176,7 @@ class CommandServer:
     def _permit(
         self, command: requests.ReceivedCommand, request: requests.Request | requests.Refused
     ) -> requests.Request | requests.Refused:
-        """The request, or its refusal when its sender may not ask for that."""
+        """Return the request, or its refusal when the sender has no permission."""
         name = _NAMES.get(type(request))
         if name is None:
             return request
@@ -185,7 +184,7 @@ class CommandServer:
         return requests.Refused(mavlink.MAV_RESULT_DENIED, f"{name} refused: {reason}") if reason else request
 
     def _is_copy(self, command: requests.ReceivedCommand, now_s: float) -> bool:
-        """Whether the network delivered this very packet before."""
+        """Return whether the network delivered this packet before."""
         while self._packets and now_s - self._packets[0][0] > SAME_PACKET_S:
             self._packets.popleft()
         if any(packet == command.packet for _, packet in self._packets):
@@ -194,18 +193,23 @@ class CommandServer:
         return False
 
     def _obey(self, key: requests.Key, request: requests.Request | requests.Refused, now_s: float) -> None:
-        match request:
-            case Calibrate() | Undo():
-                self._start(key, request, now_s)
-            case Cancel():
-                self._cancel(key, now_s)
-            case requests.SendVersion():
-                self._acknowledge(key, mavlink.MAV_RESULT_ACCEPTED)
-                self._link.send(autopilot_version())
-            case requests.Refused(result, reason):
-                # Ground stations try out by themselves what a component supports: that is worth no warning.
-                unsupported = result == mavlink.MAV_RESULT_UNSUPPORTED
-                self._refuse(key, result, reason, now_s, Severity.INFO if unsupported else Severity.WARNING)
+        try:
+            match request:
+                case Calibrate() | Undo():
+                    self._start(key, request, now_s)
+                case Cancel():
+                    self._cancel(key, now_s)
+                case requests.SendVersion():
+                    self._acknowledge(key, mavlink.MAV_RESULT_ACCEPTED)
+                    self._link.send(autopilot_version())
+                case requests.Refused(result, reason):
+                    # Ground stations try out by themselves what a component supports: that is worth no warning.
+                    unsupported = result == mavlink.MAV_RESULT_UNSUPPORTED
+                    self._refuse(key, result, reason, now_s, Severity.INFO if unsupported else Severity.WARNING)
+        except Exception:
+            name = _NAMES.get(type(request), "Request")
+            logger.exception("%s failed", name)
+            self._refuse(key, mavlink.MAV_RESULT_FAILED, f"{name} failed: internal error, see the log", now_s)
 
     def _start(self, key: requests.Key, request: Calibrate | Undo, now_s: float) -> None:
         name = _NAMES[type(request)]
@@ -217,15 +221,10 @@ class CommandServer:
             self._refuse(key, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, reason, now_s)
             return
         requester = f"mavlink {key.system_id}/{key.component_id}"
-        try:
-            if isinstance(request, Undo):
-                job = self._service.start_undo(requester)
-            else:
-                job = self._service.start_calibration(request.biases, requester, reboot=request.reboot)
-        except Exception:
-            logger.exception("starting %s failed", name.lower())
-            self._refuse(key, mavlink.MAV_RESULT_FAILED, f"{name} failed: internal error, see the log", now_s)
-            return
+        if isinstance(request, Undo):
+            job = self._service.start_undo(requester)
+        else:
+            job = self._service.start_calibration(request.biases, requester, reboot=request.reboot)
         if isinstance(job, Refusal):
             later, never = mavlink.MAV_RESULT_TEMPORARILY_REJECTED, mavlink.MAV_RESULT_DENIED
             self._refuse(key, later if job.kind == "busy" else never, f"{name} refused: {job.reason}", now_s)
@@ -238,18 +237,13 @@ class CommandServer:
         self._wake()
 
     def _cancel(self, key: requests.Key, now_s: float) -> None:
-        try:
-            was_running = self._service.cancel(f"mavlink {key.system_id}/{key.component_id}")
-        except Exception:
-            logger.exception("cancelling failed")
-            self._refuse(key, mavlink.MAV_RESULT_FAILED, "Cancel failed: internal error, see the log", now_s)
-            return
+        was_running = self._service.cancel(f"mavlink {key.system_id}/{key.component_id}")
         if not was_running:
             self._say(Severity.INFO, "Nothing to cancel", Weight.NEWS)
         self._finally(key, mavlink.MAV_RESULT_ACCEPTED, now_s, 0 if was_running else NOTHING_RAN)
 
     def _finish(self, running: _Running, now_s: float) -> None:
-        """Acknowledge the end. Its words are the service's: it knows the ends of jobs that others asked for too."""
+        """Acknowledge the end; the service itself says how a job ended."""
         self._running = None
         self._finally(running.key, _RESULTS[running.job.finished.result().outcome], now_s)
 
@@ -269,7 +263,7 @@ class CommandServer:
             self._wake()
 
     def _send_unsent(self, now_s: float) -> float:
-        """Try again what a transport that was gone or full did not take, for as long as somebody may still wait."""
+        """Send final ACKs again that the transport did not take, while their requesters may still wait."""
         retry_s = math.inf
         for key, final in self._finals.items():
             if not final.sent and now_s - final.at_s <= REMEMBER_FINAL_S:

@@ -1,10 +1,9 @@
-"""Component 191 as a whole: one working loop that beats the heart, answers commands, speaks and serves parameters."""
+"""MAVLink component 191: one loop sends heartbeats, ACKs, texts, tunes and parameters."""
 
 from __future__ import annotations
 
 import asyncio
 import math
-import struct
 from collections.abc import Sequence
 from typing import Final
 
@@ -22,17 +21,14 @@ from companion.links.mavlink.link import MavlinkLink
 HEARTBEAT_PERIOD_S = 1.0
 _RETRY_S = 0.05
 PROGRESS: Final = "CMP_PROG"
-"""Percent of the calibration under way; 100 where none is."""
+"""Progress of the calibration under way in percent; 100 where none is."""
 READY: Final = "CMP_READY"
 """1: it may arm; 0: not now."""
 IDLE_BEATS: Final = 5
 
 
 class MavlinkComponent:
-    """The companion on the MAVLink network.
-
-    Everything is sent from `run`: when that loop stalls, so does the heartbeat, and the network can see it.
-    """
+    """The companion on the MAVLink network; a loop that stalls stops its heartbeat too."""
 
     def __init__(
         self,
@@ -51,17 +47,16 @@ class MavlinkComponent:
         self._next_heartbeat_s = -math.inf
         self._beats = 0
         self.turns = 0
-        """Turns of the working loop, so that it is seen to go on."""
+        """Turns of the loop, for the watchdog."""
         self.permission = Permission(senders)
         self.parameters = OwnParameters(link, parameters, texts.say, self._woken.set, self.permission)
         self._commands = CommandServer(link, service, texts.say, self._woken.set, self.permission)
         self._script = ArmingScript(link, gate)
         self._authoriser = ArmAuthoriser(link, gate, texts.say)
-        refuse_files(link)
         link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
 
     async def run(self) -> None:
-        """Be the component until cancelled."""
+        """Send until cancelled."""
         loop = asyncio.get_running_loop()
         try:
             while True:
@@ -78,11 +73,13 @@ class MavlinkComponent:
             self._texts.step(loop.time())
 
     def _step(self, now_s: float) -> float:
-        self._follow_vehicle()
+        if self._link.system_id != self._known_as:
+            # Be heard under the vehicle's system id as soon as the link belongs to it.
+            self._known_as, self._next_heartbeat_s = self._link.system_id, -math.inf
         if now_s >= self._next_heartbeat_s:
             if self._link.connected:
                 self._link.send(heartbeat(self._service.mav_state))
-                self._tell_values(now_s)
+                self._send_values(now_s)
                 # The rhythm is kept, but what a stall has missed is not made up for.
                 next_s = self._next_heartbeat_s + HEARTBEAT_PERIOD_S
                 self._next_heartbeat_s = next_s if next_s > now_s else now_s + HEARTBEAT_PERIOD_S
@@ -99,8 +96,8 @@ class MavlinkComponent:
             self._tunes.step(now_s),
         )
 
-    def _tell_values(self, now_s: float) -> None:
-        """Progress and readiness, with some 12 bytes a second: at every beat while it calibrates, else every fifth.
+    def _send_values(self, now_s: float) -> None:
+        """Send progress and readiness, at every heartbeat of a calibration, else at every fifth.
 
         Mission Planner shows them in its Quick tab (`propagateNamedFloats`), QGroundControl in its MAVLink inspector.
         """
@@ -112,51 +109,13 @@ class MavlinkComponent:
             boot_ms = int(now_s * 1e3) % 2**32
             self._link.send(mavlink.MAVLink_named_value_float_message(boot_ms, name.encode("ascii"), value))
 
-    def _follow_vehicle(self) -> None:
-        """Be heard under the vehicle's system id as soon as the link belongs to it."""
-        if self._link.system_id != self._known_as:
-            self._known_as = self._link.system_id
-            self._next_heartbeat_s = -math.inf
-
     def _on_heartbeat(self, _message: mavlink.MAVLink_heartbeat_message, _t_s: float) -> None:
         if self._link.system_id != self._known_as:
             self._woken.set()
 
 
 def heartbeat(mav_state: int) -> mavlink.MAVLink_heartbeat_message:
-    """Our heartbeat: an onboard controller that is no autopilot."""
+    """Encode our heartbeat: an onboard controller that is no autopilot."""
     return mavlink.MAVLink_heartbeat_message(
         mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mav_state, 3
     )
-
-
-_HEADER: Final = struct.Struct("<HBBBBBBI")
-_PAYLOAD_BYTES: Final = 251
-_NAK: Final = 129
-_ANSWERS: Final = 128
-"""Opcodes from here on are answers."""
-_OPENS: Final = (4, 6, 11)
-"""To read, to create, to write."""
-_UNKNOWN_COMMAND, _FILE_NOT_FOUND = 7, 10
-
-
-def refuse_files(link: MavlinkLink) -> None:
-    """Answer requests for files that are addressed to us: MAVProxy would wait through two time-outs for our parameters.
-
-    MAVFTP (FILE_TRANSFER_PROTOCOL, 110), MAVLink developer guide: a request's payload is sequence, session, opcode,
-    size, opcode answered to, burst, a byte of padding, offset, data; an answer's sequence is the next one.
-    """
-
-    def answer(message: mavlink.MAVLink_file_transfer_protocol_message, _t_s: float) -> None:
-        sequence, session, opcode, *_ = _HEADER.unpack_from(bytes(message.payload))
-        if (message.target_system, message.target_component) != (link.system_id, link.component_id):
-            return
-        if opcode >= _ANSWERS:
-            return
-        why = _FILE_NOT_FOUND if opcode in _OPENS else _UNKNOWN_COMMAND
-        header = _HEADER.pack((sequence + 1) % 65536, session, _NAK, 1, opcode, 0, 0, 0)
-        payload = list((header + bytes([why])).ljust(_PAYLOAD_BYTES, b"\0"))
-        sender = message.get_srcSystem(), message.get_srcComponent()
-        link.send(mavlink.MAVLink_file_transfer_protocol_message(0, *sender, payload))
-
-    link.subscribe(mavlink.MAVLink_file_transfer_protocol_message, answer)

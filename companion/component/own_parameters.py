@@ -1,12 +1,11 @@
-"""Our own parameters: a small server of the MAVLink parameter protocol.
+"""Parameters of component 191: a small server of the MAVLink parameter protocol.
 
-All are REAL32, where the two encodings that autopilots use (the number itself, or its integer's bytes) are the same.
-All names begin with CMP_: ArduPilot executes a PARAM_SET for component 191 itself when it cannot forward it, so that
-a name of ours must never be one of an autopilot's.
+All are REAL32, for which the two encodings of autopilots (number, or bytes of an integer) are the same. All names begin
+with CMP_: ArduPilot executes a PARAM_SET for component 191 itself when it cannot forward it, so that none may be one of
+an autopilot's.
 
-Whoever sends PARAM_SET gets a PARAM_VALUE at once, with the old value where the new one is not allowed. Everything
-else is answered from one pending set (each parameter at most once), at a pace that a slow telemetry link bears: a
-flood of requests costs neither memory nor bandwidth, and still gets every parameter.
+PARAM_SET is answered at once, with the old value where the new one is not allowed. Other requests are answered from one
+pending set, at a pace for slow telemetry links: a flood of requests costs neither memory nor bandwidth.
 """
 
 from __future__ import annotations
@@ -32,26 +31,25 @@ VALUES_PER_S = 40.0
 AT_ARM: Final[tuple[AtArm, ...]] = ("off", "warn", "gate")
 """CMP_AT_ARM."""
 RESULTS: Final = ("none", "done", "failed", "cancelled")
-"""CMP_STATE: how the last calibration since the start has ended."""
+"""CMP_STATE: end of the last calibration since the start."""
 _REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Parameter:
-    """One of ours; like every value its limits are rounded to float32."""
+    """One parameter; its limits are rounded to float32, as every value is."""
 
     name: str
     """CMP_ and at most 12 more of A-Z, 0-9 and _ (16 in all, the protocol's limit)."""
     value: float
-    """At the start."""
+    """Value at the start."""
     minimum: float
     maximum: float
     on_set: Callable[[float], None] | None = None
-    """Told of a value that a ground station sets, before it is in force; raises a CompanionError to refuse it. None:
-    ground stations may not set it (results)."""
+    """Called before a value takes effect; raises a CompanionError to refuse it. None: read only."""
 
     def allows(self, value: float) -> bool:
-        """Whether a float32 is a number within the limits (NaN compares false)."""
+        """Return whether a float32 is a number within the limits (NaN compares false)."""
         return float32(self.minimum) <= value <= float32(self.maximum)
 
 
@@ -70,7 +68,6 @@ class OwnParameters:
         self._by_name = {parameter.name: parameter for parameter in parameters}
         self._values = {parameter.name: float32(parameter.value) for parameter in parameters}
         self._names = list(self._by_name)
-        """By index."""
         self._pending: dict[str, None] = {}
         self._next_s = -math.inf
         link.subscribe(mavlink.MAVLink_param_request_list_message, self._on_request_list)
@@ -78,16 +75,11 @@ class OwnParameters:
         link.subscribe(mavlink.MAVLink_param_set_message, self._on_set)
 
     def get(self, name: str) -> float:
-        """The value in force; KeyError when there is no such parameter."""
+        """Return the value of a parameter."""
         return self._values[name]
 
     def set(self, name: str, value: float) -> None:
-        """Change a value from inside and tell everyone, if it is another; `on_set` is not called.
-
-        Raises:
-            KeyError: there is no such parameter.
-            ValueError: not a number, or out of the limits.
-        """
+        """Set a value from inside and send a new one to everyone; raise ValueError where it is out of the limits."""
         parameter = self._by_name[name]
         value = float32(value)
         if not parameter.allows(value):
@@ -99,7 +91,7 @@ class OwnParameters:
     def step(self, now_s: float) -> float:
         """Send the values that are due; return when the next one is (infinity: none waits)."""
         if not self._pending or not self._link.connected:
-            # Without a transport nobody is there who asked; what changed meanwhile is told once one is back.
+            # Changes are sent once there is a transport again.
             return math.inf
         if now_s >= self._next_s:
             name = next(iter(self._pending))
@@ -158,7 +150,7 @@ class OwnParameters:
             self._request(parameter.name)
 
     def _apply(self, parameter: Parameter, message: mavlink.MAVLink_param_set_message) -> str:
-        """Take over the new value; returns why not, or nothing."""
+        """Set the value; return the reason of a refusal, or an empty text."""
         value = float32(message.param_value)
         if parameter.on_set is None:
             return "it is read only"

@@ -1,4 +1,4 @@
-"""What a command asks of us: COMMAND_LONG and COMMAND_INT alike, judged before anything is done."""
+"""Requests in COMMAND_LONG and COMMAND_INT: parse and check them before anything is done."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CommandMessage = mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_
 
 
 class Key(NamedTuple):
-    """What makes two commands the same request: a COMMAND_ACK names no more than its requester and the command."""
+    """Identity of a request: a COMMAND_ACK names its requester and the command, nothing else."""
 
     system_id: int
     component_id: int
@@ -22,22 +22,22 @@ class Key(NamedTuple):
 
 
 class ReceivedCommand(NamedTuple):
-    """A command as it came, whichever message carried it."""
+    """A command, from either message."""
 
     key: Key
     parameters: tuple[float, float, float, float, float, float, float]
     confirmation: int
-    """How often this was sent before; COMMAND_INT cannot say and always counts as new."""
+    """Number of earlier transmissions; COMMAND_INT has no such field and always counts as new."""
     packet: bytes
-    """The whole packet with its sequence number: only a copy that the network made is equal."""
+    """The packet with its sequence number: only a copy made by the network is equal."""
 
 
 class SendVersion(NamedTuple):
-    """Send AUTOPILOT_VERSION."""
+    """A request for AUTOPILOT_VERSION."""
 
 
 class Refused(NamedTuple):
-    """Not to be done: the MAV_RESULT and the reason."""
+    """A refusal: the MAV_RESULT and the reason."""
 
     result: int
     reason: str
@@ -47,7 +47,7 @@ Request = Calibrate | Undo | Cancel | SendVersion
 
 
 def from_message(message: CommandMessage) -> ReceivedCommand:
-    """The command in a COMMAND_LONG or COMMAND_INT; the latter's x, y, z are parameters 5, 6, 7."""
+    """Parse a COMMAND_LONG or COMMAND_INT; x, y and z of the latter are parameters 5, 6 and 7."""
     key = Key(message.get_srcSystem(), message.get_srcComponent(), message.command)
     if isinstance(message, mavlink.MAVLink_command_int_message):
         last, confirmation = (float(message.x), float(message.y), message.z), 0
@@ -58,7 +58,7 @@ def from_message(message: CommandMessage) -> ReceivedCommand:
 
 
 def judge(command: ReceivedCommand) -> Request | Refused:
-    """What is asked for. Parameters count exactly: NaN, 0.5 and 3 are refused where 0, 1 and 2 are allowed."""
+    """Return the request of a command. NaN, 0.5 and 3 are refused where 0, 1 and 2 are allowed."""
     match command.key.command:
         case mavlink.MAV_CMD_USER_1:
             return _calibrate(command.parameters[0], command.parameters[1])
@@ -87,10 +87,9 @@ def _calibrate(which: float, reboot: float) -> Calibrate | Refused:
 
 
 def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refused:
-    """MAV_CMD_PREFLIGHT_CALIBRATION: param1 gyros, param5 accelerometers; we have nothing else to calibrate.
+    """Parse MAV_CMD_PREFLIGHT_CALIBRATION: param1 gyros, param5 accelerometers.
 
-    Mission Planner's button also ticks param3, ground pressure, by habit: beside gyros or accelerometers that is let
-    pass, for nobody who presses it means our barometer.
+    Mission Planner's button always sets param3, ground pressure, too: it is ignored beside gyros or accelerometers.
     """
     for number, value in enumerate(parameters, start=1):
         if value != 0 and not (number in (1, 3, 5) and value == 1):

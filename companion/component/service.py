@@ -1,7 +1,6 @@
-"""What the component needs from the rest of the house: someone who calibrates, and who knows whether it may arm.
+"""Interfaces that the MAVLink component needs from the daemon: the calibration service and the arm gate.
 
-Whether the aircraft is armed, and everything else that decides if a calibration may start, is the service's to
-know; the component carries requests in and verdicts out.
+The service decides whether a calibration may start; the component carries requests in and verdicts out.
 """
 
 from __future__ import annotations
@@ -14,20 +13,20 @@ import msgspec
 from companion.estimation.request import What
 
 MEASURED_PERCENT: Final = 70.0
-"""Progress of a calibration: below this it measures, from here on it works out and writes."""
+"""Progress at which measuring ends, and estimating and writing begin."""
 WRITTEN_PERCENT: Final = 80.0
-"""From here on it watches the telemetry take the new values, and the autopilot settle."""
+"""Progress from which on the telemetry is watched for the new values, and the autopilot settles."""
 
 
 class Refusal(msgspec.Struct, frozen=True):
-    """Why a request was not taken; `reason` is one line for people, without a leading "refused"."""
+    """Refusal of a request; `reason` is one line for people, without a leading "refused"."""
 
     kind: Literal["armed", "unknown", "busy", "nothing_to_undo", "other"]
     reason: str
 
 
 class JobResult(msgspec.Struct, frozen=True):
-    """How a job ended; `reason` is one line for people (the figures when done)."""
+    """End of a job; `reason` is one line for people (the figures when done)."""
 
     outcome: Literal["done", "failed", "cancelled"]
     reason: str = ""
@@ -42,28 +41,28 @@ class AcceptedJob(Protocol):
 
     @property
     def finished(self) -> asyncio.Future[JobResult]:
-        """Done once, with the result."""
+        """The result, set once."""
 
 
 class CalibrationService(Protocol):
-    """Who calibrates. Every method returns at once: it neither waits nor computes for long.
+    """The calibration service. Every method returns at once.
 
-    The service itself says (`StatusText.say`) that a job starts, what it waits for and how it ended, as jobs are
-    asked for by others than MAVLink too. The component says refusals, which only it can tell.
+    The service itself says (`StatusText.say`) that a job starts, what it waits for and how it ended, as jobs are also
+    requested by others than MAVLink. The component says refusals.
     """
 
     def start_calibration(self, what: What, requester: str, *, reboot: bool = False) -> AcceptedJob | Refusal:
-        """Start measuring, and restart the autopilot when the result is stored if asked to; or say why not."""
+        """Start a calibration, with a restart of the autopilot after it if requested; or refuse."""
 
     def start_undo(self, requester: str) -> AcceptedJob | Refusal:
-        """Start putting the previous values back, or say why not."""
+        """Start restoring the previous values, or refuse."""
 
     def cancel(self, requester: str) -> bool:
-        """Cancel what runs, whoever asked for it; whether something was running."""
+        """Cancel the running job, whoever requested it; return whether there was one."""
 
     @property
     def progress_percent(self) -> int:
-        """Of the calibration or undo under way; 100 where none is."""
+        """Progress of the calibration or undo under way; 100 where none is."""
 
     @property
     def mav_state(self) -> int:
@@ -71,37 +70,37 @@ class CalibrationService(Protocol):
 
 
 class ArmAnswer(msgspec.Struct, frozen=True):
-    """Whether the aircraft may arm at this moment.
+    """The arm gate's answer at this moment.
 
-    "accept": yes. "wait": not now, but soon, by itself or by holding still. "refuse": not without somebody doing
-    something. `words` say why and what to do, in at most 41 characters where possible (what ArduPilot shows).
+    "accept": it may arm. "wait": soon, by itself or by holding still. "refuse": not until somebody acts. `words` give
+    reason and remedy, in at most 41 characters where possible (the length that ArduPilot shows).
     """
 
     verdict: Literal["accept", "wait", "refuse"]
     words: str
     hold_still_s: int | None = None
-    """How long to hold still, where nothing else is needed."""
+    """Time to hold still, where nothing else is needed."""
     meanwhile: str = ""
-    """What goes on while it is held still."""
+    """Activity while it is held still."""
 
     @classmethod
     def hold_still(cls, seconds: float, meanwhile: str = "") -> ArmAnswer:
-        """That it may arm when it has stood still for so long."""
+        """Answer that it may arm when it has stood still for so long."""
         whole_s = max(1, round(seconds))
         words = f"hold still {whole_s} s"
         return cls("wait", f"{words}: {meanwhile}" if meanwhile else words, whole_s, meanwhile)
 
 
 class ArmGate(Protocol):
-    """Who knows whether the aircraft may arm. Both return at once, whatever else goes on."""
+    """The arm gate; it answers at once."""
 
     @property
     def at_arm(self) -> Literal["gate", "warn", "off"]:
-        """What is to happen at arming."""
+        """Action at arming."""
 
     @property
     def asks_script(self) -> bool:
-        """Whether a script on the autopilot may be waiting for the answer, as on ArduPilot."""
+        """Return whether a script on the autopilot (ArduPilot) waits for the answer."""
 
     def answer(self) -> ArmAnswer:
-        """The answer, ready made."""
+        """Return the prepared answer."""

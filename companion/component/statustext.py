@@ -1,24 +1,22 @@
-"""STATUSTEXT: words for people, in few and short lines.
+"""STATUSTEXT: short lines for people.
 
-Three limits protect a slow telemetry link: the same text is not repeated within seconds unless a result came between
-(who cancels and asks again wants to hear that it has started), a token bucket bounds the lines per second, and the
-queue is bounded. What is dropped from a full queue is the least weighty text, and among those the oldest, so that a
-stream of news or of refused commands can never push out a result.
+Three limits protect a slow telemetry link: a text is not repeated within seconds unless a result came in between, a
+token bucket bounds the lines per second, and the queue is bounded. A full queue drops the oldest of the lightest texts,
+so that news and refused commands never displace a result.
 
-Texts must not begin with "[cal]": QGroundControl takes such lines from any component of the vehicle as the progress
-of PX4's own calibration.
+Texts must not begin with "[cal]": QGroundControl takes such lines as the progress of PX4's own calibration.
 """
 
 from __future__ import annotations
 
 import asyncio
 import enum
+import itertools
 import math
 import re
 import unicodedata
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -26,20 +24,20 @@ from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.connection import Budget
 
 LINE_BYTES = 50
-"""What one STATUSTEXT holds."""
+"""Length of one STATUSTEXT."""
 MOST_LINES = 5
-"""Longer texts lose their tail."""
+"""Lines of one text; longer texts are cut."""
 QUEUE_TEXTS = 16
 LINES_PER_S = 2.0
 BURST_LINES = 8.0
 REPEAT_S = 3.0
 GOES_ON = "... "
-"""How a line begins that goes on with the one before it."""
+"""Beginning of a line that continues the one before."""
 SPOKEN = 4
-"""How many of what was to be heard are kept for those who look on."""
+"""Number of spoken texts kept for page and monitor."""
 STALE_S = 20.0
-"""What could not be said for so long (no link) is no news any more; results are kept."""
-_REMEMBERED_TEXTS = 32
+"""Age at which a text that could not be sent (no link) is dropped, unless it is a result."""
+RECENT_TEXTS = 32
 _FULL_RETRY_S = 0.1
 _FIGURE = re.compile(r"[-+]?\d+(\.\d| ?(%|mg\b|deg\b|K\b))")
 
@@ -58,19 +56,19 @@ class Severity(enum.IntEnum):
     """
 
     CRITICAL = 2
-    """Somebody must act this second."""
+    """Act this second."""
     ERROR = 3
-    """What was asked for has failed."""
+    """A request has failed."""
     WARNING = 4
-    """Something is wrong, and who flies has to know it."""
+    """Something is wrong, and the pilot has to know it."""
     NOTICE = 5
-    """For who is at the aircraft and looks at no screen: what to do now, and that it is done. Short, to be heard."""
+    """What to do now, and that it is done, for an operator who looks at no screen: short, spoken."""
     INFO = 6
     """To be read."""
 
 
 class Weight(enum.IntEnum):
-    """What a text is worth when the queue is full or the link is slow; heavier texts go first."""
+    """Priority of a text when the queue is full or the link is slow; heavier texts go first."""
 
     NEWS = 0
     REFUSAL = 1
@@ -78,22 +76,21 @@ class Weight(enum.IntEnum):
 
 
 Say = Callable[[Severity, str, Weight], object]
-"""Tells people at the ground stations."""
+"""Sends a text to the ground stations."""
 
 
 def to_ascii(text: str) -> str:
-    """One line of plain ASCII: ground stations disagree on everything else."""
+    """Convert to one line of ASCII: ground stations disagree on everything else."""
     text = unicodedata.normalize("NFKD", " ".join(text.translate(_ASCII).split()))
     text = "".join(character for character in text if not unicodedata.combining(character))
     return "".join(character if " " <= character <= "~" else "?" for character in text)
 
 
 def as_lines(severity: Severity, text: str) -> list[tuple[Severity, str]]:
-    """A plain text as lines of one message each: what is heard of it, if anything is, is the first.
+    """Split a text into lines of one message each, of which only the first is spoken.
 
-    Cut is at the last pause that leaves one line, else between any two words, and in good news before the first
-    figure: that is for who reads. MAVLink's own way of longer texts (`chunk_seq`) is not taken: it cuts in the middle
-    of words, many receivers show each part by itself, and what puts them together speaks all of it.
+    Lines end at the last pause that fits, else between two words; a NOTICE ends before its first figure, which is for
+    readers. MAVLink's own split of long texts (`chunk_seq`) cuts words, and some receivers speak all of it.
     """
     found: list[tuple[Severity, str]] = []
     rest = text
@@ -109,7 +106,7 @@ def as_lines(severity: Severity, text: str) -> list[tuple[Severity, str]]:
 
 
 def shortened(text: str, most: int) -> str:
-    """Beginning of a text in so many characters: up to its last pause, else up to its last whole word."""
+    """Cut a text to so many characters: at its last pause, else after its last whole word."""
     return text if len(text) <= most else text[: _end_of_line(text, figures=True, most=most)].rstrip(" :;,")
 
 
@@ -129,64 +126,42 @@ def _end_of_line(text: str, *, figures: bool, most: int = LINE_BYTES) -> int:
     return (pauses or blanks or [most])[-1]
 
 
-class _Text(NamedTuple):
-    severity: Severity
-    text: str
-    said_s: float
-
-
-class Spoken(NamedTuple):
-    """A text that is to be heard."""
-
-    number: int
-    """Counts from 1."""
-    text: str
-
-
 class StatusText:
-    """The component's voice.
-
-    `step` sends what may be sent now.
-    """
+    """Queue of texts; `step` sends what may be sent now."""
 
     def __init__(self, link: MavlinkLink) -> None:
         self.woken = asyncio.Event()
-        """Set when there is something new to send: whoever calls `step` waits for it."""
+        """Set when there is something new to send, for the caller of `step`."""
         self._link = link
-        self._waiting: dict[Weight, deque[_Text]] = {weight: deque() for weight in reversed(Weight)}
-        self._said_s: OrderedDict[tuple[Severity, str], float] = OrderedDict()
+        self._waiting: dict[Weight, deque[tuple[Severity, str, float]]] = {
+            weight: deque() for weight in reversed(Weight)
+        }
+        self._recent: deque[tuple[Severity, str, float]] = deque(maxlen=RECENT_TEXTS)
         self._sending: deque[mavlink.MAVLink_statustext_message] = deque()
         self._lines = Budget(LINES_PER_S, BURST_LINES)
-        self._spoken: deque[Spoken] = deque(maxlen=SPOKEN)
+        self.spoken: deque[dict[str, object]] = deque(maxlen=SPOKEN)
+        """The latest spoken texts, the oldest first, numbered from 1."""
+        self._numbers = itertools.count(1)
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
-        """Queue a text; False when it repeats one said within the last seconds, or when the queue is full.
+        """Queue a text; return False when it repeats one of the last seconds, or when the queue is full.
 
-        Of what is to be heard only the first of its lines goes out as such, the rest to be read.
-        A result is no repeat, whatever it says: each ends a request of its own. What was said before it belongs to that
-        request, and may be said of the next at once.
+        A result is never a repeat: each ends a request of its own, and texts before it may be repeated for the next.
         """
         text = to_ascii(text)
         now_s = asyncio.get_running_loop().time()
         if weight is Weight.RESULT:
-            self._said_s.clear()
-        if not text or self._is_repeat(severity, text, now_s):
+            self._recent.clear()
+        if not text or any(said[:2] == (severity, text) and now_s - said[2] < REPEAT_S for said in self._recent):
             return False
         if sum(map(len, self._waiting.values())) >= QUEUE_TEXTS and not self._make_room(weight):
             return False
-        self._remember(severity, text, now_s)
-        self._waiting[weight].append(_Text(severity, text, now_s))
+        self._recent.append((severity, text, now_s))
+        self._waiting[weight].append((severity, text, now_s))
         if severity <= Severity.NOTICE:
-            self._spoken.append(
-                Spoken(self._spoken[-1].number + 1 if self._spoken else 1, as_lines(severity, text)[0][1])
-            )
+            self.spoken.append({"number": next(self._numbers), "text": as_lines(severity, text)[0][1]})
         self.woken.set()
         return True
-
-    @property
-    def spoken(self) -> tuple[Spoken, ...]:
-        """The latest texts that are to be heard, the oldest first."""
-        return tuple(self._spoken)
 
     def step(self, now_s: float) -> float:
         """Send what the bucket allows; return when there is more to do (infinity: nothing waits)."""
@@ -208,12 +183,12 @@ class StatusText:
 
     def _take_next(self, now_s: float) -> None:
         for weight, waiting in self._waiting.items():
-            while weight is not Weight.RESULT and waiting and now_s - waiting[0].said_s > STALE_S:
+            while weight is not Weight.RESULT and waiting and now_s - waiting[0][2] > STALE_S:
                 waiting.popleft()
             if waiting:
-                text = waiting.popleft()
-                for severity, line in as_lines(text.severity, text.text):
-                    self._sending.append(mavlink.MAVLink_statustext_message(severity, line.encode("ascii")))
+                severity, text, _ = waiting.popleft()
+                for each, line in as_lines(severity, text):
+                    self._sending.append(mavlink.MAVLink_statustext_message(each, line.encode("ascii")))
                 return
 
     def _make_room(self, weight: Weight) -> bool:
@@ -225,13 +200,3 @@ class StatusText:
                 self._waiting[lighter].popleft()
                 return True
         return False
-
-    def _is_repeat(self, severity: Severity, text: str, now_s: float) -> bool:
-        said_s = self._said_s.get((severity, text))
-        return said_s is not None and now_s - said_s < REPEAT_S
-
-    def _remember(self, severity: Severity, text: str, now_s: float) -> None:
-        self._said_s[(severity, text)] = now_s
-        self._said_s.move_to_end((severity, text))
-        if len(self._said_s) > _REMEMBERED_TEXTS:
-            self._said_s.popitem(last=False)

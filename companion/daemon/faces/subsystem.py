@@ -151,7 +151,7 @@ class Faces(Subsystem):
             "vehicle": self._vehicle(),
             **self._mqtt_status(),
             "page": None if self.page is None else _NO_PAGE | self.page.status(),
-            "spoken": [spoken._asdict() for spoken in self._core.texts.spoken],
+            "spoken": list(self._core.texts.spoken),
         }
 
     def _vehicle(self) -> Mapping[str, object]:
