@@ -1,16 +1,15 @@
-"""Attitude of the aircraft from one calibrated IMU, a compass now and then, and what is known of the place.
+"""Attitude of the aircraft from one calibrated IMU, a compass and the site (method 3.7).
 
-Method 3.7, "best candidate for the pushed attitude of a micro aircraft without GPS": strapdown on calibrated
-rates with the Earth's rotation taken out, a slow leveller, a scalar heading correction; the gyro biases are refined at
-rest only, because what looks like a bias in flight is a manoeuvre.
+Strapdown integration of calibrated rates less the Earth's rotation, a slow leveller, and a scalar heading correction.
+Gyro biases are refined at rest only: in flight a manoeuvre looks like a bias.
 
 Levelling has the form of VQF (Laidig and Seel, Information Fusion 91:187-204, 2023): specific force is low-passed in a
-frame that only gyro errors turn. There manoeuvre accelerations average out over the time constant while gravity stays;
-a bias b leaves b * tau of tilt. A lasting turn or climb does not average out, but changes the length of the force:
-where that is not g, less is believed.
+frame that only gyro errors turn. Manoeuvre accelerations average out over the time constant, gravity stays; a bias b
+leaves b * tau of tilt. A lasting turn or climb does not average out, but makes the force longer or shorter than g: then
+it has less weight.
 
-The compass corrects a gated scalar, and never touches the tilt: a device's own heading leans on its own pendulum and is
-worth nothing while the aircraft accelerates or stands steep (method 3.5).
+The compass corrects the gated heading, never the tilt: its own tilt comes from a pendulum, which is wrong while the
+aircraft accelerates or is steep (method 3.5).
 """
 
 from __future__ import annotations
@@ -49,20 +48,20 @@ Phase = Literal["ground", "flight"]
 
 LEVEL_TAU_S: Final[dict[Phase, float]] = {"ground": 3.0, "flight": 30.0}
 STEADY_SHARE: Final = 0.03
-"""Deviation of specific force from g, as a share, up to which a compass that levels itself is read."""
+"""Largest deviation of specific force from g, as a share, at which a self-levelling compass is used."""
 STEADY_RAD_S: Final = math.radians(20.0)
-"""Rate up to which it is read."""
+"""Largest rate at which the compass is used."""
 COVARIANCE_STEP_S: Final = 0.2
 REST_S: Final = 1.0
 REST_SIGMAS: Final = 5.0
-"""Rest that shows a larger bias was a movement that had begun unnoticed."""
+"""Threshold beyond which a rest was a movement that began unnoticed."""
 KEPT_S: Final = 2.0
 """Orientations kept for compass readings that come late."""
 FORCE_SMOOTHED_S: Final = 1.0
-"""Averaging time of the length of specific force: vibration and gusts are shorter."""
+"""Averaging time of the length of specific force, longer than vibration and gusts."""
 DOUBTED_SHARE: Final = 0.03
-"""Deviation from g, as a share, at which half is believed: three times the scale error of accelerometers.
-Above it (15 degrees of bank) a turn tilts more than a calibrated gyro drifts in its time."""
+"""Deviation from g, as a share, that halves the weight: three times the scale error of accelerometers. Beyond (15
+degrees of bank) a turn tilts more than a calibrated gyro drifts in its time."""
 _UP: Final = (0.0, 0.0, -1.0)
 
 TAU_S: Final = 9.0
@@ -71,33 +70,31 @@ GATE_SIGMAS: Final = 4.0
 GATE_LEAST_RAD: Final = math.radians(10.0)
 STEEP_RAD: Final = math.radians(60.0)
 FIRST_S: Final = 0.1
-"""Time for which the first reading stands."""
+"""Time that the first reading counts for."""
 BADLY: Final = 1.5
-"""Sigma of a badly known heading, in sigmas of the compass."""
+"""Sigma of a poorly known heading, in sigmas of the compass."""
 REFUSED_S: Final = 20.0
-"""Time outside the gate after which the pilot is warned."""
+"""Time outside the gate after which the push stops."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class AttitudeSettings:
-    """Results of a calibration and data of the site. Vectors in vehicle FRD.
-
-    `latitude_deg` None: the Earth's rotation is not taken out, and may be an error of 15 deg/h.
-    """
+    """Results of a calibration and data of the site; vectors in vehicle FRD."""
 
     vehicle_from_sensor: Matrix
     gravity_m_s2: float
     latitude_deg: float | None
+    """None: the Earth's rotation is not subtracted, an error of up to 15 deg/h."""
     gyro_noise: AllanModel
     gyro_bias_rad_s: Triple
     gyro_covariance: Matrix
-    """(3, 3) of the bias, as a prediction of the next minutes."""
+    """(3, 3) covariance of the bias in the next minutes."""
     accel_bias_m_s2: Triple
     accel_sigma_m_s2: Triple
 
 
 class Attitude(msgspec.Struct, frozen=True, gc=False):
-    """The attitude at one instant, body FRD against NED and true north."""
+    """Attitude at one instant, body FRD to NED and true north."""
 
     t_s: float
     quaternion: Quaternion
@@ -107,29 +104,27 @@ class Attitude(msgspec.Struct, frozen=True, gc=False):
     yaw_rad: float
     """In [-pi, pi], from true north."""
     rate_rad_s: Triple
-    """Rate of the body against the Earth in FRD, without bias."""
+    """Rate of the body relative to the Earth in FRD, without bias."""
     sigma_rad: Triple
     """One sigma of roll, pitch and yaw."""
 
 
 class Leveller:
-    """Keeps the turn from E to NED that puts the mean specific force upright."""
+    """Estimates the rotation from E to NED that levels the mean specific force."""
 
     def __init__(self, gravity_m_s2: float) -> None:
         self.gravity_m_s2 = gravity_m_s2
         self.ned_from_e: Quaternion = IDENTITY
-        """Tilt and heading together; the heading aid turns it about the vertical."""
         self.doubt = 0.0
-        """Deviation of the force from gravity, over `FORCE_SMOOTHED_S`, as a share of g."""
+        """Smoothed deviation of the force from gravity, as a share of g."""
         self._force: Triple = (0.0, 0.0, -gravity_m_s2)
         self._slope: Triple = (0.0, 0.0, 0.0)
         self._length = gravity_m_s2
 
     def update(self, force_m_s2: Triple, span_s: float, tau_s: float) -> float:
-        """Take the mean specific force (3,) in E over `span_s`; return the share of it that was believed.
+        """Add the mean specific force (3,) in E over `span_s`; return its weight.
 
-        The low-pass is of the second order, Butterworth's, with natural frequency sqrt(2) / tau, as its own states, so
-        that tau may change at any time.
+        A Butterworth low-pass of second order with natural frequency sqrt(2) / tau, so that tau may change at any time.
         """
         x, y, z = force_m_s2
         length = math.sqrt(x * x + y * y + z * z)
@@ -137,8 +132,8 @@ class Leveller:
         self.doubt = abs(self._length - self.gravity_m_s2) / self.gravity_m_s2
         believed = 1.0 / (1.0 + (self.doubt / DOUBTED_SHARE) ** 2)
         omega = math.sqrt(2.0) / tau_s
-        # To believe less is to let less time pass: the low-pass stands still with all its states. Semi-implicit, hence
-        # stable up to omega * step = 1; the longest span is far shorter than the shortest tau.
+        # The weight scales the time step. Semi-implicit, hence stable up to omega * step = 1; the longest span is far
+        # shorter than the shortest tau.
         step = min(believed * span_s, 0.5 / omega)
         damped, pulled = 1.0 / (1.0 + math.sqrt(2.0) * omega * step), omega * omega * step
         fx, fy, fz = self._force
@@ -155,19 +150,19 @@ class Leveller:
         return believed
 
     def turn_heading(self, angle_rad: float) -> None:
-        """Turn everything clockwise by so much about the vertical."""
+        """Turn clockwise about the vertical."""
         self.ned_from_e = normalised(multiply(from_rotation_vector((0.0, 0.0, angle_rad)), self.ned_from_e))
 
 
 class HeadingAid:
-    """Decides what of an innovation is believed."""
+    """Gain and gate of the heading correction."""
 
     def __init__(self) -> None:
         self._last_s: float | None = None
         self._refused_since_s: float | None = None
 
     def gain(self, t_s: float, innovation_rad: float, sigma_rad: float, compass_sigma_rad: float) -> float:
-        """The share of the innovation to turn by, `sigma_rad` being that of our heading; 0: it is refused."""
+        """Return the gain for an innovation, with the sigma of our heading; 0: rejected by the gate."""
         gate = max(GATE_LEAST_RAD, GATE_SIGMAS * math.hypot(sigma_rad, compass_sigma_rad))
         if not abs(innovation_rad) <= gate:
             if self._refused_since_s is None:
@@ -175,19 +170,19 @@ class HeadingAid:
             return 0.0
         since_s = FIRST_S if self._last_s is None else max(0.0, t_s - self._last_s)
         self._last_s, self._refused_since_s = t_s, None
-        # What is known badly is told by the first reading at once; after that the time constant rules. A heading that
-        # the compass holds is as uncertain as it is, and what the gyros add in that time: that is not known badly.
+        # A poorly known heading is set by the first reading; after that the time constant applies. A heading held by
+        # the compass has its sigma and what the gyros add meanwhile: that is not poorly known.
         badly_rad = BADLY * compass_sigma_rad
         trust = 1.0 - (badly_rad / sigma_rad) ** 2 if sigma_rad > badly_rad else 0.0
         return max(trust, min(1.0, since_s / TAU_S))
 
     def refused_for_s(self, t_s: float) -> float:
-        """Return the time for which readings have been refused without a break."""
+        """Return the time since which all readings were rejected."""
         return 0.0 if self._refused_since_s is None else t_s - self._refused_since_s
 
 
 class AttitudeEstimator:
-    """One call per batch of samples. Nothing in a sample makes it raise."""
+    """Attitude estimator; one call per batch of samples, and no sample makes it raise."""
 
     def __init__(self, settings: AttitudeSettings) -> None:
         self._strapdown = Strapdown()
@@ -202,7 +197,7 @@ class AttitudeEstimator:
         self._leveller = Leveller(settings.gravity_m_s2)
 
     def settle(self, settings: AttitudeSettings) -> None:
-        """Use the result of a newer calibration; the attitude goes on, its bias sigma begins anew."""
+        """Use a newer calibration; the attitude stays, the bias sigma restarts."""
         kept = self._uncertainty.attitude
         self._settle(settings)
         self._leveller.gravity_m_s2 = settings.gravity_m_s2
@@ -220,13 +215,12 @@ class AttitudeEstimator:
         covariance, sigma = turn.T @ settings.gyro_covariance @ turn, settings.accel_sigma_m_s2
         self._uncertainty = Uncertainty(settings.gyro_noise, covariance, sigma, settings.gravity_m_s2)
 
-    # ------------------------------------------------------------------------------------------------- alignment
+    # --- alignment
 
     def align(self, t_s: float | None, body_from_ned: Matrix, covariance: Matrix) -> None:
-        """Begin from an attitude (3, 3) that was found otherwise at `t_s`; None: at the next sample.
+        """Start from an attitude (3, 3) at `t_s` (None: at the next sample) with its covariance (3, 3) in NED, rad^2.
 
-        Its covariance is (3, 3) in NED, rad^2. Where no heading is known any will do, with a variance of at least
-        `HEADING_UNKNOWN_RAD` squared.
+        An unknown heading may have any value, with a variance of at least `HEADING_UNKNOWN_RAD` squared.
         """
         ned_from_body = from_matrix(np.asarray(body_from_ned).T)
         self._strapdown.restart(multiply(ned_from_body, conjugate(self._sensor_from_vehicle)), t_s)
@@ -240,91 +234,91 @@ class AttitudeEstimator:
 
     @property
     def aligned(self) -> bool:
-        """True if there is an attitude."""
+        """Return whether there is an attitude."""
         return self._aligned and not self._strapdown.lost
 
     @property
     def heading_known(self) -> bool:
-        """True if the heading is more than a guess."""
+        """Return whether the heading is known."""
         return self.aligned and self._uncertainty.heading_sigma_rad < 0.5 * HEADING_UNKNOWN_RAD
 
     @property
     def gyro_bias_rad_s(self) -> Triple:
-        """Bias in use, vehicle FRD: that of the calibration, refined at rest."""
+        """Return the bias in use in vehicle FRD: that of the calibration, refined at rest."""
         return rotate(conjugate(self._sensor_from_vehicle), self._strapdown.bias_rad_s)
 
-    # ------------------------------------------------------------------------------------------------- samples
+    # --- samples
 
     def update(
         self, samples: Sequence[ImuSample], *, phase: Phase, still: bool = False, airspeed_m_s: float | None = None
     ) -> None:
-        """Take samples, in the sensor's axes and in the order of time; without an alignment they are left.
+        """Add samples, in the sensor's axes and in order of time; ignored without an alignment.
 
-        While it stands still gyro biases are refined. What turning at a forward airspeed makes is no tilt (omega x V).
+        `still` refines the gyro biases; `airspeed_m_s` corrects the centripetal acceleration (omega x V).
         """
         if not self._aligned:
             return
         self._strapdown.frame_rate_rad_s = rotate(conjugate(self._leveller.ned_from_e), self._earth)
-        for stretch in self._strapdown.integrate(samples):
-            self._take(stretch, phase, still=still, airspeed_m_s=airspeed_m_s)
+        for step in self._strapdown.integrate(samples):
+            self._take(step, phase, still=still, airspeed_m_s=airspeed_m_s)
 
-    def _take(self, stretch: MotionStep, phase: Phase, *, still: bool, airspeed_m_s: float | None) -> None:
-        leveller, span_s, force = self._leveller, stretch.span_s, stretch.force_m_s2
+    def _take(self, step: MotionStep, phase: Phase, *, still: bool, airspeed_m_s: float | None) -> None:
+        leveller, span_s, force = self._leveller, step.span_s, step.force_m_s2
         if airspeed_m_s is not None:
-            force = self._without_turning(force, stretch, airspeed_m_s)
+            force = self._without_turning(force, step, airspeed_m_s)
         tau_s = LEVEL_TAU_S[phase]
         believed = leveller.update(force, span_s, tau_s)
-        self._remember(stretch)
-        rx, ry, rz = stretch.rate_rad_s
+        self._remember(step)
+        rx, ry, rz = step.rate_rad_s
         tx, ty, tz = self._turned_rad
         self._turned_rad = (tx + rx * span_s, ty + ry * span_s, tz + rz * span_s)
         self._waiting_s += span_s
-        self._missing_s += stretch.missing_s
+        self._missing_s += step.missing_s
         if self._waiting_s >= COVARIANCE_STEP_S:
-            ned_from_sensor = to_matrix(multiply(leveller.ned_from_e, stretch.orientation))
+            ned_from_sensor = to_matrix(multiply(leveller.ned_from_e, step.orientation))
             self._uncertainty.propagate(self._waiting_s, ned_from_sensor, np.asarray(self._turned_rad), self._missing_s)
             self._uncertainty.level(self._waiting_s, tau_s, believed, leveller.doubt, phase)
             self._waiting_s = self._missing_s = 0.0
             self._turned_rad = (0.0, 0.0, 0.0)
-        if still and phase == "ground" and not stretch.missing_s:
-            self._rest(stretch)
+        if still and phase == "ground" and not step.missing_s:
+            self._rest(step)
         else:
             self._forget_rest()
 
-    def _without_turning(self, force: Triple, stretch: MotionStep, airspeed_m_s: float) -> Triple:
+    def _without_turning(self, force: Triple, step: MotionStep, airspeed_m_s: float) -> Triple:
         vx, vy, vz = rotate(self._sensor_from_vehicle, (airspeed_m_s, 0.0, 0.0))
-        wx, wy, wz = stretch.rate_rad_s
+        wx, wy, wz = step.rate_rad_s
         turning = (wy * vz - wz * vy, wz * vx - wx * vz, wx * vy - wy * vx)
-        tx, ty, tz = rotate(stretch.orientation, turning)
+        tx, ty, tz = rotate(step.orientation, turning)
         return force[0] - tx, force[1] - ty, force[2] - tz
 
-    def _remember(self, stretch: MotionStep) -> None:
+    def _remember(self, step: MotionStep) -> None:
         history = self._history
-        history.append((stretch.t_s, stretch.orientation))
-        while history[0][0] < stretch.t_s - KEPT_S:
+        history.append((step.t_s, step.orientation))
+        while history[0][0] < step.t_s - KEPT_S:
             history.popleft()
 
-    # ------------------------------------------------------------------------------------------------- rest
+    # --- rest
 
     def _forget_rest(self) -> None:
         self._still_s = 0.0
         self._still_angle = (0.0, 0.0, 0.0)
 
-    def _rest(self, stretch: MotionStep) -> None:
-        span_s = stretch.span_s
-        rx, ry, rz = stretch.rate_rad_s
+    def _rest(self, step: MotionStep) -> None:
+        span_s = step.span_s
+        rx, ry, rz = step.rate_rad_s
         ax, ay, az = self._still_angle
         self._still_s += span_s
         self._still_angle = (ax + rx * span_s, ay + ry * span_s, az + rz * span_s)
         if self._still_s < REST_S:
             return
-        sensor_from_ned = conjugate(multiply(self._leveller.ned_from_e, stretch.orientation))
+        sensor_from_ned = conjugate(multiply(self._leveller.ned_from_e, step.orientation))
         left = np.asarray(self._still_angle) / self._still_s - np.asarray(rotate(sensor_from_ned, self._earth))
         if np.any(np.abs(left) > REST_SIGMAS * self._uncertainty.rest_sigma(self._still_s)):
             self._forget_rest()
             return
         gain = self._uncertainty.rest(self._still_s)
-        # Both states are truth against estimate: what is found is added to the bias, and turns the attitude.
+        # Both states are truth less estimate: add the correction to the bias, and turn the attitude by it.
         found = gain @ left
         bx, by, bz = self._strapdown.bias_rad_s
         self._strapdown.bias_rad_s = (bx + float(found[3]), by + float(found[4]), bz + float(found[5]))
@@ -332,10 +326,10 @@ class AttitudeEstimator:
         self._leveller.ned_from_e = normalised(multiply(turn, self._leveller.ned_from_e))
         self._forget_rest()
 
-    # ------------------------------------------------------------------------------------------------- compass
+    # --- compass
 
     def add_heading(self, t_s: float, heading_true_rad: float, sigma_rad: float) -> bool:
-        """Take the heading that a self-levelling compass had at `t_s`; returns whether it was used."""
+        """Add the heading of a self-levelling compass at `t_s`; return whether it was used."""
         found = self.kept_at(t_s)
         if found is None or self._leveller.doubt > STEADY_SHARE:
             return False
@@ -354,19 +348,16 @@ class AttitudeEstimator:
         return True
 
     def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
-        """Return a time at most a stretch before `t_s` and the attitude then, body to NED, by the present level.
-
-        None when nothing is kept of it.
-        """
+        """Return the last step before `t_s` and the attitude then, body to NED, by the present level; None: too old."""
         for then_s, orientation in reversed(self._history if self.aligned else ()):
             if then_s <= t_s:
                 return then_s, multiply(multiply(self._leveller.ned_from_e, orientation), self._sensor_from_vehicle)
         return None
 
-    # ------------------------------------------------------------------------------------------------- result
+    # --- result
 
     def attitude(self) -> Attitude | None:
-        """The attitude at the last sample; None while there is none."""
+        """Return the attitude at the last sample; None while there is none."""
         t_s = self._strapdown.last_s
         if not self.aligned or t_s is None:
             return None
@@ -385,7 +376,7 @@ class AttitudeEstimator:
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         about_forward = max(c * c * nn + 2.0 * c * s * ne + s * s * ee, 0.0)
         about_right = max(s * s * nn - 2.0 * c * s * ne + c * c * ee, 0.0)
-        # Near +-90 degrees of pitch roll and yaw are told apart by nothing; both then may be anything.
+        # Near +-90 degrees of pitch roll and yaw cannot be separated: both are unknown.
         level = max(math.cos(pitch_rad) ** 2, 1e-4)
         unknown = HEADING_UNKNOWN_RAD**2
         return (

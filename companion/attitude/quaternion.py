@@ -1,6 +1,6 @@
-"""Quaternions as plain tuples (w, x, y, z), Hamilton's product, unit length; fast enough without an array in sight.
+"""Unit quaternions as plain tuples (w, x, y, z), with Hamilton's product; at this size faster than arrays.
 
-A quaternion `q` takes a vector's components from frame A to frame B: v_B = rotate(q, v_A). Multiplying on the left
+A quaternion `q` maps a vector's components from frame A to frame B: v_B = rotate(q, v_A). Multiplying on the left
 rotates in B, on the right in A.
 """
 
@@ -20,7 +20,7 @@ _NO_LENGTH = 1e-150
 
 
 def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
-    """The product p q: first q, then p."""
+    """Return the product p q: first q, then p."""
     pw, px, py, pz = p
     qw, qx, qy, qz = q
     return (
@@ -32,16 +32,12 @@ def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
 
 
 def conjugate(q: Quaternion) -> Quaternion:
-    """The inverse rotation."""
+    """Return the inverse rotation."""
     return (q[0], -q[1], -q[2], -q[3])
 
 
 def normalised(q: Quaternion) -> Quaternion:
-    """The same rotation with length 1.
-
-    Raises:
-        ValueError: the length is zero or not finite.
-    """
+    """Scale to length 1; raise ValueError where the length is zero or not finite."""
     w, x, y, z = q
     length = math.sqrt(w * w + x * x + y * y + z * z)
     if not 0.0 < length < math.inf:
@@ -50,7 +46,7 @@ def normalised(q: Quaternion) -> Quaternion:
 
 
 def rotate(q: Quaternion, v: Triple) -> Triple:
-    """The vector's components in the other frame."""
+    """Return a vector's components in the other frame."""
     w, x, y, z = q
     a, b, c = v
     tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
@@ -58,7 +54,7 @@ def rotate(q: Quaternion, v: Triple) -> Triple:
 
 
 def from_rotation_vector(v: Triple) -> Quaternion:
-    """A turn by |v| radians about v."""
+    """Return the rotation by |v| radians about v."""
     x, y, z = v
     angle = math.sqrt(x * x + y * y + z * z)
     scale = math.sin(0.5 * angle) / angle if angle > 1e-9 else 0.5
@@ -66,7 +62,7 @@ def from_rotation_vector(v: Triple) -> Quaternion:
 
 
 def shortest_arc(a: Triple, b: Triple) -> Quaternion:
-    """The smallest turn that takes direction `a` to direction `b`; the identity where either has no length."""
+    """Return the smallest rotation from direction `a` to `b`; the identity where either has no length."""
     length_a, length_b = math.hypot(*a), math.hypot(*b)
     if not (length_a > _NO_LENGTH and length_b > _NO_LENGTH):
         return IDENTITY
@@ -81,25 +77,20 @@ def shortest_arc(a: Triple, b: Triple) -> Quaternion:
 
 
 def from_matrix(matrix: Matrix) -> Quaternion:
-    """The quaternion of a 3x3 rotation matrix that takes A to B (Shepperd's choice of the largest element)."""
-    m = matrix
-    trace = float(m[0, 0] + m[1, 1] + m[2, 2])
-    squares = [trace, float(m[0, 0]), float(m[1, 1]), float(m[2, 2])]
-    largest = squares.index(max(squares))
-    if largest == 0:
-        found = (1.0 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
-    elif largest == 1:
-        found = (m[2, 1] - m[1, 2], 1.0 + 2.0 * m[0, 0] - trace, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0])
-    elif largest == 2:
-        found = (m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1.0 + 2.0 * m[1, 1] - trace, m[1, 2] + m[2, 1])
-    else:
-        found = (m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1.0 + 2.0 * m[2, 2] - trace)
-    w, x, y, z = (float(value) for value in found)
-    return normalised((w, x, y, z))
+    """Convert a 3x3 rotation matrix (Shepperd's choice of the largest element)."""
+    ((xx, xy, xz), (yx, yy, yz), (zx, zy, zz)) = np.asarray(matrix, dtype=np.float64).tolist()
+    # The rows are multiples of the quaternion; the largest one is known best.
+    rows = (
+        (1.0 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
+        (zy - yz, 1.0 + xx - yy - zz, xy + yx, xz + zx),
+        (xz - zx, xy + yx, 1.0 - xx + yy - zz, yz + zy),
+        (yx - xy, xz + zx, yz + zy, 1.0 - xx - yy + zz),
+    )
+    return normalised(max(rows, key=lambda row: math.hypot(*row)))
 
 
 def to_matrix(q: Quaternion) -> Matrix:
-    """The 3x3 matrix of the same rotation."""
+    """Convert to a 3x3 rotation matrix."""
     return np.array([rotate(q, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]).T
 
 
@@ -121,6 +112,6 @@ def roll_pitch_yaw(q: Quaternion) -> Triple:
 
 
 def from_roll_pitch_yaw(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
-    """Body FRD to NED from aerospace angles."""
+    """Return body FRD to NED from aerospace angles."""
     roll, pitch = from_rotation_vector((roll_rad, 0.0, 0.0)), from_rotation_vector((0.0, pitch_rad, 0.0))
     return multiply(from_rotation_vector((0.0, 0.0, yaw_rad)), multiply(pitch, roll))

@@ -1,8 +1,7 @@
-"""Quaternion strapdown: calibrated rates to attitude, and specific force turned along with it.
+"""Quaternion strapdown: integrate calibrated rates to attitude, and rotate the specific force.
 
-The frame E that it ends in is fixed to the Earth and near NED; what is left between the two belongs to the leveller
-and to the heading. Rotation vectors with two-sample coning, phi_k = a_k + (a_{k-1} x a_k) / 12 (Savage; method
-3.7). Plain floats: at these sizes they are ten times faster than arrays.
+Frame E is fixed to the Earth and near NED; leveller and heading hold the rest. Rotation vectors with two-sample coning,
+phi_k = a_k + (a_{k-1} x a_k) / 12 (Savage; method 3.7). Plain floats: at these sizes ten times faster than arrays.
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ from companion.attitude.quaternion import (
 from companion.samples import ImuSample
 
 STEP_S: Final = 0.02
-"""Length of the stretches over which specific force is averaged for levelling."""
+"""Length of the steps over which specific force is averaged for levelling."""
 TURN_S: Final = 0.004
-"""Longest time between turns of the specific force into E: 4 degrees at 1000 deg/s."""
+"""Longest time between rotations of the specific force into E: 4 degrees at 1000 deg/s."""
 GAP_S: Final = 0.1
-"""A longer silence is bridged with the last rate, a guess, and counted as `missing_s`."""
+"""Silence beyond which the integration is a guess, counted as `missing_s`."""
 _ROUNDING_S: Final = 1e-6
 _ANGLE_SQUARE: Final = 1e6
 _FORCE_SQUARE: Final = 1e8
 """Limits of one sample, squared: ten times those of the decoders, so that nothing overflows."""
 LOST_S: Final = 1.0
-"""After a longer silence the attitude is lost."""
+"""Silence after which the attitude is lost."""
 
 
 class MotionStep(NamedTuple):
@@ -51,26 +50,22 @@ class MotionStep(NamedTuple):
 
 
 class Strapdown:
-    """Integrates one IMU's rates, in the sensor's own axes.
-
-    `orientation` takes sensor axes to E; `bias_rad_s` and `force_bias_m_s2` are subtracted from every sample.
-    """
+    """Integrates the rates of one IMU in its own axes; `orientation` is sensor axes to E."""
 
     def __init__(self) -> None:
         self.orientation: Quaternion = IDENTITY
         self.bias_rad_s: Triple = (0.0, 0.0, 0.0)
         self.force_bias_m_s2: Triple = (0.0, 0.0, 0.0)
         self.frame_rate_rad_s: Triple = (0.0, 0.0, 0.0)
-        """Rate of E against inertial space, in E: the Earth's rotation."""
+        """The Earth's rotation, in E."""
         self.last_s: float | None = None
         self.last_rate_rad_s: Triple = (0.0, 0.0, 0.0)
         self.lost = False
-        """True after a silence longer than `LOST_S`, until a restart."""
         self._previous: Triple = (0.0, 0.0, 0.0)
         self._clear()
 
     def restart(self, orientation: Quaternion, t_s: float | None) -> None:
-        """Begin anew with this orientation, valid at `t_s`."""
+        """Start from an orientation at `t_s`."""
         self.orientation, self.last_s, self.lost = orientation, t_s, False
         self._previous = (0.0, 0.0, 0.0)
         self._clear()
@@ -84,7 +79,7 @@ class Strapdown:
         self._turn_s = 0.0
 
     def integrate(self, samples: Sequence[ImuSample]) -> list[MotionStep]:
-        """Integrate samples in the order of time, cut into calls in any way; return the stretches they complete."""
+        """Integrate samples in order of time; return the steps they complete."""
         done: list[MotionStep] = []
         for sample in samples:
             if (dt := self._since_last(sample)) is None:
@@ -97,7 +92,7 @@ class Strapdown:
             ry = ay + (pz * ax - px * az) / 12.0
             rz = az + (px * ay - py * ax) / 12.0
             if not (rx * rx + ry * ry + rz * rz < _ANGLE_SQUARE and fx * fx + fy * fy + fz * fz < _FORCE_SQUARE):
-                self._missing_s += dt  # no sensor can mean that
+                self._missing_s += dt  # impossible values
                 continue
             self._previous = (ax, ay, az)
             self.orientation = multiply(self.orientation, from_rotation_vector((rx, ry, rz)))
@@ -115,7 +110,7 @@ class Strapdown:
         return done
 
     def _since_last(self, sample: ImuSample) -> float | None:
-        """Return the seconds since the last sample; None where this one tells nothing."""
+        """Return the seconds since the last sample; None where this one cannot be used."""
         if self.last_s is None:
             self.last_s = sample.t_s
             return None
@@ -131,13 +126,13 @@ class Strapdown:
         return dt
 
     def _turn(self) -> None:
-        """Turn the specific force since the last time into E."""
+        """Rotate the specific force since the last call into E."""
         (vx, vy, vz), (fx, fy, fz) = self._velocity, rotate(self.orientation, self._unturned)
         self._velocity = (vx + fx, vy + fy, vz + fz)
         self._unturned, self._turn_s = (0.0, 0.0, 0.0), 0.0
 
     def _finished(self, t_s: float) -> MotionStep:
-        """Return the complete stretch and begin the next."""
+        """Return the complete step and begin the next."""
         (ex, ey, ez), half = self.frame_rate_rad_s, -0.5 * self._span_s
         self.orientation = normalised(multiply((1.0, half * ex, half * ey, half * ez), self.orientation))
         (vx, vy, vz), (ux, uy, uz), mean = self._velocity, self._angle, 1.0 / self._span_s

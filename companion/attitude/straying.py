@@ -1,4 +1,4 @@
-"""Watch for a heading that turns while other gyros do not, by the rule of the script on the flight controller."""
+"""Detect a heading that turns while other gyros do not, by the rule of the script on the flight controller."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from typing import Final
 
 STRAYS_RAD: Final = math.radians(5.0)
 WITHIN_S: Final = 4.0
-"""Time in which the sum fades: 1.25 deg/s go unnoticed, and are what the compass holds."""
+"""Time in which the sum fades: a drift of 1.25 deg/s goes unnoticed, and the compass corrects it."""
 SIGMAS: Final = 3.0
-"""A heading that was not well known may be set right by its compass."""
+"""Allowed turn in sigmas of the heading: the compass may correct a poorly known one."""
 SCALES: Final = 0.01
 """Share of a turn by which two gyros may differ."""
 LATE_S: Final = 0.03
-"""Usual difference of the times of both while they turn."""
+"""Usual difference of the two times."""
 LONGEST_STEP_S: Final = 0.25
-"""Longest step that is compared: a turn to and fro within it is not seen."""
+"""Longest step that is compared: it hides a turn to and fro."""
 
 
 class Straying:
-    """Adds up heading less gyros; `add` at every instant of which both are known."""
+    """Sums the turn of the heading less that of the gyros; `add` at every instant with both."""
 
     def __init__(self) -> None:
         self.strayed_rad = 0.0
@@ -29,14 +29,11 @@ class Straying:
         self._turned_rad = self._sigma_rad = self._apart_rad = 0.0
 
     def skip(self) -> None:
-        """Leave out the step to the next instant: the delays of its two ends differ."""
+        """Skip the step to the next instant, as the delays of its ends differ."""
         self._last = None
 
     def add(self, t_s: float, heading_rad: float, sigma_rad: float, rate_rad_s: float, late_s: float = 0.0) -> None:
-        """Add a heading with its sigma, and the rate of the other gyros about the vertical.
-
-        A gap is not counted; after one of `WITHIN_S` it begins anew. `late_s`: delay beyond the usual.
-        """
+        """Add a heading with its sigma, and the rate of the other gyros about the vertical; `late_s`: extra delay."""
         before, self._last = self._last, (t_s, heading_rad, rate_rad_s)
         if before is None:
             self._sigma_rad = max(self._sigma_rad, sigma_rad)

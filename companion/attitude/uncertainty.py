@@ -15,24 +15,22 @@ from companion.config.sections import AllanModel
 from companion.physics.frames import Array, Matrix
 
 SCALE_SHARE: Final = 0.003
-"""Scale error and misalignment of a consumer gyro after its factory's trim, counted by the net turn since the last
-correction: turning back undoes it."""
+"""Scale error and misalignment of a trimmed consumer gyro, times the net turn since the last correction."""
 GAP_RATE_RAD_S: Final = math.radians(20.0)
 """Error of the rate while samples were missing."""
 MANOEUVRE_M_S2: Final = {"ground": 0.05, "flight": 0.6}
-"""Horizontal acceleration left after averaging that does not show in the length of the force."""
+"""Horizontal acceleration after averaging that does not show in the length of the force."""
 MANOEUVRE_LASTS_S: Final = 2.0
 HEADING_UNKNOWN_RAD: Final = math.pi / math.sqrt(3.0)
 """One sigma of an unknown heading."""
 _BIAS_WANDERS_S: Final = 300.0
-"""Time in which a bias moves by the floor of its Allan deviation: the middle of the flat part of consumer gyros."""
+"""Time in which a bias moves by the floor of its Allan deviation, for consumer gyros."""
 
 
 class Uncertainty:
-    """The covariance.
+    """Covariance of attitude and gyro bias.
 
-    `bias_covariance`: of the gyro bias, (3, 3), sensor axes, by sigma_use. The sigma (3,) of the accelerometer bias
-    levels the aircraft wrongly for ever.
+    `bias_covariance`: (3, 3) of the gyro bias, sensor axes, by sigma_use. The accelerometer bias adds a constant tilt.
     """
 
     def __init__(
@@ -45,7 +43,7 @@ class Uncertainty:
         self.restart(np.eye(3) * HEADING_UNKNOWN_RAD**2)
 
     def restart(self, attitude_covariance: Matrix) -> None:
-        """Begin with the covariance of an alignment, (3, 3) in NED, rad^2."""
+        """Start from the covariance of an alignment, (3, 3) in NED, rad^2."""
         self._covariance = np.zeros((6, 6))
         self._covariance[:3, :3] = attitude_covariance
         self._covariance[3:, 3:] = self._bias_start
@@ -82,7 +80,7 @@ class Uncertainty:
         keep[2, 2] = 1.0 - gain
         self._turned[2] *= 1.0 - gain
         self._covariance = keep @ self._covariance @ keep.T
-        # A compass is wrong in the same way for minutes: its share of the error is sigma, however often it is read.
+        # The error of a compass is constant for minutes: readings do not average it.
         known = math.sqrt(max(self._covariance[2, 2], 0.0))
         self._covariance[2, 2] = (known + gain * sigma_rad) ** 2
 
@@ -90,11 +88,11 @@ class Uncertainty:
         return self._noise.white**2 / seconds + self._noise.floor**2
 
     def rest_sigma(self, seconds: float) -> Array:
-        """Return the sigma of the mean rate that is left after a rest, (3,), sensor axes."""
+        """Return the sigma of the mean rate of a rest, (3,), sensor axes."""
         return np.sqrt(np.maximum(np.diag(self._covariance)[3:], 0.0) + self._rest_variance(seconds))
 
     def rest(self, seconds: float) -> Matrix:
-        """Add a rest; return the gain (6, 3) for the mean rate that was left, sensor axes."""
+        """Add a rest; return the gain (6, 3) for its mean rate, sensor axes."""
         variance = self._rest_variance(seconds)
         part = self._covariance[:, 3:]
         gain = np.linalg.solve(self._covariance[3:, 3:] + np.eye(3) * variance, part.T).T
@@ -104,7 +102,7 @@ class Uncertainty:
 
     @property
     def attitude(self) -> Matrix:
-        """(3, 3) covariance of the attitude error in NED, rad^2."""
+        """Return the covariance (3, 3) of the attitude error in NED, rad^2."""
         result = self._covariance[:3, :3].copy()
         result[range(2), range(2)] += self._levelled**2 * self._level_variance
         result[range(3), range(3)] += np.square(SCALE_SHARE * self._turned)
@@ -112,6 +110,6 @@ class Uncertainty:
 
     @property
     def heading_sigma_rad(self) -> float:
-        """One sigma of the heading, at most that of an unknown one."""
+        """Return one sigma of the heading, at most that of an unknown one."""
         variance = float(self._covariance[2, 2]) + (SCALE_SHARE * float(self._turned[2])) ** 2
         return min(math.sqrt(max(variance, 0.0)), HEADING_UNKNOWN_RAD)

@@ -1,4 +1,4 @@
-"""Attitude in the daemon: wiring, rhythm, and what people are told."""
+"""The pushed attitude: samples in, messages out, the fallback of ArduPilot, and the texts for people."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ INTERNAL: Final = "internal error; the log has the details"
 SAID_AGAIN_S: Final = 30.0
 LATE_S: Final = 3.0
 SHORTEST_S: Final = 0.02
-"""The least time between two messages: ArduPilot drops what comes sooner (autopilots 6)."""
+"""Least time between two messages: ArduPilot drops any that comes sooner (autopilots 6)."""
 SHOWN_EVERY_S: Final = 0.2
-"""For people: autopilots forward these to radios that carry little."""
+"""Interval of messages for people: autopilots forward them to slow radios."""
 _ROUNDING_S: Final = 1e-6
 SCRIPT_STARTS_S: Final = 15.0
-"""After the first heartbeat: before that nobody knows whether there is one."""
+"""Time from the first heartbeat until it is known whether there is a script."""
 WELL_S: Final = 10.0
-"""Time that our heading must have been pushed before its source set is asked for again."""
+"""Time for which our heading must have been pushed before its source set is requested again."""
 AGAIN_S: Final = 1.0
 _OURS, _COMPASS, _GYROS = 1, 2, 3
 _WORDS: Final = {
@@ -63,10 +63,10 @@ _WORDS: Final = {
 
 
 class Fallback:
-    """Source set that ArduPilot flies by when our heading ends: gyros and GNSS in flight, set 3 (autopilots 10.4).
+    """Source set of ArduPilot when our heading ends: gyros and GNSS in flight, set 3 (autopilots 10.4).
 
-    The compass, set 2, is for the ground: in flight nobody could compare it. The script on the flight controller
-    (companion/lua) selects; where `run` finds none, `step` asks. PX4 goes back to its magnetometer by itself.
+    The compass, set 2, is for the ground: in flight it cannot be compared. The script on the flight controller
+    (companion/lua) selects; without a script `step` requests the set. PX4 falls back to its magnetometer by itself.
     """
 
     def __init__(self, core: Core) -> None:
@@ -81,11 +81,11 @@ class Fallback:
 
     @property
     def is_all(self) -> bool:
-        """Return whether the autopilot has no heading but ours: its yaw means nothing without it."""
+        """Return whether the autopilot has no heading but ours, so that its yaw proves nothing."""
         return self._selected and self.net == "none"
 
     async def run(self) -> None:
-        """Look at every start of the autopilot, until cancelled."""
+        """Read the settings after every start of the autopilot, until cancelled."""
         while True:
             await self._vehicle.found.wait()
             self._stale.clear()
@@ -106,13 +106,13 @@ class Fallback:
             self._stale.set()
 
     def step(self, now_s: float, *, pushing: bool) -> None:
-        """Ask for the set that is right, if nobody else does."""
+        """Request the right source set where no script does."""
         self._pushed_since_s = min(self._pushed_since_s, now_s) if pushing else math.inf
         if self.net != "command" or not self._selected:
             return
         if pushing:
             if now_s - self._pushed_since_s < WELL_S:
-                return  # until ours has been well for long enough, what is in use stays
+                return
             wanted = _OURS
         else:
             wanted = _COMPASS if self._vehicle.arm_state is ArmState.DISARMED else _GYROS
@@ -123,7 +123,7 @@ class Fallback:
         answer.add_done_callback(lambda done: self._answered(wanted, done.result()))
 
     def close(self, now_s: float) -> None:
-        """Our heading ends with the daemon."""
+        """Request the set for the time after the daemon."""
         self._tried_s = -math.inf
         self.step(now_s, pushing=False)
 
@@ -134,7 +134,7 @@ class Fallback:
 
 
 class Sender:
-    """Sends the autopilot what is due; ground stations too, if `full`."""
+    """Sends the attitude to the autopilot when it is due; to ground stations too, if `full`."""
 
     def __init__(self, link: MavlinkLink, rate_hz: float, *, full: bool) -> None:
         self.sent = 0
@@ -143,7 +143,7 @@ class Sender:
         self._next_s = self._last_s = self._left_s = self._shown_s = -math.inf
 
     def is_due(self, t_s: float, now_s: float) -> bool:
-        """Return whether the attitude at `t_s` is due; neither stamps nor packets may come closer than allowed."""
+        """Return whether the attitude at `t_s` is due; stamps and packets keep the least time apart."""
         return (
             t_s >= self._next_s - _ROUNDING_S
             and t_s - self._last_s >= SHORTEST_S - _ROUNDING_S
@@ -154,9 +154,9 @@ class Sender:
     def send(
         self, firmware: Firmware, attitude: Attitude, levelled: Attitude, reset_counter: int, now_s: float
     ) -> None:
-        """Send it, and what goes with it; to the autopilot `levelled` in its place."""
+        """Send `levelled` to the autopilot, and `attitude` to ground stations."""
         t_s = attitude.t_s
-        # The rhythm is kept on the average, but what a gap has missed is not made up for.
+        # The rate is kept on average, but messages missed in a gap are not made up for.
         self._next_s = self._next_s + self._period_s if self._next_s > t_s - self._period_s else t_s + self._period_s
         self._last_s, self._left_s = t_s, now_s
         if self._link.send(vision_position_estimate(firmware, levelled, reset_counter)):
@@ -167,13 +167,8 @@ class Sender:
                 self._link.send(message)
 
 
-def is_sane(attitude: Attitude) -> bool:
-    """Return whether everything in it is a number."""
-    return all(map(math.isfinite, (*attitude.quaternion, *attitude.sigma_rad, *attitude.rate_rad_s, attitude.t_s)))
-
-
 class AttitudeService:
-    """Carries, pushes and watches the attitude; `run` it."""
+    """Carries, pushes and supervises the attitude; `run` it."""
 
     def __init__(self, core: Core, devices: Devices, in_force: InForce, calibrating: Calibrating) -> None:
         config, link, vehicle = core.config, core.link, core.vehicle
@@ -210,7 +205,7 @@ class AttitudeService:
     # --- what arrives
 
     def _guarded(self, take: Callable[[Sequence[Sample], float], None]) -> Callable[[Sequence[Sample], float], None]:
-        """A fault in here must cost neither the calibration its samples nor the autopilot its truth."""
+        """Contain a fault: it must cost neither the calibration its samples nor the autopilot a true heading."""
 
         def guarded(samples: Sequence[Sample], read_s: float) -> None:
             try:
@@ -229,17 +224,11 @@ class AttitudeService:
             self._push(read_s)
 
     def _push(self, read_s: float) -> None:
-        """Send what is due, in the turn of the loop that brought the samples.
-
-        Its rhythm is that of the reads: by when each turn has got here, every other one would now and then come too
-        soon, and be left out.
-        """
-        if not self.health.pushing:
-            return
-        if not self.sender.is_due(self.carrier.heard_s, read_s):
+        """Send what is due, in the turn of the event loop that brought the samples: a timer would skip messages."""
+        if not self.health.pushing or not self.sender.is_due(self.carrier.heard_s, read_s):
             return
         attitude = self.carrier.now()
-        if attitude is None or not is_sane(attitude):
+        if attitude is None or not all(map(math.isfinite, (*attitude.quaternion, *attitude.sigma_rad))):
             self.health.stop("attitude lost: samples were missing for too long")
             return
         levelled = self.difference.levelled(attitude, read_s)
@@ -262,7 +251,7 @@ class AttitudeService:
     # --- the rhythm
 
     async def run(self) -> None:
-        """Look after everything that is not as urgent as a sample, until cancelled."""
+        """Do everything that is less urgent than a sample, until cancelled."""
         loop = asyncio.get_running_loop()
         self._running, self._started_s = True, loop.time()
         try:
@@ -271,7 +260,7 @@ class AttitudeService:
                 try:
                     await self._turn(loop.time())
                 except Exception:
-                    # What is pushed to an EKF in flight must be in order, or not be at all.
+                    # A doubtful attitude must not be pushed to an EKF in flight.
                     logger.exception("attitude met a fault of the program")
                     self.health.stop(INTERNAL)
                     await asyncio.sleep(1.0)
@@ -295,7 +284,7 @@ class AttitudeService:
         self._tell(now_s)
 
     def close(self) -> None:
-        """Push no more; where nobody else sees to another heading, ask for one."""
+        """Stop the push, and request another heading where no script does."""
         self.health.stop("the companion ends")
         self.fallback.close(asyncio.get_running_loop().time())
 
@@ -329,7 +318,7 @@ class AttitudeService:
 
     @property
     def concern(self) -> str | None:
-        """Return what the pilot of an armed aircraft should know at once."""
+        """Return the warning for the pilot of an armed aircraft."""
         if self._restarted:
             return f"attitude not pushed: {self.health.why_not}"
         if self.carrier.phase == "flight" and not self.health.pushing and self.carrier.alignments:
@@ -337,8 +326,8 @@ class AttitudeService:
         return self.health.warning
 
     def status(self) -> Object:
-        """For `companion status` and `check`: one line among the devices."""
-        # That nothing has been calibrated yet is no fault of a device.
+        """Return the attitude's line among the devices."""
+        # A missing calibration is no fault of a device.
         calibrated = self.carrier.alignments > 0 or self._restarted
         good = not self._running or self.health.pushing or not calibrated
         summary = self._summary() if self._running else "starts with companion run"
@@ -353,7 +342,7 @@ class AttitudeService:
         return f"heading {seen['heading_deg']:.1f} +- {seen['sigma_deg']['heading']:.1f} deg pushed{differs}"
 
     def view(self) -> Object:
-        """The attitude as JSON can hold it."""
+        """Return the attitude for the status."""
         now_s = asyncio.get_running_loop().time()
         attitude, difference = self.carrier.now(), self.difference
         known = attitude is not None and difference.is_known(now_s)

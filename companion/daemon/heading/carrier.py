@@ -1,4 +1,4 @@
-"""The attitude estimator in the daemon: its samples, at once; its calibration and alignment, a few times a second."""
+"""The attitude estimator in the daemon: its samples, its calibration, and its alignments."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from companion.samples import CompassSample, ImuSample, Sample, Triad, Vector
 logger = logging.getLogger(__name__)
 
 KEPT_S: Final = 5.0
-"""A still window ends up to two seconds ago; with what came since the alignment is carried on to now."""
+"""Samples kept since a still window, which ended up to 2 s ago, to carry its alignment on to now."""
 _NO_STAND: Final = {False: "waiting for an alignment: hold still", True: "waiting for an alignment: not on a deck"}
 STOOD_S: Final = 7.0
 CHECK_EVERY_S: Final = 10.0
@@ -43,7 +43,7 @@ TILT_FLOOR_RAD: Final = 0.5 * DEG
 HEADING_FLOOR_RAD: Final = 3.0 * DEG
 DISAGREES_SIGMAS: Final = 3.0
 JUMP_RAD: Final = 1.0 * DEG
-"""A heading that changes by more at an alignment is told to the autopilot as a reset."""
+"""Least change of heading at an alignment that is sent to the autopilot as a reset."""
 SLOWEST_AIRSPEED_M_S: Final = 5.0
 UNCALIBRATED_ACCEL_MG: Final = 50.0
 """Error of a consumer accelerometer where only the gyros were calibrated."""
@@ -51,7 +51,7 @@ _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 def carrying_imu(config: Config) -> Imu:
-    """The companion's own IMU where it has one: faster, unfiltered, and nobody else changes its offsets."""
+    """Return the companion's own IMU, if any: it is faster, unfiltered, and nobody else changes its offsets."""
     return next((imu for imu in config.imu if imu.source == "serial"), config.imu[0])
 
 
@@ -67,7 +67,7 @@ def settings_of(imu: Imu, record: ImuRecord, local: LocalEarth, gyro_step_rad_s:
         full = [row[:3] for row in record.covariance[:3]]
         if not any(value is None for row in full for value in row):
             covariance = np.array(full, dtype=np.float64)
-    # What is left of the steps where the rate is too small to be told from none.
+    # Quantisation: a rate below one step reads zero.
     covariance = covariance + np.eye(3) * gyro_step_rad_s**2 / 12.0
     unknown = UNCALIBRATED_ACCEL_MG * MG
     # In flight the aircraft is mostly level, however it stood when it was calibrated.
@@ -90,14 +90,9 @@ def _left(record: ImuRecord, residual: Vector | None, triad: Triad) -> Vector | 
 
 
 def without_truncation(sample: ImuSample, step_rad_s: float) -> ImuSample:
-    """A sample whose rates were cut off towards zero: in the middle of what they may have been."""
-    x, y, z = sample.gyro_rad_s
-    rates: Vector = (_middle(x, step_rad_s), _middle(y, step_rad_s), _middle(z, step_rad_s))
-    return ImuSample(t_s=sample.t_s, gyro_rad_s=rates, accel_m_s2=sample.accel_m_s2)
-
-
-def _middle(value: float, step: float) -> float:
-    return value + math.copysign(0.5 * step, value) if value else 0.0
+    """Correct rates that were truncated towards zero by half a step."""
+    x, y, z = (rate + math.copysign(0.5 * step_rad_s, rate) if rate else 0.0 for rate in sample.gyro_rad_s)
+    return ImuSample(t_s=sample.t_s, gyro_rad_s=(x, y, z), accel_m_s2=sample.accel_m_s2)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +110,7 @@ class StandingAttitude:
 def standing_attitude(
     window: Window, where: Whereabouts, gradienter: GradienterModel | None, compass: CompassModel | None
 ) -> StandingAttitude:
-    """Estimate the stand; blocking. Raise CalibrationRefusedError where the readings contradict each other."""
+    """Estimate the attitude of a still window; blocking. Refuse readings that contradict each other."""
     local = local_earth(where)
     truth = truth_of(window, gradienter if window.tilt is not None else None, compass, local, [])
     turn = truth.body_from_ned
@@ -126,7 +121,7 @@ def standing_attitude(
 
 
 def turn_between(ours: Quaternion, theirs: Quaternion) -> Triple:
-    """Return the turns from ours to theirs about north, east and down in rad; of large ones 2 sin(half)."""
+    """Return the rotation from ours to theirs about north, east and down in rad; 2 sin(angle / 2) of large ones."""
     error = multiply(theirs, conjugate(ours))
     sign = math.copysign(2.0, error[0])
     return sign * error[1], sign * error[2], sign * error[3]
@@ -143,7 +138,7 @@ class Carrier:
         self.still = False
         self.alignments = 0
         self.reset_counter = 0
-        """Counts the alignments at which the heading jumped."""
+        """Number of alignments at which the heading jumped."""
         self.airspeed_m_s: float | None = None
         self.gyro_step_rad_s = 0.0
         self.waiting_for = "waiting for a calibration"
@@ -160,10 +155,10 @@ class Carrier:
         self._checked_s = -math.inf
         core.vehicle.on_event.add(self._on_event)
 
-    # --- what comes in, in the turn of the loop in which it was read
+    # --- samples, in the turn of the loop in which they were read
 
     def add(self, samples: Sequence[ImuSample]) -> None:
-        """Take the samples of one read."""
+        """Add the samples of one read."""
         self.heard_s = samples[-1].t_s
         if self.phase == "ground" or self.estimator is None:
             recent = self._recent
@@ -174,7 +169,7 @@ class Carrier:
             self.estimator.update(samples, phase=self.phase, still=self.still, airspeed_m_s=self.airspeed_m_s)
 
     def take_compass(self, samples: Sequence[Sample]) -> None:
-        """Take headings."""
+        """Add headings of the compass."""
         estimator, compass, local = self.estimator, self._compass, self._local
         if estimator is None or compass is None or local is None:
             return
@@ -194,20 +189,20 @@ class Carrier:
             estimator.add_heading(sample.t_s, heading, sigma_deg * DEG)
 
     def forget(self) -> None:
-        """Begin anew, with the calibration in force."""
+        """Start anew, with the active calibration."""
         self.estimator = self._record = None
         self._recent.clear()
 
     def align_anew(self) -> None:
-        """Align as soon as it stands still on the ground."""
+        """Request an alignment as soon as it is still on the ground."""
         self._wanted = True
 
     def now(self) -> Attitude | None:
-        """The attitude at the last sample; None while there is none."""
+        """Return the attitude at the last sample; None while there is none."""
         return None if self.estimator is None else self.estimator.attitude()
 
     def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
-        """Return instant and turn from body to NED that are remembered near then; None without any."""
+        """Return the remembered instant nearest before a time, and the attitude then (body to NED)."""
         return None if self.estimator is None else self.estimator.kept_at(t_s)
 
     def _on_event(self, event: VehicleEvent) -> None:
@@ -217,12 +212,12 @@ class Carrier:
         elif event == "disarmed":
             self.phase = "ground"
 
-    # --- what is looked at now and then
+    # --- calibration and alignment, a few times a second
 
     async def update(self, now_s: float) -> None:
-        """Follow arming, calibrations and stillness; align when it is time to."""
+        """Follow arming, calibrations and stillness; align when needed."""
         disarmed = self._vehicle.arm_state is ArmState.DISARMED
-        # While nobody knows, what flight demands is right on the ground too; not so the other way round.
+        # With an unknown arm state the rules of flight are safe.
         self.phase = "ground" if disarmed else "flight"
         on_deck = self._config.vehicle.platform == "deck"
         self.still = disarmed and not on_deck and self._collector.glance(now_s).obstacle is None
@@ -245,7 +240,7 @@ class Carrier:
     async def _follow_calibration(self) -> None:
         found = self._in_force.record_of(self.imu.name)
         if found is None and self.imu.source == "serial":
-            found = self._record  # what was undone or replaced is the autopilot's; this bias is still the sensor's
+            found = self._record  # an undo changes the autopilot, not the bias of our own sensor
         if found is self._record:
             return
         self._record = found
@@ -264,7 +259,7 @@ class Carrier:
             self._wanted = True
 
     def resume(self, settings: AttitudeSettings, stand: StandingAttitude) -> None:
-        """Begin in flight."""
+        """Start in flight."""
         self.estimator, self._local = AttitudeEstimator(settings), stand.local
         self._align(stand)
 
@@ -297,7 +292,7 @@ class Carrier:
         assert self.estimator is not None
         before = self.now()
         since = [sample for read in self._recent for sample in read if sample.t_s > stand.t_s]
-        # Just landed nothing is kept: then it stood so at the last sample, and is known at once.
+        # Just landed no samples are kept: the attitude is then that of the last sample.
         begun_s = stand.t_s if since else self.heard_s if math.isfinite(self.heard_s) else None
         self.estimator.align(begun_s, stand.body_from_ned, stand.covariance)
         self.estimator.update(since, phase=self.phase)

@@ -1,4 +1,4 @@
-"""May the attitude be pushed? What is wrong with it, in one line, and how it lies to the autopilot's own."""
+"""Whether the attitude may be pushed, with the reason in one line, and its difference to the autopilot's own."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ ATTITUDE_RATE_HZ: Final = 10.0
 THEIR_TILT_DEG: Final = 2.0
 """One sigma of the error of the autopilot's own tilt, with trim (AHRS_TRIM) and mounting errors."""
 THEIR_HEADING_DEG: Final = 5.0
-"""One sigma of the error of its heading, where a compass or the companion gives it."""
+"""One sigma of the error of the autopilot's heading, from a compass or the companion."""
 GOOD_S: Final = 3.0
-"""After a stop everything has to be well for so long before the push begins again."""
+"""Time without a fault before a stopped push begins again."""
 TOLD_TILT_DEG: Final = 4.0
 TOLD_HEADING_DEG: Final = 8.0
-"""A smoothed difference beyond these is told; it is over at half of them."""
+"""Smoothed differences that cause a warning; it ends at half of them."""
 SMOOTHED_S: Final = 3.0
-"""The two differ for moments by their filters' delays; over so long what lasts is left."""
+"""Smoothing time: the two differ for moments by the delays of their filters."""
 OLD_S: Final = 2.0
 STEEP_RAD: Final = math.radians(60.0)
-"""Pitch beyond which roll and heading can hardly be told apart."""
+"""Pitch beyond which roll and heading cannot be separated."""
 FORGETS_PER_S: Final = 0.02
-"""The shortest delay that was seen is forgotten as two clocks may run apart, a simulated one by 1 %."""
+"""Growth of the shortest delay seen, as two clocks may drift apart, a simulated one by 1 %."""
 HEADING_UNKNOWN: Final = "heading unknown: no compass reading fits"
 _DOWN: Final[Triple] = (0.0, 0.0, 1.0)
 
@@ -64,17 +64,17 @@ class Difference:
         self._now, self._kept_at = now, kept_at
         self._offset_s: float | None = None
         self._forgotten_s = 0.0
-        """Possible error of the instants, as no message has been as quick as expected."""
+        """Possible error of the times, as no message had the shortest delay."""
         self.theirs: tuple[float, Quaternion] | None = None
-        """The autopilot's last attitude: instant on our clock, and turn from body to NED."""
+        """The autopilot's last attitude: time on our clock, and body to NED."""
         self.latest: tuple[float, float] | None = None
-        """Unsmoothed `tilt_rad` and `heading_rad`; None where it is too steep to tell them apart."""
+        """Unsmoothed `tilt_rad` and `heading_rad`; None where it is too steep."""
         self.heard_s = -math.inf
         self.forget()
         vehicle.hear(mavlink.MAVLink_attitude_message, self._on_attitude, ATTITUDE_RATE_HZ)
 
     def forget(self) -> None:
-        """Begin anew: our attitude was aligned."""
+        """Start anew after an alignment."""
         self._sine = self._cosine = 0.0
         self._down: Triple = (0.0, 0.0, 0.0)
         self._down_now: Triple = (0.0, 0.0, 0.0)
@@ -86,25 +86,25 @@ class Difference:
         return now_s - self.heard_s < OLD_S
 
     def is_known(self, now_s: float) -> bool:
-        """Return whether it has done so long enough to smooth."""
+        """Return whether the difference has been smoothed long enough."""
         return self.is_heard(now_s) and now_s - self._since_s > SMOOTHED_S
 
     @property
     def tilt_rad(self) -> float:
-        """Between the two opinions of the vertical, smoothed."""
+        """Smoothed angle between the two verticals."""
         return math.hypot(*self._down)
 
     @property
     def heading_rad(self) -> float:
-        """Theirs less ours, smoothed, in [-pi, pi]."""
+        """Smoothed heading of the autopilot less ours, in [-pi, pi]."""
         return math.atan2(self._sine, self._cosine)
 
     def levelled(self, attitude: Attitude, now_s: float) -> Attitude:
-        """Ours, turned by the shortest way to the vertical of the autopilot, as far as that is known.
+        """Return our attitude turned by the shortest arc to the autopilot's vertical, if known.
 
-        PX4 compares headings in the order of angles that a tilt asks for: its own tilt where it takes its own heading,
-        ours where it takes ours. At 30 deg of tilt the two orders are up to 10 deg apart, and to a heading that it has
-        refused for 1 s it leaps (ev_yaw_control.cpp, getEulerYaw).
+        PX4 takes the yaw of its own quaternion in an order of angles that depends on the tilt. At 30 deg of tilt two
+        orders differ by up to 10 deg, and PX4 jumps to a heading that it has refused for 1 s (ev_yaw_control.cpp,
+        getEulerYaw).
         """
         if not self.is_heard(now_s):
             return attitude
@@ -165,7 +165,7 @@ class Difference:
             self._offset_s += forgotten_s
             self._forgotten_s += forgotten_s
             if offset_s < self._offset_s - LATE_S:
-                # The line was late, and is less so: in a turn the two would seem to part at this moment.
+                # A delay that ends would look like a difference in a turn.
                 self.straying.skip()
         if offset_s <= self._offset_s:
             self._offset_s, self._forgotten_s = offset_s, 0.0
@@ -173,7 +173,7 @@ class Difference:
 
 
 def disagreements(attitude: Attitude, tilt_rad: float, heading_rad: float) -> tuple[str | None, str | None]:
-    """Return in words whether tilt and heading differ by more than both errors allow."""
+    """Return in words whether tilt and heading differ by more than both errors allow; None where they do not."""
     roll, pitch, yaw = (sigma / DEG for sigma in attitude.sigma_rad)
     words: list[str | None] = []
     for name, found_rad, ours_deg, theirs_deg in (
@@ -187,10 +187,10 @@ def disagreements(attitude: Attitude, tilt_rad: float, heading_rad: float) -> tu
 
 
 class Health:
-    """Judges whether the attitude may be pushed; `judge` several times a second.
+    """Judges whether the attitude may be pushed; call `judge` several times a second.
 
-    A heading that differs stops the push if the two have agreed since the last alignment, or if the autopilot's is its
-    own compass' (`own_agrees`): one of the two compasses lies. Drift in flight ends with an alignment only.
+    A different heading stops the push if the two have agreed since the last alignment, or if the autopilot's comes from
+    its own compass (`own_agrees`): one of the two is wrong. Only an alignment ends a drift in flight.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class Health:
         self._has_ours &= event != "rebooted"
 
     def judge(self, now_s: float) -> None:
-        """Look at everything; `pushing` and the words follow."""
+        """Update `pushing`, `why_not` and `warning`."""
         if self._alignments != self._carrier.alignments:
             self._alignments = self._carrier.alignments
             self._agreed, self._differs_since_s, self._strayed = False, None, None
@@ -232,7 +232,7 @@ class Health:
             self.why_not = f"well again, pushed after {GOOD_S:.0f} s of it"
 
     def stop(self, why: str) -> None:
-        """Stop between two looks."""
+        """Stop the push at once."""
         self._stopped |= self.pushing
         self.pushing, self.why_not, self._good_since_s = False, why, None
 
@@ -294,7 +294,7 @@ class Health:
             return None
         if self._differs_since_s is None:
             self._differs_since_s = now_s
-        # What has stopped the push goes on doing so until it is well again.
+        # A difference that has stopped the push keeps it stopped until it ends.
         return words if now_s - self._differs_since_s >= DIFFERS_S or not self.pushing else None
 
     def _compare(self, now_s: float) -> None:

@@ -1,6 +1,6 @@
-"""A daemon that starts in flight: the attitude begins again from the last calibration, or not at all.
+"""Start in flight: the attitude resumes from the last calibration, or not at all.
 
-Roll and pitch are the autopilot's, the heading is our compass'. Nothing is pushed before both agree for a while.
+Roll and pitch come from the autopilot, the heading from our compass. Nothing is pushed before the two attitudes agree.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from companion.physics.units import DEG
 from companion.samples import Vector
 
 AGREES_S: Final = 0.7
-"""Agreement needed before the push, and disagreement before it begins anew."""
+"""Time of agreement before the push, and of disagreement before a new start."""
 FRESH_S: Final = 1.0
-"""Largest age of the autopilot's attitude: the gyros tell what has turned since."""
+"""Largest age of the autopilot's attitude; the gyros carry it on."""
 LATEST: Final = 10
-"""Records searched for an active one; the others were cancelled or have failed."""
+"""Records searched for one that is not cancelled or failed."""
 DECLINATION_SIGMA_DEG: Final = 1.0
-"""Error of a stored declination: 0.3 to 0.5 deg of the model where people live, and the way flown since."""
+"""Error of a stored declination: 0.3 to 0.5 deg of the model, and the distance flown since."""
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 class Resume:
-    """`step` several times a second; it has done its part once all agrees, or the aircraft is seen disarmed."""
+    """Resumes the attitude in flight; `step` several times a second until `pending` is false."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class Resume:
         self._since_s = self._unknown_s = 0.0
 
     async def step(self, now_s: float) -> None:
-        """Begin, compare, and begin anew where the two do not agree."""
+        """Start, compare, and start anew where the two attitudes do not agree."""
         carrier = self._carrier
         if not self.pending or self._core.vehicle.system_id is None:
             return

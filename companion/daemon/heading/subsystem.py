@@ -1,4 +1,4 @@
-"""The heading: how the aircraft stands and turns, and what of it the autopilot is told."""
+"""The pose for people, the attitude for the autopilot, and the check of the autopilot's settings for it."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ DECLINATION_EVERY_S: Final = 60.0
 
 
 class Heading(Subsystem):
-    """The pose that people see, and the attitude that is pushed."""
+    """Wires the shown pose and the pushed attitude."""
 
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating, arming: Arming) -> None:
         self._core = core
         self.attitude: AttitudeService | None = None
         if core.config.push.attitude != "off":
-            # What nobody asked for costs the start nothing.
+            # Imported here: the start is shorter without.
             from companion.daemon.heading.attitude_service import AttitudeService
 
             self.attitude = AttitudeService(core, devices, arming.in_force, calibrating)
@@ -52,11 +52,9 @@ class Heading(Subsystem):
         found = await self._core.parameters.read_many(firmware.heading_names(), optional=True)
         changes = firmware.heading_changes(found)
         gate = await firmware.find_gate_problem(self._core.parameters, self._core.vehicle.system_id, 0.0)
-        sends, todo = (
-            self._core.config.push.attitude != "off",
-            ", ".join(f"{one.parameter} {one.after:g}" for one in changes),
-        )
-        # Where no heading is sent and none is taken in, nothing hangs on it.
+        sends = self._core.config.push.attitude != "off"
+        todo = ", ".join(f"{one.parameter} {one.after:g}" for one in changes)
+        # Without a heading sent or expected the rest does not matter.
         concerned = sends or not changes
         net = firmware.heading_net(found)
         missing = firmware.missing_compass(found) if concerned else None
@@ -102,7 +100,7 @@ class Heading(Subsystem):
         }
 
     def close(self) -> None:
-        """Push no more, and have the autopilot fly by something else."""
+        """Stop the push, and request the fallback."""
         if self.attitude is not None:
             self.attitude.close()
 
@@ -113,7 +111,7 @@ class Heading(Subsystem):
 
 
 class PoseNow:
-    """Takes samples, tells the pose; `carried` gives the attitude that is right in flight, too, while there is one."""
+    """The pose from gradienter and compass, or from `carried`, which holds in flight too, while that gives one."""
 
     def __init__(self, core: Core, alignment: AlignmentInForce, carried: Callable[[], Object | None] | None) -> None:
         self._core, self._alignment, self._carried = core, alignment, carried
@@ -124,14 +122,14 @@ class PoseNow:
         self._looked_up_s = -math.inf
 
     def add(self, sample: Sample) -> None:
-        """Take a reading of gradienter or compass."""
+        """Add a reading of gradienter or compass."""
         if isinstance(sample, TiltSample):
             self._tilt = sample
         elif isinstance(sample, CompassSample):
             self._heading = sample
 
     async def refresh(self) -> Object | None:
-        """Return `now`, with the declination of the place looked up now and then."""
+        """Return `now`, with the declination updated when due."""
         if self._compass is not None and self._compass.magnetic:
             await self._look_up(asyncio.get_running_loop().time())
         return self.now()
