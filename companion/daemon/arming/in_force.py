@@ -1,9 +1,8 @@
-"""The calibration in force in each IMU, since when, and what speaks against it.
+"""The active calibration of each IMU, its age, and the findings against it.
 
-Three things are watched: calibrations that end, the offsets that the autopilot reports (`offset_watch`), and the
-present output in the rolling window. What an automatic calibration has measured and not written, because it contradicts
-earlier ones, is held back: it is in doubt, so that it judges nothing. What is in force stays so, and the gate as it
-was, until somebody asks for a calibration or the output changes again.
+Three inputs: calibrations that end, the offsets that the autopilot reports (`offset_watch`), and the output in the
+rolling window. A result that contradicts earlier ones and that nobody requested is held back: the active calibration
+and the gate stay as they are, until somebody requests a calibration or the output changes again.
 """
 
 from __future__ import annotations
@@ -50,12 +49,12 @@ from companion.samples import TRIADS, Triad
 
 logger = logging.getLogger(__name__)
 
-# What the pilot undid and what somebody else chose is theirs until asked for; what a boot replaced is written again.
+# Offsets that the pilot restored or somebody else set stay until a request; those replaced by a boot are written again.
 _SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
 _NOT_IN_DOUBT: Final = frozenset({Why.UNDONE, Why.CHANGED, Why.UNSEEN})
-"""Findings that count although a measurement is held back: choices of people, and writes that were not seen."""
+"""Findings that count although a result is held back: choices of people, and writes without a seen effect."""
 SETTLED_EVERY_S: Final = 5
-"""Interval of checks of the output while nothing speaks against what is in force; otherwise every second."""
+"""Interval of checks of the output without a finding; otherwise every second."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -64,17 +63,16 @@ class _TriadState:
 
     held: Held | Why = Why.NEVER
     shelved: Held | None = None
-    """State before a restart that kept the offsets: it counts again once a window agrees."""
+    """State before a restart that kept the offsets; restored once a window agrees."""
     present: Present | None = None
-    """Present output; None without a still window."""
     in_doubt: tuple[str, Held] | None = None
-    """Held back, why, and what was measured: while the output stays there, measuring again would give the same."""
+    """Reason and value of a result held back, as long as the output stays there."""
     judged: bool = True
-    """False: no calibration can settle it, as its integer readings tell nothing."""
+    """False: its integer readings carry no information."""
 
 
 class InForce:
-    """The calibration in force; `poll` often, `measure` whenever there may be a new window."""
+    """The active calibration; `poll` often, `measure` whenever there may be a new window."""
 
     def __init__(
         self,
@@ -98,12 +96,12 @@ class InForce:
         triads = TRIADS if config.gradienter is not None else TRIADS[:1]
         self._triads: dict[Key, _TriadState] = {(name, triad): _TriadState() for name in names for triad in triads}
         self.temperatures_degc: dict[str, float] = {}
-        """Temperature of each IMU that tells one, at the last look at its output."""
+        """Temperatures of the IMUs at the last check of their output."""
         self._measured_s = self._looked_s = -1.0
         self._worth_since_s: float | None = None
         self.offsets = OffsetWatch(core.vehicle, imus, self._lose)
         self.calibration: Record | None = None
-        """The last finished calibration of this run, while at least one of its values is in force."""
+        """The last finished calibration of this run, while any of its values is active."""
         self.undone = False
         estimator.alignment.on_change.add(self._realigned)
 
@@ -115,7 +113,7 @@ class InForce:
         return What.BOTH if self._config.gradienter is not None else What.GYROS
 
     def findings(self, now_s: float) -> list[Objection]:
-        """List everything that speaks against what is in force; empty while it is good. Computes little."""
+        """List the findings against the active calibration; empty while it is good."""
         found: list[Objection] = []
         for (name, triad), state in self._triads.items():
             held = state.held
@@ -139,21 +137,18 @@ class InForce:
 
     @property
     def held_back(self) -> str | None:
-        """Triads that were measured and not written, and why, in one short line; None without."""
+        """Triads held back, with the reasons, in one short line; None without."""
         kept = {key: state.in_doubt[0] for key, state in self._triads.items() if state.in_doubt is not None}
         return f"held back: {in_short(kept)} ({', '.join(dict.fromkeys(kept.values()))})" if kept else None
 
     @property
     def earlier(self) -> Record | None:
-        """The last calibration, also from before this start, if it was good and has not been undone."""
+        """The last good calibration, also from before this start, if it has not been undone."""
         return None if self.undone else self._manager.last_good
 
     @property
     def worth_writing_s(self) -> float:
-        """Seconds in a row for which the window has promised better offsets than those in force.
-
-        One look in a hundred says so by chance, and there is one every second.
-        """
+        """Seconds for which every window has promised better offsets; one in a hundred does so by chance."""
         return 0.0 if self._worth_since_s is None else self._measured_s - self._worth_since_s
 
     @property
@@ -167,38 +162,38 @@ class InForce:
 
     @property
     def calibrated_s(self) -> float | None:
-        """Time of the oldest calibration in force; None where something was only measured to be right."""
+        """Time of the oldest active calibration; None where offsets were only confirmed."""
         times = [held.calibrated_s for held in self._judged if isinstance(held, Held)]
         known = [time_s for time_s in times if time_s is not None]
         return min(known) if times and len(known) == len(times) else None
 
     @property
     def confirmed_s(self) -> float | None:
-        """Time at which everything in force was last seen to be right; None while something was never."""
+        """Time at which all offsets were last confirmed; None while some never were."""
         known = [held.confirmed_s for held in self._judged if isinstance(held, Held)]
         return min(known) if known and len(known) == len(self._judged) else None
 
     def sigma(self, triad: Triad) -> float | None:
-        """Return the largest sigma_use in force, rad/s or m/s^2; None without any."""
+        """Return the largest active sigma_use, rad/s or m/s^2; None without any."""
         held = [state.held for (_, of), state in self._triads.items() if of == triad]
         return max((max(each.sigma_use) for each in held if isinstance(each, Held)), default=None)
 
     def record_of(self, name: str) -> ImuRecord | None:
-        """Return what the last calibration found in one IMU; None if nothing, or if something has replaced it."""
+        """Return the last calibration of one IMU; None without, or if it was replaced."""
         states = [state for key, state in self._triads.items() if key[0] == name and state.judged]
         if self.calibration is None or any(isinstance(one.held, Why) or one.in_doubt for one in states):
             return None
         return next((imu for imu in self.calibration.imus if imu.name == name), None)
 
     def reading(self) -> str | None:
-        """Name an IMU of the autopilot whose offsets are not known at this moment, and why, in one line."""
+        """Name an IMU of the autopilot whose offsets are not known now, with the reason, in one line."""
         found = ((name, imu.obstacle) for name, imu in self._imus.items())
         return next((f"imu {name}: {obstacle}" for name, obstacle in found if obstacle is not None), None)
 
     # --- what happens
 
     def on_ended(self, job: Job, result: JobResult) -> None:
-        """Note the end of a job: the autopilot's present offsets are of our doing."""
+        """Handle the end of a job; the autopilot's present offsets are ours."""
         self._forget_window()
         self.offsets.on_ended(job, result)
         if result.outcome != "done":
@@ -213,9 +208,9 @@ class InForce:
                 self._take(imu, asyncio.get_running_loop().time(), job.held_back)
 
     def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Doubt]) -> None:
-        """Note what a calibration has found in one IMU, and what of it was not written for doubt."""
+        """Make a calibration of one IMU the active one, except for triads held back."""
         corrected, averaged_s = imu.name in self._imus, self._config.calibration.min_still_s
-        # Of an IMU that is not in the autopilot's telemetry "stored" is all that can ever be known.
+        # Without telemetry of an IMU "stored" is the best outcome.
         for triad, residual in zip(TRIADS, (imu.residual_gyro_rad_s, imu.residual_accel_m_s2), strict=True):
             seen = outcomes_of(triad, imu.written) <= {"verified"} or not corrected
             found = held_of(imu, triad, now_s, averaged_s, corrected=corrected, seen=seen)
@@ -229,7 +224,7 @@ class InForce:
             state.in_doubt = doubt.in_short, msgspec.structs.replace(found, expected=expected)
 
     def _realigned(self) -> None:
-        """Note another zero of the gradienter: accelerometers calibrated with the old one must be seen anew."""
+        """Void accelerometers that were calibrated with another zero of the gradienter."""
         for (_, triad), state in self._triads.items():
             if triad == "accel":
                 state.held = Why.ALIGNED if isinstance(state.held, Held) else state.held
@@ -237,7 +232,7 @@ class InForce:
         self._forget_window()
 
     def poll(self, *, writing: bool) -> None:
-        """Check whether anybody has changed the autopilot's offsets, unless we may be changing them just now."""
+        """Check whether somebody else has changed the autopilot's offsets, unless we are `writing`."""
         if writing:
             self.offsets.let_go()
             self._forget_window()
@@ -248,7 +243,7 @@ class InForce:
         for state in (state for key, state in self._triads.items() if key[0] == name and state.judged):
             if why is not Why.REBOOTED:  # which has kept them
                 state.in_doubt = None
-            # What was never there, or was taken back on purpose, is not lost again by a restart.
+            # A restart does not change offsets that never were, or that were restored on purpose.
             if isinstance(state.held, Held) or why in (Why.CHANGED, Why.FAILED):
                 if isinstance(state.held, Held) and why is Why.REBOOTED:
                     state.shelved = state.held
@@ -260,7 +255,7 @@ class InForce:
             state.present = None
 
     async def measure(self, now_s: float) -> bool:
-        """Check the present output when that is due; returns whether it was."""
+        """Check the present output when due; return whether it was."""
         second = math.floor(now_s)  # the collector's seconds end with the clock's
         settled = self.measured and self._worth_since_s is None and not self.findings(now_s)
         if second == self._looked_s or (settled and second - self._looked_s < SETTLED_EVERY_S):
@@ -322,7 +317,7 @@ class InForce:
             state.judged = False
 
     def _stays_in_doubt(self, state: _TriadState, present: Present, end_s: float) -> bool:
-        """Let go of what is held back once the output shows what is in force, or something else, or after long."""
+        """Drop a result held back once the output agrees with the active one, or with neither, or after long."""
         if state.in_doubt is None:
             return False
         measured = state.in_doubt[1]
@@ -335,7 +330,7 @@ class InForce:
     def _confirm(
         self, key: Key, state: _TriadState, present: Present, degc: float | None, end_s: float, averaged_s: float
     ) -> None:
-        """Count what the window agrees with as right from now on."""
+        """Confirm what the window agrees with."""
         held = state.held
         if held is Why.REBOOTED:
             held = state.shelved or held
@@ -355,12 +350,12 @@ class InForce:
                     averaged_s=averaged_s,
                 )
         elif worst_axis(held, present) is None and (end_s > held.confirmed_s or not held.seen):
-            # What is collected while offsets are in doubt was sent under the new ones: a write voids what was before.
+            # A write voids earlier telemetry, so that this window was sent under the new offsets.
             confirmed_s = max(end_s, held.confirmed_s)
             state.held = msgspec.structs.replace(held, confirmed_s=confirmed_s, temperature_degc=degc, seen=True)
 
     def _from_record(self, key: Key, now_s: float) -> Held | None:
-        """Return what the last calibration before this start wrote, if the IMU has run ever since with just that."""
+        """Return the calibration before this start, if the IMU has run with its offsets ever since."""
         (name, triad), record = key, self.earlier
         calibration = self._imus[name].calibration if name in self._imus else None
         imu = None if record is None else next((each for each in record.imus if each.name == name), None)

@@ -1,14 +1,9 @@
-"""Detects changes of the autopilot's offsets that are not ours.
-
-Offsets that change while nobody here writes were changed by somebody else, or by a boot that measured the gyros itself
-(INS_GYR_CAL = 1, autopilots 1.5).
-"""
+"""Detects changes of the autopilot's offsets by others: people, or a boot that measures the gyros (INS_GYR_CAL = 1)."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.vehicle.vehicle import Vehicle
@@ -20,14 +15,12 @@ from companion.estimation.records.validity import Why
 logger = logging.getLogger(__name__)
 
 
-class _Known(NamedTuple):
-    offsets: tuple[float, ...]
-    """Gyro offsets first; not by name, since what is learned of PX4's slots gives the same IMU other names."""
-    boots: int
+_Known = tuple[tuple[float, ...], int]
+"""Offsets, and number of boots. Without names: PX4 may move an IMU to other parameters."""
 
 
 class OffsetWatch:
-    """Compares; `poll` often. `lost` is called with the IMU whose offsets are ours no longer, and why."""
+    """Compares offsets; `poll` often. `lost` is called with an IMU whose offsets are not ours any more, and why."""
 
     def __init__(self, vehicle: Vehicle, imus: Mapping[str, AutopilotImu], lost: Callable[[str, Why], object]) -> None:
         self._vehicle, self._imus, self._lost = vehicle, imus, lost
@@ -36,12 +29,12 @@ class OffsetWatch:
         """Offsets before a job, until those after it are read."""
         self._failed = self._asked_restart = False
         self._written: dict[str, dict[str, float]] = {}
-        """Values by IMU that a calibration has just written, until they are read."""
+        """Values just written, by IMU, until they are read."""
         self.foreign: str | None = None
-        """Change by somebody else since the last request, in few words."""
+        """Change by somebody else since the last request, in short."""
 
     def known(self) -> dict[str, _Known]:
-        """Return the present offsets, to be compared with later."""
+        """Return the present offsets for a later comparison."""
         return dict(self._known)
 
     def let_go(self) -> None:
@@ -49,7 +42,7 @@ class OffsetWatch:
         self._before, self._known = dict(self._known) or self._before, {}
 
     def on_ended(self, job: Job, result: JobResult) -> None:
-        """Note the end of a calibration, an alignment or an undo."""
+        """Handle the end of a calibration, an alignment or an undo."""
         self.let_go()
         self._written, self._failed = {}, result.outcome != "done"
         if job.kind == "undo":
@@ -67,22 +60,22 @@ class OffsetWatch:
             calibration = imu.calibration
             if calibration is None:
                 continue
-            now = _Known(tuple(calibration.offsets.values()), self._vehicle.boots)
+            now = tuple(calibration.offsets.values()), self._vehicle.boots
             known, self._known[name] = self._known.get(name), now
             if known is None:
                 self._check_after_job(name, self._before.pop(name, now), now, calibration)
-            elif known.boots != now.boots:
-                self._lost(name, Why.REPLACED if known.offsets != now.offsets else Why.REBOOTED)
+            elif known[1] != now[1]:
+                self._lost(name, Why.REPLACED if known[0] != now[0] else Why.REBOOTED)
             elif known != now:
                 self._changed_by_others(name)
 
     def _check_after_job(self, name: str, before: _Known, now: _Known, calibration: ImuCalibration) -> None:
-        """Compare with what a job has left: between the two the EKF may have settled for minutes."""
-        written = self._written.pop(name, {})
-        restarted = before.boots != now.boots and not self._asked_restart
-        changed = (self._failed and before.offsets != now.offsets) or (written and calibration.contradicts(written))
-        if changed and before.boots != now.boots and (self._failed or restarted):
-            # What was ours has been restored by now.
+        """Compare with the end of a job: the EKF may have settled for minutes since."""
+        written, rebooted = self._written.pop(name, {}), before[1] != now[1]
+        restarted = rebooted and not self._asked_restart
+        changed = (self._failed and before[0] != now[0]) or (written and calibration.contradicts(written))
+        if changed and rebooted and (self._failed or restarted):
+            # Our own changes have been restored by now.
             self._lost(name, Why.FAILED if self._failed else Why.REPLACED)
         elif changed:
             self._changed_by_others(name)

@@ -1,7 +1,7 @@
-"""The answer to an arming request, and why: prepared four times a second, given in microseconds.
+"""The answer to an arming request with its reason, prepared four times a second.
 
-PX4 waits for it with its commander thread stopped (autopilots 5.2), so that nothing may be computed, read or awaited
-once the request is there. `Readiness._judge` lists what keeps the gate closed, in the order in which it is reported.
+PX4 waits for it with its commander thread stopped (autopilots 5.2): nothing may be computed, read or awaited then.
+`Readiness._judge` lists the reasons for a closed gate in the order in which they are reported.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ logger = logging.getLogger(__name__)
 POLL_S: Final = 0.25
 BY_ITSELF: Final = "calibrates by itself"
 STEADY_S: Final = 2.0
-"""Stillness required of an aircraft that somebody has just let go of."""
+"""Stillness required after somebody has let go of the aircraft."""
 COUNTDOWN_KEPT_S: Final = 2.0
-"""A countdown that was not shown for so long begins anew."""
+"""Age at which a countdown starts anew."""
 OLDEST_ANSWER_S: Final = 1.5
-"""Age beyond which an answer, which the loop has not renewed, is not given."""
+"""Age at which an answer that was not renewed is void."""
 _STEPS: Final[dict[State, str]] = {
     State.WRITING: "writing offsets",
     State.VERIFYING: "checking new offsets",
@@ -46,7 +46,7 @@ _CHECKED_NEXT: Final[dict[Why, str]] = {
     Why.REBOOTED: "checking after restart",
     Why.UNSEEN: _STEPS[State.VERIFYING],
 }
-"""Findings that the next still window settles without anybody's help."""
+"""Findings that the next still window settles by itself."""
 _NEEDED: Final = tuple(one for one in Precondition if one not in (Precondition.IDLE, Precondition.DISARMED))
 """Conditions without which the gate stays closed, whatever calibration is active."""
 _WAITS: Final = {
@@ -84,19 +84,19 @@ class Readiness:
 
     @property
     def asks_script(self) -> bool:
-        """Whether ArduPilot's script gets the answer: while this gates, and afterwards, to let go."""
+        """Whether ArduPilot's script gets the answer: while this gates, and afterwards, to release it."""
         self._has_gated |= self.at_arm == "gate"
         return self._has_gated and self._vehicle.kind.gate_is_script
 
     @property
     def owed(self) -> str | None:
-        """Action that the autopilot needs from the pilot before it flies."""
+        """Action required of the pilot before the flight."""
         return self._owed.words
 
     # --- the answer
 
     def answer(self) -> ArmAnswer:
-        """Return the prepared answer; only what can change at once is looked at again."""
+        """Return the prepared answer, unless it is too old or a write has begun."""
         if asyncio.get_running_loop().time() - self._answered_s > OLDEST_ANSWER_S:
             return ArmAnswer("wait", "companion is busy: try again")
         if self._manager.state.is_writing and self._answer.verdict == "accept":
@@ -109,8 +109,8 @@ class Readiness:
         while True:
             try:
                 self.update()
-                await asyncio.sleep(0)  # a request that has arrived meanwhile is answered in between
-                # The output during a write says nothing about the offsets that will be in force after it.
+                await asyncio.sleep(0)  # answer a request that has arrived meanwhile
+                # The output during a write says nothing about the offsets after it.
                 if not self._writing and await self._measured(loop.time()):
                     self.update()
                 self.turns += 1
@@ -141,14 +141,14 @@ class Readiness:
                 meanwhile = "" if self._answer.meanwhile == BY_ITSELF else self._answer.meanwhile
                 self._answer = ArmAnswer("wait", f"wait: {meanwhile or status.left or status.measuring}")
         else:
-            # Arming is not held back; the answer names the state in which it would arm.
+            # No gate; the answer names the state in which it would arm.
             state, words = self.state(now_s)
             self._answer = ArmAnswer("wait" if state == "uncalibrated" else "accept", words)
         self._answered_s = now_s
 
     @property
     def _writing(self) -> bool:
-        """Whether a job that may write runs, or an interrupted write is being restored."""
+        """Whether a job runs, or an interrupted write is being restored."""
         return self._manager.blocking_reason((Precondition.IDLE, Precondition.RESTORED)) is not None
 
     def _judge(self, now_s: float) -> ArmAnswer:
@@ -180,7 +180,7 @@ class Readiness:
     # --- how long yet
 
     def looked_at(self, now_s: float) -> ArmAnswer | None:
-        """Return how long to hold still, where the next still window settles every finding; else None."""
+        """Return the time to hold still, where the next still window settles every finding; else None."""
         findings = self.in_force.findings(now_s)
         if not findings or self.in_force.measured or any(finding.why not in _CHECKED_NEXT for finding in findings):
             return None
@@ -188,15 +188,15 @@ class Readiness:
         return ArmAnswer.hold_still(left_s, _CHECKED_NEXT[findings[0].why])
 
     def until_calibrated_s(self, now_s: float) -> float:
-        """Seconds of holding still until an automatic calibration would be in force."""
+        """Return the seconds of holding still until an automatic calibration would be active."""
         status, write_s = self._collector.status(now_s), math.ceil(self._vehicle.kind.write_s + self._check_s)
         if status.enough:
             return write_s
-        # Before the noise is known this is the longest there is: the wait may only get shorter.
+        # Before the noise is known this is the longest wait.
         whole_s = status.still_s / status.progress if status.progress > 0.0 else self._wanted.settings.max_s
         left_s: float = max(1, math.ceil(whole_s - status.still_s)) + write_s
         named_at_s, named_s = self._countdown
-        # Only a movement makes it longer. Where PX4's readings turn into floats it stops for a moment.
+        # Only a movement makes it longer.
         if self._collector.glance(now_s).moves is None and now_s - named_at_s < COUNTDOWN_KEPT_S:
             left_s = min(left_s, named_s)
         self._countdown = now_s, left_s
@@ -231,10 +231,8 @@ class Readiness:
         if against or self.owed is not None:
             return "uncalibrated", against or self.owed or ""
         gyro, accel = in_force.sigma("gyro"), in_force.sigma("accel")
-        sigmas = [
-            *([f"{gyro / DEG_H:.1f} deg/h"] if gyro is not None else []),
-            *([f"{accel / MG:.2f} mg"] if accel is not None else []),
-        ]
+        sigmas = [f"{gyro / DEG_H:.1f} deg/h"] if gyro is not None else []
+        sigmas += [f"{accel / MG:.2f} mg"] if accel is not None else []
         if in_force.calibrated_s is not None:
             return "calibrated", ", ".join([f"calibrated {_ago(now_s - in_force.calibrated_s)} ago", *sigmas])
         if in_force.confirmed_s is not None:
@@ -242,7 +240,7 @@ class Readiness:
         return "uncalibrated", "not calibrated yet" if in_force.held_back is None else ""
 
     def _quality(self, triad: Triad, unit: float) -> dict[str, object]:
-        """Return the largest sigma in force and its target, in deg/h or mg."""
+        """Return the largest active sigma and its target, in deg/h or mg."""
         sigma, settings = self.in_force.sigma(triad), self._wanted.settings
         wanted = settings.target_gyro_sigma_rad_s if triad == "gyro" else settings.target_accel_sigma_m_s2
         return {
@@ -252,7 +250,7 @@ class Readiness:
         }
 
     def status(self) -> dict[str, object]:
-        """For `companion status`."""
+        """Return the gate's part of the status."""
         now_s = asyncio.get_running_loop().time()
         state, words = self.state(now_s)
         answer = self.answer()

@@ -1,4 +1,4 @@
-"""Arming: the calibration in force, the gate's answer, automatic calibrations, and the history of armings."""
+"""Arming: the active calibration, the gate, automatic calibrations, and the history of armings."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SCRIPT_STARTS_S: Final = 10.0
 
 
 class Armings:
-    """Report and keep the calibration in force at each arming; `run` writes to disk, off the loop."""
+    """Reports and records the active calibration at each arming; `run` writes to disk."""
 
     def __init__(self, core: Core, readiness: Readiness) -> None:
         self._readiness, self._say, self._offload = readiness, core.say, core.offload
@@ -50,7 +50,7 @@ class Armings:
         core.vehicle.on_event.add(self._on_event)
 
     async def run(self) -> None:
-        """Keep every arming until cancelled; those still queued then are written as well."""
+        """Save every arming until cancelled, and then those still queued."""
         try:
             while True:
                 arming = await self._queue.get()
@@ -94,20 +94,20 @@ class Armings:
 
 
 class GateSetup:
-    """Checks whether the autopilot asks before it arms: a gate without that must be known before the flight line."""
+    """Checks whether the autopilot asks before it arms."""
 
     def __init__(self, core: Core) -> None:
         self._core, self._vehicle = core, core.vehicle
         self._stale = asyncio.Event()
         self._said: str | None = None
         self.problem: str | None = None
-        """Missing settings, for people; None while all is well or not known yet."""
+        """Missing settings, for people; None while complete or not known."""
         self.known = False
         core.vehicle.on_event.add(self._on_event)
         core.parameters.on_value.add(self._on_parameter)
 
     async def run(self) -> None:
-        """Check whenever there is something new, until cancelled."""
+        """Check after every start of the autopilot and change of its settings, until cancelled."""
         while True:
             await self._stale.wait()
             while self._core.wanted.at_arm != "gate":  # may be set at the flight line
@@ -141,14 +141,14 @@ class GateSetup:
 
 
 class Arming(Subsystem):
-    """Wires the calibration in force, the gate, automatic calibrations and the history of armings."""
+    """Wires the active calibration, the gate, automatic calibrations and the history of armings."""
 
     def __init__(self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating) -> None:
         self._core, self._store, self._by_hand = core, calibrating.store, calibrating.by_hand
         self._recovery = offsets.recovery
         self.in_force = InForce(core, devices.imus, calibrating.manager, calibrating.estimator, calibrating.memory)
         self.automatic = Automatic(core, devices.imus, calibrating.manager, self.in_force)
-        # In this order: the next automatic calibration asks for what is in force.
+        # In this order: automatic calibrations ask for the active one.
         calibrating.manager.on_ended.add(self.in_force.on_ended)
         calibrating.manager.on_ended.add(self.automatic.on_ended)
         self.readiness = Readiness(core, offsets.owed, calibrating.manager, self.in_force, self.automatic)
@@ -178,11 +178,7 @@ class Arming(Subsystem):
         return [*writing, ("armings", self.armings.run), *setup]
 
     def _calibration(self) -> Object | None:
-        """Return the calibration in force; without one the last good one that was not undone; else None.
-
-        `calibrated_ago_s` and `confirmed_ago_s` are null unless it is known to be in force: a wall clock that was wrong
-        in the field gives no age.
-        """
+        """Return the active calibration, else the last good one, without its age: the wall clock may be wrong."""
         in_force, now_s = self.in_force, asyncio.get_running_loop().time()
         known, record = in_force.calibration is not None, in_force.calibration or in_force.earlier
         if record is None:
@@ -209,7 +205,7 @@ class Arming(Subsystem):
         }
 
     async def _answer_history(self, request: History, _face: str) -> AsyncIterator[Object]:
-        # A thousand records take longer to read than a ground station waits for an answer.
+        # Reading a thousand records would hold the event loop too long.
         yield await self._core.offload(self._history, request.limit)
 
     def _history(self, limit: int | None) -> Object:
@@ -234,8 +230,7 @@ class Arming(Subsystem):
         }
 
     def _flights(self, limit: int | None) -> list[Object]:
-        """Return the flights that `companion flight` has kept."""
-        # Imported here, as it would slow every start.
+        # Imported here: the start is shorter without.
         from companion.storage.flights import FlightStore
 
         try:

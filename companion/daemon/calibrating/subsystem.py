@@ -96,7 +96,7 @@ class Calibrating(Subsystem):
             "waiting_for": still.waiting_for,
             "alignment": self.alignment.status(),
             "by_hand": self.by_hand.latest(),
-            "stands": msgspec.to_builtins(self.stands.shown),
+            "stands": None if self.stands.state is None else self.stands.state.shown(),
             "last": None
             if last is None
             else {

@@ -36,7 +36,10 @@ from companion.estimation.means.windows import Window
 from companion.estimation.records.align_record import HandRecord, completed
 from companion.estimation.records.record import WrittenParameter
 from companion.estimation.solution.site import LocalEarth
+from companion.formats import Object
+from companion.physics.frames import vector
 from companion.physics.units import DEG
+from companion.samples import Vector
 
 STAND_S: Final = 12.0
 """Seconds of stillness for each stand: averaging beyond 10 s improves no accelerometer (method 2.3)."""
@@ -54,55 +57,68 @@ LEANED_DEG: Final = 0.03
 ARMED: Final = "armed during the alignment; the earlier one stays in force"
 
 
-class StandsShown(msgspec.Struct):
-    """Progress of the latest alignment, for a page that may be opened at any time, also after its end."""
+@dataclasses.dataclass(slots=True, eq=False)
+class SessionState:
+    """All state of one alignment; it stays after its end, for a page that is opened then."""
 
-    kind: str
-    number: int
-    total: int
-    wish: str
-    hold: Hold
-    unknown: tuple[str, ...] = ()
-    words: str = ""
-    objection: str | None = None
-    """Fault of the latest stand, if it was not the one asked for."""
-    share: float = 0.0
-    """Progress of the present stand, 0 to 1."""
-    done: list[tuple[float, float, float]] = []
-    """Up in the aircraft's axes, of each stand so far, as its accelerometers read it."""
+    job: Job
+    windows: list[Window] = dataclasses.field(default_factory=list)
+    poses: list[HeldPose] = dataclasses.field(default_factory=list)
+    ups: list[Vector] = dataclasses.field(default_factory=list)
+    """Up in the aircraft's axes, of each stand, as its accelerometers read it."""
+    first: dict[str, ImuCalibration] = dataclasses.field(default_factory=dict)
+    """Offsets and scales during the first stand, by IMU."""
     outcome: str | None = None
     """None while it runs."""
 
-
-@dataclasses.dataclass(slots=True, eq=False)
-class SessionState:
-    """All state of one alignment."""
-
-    job: Job
-    shown: StandsShown
-    windows: list[Window] = dataclasses.field(default_factory=list)
-    poses: list[HeldPose] = dataclasses.field(default_factory=list)
-    first: dict[str, ImuCalibration] = dataclasses.field(default_factory=dict)
-    """Offsets and scales during the first stand, by IMU."""
-
     # The present pose
+    number: int = 1
+    total: int = 1
+    wish: Wish = dataclasses.field(default_factory=lambda: Wish("", Hold(LEVEL)))
+    words: str = ""
+    objection: str = ""
+    """Fault of the latest stand, if it was not the one asked for."""
+    share: float = 0.0
+    """Progress of the stand, 0 to 1."""
     since_s: float = 0.0
     """Time since which it has not moved."""
     moved: bool = False
     """Moved since the stand before, or since the latest objection."""
     still_s: float = 0.0
     moving_since_s: float = math.inf
-    objection: str = ""
     hold_still_said: bool = False
     turn_read_s: float = -math.inf
     turned_deg: float = math.nan
     stop_said: bool = False
 
-    def begin_pose(self, now_s: float) -> None:
+    def begin_pose(self, wish: Wish, total: int, now_s: float) -> None:
         """Wait for the next pose; a time before its request does not count, the operator may still correct it."""
+        self.number, self.wish = len(self.poses) + 1, wish
+        self.total = max(total, self.number)
         self.since_s, self.moved = (self.windows[-1].end_s, False) if self.windows else (now_s, True)
         self.still_s, self.moving_since_s, self.objection, self.hold_still_said = 0.0, math.inf, "", False
         self.turn_read_s, self.turned_deg, self.stop_said = -math.inf, math.nan, False
+
+    @property
+    def request(self) -> str:
+        """The request for the present pose, for people."""
+        return f"{self.number} of {self.total}: {self.wish.words}"
+
+    def shown(self) -> Object:
+        """Return the progress for the page."""
+        return {
+            "kind": self.job.kind,
+            "number": self.number,
+            "total": self.total,
+            "wish": self.wish.words,
+            "hold": msgspec.to_builtins(self.wish.hold),
+            "unknown": list(self.wish.unknown),
+            "words": self.words,
+            "objection": self.objection or None,
+            "share": round(self.share, 3),
+            "done": [list(up) for up in self.ups],
+            "outcome": self.outcome,
+        }
 
 
 class PoseTask(abc.ABC):
@@ -131,19 +147,11 @@ class PoseTask(abc.ABC):
 
     @abc.abstractmethod
     def fit(self, state: SessionState, local: LocalEarth) -> list[str]:
-        """Estimate from all stands, blocking, in a thread; returns what the operator should hear.
-
-        Raises:
-            CalibrationRefusedError: the stands do not fit together.
-        """
+        """Estimate from all stands, in a thread; returns what the operator should hear. Refuse what does not fit."""
 
     @abc.abstractmethod
     def record(self, state: SessionState, local: LocalEarth, log: WriteLog) -> HandRecord:
-        """Build the record of what was measured, before anything is written; adds warnings to `log`.
-
-        Raises:
-            CalibrationRefusedError: the estimate cannot be used as requested.
-        """
+        """Build the record of the measurement, before anything is written; add warnings to `log`."""
 
     def changes(self) -> dict[str, list[Change]]:
         """Return the offsets and scales to write, by IMU."""
@@ -167,15 +175,13 @@ class PoseSession:
         self._core, self._machine, self._collector, self._say = core, core.machine, core.collector, core.say
         self._imus, self._measuring, self._writes = imus, measuring, writes
         self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
-        self.shown: StandsShown | None = None
-        """None before the first alignment."""
+        self.state: SessionState | None = None
+        """The latest alignment; None before the first."""
 
     async def run(self, job: Job, request: AlignmentRequest, task: PoseTask) -> str:
         """Measure all poses, estimate, write and keep; returns the result in one line.
 
-        Raises:
-            CompanionError: it failed, and why; what was written is restored, or the error names what is not.
-            JobCancelledError: cancelled, likewise.
+        After an error or a cancel the old values are restored, or the error names those that are not.
         """
         if request.write and request.action == "faces":
             await self._writes.path.offsets_still_hold()
@@ -218,67 +224,59 @@ class PoseSession:
         self._collector.count_turns(wanted=True)
         if task.imus_alone:
             self._collector.expect(gradienter=False, compass=False)
-        self.shown = shown = StandsShown(job.kind, 1, 1, "", Hold(LEVEL))
+        self.state = state = SessionState(job)
 
         def ended(result: asyncio.Future[JobResult]) -> None:
-            shown.outcome, shown.words, shown.share = result.result().outcome, result.result().reason, 0.0
+            state.outcome, state.words, state.share = result.result().outcome, result.result().reason, 0.0
             self._collector.count_turns(wanted=False)
             if task.imus_alone:
                 config = self._core.config
                 self._collector.expect(gradienter=config.gradienter is not None, compass=config.compass is not None)
 
         job.finished.add_done_callback(ended)
-        return SessionState(job, shown)
+        return state
 
     # --- one pose
 
     async def _measure(self, state: SessionState, task: PoseTask, wish: Wish) -> None:
-        """Wait for the pose that is wanted, and measure it.
-
-        Raises:
-            CalibrationRefusedError: armed, out of time, or what was measured before is void.
-            JobCancelledError: cancelled.
-        """
-        loop, job, shown = asyncio.get_running_loop(), state.job, state.shown
-        number = len(state.poses) + 1
-        total = max(task.total, number)
-        shown.number, shown.total, shown.wish, shown.hold, shown.unknown = number, total, *wish
-        if number > 1:
+        """Wait for the pose that is wanted, and measure it; refused if armed, out of time, or void."""
+        loop, job = asyncio.get_running_loop(), state.job
+        state.begin_pose(wish, task.total, loop.time())
+        if state.number > 1:
             self._machine.on(Event.MOVED)
             self._core.tunes.play(Tune.NEXT)
-        request = f"{number} of {total}: {wish.words}"
-        self._say(Severity.NOTICE, request)
-        state.begin_pose(loop.time())
+        self._say(Severity.NOTICE, state.request)
         while True:
             now_s = loop.time()
             status, waiting_for, hold_still_s = await self._measuring.read_state(job, task.if_armed)
             self._check_known(state)
-            moving = self._watch_movement(state, now_s, request)
+            moving = self._watch_movement(state, now_s)
             state.still_s = min(status.still_s, now_s - state.since_s - SETTLE_S)
             # A stand that only has to go on is measured, and shown so, from its first second on.
             standing = state.moved and (waiting_for is None or hold_still_s is not None)
-            share = min(max(state.still_s, 0.0) / self._stand_s, 1.0) if standing else 0.0
+            state.share = min(max(state.still_s, 0.0) / self._stand_s, 1.0) if standing else 0.0
             if not state.moved:
                 words = f"{state.objection or wish.words}; waiting for it to move"
             elif not standing:
-                turned = self._turned(state, wish, now_s) if moving else ""
+                turned = self._turned(state, now_s) if moving else ""
                 words = f"{state.objection or wish.words}; {turned or waiting_for}"
             else:
-                turned = self._turned(state, wish, now_s)
+                turned = self._turned(state, now_s)
                 words = f"measuring, {max(state.still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
                 words += f" ({turned})" if turned else ""
                 if not state.hold_still_said:
                     state.hold_still_said = True
                     self._core.prompt(Tune.HOLD_STILL, "Hold still")
-            self._measuring.show(measuring=share > 0.0)
-            job.progress(100.0 * (number - 1 + share) / total, f"{number} of {total}: {words}")
-            shown.words, shown.share, shown.objection = words, round(share, 3), state.objection or None
+            self._measuring.show(measuring=state.share > 0.0)
+            percent = 100.0 * (state.number - 1 + state.share) / state.total
+            job.progress(percent, f"{state.number} of {state.total}: {words}")
+            state.words = words
             enough = state.moved and waiting_for is None and state.still_s >= self._stand_s
-            if enough and await self._accept(state, task, request, now_s):
+            if enough and await self._accept(state, task, now_s):
                 return
             await job.pause(POLL_S)
 
-    async def _accept(self, state: SessionState, task: PoseTask, request: str, now_s: float) -> bool:
+    async def _accept(self, state: SessionState, task: PoseTask, now_s: float) -> bool:
         """Take the stand if it is the pose that is wanted; else object."""
         window = await self._core.window(since_s=state.since_s + SETTLE_S)
         pose, objection = task.examine(state, window)
@@ -286,26 +284,25 @@ class PoseSession:
         # A hand that is taken off too slowly for a movement, or soft ground.
         if (leaned := leaned_deg(np.array(forces))) >= LEANED_DEG:
             state.since_s = now_s
-            self._object(state, f"it leaned by {leaned:.2g} degrees: hands off, firm ground", request)
+            self._object(state, f"it leaned by {leaned:.2g} degrees: hands off, firm ground")
             return False
         if objection is not None:
             state.moved = False
             self._measuring.show(measuring=False)
-            self._object(state, objection, request)
+            self._object(state, objection)
             return False
         state.windows.append(window)
         state.poses.append(pose)
         if not state.first:
             state.first = {name: imu.calibration for name, imu in self._imus.items() if imu.calibration is not None}
         read = np.array(window.imus[0].accel_m_s2)
-        x, y, z = (read / max(float(np.linalg.norm(read)), 1e-9)).round(3).tolist()
-        state.shown.done.append((x, y, z))
+        state.ups.append(vector((read / max(float(np.linalg.norm(read)), 1e-9)).round(3)))
         self._machine.on(Event.ENOUGH)
         return True
 
-    def _turned(self, state: SessionState, wish: Wish, now_s: float) -> str:
+    def _turned(self, state: SessionState, now_s: float) -> str:
         """Return the turn since the stand before, read once a second; says once when to stop."""
-        wanted_deg = wish.hold.turn_deg
+        wanted_deg = state.wish.hold.turn_deg
         if not state.windows or not wanted_deg:
             return ""
         if now_s - state.turn_read_s >= 1.0:
@@ -320,7 +317,7 @@ class PoseSession:
                 self._say(Severity.NOTICE, "Stop turning")
         return "" if math.isnan(state.turned_deg) else f"turned {state.turned_deg:.0f} of {wanted_deg:.0f} degrees"
 
-    def _watch_movement(self, state: SessionState, now_s: float, request: str) -> bool:
+    def _watch_movement(self, state: SessionState, now_s: float) -> bool:
         """Note a movement; tell the operator if it ended a measurement or lasts long."""
         glance = self._collector.glance(now_s)
         if not glance.moving:
@@ -329,30 +326,24 @@ class PoseSession:
         if glance.moves is not None and state.moved:
             state.moving_since_s = min(state.moving_since_s, now_s)
             if state.still_s >= EARLY_S:
-                words = f"it moved after {state.still_s:.0f} of {self._stand_s:.0f} seconds: hands off"
-                self._object(state, words, request)
+                self._object(state, f"it moved after {state.still_s:.0f} of {self._stand_s:.0f} seconds: hands off")
             elif now_s - state.moving_since_s >= STILL_MOVING_S:
                 state.moving_since_s = now_s
                 self._say(Severity.NOTICE, "It still moves: set it down, hands off")
         state.moved, state.since_s, state.still_s = True, now_s, 0.0
         return True
 
-    def _object(self, state: SessionState, objection: str, request: str) -> None:
+    def _object(self, state: SessionState, objection: str) -> None:
         """Tell the operator; an objection too long to be heard whole is followed by the request."""
         state.objection, state.hold_still_said = objection, False
         self._core.prompt(Tune.WRONG, objection)
         if len(objection) > LINE_BYTES:
-            self._say(Severity.NOTICE, request)
+            self._say(Severity.NOTICE, state.request)
 
     # --- the autopilot's side
 
     async def _check_offsets(self, state: SessionState) -> None:
-        """Read the offsets afresh: somebody may have changed them without a word.
-
-        Raises:
-            CalibrationRefusedError: what was measured before is void.
-            AutopilotError: they cannot be read.
-        """
+        """Read the offsets afresh, and refuse to go on if somebody has changed them unnoticed."""
         for name, imu in self._imus.items():
             holds = await imu.refresh()
             self._check_known(state)
