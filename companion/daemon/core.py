@@ -24,9 +24,9 @@ from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners
 
 CATCH_UPS: Final = 3
-"""Estimates computed in a row: while one is computed the next may become due, which must not block the event loop."""
+"""Most estimates in a row: while one is computed the next may become due."""
 TICK_S: Final = 0.2
-"""Interval at which complete seconds end, also those of silent sources."""
+"""Interval at which the collector is told the time."""
 Handler = Callable[[Any, str], AsyncIterator[Object]]
 """Answers a `Command` that came through an interface (second), with any number of replies."""
 Task = tuple[str, Callable[[], Coroutine[Any, Any, None]]]
@@ -40,13 +40,8 @@ class Wanted:
 
     def __init__(self, config: Config, retargeted: Callable[[Settings], object]) -> None:
         self.at_arm: AtArm = config.calibration.at_arm
-        """Action at arming."""
-        self.push = config.push.parameters
-        """Whether results are written to the autopilot."""
-        self.tunes = config.component.tunes
-        """Whether the autopilot's buzzer is used."""
+        self.push, self.tunes = config.push.parameters, config.component.tunes
         self.settings = models.settings(config)
-        """Targets of a calibration."""
         self._retargeted = retargeted
 
     def switch(self, *, at_arm: AtArm | None = None, push: bool | None = None, tunes: bool | None = None) -> None:
@@ -62,10 +57,7 @@ class Wanted:
 
 
 class Core:
-    """The configuration, the autopilot's link and the collector, which all subsystems share.
-
-    A test brings a link that is on a wire of its own.
-    """
+    """The configuration, the autopilot's link and the collector, which all subsystems share; `link` is for tests."""
 
     def __init__(self, config: Config, link: MavlinkLink | None, offload: Offload, only_listening: str | None) -> None:
         self.config, self.offload = config, offload
@@ -104,11 +96,7 @@ class Core:
             await asyncio.sleep(TICK_S)
 
     async def catch_up(self, *, since_s: float | None = None) -> None:
-        """Evaluate what the collector's window holds by now, if that is due.
-
-        The estimate costs milliseconds on a desktop and tens of them on a small board; an autopilot that asks whether
-        it may arm waits with its commander stopped (autopilots 5.2).
-        """
+        """Evaluate the collector's window if due, in a thread: arming requests must not wait (autopilots 5.2)."""
         for _ in range(CATCH_UPS):
             work = self.collector.pending(asyncio.get_running_loop().time(), since_s=since_s)
             if work is None:
@@ -116,11 +104,7 @@ class Core:
             self.collector.accept(work, await self.offload(work.run))
 
     async def window(self, *, since_s: float | None = None) -> Window:
-        """`RollingCollector.window` as of now.
-
-        Raises:
-            CalibrationRefusedError: as there.
-        """
+        """Return `RollingCollector.window` as of now; refused as there."""
         await self.catch_up(since_s=since_s)
         return self.collector.window(asyncio.get_running_loop().time(), since_s=since_s)
 
@@ -135,13 +119,13 @@ class Core:
 
 
 class Subsystem:
-    """A part of the daemon as the service sees it; each overrides what it has."""
+    """A part of the daemon, for the service."""
 
     def load(self) -> None:
-        """Load what was kept before this start, before anything runs; blocking."""
+        """Load stored data before anything runs; blocking."""
 
     def status(self) -> Object:
-        """Return its part of `companion status`, as JSON can hold it."""
+        """Return its part of the status."""
         return {}
 
     def commands(self) -> Mapping[str, Handler]:

@@ -63,11 +63,11 @@ class Job:
         loop = asyncio.get_running_loop()
         self.kind, self.what, self.requester = kind, what, requester
         self.reboot = reboot
-        """Whether to restart the autopilot once the result is stored."""
+        """Restart the autopilot once the result is stored."""
         self.automatic = automatic
-        """Whether nobody asked for it."""
+        """Nobody requested it."""
         self.was_armed = False
-        """Whether the aircraft was armed at any moment since the start."""
+        """Whether the aircraft was armed since the start."""
         self.deadline_s = None if timeout_s is None else loop.time() + timeout_s
         """Loop time by which measuring must end; None: no limit."""
         self.finished: asyncio.Future[JobResult] = loop.create_future()
@@ -136,30 +136,18 @@ class Job:
         self._nudge.set()
 
     def check_cancelled(self) -> None:
-        """Stop here if it was cancelled: a safe point.
-
-        Raises:
-            JobCancelledError: somebody cancelled it; says who.
-        """
+        """Raise JobCancelledError, with the canceller, if it was cancelled: a safe point."""
         if self._cancelled_by is not None:
             raise JobCancelledError(f"cancelled by {self._cancelled_by}")
 
     def check_time(self) -> None:
-        """Check the deadline.
-
-        Raises:
-            CalibrationRefusedError: it is over.
-        """
+        """Raise CalibrationRefusedError after the deadline."""
         if self.deadline_s is not None and asyncio.get_running_loop().time() >= self.deadline_s:
             boat = '; on a boat? set vehicle.platform = "deck"' if self.words.startswith("hold still: ") else ""
             raise CalibrationRefusedError(f"not finished in the time given: {self.words}{boat}")
 
     async def pause(self, seconds: float) -> None:
-        """Wait, but not past a cancel or a `look_again`.
-
-        Raises:
-            JobCancelledError: somebody cancelled it.
-        """
+        """Wait, but not past a cancel (JobCancelledError) or a `look_again`."""
         self.check_cancelled()
         self._nudge.clear()
         if await comes(self._nudge, seconds):

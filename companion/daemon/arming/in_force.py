@@ -22,12 +22,12 @@ from companion.component.service import JobResult
 from companion.configured import models
 from companion.daemon.arming.offset_watch import OffsetWatch
 from companion.daemon.biases.memory import BiasMemory
-from companion.daemon.calibrating.estimator import Estimator
 from companion.daemon.calibrating.manager import CalibrationManager
 from companion.daemon.calibrating.run import CalibrationRun, Key, in_short
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
+from companion.daemon.stands.measuring import Estimator
 from companion.errors import CalibrationRefusedError
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.record import ImuRecord, Record
@@ -270,7 +270,7 @@ class InForce:
                 return False
             self._measured_s = window.end_s
             known = self.offsets.known()
-            solution, _ = await self._estimator.solve(window, self.what)
+            solution, *_ = await self._estimator.solve(window, self.what)
         except CalibrationRefusedError:
             self._forget_window()
             return True

@@ -23,7 +23,7 @@ _IN_WORDS: Final = {
     "accel": "accelerometer (device id)",
     "scale": "accelerometer scale",
 }
-"""Words for keys of the identity; others are said as they are."""
+"""Words for keys of the identity, where the key is not plain."""
 
 
 class ImuIdentities:
@@ -44,7 +44,7 @@ class ImuIdentities:
 
     @property
     def names(self) -> Collection[str]:
-        """Names of the IMUs."""
+        """All configured IMUs."""
         return self._sources.keys()
 
     def power_up(self, name: str, unix_s: float) -> PowerUp:
@@ -53,7 +53,7 @@ class ImuIdentities:
         return PowerUp(host=self._host, since_unix_s=None if up_s is None else round(unix_s - up_s, 1))
 
     def session(self, name: str) -> str:
-        """Give a word that changes as soon as the sensor may have been without power."""
+        """Return a word that changes as soon as the sensor may have been without power."""
         if name in self._imus:
             return f"boot {self._vehicle.boots}"
         sensor = self._sensors.get(name)
@@ -62,7 +62,7 @@ class ImuIdentities:
         return f"{sensor.link.reconnects} {sensor.decoder.times.clock.breaks} {sorted(sensor.health.counts.items())}"
 
     def zero(self) -> str | None:
-        """Give the zero of the gradienter in force: another one has another error."""
+        """Identify the active zero of the gradienter."""
         gradienter, used = self._config.gradienter, self._alignment.used
         if gradienter is None:
             return None
@@ -71,7 +71,7 @@ class ImuIdentities:
         return f"{gradienter.protocol} {gradienter.law} {mounting} {_plain(gradienter.offset_deg)} {at}"
 
     def identity(self, name: str, before: Mapping[str, str]) -> dict[str, str]:
-        """Give what makes it another sensor, or its biases others, if it changes; `before` fills gaps."""
+        """Return the properties that define a sensor and its biases; `before` fills gaps."""
         source = self._sources[name]
         profile = source.profile.name if isinstance(source.profile, NoiseProfile) else source.profile
         found: dict[str, str] = {"source": source.source, "profile": profile or "unknown"}
@@ -84,7 +84,7 @@ class ImuIdentities:
             "firmware": str(self._vehicle.firmware),
         }
         if calibration is None:
-            # What is not known at the moment is no change.
+            # A property that is not known now has not changed.
             return {**before, **found}
         return found | {
             "gyro": str(calibration.gyro_id),
@@ -94,13 +94,13 @@ class ImuIdentities:
         }
 
     def aligned(self, name: str) -> ImuAlignmentRecord | None:
-        """Give an IMU's part of the alignment in force."""
+        """Return an IMU's part of the active alignment."""
         record = self._alignment.record if self._alignment.unused is None else None
         return None if record is None else next((imu for imu in record.imus if imu.name == name), None)
 
 
 def changed(before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """Say what differs between two identities; empty: nothing."""
+    """Name the differences of two identities; empty: none."""
     keys = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
     return ", ".join(_IN_WORDS.get(key, key) for key in keys)
 

@@ -1,6 +1,6 @@
 """Writes bias curves over temperature to the autopilot's own temperature calibration, on request.
 
-The output at the present temperature stays as it is; that is verified.
+The output at the present temperature stays, and that is verified.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class IntoAutopilot:
         self._path, self._ledger = offsets.write_path, offsets.ledger
 
     def why_no_undo(self) -> str | None:
-        """Say why the write of curves cannot be undone; None where it is the latest write."""
+        """Return why the write of curves cannot be undone; None where it is the latest write."""
         steps = self._ledger.steps(self._core.vehicle.system_id)
         after = [step.origin.what or "a write" for step in steps]
         if BY_TEMPERATURE not in after:
@@ -50,13 +50,10 @@ class IntoAutopilot:
         return None if not later else f"written since: {', '.join(later)}; companion undo puts that back first"
 
     async def run(self, job: Job, *, overwrite: bool) -> str:
-        """Measure, write and verify; returns in words what was written.
+        """Measure, write and verify; return in words what was written.
 
-        `overwrite`: replace a temperature calibration of the autopilot that is not ours.
-
-        Raises:
-            CompanionError: it failed, and why; the old values are restored, or the error names those that are not.
-            JobCancelledError: cancelled; likewise.
+        `overwrite`: replace a temperature calibration that is not ours. After an error or a cancel the old values are
+        restored, or the error names those that are not.
         """
         log = WriteLog()
         await self._core.offload(self._memory.follow)
@@ -110,14 +107,14 @@ class IntoAutopilot:
         return targets, words, left
 
     def _of_accelerometers(self, name: str, gyro: Curve) -> Polynomial | None:
-        """Return their curve if it spans the same temperatures as the gyros': an autopilot has one span for both."""
+        """Return the accelerometers' curve if it spans the gyros' temperatures: an autopilot has one span for both."""
         curve, calibration = self._memory.curves.of(name, "accel"), self._imus[name].in_force
         if curve is None or not np.allclose(curve.span_degc, gyro.span_degc, rtol=0.0, atol=LOOK_K):
             return None
         return of_curve(curve, calibration.orientation, calibration.accel_scale)
 
     def _is_ours(self, thermal: Thermal) -> bool:
-        """Whether our writes left it so."""
+        """Return whether the values are those of our latest write."""
         ours: dict[str, float | None] = {}
         for step in reversed(self._ledger.steps(self._core.vehicle.system_id)):
             if step.origin.what == BY_TEMPERATURE:

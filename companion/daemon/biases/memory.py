@@ -1,7 +1,6 @@
-"""Biases of each IMU from earlier calibrations and still windows, and what they predict for today.
+"""Biases of each IMU from earlier calibrations and still windows, and their prediction for today.
 
-A change of sensor, profile or mounting forgets them. A calibration in this run of the daemon, with the sensor powered
-ever since, is remembered besides: it predicts best.
+A change of sensor, profile or mounting voids them. The last calibration since the power-up predicts best.
 """
 
 from __future__ import annotations
@@ -47,11 +46,11 @@ from companion.storage.learned import BiasStore, KnownImu
 logger = logging.getLogger(__name__)
 
 LOOK_K: Final = 1.0
-"""Temperatures nearer than this count as one."""
+"""Temperatures nearer than this count as equal."""
 WRITE_EVERY_S: Final = 60.0
-"""Least time between writes of still windows: a power cut costs no more of them."""
+"""Least time between writes of still windows to the disk."""
 _MUCH_BETTER: Final = 0.7
-"""Largest sigma of a still window that replaces another one of the same temperature, as a share of its sigma."""
+"""Share of its sigma below which a still window replaces another one of the same temperature."""
 
 
 class Curves:
@@ -64,7 +63,7 @@ class Curves:
         self._settling: dict[str, tuple[float, float] | None] = {}
 
     def follow(self, known: Mapping[str, KnownImu]) -> None:
-        """Fit the curves anew; blocking."""
+        """Fit the curves; blocking."""
         of: dict[tuple[str, Triad], Curve | None] = {}
         settles: dict[str, tuple[float, float] | None] = {}
         for name in known.keys() & self._names:
@@ -80,11 +79,11 @@ class Curves:
         self._settling.pop(name, None)
 
     def of(self, name: str, triad: Triad) -> Curve | None:
-        """Give the curve of one triad; None: not known."""
+        """Return the curve of one triad; None: not known."""
         return self._of.get((name, triad))
 
     def along(self, name: str, triad: Triad, warming: Warming | None) -> Along | None:
-        """Predict the bias within a window; None: no curve, or the temperature is not known to have changed."""
+        """Predict the bias within a window; None without a curve or a known change of temperature."""
         curve, path = self.of(name, triad), None if warming is None else warming.path
         if curve is None or path is None:
             return None
@@ -100,7 +99,7 @@ class Curves:
     def drift(
         self, name: str, triad: Triad, degc: float | None, now_degc: float | None
     ) -> tuple[Vector, Vector] | None:
-        """Predict the change of the output since a temperature, rad/s or m/s^2, and its variance; None: not known."""
+        """Predict the change of the output since a temperature, and its variance; None: not known."""
         curve = self.of(name, triad)
         if curve is None or degc is None or now_degc is None:
             return None
@@ -108,7 +107,7 @@ class Curves:
         return vector(mean - self.taken_off(name, triad, degc, now_degc)), vector(variance)
 
     def taken_off(self, name: str, triad: Triad, degc: float, now_degc: float) -> Array:
-        """Give the change that the autopilot compensates by temperature itself, (3,)."""
+        """Return the change that the autopilot compensates by temperature itself, (3,)."""
         calibration = self._imus[name].calibration if name in self._imus else None
         return np.zeros(3) if calibration is None else calibration.thermal_change(triad, degc, now_degc)
 
@@ -122,7 +121,7 @@ class _Reference(msgspec.Struct):
 
 
 class BiasMemory:
-    """Predicts before a result is used, and remembers it afterwards."""
+    """Predicts biases before a result is used, and remembers the result."""
 
     def __init__(
         self, core: Core, imus: Mapping[str, AutopilotImu], sensors: Sequence[SerialSensor], used: AlignmentInForce
@@ -138,22 +137,18 @@ class BiasMemory:
         self._written_s = -math.inf
 
     def load(self) -> None:
-        """Read what was kept before this start; blocking."""
+        """Load the stored biases; blocking."""
         self._known = self._store.read()
         self.follow()
 
     def follow(self) -> None:
-        """Fit the curves to what is known by now; blocking."""
+        """Fit the curves to all known biases; blocking."""
         self.curves.follow(dict(self._known))
 
     # --- before a result is used
 
     def whole(self, solution: Solution) -> Whole:
-        """Give the whole biases by the readings alone.
-
-        Raises:
-            AutopilotError: the offsets in force are not known at the moment.
-        """
+        """Return the whole biases by the readings alone; AutopilotError while the active offsets are not known."""
         imus = self._imus
         return {
             found.name: whole_of(imus[found.name].in_force, found) if found.name in imus else found.biases
@@ -161,12 +156,12 @@ class BiasMemory:
         }
 
     def device_ids(self) -> dict[str, tuple[int | None, int | None]]:
-        """Give the device ids of gyro and accelerometer by IMU of the autopilot, where they are known at the moment."""
+        """Return the known device ids of gyro and accelerometer, by IMU of the autopilot."""
         known = {name: imu.calibration for name, imu in self._imus.items()}
         return {name: (each.gyro_id, each.accel_id) for name, each in known.items() if each is not None}
 
     def forgotten(self) -> dict[str, str]:
-        """Forget the biases of replaced sensors; give the reason by IMU, in one line."""
+        """Forget the biases of replaced sensors; return the reason by IMU, in one line."""
         found: dict[str, str] = {}
         for name in self.identities.names:
             what = self._changed(name)
@@ -181,9 +176,9 @@ class BiasMemory:
         return found
 
     def why_not_now(self, name: str, started_at: str) -> str | None:
-        """Say why the bias of a calibration may hold no more; None: nothing speaks against it.
+        """Return why the bias of a calibration may have changed since; None without a reason.
 
-        An autopilot outlives our board's power, and without a clock nobody knows since when it has been on.
+        An autopilot may have run on while our board was off.
         """
         if (point := self._point(name, started_at)) is None:
             return "its calibration is not known of"
@@ -193,7 +188,7 @@ class BiasMemory:
         return None if same else "the IMU was without power since its calibration"
 
     def on_since(self, name: str, started_at: str) -> bool:
-        """Whether an IMU is the one of a calibration, and its device has run ever since."""
+        """Return whether an IMU is the one of a calibration, and has run ever since."""
         point = None if self._changed(name) else self._point(name, started_at)
         return point is not None and point.power_up.started_with(self.identities.power_up(name, time.time()))
 
@@ -242,7 +237,7 @@ class BiasMemory:
     def measured(
         self, solution: Solution, whole: Whole, doubts: Sequence[Doubt], started_at: str, unix_s: float
     ) -> dict[str, Point]:
-        """Make the points of the history; `solution` by the readings alone."""
+        """Make the points of the history from a solution by the readings alone."""
         at_mean = dict(whole)
         for imu in solution.imus:
             degc, end_degc = imu.mean_degc, imu.temperature_degc
@@ -260,9 +255,9 @@ class BiasMemory:
         )
 
     async def keep(self, found: Mapping[str, Point]) -> None:
-        """Remember a calibration that has come to a good end; a failure of the disk is only logged."""
+        """Remember a good calibration; a failure of the disk is only logged."""
         for name, point in found.items():
-            # Without a temperature, of an IMU whose curve is known, it would fit to none.
+            # A point without a temperature fits no curve.
             if point.temperature_degc is not None or all(one.temperature_degc is None for one in self._points(name)):
                 self._remember(name, (*self._points(name), point))
             for triad in TRIADS:
@@ -270,7 +265,7 @@ class BiasMemory:
         await self._write()
 
     async def look(self, solution: Solution) -> None:
-        """Remember still windows that no calibration used: of each kelvin of a power-up the best."""
+        """Remember the best still window of each kelvin of a power-up."""
         unix_s = time.time()
         self._now_degc |= {imu.name: imu.temperature_degc for imu in solution.imus}
         news = [imu.name for imu in solution.imus if self._tells_more(imu, unix_s)]
@@ -294,7 +289,7 @@ class BiasMemory:
             await self._write()
 
     def _tells_more(self, imu: ImuSolution, unix_s: float) -> bool:
-        """Whether a window is the first at its temperature since the power came, or much better than that one."""
+        """Return whether a window is the first at its temperature in this power-up, or much better."""
         degc, power_up = imu.mean_degc, self.identities.power_up(imu.name, unix_s)
         if imu.gyro_rad_s is None or degc is None or self._changed(imu.name):
             return False
@@ -303,7 +298,7 @@ class BiasMemory:
         return bool(imu.sigma_stat[:3].max() < _MUCH_BETTER * best)
 
     async def forget(self, started: Collection[str]) -> None:
-        """Forget calibrations that were undone, by when they had begun."""
+        """Forget calibrations that were undone, by their start."""
         if not any(point.started_at in started for known in self._known.values() for point in known.points):
             return
         for name, known in self._known.items():
@@ -321,7 +316,7 @@ class BiasMemory:
             logger.warning("%s; later calibrations will not know of this one", error)
 
     def _refer(self, name: str, triad: Triad, point: Point) -> None:
-        """Set the reference of this power-up: the last calibration that was believed, or that contradicted thrice."""
+        """Set the reference of this power-up; a contradiction becomes the reference the third time."""
         found = point.of(triad)
         if found is None:
             return
@@ -335,8 +330,8 @@ class BiasMemory:
     # --- what is known
 
     def temperature(self) -> list[Object]:
-        """Summarise the biases over temperature, for `companion temperature`; blocking."""
-        # Imported here: the start does without.
+        """Summarise the biases over temperature; blocking."""
+        # Imported here: the start is shorter without.
         from companion.estimation.solution.by_temperature import by_temperature
 
         self.follow()
@@ -364,12 +359,12 @@ class BiasMemory:
         return next((each for each in self._points(name) if each.started_at == started_at), None)
 
     def _remember(self, name: str, known: Sequence[Point]) -> None:
-        """Keep the points of an IMU, as many as the disk does: predictions must not depend on the daemon's start."""
+        """Keep as many points of an IMU as the disk does: predictions must not change with a restart."""
         imu = self._known.get(name) or KnownImu(identity=self.identities.identity(name, {}))
         self._known[name] = msgspec.structs.replace(imu, points=kept(known))
 
     def _changed(self, name: str) -> str:
-        """Say what makes it another sensor than the known one; empty: nothing."""
+        """Name the differences to the known sensor; empty: none."""
         known = self._known.get(name)
         return "" if known is None else changed(known.identity, self.identities.identity(name, known.identity))
 
@@ -379,6 +374,6 @@ def _is_near(point: Point, degc: float) -> bool:
 
 
 def _is_window_like(earlier: Point, now: Point) -> bool:
-    """Whether a point is a window without a calibration, of the same power-up and temperature."""
+    """Return whether a point is a window without a calibration, of the same power-up and temperature."""
     near = now.temperature_degc is not None and _is_near(earlier, now.temperature_degc)
     return not earlier.started_at and near and earlier.power_up.is_same(now.power_up)

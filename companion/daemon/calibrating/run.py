@@ -1,7 +1,7 @@
-"""One calibration from request to record: all of its state, and its phases in their order.
+"""One calibration from request to record: its state, and its phases in their order.
 
-`CalibrationRun.calibrate` is the whole of it. `estimation.machine` says which phase may follow which; a phase reports
-an event there, and raises where the calibration cannot go on.
+`CalibrationRun.calibrate` reads from start to end. `estimation.machine` has the table of states; a phase reports events
+to it, and raises an error where the calibration cannot go on.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from companion.component.statustext import Severity
 from companion.component.tunes import Tune
 from companion.config.sections import Platform
 from companion.daemon.biases.memory import BiasMemory
-from companion.daemon.calibrating.estimator import Estimator, EstimatorInputs
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
@@ -40,7 +39,7 @@ from companion.daemon.offsets.plan import (
 )
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.offsets.write import WATCHING
-from companion.daemon.stands.measuring import Measuring
+from companion.daemon.stands.measuring import Estimator, Measuring
 from companion.estimation.machine import Event
 from companion.estimation.means.windows import Window
 from companion.estimation.records.history import Point
@@ -50,7 +49,9 @@ from companion.estimation.solution.doubt import Doubt
 from companion.estimation.solution.joint import Weighed, weigh
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.results import imu_records, in_words, record_of, unseen_turn, when_warm
+from companion.estimation.solution.site import Whereabouts
 from companion.estimation.solution.solve import ImuSolution, Pair, Solution
+from companion.estimation.solution.truth import Otherwise
 from companion.links.system.listeners import Listeners
 from companion.samples import Triad
 from companion.storage.changes import AUTOMATIC
@@ -61,7 +62,7 @@ Key = tuple[str, Triad]
 """Name of an IMU, and its gyros or its accelerometers."""
 
 WRONG_IMU_ATTEMPTS: Final = 3
-"""Writes that may act on another IMU than believed: two of three IMUs may be mistaken for the right one."""
+"""Most writes that act on the wrong IMU: two of three may be mistaken for the right one."""
 _STARTED: Final[dict[Platform, str]] = {
     "ground": "Calibration started: keep the aircraft still",
     "deck": "Calibration started: the deck may sway",
@@ -70,7 +71,7 @@ _TRIADS: Final[dict[Triad, str]] = {"gyro": "gyros of", "accel": "accelerometers
 
 
 class CalibrationParts(NamedTuple):
-    """Parts of the daemon that every calibration uses; none of them holds the state of one."""
+    """Parts of the daemon that every calibration uses."""
 
     core: Core
     imus: Mapping[str, AutopilotImu]
@@ -78,12 +79,12 @@ class CalibrationParts(NamedTuple):
     estimator: Estimator
     memory: BiasMemory
     offsets: Offsets
-    on_solved: Listeners[EstimatorInputs, What, Expectation]
-    """Listeners to estimates: inputs besides the window, request, earlier biases."""
+    on_solved: Listeners[Whereabouts, Otherwise, What, Expectation]
+    """Listeners to estimates: place, fallbacks, request, earlier biases."""
 
 
 class CalibrationRun(Job):
-    """One calibration; as a `Job` it holds request, progress, cancel and outcome too."""
+    """One calibration; `Job` adds request, progress, cancel and outcome."""
 
     def __init__(
         self,
@@ -106,23 +107,23 @@ class CalibrationRun(Job):
         self.log = WriteLog()
         """Written parameters, and warnings."""
         self.alignment: AlignmentUsed | None = None
-        """Alignment of the gradienter in force; None: its zero and sigma are those of the configuration."""
+        """Active alignment of the gradienter; None: zero and sigma of the configuration."""
         self.device_ids: dict[str, tuple[int | None, int | None]] = {}
         """Gyro and accelerometer ids by IMU of the autopilot."""
         self.held_back: dict[Key, Doubt] = {}
-        """Measured triads that are not written, and why: they contradict earlier calibrations and nobody asked."""
+        """Triads that contradict earlier calibrations and are not written, as nobody requested it."""
         self._forget()
 
     def _forget(self) -> None:
         """Clear the results of all phases."""
         self.measured: Window | None = None
-        """Window of telemetry under the offsets in force."""
+        """Window of telemetry under the active offsets."""
         self.solution: Solution | None = None
         """The estimate: residuals in the output of the autopilot's IMUs, whole biases of others."""
         self.whole: dict[str, Pair] = {}
         """Whole biases by IMU, where the autopilot subtracts offsets."""
         self.points: dict[str, Point] = {}
-        """Biases by IMU that later calibrations learn from, once this one has ended well."""
+        """Biases by IMU for later predictions, once this calibration has ended well."""
         self.unchanged: set[Key] = set()
         """Triads whose offsets are as good as new ones, and stay."""
         self.plan: Plan | None = None
@@ -131,11 +132,9 @@ class CalibrationRun(Job):
         self.log.imu_warnings.clear()
 
     async def calibrate(self) -> str:
-        """Run all phases; returns the result in one line.
+        """Run all phases; return the result in one line.
 
-        Raises:
-            CompanionError: cause of the failure; the autopilot is as before, or the message says what is not.
-            JobCancelledError: cancelled; likewise.
+        After an error or a cancel the autopilot is as before, or the error says what is not.
         """
         self._announce()
         self._measuring.begin()
@@ -156,11 +155,11 @@ class CalibrationRun(Job):
 
     @property
     def is_adoptable(self) -> bool:
-        """Whether a request may still take over this automatic run as a whole."""
+        """Whether a request may still adopt this automatic run."""
         return self.automatic and not self.cancelled and not self.held_back
 
     def adopt(self, requester: str, timeout_s: float | None, *, reboot: bool) -> None:
-        """Hand an automatic calibration to somebody who asks for one."""
+        """Turn an automatic calibration into a requested one."""
         self.reboot |= reboot
         self.kind, self.requester, self.automatic = "calibration", requester, False
         self.deadline_s = None if timeout_s is None else asyncio.get_running_loop().time() + timeout_s
@@ -196,24 +195,23 @@ class CalibrationRun(Job):
             self._machine.on(Event.MOVED)
 
     async def _estimate(self) -> None:
-        """Estimate biases, weigh them with earlier ones, and hold back contradictions that nobody asked for.
+        """Estimate biases, weigh them with earlier ones, and hold back contradictions that nobody requested.
 
-        A contradiction is written where somebody has asked for the calibration. In an automatic one it is held back:
-        the offsets in force were right once, and a gradienter that has moved would spoil them without anybody looking.
+        A contradiction is written on request only: a gradienter that has moved would spoil good offsets unnoticed.
         """
         assert self.measured is not None
         core, memory, unix_s = self._core, self._parts.memory, self.log.started_at.timestamp()
         estimator = self._parts.estimator
-        solution, given = await estimator.solve(self.measured, self.what)
+        solution, where, otherwise = await estimator.solve(self.measured, self.what)
         self.alignment, self.solution = estimator.alignment.used, solution
         for name, words in memory.forgotten().items():
             self.log.warn(name, words)
         expectation: Expectation = await core.offload(memory.expectation, solution, unix_s)
-        self._parts.on_solved.tell(given, self.what, expectation)
+        self._parts.on_solved.tell(where, otherwise, self.what, expectation)
         self.device_ids = memory.device_ids()
         whole = memory.whole(solution)
         weighed: Weighed = await core.offload(weigh, solution, whole, expectation)
-        # From here on nobody can adopt this run, so that a request is never answered with half of it.
+        # From here on nobody can adopt this run: a request must not get half of a result.
         if self.automatic and core.wanted.push:
             written = {i.name for i in core.config.imu if i.source == "autopilot" or i.autopilot_instance}
             self.held_back = {key: doubt for key, doubt in weighed.doubted.items() if key[0] in written}
@@ -230,11 +228,7 @@ class CalibrationRun(Job):
             core.say(Severity.WARNING, f"Held back: {kept}; calibrate on request to write it all the same")
 
     async def _make_plan(self) -> None:
-        """Work out new offsets of every IMU that the autopilot uses, and the rivals to switch off.
-
-        Raises:
-            AutopilotError: a parameter cannot be read, or the autopilot cannot be calibrated as it is.
-        """
+        """Compute new offsets of every IMU that the autopilot uses, and the rivals to switch off."""
         assert self.solution is not None
         core, rivalry, slots = self._core, self._parts.offsets.rivalry, self._parts.offsets.slots
         sources = {imu.name: imu for imu in core.config.imu}
@@ -261,7 +255,7 @@ class CalibrationRun(Job):
         refuse_shared(targets, slots)
         if targets:
             stops = rivalry.changes([target.calibration for target in targets])
-            # First of all, so that no rival acts between this and the biases; undone last.
+            # Written first, so that no rival acts in between; undone last.
             targets[0] = dataclasses.replace(targets[0], changes=(*stops, *targets[0].changes))
             for change in stops:
                 words = f"{change.parameter} is switched off; companion undo switches it on again"
@@ -288,7 +282,7 @@ class CalibrationRun(Job):
         await self._path.settle(self, self.plan, self.measured, self.log)
 
     def _watching(self, words: str) -> None:
-        """Show progress while the telemetry is watched, and tell who asked that it moves."""
+        """Show progress while the telemetry is watched, and report movement."""
         self.check_cancelled()
         now_s, collector = asyncio.get_running_loop().time(), self._core.collector
         moves = collector.glance(now_s).moves
@@ -301,8 +295,8 @@ class CalibrationRun(Job):
         """Let later calibrations learn from this one."""
         points = self.points
         if self._core.wanted.push and not self.automatic:
-            # Who asked was told of every contradiction, and the measured biases are in force: they are right now. But
-            # gyros that may have turned are no new ones.
+            # The requester knows of every contradiction, and the measured biases are active. But gyros that may have
+            # turned are no news.
             told = self.solution is not None and self.solution.turn.by != "earlier calibrations"
             points = {name: point.as_chosen(gyro=told) for name, point in points.items()}
         await self._parts.memory.keep(points)
@@ -312,7 +306,7 @@ class CalibrationRun(Job):
     # --- the record
 
     def make_record(self, result: JobResult) -> Record:
-        """Build the record; after a failure it holds what was known until then."""
+        """Build the record, after a failure from what was known until then."""
         record = record_of(
             self.solution,
             self.log.started_at,
@@ -350,7 +344,7 @@ def in_short(triads: Collection[Key]) -> str:
 
 
 def _less(points: Mapping[str, Point], held_back: Collection[Key]) -> dict[str, Point]:
-    """Leave out what was held back: it must not become a habit by being measured again and again."""
+    """Leave out triads held back: repeated measurements must not confirm each other."""
     left = {
         name: msgspec.structs.replace(
             point,

@@ -14,7 +14,6 @@ from companion.commands import Align, Calibrate, Cancel, Temperature, Undo
 from companion.component.service import Refusal
 from companion.daemon.biases.into_autopilot import IntoAutopilot
 from companion.daemon.biases.memory import BiasMemory
-from companion.daemon.calibrating.estimator import Estimator, EstimatorInputs
 from companion.daemon.calibrating.manager import CalibrationManager, Precondition
 from companion.daemon.calibrating.run import CalibrationParts
 from companion.daemon.core import Core, Handler, Subsystem
@@ -23,7 +22,7 @@ from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job, Undon
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.stands.alignment import AlignmentInForce, ByHand, FacesInForce
 from companion.daemon.stands.all_sides import SidesTask
-from companion.daemon.stands.measuring import Measuring
+from companion.daemon.stands.measuring import Estimator, Measuring
 from companion.daemon.stands.on_spot import TurnTask, ZeroTask
 from companion.daemon.stands.session import PoseSession, PoseTask
 from companion.daemon.stands.writes import AlignmentWrites
@@ -31,6 +30,8 @@ from companion.errors import CalibrationRefusedError, RequestRefusedError
 from companion.estimation.alignment.poses import HEADINGS, AlignmentRequest
 from companion.estimation.request import What
 from companion.estimation.solution.prior import Expectation
+from companion.estimation.solution.site import Whereabouts
+from companion.estimation.solution.truth import Otherwise
 from companion.formats import Object
 from companion.links.system.listeners import Listeners
 from companion.links.system.waiting import comes
@@ -63,7 +64,7 @@ class Calibrating(Subsystem):
         self.faces = FacesInForce(core, imus)
         own = OwnAttitude(core.vehicle, wanted=config.compass is None)
         self.estimator = Estimator(core, self.alignment, self.faces, own)
-        self.on_solved: Listeners[EstimatorInputs, What, Expectation] = Listeners()
+        self.on_solved: Listeners[Whereabouts, Otherwise, What, Expectation] = Listeners()
         self.stands = PoseSession(core, imus, measuring, AlignmentWrites(core, imus, offsets, own))
         self.by_hand = ByHand(core, imus)
         self._into_autopilot = IntoAutopilot(core, imus, measuring, self.memory, offsets)
@@ -75,7 +76,7 @@ class Calibrating(Subsystem):
             part.load()
 
     def commands(self) -> Mapping[str, Handler]:
-        """Return the handlers; each raises `RequestRefusedError`, or another `CompanionError` once it has started."""
+        """Return the handlers; they raise RequestRefusedError, or another CompanionError after the start."""
         return {
             "calibrate": self._calibrate,
             "align": self._align,
@@ -203,11 +204,7 @@ class Calibrating(Subsystem):
         return {"state": state, "reason": reason, **found}
 
     def start_alignment(self, asked: Align, by: str) -> Job | Refusal:
-        """Start an alignment, or refuse.
-
-        Raises:
-            CalibrationRefusedError: it is not said which.
-        """
+        """Start an alignment, or refuse; CalibrationRefusedError where no kind is named."""
         action = next((each for each in _KINDS if each == asked.action), None)
         if action is None:
             allowed = Align.fields()["action"].allowed

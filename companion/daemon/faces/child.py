@@ -1,6 +1,6 @@
-"""One child process of the daemon: started, watched, and started again when it ends or falls silent.
+"""One child process of the daemon: started, watched, and restarted when it ends or falls silent.
 
-The child side is `companion.links.system.child`. Whatever happens to a child costs the daemon nothing but its status.
+The child side is `companion.links.system.child`.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Child:
             silent_s, heard = 0.0, self._report
             while not reading.done():
                 await asyncio.wait([reading], timeout=REPORT_EVERY_S)
-                # Counted, not read from the clock: a daemon that stood still itself must not blame its child.
+                # Counted, not read from the clock: the daemon itself may have stood still.
                 silent_s, heard = (silent_s + REPORT_EVERY_S if heard is self._report else 0.0), self._report
                 if silent_s >= (SILENT_S if heard is not None else FIRST_REPORT_S):
                     _kill(process)
@@ -113,7 +113,7 @@ StartChild = Callable[[str, str, ChildSettings], Child]
 
 
 async def _end(process: Process) -> None:
-    # A pipe that still holds what nobody read stays open, and keeps `wait` from returning.
+    # Unread data would keep the pipe open, and `wait` from returning.
     drained = asyncio.ensure_future(_drain(process))
     if process.returncode is None:
         with contextlib.suppress(ProcessLookupError):

@@ -1,4 +1,4 @@
-"""Control socket: how the command line and the child processes talk to the running daemon.
+"""Control socket, for the command line and the child processes.
 
 A Unix stream socket of the daemon's user (mode 0600) or a group (0660). One request a connection, one JSON object a
 line: progress lines, then one of kind "result" or "error". A client that goes away stops nothing.
@@ -28,13 +28,12 @@ logger = logging.getLogger(__name__)
 
 Handler = Callable[[Object], AsyncIterator[Object]]
 
-# A request is below 1 kB.
 REQUEST_LIMIT: Final = 64 * 1024
 REQUEST_TIMEOUT_S: Final = 5.0
 KERNEL_BYTES: Final = 16 * 1024
 INTERNAL_ERROR: Final = "internal error of the daemon; its log has the details"
 MAX_CLIENTS: Final = 16
-"""The most connections of each kind: not asked yet, urgent commands, all others."""
+"""Most connections of each kind: without a request yet, urgent commands, all others."""
 URGENT: Final = tuple(name for name, command in ALL.items() if command.urgent)
 
 
@@ -72,11 +71,11 @@ class ControlServer:
 
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if len(self._silent) >= MAX_CLIENTS:
-            # A client of ours asks at once: the oldest one that has not makes way.
+            # Our clients send their request at once: the oldest silent one makes way.
             oldest = next(iter(self._silent))
             oldest.cancel()
             del self._silent[oldest]
-        # One that does not read is soon noticed.
+        # Small buffers, so that a client that does not read is soon noticed.
         writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BYTES)
         writer.transport.set_write_buffer_limits(0)
         client = asyncio.get_running_loop().create_task(self._serve(reader, writer), name="control client")
@@ -96,7 +95,7 @@ class ControlServer:
             if request is not None:
                 await self._take(request, writer)
         except (ConnectionError, TimeoutError):
-            pass  # the client went away, or is deaf; what it asked for goes on
+            pass  # the client went away; its job goes on
 
     async def _request(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Object | None:
         try:
@@ -139,7 +138,7 @@ class ControlServer:
 
 
 async def _finish(writer: asyncio.StreamWriter) -> None:
-    """Close when the other side has everything; an OSError where it is gone, or does not read."""
+    """Close when the client has read everything; an OSError where it is gone, or does not read."""
     writer.close()
     async with asyncio.timeout(READ_TIMEOUT_S):
         await writer.wait_closed()
@@ -165,7 +164,7 @@ def _bind(path: Path) -> socket.socket:
 
 
 def _open_to(path: Path, group: str) -> None:
-    """Let a group of which we are a member use the socket; where that cannot be it stays closed, and it is said."""
+    """Open the socket to a group; log where that is not possible."""
     try:
         os.chown(path, -1, grp.getgrnam(group).gr_gid)
         path.chmod(0o660)
@@ -175,7 +174,7 @@ def _open_to(path: Path, group: str) -> None:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove a socket that nobody listens on any more; a LinkError where somebody does, or it is no socket."""
+    """Remove a socket without a listener; a LinkError where there is one, or it is no socket."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
@@ -194,7 +193,7 @@ def _remove_stale(path: Path) -> None:
 
 
 def process_behind(path: Path) -> set[int]:
-    """The process that listens on a control socket; empty where nobody does, or it is not ours to ask."""
+    """Return the process that listens on a control socket; empty where there is none, or without access."""
     try:
         with socket.socket(socket.AF_UNIX) as asking:
             asking.settimeout(1.0)

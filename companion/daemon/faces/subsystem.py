@@ -1,12 +1,11 @@
-"""The faces: the component on MAVLink, the control socket, MQTT and the page, all by one door.
+"""Interfaces: the MAVLink component, the control socket, and the child processes for MQTT and the page.
 
-Each command is answered by the subsystem whose it is, and the status by all of them together.
+Each command is answered by its subsystem, and the status by all of them together.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 from collections.abc import AsyncIterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, get_args
@@ -82,7 +81,7 @@ class Faces(Subsystem):
         self.page = None if core.config.web is None else self._child("page", "companion.web")
 
     def _child(self, name: str, module: str) -> Child:
-        # Imported only where a child is configured: the start of the daemon is short.
+        # Imported here: the start is shorter without.
         from companion.daemon.faces.child import Child
         from companion.links.system.child import ChildSettings
 
@@ -134,7 +133,7 @@ class Faces(Subsystem):
 
     def all_status(self) -> Object:
         """Return the daemon's status for JSON."""
-        # Headline, arming line and the rest then tell the same moment, not one of a quarter of a second before.
+        # Headline and arming line must belong to the same moment.
         self._readiness.update()
         return joined([subsystem.status() for subsystem in self._subsystems])
 
@@ -186,14 +185,13 @@ class Faces(Subsystem):
         return {"mqtt": report, "fleet": fleet}
 
     async def settled(self, within_s: float) -> None:
-        """Wait until the MQTT process has reached its broker, or says why not; for so long at most."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(within_s):
-                while self.mqtt is not None:
-                    report = self.mqtt.status()
-                    if report.get("connected") or report.get("last_error"):
-                        return
-                    await asyncio.sleep(POSE_EVERY_S)
+        """Wait until the MQTT process has reached its broker, or reports an error, or the time is over."""
+        deadline_s = asyncio.get_running_loop().time() + within_s
+        while self.mqtt is not None and asyncio.get_running_loop().time() < deadline_s:
+            report = self.mqtt.status()
+            if report.get("connected") or report.get("last_error"):
+                return
+            await asyncio.sleep(POSE_EVERY_S)
 
     def tasks(self) -> Sequence[Task]:  # noqa: D102
         tasks: list[Task] = [("component", self.component.run)]

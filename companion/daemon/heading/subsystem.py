@@ -128,6 +128,11 @@ class PoseNow:
         elif isinstance(sample, CompassSample):
             self._heading = sample
 
+    def _fresh(self) -> tuple[TiltSample | None, CompassSample | None]:
+        since_s = asyncio.get_running_loop().time() - OLDEST_S
+        tilt, heading = self._tilt, self._heading
+        return tilt if tilt and tilt.t_s >= since_s else None, heading if heading and heading.t_s >= since_s else None
+
     async def refresh(self) -> Object | None:
         """Return `now`, with the declination updated when due."""
         if self._compass is not None and self._compass.magnetic:
@@ -138,43 +143,37 @@ class PoseNow:
         """Return the pose; None without a fresh tilt. The heading is magnetic while no declination is known."""
         if self._carried is not None and (carried := self._carried()) is not None:
             return carried
-        now_s = asyncio.get_running_loop().time()
-        tilt, heading = self._tilt, self._heading
+        tilt, heading = self._fresh()
         gradienter = self._alignment.model()
-        if gradienter is None or tilt is None or now_s - tilt.t_s > OLDEST_S:
+        if gradienter is None or tilt is None:
             return None
         try:
             up = up_in_vehicle(gradienter, tilt.x_deg, tilt.y_deg)
         except ValueError:
             return None
         roll, pitch = roll_pitch_from_up(up)
+        still = self._core.collector.glance(asyncio.get_running_loop().time()).obstacle is None
         pose: Object = {
             "roll_deg": round(roll / DEG, 3),
             "pitch_deg": round(pitch / DEG, 3),
             "heading_deg": None,
             "north": None,
             "source": "gradienter",
-            "still": self._core.collector.glance(now_s).obstacle is None
-            and self._core.config.vehicle.platform == "ground",
+            "still": still and self._core.config.vehicle.platform == "ground",
         }
-        if self._compass is not None and heading is not None and now_s - heading.t_s <= OLDEST_S:
+        if self._compass is not None and heading is not None:
             heading_deg = vehicle_heading_rad(self._compass, heading.heading_deg, up) / DEG
-            north = "true"
-            if self._compass.magnetic:
-                north = "true" if self._declination_deg is not None else "magnetic"
-                heading_deg += self._declination_deg or 0.0
+            declination_deg = self._declination_deg if self._compass.magnetic else 0.0
             pose |= {
-                "heading_deg": round(heading_deg % 360.0, 2) % 360.0,
-                "north": north,
+                "heading_deg": round((heading_deg + (declination_deg or 0.0)) % 360.0, 2) % 360.0,
+                "north": "magnetic" if declination_deg is None else "true",
                 "source": "gradienter and compass",
             }
         return pose
 
     def readings(self) -> dict[str, float | None]:
         """Return the readings of gradienter and compass before any offset; None where nothing is fresh."""
-        now_s = asyncio.get_running_loop().time()
-        tilt = self._tilt if self._tilt is not None and now_s - self._tilt.t_s <= OLDEST_S else None
-        heading = self._heading if self._heading is not None and now_s - self._heading.t_s <= OLDEST_S else None
+        tilt, heading = self._fresh()
         return {
             "gradienter_x_deg": None if tilt is None else round(tilt.x_deg, 4),
             "gradienter_y_deg": None if tilt is None else round(tilt.y_deg, 4),

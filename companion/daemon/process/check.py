@@ -1,6 +1,6 @@
-"""`companion check`: does everything the configuration names answer? What is wrong with a sensor, and what to type.
+"""`companion check`: whether everything in the configuration answers, faults of sensors, and what to type.
 
-With a daemon running the ports are its, so it is asked; otherwise every port is opened and listened to for a while.
+A running daemon, which holds the ports, is asked; otherwise every port is opened and read for a while.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
 @dataclass(frozen=True, slots=True)
 class CheckLine:
-    """One line of the check: whose, whether all is well, in words, and what to type (empty: nothing)."""
+    """One line of the check; `remedy`: what to type, if anything."""
 
     name: str
     good: bool
@@ -47,7 +47,7 @@ class CheckLine:
 
     @property
     def verdict(self) -> Literal["ok", "warning", "wrong"]:
-        """In one word: what is good has a remedy only where it may not stay so."""
+        """The line in one word; a good one with a remedy may not stay good."""
         if not self.good:
             return "wrong"
         return "warning" if self.remedy or self.name == "warning" else "ok"
@@ -81,7 +81,7 @@ def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> l
 
 
 async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -> list[CheckLine]:
-    """Explain from its bytes why a sensor gives no good samples; `may_listen`: no daemon has the ports."""
+    """Explain from its bytes why a sensor gives no good samples; `may_listen`: no daemon holds the ports."""
     devices = {device["name"]: device for device in status["devices"]}
     sick = [sensor for sensor in serial_devices(config) if devices.get(sensor.name, {}).get("trouble") in _TO_BE_TRIED]
     tried: dict[str, Heard | str] = {}
@@ -126,12 +126,8 @@ def _explain(sensor: SerialDevice, device: Object, heard: Heard | str | None, *,
 
 
 def _line_keys(sensor: SerialDevice, line: Line) -> list[str]:
-    keys = []
-    if line.baud != sensor.line.baud:
-        keys.append(f"baud = {line.baud}")
-    if line.parity != sensor.line.parity:
-        keys.append(f'parity = "{line.parity}"')
-    return keys
+    keys = [f"baud = {line.baud}"] if line.baud != sensor.line.baud else []
+    return keys + ([f'parity = "{line.parity}"'] if line.parity != sensor.line.parity else [])
 
 
 def _other_protocol(sensor: SerialDevice, protocol: str) -> tuple[str, str]:
@@ -155,7 +151,7 @@ async def run_check(
         async for reply in ask(config.control.path, {"command": "status"}):
             status = reply.get("status")
     except DaemonDeniedError:
-        raise  # its ports are in use: opening them would only find that
+        raise  # the ports are in use by the daemon
     except DaemonUnreachableError:
         pass
     is_running = status is not None
@@ -167,7 +163,7 @@ async def run_check(
         findings.append(CheckLine("daemon", good=True, words="not running: ports opened by this check"))
         findings.append(_storage(config.storage.path))
         say(f"checking: {seconds:g} s, half a minute more for a sensor not understood")
-        # The status that a daemon would have after some seconds; nothing is written anywhere.
+        # The status of a daemon after some seconds; nothing is written.
         service = Service(config, only_listening=ONLY_CHECKING)
         status = await service.listen(lambda listened_s: listened_s < seconds)
     findings += [CheckLine("configuration", good=False, words=words) for words in cannot_work(config)]
@@ -200,7 +196,7 @@ async def run_check(
 
 
 async def answering_imus(config: Config, imus: Sequence[Imu]) -> dict[str, str | None]:
-    """Find out which of these autopilot IMUs exist, by offsets and samples; return their parts (None: not known)."""
+    """Return the parts of those autopilot IMUs that exist, by offsets and samples (None: part not known)."""
     alone = msgspec.structs.replace(config, imu=list(imus), gradienter=None, compass=None, mqtt=None, web=None)
     service = Service(alone, only_listening=ONLY_CHECKING)
 
@@ -228,19 +224,19 @@ def _autopilot(config: Config, vehicle: Object) -> CheckLine:
 
 
 def _profile(profile: Object) -> CheckLine:
-    name, words = f"profile {profile['imu']}", profile["summary"]
-    if profile["name"] not in (None, UNKNOWN):
-        return CheckLine(name, good=True, words=words)
-    remedy = f'set profile in [[imu]] "{profile["imu"]}", or companion setup again'
-    return CheckLine(name, good=True, words=f"{words}: {remedy}", remedy=remedy)
+    words, remedy = profile["summary"], ""
+    if profile["name"] in (None, UNKNOWN):
+        remedy = f'set profile in [[imu]] "{profile["imu"]}", or companion setup again'
+        words = f"{words}: {remedy}"
+    return CheckLine(f"profile {profile['imu']}", good=True, words=words, remedy=remedy)
 
 
 def _gate(config: Config, setup: Object) -> CheckLine:
-    if not config.push.parameters:
-        return CheckLine("arming", good=False, words="at_arm = gate with push.parameters = false never opens")
-    if not setup["known"]:
-        return CheckLine("arming", good=False, words="not known whether the autopilot asks before it arms: try again")
     problem = setup["problem"]
+    if not config.push.parameters:
+        problem = "at_arm = gate with push.parameters = false never opens"
+    elif not setup["known"]:
+        problem = "not known whether the autopilot asks before it arms: try again"
     return CheckLine("arming", good=problem is None, words=problem or "the autopilot asks before it arms")
 
 
@@ -256,5 +252,6 @@ def _storage(directory: Path) -> CheckLine:
     while not place.exists() and place != place.parent:
         place = place.parent
     good = place.is_dir() and os.access(place, os.W_OK)
-    words = f"{directory}" + ("" if good else f": cannot be written by this user ({place})")
-    return CheckLine("storage", good, words)
+    return CheckLine(
+        "storage", good, f"{directory}" if good else f"{directory}: cannot be written by this user ({place})"
+    )

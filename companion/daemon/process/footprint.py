@@ -1,7 +1,4 @@
-"""What makes the daemon's start short and keeps its memory small: settings of the process, once, before anything else.
-
-Measured by `python -m tests.bench_start`; the figures stand in docs/speed.md. None changes what the daemon does.
-"""
+"""Process settings for a short start and small memory, measured by `python -m tests.bench_start` (docs/speed.md)."""
 
 from __future__ import annotations
 
@@ -16,8 +13,7 @@ def prepare() -> None:
     # The daemon speaks no TLS, and asyncio and hashlib do without OpenSSL where it is not installed: 5 MiB less.
     # None in the place of a module makes its import an ImportError.
     sys.modules.update({"ssl": None, "_hashlib": None})  # type: ignore[dict-item]
-    # Three hundred classes and two hundred modules are made to stay. Looking among them for garbage, again and again
-    # while they are made, costs a tenth of the start.
+    # Garbage collection among classes and modules that stay costs a tenth of the start.
     gc.disable()
     # A thread for every processor, with its own buffers, for matrices of 6 by 6.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

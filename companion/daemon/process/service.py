@@ -36,7 +36,7 @@ LISTEN_TURN_S: Final = 0.1
 class Service:
     """The daemon, subsystem by subsystem; each knows only those above it here.
 
-    `only_listening`: why nothing may be started or changed; `link`, `offload` and `child` are a test's.
+    `only_listening`: reason to start and change nothing; `link`, `offload` and `child` are for tests.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Service:
                 await self.serve()
 
     async def serve(self, *, mavlink: bool = True, ports: bool = True) -> None:
-        """Work until cancelled, then leave the autopilot in order; without `mavlink` or `ports` others feed bytes."""
+        """Work until cancelled, then leave the autopilot in order; without `mavlink` or `ports` a test feeds bytes."""
         for subsystem in (self.devices, self.offsets, self.calibrating):
             subsystem.load()
         transport: list[Task] = [("mavlink", self._connect)] if mavlink else []
@@ -93,7 +93,7 @@ class Service:
                         group.create_task(run(), name=name)
                     await asyncio.get_running_loop().create_future()
                 finally:
-                    # Before the links go: the heading needs another source, a write under way its end.
+                    # While the links are up: the heading needs its fallback, a write under way its end.
                     self.heading.close()
                     await self.calibrating.manager.close()
         finally:
@@ -103,9 +103,9 @@ class Service:
         await run_transport(self.core.link, self.config.mavlink.url)
 
     async def listen(self, goes_on: Callable[[float], bool]) -> Object:
-        """Open everything, listen while `goes_on`, and return the status, for `companion check`; writes nothing.
+        """Open everything, listen while `goes_on` (seconds), and return the status; writes nothing.
 
-        Seconds are counted in turns of the loop, each of which reads what has arrived: a slow process listens longer.
+        Seconds are turns of the event loop: a slow process listens longer.
         """
         self.devices.load()
         tasks = [("mavlink", self._connect), *self.faces.tasks(), *self.devices.tasks(), *self.arming.tasks()]

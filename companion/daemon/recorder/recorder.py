@@ -1,6 +1,6 @@
-"""Keeps the inputs of the last hour and a half in a ring of files, and records to a file on request.
+"""Records the inputs of the last hour and a half to a ring of files, and to a file on request.
 
-Sensing and MAVLink never wait for it: a thread empties a bounded queue once a second.
+Sensing and MAVLink never wait for the disk: a thread empties a bounded queue once a second.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from companion.autopilot.firmware.imu_messages import EkfBiasReading, Six
 from companion.commands import RecordInputs
 from companion.component.service import JobResult
 from companion.configured import models
-from companion.daemon.calibrating.estimator import EstimatorInputs
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -32,6 +31,7 @@ from companion.estimation.records.record import to_json
 from companion.estimation.request import What
 from companion.estimation.solution.prior import Expectation
 from companion.estimation.solution.site import Whereabouts
+from companion.estimation.solution.truth import Otherwise
 from companion.formats import Object
 from companion.links.mavlink.link import Direction
 from companion.recording import messages
@@ -55,8 +55,8 @@ RETRY_S: Final = 60.0
 DEFAULT_MB: Final = 64
 """Default size of the ring: some 100 minutes of a 200 Hz IMU beside 100 Hz telemetry."""
 MOST_BYTES: Final = 4 << 30, 1 << 30
-"""Sizes at which a recording with and without a stated length ends: what fits into a file on many USB sticks, and 27
-hours of a 200 Hz IMU beside 100 Hz telemetry."""
+"""Largest size of a recording without and with a stated length: the file limit of many USB sticks, and 27 hours of a
+200 Hz IMU beside 100 Hz telemetry."""
 PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
 INTERNAL: Final = "internal error; the log has the details"
@@ -154,13 +154,13 @@ class Recorder(Subsystem):
         )
         self.tape.put(messages.MEASURED, _now_s(), messages.encode(measured))
 
-    def _on_solved(self, given: EstimatorInputs, what: What, expectation: Expectation) -> None:
+    def _on_solved(self, where: Whereabouts, otherwise: Otherwise, what: What, expectation: Expectation) -> None:
         used = self._alignment.used
         solved = Solved(
-            where=given.where,
+            where=where,
             what=what.name,
             alignment=None if used is None else (*used.offset_deg, used.sigma_deg),
-            otherwise=given.otherwise,
+            otherwise=otherwise,
             expectation=expectation,
         )
         self.tape.put(messages.SOLVED, _now_s(), messages.encode(solved))
@@ -191,7 +191,7 @@ class Recorder(Subsystem):
                         self._note_place()
                     await self._flush()
                 except Exception:
-                    # Whatever it is, it must not take the daemon along.
+                    # No fault in here may end the daemon.
                     logger.exception("recordings: internal error; none are kept until the next start")
                     self.fault = INTERNAL
                     if self._on_request is not None:
@@ -248,7 +248,7 @@ class Recorder(Subsystem):
                 self.fault = None
 
     async def _in_thread(self, function: Callable[..., T], *arguments: object) -> T:
-        """Run a call that touches a file; a cancel waits for its end, since two of them must never overlap."""
+        """Run a call that touches a file; a cancel waits for its end, as two of them must not overlap."""
         task: asyncio.Future[T] = asyncio.ensure_future(self._offload(function, *arguments))
         try:
             return await asyncio.shield(task)
@@ -256,8 +256,7 @@ class Recorder(Subsystem):
             done, _ = await asyncio.wait([task], timeout=HANGS_S)
             if not done:
                 raise StorageError("the disk hangs") from None
-            if (error := task.exception()) is not None:
-                logger.debug("recordings: %s", error)
+            task.exception()  # retrieved: it is too late for a report
             raise
 
     async def _flush_file(self, recording: _OnRequest, batch: list[Message], beginning: Beginning) -> None:

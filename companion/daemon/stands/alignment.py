@@ -50,12 +50,12 @@ class AlignmentInForce:
         self.record: AlignmentRecord | None = None
         """The stored alignment, used or not."""
         self.unused: str | None = None
-        """Reason why the stored alignment is not used, in one line; None while it is used, or without one."""
+        """Reason in one line why the stored alignment is not used, if so."""
         self.on_change: Listeners[[]] = Listeners()
         """Notified when another zero becomes active."""
 
     def load(self) -> None:
-        """Load the stored alignment; blocking. A file that cannot be used is set aside, with a warning."""
+        """Load the stored alignment; blocking."""
         self._take(self._store.load())
         if self._store.unusable is not None:
             self.unused = self._store.unusable
@@ -63,21 +63,13 @@ class AlignmentInForce:
             logger.warning("alignment not used: %s", self.unused)
 
     async def keep(self, record: AlignmentRecord) -> None:
-        """Make a new alignment the active one, now and after every restart.
-
-        Raises:
-            StorageError: it could not be kept; the one before stays active.
-        """
+        """Save a new alignment and make it the active one; a StorageError leaves the one before active."""
         await self._offload(self._store.write, record)
         self._take(record)
         self.on_change.tell()
 
     async def forget(self) -> bool:
-        """Go back to the configuration's zero; returns whether there was an alignment to forget.
-
-        Raises:
-            StorageError: the file could not be removed.
-        """
+        """Return to the configuration's zero; returns whether there was an alignment."""
         was = self.record is not None or self.unused is not None
         await self._offload(self._store.clear)
         self._take(None)
@@ -133,15 +125,11 @@ class FacesInForce:
         self.record: FacesRecord | None = None
 
     def load(self) -> None:
-        """Load the stored record; blocking. A file that cannot be used is set aside."""
+        """Load the stored record; blocking."""
         self.record = self._store.load()
 
     async def keep(self, record: FacesRecord) -> None:
-        """Replace the stored record.
-
-        Raises:
-            StorageError: it could not be kept; the record before stays.
-        """
+        """Replace the stored record; a StorageError leaves the one before."""
         await self._offload(self._store.write, record)
         self.record = record
 
@@ -224,7 +212,7 @@ class ByHand:
         self._done = self._file.read()
 
     async def keep(self, job: Job, result: JobResult) -> None:
-        """Add an alignment that has delivered a record, unless it was cancelled."""
+        """Add an alignment with a record, unless it was cancelled."""
         record = job.product
         if result.outcome == "cancelled" or not isinstance(record, AlignmentRecord | FacesRecord | TurnRecord):
             return

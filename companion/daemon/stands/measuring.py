@@ -1,4 +1,4 @@
-"""Measuring one still window: the reasons to wait, and when there is enough."""
+"""Measuring one still window, and the biases in it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Final
 
 import msgspec
 
+from companion.autopilot.vehicle.ekf import OwnAttitude
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.service import MEASURED_PERCENT
 from companion.component.statustext import Severity
@@ -16,21 +17,26 @@ from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.job import Job
+from companion.daemon.stands.alignment import AlignmentInForce, FacesInForce
 from companion.errors import AutopilotError, CalibrationRefusedError
 from companion.estimation.collector.outlook import CollectorStatus
 from companion.estimation.machine import Event, State
 from companion.estimation.means.windows import Window
+from companion.estimation.request import What
+from companion.estimation.solution.site import Whereabouts, local_earth
+from companion.estimation.solution.solve import Solution, solve
+from companion.estimation.solution.truth import NOTHING, Otherwise, OwnHeading
 from companion.links.system.listeners import Listeners
 
 POLL_S: Final = 0.2
-"""Interval at which all but a complete second is checked; a second is handled when it is complete."""
+"""Interval of checks; a complete second is handled at once."""
 SAY_WAITING_EVERY_S: Final = 10.0
 SAY_LEFT_EVERY_S: Final = 75.0
-"""Interval of messages while nothing is in the way; the first minute of a deck says nothing yet."""
+"""Interval of messages while it measures; the first minute of a deck has none."""
 READ_ATTEMPTS: Final = 2
-"""Failed reads of the autopilot's offsets within one calibration that make it fail."""
+"""Failed reads of the autopilot's offsets that end a calibration."""
 MOST_UPSETS: Final = 5
-"""Changes of the offsets, or restarts of the autopilot, within one calibration that make it fail."""
+"""Changes of the offsets or restarts of the autopilot that end a calibration."""
 
 
 class Measuring:
@@ -42,20 +48,17 @@ class Measuring:
         """Number of upsets before this calibration, by IMU."""
         self._said, self._said_s = "", -math.inf
         self.on_measured: Listeners[Window] = Listeners()
-        """Notified of every window, in the moment in which it is taken."""
+        """Notified of every window at once."""
 
     def begin(self) -> None:
-        """Begin a calibration, which may measure more than once."""
+        """Start a calibration, which may measure more than once."""
         self._said, self._said_s = "", -math.inf
         self._upsets = {name: imu.upsets for name, imu in self._imus.items()}
 
     async def read_state(self, job: Job, if_armed: str | None) -> tuple[CollectorStatus, str | None, int | None]:
         """Return the collector's status, the reason to wait, and the seconds to hold still where that is all.
 
-        `if_armed`: reason of the failure if it was armed since the job began; None: it goes on once disarmed.
-
-        Raises:
-            CalibrationRefusedError: armed (in those words), or out of time.
+        `if_armed`: error if it was armed since the job began; None: it goes on once disarmed.
         """
         armed = self._core.vehicle.arm_state is ArmState.ARMED
         if if_armed is not None and (armed or job.was_armed):
@@ -78,12 +81,7 @@ class Measuring:
             self._machine.on(Event.MOVED)
 
     async def measure(self, job: Job) -> Window:
-        """Wait for stillness and for enough of it; returns the averages.
-
-        Raises:
-            CalibrationRefusedError: armed in the middle, out of time, or the readings fail their checks.
-            JobCancelledError: cancelled.
-        """
+        """Wait for a long enough still window and return it."""
         collector = self._core.collector
         settings = self._core.wanted.settings
         gyro = settings.target_gyro_sigma_rad_s if job.what.gyros else math.inf
@@ -113,7 +111,7 @@ class Measuring:
             collector.on_second.remove(job.look_again)
 
     def tell(self, job: Job, words: str, every_s: float = SAY_WAITING_EVERY_S) -> None:
-        """Tell the requester what is waited for: changes only, and not too often."""
+        """Send the reason to wait when it changes, but not too often."""
         now_s = asyncio.get_running_loop().time()
         if words != self._said and not job.automatic and now_s - self._said_s >= every_s:
             self._said, self._said_s = words, now_s
@@ -123,9 +121,44 @@ class Measuring:
         for name, imu in self._imus.items():
             failures[name] = min(failures[name], imu.failures)
             if imu.failures - failures[name] >= READ_ATTEMPTS:
-                # Patience is for what can change by itself; an autopilot that does not answer is a fault.
+                # An autopilot that does not answer is a fault, not a reason to wait.
                 raise AutopilotError(f"imu {name}: {imu.problem}")
             if (upsets := imu.upsets - self._upsets.get(name, 0)) >= MOST_UPSETS:
                 raise AutopilotError(
                     f"{imu.upset}, {upsets} times now: does something else write, or pretend to be the autopilot?"
                 )
+
+
+class Estimator:
+    """Estimates biases with the alignment and the site in force."""
+
+    def __init__(self, core: Core, alignment: AlignmentInForce, faces: FacesInForce, own: OwnAttitude) -> None:
+        self._core, self.alignment, self._faces, self._own = core, alignment, faces, own
+
+    async def solve(self, window: Window, what: What) -> tuple[Solution, Whereabouts, Otherwise]:
+        """Estimate the biases; return the place and the fallbacks that were used, too."""
+        config = self._core.config
+        where, otherwise = models.whereabouts(config, self._core.vehicle), await self._otherwise(window)
+        poses = self.alignment.model(), models.compass_model(config.compass)
+        platform, any_bias = config.vehicle.platform, config.calibration.any_bias
+        found: Solution = await self._core.offload(
+            lambda: solve(window, local_earth(where), *poses, what, platform, any_bias=any_bias, otherwise=otherwise)
+        )
+        return found, where, otherwise
+
+    async def _otherwise(self, window: Window) -> Otherwise:
+        config = self._core.config
+        if config.gradienter is not None and config.compass is not None:
+            return NOTHING
+        return Otherwise(
+            sides=self._faces.sides(window) if config.gradienter is None else {},
+            heading=await self._own_heading() if config.compass is None else None,
+        )
+
+    async def _own_heading(self) -> OwnHeading | None:
+        """Return the autopilot's heading; None where it has none of its own."""
+        found, core = self._own.heading(), self._core
+        try:
+            return found if found is not None and await core.vehicle.kind.yaw_is_its_own(core.parameters) else None
+        except AutopilotError:
+            return None

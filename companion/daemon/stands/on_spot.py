@@ -70,10 +70,7 @@ class SpotTask(PoseTask):
         return wanted_pose(self._request, state.poses) if len(state.poses) < self.total else None
 
     def _counted(self, state: SessionState, now: Window, up: Array, first_sigma_deg: float) -> HeldPose:
-        """Return a pose whose heading is the turn that the gyros of the first IMU have counted.
-
-        Where samples are missing, as when the autopilot restarts, it was turned as asked.
-        """
+        """Return a pose with the turn counted by the gyros of the first IMU, or as requested if samples are missing."""
         if not state.poses:
             return HeldPose(up, 0.0, first_sigma_deg)
         before, imu = state.windows[-1], now.imus[0]
@@ -274,11 +271,7 @@ def _imu_stand(imu: ImuWindow) -> ImuStand:
 
 
 def readable(windows: Sequence[Window], among: Mapping[str, AutopilotImu] | None = None) -> list[str]:
-    """Return the IMUs, of these or of all, whose accelerometers can be read in all stands.
-
-    Raises:
-        CalibrationRefusedError: there is none.
-    """
+    """Return the IMUs (of `among`) whose accelerometers can be read in all stands; refuse where there is none."""
     read = [{imu.name for imu in window.imus if not imu.refused("accel")} for window in windows]
     names = [imu.name for imu in windows[0].imus if all(imu.name in each for each in read)]
     names = [name for name in names if among is None or name in among]

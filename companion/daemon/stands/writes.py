@@ -1,8 +1,7 @@
 """Writes of alignments to the autopilot: accelerometer offsets and scales, and the level of the board.
 
-The level is ArduPilot's AHRS_TRIM or PX4's SENS_BOARD_X/Y_OFF. ArduPilot turns the attitude that it reports, and that
-alone. PX4 turns the output of its IMUs, so that their telemetry shows it within a second; its EKF2 keeps its tilt, and
-learns the new one slowly, or at a restart.
+The level is ArduPilot's AHRS_TRIM, which rotates the reported attitude only, or PX4's SENS_BOARD_X/Y_OFF, which rotates
+the output of the IMUs: telemetry shows it within a second, but EKF2 learns the new tilt slowly, or at a restart.
 """
 
 from __future__ import annotations
@@ -49,7 +48,10 @@ REBOOT: Final = "reboot the autopilot before flight: PX4's attitude follows the 
 
 
 class AlignmentWrites:
-    """Writes accelerometer offsets and scales, or the level, all or nothing, and verifies the effect."""
+    """Writes accelerometer offsets and scales, or the level, all or nothing, and verifies the effect.
+
+    After an error or a cancel the old values are restored, or the error names those that are not.
+    """
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], offsets: Offsets, own: OwnAttitude) -> None:
         self._core, self._vehicle, self._imus, self._own = core, core.vehicle, imus, own
@@ -58,12 +60,7 @@ class AlignmentWrites:
     async def write_accelerometers(
         self, job: Job, last: Window, changes: Mapping[str, Sequence[Change]], log: WriteLog
     ) -> None:
-        """Write the changes of each IMU; the aircraft stands still as in the last stand.
-
-        Raises:
-            CompanionError: it failed, and why; the old values are restored, or the error names those that are not.
-            JobCancelledError: cancelled; likewise.
-        """
+        """Write the changes of each IMU; the aircraft stands still as in the last stand."""
         if not await self.path.offsets_still_hold():
             raise CalibrationRefusedError("the offsets were changed in between: align again")
         means = {imu.name: imu for imu in last.imus}
@@ -83,12 +80,7 @@ class AlignmentWrites:
         await self.path.settle(job, plan, last, log)
 
     async def write_level(self, job: Job, board: Mounting, last: Window, log: WriteLog) -> dict[str, WrittenParameter]:
-        """Write the level, watch the attitude follow, and restore the old one if it does not.
-
-        Raises:
-            CompanionError: it failed, and why; the old values are restored, or the error names those that are not.
-            JobCancelledError: cancelled; likewise.
-        """
+        """Write the level, watch the attitude follow, and restore the old one if it does not."""
         if math.degrees(max(abs(board.roll_rad), abs(board.pitch_rad))) > MOST_DEG:
             raise CalibrationRefusedError("the board would sit more than 10 deg askew: no level is for that")
         kind = self._vehicle.kind
@@ -123,11 +115,7 @@ class AlignmentWrites:
     async def _verify_level(
         self, job: Job, turn: Matrix, before: Array | None, last: Window
     ) -> tuple[Outcome, str | None]:
-        """Watch the attitude turn; returns the outcome and a warning.
-
-        Raises:
-            AutopilotError: it did not follow.
-        """
+        """Watch the attitude turn; return the outcome and a warning, or raise AutopilotError where it did not."""
         loop, vehicle = asyncio.get_running_loop(), self._vehicle
         job.progress(WRITTEN_PERCENT, "watching the attitude take the new level")
         since_s, boots = loop.time() + USED_AFTER_S, vehicle.boots
