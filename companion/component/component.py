@@ -78,7 +78,8 @@ class MavlinkComponent:
             self._known_as, self._next_heartbeat_s = self._link.system_id, -math.inf
         if now_s >= self._next_heartbeat_s:
             if self._link.connected:
-                self._link.send(heartbeat(self._service.mav_state))
+                kind = mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID
+                self._link.send(mavlink.MAVLink_heartbeat_message(*kind, 0, 0, self._service.mav_state, 3))
                 self._send_values(now_s)
                 # The rhythm is kept, but what a stall has missed is not made up for.
                 next_s = self._next_heartbeat_s + HEARTBEAT_PERIOD_S
@@ -112,10 +113,3 @@ class MavlinkComponent:
     def _on_heartbeat(self, _message: mavlink.MAVLink_heartbeat_message, _t_s: float) -> None:
         if self._link.system_id != self._known_as:
             self._woken.set()
-
-
-def heartbeat(mav_state: int) -> mavlink.MAVLink_heartbeat_message:
-    """Encode our heartbeat: an onboard controller that is no autopilot."""
-    return mavlink.MAVLink_heartbeat_message(
-        mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mav_state, 3
-    )

@@ -21,13 +21,11 @@ from companion.autopilot.firmware.firmwares import outcomes_of
 from companion.component.service import JobResult
 from companion.configured import models
 from companion.daemon.arming.offset_watch import OffsetWatch
-from companion.daemon.biases.memory import BiasMemory
-from companion.daemon.calibrating.manager import CalibrationManager
 from companion.daemon.calibrating.run import CalibrationRun, Key, in_short
+from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
-from companion.daemon.stands.measuring import Estimator
 from companion.errors import CalibrationRefusedError
 from companion.estimation.noise.allan import noise_profile
 from companion.estimation.records.record import ImuRecord, Record
@@ -74,17 +72,10 @@ class _TriadState:
 class InForce:
     """The active calibration; `poll` often, `measure` whenever there may be a new window."""
 
-    def __init__(
-        self,
-        core: Core,
-        imus: Mapping[str, AutopilotImu],
-        manager: CalibrationManager,
-        estimator: Estimator,
-        memory: BiasMemory,
-    ) -> None:
-        self._core, self._config, self._manager = core, core.config, manager
-        config = core.config
-        self._imus, self._estimator, self._memory = imus, estimator, memory
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], calibrating: Calibrating) -> None:
+        self._core, self._config, self._imus, config = core, core.config, imus, core.config
+        self._manager, self._memory = calibrating.manager, calibrating.memory
+        self._estimator = calibrating.estimator
         settings = models.settings(config)
         self._floors: dict[Triad, float] = {
             "gyro": settings.target_gyro_sigma_rad_s,
@@ -103,7 +94,7 @@ class InForce:
         self.calibration: Record | None = None
         """The last finished calibration of this run, while any of its values is active."""
         self.undone = False
-        estimator.alignment.on_change.add(self._realigned)
+        calibrating.alignment.on_change.add(self._realigned)
 
     # --- what is known
 

@@ -145,8 +145,9 @@ class Arming(Subsystem):
 
     def __init__(self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating) -> None:
         self._core, self._store, self._by_hand = core, calibrating.store, calibrating.by_hand
+        self.manager = calibrating.manager
         self._recovery = offsets.recovery
-        self.in_force = InForce(core, devices.imus, calibrating.manager, calibrating.estimator, calibrating.memory)
+        self.in_force = InForce(core, devices.imus, calibrating)
         self.automatic = Automatic(core, devices.imus, calibrating.manager, self.in_force)
         # In this order: automatic calibrations ask for the active one.
         calibrating.manager.on_ended.add(self.in_force.on_ended)

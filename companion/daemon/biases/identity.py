@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Final
 
 import numpy as np
 
 from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
-from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.devices.sensors import SerialSensor
+from companion.daemon.devices.subsystem import Devices
 from companion.daemon.stands.alignment import AlignmentInForce
 from companion.estimation.records.align_record import ImuAlignmentRecord
 from companion.estimation.records.history import PowerUp
@@ -29,16 +28,10 @@ _IN_WORDS: Final = {
 class ImuIdentities:
     """Identities of the configured IMUs."""
 
-    def __init__(
-        self,
-        core: Core,
-        imus: Mapping[str, AutopilotImu],
-        sensors: Sequence[SerialSensor],
-        used: AlignmentInForce,
-    ) -> None:
-        self._config, self._vehicle, self._imus = core.config, core.vehicle, imus
+    def __init__(self, core: Core, devices: Devices, used: AlignmentInForce) -> None:
+        self._config, self._vehicle, self._imus = core.config, core.vehicle, devices.imus
         self._alignment, self._collector = used, core.collector
-        self._sensors = {role.name: sensor for sensor in sensors for role in sensor.roles if role.kind == "imu"}
+        self._sensors = {role.name: sensor for sensor in devices.sensors for role in sensor.roles if role.kind == "imu"}
         self._sources = {imu.name: imu for imu in core.config.imu}
         self._host = this_boot() or os.urandom(8).hex()
 

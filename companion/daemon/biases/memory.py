@@ -19,7 +19,7 @@ from companion.autopilot.firmware.imu_calibration import whole_of
 from companion.daemon.biases.identity import ImuIdentities, changed
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.devices.sensors import SerialSensor
+from companion.daemon.devices.subsystem import Devices
 from companion.daemon.stands.alignment import AlignmentInForce
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.means.warming import Warming
@@ -123,13 +123,11 @@ class _Reference(msgspec.Struct):
 class BiasMemory:
     """Predicts biases before a result is used, and remembers the result."""
 
-    def __init__(
-        self, core: Core, imus: Mapping[str, AutopilotImu], sensors: Sequence[SerialSensor], used: AlignmentInForce
-    ) -> None:
+    def __init__(self, core: Core, devices: Devices, used: AlignmentInForce) -> None:
         self._config, self._profiles, self._offload = core.config, core.profiles, core.offload
-        self._imus, self._alignment = imus, used
-        self.identities = ImuIdentities(core, imus, sensors, used)
-        self.curves = Curves(core, imus)
+        self._imus, self._alignment = devices.imus, used
+        self.identities = ImuIdentities(core, devices, used)
+        self.curves = Curves(core, devices.imus)
         self._store = BiasStore(core.config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], _Reference] = {}
@@ -282,7 +280,14 @@ class BiasMemory:
             point = found[name]
             if any(of is not None and of.is_outlier for of in (point.gyro, point.accel)):
                 continue
-            others = [earlier for earlier in self._points(name) if not _is_window_like(earlier, point)]
+            degc, power_up = point.temperature_degc, point.power_up
+            others = [
+                earlier
+                for earlier in self._points(name)
+                if earlier.started_at
+                or degc is None
+                or not (_is_near(earlier, degc) and earlier.power_up.is_same(power_up))
+            ]
             self._remember(name, (*others, point))
         now_s = asyncio.get_running_loop().time()
         if now_s - self._written_s >= WRITE_EVERY_S:
@@ -371,9 +376,3 @@ class BiasMemory:
 
 def _is_near(point: Point, degc: float) -> bool:
     return point.temperature_degc is not None and abs(point.temperature_degc - degc) < LOOK_K
-
-
-def _is_window_like(earlier: Point, now: Point) -> bool:
-    """Return whether a point is a window without a calibration, of the same power-up and temperature."""
-    near = now.temperature_degc is not None and _is_near(earlier, now.temperature_degc)
-    return not earlier.started_at and near and earlier.power_up.is_same(now.power_up)

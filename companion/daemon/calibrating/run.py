@@ -345,12 +345,9 @@ def in_short(triads: Collection[Key]) -> str:
 
 def _less(points: Mapping[str, Point], held_back: Collection[Key]) -> dict[str, Point]:
     """Leave out triads held back: repeated measurements must not confirm each other."""
-    left = {
-        name: msgspec.structs.replace(
-            point,
-            gyro=None if (name, "gyro") in held_back else point.gyro,
-            accel=None if (name, "accel") in held_back else point.accel,
-        )
-        for name, point in points.items()
-    }
-    return {name: point for name, point in left.items() if point.gyro is not None or point.accel is not None}
+    left: dict[str, Point] = {}
+    for name, point in points.items():
+        kept = msgspec.structs.replace(point, **{triad: None for imu, triad in held_back if imu == name})
+        if kept.gyro is not None or kept.accel is not None:
+            left[name] = kept
+    return left

@@ -59,7 +59,7 @@ class Calibrating(Subsystem):
         self._core, self._offsets, self._imus = core, offsets, imus
         self.store = RecordStore(config.storage.path)
         self.alignment = AlignmentInForce(config, core.offload)
-        self.memory = BiasMemory(core, imus, devices.sensors, self.alignment)
+        self.memory = BiasMemory(core, devices, self.alignment)
         self.measuring = measuring = Measuring(core, imus)
         self.faces = FacesInForce(core, imus)
         own = OwnAttitude(core.vehicle, wanted=config.compass is None)

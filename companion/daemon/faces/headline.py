@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.daemon.arming.readiness import BY_ITSELF
 from companion.daemon.arming.subsystem import Arming
-from companion.daemon.calibrating.manager import CalibrationManager, Precondition
+from companion.daemon.calibrating.manager import Precondition
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import Job
@@ -31,15 +31,8 @@ Headline = tuple[str, str, Tone]
 class Headlines:
     """Works out the headline, for all interfaces alike."""
 
-    def __init__(
-        self,
-        core: Core,
-        devices: Devices,
-        manager: CalibrationManager,
-        arming: Arming,
-        attitude: AttitudeService | None,
-    ) -> None:
-        self._vehicle, self._collector, self._manager = core.vehicle, core.collector, manager
+    def __init__(self, core: Core, devices: Devices, arming: Arming, attitude: AttitudeService | None) -> None:
+        self._vehicle, self._collector, self._manager = core.vehicle, core.collector, arming.manager
         self._readiness, self._automatic, self._armings = arming.readiness, arming.automatic, arming.armings
         self._devices, self._attitude = devices, attitude
         self._on_deck = core.config.vehicle.platform == "deck"

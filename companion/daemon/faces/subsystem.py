@@ -69,7 +69,7 @@ class Faces(Subsystem):
             Senders(core.config.mavlink.allow),
         )
         calibrating.manager.on_ended.add(self._show_result)
-        self._headlines = Headlines(core, devices, calibrating.manager, arming, heading.attitude)
+        self._headlines = Headlines(core, devices, arming, heading.attitude)
         self._pose, self._readiness = heading.pose, arming.readiness
         self._manager = calibrating.manager
         self._subsystems = (self, devices, offsets, calibrating, arming, heading, recorder)

@@ -175,7 +175,7 @@ class AttitudeService:
         self.turns = 0
         self._config, self._vehicle, self._say = config, vehicle, core.say
         self.carrier = Carrier(core, carrying_imu(config), in_force, calibrating.alignment)
-        self.difference = Difference(vehicle, self.carrier.now, self.carrier.kept_at)
+        self.difference = Difference(vehicle, self.carrier)
         self.resume = Resume(core, self.carrier, self.difference, calibrating, devices.imus)
         self.fallback, own = Fallback(core), OwnCompass(vehicle, wanted=True)
         self.health = Health(

@@ -55,13 +55,8 @@ _DOWN: Final[Triple] = (0.0, 0.0, 1.0)
 class Difference:
     """Difference of our attitude to the latched autopilot's, by its ATTITUDE messages."""
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        now: Callable[[], Attitude | None],
-        kept_at: Callable[[float], tuple[float, Quaternion] | None],
-    ) -> None:
-        self._now, self._kept_at = now, kept_at
+    def __init__(self, vehicle: Vehicle, carrier: Carrier) -> None:
+        self._carrier = carrier
         self._offset_s: float | None = None
         self._forgotten_s = 0.0
         """Possible error of the times, as no message had the shortest delay."""
@@ -120,13 +115,13 @@ class Difference:
             return
         late_s = self._late_s(message.time_boot_ms * 1e-3, t_s)
         self.theirs = t_s - late_s, from_roll_pitch_yaw(*angles)
-        ours = self._now()
+        ours = self._carrier.now()
         if ours is None or abs(ours.t_s - t_s) > OLD_S:
             return
         span_s = min(max(t_s - self.heard_s, 0.0), OLD_S)
         self.heard_s = t_s
         instant_s, theirs = self.theirs
-        kept_s, turn = self._kept_at(instant_s) or (ours.t_s, ours.quaternion)
+        kept_s, turn = self._carrier.kept_at(instant_s) or (ours.t_s, ours.quaternion)
         since_s = kept_s - instant_s
         rx, ry, rz = ours.rate_rad_s
         then = multiply(turn, from_rotation_vector((-rx * since_s, -ry * since_s, -rz * since_s)))

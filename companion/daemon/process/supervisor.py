@@ -14,17 +14,18 @@ import logging
 import signal
 import sys
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from companion import config
+from companion import config, summary
 from companion.autopilot.telemetry import imu_stream
 from companion.config.sections import Config
 from companion.daemon.process import footprint
 from companion.daemon.process.service import Service
 from companion.errors import CompanionError, ConfigError
+from companion.formats import Object
 from companion.links.serial import bytestream
 from companion.links.system import logs
 from companion.links.system.service_manager import ServiceManager
@@ -222,18 +223,10 @@ def _where(task_name: str) -> str:
     return "its task has ended"
 
 
-def status_line(status: Mapping[str, Any]) -> str:
-    """Return the status in one line for a pilot, most important first."""
-    parts = [f"FAULT: {status['fault']}"] if status["fault"] is not None else []
-    if status["putting_back"]:
-        parts.append("an interrupted write is being put back")
-    progress = "" if status["progress"] is None else f" {status['progress']} %"
-    parts.append(f"{status['state']}{progress}" + (f", {status['reason']}" if status["reason"] else ""))
-    parts.append(str(status["vehicle"]["summary"]))
-    parts.append(f"in force: {status['arming']['in_force']}")
-    devices = status["devices"]
-    good = [device["name"] for device in devices if device["good"]]
-    parts += [f"{device['name']}: {device['summary']}" for device in devices if not device["good"]]
-    if good:
-        parts.append(f"{', '.join(good)} good")
-    return "; ".join(parts)
+def status_line(status: Object) -> str:
+    """Return the status in one line, most important first."""
+    rows = [row for row in summary.rows(status) if row.name != "autopilot"]
+    parts = [summary.headline(status), str(status["vehicle"]["summary"])]
+    parts += [f"{row.name}: {row.words}" for row in rows if row.verdict == "wrong"]
+    good = [row.name for row in rows if row.verdict == "ok"]
+    return "; ".join([*parts, f"{', '.join(good)} good"] if good else parts)

@@ -16,7 +16,7 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from companion.autopilot.firmware.imu_messages import EkfBiasReading, Six
+from companion.autopilot.firmware.imu_messages import Six
 from companion.commands import RecordInputs
 from companion.component.service import JobResult
 from companion.configured import models
@@ -111,7 +111,9 @@ class Recorder(Subsystem):
         for imu in devices.imus.values():
             imu.on_change.add(partial(self._on_imu, imu))
             imu.on_raw.add(partial(self._on_raw, imu.name))
-        devices.ekf_bias.on_read.add(self._on_ekf_bias)
+        devices.ekf_bias.on_read.add(
+            lambda reading: self.tape.put_state(messages.EKF_BIAS, _now_s(), messages.encode(reading))
+        )
         calibrating.measuring.on_measured.add(self._on_measured)
         calibrating.on_solved.add(self._on_solved)
         calibrating.manager.on_ended.add(self._on_ended)
@@ -142,9 +144,6 @@ class Recorder(Subsystem):
 
     def _on_raw(self, name: str, t_s: float, output: Six, degc: float | None) -> None:
         self.tape.put(messages.RAW_MEAN, t_s, messages.encode(RawOutput(name, output, degc)))
-
-    def _on_ekf_bias(self, reading: EkfBiasReading) -> None:
-        self.tape.put_state(messages.EKF_BIAS, _now_s(), messages.encode(reading))
 
     def _on_measured(self, window: Window) -> None:
         collector = self._core.collector

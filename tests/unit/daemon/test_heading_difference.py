@@ -37,7 +37,8 @@ def compare(rate_rad_s: float, clock: float, late_s: Callable[[int], float], dri
         sigma = math.radians(1.0)
         return Attitude(now_s, attitude(now_s), 0.0, 0.0, ours(now_s), (0.0, 0.0, rate), (sigma, sigma, sigma))
 
-    difference = Difference(vehicle, now, lambda t_s: (t_s, attitude(t_s)))
+    carrier: Any = SimpleNamespace(now=now, kept_at=lambda t_s: (t_s, attitude(t_s)))
+    difference = Difference(vehicle, carrier)
     for k in range(int((TURNS_AT_S + 8.0) * ATTITUDE_RATE_HZ)):
         said_s = 1.0 + k / ATTITUDE_RATE_HZ
         rate = rate_rad_s if said_s > TURNS_AT_S else 0.0
@@ -83,7 +84,8 @@ def test_what_is_sent_has_the_autopilots_vertical_and_our_heading() -> None:
     angles = (math.radians(-20.0), math.radians(21.0), math.radians(40.0))
     sigma = (0.02, 0.02, 0.02)
     ours = Attitude(10.0, from_roll_pitch_yaw(*angles), *angles, (0.0, 0.0, 0.0), sigma)
-    difference = Difference(vehicle, lambda: ours, lambda _t_s: (10.0, ours.quaternion))
+    carrier: Any = SimpleNamespace(now=lambda: ours, kept_at=lambda _t_s: (10.0, ours.quaternion))
+    difference = Difference(vehicle, carrier)
     assert difference.levelled(ours, 10.0) is ours
     roll, pitch = math.radians(-24.0), math.radians(23.0)
     heard[0](mavlink.MAVLink_attitude_message(5000, roll, pitch, math.radians(41.0), 0.0, 0.0, 0.0), 10.0)
