@@ -62,7 +62,7 @@ class Severity(enum.IntEnum):
     WARNING = 4
     """Something is wrong, and the pilot has to know it."""
     NOTICE = 5
-    """What to do now, and that it is done, for an operator who looks at no screen: short, spoken."""
+    """Request or success, spoken to an operator who looks at no screen: short."""
     INFO = 6
     """To be read."""
 
@@ -133,9 +133,7 @@ class StatusText:
         self.woken = asyncio.Event()
         """Set when there is something new to send, for the caller of `step`."""
         self._link = link
-        self._waiting: dict[Weight, deque[tuple[Severity, str, float]]] = {
-            weight: deque() for weight in reversed(Weight)
-        }
+        self._waiting: list[tuple[Weight, float, Severity, str]] = []
         self._recent: deque[tuple[Severity, str, float]] = deque(maxlen=RECENT_TEXTS)
         self._sending: deque[mavlink.MAVLink_statustext_message] = deque()
         self._lines = Budget(LINES_PER_S, BURST_LINES)
@@ -154,10 +152,13 @@ class StatusText:
             self._recent.clear()
         if not text or any(said[:2] == (severity, text) and now_s - said[2] < REPEAT_S for said in self._recent):
             return False
-        if sum(map(len, self._waiting.values())) >= QUEUE_TEXTS and not self._make_room(weight):
-            return False
+        if len(self._waiting) >= QUEUE_TEXTS:
+            lightest = min(self._waiting, key=_weight)
+            if lightest[0] > weight:
+                return False
+            self._waiting.remove(lightest)
         self._recent.append((severity, text, now_s))
-        self._waiting[weight].append((severity, text, now_s))
+        self._waiting.append((weight, now_s, severity, text))
         if severity <= Severity.NOTICE:
             self.spoken.append({"number": next(self._numbers), "text": as_lines(severity, text)[0][1]})
         self.woken.set()
@@ -177,26 +178,18 @@ class StatusText:
                 return now_s + _FULL_RETRY_S
             self._sending.popleft()
             self._lines.spend(1, now_s)
-        if not self._sending and not any(self._waiting.values()):
+        if not self._sending and not self._waiting:
             return math.inf
         return now_s + (1.0 - self._lines.left(now_s)) / LINES_PER_S
 
     def _take_next(self, now_s: float) -> None:
-        for weight, waiting in self._waiting.items():
-            while weight is not Weight.RESULT and waiting and now_s - waiting[0][2] > STALE_S:
-                waiting.popleft()
-            if waiting:
-                severity, text, _ = waiting.popleft()
-                for each, line in as_lines(severity, text):
-                    self._sending.append(mavlink.MAVLink_statustext_message(each, line.encode("ascii")))
-                return
+        self._waiting = [text for text in self._waiting if text[0] is Weight.RESULT or now_s - text[1] <= STALE_S]
+        if self._waiting:
+            heaviest = max(self._waiting, key=_weight)
+            self._waiting.remove(heaviest)
+            for severity, line in as_lines(*heaviest[2:]):
+                self._sending.append(mavlink.MAVLink_statustext_message(severity, line.encode("ascii")))
 
-    def _make_room(self, weight: Weight) -> bool:
-        """Drop the oldest of the lightest texts, unless all that waits is heavier than the new one."""
-        for lighter in Weight:
-            if lighter > weight:
-                return False
-            if self._waiting[lighter]:
-                self._waiting[lighter].popleft()
-                return True
-        return False
+
+def _weight(text: tuple[Weight, float, Severity, str]) -> Weight:
+    return text[0]

@@ -33,7 +33,7 @@ class Undone(msgspec.Struct, frozen=True):
     written: dict[str, WrittenParameter]
     """Restored parameters; fewer than in the step where others have changed some."""
     by_hand: bool
-    """Whether an alignment or a temperature curve was undone, so that the last calibration stays."""
+    """An alignment or a temperature curve was undone; the last calibration stays."""
 
 
 class CurvesWritten(msgspec.Struct, frozen=True):
@@ -65,9 +65,8 @@ class Job:
         self.reboot = reboot
         """Restart the autopilot once the result is stored."""
         self.automatic = automatic
-        """Nobody requested it."""
+        """Started by the daemon itself."""
         self.was_armed = False
-        """Whether the aircraft was armed since the start."""
         self.deadline_s = None if timeout_s is None else loop.time() + timeout_s
         """Loop time by which measuring must end; None: no limit."""
         self.finished: asyncio.Future[JobResult] = loop.create_future()
@@ -84,12 +83,12 @@ class Job:
 
     @property
     def is_running(self) -> bool:
-        """Whether it has not finished."""
+        """Return whether it has not finished."""
         return not self.finished.done()
 
     @property
     def cancelled(self) -> bool:
-        """Whether somebody has cancelled it."""
+        """Return whether it was cancelled."""
         return self._cancelled_by is not None
 
     @property
@@ -99,7 +98,7 @@ class Job:
 
     @property
     def undid_calibration(self) -> bool:
-        """Whether the write of a calibration was undone, also of an automatic one."""
+        """Return whether a calibration was undone."""
         return self.kind == "undo" and not (isinstance(self.product, Undone) and self.product.by_hand)
 
     @property

@@ -1,12 +1,11 @@
-"""Automatic calibrations: so that a fresh result is in force before anyone arms.
+"""Automatic calibrations, so that a fresh result is active before anyone arms.
 
-A companion sees arming only after it has happened. So while the aircraft stands disarmed and still, and at_arm is
-"gate" or "warn", it calibrates at the first opportunity, and again when that is worth it. Every write wears the
-autopilot's flash: what is right already is not written (a still window that agrees counts as a calibration's proof),
-and the writes of a day are bounded, also over restarts.
+While the aircraft is disarmed and still, and at_arm is "gate" or "warn", it is calibrated at the first opportunity, and
+again when that is worth it. Every write wears the autopilot's flash: offsets that a still window confirms are not
+written again, and the writes of a day are bounded, also over restarts.
 
-It never overwrites what somebody else has chosen: after an undo, a cancel, or a change by another station it stops
-until the next request or restart, and says so.
+Choices of people are never overwritten: after an undo, a cancel, or a change by another station automatic calibrations
+stop until the next request or restart, with a message.
 """
 
 from __future__ import annotations
@@ -17,8 +16,6 @@ import math
 import time
 from collections.abc import Mapping
 from typing import Final
-
-import msgspec
 
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.service import JobResult, Refusal
@@ -37,22 +34,15 @@ logger = logging.getLogger(__name__)
 REQUESTER: Final = "the companion itself"
 POLL_S: Final = 1.0
 SPACING_S: Final = 300.0
-"""Least time between automatic writes; the horizon of sigma_use is 180 s, so that nothing is lost by waiting."""
+"""Least time between automatic writes; sigma_use holds for 180 s."""
 WORTH_FOR_S: Final = 30.0
-"""Time for which better offsets must seem available before good ones are replaced."""
+"""Time of better windows before good offsets are replaced."""
 PER_DAY: Final = 24
-"""A dozen parameters each: some 300 of the 10 000 rewrites that a page of flash is good for, spread over its log."""
+"""Most automatic writes a day: some 300 parameters; a page of flash bears 10 000 rewrites."""
 FAILURES: Final = 3
 RETRY_S: Final = 60.0
 """Wait after a failure; doubled with each further one."""
 TIMEOUT_S: Final = 180.0
-
-
-class AutomaticWrite(msgspec.Struct, frozen=True):
-    """One automatic calibration that wrote."""
-
-    at_unix_s: float
-    parameters: int
 
 
 class Automatic:
@@ -62,39 +52,39 @@ class Automatic:
         self, core: Core, imus: Mapping[str, AutopilotImu], manager: CalibrationManager, in_force: InForce
     ) -> None:
         self._core, self._manager, self._imus, self._in_force = core, manager, imus, in_force
-        self._file = BoundedList(core.config.storage.path / "automatic.json", AutomaticWrite, PER_DAY + 8)
-        self._writes: list[AutomaticWrite] = []
-        self._to_keep: list[AutomaticWrite] = []
+        self._file = BoundedList(core.config.storage.path / "automatic.json", dict[str, float], PER_DAY + 8)
+        self._writes: list[dict[str, float]] = []
+        self._to_keep: list[dict[str, float]] = []
         self._next_s = -math.inf
         self._failures = 0
         self.turns = 0
         """Turns of `run`, for the watchdog."""
         self.stopped: str | None = None
-        """Reason to wait for a request, for people; None while it works."""
+        """Reason to wait for a request; None while it works."""
 
     @property
     def wanted(self) -> bool:
-        """Whether the settings ask for it."""
+        """Return whether the settings ask for it."""
         wanted = self._core.wanted
         return wanted.at_arm != "off" and wanted.push and self._core.only_listening is None
 
     def why_not(self) -> str | None:
-        """Say what to do where none will start by itself; None when one will as soon as it is needed."""
+        """Return the remedy where none will start by itself; None when one will as soon as needed."""
         if not self.wanted or self.stopped is not None:
             return "calibrate"
         if self._writes_today() >= PER_DAY:
             return "calibrate (flash spared)"
         now_s = asyncio.get_running_loop().time()
-        # A boot that threw our values away, or a new zero, is urgent, unless it fails.
+        # Offsets replaced by a boot, or a new zero, are urgent, unless a calibration has failed.
         urgent = any(finding.why in (Why.REPLACED, Why.ALIGNED) for finding in self._in_force.findings(now_s))
         if self._next_s > now_s and not (urgent and self._failures == 0):
             return f"again in {math.ceil((self._next_s - now_s) / 60)} min"
         return None
 
     def _writes_today(self) -> int:
-        # The clock of a field computer may jump: what seems to lie in the future counts as of today.
+        # A clock that has jumped: writes in the future count as of today.
         since_s = time.time() - 86400.0
-        return sum(write.at_unix_s > since_s for write in self._writes)
+        return sum(write["at_unix_s"] > since_s for write in self._writes)
 
     async def run(self) -> None:
         """Calibrate whenever it is worth it, until cancelled."""
@@ -122,7 +112,7 @@ class Automatic:
                 logger.info("nothing is written by itself: %s", answer.reason)
 
     async def _still_ours(self) -> bool:
-        """Read the offsets: nobody asked to overwrite what another station has set unheard by us."""
+        """Read the offsets, as another station may have set them unnoticed."""
         try:
             same = [await imu.refresh() for imu in self._imus.values()]
         except AutopilotError as error:
@@ -132,7 +122,7 @@ class Automatic:
         return all(same)
 
     def _is_possible(self) -> bool:
-        """Disarmed, nothing else runs, and the window would not get better by waiting."""
+        """Return whether it is disarmed, nothing runs, and the window is complete."""
         needed = (Precondition.IDLE, Precondition.DISARMED, Precondition.ARM_STATE_KNOWN)
         if self._manager.blocking_reason(needed) is not None:
             return False
@@ -146,7 +136,7 @@ class Automatic:
             self._core.say(Severity.WARNING, f"Auto calibration off until asked: {why}", Weight.REFUSAL)
 
     def on_ended(self, job: Job, result: JobResult) -> None:
-        """Count an automatic calibration, and decide when the next one may start."""
+        """Count an automatic calibration, and set the time of the next."""
         now_s = asyncio.get_running_loop().time()
         if job.kind == "undo":
             if result.outcome == "done" and job.undid_calibration:
@@ -156,8 +146,8 @@ class Automatic:
         elif not job.automatic:
             self.stopped, self._failures, self._next_s = None, 0, now_s + SPACING_S
         else:
-            if parameters := sum(len(imu.written) for imu in job.record.imus) if job.record is not None else 0:
-                write = AutomaticWrite(time.time(), parameters)
+            if job.record is not None and job.record.written:
+                write = {"at_unix_s": time.time()}
                 self._writes = [*self._writes, write][-PER_DAY - 8 :]
                 self._to_keep.append(write)
             if result.outcome == "done":

@@ -144,7 +144,7 @@ class InForce:
 
     @property
     def measured(self) -> bool:
-        """Whether there is a still window now."""
+        """Return whether there is a still window now."""
         return any(state.present is not None for state in self._triads.values())
 
     @property

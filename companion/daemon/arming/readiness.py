@@ -84,7 +84,7 @@ class Readiness:
 
     @property
     def asks_script(self) -> bool:
-        """Whether ArduPilot's script gets the answer: while this gates, and afterwards, to release it."""
+        """Return whether ArduPilot's script gets the answer: while this gates, and afterwards, to release it."""
         self._has_gated |= self.at_arm == "gate"
         return self._has_gated and self._vehicle.kind.gate_is_script
 
@@ -148,7 +148,7 @@ class Readiness:
 
     @property
     def _writing(self) -> bool:
-        """Whether a job runs, or an interrupted write is being restored."""
+        """Return whether a job runs, or an interrupted write is being restored."""
         return self._manager.blocking_reason((Precondition.IDLE, Precondition.RESTORED)) is not None
 
     def _judge(self, now_s: float) -> ArmAnswer:

@@ -155,7 +155,7 @@ class CalibrationRun(Job):
 
     @property
     def is_adoptable(self) -> bool:
-        """Whether a request may still adopt this automatic run."""
+        """Return whether a request may still adopt this automatic run."""
         return self.automatic and not self.cancelled and not self.held_back
 
     def adopt(self, requester: str, timeout_s: float | None, *, reboot: bool) -> None:

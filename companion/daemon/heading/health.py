@@ -1,4 +1,4 @@
-"""Whether the attitude may be pushed, with the reason in one line, and its difference to the autopilot's own."""
+"""Health of the pushed attitude, and its difference to the autopilot's own."""
 
 from __future__ import annotations
 
