@@ -174,34 +174,22 @@ class CalibrationManager:
         )
         return self._start(run, Event.REQUEST, self._finish(run, run.calibrate()))
 
-    def start_job(
-        self,
-        kind: str,
-        what: What,
-        requester: str,
-        timeout_s: float | None,
-        missing: str | None,
-        run: Callable[[Job], Awaitable[str]],
-    ) -> Job | Refusal:
-        """Start a job of a kind in `NO_CALIBRATION`, or refuse.
-
-        `missing`: why it cannot be done on this aircraft, if so. `run` carries it out; returns the result in words.
-        """
+    def start_job(self, job: Job, run: Callable[[Job], Awaitable[str]], missing: str | None) -> Job | Refusal:
+        """Start a job of a kind in `NO_CALIBRATION`, or refuse; `missing`: why this aircraft cannot do it, if so."""
         if (refusal := self._refusal(missing)) is not None:
             return refusal
-        job = Job(kind, what, requester, timeout_s)
         return self._start(job, Event.REQUEST, self._finish(job, run(job)))
 
     def start_undo(self, requester: str, *, force: bool = False) -> Job | Refusal:
         """Start restoring the values from before the last write (see `Recovery.undo`), or refuse."""
         running = self._automatic_run()
         missing = None if running is not None else self._recovery.why_no_undo()
-        if (refusal := self._refusal(missing, "nothing_to_undo", but=running)) is not None:
-            return refusal
+        if (refusal := self._refusal(missing, but=running)) is not None:
+            return msgspec.structs.replace(refusal, kind="nothing_to_undo") if refusal.reason == missing else refusal
         job = Job("undo", What.BOTH, requester)
         if running is None:
             return self._start(job, Event.UNDO, self._finish(job, self._undo(job, force=force)))
-        # Whoever wants old values back must not wait for new ones that nobody asked for.
+        # An undo does not wait for a calibration that nobody requested.
         running.cancel(requester)
         return self._start(job, None, self._undo_instead(self._task, running, job, force=force))
 
@@ -218,20 +206,14 @@ class CalibrationManager:
         if self._task is not None:
             await asyncio.wait([self._task])
 
-    def _refusal(
-        self,
-        missing: str | None,
-        kind: Literal["other", "nothing_to_undo"] = "other",
-        *,
-        but: Job | None = None,
-    ) -> Refusal | None:
+    def _refusal(self, missing: str | None, *, but: Job | None = None) -> Refusal | None:
         """Refuse what cannot be started; `but` is a running job that does not count."""
         if self._core.only_listening is not None:
             return Refusal("other", self._core.only_listening)
         if but is None and (found := self.blocking_reason()) is not None:
             return Refusal(REFUSAL_KINDS.get(found[0], "other"), found[1])
         if missing is not None:
-            return Refusal(kind, missing)
+            return Refusal("other", missing)
         now_s = asyncio.get_running_loop().time()
         if (left := self._starts.left(now_s)) < 1.0:
             return Refusal("busy", f"too many requests, wait {math.ceil((1.0 - left) / STARTS_PER_S)} s")

@@ -141,9 +141,9 @@ class Calibrating(Subsystem):
                 yield reply
         elif asked.action == "write":
             missing = self._why_not_written(write=True) or self._core.vehicle.kind.why_no_thermal_write
-            run, by = partial(into.run, overwrite=asked.overwrite), f"{face} temperature"
-            job = self.manager.start_job(TEMPERATURE, What.GYROS, by, ALIGN_TIMEOUT_S, missing, run)
-            async for reply in self._to_end(_accepted(job), "written"):
+            job = Job(TEMPERATURE, What.GYROS, f"{face} temperature", ALIGN_TIMEOUT_S)
+            started = self.manager.start_job(job, partial(into.run, overwrite=asked.overwrite), missing)
+            async for reply in self._to_end(_accepted(started), "written"):
                 yield reply
         else:
             yield {"kind": "result", "imus": await self._core.offload(self.memory.temperature)}
@@ -228,9 +228,9 @@ class Calibrating(Subsystem):
         else:
             task = ZeroTask(self._core, request, self.alignment)
         what = What.BOTH if _KINDS[action] == ALIGNMENT else What.ACCELEROMETERS
+        job = Job(_KINDS[action], what, by, asked.timeout_s or ALIGN_TIMEOUT_S)
         run = partial(self.stands.run, request=request, task=task)
-        timeout_s = asked.timeout_s or ALIGN_TIMEOUT_S
-        return self.manager.start_job(_KINDS[action], what, by, timeout_s, self._why_not_aligned(request), run)
+        return self.manager.start_job(job, run, self._why_not_aligned(request))
 
     def _why_not_aligned(self, request: AlignmentRequest) -> str | None:
         """Say why there is nothing to measure, or nothing could be written; None when there is."""
