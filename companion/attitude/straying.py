@@ -18,7 +18,7 @@ LONGEST_STEP_S: Final = 0.25
 """Longest step that is compared: it hides a turn to and fro."""
 
 
-class Straying:
+class HeadingDriftMonitor:
     """Sums the turn of the heading less that of the gyros; `add` at every instant with both."""
 
     def __init__(self) -> None:

@@ -35,7 +35,7 @@ Offload = Callable[..., Awaitable[Any]]
 """Runs a blocking call elsewhere: `asyncio.to_thread` in the daemon."""
 
 
-class Wanted:
+class RuntimeSettings:
     """Settings that a ground station can change at run time; they reset at restart."""
 
     def __init__(self, config: Config, retargeted: Callable[[Settings], object]) -> None:
@@ -70,7 +70,7 @@ class Core:
         self.profiles, self.collector, self.machine = Profiles(config), models.collector(config), Machine()
         self.on_tick: Listeners[[float]] = Listeners()
         """Notified of the time of every tick, before the collector."""
-        self.wanted, self.texts = Wanted(config, self._retarget), StatusText(self.link)
+        self.wanted, self.texts = RuntimeSettings(config, self._retarget), StatusText(self.link)
         self.tunes = Tunes(self.link, self.vehicle, lambda: self.wanted.tunes, self.texts.woken)
 
     def _is_carried(self) -> bool:

@@ -20,8 +20,8 @@ from typing import Final
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
-from companion.daemon.arming.in_force import InForce
-from companion.daemon.calibrating.manager import CalibrationManager, Precondition
+from companion.daemon.arming.in_force import ActiveCalibration
+from companion.daemon.calibrating.manager import Precondition
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import NO_CALIBRATION, Job
@@ -48,10 +48,8 @@ TIMEOUT_S: Final = 180.0
 class Automatic:
     """Starts calibrations by itself; `run` decides when."""
 
-    def __init__(
-        self, core: Core, imus: Mapping[str, AutopilotImu], manager: CalibrationManager, in_force: InForce
-    ) -> None:
-        self._core, self._manager, self._imus, self._in_force = core, manager, imus, in_force
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], in_force: ActiveCalibration) -> None:
+        self._core, self._manager, self._imus, self._in_force = core, in_force.manager, imus, in_force
         self._file = BoundedList(core.config.storage.path / "automatic.json", dict[str, float], PER_DAY + 8)
         self._writes: list[dict[str, float]] = []
         self._to_keep: list[dict[str, float]] = []

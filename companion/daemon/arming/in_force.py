@@ -69,12 +69,12 @@ class _TriadState:
     """False: its integer readings carry no information."""
 
 
-class InForce:
+class ActiveCalibration:
     """The active calibration; `poll` often, `measure` whenever there may be a new window."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], calibrating: Calibrating) -> None:
         self._core, self._config, self._imus, config = core, core.config, imus, core.config
-        self._manager, self._memory = calibrating.manager, calibrating.memory
+        self.manager, self._memory = calibrating.manager, calibrating.memory
         self._estimator = calibrating.estimator
         settings = models.settings(config)
         self._floors: dict[Triad, float] = {
@@ -135,7 +135,7 @@ class InForce:
     @property
     def earlier(self) -> Record | None:
         """The last good calibration, also from before this start, if it has not been undone."""
-        return None if self.undone else self._manager.last_good
+        return None if self.undone else self.manager.last_good
 
     @property
     def worth_writing_s(self) -> float:

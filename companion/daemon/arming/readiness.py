@@ -15,8 +15,8 @@ from companion.autopilot.vehicle.ekf import ADJUSTING
 from companion.component.service import ArmAnswer
 from companion.config.sections import AtArm
 from companion.daemon.arming.automatic import Automatic
-from companion.daemon.arming.in_force import InForce
-from companion.daemon.calibrating.manager import CalibrationManager, Precondition
+from companion.daemon.arming.in_force import ActiveCalibration
+from companion.daemon.calibrating.manager import Precondition
 from companion.daemon.core import Core
 from companion.daemon.offsets.effect import LOOK_S
 from companion.daemon.offsets.reboot import RebootOwed
@@ -62,10 +62,8 @@ ArmedState = Literal["calibrated", "checked", "uncalibrated"]
 class Readiness:
     """The arm gate's answer with its words; `run` keeps it fresh."""
 
-    def __init__(
-        self, core: Core, owed: RebootOwed, manager: CalibrationManager, in_force: InForce, automatic: Automatic
-    ) -> None:
-        self._vehicle, self._collector, self._manager = core.vehicle, core.collector, manager
+    def __init__(self, core: Core, owed: RebootOwed, in_force: ActiveCalibration, automatic: Automatic) -> None:
+        self._vehicle, self._collector, self._manager = core.vehicle, core.collector, in_force.manager
         self._wanted, self._on_deck = core.wanted, core.config.vehicle.platform == "deck"
         self._min_still_s = core.config.calibration.min_still_s
         self.in_force, self._automatic, self._owed = in_force, automatic, owed
@@ -120,7 +118,7 @@ class Readiness:
             await asyncio.sleep(POLL_S)
 
     async def _measured(self, now_s: float) -> bool:
-        """Call `InForce.measure`, which may take seconds on a deck, and keep the answer fresh meanwhile."""
+        """Call `ActiveCalibration.measure`, which may take seconds on a deck, and keep the answer fresh meanwhile."""
         measuring = asyncio.ensure_future(self.in_force.measure(now_s))
         try:
             while not (await asyncio.wait((measuring,), timeout=POLL_S))[0]:

@@ -14,7 +14,7 @@ from companion.autopilot.vehicle.vehicle import VehicleEvent
 from companion.commands import History
 from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.automatic import Automatic
-from companion.daemon.arming.in_force import InForce
+from companion.daemon.arming.in_force import ActiveCalibration
 from companion.daemon.arming.readiness import Readiness
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
@@ -147,12 +147,12 @@ class Arming(Subsystem):
         self._core, self._store, self._by_hand = core, calibrating.store, calibrating.by_hand
         self.manager = calibrating.manager
         self._recovery = offsets.recovery
-        self.in_force = InForce(core, devices.imus, calibrating)
-        self.automatic = Automatic(core, devices.imus, calibrating.manager, self.in_force)
+        self.in_force = ActiveCalibration(core, devices.imus, calibrating)
+        self.automatic = Automatic(core, devices.imus, self.in_force)
         # In this order: automatic calibrations ask for the active one.
         calibrating.manager.on_ended.add(self.in_force.on_ended)
         calibrating.manager.on_ended.add(self.automatic.on_ended)
-        self.readiness = Readiness(core, offsets.owed, calibrating.manager, self.in_force, self.automatic)
+        self.readiness = Readiness(core, offsets.owed, self.in_force, self.automatic)
         self.armings = Armings(core, self.readiness)
         self.gate_setup = GateSetup(core)
 

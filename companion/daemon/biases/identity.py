@@ -11,7 +11,7 @@ import numpy as np
 from companion.config.sections import NoiseProfile
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.stands.alignment import AlignmentInForce
+from companion.daemon.stands.alignment import ActiveAlignment
 from companion.estimation.records.align_record import ImuAlignmentRecord
 from companion.estimation.records.history import PowerUp
 from companion.storage.learned import this_boot
@@ -28,7 +28,7 @@ _IN_WORDS: Final = {
 class ImuIdentities:
     """Identities of the configured IMUs."""
 
-    def __init__(self, core: Core, devices: Devices, used: AlignmentInForce) -> None:
+    def __init__(self, core: Core, devices: Devices, used: ActiveAlignment) -> None:
         self._config, self._vehicle, self._imus = core.config, core.vehicle, devices.imus
         self._alignment, self._collector = used, core.collector
         self._sensors = {role.name: sensor for sensor in devices.sensors for role in sensor.roles if role.kind == "imu"}

@@ -20,7 +20,7 @@ from companion.daemon.biases.identity import ImuIdentities, changed
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.stands.alignment import AlignmentInForce
+from companion.daemon.stands.alignment import ActiveAlignment
 from companion.errors import AutopilotError, StorageError
 from companion.estimation.means.warming import Warming
 from companion.estimation.noise.allan import noise_profile
@@ -123,7 +123,7 @@ class _Reference(msgspec.Struct):
 class BiasMemory:
     """Predicts biases before a result is used, and remembers the result."""
 
-    def __init__(self, core: Core, devices: Devices, used: AlignmentInForce) -> None:
+    def __init__(self, core: Core, devices: Devices, used: ActiveAlignment) -> None:
         self._config, self._profiles, self._offload = core.config, core.profiles, core.offload
         self._imus, self._alignment = devices.imus, used
         self.identities = ImuIdentities(core, devices, used)

@@ -20,7 +20,7 @@ from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import ALIGNMENT, FACES, TEMPERATURE, TURN, Job, Undone
 from companion.daemon.offsets.subsystem import Offsets
-from companion.daemon.stands.alignment import AlignmentInForce, ByHand, FacesInForce
+from companion.daemon.stands.alignment import ActiveAlignment, ActiveSixPosition, ByHand
 from companion.daemon.stands.all_sides import SidesTask
 from companion.daemon.stands.measuring import Estimator, Measuring
 from companion.daemon.stands.on_spot import TurnTask, ZeroTask
@@ -58,10 +58,10 @@ class Calibrating(Subsystem):
         config, imus = core.config, devices.imus
         self._core, self._offsets, self._imus = core, offsets, imus
         self.store = RecordStore(config.storage.path)
-        self.alignment = AlignmentInForce(config, core.offload)
+        self.alignment = ActiveAlignment(config, core.offload)
         self.memory = BiasMemory(core, devices, self.alignment)
         self.measuring = measuring = Measuring(core, imus)
-        self.faces = FacesInForce(core, imus)
+        self.faces = ActiveSixPosition(core, imus)
         own = OwnAttitude(core.vehicle, wanted=config.compass is None)
         self.estimator = Estimator(core, self.alignment, self.faces, own)
         self.on_solved: Listeners[Whereabouts, Otherwise, What, Expectation] = Listeners()

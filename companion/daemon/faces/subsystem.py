@@ -19,7 +19,7 @@ from companion.component.service import JobResult
 from companion.config.sections import AtArm, Senders
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
-from companion.daemon.core import Core, Handler, Subsystem, Task, Wanted, joined
+from companion.daemon.core import Core, Handler, RuntimeSettings, Subsystem, Task, joined
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.faces.headline import Headlines
 from companion.daemon.heading.subsystem import Heading
@@ -44,7 +44,7 @@ _NO_PAGE: Final[Object] = {"url": None, "viewers": 0, "wrong_tokens": 0}
 """Keys of the page's status while its process reports nothing."""
 
 
-class Faces(Subsystem):
+class Interfaces(Subsystem):
     """The MAVLink component, the control socket's answers, and the child processes."""
 
     def __init__(
@@ -202,7 +202,7 @@ class Faces(Subsystem):
         return tasks
 
 
-def own_parameters(wanted: Wanted) -> list[Parameter]:
+def own_parameters(wanted: RuntimeSettings) -> list[Parameter]:
     """List the CMP_* parameters. What a ground station sets holds until the daemon restarts."""
     assert set(AT_ARM) == set(get_args(AtArm))
     gyro, accel = wanted.settings.target_gyro_sigma_rad_s / DEG_H, wanted.settings.target_accel_sigma_m_s2 / MG

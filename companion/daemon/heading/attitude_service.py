@@ -22,7 +22,7 @@ from companion.autopilot.vehicle.ekf import OwnCompass
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
 from companion.component.statustext import Severity, Weight
 from companion.configured import models
-from companion.daemon.arming.in_force import InForce
+from companion.daemon.arming.in_force import ActiveCalibration
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
@@ -170,7 +170,7 @@ class Sender:
 class AttitudeService:
     """Carries, pushes and supervises the attitude; `run` it."""
 
-    def __init__(self, core: Core, devices: Devices, in_force: InForce, calibrating: Calibrating) -> None:
+    def __init__(self, core: Core, devices: Devices, in_force: ActiveCalibration, calibrating: Calibrating) -> None:
         config, link, vehicle = core.config, core.link, core.vehicle
         self.turns = 0
         self._config, self._vehicle, self._say = config, vehicle, core.say
@@ -228,7 +228,7 @@ class AttitudeService:
         if not self.health.pushing or not self.sender.is_due(self.carrier.heard_s, read_s):
             return
         attitude = self.carrier.now()
-        if attitude is None or not all(map(math.isfinite, (*attitude.quaternion, *attitude.sigma_rad))):
+        if attitude is None or not _is_finite(attitude):
             self.health.stop("attitude lost: samples were missing for too long")
             return
         levelled = self.difference.levelled(attitude, read_s)
@@ -369,6 +369,10 @@ class AttitudeService:
         if attitude is None:
             return None
         return {**_angles(attitude), "north": "true", "source": "attitude", "still": self.carrier.still}
+
+
+def _is_finite(attitude: Attitude) -> bool:
+    return all(map(math.isfinite, (*attitude.quaternion, *attitude.sigma_rad, *attitude.rate_rad_s, attitude.t_s)))
 
 
 def _angles(attitude: Attitude | None) -> Object:

@@ -18,9 +18,9 @@ from companion.autopilot.firmware.firmwares import outcomes_of
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
 from companion.config.sections import Config, Imu
 from companion.configured import models
-from companion.daemon.arming.in_force import InForce
+from companion.daemon.arming.in_force import ActiveCalibration
 from companion.daemon.core import Core
-from companion.daemon.stands.alignment import AlignmentInForce
+from companion.daemon.stands.alignment import ActiveAlignment
 from companion.errors import CalibrationRefusedError
 from companion.estimation.means.pose import CompassModel, GradienterModel, vehicle_heading_rad
 from companion.estimation.means.windows import Window
@@ -130,7 +130,7 @@ def turn_between(ours: Quaternion, theirs: Quaternion) -> Triple:
 class Carrier:
     """Carries the attitude of one IMU."""
 
-    def __init__(self, core: Core, imu: Imu, in_force: InForce, alignment: AlignmentInForce) -> None:
+    def __init__(self, core: Core, imu: Imu, in_force: ActiveCalibration, alignment: ActiveAlignment) -> None:
         self.imu = imu
         self.estimator: AttitudeEstimator | None = None
         self.heard_s = -math.inf

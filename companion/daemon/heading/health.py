@@ -21,7 +21,7 @@ from companion.attitude.quaternion import (
     rotate,
     shortest_arc,
 )
-from companion.attitude.straying import LATE_S, Straying
+from companion.attitude.straying import LATE_S, HeadingDriftMonitor
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.daemon.heading.carrier import Carrier
 from companion.physics.units import DEG
@@ -74,7 +74,7 @@ class Difference:
         self._down: Triple = (0.0, 0.0, 0.0)
         self._down_now: Triple = (0.0, 0.0, 0.0)
         self._since_s = math.inf
-        self.straying = Straying()
+        self.straying = HeadingDriftMonitor()
 
     def is_heard(self, now_s: float) -> bool:
         """Return whether the autopilot sends its attitude."""

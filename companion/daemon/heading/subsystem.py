@@ -14,7 +14,7 @@ from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.stands.alignment import AlignmentInForce
+from companion.daemon.stands.alignment import ActiveAlignment
 from companion.estimation.means.pose import up_in_vehicle, vehicle_heading_rad
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.formats import Object
@@ -113,7 +113,7 @@ class Heading(Subsystem):
 class PoseNow:
     """The pose from gradienter and compass, or from `carried`, which holds in flight too, while that gives one."""
 
-    def __init__(self, core: Core, alignment: AlignmentInForce, carried: Callable[[], Object | None] | None) -> None:
+    def __init__(self, core: Core, alignment: ActiveAlignment, carried: Callable[[], Object | None] | None) -> None:
         self._core, self._alignment, self._carried = core, alignment, carried
         self._compass = models.compass_model(core.config.compass)
         self._tilt: TiltSample | None = None

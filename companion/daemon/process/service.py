@@ -14,7 +14,7 @@ from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Offload, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.faces.control import ControlServer
-from companion.daemon.faces.subsystem import Faces
+from companion.daemon.faces.subsystem import Interfaces
 from companion.daemon.heading.subsystem import Heading
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.recorder.recorder import Recorder
@@ -57,7 +57,7 @@ class Service:
         self.arming = Arming(core, self.devices, self.offsets, self.calibrating)
         self.heading = Heading(core, self.devices, self.calibrating, self.arming)
         self.recorder = Recorder(core, self.devices, self.calibrating)
-        self.faces = Faces(
+        self.faces = Interfaces(
             core, self.devices, self.offsets, self.calibrating, self.arming, self.heading, self.recorder, child
         )
 

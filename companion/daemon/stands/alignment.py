@@ -41,7 +41,7 @@ from companion.storage.learned import KEEP_DONE, Done, alignment_in, alignments_
 logger = logging.getLogger(__name__)
 
 
-class AlignmentInForce:
+class ActiveAlignment:
     """The gradienter's measured zero, and whether it still belongs to this configuration."""
 
     def __init__(self, config: Config, offload: Offload) -> None:
@@ -115,7 +115,7 @@ class AlignmentInForce:
             self.unused = f"measured with another {names}: companion align zero, or companion align --forget"
 
 
-class FacesInForce:
+class ActiveSixPosition:
     """The accelerometers' errors known from all sides, for the offsets and scales that are active now."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:

@@ -14,7 +14,7 @@ from companion.autopilot.firmware.imu_calibration import whole_accelerometer
 from companion.autopilot.parameters.change import Change
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.offsets.plan import WriteLog
-from companion.daemon.stands.alignment import FacesInForce
+from companion.daemon.stands.alignment import ActiveSixPosition
 from companion.daemon.stands.session import PoseTask, SessionState
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.faces import BIAS, SCALE, Face, FacesEstimate, faces, missing, seen_before
@@ -34,7 +34,7 @@ _FIRST: Final = Wish("any side down, propped up, hands off", Hold(LEVEL))
 class SidesTask(PoseTask):
     """Accelerometers held on all sides."""
 
-    def __init__(self, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], kept: FacesInForce) -> None:
+    def __init__(self, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], kept: ActiveSixPosition) -> None:
         self._request, self._imus, self._kept = request, imus, kept
         self.total, self.fit_from = EXPECTED, 1
         self._by_imu: dict[str, FacesEstimate] = {}

@@ -17,7 +17,7 @@ from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.job import Job
-from companion.daemon.stands.alignment import AlignmentInForce, FacesInForce
+from companion.daemon.stands.alignment import ActiveAlignment, ActiveSixPosition
 from companion.errors import AutopilotError, CalibrationRefusedError
 from companion.estimation.collector.outlook import CollectorStatus
 from companion.estimation.machine import Event, State
@@ -132,7 +132,7 @@ class Measuring:
 class Estimator:
     """Estimates biases with the alignment and the site in force."""
 
-    def __init__(self, core: Core, alignment: AlignmentInForce, faces: FacesInForce, own: OwnAttitude) -> None:
+    def __init__(self, core: Core, alignment: ActiveAlignment, faces: ActiveSixPosition, own: OwnAttitude) -> None:
         self._core, self.alignment, self._faces, self._own = core, alignment, faces, own
 
     async def solve(self, window: Window, what: What) -> tuple[Solution, Whereabouts, Otherwise]:

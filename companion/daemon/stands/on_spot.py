@@ -14,7 +14,7 @@ from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.offsets.plan import WriteLog
-from companion.daemon.stands.alignment import AlignmentInForce, FacesInForce
+from companion.daemon.stands.alignment import ActiveAlignment, ActiveSixPosition
 from companion.daemon.stands.session import ARMED, PoseTask, SessionState
 from companion.errors import CalibrationRefusedError
 from companion.estimation.alignment.align import Alignment, ImuAlignment, align, in_words, turned
@@ -125,7 +125,7 @@ class ZeroTask(SpotTask):
     imus_alone: ClassVar[bool] = False
     if_armed: ClassVar[str | None] = ARMED
 
-    def __init__(self, core: Core, request: AlignmentRequest, kept: AlignmentInForce) -> None:
+    def __init__(self, core: Core, request: AlignmentRequest, kept: ActiveAlignment) -> None:
         super().__init__(core, request)
         self.fit_from = LEAST_STANDS
         self._kept, self._compass = kept, models.compass_model(core.config.compass)
@@ -206,7 +206,7 @@ class TurnTask(SpotTask):
     """Level accelerometers and the slope, without a gradienter; the board's tilt, where all sides are known."""
 
     def __init__(
-        self, core: Core, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], known: FacesInForce
+        self, core: Core, request: AlignmentRequest, imus: Mapping[str, AutopilotImu], known: ActiveSixPosition
     ) -> None:
         super().__init__(core, request)
         self._imus, self._known = imus, known

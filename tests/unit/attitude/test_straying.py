@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from companion.attitude.straying import Straying
+from companion.attitude.straying import HeadingDriftMonitor
 
 HZ = 10.0
 
@@ -23,7 +23,7 @@ def strays_after_s(
     late_s: float = 0.0,
 ) -> float:
     """When a heading that is off by `wrong_deg` is found to stray from gyros sampled at 10 Hz; inf: never."""
-    straying, dice = Straying(), np.random.default_rng(1)
+    straying, dice = HeadingDriftMonitor(), np.random.default_rng(1)
     fine = np.arange(0.0, 61.0, 1e-3)
     turned = np.cumsum([rate_deg_s(t) for t in fine]) * 1e-3
     for t_s in np.arange(1.0, 60.0, 1.0 / HZ):
@@ -65,9 +65,9 @@ def test_a_compass_may_set_right_what_was_not_well_known() -> None:
 
 def test_a_drift_is_found_on_a_line_that_loses_a_fifth() -> None:
     """Two lost in a row are a gap in which nothing is compared, and nothing is forgotten."""
-    straying, dice = Straying(), np.random.default_rng(3)
+    straying, dice = HeadingDriftMonitor(), np.random.default_rng(3)
     for seed in range(20):
-        straying, found_s = Straying(), math.inf
+        straying, found_s = HeadingDriftMonitor(), math.inf
         for t_s in np.arange(10.0, 30.0, 1.0 / HZ):
             if dice.random() > 0.2:
                 straying.add(float(t_s), math.radians(3.0 * max(0.0, t_s - 20.0)), math.radians(1.0), 0.0)

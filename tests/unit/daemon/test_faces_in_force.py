@@ -13,7 +13,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_
 from companion.cli.client import sides_lines
 from companion.config import parse
 from companion.daemon.core import Core
-from companion.daemon.stands.alignment import FacesInForce
+from companion.daemon.stands.alignment import ActiveSixPosition
 from companion.estimation.alignment.faces import BIAS, SCALE
 from companion.estimation.records.align_record import Determined, FacesImuRecord, FacesRecord, Running
 from companion.physics.frames import rotation_matrix, vector
@@ -68,14 +68,14 @@ def record(when: Running | None) -> FacesRecord:
     return FacesRecord(measured_at="2026-01-01T00:00:00+00:00", gravity_m_s2=9.81, stands=(), imus=(imu,))
 
 
-class There(FacesInForce):
+class There(ActiveSixPosition):
     """Of a daemon that hears for how long the sensor has been on."""
 
     def running(self, name: str) -> Running | None:
         return running()
 
 
-def kept(folder: Path, when: Running | None) -> FacesInForce:
+def kept(folder: Path, when: Running | None) -> ActiveSixPosition:
     text = f"""
 [mavlink]
 url = "udpout:127.0.0.1:9"
@@ -87,7 +87,7 @@ profile = "icm42688p"
 directory = "{folder}"
 """
 
-    async def made() -> FacesInForce:
+    async def made() -> ActiveSixPosition:
         core = Core(parse(text, "a.toml"), None, inline, None)
         await There(core, {}).keep(record(when))
         again = There(core, {})
