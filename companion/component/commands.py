@@ -160,8 +160,10 @@ class CommandServer:
         running = self._running
         if running is not None and running.key == command.key and not isinstance(request, requests.Refused):
             if request != running.request:
-                # Only words can tell: any other ACK would be taken for the end of the job that runs.
-                self._say(Severity.WARNING, f"Still {_doing(running.request)}", Weight.REFUSAL)
+                # Not by an ACK, which would be taken for the end of the running job.
+                before = running.request
+                doing = "undoing" if isinstance(before, Undo) else f"calibrating {_WORDS[before.biases]}"
+                self._say(Severity.WARNING, f"Still {doing}", Weight.REFUSAL)
             self._acknowledge_progress(running)
             return
         if copy:
@@ -280,10 +282,6 @@ class CommandServer:
         return self._link.send(
             mavlink.MAVLink_command_ack_message(key.command, result, progress, detail, key.system_id, key.component_id)
         )
-
-
-def _doing(request: Calibrate | Undo) -> str:
-    return "undoing" if isinstance(request, Undo) else f"calibrating {_WORDS[request.biases]}"
 
 
 CAPABILITIES = (

@@ -151,7 +151,8 @@ class Carrier:
         self._record: ImuRecord | None = None
         self._recent: deque[Sequence[ImuSample]] = deque()
         """Reads within `KEPT_S` on the ground, or without an estimator."""
-        self._wanted = False
+        self.align_wanted = False
+        """Align as soon as it is still on the ground."""
         self._checked_s = -math.inf
         core.vehicle.on_event.add(self._on_event)
 
@@ -193,10 +194,6 @@ class Carrier:
         self.estimator = self._record = None
         self._recent.clear()
 
-    def align_anew(self) -> None:
-        """Request an alignment as soon as it is still on the ground."""
-        self._wanted = True
-
     def now(self) -> Attitude | None:
         """Return the attitude at the last sample; None while there is none."""
         return None if self.estimator is None else self.estimator.attitude()
@@ -229,12 +226,12 @@ class Carrier:
                 self.waiting_for = _NO_STAND[on_deck]
             return
         lost = not self.estimator.aligned
-        if self._wanted or lost or now_s - self._checked_s >= CHECK_EVERY_S:
+        if self.align_wanted or lost or now_s - self._checked_s >= CHECK_EVERY_S:
             self._checked_s = now_s
             stand = await self._stand(now_s)
             if stand is not None and self._vehicle.arm_state is ArmState.DISARMED:
                 self._local = stand.local
-                if self._wanted or lost or self._disagrees(stand):
+                if self.align_wanted or lost or self._disagrees(stand):
                     self._align(stand)
 
     async def _follow_calibration(self) -> None:
@@ -253,10 +250,10 @@ class Carrier:
         if settings is None:
             self.estimator, self.waiting_for = None, "waiting for a calibration of the gyros"
         elif self.estimator is None:
-            self.estimator, self._wanted = AttitudeEstimator(settings), True
+            self.estimator, self.align_wanted = AttitudeEstimator(settings), True
         else:
             self.estimator.settle(settings)
-            self._wanted = True
+            self.align_wanted = True
 
     def resume(self, settings: AttitudeSettings, stand: StandingAttitude) -> None:
         """Start in flight."""
@@ -297,7 +294,7 @@ class Carrier:
         self.estimator.align(begun_s, stand.body_from_ned, stand.covariance)
         self.estimator.update(since, phase=self.phase)
         after = self.now()
-        self._wanted = False
+        self.align_wanted = False
         if after is None:
             return
         jump = math.inf if before is None else abs(math.remainder(after.yaw_rad - before.yaw_rad, 2.0 * math.pi))

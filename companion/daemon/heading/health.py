@@ -250,7 +250,7 @@ class Health:
         straying = self._difference.straying
         if self._strayed is None and straying.is_too_far and carrier.phase == "flight":
             self._strayed = f"heading drifts: {abs(straying.strayed_rad) / DEG:.0f} deg off the autopilot's gyros"
-            carrier.align_anew()
+            carrier.align_wanted = True
         if self._strayed is not None:
             return self._strayed
         return self._unsure(now_s, carrier.estimator)

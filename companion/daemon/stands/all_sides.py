@@ -93,13 +93,15 @@ class SidesTask(PoseTask):
                 faces_imu_record(
                     found,
                     name=name,
-                    accel_id=self._imus[name].in_force.accel_id,
-                    corrections=self._imus[name].in_force.corrections,
+                    accel_id=calibration.accel_id,
+                    corrections=calibration.corrections,
                     temperature_degc=degrees.get(name),
                     running=self._kept.running(name),
-                    whole_m_s2=self._whole_m_s2(name, found),
+                    # Bias without any offset, in the sensor's own scale, as an offset corrects it.
+                    whole_m_s2=np.asarray(calibration.accel_offset_m_s2) + found.figures[BIAS] / calibration.in_use(),
                 )
                 for name, found in self._by_imu.items()
+                for calibration in (self._imus[name].in_force,)
             ),
         )
 
@@ -126,11 +128,6 @@ class SidesTask(PoseTask):
         turn = self._imus[imu.name].in_force.orientation.T
         sigma = np.sqrt(np.diag(turn @ np.diag(np.square(imu.accel_sigma_use_m_s2)) @ turn.T))
         return Face(turn @ np.array(imu.accel_m_s2), sigma)
-
-    def _whole_m_s2(self, name: str, found: FacesEstimate) -> Array:
-        """Return the bias without any offset, in the sensor's own scale, as an offset would correct it."""
-        calibration = self._imus[name].in_force
-        return np.asarray(calibration.accel_offset_m_s2) + found.figures[BIAS] / calibration.in_use()
 
     def _scales_left(self) -> Iterator[str]:
         """Warn of scales that the firmware would not keep."""

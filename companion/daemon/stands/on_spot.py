@@ -61,6 +61,8 @@ class SpotTask(PoseTask):
 
     result: Alignment
     stands: Sequence[StandMeans] = ()
+    zero_deg: tuple[float, float] = (0.0, 0.0)
+    """Zero of the gradienter in the configuration."""
 
     def __init__(self, core: Core, request: AlignmentRequest) -> None:
         self._core, self._request = core, request
@@ -81,19 +83,13 @@ class SpotTask(PoseTask):
             turn_deg, sigma_deg = counted.angle_rad / DEG, counted.sigma_rad / DEG
         return HeldPose(up, state.poses[-1].heading_deg + turn_deg, sigma_deg, counted=True)
 
-    def _stand_records(self, state: SessionState, zero_deg: tuple[float, float]) -> tuple[StandRecord, ...]:
+    def _stand_records(self, state: SessionState) -> tuple[StandRecord, ...]:
         return tuple(
-            stand_record(stand, attitude, window.end_s - window.start_s, zero_deg)
+            stand_record(stand, attitude, window.end_s - window.start_s, self.zero_deg)
             for stand, attitude, window in zip(self.stands, self.result.attitudes, state.windows, strict=True)
         )
 
-    def _make_stands(
-        self,
-        state: SessionState,
-        names: Sequence[str],
-        north_deg: float = 0.0,
-        zero_deg: tuple[float, float] = (0.0, 0.0),
-    ) -> None:
+    def _make_stands(self, state: SessionState, names: Sequence[str], north_deg: float = 0.0) -> None:
         """Make the stands of these IMUs; `north_deg` is the poses' north from the true one."""
         stands = []
         for number, (window, pose) in enumerate(zip(state.windows, state.poses, strict=True)):
@@ -103,7 +99,7 @@ class SpotTask(PoseTask):
             stands.append(
                 StandMeans(
                     imus=tuple(_imu_stand(imus[name]) for name in names),
-                    tilt_deg=None if tilt is None else (tilt.x_deg - zero_deg[0], tilt.y_deg - zero_deg[1]),
+                    tilt_deg=None if tilt is None else (tilt.x_deg - self.zero_deg[0], tilt.y_deg - self.zero_deg[1]),
                     tilt_sigma_deg=(x_sigma_deg, y_sigma_deg),
                     heading_rad=(pose.heading_deg + north_deg) * DEG,
                     heading_sigma_rad=pose.heading_sigma_deg * DEG,
@@ -130,7 +126,8 @@ class ZeroTask(SpotTask):
         self.fit_from = LEAST_STANDS
         self._kept, self._compass = kept, models.compass_model(core.config.compass)
         self._gradienter = models.gradienter_model(core.config.gradienter)
-        self._zero_deg = (0.0, 0.0) if core.config.gradienter is None else core.config.gradienter.offset_deg
+        if core.config.gradienter is not None:
+            self.zero_deg = core.config.gradienter.offset_deg
 
     def examine(self, state: SessionState, now: Window) -> tuple[HeldPose, str | None]:  # noqa: D102
         assert self._gradienter is not None
@@ -152,7 +149,7 @@ class ZeroTask(SpotTask):
         compass = self._core.config.compass
         magnetic = compass is not None and compass.reference == "magnetic"
         north_deg = local.declination_deg if magnetic else 0.0
-        self._make_stands(state, readable(state.windows), north_deg, self._zero_deg)
+        self._make_stands(state, readable(state.windows), north_deg)
         law, mounted = self._gradienter.law, self._gradienter.vehicle_from_sensor
         self._estimated(align(law, mounted, self.stands, ground(local, self._compass)))
         return []
@@ -189,7 +186,7 @@ class ZeroTask(SpotTask):
             chi_square=round(result.chi_square, 3),
             freedom=result.freedom,
             temperature_degc=tilt.temperature_degc if tilt is not None else None,
-            stands=self._stand_records(state, self._zero_deg),
+            stands=self._stand_records(state),
             imus=tuple(imu_record(imu, degrees.get(imu.name)) for imu in result.imus),
         )
 
@@ -238,7 +235,7 @@ class TurnTask(SpotTask):
             checked=result.checked,
             chi_square=round(result.chi_square, 3),
             freedom=result.freedom,
-            stands=self._stand_records(state, (0.0, 0.0)),
+            stands=self._stand_records(state),
             imus=tuple(self._imu_record(imu, degrees.get(imu.name)) for imu in result.imus),
             board=None
             if self.board is None or faces is None
