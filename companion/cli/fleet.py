@@ -42,10 +42,8 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
     words = f"address of the page (default {DEFAULT_PAGE}, for this computer alone; off: no page)"
     run.add_argument("--page", default=DEFAULT_PAGE, metavar="HOST:PORT", help=words)
     run.add_argument("--password-file", type=Path, metavar="FILE", help="file with the password of the page")
-    run.add_argument("--cert", type=Path, metavar="FILE", help="certificate of the page with its chain (PEM)")
-    run.add_argument("--key", type=Path, metavar="FILE", help="key of the certificate; both together turn on https")
     acl = add("acl", _acl, "print a broker's access list: each aircraft below its own name, and the collector")
-    acl.add_argument("broker", choices=("mosquitto", "emqx"), help="format of the list")
+    acl.add_argument("broker", choices=("mosquitto",), help="format of the list")
     words = "user name of an aircraft and its id (default: each aircraft's user name is its id)"
     acl.add_argument("aircraft", nargs="*", metavar="USER=ID", help=words)
 
@@ -67,18 +65,15 @@ async def _run(options: argparse.Namespace) -> int:
 async def _acl(options: argparse.Namespace) -> int:
     from companion.fleet.acl import access_list
 
-    print_lines(*access_list(options.broker, options.aircraft))
+    print_lines(*access_list(options.aircraft))
     return DONE
 
 
 def _server(options: argparse.Namespace) -> Server:
-    from companion.fleet.server import Certificate, Server, read_password
+    from companion.fleet.server import Server, read_password
 
     password = None if options.password_file is None else read_password(options.password_file)
-    if (options.cert is None) != (options.key is None):
-        raise ConfigError("--cert and --key: found one of them; allowed: both, or neither")
-    certificate = None if options.cert is None else Certificate(options.cert, options.key)
-    return Server(options.page, options.database, password, certificate)
+    return Server(options.page, options.database, password)
 
 
 async def _until_stopped(*runs: Coroutine[Any, Any, None]) -> None:

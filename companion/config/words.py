@@ -23,6 +23,7 @@ KEYS: Final[dict[str, str]] = {
 """Removed configuration keys without list indexes ("imu.port"), each with its version and its remedy."""
 
 _RECORD: Final = "0.2: record where a gradienter or a boat is (companion record), and replay that"
+_PROXY: Final = "0.2: put a web server with https before the page, as docs/fleet.md shows (The page)"
 COMMAND_LINE: Final[dict[str, str]] = {
     "companion install-service --dry-run": "0.2: install below a folder with --root to see the files",
     "companion uninstall-service --dry-run": "0.2: each removed file is printed",
@@ -35,6 +36,9 @@ COMMAND_LINE: Final[dict[str, str]] = {
     "companion replay --longitude-deg": _RECORD,
     "companion ground params": "0.2: set CMP_ parameters in the parameter list of a ground station program",
     "companion profile --warm-up": "0.2: leave it out (each IMU's temperature curve is learned in service)",
+    "companion fleet run --cert": _PROXY,
+    "companion fleet run --key": _PROXY,
+    "companion fleet acl emqx": "0.2: give other brokers the rights that companion fleet acl mosquitto lists",
     "companion fleet demo": "0.2: run python -m sim fleet in the folder of the companion's sources",
     "companion fleet export": "0.2: use psql, sqlite3 or DuckDB, as docs/fleet.md shows (Export)",
 }

@@ -1,4 +1,4 @@
-"""The pages over HTTP or HTTPS: read only, for this computer alone or for clients with the password."""
+"""The pages over HTTP: read only, for this computer alone or for clients with the password."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import datetime
 import logging
 import re
 import secrets
-import ssl
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -28,7 +27,6 @@ from companion.errors import ConfigError
 from companion.fleet import page
 from companion.fleet.database import engine_of, why
 from companion.links.system.connection import Backoff, Reconnection
-from companion.mqtt.broker import load_pair, unusable
 from companion.storage.state import read_regular
 from companion.web.access import Access, is_loopback, page_url, split_address
 from companion.web.listener import listening
@@ -41,8 +39,6 @@ AGAIN_S: Final = 30
 """Period after which a browser loads the first page again."""
 SOON_S: Final = 2
 """Period after which a browser tries again when the database could not be read."""
-CERTIFICATE_S: Final = 60.0
-"""Period at which the certificate's files are checked for a change."""
 FRESH_S: Final = 2.0
 """Time for which a rendered page is given to further clients."""
 _GLANCE: Final = re.compile(r"/(?:page/([1-9][0-9]{0,6}))?")
@@ -70,49 +66,6 @@ def read_password(path: Path) -> str:
     if len(found) < LEAST_PASSWORD:
         raise ConfigError(f"{path}: found a password of {len(found)} characters; allowed: at least {LEAST_PASSWORD}")
     return found
-
-
-class Certificate:
-    """A certificate with its chain, and its key, PEM; `context` is for a server.
-
-    Raises:
-        ConfigError: they cannot be used; one line that names the file.
-    """
-
-    def __init__(self, cert: Path, key: Path) -> None:
-        self._cert, self._key = cert, key
-        self.context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        self._stamps: object = None
-        self._load()
-
-    def reload(self) -> None:
-        """Load files that have changed, for new connections; files that cannot be used change nothing."""
-        if self._read_stamps() == self._stamps:
-            return
-        try:
-            self._load()
-        except ConfigError as error:
-            logger.warning("page: the former certificate is used: %s", error)
-        else:
-            logger.info("page: %s was taken anew", self._cert)
-
-    def _read_stamps(self) -> object:
-        try:
-            return [(found.st_mtime_ns, found.st_ino) for found in (self._cert.stat(), self._key.stat())]
-        except OSError:
-            return None
-
-    def _load(self) -> None:
-        self._stamps = self._read_stamps()
-        where = self._cert
-        try:
-            # An unusable pair must not reach the context in use.
-            ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_verify_locations(where)
-            where = self._key
-            for context in (ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), self.context):
-                load_pair(context, self._cert, self._key)
-        except OSError as error:
-            raise ConfigError(str(unusable(error, where))) from None
 
 
 class Renderer:
@@ -168,13 +121,7 @@ class Server:
         ConfigError: the address is none, or others could look without a password.
     """
 
-    def __init__(
-        self,
-        bind: str,
-        database: str,
-        password: str | None,
-        certificate: Certificate | None = None,
-    ) -> None:
+    def __init__(self, bind: str, database: str, password: str | None) -> None:
         if (wrong := bind_problem(bind, "--page")) is not None:
             raise ConfigError(wrong)
         self._host, self._port = split_address(bind)
@@ -182,9 +129,10 @@ class Server:
             raise ConfigError(
                 f"--page: found {bind!r}; allowed without --password-file: this computer alone, as 127.0.0.1:8291"
             )
-        if certificate is None and not is_loopback(self._host):
-            logger.warning("page: whoever listens on the network can read its password: --cert and --key prevent it")
-        self._certificate = certificate
+        if not is_loopback(self._host):
+            logger.warning(
+                "page: whoever listens on the network can read its password: put a proxy with https before it"
+            )
         self._engine = engine_of(database, reads_only=True)
         self._pages = Renderer(self._engine)
         self._app = Starlette(
@@ -195,21 +143,18 @@ class Server:
     @property
     def url(self) -> str:
         """Address for a browser."""
-        return page_url(self._host, self._port, "http" if self._certificate is None else "https")
+        return page_url(self._host, self._port)
 
     async def run(self) -> NoReturn:
         """Serve until cancelled; an address that is taken is waited for."""
         await self._reconnection.keep(self._serve)
 
     async def _serve(self) -> str:
-        context = None if self._certificate is None else self._certificate.context
         try:
-            async with listening(self._app, self._host, self._port, _HEADERS, context) as self._port:
+            async with listening(self._app, self._host, self._port, _HEADERS) as self._port:
                 self._reconnection.up(self.url)
-                while True:
-                    await asyncio.sleep(CERTIFICATE_S)
-                    if self._certificate is not None:
-                        await asyncio.to_thread(self._certificate.reload)
+                never: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+                return await never
         except OSError as error:
             return f"{self._host}:{self._port}: {error.strerror or error}"
         finally:

@@ -43,11 +43,11 @@ def is_loopback(host: str) -> bool:
     return host == "localhost" or ipaddress.ip_address(host).is_loopback
 
 
-def page_url(host: str, port: int, scheme: str = "http") -> str:
+def page_url(host: str, port: int) -> str:
     """Return the URL for a browser; an address for all networks becomes the board's name."""
     if host in ("0.0.0.0", "::"):  # noqa: S104 - compared, not bound
         host = f"{socket.gethostname().partition('.')[0]}.local"
-    return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
 
 
 def new_token() -> str:

@@ -9,9 +9,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-import ssl
 from collections.abc import AsyncIterator, Callable
-from typing import Any, Final
+from typing import Final
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.config import Config
@@ -28,7 +27,6 @@ MAX_BODY_BYTES: Final = 4096
 KERNEL_BYTES: Final = 64 * 1024
 UNHEARD_MS: Final = 10_000
 """The kernel gives up a client that acknowledges nothing for this long: out of range, or asleep."""
-HANDSHAKE_WITHIN_S: Final = 10.0
 
 
 class Connection(H11Protocol):
@@ -80,9 +78,7 @@ class Connection(H11Protocol):
 
 
 @contextlib.asynccontextmanager
-async def listening(
-    app: ASGIApp, host: str, port: int, headers: Headers, certificate: ssl.SSLContext | None = None
-) -> AsyncIterator[int]:
+async def listening(app: ASGIApp, host: str, port: int, headers: Headers) -> AsyncIterator[int]:
     """Serve the application, with `headers` on every answer; yield the port.
 
     Raises:
@@ -106,14 +102,10 @@ async def listening(
     config.load()
     state, unanswered = ServerState(), dict[Connection, None]()
     state.default_headers = config.encoded_headers
-    tls: dict[str, Any] = {}
-    if certificate is not None:
-        tls = {"ssl": certificate, "ssl_handshake_timeout": HANDSHAKE_WITHIN_S}
-        tls["ssl_shutdown_timeout"] = HANDSHAKE_WITHIN_S
     # Not by uvicorn.Server: it takes over the signals, ends the process where an address is in use, and wakes up ten
     # times a second.
     loop = asyncio.get_running_loop()
-    server = await loop.create_server(lambda: Connection(config, state, unanswered), host, port, **tls)
+    server = await loop.create_server(lambda: Connection(config, state, unanswered), host, port)
     try:
         yield server.sockets[0].getsockname()[1]
     finally:

@@ -1,15 +1,13 @@
-"""`companion fleet acl` at a real Mosquitto, and by EMQX's documented grammar: who may say and hear what in a fleet."""
+"""`companion fleet acl` at a real Mosquitto: who may say and hear what in a fleet."""
 
 from __future__ import annotations
 
 import asyncio
-import re
 import subprocess
 from pathlib import Path
 
 import aiomqtt
 import pytest
-from paho.mqtt.client import topic_matches_sub
 
 from companion.errors import ConfigError
 from companion.fleet.acl import access_list
@@ -47,7 +45,7 @@ def said_and_heard(users: tuple[str, str]) -> tuple[dict[str, set[str]], dict[st
 def start(folder: Path, aircraft: list[str], users: tuple[str, ...], more: str = "") -> Broker:
     """A Mosquitto with the access list, not started yet; a witness may do everything."""
     acl = folder / "acl"
-    acl.write_text("\n".join([*access_list("mosquitto", aircraft), "user witness", "topic readwrite #", ""]))
+    acl.write_text("\n".join([*access_list(aircraft), "user witness", "topic readwrite #", ""]))
     one = Broker(folder, users=True, more=f"acl_file {acl}\n{more}")
     names = one.folder / "users"
     for user in users:
@@ -109,33 +107,6 @@ def test_each_says_and_hears_what_is_its_own_and_nothing_else(tmp_path: Path, ai
     assert f"'fleet/{HERON}/item'" in denied
 
 
-# --- EMQX: grammar and order by "Use ACL File" of its documentation: the first rule that fits decides
-
-_RULE = re.compile(r'\{allow, (all|\{username, "([^"]+)"\}), (publish|subscribe), \[(("[^"]+"(, )?)+)\]\}\.')
-
-
-def emqx_lets(lines: list[str], user: str, verb: str, topic: str) -> bool:
-    assert lines[0].startswith("%% ")
-    assert lines[-1] == "{deny, all}."
-    for line in lines[1:-1]:
-        rule = _RULE.fullmatch(line)
-        assert rule is not None, line
-        filters = [words.replace("${username}", user) for words in re.findall(r'"([^"]+)"', rule[4])]
-        if rule[2] in (None, user) and rule[3] == verb and any(topic_matches_sub(each, topic) for each in filters):
-            return True
-    return False
-
-
-@pytest.mark.parametrize(("aircraft", "users"), FLEETS)
-def test_emqx_gets_the_same_rights(aircraft: list[str], users: str) -> None:
-    lines = access_list("emqx", aircraft)
-    says, hears = said_and_heard(USERS[users])
-    topics = sorted(set().union(*says.values(), *hears.values()))
-    for user in says:
-        assert {topic for topic in topics if emqx_lets(lines, user, "publish", topic)} == says[user]
-        assert {topic for topic in topics if emqx_lets(lines, user, "subscribe", topic)} == hears[user]
-
-
 @pytest.mark.parametrize(
     "aircraft",
     [
@@ -154,10 +125,10 @@ def test_emqx_gets_the_same_rights(aircraft: list[str], users: str) -> None:
 )
 def test_what_is_no_user_of_an_aircraft_is_one_line(aircraft: list[str]) -> None:
     with pytest.raises(ConfigError, match=r"found .*allowed: ") as found:
-        access_list("mosquitto", aircraft)
+        access_list(aircraft)
     assert "\n" not in str(found.value)
 
 
 def test_a_companion_that_was_moved_may_still_tell_what_it_has_kept() -> None:
-    lines = access_list("mosquitto", [f"heron={HERON}", f"heron={CRANE}"])
+    lines = access_list([f"heron={HERON}", f"heron={CRANE}"])
     assert {f"topic write fleet/{which}/item" for which in (HERON, CRANE)} <= set(lines)

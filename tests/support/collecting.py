@@ -7,7 +7,6 @@ import base64
 import contextlib
 import datetime
 import signal
-import ssl
 import subprocess
 import sys
 from collections.abc import AsyncIterator, Sequence
@@ -19,7 +18,7 @@ import sqlalchemy as sa
 from companion.fleet import schema
 from companion.fleet.collector import stop
 from companion.fleet.database import engine_of
-from companion.fleet.server import Certificate, Server
+from companion.fleet.server import Server
 from companion.fleet.store import Message, Store
 from sim.fleet.aircraft import Aircraft
 from tests.support.broker import Broker, free_port
@@ -109,11 +108,9 @@ def quick(fleet: Sequence[Aircraft], again_s: float = 0.4) -> None:
         each.again_s = again_s
 
 
-async def get(
-    port: int, path: str = "/", *headers: str, method: str = "GET", tls: ssl.SSLContext | None = None
-) -> tuple[int, str]:
+async def get(port: int, path: str = "/", *headers: str, method: str = "GET") -> tuple[int, str]:
     """The status, and all of the answer with its head."""
-    reader, writer = await asyncio.open_connection("127.0.0.1", port, ssl=tls)
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
     try:
         lines = [f"{method} {path} HTTP/1.1", *(headers or ("Host: 127.0.0.1",)), "", ""]
         writer.write("\r\n".join(lines).encode())
@@ -129,9 +126,7 @@ def basic(password: str) -> str:
 
 
 @contextlib.asynccontextmanager
-async def served(
-    folder: Path, *fleet: Aircraft, password: str | None = None, certificate: Certificate | None = None
-) -> AsyncIterator[int]:
+async def served(folder: Path, *fleet: Aircraft, password: str | None = None) -> AsyncIterator[int]:
     """The port of the pages of a database with what these have told."""
     database, port = str(folder / "fleet.sqlite"), free_port()
     store = Store(database)
@@ -140,7 +135,7 @@ async def served(
         store.take([Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()])
         store.take([Message(f"fleet/{one.id}/hello", one.hello)])
     store.close()
-    serving = asyncio.create_task(Server(f"127.0.0.1:{port}", database, password, certificate).run())
+    serving = asyncio.create_task(Server(f"127.0.0.1:{port}", database, password).run())
     try:
         async with asyncio.timeout(30.0):
             while True:
