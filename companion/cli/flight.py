@@ -27,7 +27,7 @@ from companion.physics.units import unit_of
 
 if TYPE_CHECKING:
     from companion.lab.flight.flight import Knowledge
-    from companion.storage.flights import FlightStore
+    from companion.storage.records import FlightStore
 
 
 def add_commands(add: AddCommand) -> None:
@@ -75,9 +75,8 @@ class _Progress:
 def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | None]:
     """Read what the companion has on disk, and give its store of flights; None: this user may not."""
     from companion.lab.flight.flight import Knowledge
-    from companion.storage.flights import FlightStore
     from companion.storage.learned import BiasStore
-    from companion.storage.records import RecordStore
+    from companion.storage.records import FlightStore, RecordStore
 
     directory = storage_path(options)
     try:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from companion.errors import StorageError
 from companion.estimation.records.record import ArmingRecord, Record
 from companion.report.calibration import Material
-from companion.storage.records import Entry, RecordStore
+from companion.storage.records import RecordStore
 from companion.storage.state import BoundedList
 
 MAX_EARLIER: Final = 60
@@ -26,39 +25,32 @@ def material(directory: Path, wanted: int | None) -> Material:
     except OSError as error:
         hint = "; run it with sudo" if isinstance(error, PermissionError) else ""
         raise StorageError(f"{records}: cannot be read: {error.strerror}{hint}") from error
-    entries = list(store.entries())[::-1]  # oldest first
-    damaged = [f"{entry.path.name}: {entry.problem}" for entry in entries if entry.record is None]
-    if not entries:
-        raise StorageError(f"no calibration yet: {records} is empty")
-    if not any(entry.record for entry in entries):
-        raise StorageError(f"no calibration can be read: {'; '.join(damaged[:3])}")
-    entry, record = _find(entries, wanted)
-    armings: list[ArmingRecord] = []
+    found: dict[int, Record] = {}
+    damaged: dict[int, str] = {}
+    for number in store.numbers():
+        try:
+            found |= {number: one} if (one := store.file(number).read()) is not None else {}
+        except StorageError as error:
+            damaged[number] = str(error)
+    if not found:
+        why = f"can be read: {'; '.join([*damaged.values()][:3])}" if damaged else f"yet: {records} is empty"
+        raise StorageError(f"no calibration {why}")
+    number = max(found) if wanted is None else wanted
+    if number not in found:
+        first, last = min(found | damaged), max(found | damaged)
+        words = f"no calibration {number}; there are number {first} to {last} (companion history)"
+        raise StorageError(damaged.get(number, words))
+    record = found[number]
+    problems, armings = [*damaged.values()], list[ArmingRecord]()
     try:
         armings = BoundedList(directory / "armings.json", ArmingRecord, keep=0).all()
     except StorageError as error:
-        damaged.append(str(error))
-    earlier = [
-        (one.number, one.record)
-        for one in entries
-        if one.record is not None and one.number <= entry.number and one.record.system_id == record.system_id
-    ]
+        problems.append(str(error))
+    earlier = [(k, one) for k, one in found.items() if k <= number and one.system_id == record.system_id]
     return Material(
-        number=entry.number,
+        number=number,
         record=record,
         earlier=earlier[-MAX_EARLIER:],
         armings=[arming for arming in armings if arming.calibration == record.started_at],
-        damaged=damaged,
+        damaged=problems,
     )
-
-
-def _find(entries: Sequence[Entry], wanted: int | None) -> tuple[Entry, Record]:
-    if wanted is None:
-        return next((entry, entry.record) for entry in reversed(entries) if entry.record is not None)
-    found = next((entry for entry in entries if entry.number == wanted), None)
-    if found is None:
-        first, last = entries[0].number, entries[-1].number
-        raise StorageError(f"no calibration {wanted}; there are number {first} to {last} (companion history)")
-    if found.record is None:
-        raise StorageError(f"{found.path}: {found.problem}")
-    return found, found.record

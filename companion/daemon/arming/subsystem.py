@@ -26,6 +26,7 @@ from companion.formats import Object, utc_now
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
 from companion.storage.learned import armings_in
+from companion.storage.records import FlightStore
 
 logger = logging.getLogger(__name__)
 
@@ -214,7 +215,7 @@ class Arming(Subsystem):
         by_calibration: dict[str | None, list[ArmingRecord]] = {}
         for arming in reversed(armings):
             by_calibration.setdefault(arming.calibration, []).append(arming)
-        found = self._store.numbered(limit)
+        found = self._store.newest(limit)
         return {
             "kind": "result",
             "numbers": list(found),
@@ -231,9 +232,7 @@ class Arming(Subsystem):
         }
 
     def _flights(self, limit: int | None) -> list[Object]:
-        # Imported here: the start is shorter without.
-        from companion.storage.flights import FlightStore
-
+        """Return the flights that `companion flight` has kept."""
         try:
             found = FlightStore(self._core.config.storage.path).newest(limit)
         except StorageError as error:

@@ -245,7 +245,7 @@ def test_everything_that_the_disk_has_and_each_change_once(tmp_path: Path) -> No
         async with aircraft.running() as face:
             aircraft.connection.connect()
             first, second = record(0), record(1)
-            path = store.save(first)
+            path = store.file(store.save(first)).path
             armed.append(arming(first))
             await until_told(face)
             assert collector.kinds() == ["calibration", "arming"]

@@ -202,7 +202,7 @@ def test_the_command_writes_a_file_and_says_where(tmp_path: Path, capsys: pytest
     ("more", "reason"),
     [
         (["7"], "no calibration 7; there are number 1 to 3"),
-        (["2"], "000002.json: not a readable record"),
+        (["2"], "000002.json: cannot be used: "),
         (["-o", "{folder}/none/x.html"], "there is no folder "),
     ],
 )

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from companion.errors import StorageError
-from companion.storage.flights import FlightStore
+from companion.storage.records import FlightStore
 from tests.support.flights import kept_flight
 
 
@@ -17,7 +17,7 @@ def test_a_flight_comes_back_as_it_was_and_the_service_may_read_it(tmp_path: Pat
     store, kept = FlightStore(tmp_path), kept_flight()
     assert store.newest() == {}
     assert store.save(kept) == 1
-    assert store.read(1) == kept
+    assert store.file(1).read() == kept
     assert stat.S_IMODE((tmp_path / "flights/000001.json").stat().st_mode) == 0o644
 
 
@@ -44,5 +44,5 @@ def test_a_damaged_one_is_passed_over_with_a_line(tmp_path: Path, caplog: pytest
     for content in (b"", b"{}", data[: len(data) // 2], b"[" * 100_000):
         path.write_bytes(content)
         with pytest.raises(StorageError, match="cannot be used: "):
-            store.read(2)
-    assert store.read(7) is None
+            store.file(2).read()
+    assert store.file(7).read() is None

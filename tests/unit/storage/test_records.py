@@ -123,9 +123,9 @@ def test_records_come_back_newest_first_and_whole(tmp_path: Path) -> None:
 def test_a_damaged_record_is_passed_over_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     store = RecordStore(tmp_path)
     store.save(_record("good"))
-    store.save(_record("cut")).write_bytes(b'{"format_version": 1, "st')
+    store.file(store.save(_record("cut"))).path.write_bytes(b'{"format_version": 1, "st')
     assert [record.reason for record in store.history()] == ["good"]
-    assert "000002.json: not a readable record" in caplog.text
+    assert "000002.json: cannot be used: " in caplog.text
 
 
 def test_a_record_with_keys_that_were_removed_since_is_read(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_a_record_with_keys_that_were_removed_since_is_read(tmp_path: Path) -> N
     store = RecordStore(tmp_path)
     before = to_json(record).replace(b'"shift_sigma"', b'"by_model":true,"shift_sigma"')
     assert b'"by_model"' in before
-    store.save(record).write_bytes(before)
+    store.file(store.save(record)).path.write_bytes(before)
     assert store.history() == [record]
 
 
@@ -153,11 +153,12 @@ def test_a_record_that_was_changed_is_passed_over_and_one_from_before_there_were
     tmp_path: Path,
 ) -> None:
     store = RecordStore(tmp_path)
-    store.save(_record("of before")).write_bytes(to_json(_record("of before")) + b"\n")
-    path = store.save(_record("changed"))
+    store.file(store.save(_record("of before"))).path.write_bytes(to_json(_record("of before")) + b"\n")
+    path = store.file(store.save(_record("changed"))).path
     path.write_bytes(path.read_bytes().replace(b'"duration_s":12.0', b'"duration_s":19.0'))
     assert [record.reason for record in store.history()] == ["of before"]
-    assert next(store.entries()).problem.endswith("damaged, or changed by hand")
+    with pytest.raises(StorageError, match="damaged, or changed by hand"):
+        store.file(2).read()
 
 
 def test_a_storage_directory_below_a_missing_folder_is_refused(tmp_path: Path) -> None:
