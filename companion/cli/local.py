@@ -224,13 +224,12 @@ async def install(options: argparse.Namespace) -> int:
 
 
 async def report(options: argparse.Namespace) -> int:
-    from companion.report.calibration import calibration_page
-    from companion.report.source import material
+    from companion.report.calibration import calibration_page, read_material
 
     if options.output == "-" and options.json:
         print_lines("companion report: -o - and --json both want stdout", error=True)
         return USAGE
-    found = material(options.storage or storage_path(options), options.record)
+    found = read_material(options.storage or storage_path(options), options.record)
     content = calibration_page(found, datetime.datetime.now(tz=datetime.UTC)).encode("utf-8", "replace")
     skipped = f"skipped: {'; '.join(found.damaged)}" if found.damaged else ""
     if options.output == "-":

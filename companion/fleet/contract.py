@@ -15,8 +15,6 @@ import msgspec
 
 from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.estimation.records.flight_record import KeptFlight
-from companion.estimation.solution.by_temperature import ByTemperature
-from companion.physics.units import DEG_H, MG
 
 FORMAT_VERSION: Final = 1
 MOST_RANGES: Final = 256
@@ -214,19 +212,6 @@ def _event(body: bytes) -> Rows:
     return {"events": [{"what": msgspec.json.decode(body, type=_Event).what, "body": body.decode()}]}
 
 
-def _curve(body: bytes) -> Rows:
-    told = msgspec.json.decode(body, type=ByTemperature)
-    found = [("gyro", node.degc, node.gyro_deg_h, node.sigma_deg_h, DEG_H) for node in told.curve]
-    found += [("accel", node.degc, node.accel_mg, node.sigma_mg, MG) for node in told.accel_curve]
-    which = {"imu": told.imu[:64], "power_ups": told.power_ups}
-    rows: list[Row] = [
-        {**which, "triad": triad, "axis": axis, "degc": degc, "bias": bias[k] * unit, "sigma": sigma[k] * unit}
-        for triad, degc, bias, sigma, unit in found
-        for k, axis in enumerate("xyz")
-    ]
-    return {"curves": _within(rows)}
-
-
 def _flight(body: bytes) -> Rows:
     flight = msgspec.json.decode(body, type=KeptFlight).flight
     rows: list[Row] = []
@@ -249,15 +234,11 @@ def _flight(body: bytes) -> Rows:
                 term = getattr(split, name)
                 row |= {name: term and term.value, f"{name}_sigma": term and term.sigma}
             rows.append(row)
-    return {"flights": _within(rows)}
-
-
-def _within(rows: list[Row]) -> list[Row]:
-    """Refuse figures beyond the limit, for types that have none of their own."""
+    # The type of a flight has no limits of its own.
     for name, value in (each for row in rows for each in row.items()):
         if isinstance(value, int | float) and abs(value) > _MOST:
             raise NotTakenError(f"{name}: found {value:g}; allowed: up to {_MOST:g}")
-    return rows
+    return {"flights": rows}
 
 
 def _kept_raw(body: bytes) -> Rows:
@@ -272,7 +253,7 @@ KINDS: Final[dict[str, Callable[[bytes], Rows]]] = {
     "alignment": _alignment,
     "event": _event,
     "profile": _kept_raw,
-    "curve": _curve,
+    "curve": _kept_raw,
     "flight": _flight,
 }
 """Parsers of the bodies by kind; items of other kinds are kept until a newer companion knows them."""
@@ -340,7 +321,7 @@ def read_item(item: Item, payload: bytes) -> tuple[Row, Rows]:
         rows = KINDS[told.kind](bytes(told.body))
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise NotTakenError(f"{told.kind}: {error}") from None
-    for row in (*rows.get("events", ()), *rows.get("curves", ())):
+    for row in rows.get("events", ()):
         row["at"] = columns["at"]
     columns["same"] = _same(told, rows)
     return {**columns, "state": "taken"}, {table: [{**item.key, **row} for row in of] for table, of in rows.items()}

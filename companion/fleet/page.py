@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
-from itertools import groupby
-from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
-import msgspec
 import sqlalchemy as sa
 
-from companion.estimation.solution.by_temperature import ByTemperature, Expected, ExpectedForces, WindowBias
 from companion.fleet.schema import Moment, findings, rejected
 from companion.fleet.schema import aircraft as known
 from companion.physics.units import UNITS
-from companion.report.by_temperature import biases_by_temperature
 from companion.report.markup import Child, Markup, join, row, tag
-from companion.report.page import NAMES, Point, arming_items, card, drift, page, seconds_of, with_sigma
+from companion.report.page import NAMES, PlotPoint, arming_items, card, drift, page, seconds_of, with_sigma
 from companion.samples import TRIADS, Triad, Vector
 
 STALE: Final = datetime.timedelta(days=30)
@@ -192,7 +187,6 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
     for each in _rows(connection, query, which=which, most=MOST_CALIBRATIONS * 3 * 4):
         by_imu.setdefault(each.imu, {}).setdefault((each.epoch, each.sequence), {})[each.axis] = each
     parts: list[Child] = []
-    told = _curves(connection, which)
     for imu, found in sorted(by_imu.items()):
         latest = [axes for axes in found.values() if len(axes) == 3][:MOST_CALIBRATIONS][::-1]
         newest = next(iter(next(iter(found.values())).values()))
@@ -203,7 +197,9 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
         for triad in TRIADS:
             unit, unit_name, _ = UNITS[triad]
             points = [
-                Point(axes["x"].sequence, seconds_of(axes["x"].started_at), _scaled(bias, unit), _scaled(sigma, unit))
+                PlotPoint(
+                    axes["x"].sequence, seconds_of(axes["x"].started_at), _scaled(bias, unit), _scaled(sigma, unit)
+                )
                 for axes in latest
                 if (bias := _triad(axes, triad, "bias")) and (sigma := _triad(axes, triad, "sigma_use"))
             ]
@@ -216,51 +212,7 @@ def _imus(connection: sa.Connection, which: str) -> list[Child]:
                 tag("table", row(*(tag("th", axis) for axis in "xyz")), row(*cells)),
                 drift(points, triad, name=f"{imu} {triad}"),
             ]
-        seen = [
-            WindowBias(
-                at_unix_s=seconds_of(axes["x"].started_at) or 0.0,
-                started_at="",
-                power_up=number,
-                degc=axes["x"].temperature_degc,
-                gyro_deg_h=gyro,
-                sigma_deg_h=sigma,
-                accel_mg=_triad(axes, "accel", "bias"),
-                accel_sigma_mg=_triad(axes, "accel", "sigma_use"),
-            )
-            for number, axes in enumerate(latest)
-            if axes["x"].temperature_degc is not None
-            and (gyro := _triad(axes, "gyro", "bias"))
-            and (sigma := _triad(axes, "gyro", "sigma_use"))
-        ]
-        if imu in told:
-            curve = msgspec.structs.replace(told[imu], points=tuple(seen))
-            parts.append(biases_by_temperature([curve], looking_back=True))
     return parts
-
-
-def _curves(connection: sa.Connection, which: str) -> dict[str, ByTemperature]:
-    """Read the latest curve over temperature of each IMU of an aircraft."""
-    query = """
-        SELECT imu, triad, degc, power_ups, at,
-               COALESCE(gyro_bias_deg_h, accel_bias_mg) AS bias, COALESCE(gyro_sigma_deg_h, accel_sigma_mg) AS sigma
-        FROM temperature_curves WHERE aircraft = :which ORDER BY imu, degc, triad, axis"""
-    found: dict[str, ByTemperature] = {}
-    told = connection.execute(sa.text(query).columns(at=Moment()), {"which": which})
-    for imu, rows in groupby(told, key=attrgetter("imu")):
-        gyro, accel = list[Expected](), list[ExpectedForces]()
-        for (degc, triad), (x, y, z) in groupby(rows, key=attrgetter("degc", "triad")):
-            bias, sigma = (x.bias, y.bias, z.bias), (x.sigma, y.sigma, z.sigma)
-            if triad == "gyro":
-                gyro.append(Expected(degc=degc, gyro_deg_h=bias, sigma_deg_h=sigma))
-            else:
-                accel.append(ExpectedForces(degc=degc, accel_mg=bias, sigma_mg=sigma))
-        found[imu] = ByTemperature(
-            imu=f"{imu} by temperature",
-            summary=f"The curve of {x.power_ups} power-ups, as told {x.at:%Y-%m-%d}",
-            curve=tuple(gyro),
-            accel_curve=tuple(accel),
-        )
-    return found
 
 
 def _triad(axes: dict[str, Any], triad: Triad, what: str) -> Vector | None:

@@ -167,20 +167,6 @@ events: Final = sa.Table(
     sa.Column("body", Words, nullable=False, comment="JSON"),
 )
 
-curves: Final = sa.Table(
-    "curves",
-    tables,
-    *_key(),
-    sa.Column("triad", sa.String(8), primary_key=True, comment="gyro, accel"),
-    sa.Column("axis", sa.String(1), primary_key=True),
-    sa.Column("degc", sa.Double, primary_key=True),
-    sa.Column("at", Moment),
-    sa.Column("imu", sa.String(64), nullable=False),
-    sa.Column("power_ups", sa.BigInteger, nullable=False, comment="that it was learned from"),
-    sa.Column("bias", sa.Double, nullable=False, comment="rad/s or m/s^2"),
-    sa.Column("sigma", sa.Double, nullable=False, comment="at the next power-up"),
-)
-
 flights: Final = sa.Table(
     "flights",
     tables,

@@ -7,7 +7,6 @@ import datetime
 import hashlib
 import logging
 from collections.abc import Iterable, Iterator, Sequence
-from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -41,7 +40,6 @@ _SHOWN_BYTES: Final = 4096
 _REJECTED: Final[Row] = {"state": "rejected", "kind": None, "at": None, "clock": None, "same": None}
 _AGAIN: Final = 500
 """Items of a newer aircraft that are parsed again in one transaction after an update."""
-_CURVE: Final = itemgetter("aircraft", "epoch", "imu")
 
 
 class Message(NamedTuple):
@@ -192,16 +190,8 @@ class Store:
 
     def _put_made(self, connection: sa.Connection, made: Rows) -> None:
         """Write the rows made from items, and mark the aircraft that are to be judged again."""
-        # Each power-up makes a new curve of hundreds of rows: keep the latest only.
-        curves = sorted(made.get("curves", ()), key=itemgetter("sequence"))
-        latest, each = {_CURVE(row): row["sequence"] for row in curves}, schema.curves.c
-        made = {**made, "curves": [row for row in curves if row["sequence"] == latest[_CURVE(row)]]}
         for name, rows in sorted(made.items()):
             self._put(connection, schema.tables.tables[name], rows)
-        for aircraft, epoch, imu in sorted(latest):
-            of = each.aircraft == aircraft, each.epoch == epoch, each.imu == imu
-            newest = connection.execute(sa.select(sa.func.max(each.sequence)).where(*of)).scalar()
-            connection.execute(sa.delete(schema.curves).where(*of, each.sequence < newest))
         table = schema.judgements
         which = {row["aircraft"] for name in ("calibrations", "undos") for row in made.get(name, ())}
         if which:

@@ -96,18 +96,6 @@ FROM armings r
 JOIN tellings t ON t.aircraft = r.aircraft AND t.epoch = r.epoch AND t.sequence = r.sequence
 LEFT JOIN aircraft a ON a.aircraft = r.aircraft;
 
--- temperature_curves: Biases over temperature of each IMU, by the latest curve that its aircraft has told
-SELECT aircraft, name, imu, at, power_ups, triad, axis, degc,
-       CASE WHEN triad = 'gyro' THEN bias * 206264.80624709636 END AS gyro_bias_deg_h,
-       CASE WHEN triad = 'gyro' THEN sigma * 206264.80624709636 END AS gyro_sigma_deg_h,
-       CASE WHEN triad = 'accel' THEN bias / 0.00980665 END AS accel_bias_mg,
-       CASE WHEN triad = 'accel' THEN sigma / 0.00980665 END AS accel_sigma_mg
-FROM (SELECT c.*, a.name, RANK() OVER (
-        PARTITION BY c.aircraft, c.imu
-        ORDER BY CASE WHEN c.epoch = a.epoch THEN c.sequence END DESC NULLS LAST, c.at DESC, c.sequence DESC) AS place
-      FROM curves c LEFT JOIN aircraft a ON a.aircraft = c.aircraft) AS numbered
-WHERE place = 1;
-
 -- flight_history: Biases in flight over what the offsets in force left, by IMU and axis, each flight once
 SELECT aircraft, name, flight, began_at, instance, gyro_id, accel_id, calibration_at, drift_s, drift_m, triad, axis,
        CASE WHEN triad = 'gyro' THEN in_flight * 206264.80624709636 END AS in_flight_deg_h,

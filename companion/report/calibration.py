@@ -1,14 +1,16 @@
-"""The page of one calibration."""
+"""Page of one calibration, from the files of the storage directory; it needs no daemon and changes nothing."""
 
 from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
 from operator import attrgetter
+from pathlib import Path
 from typing import Final
 
 import msgspec
 
+from companion.errors import StorageError
 from companion.estimation.records.record import ArmingRecord, ImuRecord, Outcome, Record, outcome_word
 from companion.physics.units import UNITS
 from companion.report.markup import Child, Markup, cell, join, number, row, tag
@@ -27,6 +29,10 @@ from companion.report.page import (
     with_sigma,
 )
 from companion.samples import TRIADS, Triad
+from companion.storage.records import RecordStore
+from companion.storage.state import BoundedList
+
+MAX_EARLIER: Final = 60
 
 _ARMED: Final = attrgetter("armed_at", "state", "reason")
 _OUTCOMES: Final[dict[Outcome, tuple[str, str]]] = {
@@ -47,6 +53,49 @@ class Material(msgspec.Struct, frozen=True, kw_only=True):
     armings: Sequence[ArmingRecord]
     """While it was in force, oldest first."""
     damaged: Sequence[str]
+
+
+def read_material(directory: Path, wanted: int | None) -> Material:
+    """Read the content of a page by a calibration's number; None: the latest."""
+    store, records = RecordStore(directory), directory / "records"
+    try:
+        # Else a folder that only root may enter looks like one that is not there.
+        next(iter(records.iterdir()), None)
+    except FileNotFoundError:
+        raise StorageError(f"no calibration yet: there is no {records} (--storage DIR names another folder)") from None
+    except OSError as error:
+        hint = "; run it with sudo" if isinstance(error, PermissionError) else ""
+        raise StorageError(f"{records}: cannot be read: {error.strerror}{hint}") from error
+    found: dict[int, Record] = {}
+    unreadable: dict[int, str] = {}
+    for k in store.numbers():
+        try:
+            if (one := store.file(k).read()) is not None:
+                found[k] = one
+        except StorageError as error:
+            unreadable[k] = str(error)
+    if not found:
+        why = f"can be read: {'; '.join([*unreadable.values()][:3])}" if unreadable else f"yet: {records} is empty"
+        raise StorageError(f"no calibration {why}")
+    wanted = max(found) if wanted is None else wanted
+    if wanted not in found:
+        first, last = min(found | unreadable), max(found | unreadable)
+        words = f"no calibration {wanted}; there are number {first} to {last} (companion history)"
+        raise StorageError(unreadable.get(wanted, words))
+    record = found[wanted]
+    problems, armings = [*unreadable.values()], list[ArmingRecord]()
+    try:
+        armings = BoundedList(directory / "armings.json", ArmingRecord, keep=0).all()
+    except StorageError as error:
+        problems.append(str(error))
+    earlier = [(k, one) for k, one in found.items() if k <= wanted and one.system_id == record.system_id]
+    return Material(
+        number=wanted,
+        record=record,
+        earlier=earlier[-MAX_EARLIER:],
+        armings=[arming for arming in armings if arming.calibration == record.started_at],
+        damaged=problems,
+    )
 
 
 def calibration_page(material: Material, now: datetime.datetime) -> str:

@@ -83,7 +83,7 @@ def with_sigma(value: float, sigma: float, unit: float, sign: str = "+") -> tupl
     return number(value, f"{sign}.{digits}f", value / unit), number(sigma, f".{digits}f", sigma / unit)
 
 
-class Point(msgspec.Struct, frozen=True):
+class PlotPoint(msgspec.Struct, frozen=True):
     """One triad of one IMU in one calibration of the history; SI units."""
 
     number: int
@@ -92,20 +92,16 @@ class Point(msgspec.Struct, frozen=True):
     sigma_use: Vector
 
 
-def history(records: Sequence[tuple[int, Record]], imu: str, triad: Triad) -> list[Point]:
+def history(records: Sequence[tuple[int, Record]], imu: str, triad: Triad) -> list[PlotPoint]:
     """Biases of one triad over finished calibrations, in the order given; those that found none are left out."""
-    found: list[Point] = []
+    found: list[PlotPoint] = []
     for which, record in records:
         for one in record.imus:
-            bias, sigma = (
-                (one.gyro_bias_rad_s, one.gyro_sigma_use_rad_s)
-                if triad == "gyro"
-                else (one.accel_bias_m_s2, one.accel_sigma_use_m_s2)
-            )
+            bias, _, sigma, *_ = one.of(triad)
             if one.name != imu or record.state != "done" or bias is None or sigma is None:
                 continue
             if max(map(abs, (*bias, *sigma))) < _MOST:
-                found.append(Point(which, unix_s(record.started_at), bias, sigma))
+                found.append(PlotPoint(which, unix_s(record.started_at), bias, sigma))
     return found
 
 
@@ -124,13 +120,13 @@ def seconds_of(moment: datetime.datetime) -> float | None:
     return seconds if 0.0 <= seconds < _LATEST_S else None
 
 
-def clock_is_sound(points: Sequence[Point]) -> bool:
+def clock_is_sound(points: Sequence[PlotPoint]) -> bool:
     """Return whether times ascend: a computer without a clock battery begins in the past at every boot."""
     known = [point.unix_s for point in points]
     return None not in known and all(a <= b for a, b in itertools.pairwise(known) if a is not None and b is not None)
 
 
-def drift(points: Sequence[Point], triad: Triad, *, name: str, this: int | None = None) -> Markup:
+def drift(points: Sequence[PlotPoint], triad: Triad, *, name: str, this: int | None = None) -> Markup:
     """Draw three plots, one an axis, of a bias over calibrations in their order."""
     unit, unit_name, _ = UNITS[triad]
     times = [point.unix_s for point in points]
@@ -157,8 +153,7 @@ def drift(points: Sequence[Point], triad: Triad, *, name: str, this: int | None 
         plot.points([(float(k), point.bias[axis] / unit) for k, point in enumerate(points)], CLASSES[axis], ends)
         for k, point in enumerate(points):
             if point.number == this:
-                centre = plot.at(k, point.bias[axis] / unit)
-                plot.draw(tag("circle", cx=f"{centre[0]:.1f}", cy=f"{centre[1]:.1f}", r=8, class_="ring"))
+                plot.ring(k, point.bias[axis] / unit)
         plots.append(plot.svg())
     back = None if dated else "The companion's clock went back in between, so these stand in their order, not by time. "
     return tag("figure", *plots, tag("figcaption", back, "Bars: one sigma for the next minutes."))

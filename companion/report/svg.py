@@ -16,8 +16,7 @@ import msgspec
 from companion.report.markup import Markup, tag
 
 WIDTH: Final = 360.0
-LEFT: Final = 58.0
-_RIGHT, _TOP, _TITLE = 12.0, 8.0, 20.0
+_LEFT, _RIGHT, _TOP, _TITLE = 58.0, 12.0, 8.0, 20.0
 _TICKS_HEIGHT, _LABEL_HEIGHT = 20.0, 16.0
 _MARK: Final = 3.6
 _MOST: Final = 1e12
@@ -76,8 +75,7 @@ class Plot:
     """One frame with axes, of that height, the whole 360 wide; what is drawn first lies below.
 
     Without an `x_label` no ticks are written either, for a plot with another one below it; empty: only these. `name`
-    is what a screen reader says, `told` what it shows, in words, `left` the room for what is written at the vertical
-    axis.
+    is what a screen reader says, `told` what it shows, in words.
     """
 
     def __init__(
@@ -90,9 +88,8 @@ class Plot:
         height: float = 96.0,
         x_label: str | None = None,
         y_label: str = "",
-        left: float = LEFT,
     ) -> None:
-        self._left, self._top = left, _TOP + (_TITLE if y_label else 0.0)
+        self._top = _TOP + (_TITLE if y_label else 0.0)
         self._x, self._y, self._name, self._told, self._height = x, y, name, told, height
         self._x_label, self._y_label = x_label, y_label
         self._below: list[Markup] = []
@@ -100,7 +97,7 @@ class Plot:
 
     def at(self, x: float, y: float) -> Pair:
         """Return the place of a point in the picture."""
-        across = self._left + self._x.share(x) * (WIDTH - self._left - _RIGHT)
+        across = _LEFT + self._x.share(x) * (WIDTH - _LEFT - _RIGHT)
         return across, self._top + (1.0 - self._y.share(y)) * self._height
 
     def line(self, points: Sequence[Pair], class_: str) -> None:
@@ -132,9 +129,10 @@ class Plot:
         marker = _square if class_ == "sy" else _triangle
         self._parts.append(_path("".join(marker(*self.at(*point)) for point in points), f"mark {class_}"))
 
-    def draw(self, *parts: Markup) -> None:
-        """Anything else, on top."""
-        self._parts += parts
+    def ring(self, x: float, y: float) -> None:
+        """Draw a ring around a point."""
+        across, height = self.at(x, y)
+        self._parts.append(tag("circle", cx=_n(across), cy=_n(height), r=8, class_="ring"))
 
     def svg(self) -> Markup:
         """The element."""
@@ -148,15 +146,15 @@ class Plot:
                 grid.append(tag("text", label, x=_n(across), y=_n(bottom + 15.0), class_="mid"))
         for place, label in self._y.ticks:
             height = self.at(self._x.low, place)[1]
-            grid.append(_path(f"M{_n(self._left)} {_n(height)}H{_n(WIDTH - _RIGHT)}", "grid"))
-            grid.append(tag("text", label, x=_n(self._left - 6.0), y=_n(height + 4.5), class_="end"))
+            grid.append(_path(f"M{_n(_LEFT)} {_n(height)}H{_n(WIDTH - _RIGHT)}", "grid"))
+            grid.append(tag("text", label, x=_n(_LEFT - 6.0), y=_n(height + 4.5), class_="end"))
         frame = tag(
-            "rect", x=_n(self._left), y=_n(self._top), width=_n(WIDTH - self._left - _RIGHT), height=_n(self._height),
+            "rect", x=_n(_LEFT), y=_n(self._top), width=_n(WIDTH - _LEFT - _RIGHT), height=_n(self._height),
             class_="frame",
         )  # fmt: skip
         labels: list[Markup] = []
         if self._x_label:
-            middle = (self._left + WIDTH - _RIGHT) / 2.0
+            middle = (_LEFT + WIDTH - _RIGHT) / 2.0
             labels.append(tag("text", self._x_label, x=_n(middle), y=_n(bottom + 31.0), class_="mid label"))
         if self._y_label:
             labels.append(tag("text", self._y_label, x="0", y=_n(self._top - 8.0), class_="label"))

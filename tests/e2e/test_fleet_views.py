@@ -1,4 +1,4 @@
-"""What the views say of flights, curves, calibrations and armings, against what was told, in both databases."""
+"""What the views say of flights, calibrations and armings, against what was told, in both databases."""
 
 from __future__ import annotations
 
@@ -59,12 +59,6 @@ def kept_flight(key: str, began_at: str, gyro_deg_h: float) -> KeptFlight:
     return KeptFlight(log=f"{key}.bin", read_at="2026-11-20T12:00:00.000Z", flight=flight)
 
 
-def curve(imu: str, gyro_deg_h: float) -> dict[str, Any]:
-    gyro = {"degc": 20.0, "gyro_deg_h": [gyro_deg_h, 2.0, 3.0], "sigma_deg_h": [4.0, 5.0, 6.0]}
-    accel = {"degc": 21.0, "accel_mg": [0.1, 0.2, 0.3], "sigma_mg": [0.4, 0.5, 0.6]}
-    return {"imu": imu, "power_ups": 9, "days": 4, "curve": [gyro, gyro | {"degc": 30.0}], "accel_curve": [accel]}
-
-
 @pytest.fixture(scope="module", params=["sqlite", "postgresql"])
 def database(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     if request.param == "sqlite":
@@ -83,9 +77,6 @@ def one_with_all() -> Aircraft:
     one.undo(NOW)
     one.arm(NOW)
     one.calibrate(NOW)
-    one.tell("curve", NOW - DAY, curve("fc1", 7.0))
-    one.tell("curve", NOW - 3 * DAY, curve("fc1", 1.0))  # the later one, by a wrong clock
-    one.tell("curve", NOW, curve("fc2", 8.0))
     for key, deg_h in (("a", 11.0), ("b", 12.0), ("a", 13.0)):  # one of them was read twice
         one.tell("flight", NOW, kept_flight(key, "2026-11-20T09:30:00.000Z", deg_h))
     return one
@@ -127,39 +118,6 @@ def test_calibrations_and_armings_each_once(told: str) -> None:
     (armed,) = asked(told, "SELECT * FROM arming_history")
     assert (armed["aircraft"], armed["name"], armed["clock"]) == (ONE.id, ONE.name, "good")
     assert len(asked(told, "SELECT * FROM calibration_history")) == 4
-
-
-def test_the_latest_curve_of_each_imu(told: str) -> None:
-    found = asked(told, "SELECT * FROM temperature_curves ORDER BY imu, triad, degc, axis")
-    assert {row["aircraft"] for row in found} == {ONE.id}
-    figures = [(row["imu"], row["axis"], row["degc"], *(row[name] for name in NAMES)) for row in found]
-    wanted: list[tuple[Any, ...]] = []
-    for imu, first in (("fc1", 1.0), ("fc2", 8.0)):
-        of_accel = ((0.1, 0.4), (0.2, 0.5), (0.3, 0.6))
-        wanted += [(imu, axis, 21.0, None, None, *of) for axis, of in zip("xyz", of_accel, strict=True)]
-        of_gyro = ((first, 4.0), (2.0, 5.0), (3.0, 6.0))
-        for degc in (20.0, 30.0):
-            wanted += [(imu, axis, degc, *of, None, None) for axis, of in zip("xyz", of_gyro, strict=True)]
-    assert figures == [
-        tuple(pytest.approx(each) if isinstance(each, float) else each for each in row) for row in wanted
-    ]
-
-
-def test_rows_of_former_curves_go(told: str) -> None:
-    """Each power-up makes another curve, of hundreds of rows; in whichever order they come."""
-    latest = {sequence for sequence, payload in ONE.told.items() if json.loads(payload)["kind"] == "curve"} - {6}
-    counted = "SELECT epoch, sequence, COUNT(*) AS rows FROM curves GROUP BY epoch, sequence ORDER BY sequence"
-    before = asked(told, counted)
-    assert {row["sequence"] for row in before} == latest
-    store = Store(told)
-    again = [Message(f"fleet/{ONE.id}/item", payload) for payload in reversed(ONE.told.values())]
-    for batch in (*([each] for each in again), again):
-        store.take(batch)
-    store.close()
-    assert sorted(map(str, asked(told, counted))) == sorted(map(str, before))
-
-
-NAMES = ("gyro_bias_deg_h", "gyro_sigma_deg_h", "accel_bias_mg", "accel_sigma_mg")
 
 
 def test_flights_each_once(told: str) -> None:

@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from companion.cli import main
 from companion.physics.units import DEG_H, MG
 from companion.report import calibration
-from companion.report.calibration import calibration_page
+from companion.report.calibration import calibration_page, read_material
 from companion.report.page import unix_s
-from companion.report.source import material
 from companion.samples import Vector
 from companion.storage.records import RecordStore
 from tests.support.histories import a_season, arming, imu_record, record
@@ -75,7 +74,7 @@ class Page(HTMLParser):
 
 
 def _calibration(folder: Path, wanted: int | None = None) -> str:
-    return calibration_page(material(folder, wanted), NOW)
+    return calibration_page(read_material(folder, wanted), NOW)
 
 
 def test_the_figures_are_those_of_the_record(tmp_path: Path) -> None:
@@ -113,7 +112,7 @@ def test_a_page_needs_nothing_else_and_stays_small(tmp_path: Path) -> None:
     for k in range(230):
         one = record(k, imus=tuple(imu_record(name, k) for name in names), warnings=tuple(["x" * 5000] * 100))
         store.save(one)
-    content = calibration_page(material(tmp_path, None), NOW)
+    content = calibration_page(read_material(tmp_path, None), NOW)
     assert len(content.encode()) < LARGEST
     found = Page(content)
     assert "5 more IMUs are not shown" in found.text
@@ -144,8 +143,8 @@ def test_nothing_from_a_file_becomes_a_tag(tmp_path: Path) -> None:
     guilty = msgspec.structs.replace(arming(one), reason=evil)
     (tmp_path / "armings.json").write_bytes(msgspec.json.encode([guilty]))
     for content in (
-        calibration_page(material(tmp_path, 1), NOW),
-        calibration_page(material(tmp_path, 2), NOW),
+        calibration_page(read_material(tmp_path, 1), NOW),
+        calibration_page(read_material(tmp_path, 2), NOW),
     ):
         found = Page(content)
         assert {tag for tag, _ in found.tags} <= {
