@@ -12,7 +12,6 @@ import contextlib
 import datetime
 import importlib
 import logging
-import math
 import ssl
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -21,7 +20,7 @@ from companion.config.sections import Mqtt
 from companion.links.system.connection import Backoff, Reconnection
 from companion.links.system.waiting import comes
 from companion.mqtt.broker import causes, explain, is_of_protocol, is_open_to_all, read_password, tls_context
-from companion.mqtt.outbox import Outbox, Parcel
+from companion.mqtt.outbox import Outbox
 
 if TYPE_CHECKING:
     import aiomqtt
@@ -48,11 +47,6 @@ MAX_WAITING: Final = 1000
 """The most messages received and not handled yet; more are dropped without an answer. aiomqtt fills this queue faster
 than it empties it: a flood of some hundred requests has to fit. With 64 KiB each they fit the process's memory."""
 _REFUSED: Final = 128
-LONG_BYTES: Final = 4096
-"""Shortest message that a broker may end a connection for."""
-LOSSES: Final = 3
-"""Connections that end at one long message before it is left out."""
-LEFT_OUT_S: Final = 3600.0
 
 
 class Incoming(NamedTuple):
@@ -60,7 +54,7 @@ class Incoming(NamedTuple):
 
     topic: str
     payload: bytes
-    retained: bool
+    retained: bool = False
     """Kept by the broker from earlier, or (seen in MQTT 5 only) published now to be kept."""
 
 
@@ -91,11 +85,6 @@ class MqttLink:
         self._connected_s: float | None = None
         self._since = datetime.datetime.now(tz=datetime.UTC)
         self._refused: list[str] = []
-        self._under_way: Parcel | None = None
-        self._lost: tuple[Parcel | None, int] = None, 0
-        """The long message that the last connection ended at, and how many have."""
-        self._left_out: tuple[float, float] = math.inf, -math.inf
-        """Messages of so many bytes are not sent, until then."""
         self._warned_open = False
         self._echoed = will is None
 
@@ -121,8 +110,6 @@ class MqttLink:
         next_s = self._reconnection.retry_s
         retry_s = None if next_s is None else max(0.0, next_s - now_s)
         refused_now = [*self._refused]
-        if now_s < self._left_out[1]:
-            refused_now.append(_left_out_words(self._left_out[0]))
         if since_s is not None and since_s > ANSWER_DEADLINE_S and not self._echoed:
             # Few brokers tell a client that they let it neither speak nor hear.
             refused_now.append("our own messages do not come back (the broker's access list?)")
@@ -192,7 +179,6 @@ class MqttLink:
                     group.create_task(self._speak(client), name="mqtt sender")
                     group.create_task(self._receive(client), name="mqtt receiver")
             finally:
-                self._count_loss()
                 self._connected_s = self._spoken_to = None
                 self.outbox.closed()
 
@@ -248,28 +234,12 @@ class MqttLink:
             logger.warning("mqtt: %s: %s", self.where, self._refused[-1])
 
     async def _send(self, client: aiomqtt.Client) -> None:
-        loop = asyncio.get_running_loop()
         while True:
             parcel = await self.outbox.next()
-            least_bytes, until_s = self._left_out
-            if len(parcel.payload) < least_bytes or loop.time() >= until_s:
-                self._under_way = parcel
-                await client.publish(
-                    parcel.topic, parcel.payload, qos=parcel.qos, retain=parcel.retain, timeout=ANSWER_DEADLINE_S
-                )
-                self._under_way = None
+            await client.publish(
+                parcel.topic, parcel.payload, qos=parcel.qos, retain=parcel.retain, timeout=ANSWER_DEADLINE_S
+            )
             self.outbox.sent(parcel)
-
-    def _count_loss(self) -> None:
-        """Count connections that end at the same long message: the broker or the line may not take it."""
-        lost, self._under_way = self._under_way, None
-        if lost is None or len(lost.payload) < LONG_BYTES:
-            return
-        self._lost = lost, self._lost[1] + 1 if self._lost[0] == lost else 1
-        if self._lost[1] >= LOSSES:
-            self._lost = None, 0
-            self._left_out = len(lost.payload), asyncio.get_running_loop().time() + LEFT_OUT_S
-            logger.warning("mqtt: %s: %s", self.where, _left_out_words(len(lost.payload)))
 
     async def _receive(self, client: aiomqtt.Client) -> None:
         """Handle messages until the connection ends, which raises."""
@@ -314,12 +284,6 @@ def make_client(settings: Mqtt, protocol: int, most_bytes: int, **more: Any) -> 
         properties=properties,
         logger=_quiet,
         **more,
-    )
-
-
-def _left_out_words(size: float) -> str:
-    return (
-        f"messages of {size / 1e3:.1f} kB or more end the connection (the broker's size limit?): left out for an hour"
     )
 
 
