@@ -10,7 +10,7 @@ _HEARTBEAT_S: Final = 2.0
 """An older heartbeat is a lost link."""
 
 
-class Row(NamedTuple):
+class StatusRow(NamedTuple):
     """One part that the companion is connected to, or one warning."""
 
     verdict: Literal["ok", "warning", "wrong"]
@@ -23,7 +23,7 @@ def headline(status: Object) -> str:
     return f"{status['headline']['word']}: {status['headline']['reason']}"
 
 
-def rows(status: Object) -> list[Row]:
+def rows(status: Object) -> list[StatusRow]:
     """List what the companion is connected to, then what needs attention; a reply of `status` or `monitor`."""
     vehicle, recording, gate = status["vehicle"], status["recording"], status["arming"]["setup"]
     heartbeat_s, signing = vehicle["heartbeat_age_s"], vehicle["signing"]
@@ -32,21 +32,21 @@ def rows(status: Object) -> list[Row]:
         found.append(_row(signing["good"], f"signing ({signing['mode']})", signing["summary"]))
     found += [_row(device["good"], device["name"], device["summary"] + _counts(device)) for device in status["devices"]]
     if not status["ground_stations"]["good"]:
-        found.append(Row("wrong", "ground stations", status["ground_stations"]["summary"]))
+        found.append(StatusRow("wrong", "ground stations", status["ground_stations"]["summary"]))
     found += [
         _row(one["good"], name, one["summary"]) for name in ("mqtt", "fleet") if (one := status[name]) is not None
     ]
     if recording["fault"] is not None:
-        found.append(Row("wrong", "recordings", f"none at present: {recording['fault']}"))
+        found.append(StatusRow("wrong", "recordings", f"none at present: {recording['fault']}"))
     if gate is not None and gate["problem"]:
-        found.append(Row("wrong", "arming", gate["problem"]))
+        found.append(StatusRow("wrong", "arming", gate["problem"]))
     if status["automatic"]["stopped"]:
-        found.append(Row("wrong", "by itself", f"no calibration until asked: {status['automatic']['stopped']}"))
-    return [*found, *(Row("warning", "warning", words) for words in status["warnings"])]
+        found.append(StatusRow("wrong", "by itself", f"no calibration until asked: {status['automatic']['stopped']}"))
+    return [*found, *(StatusRow("warning", "warning", words) for words in status["warnings"])]
 
 
-def _row(good: bool, name: str, words: str) -> Row:  # noqa: FBT001 - the first column
-    return Row("ok" if good else "wrong", name, words)
+def _row(good: bool, name: str, words: str) -> StatusRow:  # noqa: FBT001 - the first column
+    return StatusRow("ok" if good else "wrong", name, words)
 
 
 def _counts(device: Object) -> str:

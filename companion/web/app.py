@@ -38,7 +38,7 @@ RECORDS: Final = 10
 ACTIONS: Final = asked_by(Interface.PAGE)
 
 
-class Site:
+class PageRoutes:
     """Handlers of the page's requests; `app` serves them."""
 
     def __init__(self, access: Access, ask: Ask, viewers: Viewers, html: bytes) -> None:

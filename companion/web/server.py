@@ -12,7 +12,7 @@ from companion.errors import StorageError
 from companion.formats import Object
 from companion.links.system.connection import Backoff, Reconnection
 from companion.web.access import Access, is_loopback, kept_token, new_token, page_url, split_address
-from companion.web.app import Site
+from companion.web.app import PageRoutes
 from companion.web.listener import listening
 from companion.web.viewers import Ask, Viewers
 
@@ -38,7 +38,7 @@ class Page:
         """Why nobody can look, in one line; None while the page is there."""
         self._html = _assembled()
         self._viewers = Viewers(ask, local=self.local)
-        self._site: Site | None = None
+        self._site: PageRoutes | None = None
         self._reconnection = Reconnection(
             "page", Backoff(first_s=1.0, cap_s=30.0), worth_s=WORTH_S, on_state=self._on_state
         )
@@ -51,7 +51,7 @@ class Page:
         try:
             if not self.local:
                 self.access = Access(kept_token(self._directory), handed_out=False)
-            self._site = Site(self.access, self._ask, self._viewers, self._html)
+            self._site = PageRoutes(self.access, self._ask, self._viewers, self._html)
             headers = _security_headers(self._html)
             async with listening(self._site.app, self._host, self._port, headers) as self._port:
                 self._reconnection.up(self.url)

@@ -12,6 +12,7 @@ import msgspec
 
 from companion.errors import CompanionError
 from companion.formats import Object
+from companion.summary import rows
 from companion.web.listener import Connection
 
 logger = logging.getLogger(__name__)
@@ -105,9 +106,14 @@ class Viewers:
                 if not self._viewers:
                     return
                 if "status" in reply:
-                    data = event(reply["status"])
+                    data = event(_with_rows(reply["status"]))
                     for viewer in tuple(self._viewers):
                         viewer.send(data)
+
+
+def _with_rows(status: Object) -> Object:
+    """Add what the companion is connected to; the first-run set-up has no such rows."""
+    return {**status, "rows": rows(status)} if "vehicle" in status else status
 
 
 def event(value: object, name: str | None = None) -> bytes:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from companion.errors import CalibrationRefusedError
 from companion.web.access import Access
-from companion.web.app import Site
+from companion.web.app import PageRoutes
 from companion.web.server import Page
 from companion.web.viewers import Ask, Viewers
 
@@ -188,7 +188,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 async def press(ask: Ask, button: str, **body: Any) -> tuple[int, str]:
     """What somebody is told who presses a button, without a server: on virtual time too."""
-    site = Site(Access("k7xm-p2qd-9rtw", handed_out=True), ask, Viewers(ask, local=True), b"")
+    site = PageRoutes(Access("k7xm-p2qd-9rtw", handed_out=True), ask, Viewers(ask, local=True), b"")
     headers = {"host": "127.0.0.1", "content-type": "application/json", "x-companion-token": "k7xm-p2qd-9rtw"}
     scope = {
         "type": "http",

@@ -158,25 +158,9 @@ function link(good, name, words) {
   row.append(sign(good ? "good" : "bad"), text);
   return row;
 }
+// The rows are the companion's own summary, as the command line shows it.
 function links(status) {
-  const rows = [], vehicle = status.vehicle, beat = vehicle.heartbeat_age_s;
-  const alive = beat !== null && beat < 2;
-  const words = beat === null ? vehicle.summary : `${vehicle.summary}; heartbeat ${beat.toFixed(1)} s ago`
-    + (vehicle.bad ? `; ${vehicle.bad} of ${vehicle.messages + vehicle.bad} messages bad` : "");
-  rows.push(link(alive, "autopilot", words));
-  for (const device of status.devices) {
-    const lost = Object.values(device.rejected || {}).reduce((sum, count) => sum + count, 0);
-    rows.push(link(device.good, device.name, device.summary + (lost ? `; bad frames: ${lost}` : "")
-      + (device.reconnects ? `; reconnected: ${device.reconnects}` : "")));
-  }
-  if (!status.ground_stations.good) rows.push(link(false, "ground stations", status.ground_stations.summary));
-  if (status.mqtt) rows.push(link(status.mqtt.good, "mqtt", status.mqtt.summary));
-  if (status.recording.fault) rows.push(link(false, "recordings", status.recording.fault));
-  const gate = status.arming.setup;
-  if (gate && gate.problem) rows.push(link(false, "arming", gate.problem));
-  if (status.automatic.stopped) rows.push(link(false, "by itself", "no calibration until asked: " + status.automatic.stopped));
-  for (const warning of status.warnings) rows.push(link(false, "warning", warning));
-  $("links").replaceChildren(...rows);
+  $("links").replaceChildren(...status.rows.map(([verdict, name, words]) => link(verdict === "ok", name, words)));
 }
 async function records() {
   let found;
