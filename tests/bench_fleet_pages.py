@@ -17,7 +17,8 @@ import sqlalchemy as sa
 
 from companion.fleet import schema
 from companion.fleet.database import engine_of
-from companion.fleet.store import Message, Store
+from companion.fleet.store import Store
+from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft
 from tests.support.broker import broker, free_port
 from tests.support.collecting import CollectorProcess
@@ -36,8 +37,8 @@ def seed(url: str, sessions: Sessions, aircraft: int) -> None:
         one = Aircraft(number)
         for days in sorted(dice.uniform(0.0, 365.0) for _ in range(POWER_UPS_A_YEAR)):
             sessions.add(one, NOW - datetime.timedelta(days=365 * (YEARS - 1) + days))
-        messages = [Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()]
-        store.take([*messages, Message(f"fleet/{one.id}/hello", one.hello)])
+        messages = [Incoming(f"fleet/{one.id}/item", payload) for payload in one.told.values()]
+        store.take([*messages, Incoming(f"fleet/{one.id}/hello", one.hello)])
     store.close()
     engine = engine_of(url)
     later = "strftime('%Y-%m-%d %H:%M:%f000', {0}, '{1} days')"
@@ -47,7 +48,7 @@ def seed(url: str, sessions: Sessions, aircraft: int) -> None:
     for year in range(1, YEARS):
         of_time = {"sequence": f"sequence + {a_year * year}", "same": f"substr(same, 1, 31) || {year}"}
         _copy(engine, lambda column, year=year, of_time=of_time: of_time.get(column.name) or (  # type: ignore[misc]
-            later.format(column.name, 365 * year) if isinstance(column.type, schema.Moment) else column.name
+            later.format(column.name, 365 * year) if isinstance(column.type, schema.UtcTime) else column.name
         ), "sequence", f"sequence <= {a_year}")  # fmt: skip
     for copy in range(1, COPIES):
         _copy(engine, lambda column, copy=copy: f"substr(aircraft, 1, 35) || {copy}" if column.name == "aircraft"  # type: ignore[misc]

@@ -55,7 +55,7 @@ def _replayed(path: Path) -> None:
 
 
 def _estimated(path: Path) -> None:
-    record = estimate(read(path), Given(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0, latitude_deg=40.0)).record
+    record, _ = estimate(read(path), Given(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0, latitude_deg=40.0))
     assert record.state == "done", record.reason
 
 

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.fleet.judgement import History, columns_of, compass_column, counts
+from companion.fleet.judgement import PartHistory, columns_of, compass_column, counts
 from companion.fleet.sequential import Alarm, Columns, Scatter, scatter_of_model, scatter_of_part, watch
 from companion.physics.frames import Floats
 from companion.physics.units import DEG_H, MG
@@ -33,7 +33,7 @@ FAULTS: Final = (
 )
 
 
-def fly(dice: np.random.Generator, n: int, fault: str = "", since: int = 0, column: int = 0) -> History:
+def fly(dice: np.random.Generator, n: int, fault: str = "", since: int = 0, column: int = 0) -> PartHistory:
     """One IMU over `n` power-ups; from `since` on with a fault of one column."""
     own = TURN_ON * np.exp(dice.normal(0.0, 0.25, 6))
     month = np.arange(n) / FLIGHTS
@@ -63,7 +63,7 @@ def fly(dice: np.random.Generator, n: int, fault: str = "", since: int = 0, colu
     told = np.where(dice.uniform(size=n) < 0.02, np.nan, degc + dice.normal(0.0, 0.2, n))
     warming = dice.uniform(size=(n, 1)) < 0.05
     use = np.sqrt(np.square(noise) / seconds + poor**2 + np.square(0.3 * TURN_ON))
-    return History(
+    return PartHistory(
         at=(),
         temperature_degc=told,
         biases=TURN_ON * dice.normal(0.0, 10.0, 6) + own * (scatter + slow + knocked) + law + error,
@@ -91,7 +91,7 @@ def alarms_of(parts: Sequence[Columns]) -> Iterator[tuple[int, Alarm]]:
             yield part, one
 
 
-def model_by(histories: Sequence[History]) -> Scatter | None:
+def model_by(histories: Sequence[PartHistory]) -> Scatter | None:
     """Of all of them."""
     return scatter_of_model([scatter_of_part(each.biases, each.temperature_degc) for each in histories])
 

@@ -158,11 +158,11 @@ def _replay_log(options: argparse.Namespace, file: Path) -> int:
     log = _log(options, file)
     if options.windows is not None:
         return _windows(options, log, given)
-    found = estimate(log, given)
-    record = msgspec.to_builtins(found.record)
-    lines = [*show.record_lines(record), *_used_lines(found.used)]
-    answer = {**record, "log": msgspec.to_builtins(found.used)}
-    return conclude(options, answer, lines, good=found.record.state == "done")
+    found, used = estimate(log, given)
+    record = msgspec.to_builtins(found)
+    lines = [*show.record_lines(record), *_used_lines(used)]
+    answer = {**record, "log": msgspec.to_builtins(used)}
+    return conclude(options, answer, lines, good=found.state == "done")
 
 
 def _log(options: argparse.Namespace, file: Path) -> StillLog:

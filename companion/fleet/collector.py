@@ -24,10 +24,10 @@ from companion.config.rules import broker_complaints
 from companion.config.sections import Mqtt
 from companion.errors import CompanionError, ConfigError, LinkError
 from companion.fleet.contract import MOST_BYTES, answers, ranges
-from companion.fleet.store import Message, Outcome, Store
+from companion.fleet.store import BatchResult, Store
 from companion.links.system.connection import Backoff, Reconnection
 from companion.mqtt.broker import explain, is_of_protocol, read_password, tls_context
-from companion.mqtt.client import FIRST_WAIT_S, LONGEST_WAIT_S, MQTT_3_1_1, MQTT_5, WORTH_S, make_client
+from companion.mqtt.client import FIRST_WAIT_S, LONGEST_WAIT_S, MQTT_3_1_1, MQTT_5, WORTH_S, Incoming, make_client
 
 if TYPE_CHECKING:
     import aiomqtt
@@ -105,7 +105,7 @@ async def stop(tasks: Iterable[asyncio.Task[None]]) -> list[BaseException]:
     return [end for end in await asyncio.gather(*found, return_exceptions=True) if end is not None]
 
 
-class Waiting(asyncio.Queue[Any]):
+class BoundedMessages(asyncio.Queue[Any]):
     """Queue of messages that is bounded in bytes, too: one message may have 256 KiB."""
 
     most_bytes = WAITING_BYTES
@@ -125,7 +125,7 @@ class Waiting(asyncio.Queue[Any]):
         return item
 
 
-class Inbox(Waiting):
+class Inbox(BoundedMessages):
     """Queue of the messages of the next batch."""
 
     most_bytes = BATCH_BYTES
@@ -189,7 +189,7 @@ class Collector:
             timeout=ANSWER_S,
             tls_context=tls_context(self.settings),
             max_queued_incoming_messages=WAITING,
-            queue_type=Waiting,
+            queue_type=BoundedMessages,
         )
 
     async def _serve(self, client: aiomqtt.Client) -> None:
@@ -229,15 +229,15 @@ class Collector:
             raise LinkError(f"{self.where}: the broker does not let us hear {topic} (its access list?)")
 
     async def _receive(
-        self, client: aiomqtt.Client, items: asyncio.Queue[Message], hellos: asyncio.Queue[Message]
+        self, client: aiomqtt.Client, items: asyncio.Queue[Incoming], hellos: asyncio.Queue[Incoming]
     ) -> None:
         async for message in client.messages:
             if isinstance(message.payload, bytes):
                 topic = message.topic.value
                 inbox = hellos if topic.endswith("/hello") else items
-                await inbox.put(Message(topic, message.payload, bool(message.retain)))
+                await inbox.put(Incoming(topic, message.payload, bool(message.retain)))
 
-    async def _collect(self, client: aiomqtt.Client, inbox: asyncio.Queue[Message], times: int) -> None:
+    async def _collect(self, client: aiomqtt.Client, inbox: asyncio.Queue[Incoming], times: int) -> None:
         while True:
             batch = [await inbox.get()]
             for _ in range(times):
@@ -255,7 +255,7 @@ class Collector:
             found = await asyncio.to_thread(self.store.judge)
             await asyncio.sleep(REST * (loop.time() - began_s) if found else JUDGE_S)
 
-    async def _answer(self, client: aiomqtt.Client, outcome: Outcome) -> None:
+    async def _answer(self, client: aiomqtt.Client, outcome: BatchResult) -> None:
         # QoS 0 for confirmations: an item whose confirmation is lost is sent again, and confirmed again.
         said = [
             (f"fleet/{aircraft}/confirmed", payload, 0)

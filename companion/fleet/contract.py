@@ -37,7 +37,7 @@ _Device = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] | None
 _Word = Annotated[str, msgspec.Meta(max_length=16)]
 
 _Kind = TypeVar("_Kind")
-_Keyed = TypeVar("_Keyed", "Hello", "Item")
+_Keyed = TypeVar("_Keyed", "Hello", "ItemKey")
 
 Row = dict[str, Any]
 Rows = dict[str, list[Row]]
@@ -60,7 +60,7 @@ class Hello(msgspec.Struct, frozen=True):
     at: str = ""
 
 
-class Item(msgspec.Struct, frozen=True):
+class ItemKey(msgspec.Struct, frozen=True):
     """Key of an item; a newer format may change everything else."""
 
     format_version: Annotated[int, msgspec.Meta(ge=1, le=MOST_SEQUENCE)]
@@ -294,7 +294,7 @@ def read_hello(aircraft: str, payload: bytes) -> Hello:
     return _of(aircraft, _decode(payload, Hello))
 
 
-def read_key(aircraft: str, payload: bytes) -> Item:
+def read_key(aircraft: str, payload: bytes) -> ItemKey:
     """Parse the key of an item on that aircraft's topic, of any format.
 
     Raises:
@@ -302,10 +302,10 @@ def read_key(aircraft: str, payload: bytes) -> Item:
     """
     if len(payload) > MOST_BYTES:
         raise NotTakenError(f"found {len(payload)} bytes; allowed: up to {MOST_BYTES}")
-    return _of(aircraft, _decode(payload, Item))
+    return _of(aircraft, _decode(payload, ItemKey))
 
 
-def read_item(item: Item, payload: bytes) -> tuple[Row, Rows]:
+def read_item(item: ItemKey, payload: bytes) -> tuple[Row, Rows]:
     """Parse an item into its own columns and rows of other tables; `state` "unknown": a newer kind or format.
 
     Raises:

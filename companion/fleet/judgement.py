@@ -1,7 +1,8 @@
 """Judgement of an aircraft's sensors: from the rows of its calibrations to rows of `parts` and `findings`.
 
-Each IMU becomes a `History` over its power-ups, that becomes columns for the tests of sequential.py, and their alarms
-become findings. All calibrations are the input, never an earlier judgement: every collector gets the same result.
+Each IMU becomes a `PartHistory` over its power-ups, that becomes columns for the tests of sequential.py, and their
+alarms become findings. All calibrations are the input, never an earlier judgement: every collector gets the same
+result.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from companion.fleet import schema
 from companion.fleet.contract import Row
-from companion.fleet.schema import Moment
+from companion.fleet.schema import UtcTime
 from companion.fleet.sequential import Alarm, Columns, Scatter, middle_of, scatter_of_model, scatter_of_part, watch
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG, G
@@ -64,7 +65,7 @@ REPLACE: Final = {"scatter": 3.0, "noise": 2.0, "drift": 8.0, "bias": 8.0}
 """Least sizes of findings, by kind, for the word "replace"."""
 
 
-class History(NamedTuple):
+class PartHistory(NamedTuple):
     """One IMU over its power-ups, in their order; NaN: not known."""
 
     at: Sequence[datetime.datetime]
@@ -80,7 +81,7 @@ class History(NamedTuple):
     """(n,) whether the gradienter's zero differs from the power-up before."""
 
 
-class Finding(NamedTuple):
+class PartFinding(NamedTuple):
     """Complaint about a sensor."""
 
     kind: str
@@ -96,7 +97,7 @@ class Finding(NamedTuple):
     """Move of a level, rad/s or m/s^2."""
 
 
-def columns_of(history: History, model: Scatter | None) -> Columns:
+def columns_of(history: PartHistory, model: Scatter | None) -> Columns:
     """Make the columns of the biases, (n, 6), and of their noise, (n, 6); `model`: scatter of the other parts."""
     own = scatter_of_part(history.biases[:LEARNS], history.temperature_degc[:LEARNS])
     turn_on, wander = _FEW_TELL * own.turn_on, np.full(6, WANDER[0])
@@ -139,11 +140,11 @@ def counts(alarm: Alarm) -> bool:
     return alarm.column < 6 or (alarm.kind == "level" and alarm.size > 0.0)
 
 
-def judge(history: History, model: Scatter | None) -> list[Finding]:
+def judge(history: PartHistory, model: Scatter | None) -> list[PartFinding]:
     """List the findings against one IMU as of its latest power-up, the worst first."""
     columns = columns_of(history, model)
     n = len(history.biases)
-    found: dict[tuple[int, str], Finding] = {}
+    found: dict[tuple[int, str], PartFinding] = {}
     for alarm in filter(counts, watch(columns)):
         axis, unit = alarm.column % 6, columns.unit[alarm.column]
         if alarm.column >= 6:
@@ -153,11 +154,11 @@ def judge(history: History, model: Scatter | None) -> list[Finding]:
             times = float(np.exp(middle_of(values[-LEARNS:]) - middle_of(values[max(since - LEARNS, 0) : since])))
             if times >= LEAST_TIMES:
                 words = f"{_AXES[axis]} noise {times:.1f} times what it was"
-                found[axis, "noise"] = Finding("noise", axis, since, times, words)
+                found[axis, "noise"] = PartFinding("noise", axis, since, times, words)
         elif alarm.kind == "scatter" and alarm.until == n:
             its = "times its model's" if model is not None else "times what it was"
             words = f"{_AXES[axis]} turn-on scatter {alarm.size:.1f} {its}"
-            found[axis, "scatter"] = Finding("scatter", axis, alarm.since, alarm.size, words)
+            found[axis, "scatter"] = PartFinding("scatter", axis, alarm.since, alarm.size, words)
         elif alarm.kind == "level" and n - alarm.at <= SHOWN:
             before = found.get((axis, "level"))
             size = alarm.size + (before.size if before else 0.0)
@@ -169,13 +170,13 @@ def judge(history: History, model: Scatter | None) -> list[Finding]:
                 f"{_AXES[axis]} bias has {'drifted' if kind == 'drift' else 'moved'} by {moved:.3g}"
                 f" {'deg/h' if axis < 3 else 'mg'}, {abs(size):.1f} times {its}"
             )
-            found[axis, "level"] = Finding(kind, axis, since, size, words, size * unit)
+            found[axis, "level"] = PartFinding(kind, axis, since, size, words, size * unit)
     # A grown scatter also raises alarms of the level.
     left = [each for (axis, what), each in found.items() if what != "level" or (axis, "scatter") not in found]
     return sorted((each._replace(size=abs(each.size)) for each in left), key=lambda each: -each.size)
 
 
-def judge_compass(heading_bound_deg: Floats) -> list[Finding]:
+def judge_compass(heading_bound_deg: Floats) -> list[PartFinding]:
     """Judge the compass by the bound of the heading's error at each power-up, (n,); NaN: not known."""
     if len(heading_bound_deg) <= LEARNS:
         return []
@@ -186,7 +187,7 @@ def judge_compass(heading_bound_deg: Floats) -> list[Finding]:
         before = middle_of(heading_bound_deg[max(alarm.since - LEARNS, 0) : alarm.since])
         if alarm.kind == "level" and now > max(_BOUND_DEG, LEAST_TIMES * before):
             words = f"compass: heading good to {now:.0f} deg, before to {before:.1f}: iron near it?"
-            found = [Finding("compass", -1, alarm.since, now / before, words)]
+            found = [PartFinding("compass", -1, alarm.since, now / before, words)]
     return found
 
 
@@ -209,7 +210,7 @@ def compass_column(heading_bound_deg: Floats) -> Columns:
     )
 
 
-def judge_zero(offset_deg: Floats, sigma_deg: Floats) -> list[Finding]:
+def judge_zero(offset_deg: Floats, sigma_deg: Floats) -> list[PartFinding]:
     """Judge the gradienter by its latest two alignments, (m, 2) and (m,); `since` is the index of the later one."""
     if len(offset_deg) < 2:
         return []
@@ -218,7 +219,7 @@ def judge_zero(offset_deg: Floats, sigma_deg: Floats) -> list[Finding]:
     if not sigmas > ZERO_SIGMAS:
         return []
     words = f"gradienter: its zero has moved by {moved:.2f} deg between two alignments ({moved * G * DEG / MG:.1f} mg)"
-    return [Finding("zero", -1, len(offset_deg) - 1, sigmas / 2.0, words)]
+    return [PartFinding("zero", -1, len(offset_deg) - 1, sigmas / 2.0, words)]
 
 
 class _Calibration(NamedTuple):
@@ -272,9 +273,9 @@ def _others(connection: sa.Connection, model: str, aircraft: str) -> Scatter | N
     query = sa.select(schema.parts).where(schema.parts.c.model == model, schema.parts.c.aircraft != aircraft)
     found: dict[tuple[str, str], Scatter] = {}
     for row in connection.execute(query.order_by("aircraft", "imu").limit(6 * MOST_PARTS)):
-        one = found.setdefault((row.aircraft, row.imu), Scatter(row.power_ups, *np.full((3, 6), np.nan)))
+        one = found.setdefault((row.aircraft, row.imu), Scatter(row.power_ups, *np.full((2, 6), np.nan)))
         place = _AXES.index(f"{row.triad} {row.axis}")
-        for name in ("turn_on", "wander", "per_k"):
+        for name in ("turn_on", "wander"):
             getattr(one, name)[place] = np.nan if (value := getattr(row, name)) is None else value
     return scatter_of_model(list(found.values()))
 
@@ -288,7 +289,7 @@ def _done(connection: sa.Connection, aircraft: str) -> dict[tuple[str, int], Any
         JOIN tellings t ON t.aircraft = s.aircraft AND t.epoch = s.epoch AND t.sequence = s.sequence
         JOIN items i ON i.aircraft = s.aircraft AND i.epoch = s.epoch AND i.sequence = s.sequence
         WHERE s.aircraft = :aircraft"""
-    moments = {name: Moment() for name in ("started_at", "zero_at", "received_at")}
+    moments = {name: UtcTime() for name in ("started_at", "zero_at", "received_at")}
     rows = connection.execute(sa.text(query).columns(**moments), {"aircraft": aircraft}).all()
     began: dict[str, datetime.datetime] = {}
     for row in rows:
@@ -329,7 +330,7 @@ def _power_ups(calibrations: list[_Calibration]) -> list[_Calibration]:
     return found
 
 
-def _history(calibrations: Sequence[_Calibration]) -> History:
+def _history(calibrations: Sequence[_Calibration]) -> PartHistory:
     biases, sigma_stat, sigma_use = (
         np.array([one.figures(name) for one in calibrations]) for name in ("read", "sigma_stat", "sigma_use")
     )
@@ -340,7 +341,7 @@ def _history(calibrations: Sequence[_Calibration]) -> History:
     rate = np.array([np.fmax.reduce(rate[max(k - 7, 0) : k + 1]) for k in range(len(rate))])
     degc = np.array([one.axes[0].temperature_degc for one in calibrations], dtype=np.float64)
     zeros = [one.about.zero_at for one in calibrations]
-    return History(
+    return PartHistory(
         at=[one.about.started_at for one in calibrations],
         temperature_degc=np.where(np.abs(degc) < MOST_DEGC, degc, np.nan),
         biases=biases,
@@ -351,7 +352,7 @@ def _history(calibrations: Sequence[_Calibration]) -> History:
 
 
 def _part(aircraft: str, imu: str, model: str | None, scatter: Scatter) -> list[Row]:
-    figures = {name: getattr(scatter, name).tolist() for name in ("turn_on", "wander", "per_k")}
+    figures = {name: getattr(scatter, name).tolist() for name in ("turn_on", "wander")}
     about = {"aircraft": aircraft, "imu": imu, "model": model, "power_ups": scatter.power_ups}
     return [
         {**about, "triad": triad, "axis": axis}
@@ -360,7 +361,7 @@ def _part(aircraft: str, imu: str, model: str | None, scatter: Scatter) -> list[
     ]
 
 
-_Found = list[tuple[str | None, Sequence[datetime.datetime], Finding]]
+_Found = list[tuple[str | None, Sequence[datetime.datetime], PartFinding]]
 
 
 def _of_the_gradienter(found: _Found, imus: int) -> _Found:
@@ -383,7 +384,7 @@ def _of_the_gradienter(found: _Found, imus: int) -> _Found:
     return left
 
 
-def _row(aircraft: str, place: int, imu: str | None, at: Sequence[datetime.datetime], found: Finding) -> Row:
+def _row(aircraft: str, place: int, imu: str | None, at: Sequence[datetime.datetime], found: PartFinding) -> Row:
     since = at[min(found.since, len(at) - 1)]
     what = "" if imu is None else f"{'replace' if found.size >= REPLACE[found.kind] else 'watch'} IMU {imu}: "
     return {

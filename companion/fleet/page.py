@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import sqlalchemy as sa
 
-from companion.fleet.schema import Moment, findings, rejected
+from companion.fleet.schema import UtcTime, findings, rejected
 from companion.fleet.schema import aircraft as known
 from companion.physics.units import UNITS
 from companion.report.markup import Child, Markup, join, row, tag
@@ -26,14 +26,6 @@ MOST_LISTED: Final = 25
 MOST_REFUSED: Final = 5
 MOST_FINDINGS: Final = 8
 """Most findings in the card, the worst ones."""
-
-
-class Standing(NamedTuple):
-    """State of an aircraft: the kind of card, a word, and the reason."""
-
-    kind: str
-    word: str
-    why: str
 
 
 _CLASSES: Final = {"alarm": "bad", "caution": "warn", "fine": "ok"}
@@ -61,8 +53,8 @@ _ORDERED: Final = (
 """Ids without a calibration come last, so that invented ids move no real aircraft from the first page."""
 
 
-def standing(one: Any) -> Standing:
-    """Describe a row of the fleet in words."""
+def standing(one: Any) -> tuple[str, str, str]:
+    """Give the kind of card, the word and the reason for a row of the fleet."""
     kind, word, _ = _STANDINGS[one.standing]
     why = one.tried_reason if one.tried_state in ("failed", "cancelled") else ""
     if word == "not calibrated":
@@ -71,7 +63,7 @@ def standing(one: Any) -> Standing:
         why = f"contradicts earlier ones, not written: {one.held_back}"
     elif word == "armed without one":
         why = one.armed_reason
-    return Standing(kind, word, why)
+    return kind, word, why
 
 
 def glance(connection: sa.Connection, now: datetime.datetime, number: int = 1) -> str | None:
@@ -109,11 +101,11 @@ def glance(connection: sa.Connection, now: datetime.datetime, number: int = 1) -
 
 def _line(one: Any, now: datetime.datetime) -> Markup:
     """Make the row of one aircraft in the table of the fleet."""
-    stands = standing(one)
+    kind, word, why = standing(one)
     calibrated = "" if one.calibrated_at is None else _ago(one.calibrated_at, now)
     return row(
-        tag("td", tag("a", one.name or one.aircraft, href=f"/aircraft/{one.aircraft}"), _small(stands.why)),
-        tag("td", stands.word, _small(calibrated), class_=_CLASSES[stands.kind]),
+        tag("td", tag("a", one.name or one.aircraft, href=f"/aircraft/{one.aircraft}"), _small(why)),
+        tag("td", word, _small(calibrated), class_=_CLASSES[kind]),
         tag("td", _ago(one.heard_at, now), class_="warn" if one.silent else None),
     )
 
@@ -142,16 +134,16 @@ def aircraft(connection: sa.Connection, which: str, now: datetime.datetime) -> s
     if not found:
         return None
     one = found[0]
-    stands = standing(one)
+    kind, word, why = standing(one)
     name = one.name or one.aircraft
     calibrated = "" if one.calibrated_at is None else f", by the calibration of {_moment(one.calibrated_at)}"
     parts: list[Child] = [
         tag("p", tag("a", "Fleet", href="/")),
         tag("h1", name),
         card(
-            stands.kind,
-            tag("p", f"{stands.word.capitalize()}{calibrated}", class_="lead"),
-            tag("p", stands.why) if stands.why else None,
+            kind,
+            tag("p", f"{word.capitalize()}{calibrated}", class_="lead"),
+            tag("p", why) if why else None,
             tag("p", f"Heard {_ago(one.heard_at, now)}." if one.heard_at else "Not heard by this collector yet."),
         ),
         _findings(connection, which),
@@ -279,9 +271,9 @@ _MOMENTS: Final = ("heard_at", "calibrated_at", "tried_at", "armed_at", "started
 def _rows(connection: sa.Connection, query: str, **values: Any) -> Sequence[Any]:
     """Run a query; times are times, also where the database keeps them as texts."""
     names = [name for name in _MOMENTS if name in query.split()[1:] or "*" in query]
-    columns = {name: Moment() for name in names}
+    columns = {name: UtcTime() for name in names}
     times = [
-        sa.bindparam(name, type_=Moment()) for name, value in values.items() if isinstance(value, datetime.datetime)
+        sa.bindparam(name, type_=UtcTime()) for name, value in values.items() if isinstance(value, datetime.datetime)
     ]
     return connection.execute(sa.text(query).bindparams(*times).columns(**columns), values).all()
 

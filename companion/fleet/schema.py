@@ -21,7 +21,7 @@ _LOCK: Final = 0x636F6D70616E696F
 """Key of PostgreSQL's advisory lock that the collector holds while it reads and changes the version."""
 
 
-class Moment(sa.types.TypeDecorator[datetime.datetime]):
+class UtcTime(sa.types.TypeDecorator[datetime.datetime]):
     """Time with its zone, UTC; SQLite keeps it as a text without."""
 
     impl = sa.DateTime(timezone=True)
@@ -65,9 +65,9 @@ items: Final = sa.Table(
     *_key(),
     sa.Column("format_version", sa.BigInteger, nullable=False),
     sa.Column("kind", Words, comment="null: of a newer format"),
-    sa.Column("at", Moment),
+    sa.Column("at", UtcTime),
     sa.Column("clock", Words, comment="whether at can be believed: good, unknown"),
-    sa.Column("received_at", Moment, nullable=False, comment="by the collector's clock"),
+    sa.Column("received_at", UtcTime, nullable=False, comment="by the collector's clock"),
     sa.Column("state", sa.String(8), nullable=False, comment="taken; unknown: of a newer aircraft; rejected"),
     sa.Column("same", sa.String(32), comment="equal where one thing was told again under another epoch"),
     sa.Column("payload", Words, nullable=False, comment="JSON, as it came"),
@@ -83,23 +83,23 @@ aircraft: Final = sa.Table(
     sa.Column("epoch", sa.String(16), comment="of its last hello, as the next three"),
     sa.Column("first", sa.BigInteger),
     sa.Column("last", sa.BigInteger),
-    sa.Column("hello_at", Moment),
-    sa.Column("heard_at", Moment, comment="by the collector's clock"),
+    sa.Column("hello_at", UtcTime),
+    sa.Column("heard_at", UtcTime, comment="by the collector's clock"),
 )
 
 calibrations: Final = sa.Table(
     "calibrations",
     tables,
     *_key(),
-    sa.Column("started_at", Moment, nullable=False),
+    sa.Column("started_at", UtcTime, nullable=False),
     sa.Column("duration_s", sa.Double, nullable=False),
     sa.Column("state", sa.String(16), nullable=False, comment="done, failed, cancelled"),
     sa.Column("reason", Words, nullable=False),
     sa.Column("held_back", Words, nullable=False, comment="measured and not written, contradicting earlier ones"),
-    sa.Column("undone_at", Moment, comment="undone when it was told; later ones are in undos"),
+    sa.Column("undone_at", UtcTime, comment="undone when it was told; later ones are in undos"),
     sa.Column("firmware", sa.String(16), comment="ardupilot, px4; null: nothing was written"),
     sa.Column("heading_bound_deg", sa.Double, comment="the heading's error exceeds it in one case of twenty"),
-    sa.Column("zero_at", Moment, comment="of the gradienter's alignment in force, as the next three"),
+    sa.Column("zero_at", UtcTime, comment="of the gradienter's alignment in force, as the next three"),
     sa.Column("zero_x_deg", sa.Double),
     sa.Column("zero_y_deg", sa.Double),
     sa.Column("zero_sigma_deg", sa.Double),
@@ -130,10 +130,10 @@ armings: Final = sa.Table(
     "armings",
     tables,
     *_key(),
-    sa.Column("armed_at", Moment, nullable=False),
+    sa.Column("armed_at", UtcTime, nullable=False),
     sa.Column("state", sa.String(16), nullable=False, comment="calibrated, checked, uncalibrated"),
     sa.Column("reason", Words, nullable=False),
-    sa.Column("calibration_at", Moment, comment="started_at of the calibration in force"),
+    sa.Column("calibration_at", UtcTime, comment="started_at of the calibration in force"),
     sa.Column("gyro_sigma_use_rad_s", sa.Double, comment="the largest of all axes in force"),
     sa.Column("accel_sigma_use_m_s2", sa.Double),
 )
@@ -144,8 +144,8 @@ undos: Final = sa.Table(
     tables,
     *_key(),
     sa.Column("what", Words, nullable=False),
-    sa.Column("of_at", Moment, nullable=False, comment="started_at or measured_at of what was put back"),
-    sa.Column("undone_at", Moment, nullable=False),
+    sa.Column("of_at", UtcTime, nullable=False, comment="started_at or measured_at of what was put back"),
+    sa.Column("undone_at", UtcTime, nullable=False),
 )
 
 alignments: Final = sa.Table(
@@ -154,7 +154,7 @@ alignments: Final = sa.Table(
     *_key(),
     sa.Column("what", Words, nullable=False),
     sa.Column("state", sa.String(16), nullable=False),
-    sa.Column("measured_at", Moment, nullable=False),
+    sa.Column("measured_at", UtcTime, nullable=False),
     sa.Column("reason", Words, nullable=False),
 )
 
@@ -162,7 +162,7 @@ events: Final = sa.Table(
     "events",
     tables,
     *_key(),
-    sa.Column("at", Moment),
+    sa.Column("at", UtcTime),
     sa.Column("what", Words, nullable=False, comment="imu exchanged, airframe changed, lost"),
     sa.Column("body", Words, nullable=False, comment="JSON"),
 )
@@ -175,10 +175,10 @@ flights: Final = sa.Table(
     sa.Column("triad", sa.String(16), primary_key=True, comment="gyro, accel"),
     sa.Column("axis", sa.String(1), primary_key=True),
     sa.Column("flight", Words, nullable=False, comment="the same from whichever log it was read"),
-    sa.Column("began_at", Moment),
+    sa.Column("began_at", UtcTime),
     sa.Column("gyro_id", sa.BigInteger),
     sa.Column("accel_id", sa.BigInteger),
-    sa.Column("calibration_at", Moment, comment="started_at of the calibration whose offsets it flew with"),
+    sa.Column("calibration_at", UtcTime, comment="started_at of the calibration whose offsets it flew with"),
     sa.Column("drift_s", sa.Double, comment="a time of free inertial navigation"),
     sa.Column("drift_m", sa.Double, comment="how far it is off by then, median"),
     sa.Column(
@@ -210,7 +210,6 @@ parts: Final = sa.Table(
     sa.Column("power_ups", sa.BigInteger, nullable=False),
     sa.Column("turn_on", sa.Double, comment="its scatter from power-up to power-up, rad/s or m/s^2; null: too few"),
     sa.Column("wander", sa.Double, comment="likewise the step that stays, from one to the next"),
-    sa.Column("per_k", sa.Double, comment="how it follows the temperature, a kelvin"),
 )
 sa.Index("parts_model", parts.c.model)
 
@@ -221,7 +220,7 @@ findings: Final = sa.Table(
     sa.Column("place", sa.BigInteger, primary_key=True, autoincrement=False, comment="0: the worst"),
     sa.Column("kind", sa.String(16), nullable=False, comment="bias, drift, scatter, noise, zero, compass"),
     sa.Column("imu", sa.String(64)),
-    sa.Column("since", Moment, comment="by the aircraft's clock"),
+    sa.Column("since", UtcTime, comment="by the aircraft's clock"),
     sa.Column("power_ups", sa.BigInteger, nullable=False, comment="since then"),
     sa.Column("size", sa.Double, nullable=False, comment="in what is usual: the worst of them are the largest"),
     sa.Column("words", Words, nullable=False),
@@ -232,7 +231,7 @@ rejected: Final = sa.Table(
     tables,
     sa.Column("digest", sa.String(32), primary_key=True, comment="of topic and payload"),
     sa.Column("times", sa.BigInteger, nullable=False),
-    sa.Column("last_at", Moment, nullable=False, comment="by the collector's clock"),
+    sa.Column("last_at", UtcTime, nullable=False, comment="by the collector's clock"),
     sa.Column("topic", Words, nullable=False),
     sa.Column("reason", Words, nullable=False),
     sa.Column("payload", sa.LargeBinary, nullable=False, comment="its first 4 KiB"),

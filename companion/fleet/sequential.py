@@ -66,8 +66,6 @@ class Scatter(NamedTuple):
     """One sigma from one power-up to another at one temperature, errors of the calibrations included."""
     wander: Floats
     """One sigma of the step that stays, from one power-up to the next."""
-    per_k: Floats
-    """Slope over temperature, at the mean of the known temperatures."""
 
 
 def scatter_of_part(biases: Floats, temperature_degc: Floats) -> Scatter:
@@ -76,8 +74,7 @@ def scatter_of_part(biases: Floats, temperature_degc: Floats) -> Scatter:
     Steps between successive power-ups, less the part that follows the temperature, are the input: neither ageing nor a
     single move makes them larger.
     """
-    turn_on, wander, per_k = np.array([_column(column, temperature_degc) for column in biases.T]).T
-    return Scatter(len(biases), turn_on, wander, per_k)
+    return Scatter(len(biases), *np.array([_column(column, temperature_degc) for column in biases.T]).T)
 
 
 def scatter_of_model(parts: Sequence[Scatter]) -> Scatter | None:
@@ -86,7 +83,7 @@ def scatter_of_model(parts: Sequence[Scatter]) -> Scatter | None:
     if len(telling) < LEAST_PARTS:
         return None
     figures = np.array([part[1:] for part in telling])
-    middle = np.empty((3, 6))
+    middle = np.empty((2, 6))
     for group in _GROUPS:
         middle[:, group] = [[middle_of(each)] for each in np.moveaxis(figures[:, :, group], 1, 0)]
     return Scatter(sum(part.power_ups for part in telling), *middle)
@@ -98,11 +95,12 @@ def middle_of(values: Floats) -> float:
     return float(np.median(there)) if len(there) else np.nan
 
 
-def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float, float]:
+def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float]:
+    """Estimate the scatter and the wander of one column; NaN: not known."""
     there = np.isfinite(bias)
     value, degc = bias[there], temperature_degc[there]
     if len(value) < LEAST_POWER_UPS:
-        return np.nan, np.nan, np.nan
+        return np.nan, np.nan
     known = np.isfinite(degc)
     warmer = np.where(known, degc - (degc[known].mean() if known.any() else 0.0), 0.0) / _STEP_K
     # A line for few, up to a cubic for many.
@@ -115,10 +113,10 @@ def _column(bias: Floats, temperature_degc: Floats) -> tuple[float, float, float
         weight = (np.abs(step - by @ terms) <= _OUTLIER * scale).astype(np.float64)
     turn_on = scale / np.sqrt(2.0)
     if len(value) < 3 * WANDER_LAG:
-        return turn_on, np.nan, terms[0] / _STEP_K
+        return turn_on, np.nan
     level = value - laws @ terms
     far = _sigma(level[WANDER_LAG:] - level[:-WANDER_LAG])
-    return turn_on, np.sqrt(max(far**2 - scale**2, 0.0) / (WANDER_LAG - 1)), terms[0] / _STEP_K
+    return turn_on, np.sqrt(max(far**2 - scale**2, 0.0) / (WANDER_LAG - 1))
 
 
 def _sigma(steps: Floats) -> float:

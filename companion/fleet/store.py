@@ -20,7 +20,7 @@ from companion.fleet.contract import (
     FORMAT_VERSION,
     KINDS,
     Hello,
-    Item,
+    ItemKey,
     NotTakenError,
     Row,
     Rows,
@@ -32,6 +32,7 @@ from companion.fleet.contract import (
 )
 from companion.fleet.database import OF_THE_DATABASE, OF_THE_ITEM, engine_of, why
 from companion.fleet.judgement import judged
+from companion.mqtt.client import Incoming
 
 logger = logging.getLogger(__name__)
 
@@ -42,20 +43,12 @@ _AGAIN: Final = 500
 """Items of a newer aircraft that are parsed again in one transaction after an update."""
 
 
-class Message(NamedTuple):
-    """Message as the broker delivered it."""
-
-    topic: str
-    payload: bytes
-    retained: bool = False
-
-
-class Outcome(NamedTuple):
+class BatchResult(NamedTuple):
     """Result of a batch: sequences to confirm and to ask for, by aircraft and epoch; rejected messages with reasons."""
 
     confirmed: dict[tuple[str, str], list[int]]
     wanted: dict[tuple[str, str], list[list[int]]]
-    rejected: list[tuple[Message, str]]
+    rejected: list[tuple[Incoming, str]]
 
 
 class Store:
@@ -126,7 +119,7 @@ class Store:
             logger.error("fleet: %s cannot be judged; what was found before stands", aircraft, exc_info=True)
             return None
 
-    def take(self, messages: Sequence[Message]) -> Outcome:
+    def take(self, messages: Sequence[Incoming]) -> BatchResult:
         """Write a batch into the database; refused messages go to the table `rejected` with their reasons.
 
         Raises:
@@ -142,7 +135,7 @@ class Store:
         # Find the refused message: write each by itself.
         if len(messages) == 1:
             return self._reject(messages[0], reason, now)
-        found = Outcome({}, {}, [])
+        found = BatchResult({}, {}, [])
         for message in messages:
             one = self.take([message])
             for key, sequences in one.confirmed.items():
@@ -151,8 +144,8 @@ class Store:
             found.rejected.extend(one.rejected)
         return found
 
-    def _take(self, messages: Sequence[Message], now: datetime.datetime) -> Outcome:
-        outcome = Outcome({}, {}, [])
+    def _take(self, messages: Sequence[Incoming], now: datetime.datetime) -> BatchResult:
+        outcome = BatchResult({}, {}, [])
         told: list[Row] = []
         rows: Rows = {}
         heard: set[str] = set()
@@ -245,10 +238,10 @@ class Store:
             connection.execute(insert.on_conflict_do_update(index_elements=["aircraft"], set_=news), values)
 
     def _keep_aside(
-        self, connection: sa.Connection, refused: Sequence[tuple[Message, str]], now: datetime.datetime
+        self, connection: sa.Connection, refused: Sequence[tuple[Incoming, str]], now: datetime.datetime
     ) -> None:
         table = schema.rejected
-        rows: dict[str, tuple[Message, str]] = {}
+        rows: dict[str, tuple[Incoming, str]] = {}
         for message, reason in refused:
             digest = hashlib.sha256(message.topic.encode() + b"\0" + message.payload).hexdigest()[:32]
             rows[digest] = message, reason
@@ -267,9 +260,9 @@ class Store:
             beyond = sa.select(table.c.digest).order_by(table.c.last_at.desc()).offset(MOST_REJECTED)
             connection.execute(sa.delete(table).where(table.c.digest.in_(beyond)))
 
-    def _reject(self, message: Message, reason: str, now: datetime.datetime) -> Outcome:
+    def _reject(self, message: Incoming, reason: str, now: datetime.datetime) -> BatchResult:
         """Note a message that the database refuses; confirm an item, or its aircraft would send it for ever."""
-        outcome = Outcome({}, {}, [(message, reason)])
+        outcome = BatchResult({}, {}, [(message, reason)])
         to = addressed(message.topic)
         item = None
         with contextlib.suppress(NotTakenError):
@@ -291,8 +284,8 @@ class Store:
         with self._engine.begin() as connection:
             found = connection.execute(known.limit(_AGAIN)).all()
             for row in found:
-                item = Item(row.format_version, row.aircraft, row.epoch, row.sequence)
-                message = Message(f"fleet/{row.aircraft}/item", row.payload.encode())
+                item = ItemKey(row.format_version, row.aircraft, row.epoch, row.sequence)
+                message = Incoming(f"fleet/{row.aircraft}/item", row.payload.encode())
                 update = sa.update(items).where(*(each[key] == value for key, value in item.key.items()))
                 try:
                     with connection.begin_nested():
@@ -311,7 +304,7 @@ def _refusal(error: sa.exc.SQLAlchemyError) -> str:
     return f"the database refuses it: {why(error)}"
 
 
-def _raw(item: Item, message: Message) -> Row:
+def _raw(item: ItemKey, message: Incoming) -> Row:
     return {"format_version": item.format_version, "payload": message.payload.decode(errors="replace")}
 
 

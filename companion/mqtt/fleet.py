@@ -25,7 +25,7 @@ from companion.formats import Object, decode, utc_now
 from companion.links.system.waiting import comes
 from companion.mqtt.client import Incoming, MqttLink
 from companion.mqtt.daemon import Daemon
-from companion.mqtt.fleet_sources import Look, Sources, utc
+from companion.mqtt.fleet_sources import CurrentAircraft, Sources, utc
 from companion.storage.fleet_items import Clock, FleetItems, Kept, Mark, SourceItems, Waiting
 from companion.storage.state import UNREADABLE
 
@@ -178,11 +178,11 @@ class AircraftFleet:
         uid, system_id = self._daemon.vehicle.get("uid"), self._daemon.vehicle.get("system_id")
         if self._of is not None and not self._caught_up:
             # What an earlier run has left is of the aircraft that there was then.
-            await self._take_all(Look(self._of, None, self._clock()))
+            await self._take_all(CurrentAircraft(self._of, None, self._clock()))
         self._caught_up = True
         if uid is None:
             return
-        look = Look(uid, system_id, self._clock())
+        look = CurrentAircraft(uid, system_id, self._clock())
         if uid != self._of:
             moved = [look.item("event", utc_now(), {"what": "airframe changed", "before": self._of})]
             await self._add(uid, [SourceItems({AIRCRAFT: Mark("", uid)}, moved if self._of is not None else [])])
@@ -196,7 +196,7 @@ class AircraftFleet:
             self._curves_s = now_s + CURVES_EVERY_S
             await self._take_curves(look)
 
-    async def _take_all(self, look: Look) -> None:
+    async def _take_all(self, look: CurrentAircraft) -> None:
         batch: list[SourceItems] = [SourceItems({})] * BATCH
         while len(batch) == BATCH:
             batch = await self._offload(lambda: list(islice(self._sources.entries(look), BATCH)))
@@ -209,7 +209,7 @@ class AircraftFleet:
             await self._offload(self._items.add, aircraft, entries, utc(utc_now()))
             await self._count()
 
-    async def _take_curves(self, look: Look) -> None:
+    async def _take_curves(self, look: CurrentAircraft) -> None:
         """Keep the curves of biases over temperature that differ from those told last."""
         marks = await self._offload(self._items.marks, f"{CURVE}{look.aircraft}/")
         entries = []

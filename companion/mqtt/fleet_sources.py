@@ -65,7 +65,7 @@ def utc(at: str) -> str:
     return f"{at.removesuffix('+00:00')}Z" if at.endswith("+00:00") else at
 
 
-class Look(msgspec.Struct, frozen=True):
+class CurrentAircraft(msgspec.Struct, frozen=True):
     """Aircraft that the items found now belong to."""
 
     aircraft: str
@@ -105,7 +105,7 @@ class Sources:
         self._seen = seen
         return not (settled and self._settled)
 
-    def entries(self, look: Look) -> Iterator[SourceItems]:
+    def entries(self, look: CurrentAircraft) -> Iterator[SourceItems]:
         """Yield what was not told yet.
 
         Raises:
@@ -151,7 +151,7 @@ class Sources:
         except msgspec.ValidationError as error:
             raise StorageError(f"{self._directory / name}: cannot be used: {error}") from error
 
-    def _records(self, look: Look) -> Iterator[SourceItems]:
+    def _records(self, look: CurrentAircraft) -> Iterator[SourceItems]:
         parts = {key: mark.value for key, mark in self._items.marks(f"{IMU}{look.aircraft}/").items()}
         changed: dict[str, Mark] = {}
 
@@ -182,7 +182,7 @@ class Sources:
             yield SourceItems({**entry.marks, **changed}, entry.items)
             changed.clear()
 
-    def _alignments(self, look: Look) -> Iterator[SourceItems]:
+    def _alignments(self, look: CurrentAircraft) -> Iterator[SourceItems]:
         listed = self._listed("by-hand.json")
         # "predicted": gyro offsets that version 0.1 wrote.
         done = {f"{one.what} {one.measured_at}": (one, body) for one, body in listed if one.state != "predicted"}
@@ -209,7 +209,7 @@ class Sources:
                 return found[1]
         return None
 
-    def _profiles(self, look: Look) -> Iterator[SourceItems]:
+    def _profiles(self, look: CurrentAircraft) -> Iterator[SourceItems]:
         def tell(name: str, before: str) -> Told:
             found = self._read(f"profiles/{name}.json")
             if found is None or found[0].saved_at == before:
@@ -218,7 +218,7 @@ class Sources:
 
         return self._told(PROFILE, self._stamps("profiles"), tell)
 
-    def _flights(self, look: Look) -> Iterator[SourceItems]:
+    def _flights(self, look: CurrentAircraft) -> Iterator[SourceItems]:
         def tell(number: str, before: str) -> Told:
             found = self._read(f"flights/{number}.json")
             flight = None if found is None else found[0].flight

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final
 
 from companion.recording.messages import START, Message, Start, encode
 
@@ -10,14 +10,6 @@ MOST_MESSAGES: Final = 12_000
 """The most messages that wait: 15 s of a 200 Hz IMU beside 100 Hz telemetry, longer than a memory card stalls."""
 MOST_BYTES: Final = 2 * 1024 * 1024
 """The most bytes among them: 15 s of an IMU at 1 kHz have 1.4 MB."""
-
-
-class TapeBatch(NamedTuple):
-    """Messages for the disk, and the states in force before the first of them."""
-
-    since_s: float
-    states: list[Message]
-    messages: list[Message]
 
 
 class Tape:
@@ -49,9 +41,9 @@ class Tape:
         """Take no more messages."""
         self.is_on, self.lost, self._bytes, self._waiting = False, 0, 0, []
 
-    def drain(self, now_s: float) -> TapeBatch:
-        """Give all that waits."""
-        batch = TapeBatch(self._since_s, self._states_before, self._waiting)
+    def drain(self, now_s: float) -> tuple[float, list[Message], list[Message]]:
+        """Return all messages that wait, after their beginning and the states in force then."""
+        batch = self._since_s, self._states_before, self._waiting
         self._since_s, self._states_before = now_s, list(self._states.values())
         self._waiting, self._bytes = [], 0
         return batch

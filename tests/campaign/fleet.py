@@ -25,7 +25,7 @@ import aiomqtt
 import sqlalchemy as sa
 
 from companion.fleet.contract import moment
-from companion.fleet.schema import Moment
+from companion.fleet.schema import UtcTime
 from sim.fleet.aircraft import Aircraft
 from tests.support.broker import Broker, broker
 from tests.support.collecting import (
@@ -284,7 +284,7 @@ def judge(database: str, fleet: list[Aircraft]) -> None:
         for imu in item["body"]["imus"]
         for k, axis in enumerate("xyz")
     )
-    in_force = sa.text("SELECT aircraft, calibrated_at FROM fleet").columns(calibrated_at=Moment())
+    in_force = sa.text("SELECT aircraft, calibrated_at FROM fleet").columns(calibrated_at=UtcTime())
     assert dict(tuple(row) for row in rows_of(database, in_force)) == {one.id: _in_force(one) for one in fleet}
 
 

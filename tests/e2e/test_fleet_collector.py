@@ -14,7 +14,8 @@ import sqlalchemy as sa
 
 from companion.config.sections import Mqtt
 from companion.fleet.collector import Collector, stop
-from companion.fleet.store import Message, Store
+from companion.fleet.store import Store
+from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft
 from tests.support.broker import MOSQUITTO, broker
 from tests.support.collecting import (
@@ -82,12 +83,12 @@ def test_odd_texts_come_into_every_database(database: str) -> None:
     one.calibrate(NOW, odd)
     one.arm(NOW)
     hello = json.loads(one.hello)
-    messages = [Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()]
+    messages = [Incoming(f"fleet/{one.id}/item", payload) for payload in one.told.values()]
     store = Store(database)
     store.prepare()
     for name in (odd, None):  # a former aircraft of a companion is told without: it keeps its name
         said = json.dumps({**hello, "name": name}).encode()
-        outcome = store.take([*messages, Message(f"fleet/{one.id}/hello", said)])
+        outcome = store.take([*messages, Incoming(f"fleet/{one.id}/hello", said)])
         assert outcome[:3] == ({(one.id, one.epoch): [1, 2]}, {}, [])
     store.close()
     wanted = odd.replace("\0", "\ufffd")

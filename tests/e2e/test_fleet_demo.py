@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from companion.fleet.store import Message, Store
+from companion.fleet.store import Store
+from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft
 from sim.fleet.demo import AIRCRAFT
 from tests.support.broker import MOSQUITTO, free_port
@@ -80,8 +81,8 @@ def test_who_lies_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
             assert "Not everything could be taken" not in (await get(port))[1]
             store = Store(str(tmp_path / "fleet.sqlite"))
             for _ in range(3):
-                store.take([Message(f"fleet/{liar.id}/item", other.told[1])])
-            store.take([Message(f"fleet/{'f' * 36}/item", b"nonsense")])
+                store.take([Incoming(f"fleet/{liar.id}/item", other.told[1])])
+            store.take([Incoming(f"fleet/{'f' * 36}/item", b"nonsense")])
             store.close()
             page = (await get(port))[1]
             assert f"<strong>{liar.name}: </strong>says that it is {other.id}" in page

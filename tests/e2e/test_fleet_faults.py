@@ -11,7 +11,8 @@ import pytest
 import sqlalchemy as sa
 
 from companion.fleet.database import engine_of
-from companion.fleet.store import Message, Store
+from companion.fleet.store import Store
+from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft
 from tests.campaign.__main__ import SEED
 from tests.campaign.fleet import FAULTS, KINDS, NO_MOUNTS, Kind, judge, play
@@ -70,8 +71,8 @@ def test_the_judge_sees_what_is_lost_twice_or_wrong(tmp_path: Path, wrong: str) 
     database = str(tmp_path / "fleet.sqlite")
     store = Store(database)
     store.prepare()
-    store.take([Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()])
-    store.take([Message(f"fleet/{one.id}/hello", one.hello)])
+    store.take([Incoming(f"fleet/{one.id}/item", payload) for payload in one.told.values()])
+    store.take([Incoming(f"fleet/{one.id}/hello", one.hello)])
     store.close()
     judge(database, [one])
     engine = engine_of(database)

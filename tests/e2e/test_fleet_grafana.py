@@ -12,7 +12,8 @@ from typing import Any
 import psycopg
 import pytest
 
-from companion.fleet.store import Message, Store
+from companion.fleet.store import Store
+from companion.mqtt.client import Incoming
 from sim.fleet import demo
 from tests.support.postgres import INITDB, postgres
 
@@ -33,8 +34,8 @@ def database() -> Iterator[str]:
         store = Store(where)
         store.prepare()
         for each in fleet:
-            store.take([Message(f"fleet/{each.id}/item", payload) for payload in each.told.values()])
-            store.take([Message(f"fleet/{each.id}/hello", each.hello)])
+            store.take([Incoming(f"fleet/{each.id}/item", payload) for payload in each.told.values()])
+            store.take([Incoming(f"fleet/{each.id}/hello", each.hello)])
         while store.judge():
             pass
         store.close()

@@ -15,7 +15,8 @@ import sqlalchemy as sa
 from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
 from companion.fleet import schema
 from companion.fleet.database import engine_of
-from companion.fleet.store import Message, Store
+from companion.fleet.store import Store
+from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW, rows_of
 from tests.support.fleet import check
@@ -94,11 +95,11 @@ def told(database: str) -> str:
     for one in (ONE, OTHER):
         for payload in one.told.values():
             check("item", payload)
-            store.take([Message(f"fleet/{one.id}/item", payload)])
-        store.take([Message(f"fleet/{one.id}/hello", one.hello)])
+            store.take([Incoming(f"fleet/{one.id}/item", payload)])
+        store.take([Incoming(f"fleet/{one.id}/hello", one.hello)])
     for payload in ONE.told.values():
         item = msgspec.json.decode(payload) | {"epoch": "f" * 16}
-        store.take([Message(f"fleet/{ONE.id}/item", msgspec.json.encode(item))])
+        store.take([Incoming(f"fleet/{ONE.id}/item", msgspec.json.encode(item))])
     store.close()
     return database
 

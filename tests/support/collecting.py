@@ -19,7 +19,8 @@ from companion.fleet import schema
 from companion.fleet.collector import stop
 from companion.fleet.database import engine_of
 from companion.fleet.server import Server
-from companion.fleet.store import Message, Store
+from companion.fleet.store import Store
+from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft
 from tests.support.broker import Broker, free_port
 
@@ -132,8 +133,8 @@ async def served(folder: Path, *fleet: Aircraft, password: str | None = None) ->
     store = Store(database)
     store.prepare()
     for one in fleet:
-        store.take([Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()])
-        store.take([Message(f"fleet/{one.id}/hello", one.hello)])
+        store.take([Incoming(f"fleet/{one.id}/item", payload) for payload in one.told.values()])
+        store.take([Incoming(f"fleet/{one.id}/hello", one.hello)])
     store.close()
     serving = asyncio.create_task(Server(f"127.0.0.1:{port}", database, password).run())
     try:

@@ -222,11 +222,11 @@ class Recorder(Subsystem):
                 level = logging.WARNING if tape.lost == tape.lost_in_all else logging.DEBUG  # once is enough
                 logger.log(level, "recordings: the disk is too slow, %d messages lost; begun anew", tape.lost)
                 self._begin()
-            batch = tape.drain(now_s)
-            beginning = Beginning(batch.since_s, self._offset_ns, self._config_json, batch.states)
-            await self._flush_ring(batch.messages, beginning)
+            since_s, states, batch = tape.drain(now_s)
+            beginning = Beginning(since_s, self._offset_ns, self._config_json, states)
+            await self._flush_ring(batch, beginning)
             if self._on_request is not None:
-                await self._flush_file(self._on_request, batch.messages, beginning)
+                await self._flush_file(self._on_request, batch, beginning)
 
     async def _flush_ring(self, batch: list[Message], beginning: Beginning) -> None:
         ring = self._ring

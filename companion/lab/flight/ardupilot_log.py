@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from companion.autopilot.firmware.ardupilot import ArduPilot
 from companion.lab.flight.inertial import joined
-from companion.lab.flight.log import Boot, Estimated, FlownImu, Place, Start, changes, starts
+from companion.lab.flight.log import Boot, BootMessages, Estimated, FlownImu, changes, starts
 from companion.lab.logs.dataflash import dataflash
 from companion.lab.logs.log import Progress
 from companion.physics.frames import Floats
@@ -53,7 +53,7 @@ def read(path: Path, progress: Progress) -> Iterator[Boot]:
     return map(_boot, starts(dataflash(path, _ROWS, progress), fields))
 
 
-def _boot(start: Start) -> Boot:
+def _boot(start: BootMessages) -> Boot:
     parameters = {name: value for _, name, value in start.parameters}
     mask = round(parameters.get("EK3_IMU_MASK", 3.0))
     cores = [k for k in range(_IMUS) if mask >> k & 1]  # by EKF core, its IMU from 0
@@ -80,14 +80,14 @@ def _boot(start: Start) -> Boot:
     )
 
 
-def _lanes(start: Start) -> Floats:
+def _lanes(start: BootMessages) -> Floats:
     """Give the EKF core in use over time, (n, 2); each core logs it."""
     told = next((start.rows("XKF4", core) for core in start.instances("XKF4")), np.zeros((0, 2)))
     told = told[(told[:, 1] >= 0) & (told[:, 1] < _IMUS)]
     return told if len(told) else np.zeros((1, 2))
 
 
-def _in_use(start: Start, name: str, lanes: Floats) -> Floats:
+def _in_use(start: BootMessages, name: str, lanes: Floats) -> Floats:
     """Select the rows of a message of the EKF core in use."""
     parts = [start.rows(name)[:0]]
     for core in start.instances(name):
@@ -98,7 +98,7 @@ def _in_use(start: Start, name: str, lanes: Floats) -> Floats:
     return np.asarray(found[np.argsort(found[:, 0])])
 
 
-def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[int]) -> FlownImu:
+def _imu(start: BootMessages, instance: int, parameters: dict[str, float], cores: list[int]) -> FlownImu:
     rows = start.rows("IMU", instance)
     failed: NDArray[np.bool_] = np.any(rows[:, 8:10] < 1.0, axis=1)  # not so in a log that does not say
     used = rows[np.isfinite(rows[:, :7]).all(axis=1) & ~failed]
@@ -117,7 +117,7 @@ def _imu(start: Start, instance: int, parameters: dict[str, float], cores: list[
     )  # fmt: skip
 
 
-def _estimated(start: Start, core: int) -> Estimated | None:
+def _estimated(start: BootMessages, core: int) -> Estimated | None:
     gyro, accel = start.rows("XKF1", core), start.rows("XKF2", core)
     if not len(gyro) or not len(accel):
         return None
@@ -154,7 +154,7 @@ def _cut(cut: Floats, step: float) -> Floats:
     return np.where(np.abs(cut) < 0.5 * step, 2.0 * step, step) / math.sqrt(12.0)
 
 
-def _events(start: Start, what: str) -> tuple[tuple[float, bool], ...]:
+def _events(start: BootMessages, what: str) -> tuple[tuple[float, bool], ...]:
     rows = start.rows("ARM") if what == "armed" else np.zeros((0, 2))
     if len(rows):
         return changes(rows[:, 0], rows[:, 1] > 0.5)
@@ -181,6 +181,6 @@ def _unix_offset(gps: Floats) -> float | None:
     return float(np.sort(unix_s - fixed[:, 0])[len(fixed) // 2])
 
 
-def _place(gps: Floats) -> Place | None:
+def _place(gps: Floats) -> tuple[float, float] | None:
     fixed = gps[gps[:, 1] >= 3]
-    return Place(float(fixed[-1, 4]), float(fixed[-1, 5])) if len(fixed) else None
+    return (float(fixed[-1, 4]), float(fixed[-1, 5])) if len(fixed) else None

@@ -24,7 +24,7 @@ from companion.estimation.records.flight_record import Drift, Flight, ImuFlight,
 from companion.estimation.records.record import Record
 from companion.estimation.solution.prior import curve_of
 from companion.lab.flight import ardupilot_log, inertial, px4_log
-from companion.lab.flight.inertial import Increments, Navigation, Window, World
+from companion.lab.flight.inertial import FlightWindow, Increments, Navigation, World
 from companion.lab.flight.log import Boot, FlownImu
 from companion.lab.flight.split import LENGTH_S, SHORT_S, split
 from companion.lab.logs.log import Progress
@@ -132,9 +132,9 @@ def _during(found: Increments, stages: Stages) -> Increments:
 def _world(boot: Boot) -> World:
     place, gravity = boot.place, _STANDARD_M_S2
     if place is not None and not boot.standard_gravity:
-        gravity = gravity_m_s2(place.latitude_deg, place.height_m)
+        gravity = gravity_m_s2(*place)
     turns = boot.earth_turns and place is not None
-    return World(gravity, earth_rate_ned_rad_s(place.latitude_deg) if place is not None and turns else np.zeros(3))
+    return World(gravity, earth_rate_ned_rad_s(place[0]) if place is not None and turns else np.zeros(3))
 
 
 def _stages(boot: Boot, reference: Navigation) -> list[Stages]:
@@ -221,7 +221,7 @@ async def _imu(
     )
 
 
-def _stood(found: Increments, stages: Stages, reference: Navigation, world: World) -> list[Window]:
+def _stood(found: Increments, stages: Stages, reference: Navigation, world: World) -> list[FlightWindow]:
     """List windows before the motors, if it stood still: that is known better than any solution."""
     end_s = (stages.motors_s or stages.armed_s) - 0.5
     start_s = max(end_s - _STOOD_S, float(reference.t_s[0]))
@@ -235,7 +235,7 @@ def _stood(found: Increments, stages: Stages, reference: Navigation, world: Worl
     return rows if len(rows) and rates.std(axis=0).max() < _STILL_RAD_S else []
 
 
-def _kept(rows: Sequence[Window]) -> list[Window]:
+def _kept(rows: Sequence[FlightWindow]) -> list[FlightWindow]:
     """Leave out windows in which the solution has jumped, as when it found its heading anew."""
     if len(rows) < 4:
         return list(rows)

@@ -218,7 +218,7 @@ def drift(
     return results
 
 
-class Window(NamedTuple):
+class FlightWindow(NamedTuple):
     """Excess of the readings over the solution in some seconds; axes of the body."""
 
     t_s: float
@@ -232,7 +232,7 @@ class Window(NamedTuple):
 
 def windows(
     found: Increments, solution: Navigation, world: World, within_s: tuple[float, float], length_s: float
-) -> list[Window]:
+) -> list[FlightWindow]:
     """List windows side by side, without those in which readings or solution have holes."""
     clean = without_earth(found, solution, world)
     nodes = np.concatenate([found.t_s - found.dt_s, found.t_s[-1:]])
@@ -258,7 +258,9 @@ def windows(
         off = vectors((turn[j].T @ turn[k] @ turned)[None])[0]
         gyro = np.linalg.solve(carried.turn[j].T @ (along[j] - along[k]), off)
         more = (down[j] - down[k] + world.gravity_m_s2 * t - (velocity[j] - velocity[k])[2]) / t
-        rows.append(Window(float(0.5 * (nodes[k] + nodes[j])), gyro, float(more / level), np.array([x, y]) / level))
+        rows.append(
+            FlightWindow(float(0.5 * (nodes[k] + nodes[j])), gyro, float(more / level), np.array([x, y]) / level)
+        )
     return rows
 
 

@@ -21,7 +21,7 @@ _INSTANCES: Final = 16
 """Most instances: a larger number is damage."""
 
 
-class Start:
+class BootMessages:
     """Messages of one start of the autopilot."""
 
     def __init__(self, fields: Mapping[str, int]) -> None:
@@ -52,12 +52,12 @@ class Start:
         return sorted(instance for each, instance in self._chunks if each == name)
 
 
-def starts(blocks: Iterable[Block | None], fields: Mapping[str, int]) -> Iterator[Start]:
+def starts(blocks: Iterable[Block | None], fields: Mapping[str, int]) -> Iterator[BootMessages]:
     """Give the starts in a file one after another: memory is that of one. `fields`: number of fields by message."""
     start = None
     for block in blocks:
         if block is not None:
-            start = start or Start(fields)
+            start = start or BootMessages(fields)
             start.take(block)
         elif start is not None:
             whole, start = start, None
@@ -113,13 +113,6 @@ class FlownImu(msgspec.Struct, frozen=True, kw_only=True):
         return (len(self.t_s) - 1) / float(self.t_s[-1] - self.t_s[0]) if len(self.t_s) > 1 else 0.0
 
 
-class Place(msgspec.Struct, frozen=True):
-    """Place of the flight."""
-
-    latitude_deg: float
-    height_m: float
-
-
 class Boot(msgspec.Struct, frozen=True, kw_only=True):
     """Log of one start of the autopilot, whichever firmware wrote it; times in s on its clock."""
 
@@ -134,7 +127,8 @@ class Boot(msgspec.Struct, frozen=True, kw_only=True):
     parameters: tuple[tuple[float, str, float], ...] = ()
     unix_offset_s: float | None = None
     """UTC less its clock."""
-    place: Place | None = None
+    place: tuple[float, float] | None = None
+    """Latitude in degrees, and height in m."""
     earth_turns: bool = True
     standard_gravity: bool = False
     notes: tuple[str, ...] = ()

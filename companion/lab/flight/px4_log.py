@@ -10,7 +10,7 @@ import numpy as np
 
 from companion.autopilot.firmware.px4 import PX4
 from companion.lab.flight.inertial import Navigation, joined
-from companion.lab.flight.log import Boot, Estimated, FlownImu, Place, Start, ascending, changes, starts
+from companion.lab.flight.log import Boot, BootMessages, Estimated, FlownImu, ascending, changes, starts
 from companion.lab.logs.log import US, Progress
 from companion.lab.logs.ulog import ulog
 from companion.physics.frames import Floats
@@ -47,7 +47,7 @@ def read(path: Path, progress: Progress) -> Iterator[Boot]:
     return map(_boot, starts(ulog(path, _TOPICS, progress), fields))
 
 
-def _boot(start: Start) -> Boot:
+def _boot(start: BootMessages) -> Boot:
     armed, landed = start.rows("actuator_armed"), start.rows("vehicle_land_detected")
     return Boot(
         firmware=PX4.name,
@@ -77,12 +77,12 @@ def _sampled(rows: Floats) -> Floats:
     return ascending(_whole(np.column_stack([np.where(np.isfinite(at_s), at_s, rows[:, 0]), rows[:, 2:]])))
 
 
-def _navigation(start: Start, suffix: str) -> Navigation | None:
+def _navigation(start: BootMessages, suffix: str) -> Navigation | None:
     attitude, moving = (start.rows(f"vehicle_{what}{suffix}") for what in ("attitude", "local_position"))
     return joined(_sampled(attitude), _sampled(moving[:, :8]))
 
 
-def _imus(start: Start) -> tuple[FlownImu, ...]:
+def _imus(start: BootMessages) -> tuple[FlownImu, ...]:
     """List the IMUs that PX4 has flown by: sensor_combined is of the one in use."""
     found: dict[int, FlownImu] = {}
     status = {k: start.rows("vehicle_imu_status", k) for k in start.instances("vehicle_imu_status")}
@@ -96,13 +96,13 @@ def _imus(start: Start) -> tuple[FlownImu, ...]:
     return tuple(found[k] for k in sorted(found))
 
 
-def _selection(start: Start) -> Floats:
+def _selection(start: BootMessages) -> Floats:
     """Give the device id of the gyro in use over time, (n, 2)."""
     told = _whole(start.rows("sensor_selection"))
     return told if len(told) else np.zeros((1, 2))
 
 
-def _imu(start: Start, k: int, rows: Floats) -> FlownImu:
+def _imu(start: BootMessages, k: int, rows: Floats) -> FlownImu:
     status = start.rows("vehicle_imu_status", k)
     known = status[np.isfinite(status[:, 1:3]).all(axis=1)]
     gyro_id, accel_id = map(int, known[-1, 1:3]) if len(known) else (None, None)
@@ -112,7 +112,7 @@ def _imu(start: Start, k: int, rows: Floats) -> FlownImu:
     )  # fmt: skip
 
 
-def _estimated(start: Start, gyro_id: int | None) -> Estimated | None:
+def _estimated(start: BootMessages, gyro_id: int | None) -> Estimated | None:
     for instance in start.instances("estimator_sensor_bias"):
         rows = start.rows("estimator_sensor_bias", instance)
         if not len(rows) or gyro_id not in (None, rows[-1, 1]):
@@ -123,23 +123,23 @@ def _estimated(start: Start, gyro_id: int | None) -> Estimated | None:
     return None
 
 
-def _motors(start: Start) -> tuple[tuple[float, bool], ...]:
+def _motors(start: BootMessages) -> tuple[tuple[float, bool], ...]:
     outputs = start.rows("actuator_motors")
     turning = np.any(outputs[:, 1:] > _TURNING, axis=1)
     return changes(outputs[:, 0], turning)
 
 
-def _unix_offset(start: Start) -> float | None:
+def _unix_offset(start: BootMessages) -> float | None:
     rows = start.rows("vehicle_gps_position")
     known = np.sort((rows[:, 1] * US - rows[:, 0])[rows[:, 1] > 1e15])
     return float(known[len(known) // 2]) if len(known) else None
 
 
-def _place(start: Start) -> Place | None:
+def _place(start: BootMessages) -> tuple[float, float] | None:
     rows = _whole(start.rows("vehicle_local_position")[:, 8:10])
     rows = rows[rows[:, 0] != 0.0]
     if not len(rows):
         return None
     # The simulator's gravity is that of the ellipsoid.
     simulated = start.instances("vehicle_attitude_groundtruth")
-    return Place(float(rows[-1, 0]), 0.0 if simulated else float(rows[-1, 1]))
+    return float(rows[-1, 0]), 0.0 if simulated else float(rows[-1, 1])

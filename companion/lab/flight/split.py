@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from companion.estimation.records.flight_record import AXES, Split, Term
-from companion.lab.flight.inertial import Window
+from companion.lab.flight.inertial import FlightWindow
 from companion.physics.frames import Floats
 from companion.physics.statistics import student_quantile
 from companion.physics.units import DEG, MG
@@ -38,8 +38,8 @@ _LEAST_TREND_S: Final = 60.0
 
 
 def split(
-    before: Sequence[Window],
-    flight: Sequence[Window],
+    before: Sequence[FlightWindow],
+    flight: Sequence[FlightWindow],
     levels: Floats | None,
     warmth: Sequence[Term | None],
     ekf: Sequence[Term | None],
@@ -78,7 +78,7 @@ def split(
     return found
 
 
-def _tilt(windows: Sequence[Window]) -> float:
+def _tilt(windows: Sequence[FlightWindow]) -> float:
     """Root mean square of how x and y lie along the vertical."""
     return math.sqrt(float(np.mean([one.tilt @ one.tilt for one in windows]))) if windows else 0.0
 
@@ -94,7 +94,7 @@ def _mean(values: Floats, span_s: float, end: float, constant: float) -> Term | 
 
 
 def _slopes(
-    values: Floats, windows: Sequence[Window], levels: Floats | None, end: float, aside: float
+    values: Floats, windows: Sequence[FlightWindow], levels: Floats | None, end: float, aside: float
 ) -> tuple[Term | None, Term | None]:
     """Fit slopes against vibration and time; each only where the flight has enough of it."""
     times = np.array([one.t_s for one in windows])

@@ -21,7 +21,7 @@ from companion.errors import StorageError
 from companion.lab.logs import csv_log, dataflash, ulog
 from companion.lab.logs.log import DROPOUTS, LAST_S, NAME, Block, StillLog
 from companion.lab.logs.playback import UNUSABLE, Playback, config_of
-from companion.lab.logs.recording import Head, Message, Recording, is_text
+from companion.lab.logs.recording import Head, Recording, is_text
 from companion.physics.frames import Floats
 from companion.recording import messages
 from companion.samples import ImuSample
@@ -93,11 +93,9 @@ def _read_recording(path: Path) -> list[StillLog]:
             found = {imu.name: _Columns() for imu in config.imu}
         elif playback is not None:
             try:
-                _add(playback, item, found)
+                _add(playback, *item, found)
             except UNUSABLE as error:
-                raise StorageError(
-                    f"{path}: a message on {item.topic} cannot be used by this version ({error})"
-                ) from None
+                raise StorageError(f"{path}: a message on {item[0]} cannot be used by this version ({error})") from None
     found = {name: each for name, each in found.items() if each.rows or each.truncated}
     if head is None or config is None or not found:
         raise StorageError(f"{path}: no samples of an IMU in it")
@@ -123,13 +121,13 @@ def _read_recording(path: Path) -> list[StillLog]:
     return logs
 
 
-def _add(playback: Playback, message: Message, found: dict[str, _Columns]) -> None:
+def _add(playback: Playback, topic: str, t_s: float, data: bytes, found: dict[str, _Columns]) -> None:
     """Take the samples of a message; readings behind another state cannot be compared with those before."""
-    if message.topic == messages.START:
+    if topic == messages.START:
         playback.begin()
-    if not playback.wants(message.topic):
+    if not playback.wants(topic):
         return
-    for role, part in playback.take(message.topic, message.data, message.t_s):
+    for role, part in playback.take(topic, data, t_s):
         if isinstance(part, ImuSample):
             state = playback.state(role.name)
             columns = found[role.name]
@@ -137,8 +135,8 @@ def _add(playback: Playback, message: Message, found: dict[str, _Columns]) -> No
                 columns.truncated = True
             else:
                 columns.add(part)
-    if message.topic.startswith(messages.IMU):
-        found[message.topic.removeprefix(messages.IMU)].breaks_s.append(message.t_s)
+    if topic.startswith(messages.IMU):
+        found[topic.removeprefix(messages.IMU)].breaks_s.append(t_s)
 
 
 def _joined(logs: Iterable[StillLog]) -> list[StillLog]:

@@ -6,7 +6,7 @@ The `mcap` library does the parsing. Lengths are checked before it unpacks anyth
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -21,15 +21,6 @@ MOST_BYTES: Final = 4 * 1024 * 1024
 _NEEDS_MORE: Final = (
     "a recording needs more than is installed: pip install '.[recording]' in the folder of the companion's sources"
 )
-
-
-class Message(msgspec.Struct, frozen=True, gc=False):
-    """One message on a topic."""
-
-    topic: str
-    t_s: float
-    """Time on the daemon's clock."""
-    data: bytes
 
 
 class Head(msgspec.Struct, frozen=True):
@@ -70,8 +61,8 @@ class Recording:
         if not MAGIC.startswith(head):
             raise StorageError(f"{path}: not a recording (MCAP), nor any log that is known")
 
-    def items(self, wanted: Callable[[str], bool] = lambda topic: True) -> Iterator[Head | Message]:
-        """Give the head, then the messages on wanted topics in the order of writing, until the end or a cut."""
+    def items(self) -> Iterator[Head | messages.Message]:
+        """Give the head, then the messages in the order of writing, until the end or a cut."""
         try:
             import zstandard
             from mcap import exceptions, records, stream_reader
@@ -90,12 +81,10 @@ class Recording:
                         head = Head(table, int(table["offset_ns"]), record.data)
                         yield head
                     elif isinstance(record, records.Channel):
-                        topics.pop(record.id, None)
-                        if wanted(record.topic):
-                            topics[record.id] = record.topic
+                        topics[record.id] = record.topic
                     elif isinstance(record, records.Message) and head is not None and record.channel_id in topics:
                         t_s = (record.log_time - head.offset_ns) / 1e9
-                        yield Message(topics[record.channel_id], t_s, record.data)
+                        yield topics[record.channel_id], t_s, record.data
         except OSError as error:
             raise StorageError(f"{self.path}: cannot be read: {error.strerror or error}") from None
         except (exceptions.EndOfFile, exceptions.InvalidMagic, struct.error):

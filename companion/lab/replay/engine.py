@@ -30,7 +30,7 @@ from companion.estimation.solution.results import imu_records, record_of
 from companion.estimation.solution.site import Whereabouts, local_earth
 from companion.estimation.solution.solve import ImuSolution, Solution, solve
 from companion.lab.logs.playback import UNUSABLE, Playback, config_of
-from companion.lab.logs.recording import Head, Message, Recording
+from companion.lab.logs.recording import Head, Recording
 from companion.physics.frames import Array
 from companion.recording import messages
 from companion.recording.messages import ImuState, Measured, Solved, Start, decode
@@ -91,14 +91,12 @@ class Replay:
         self._solution: Solution | None = None
         self._not_recomputed = _BEFORE
 
-    def take(self, message: Message) -> None:
+    def take(self, topic: str, t_s: float, data: bytes) -> None:
         """Replay the next message."""
         try:
-            self._take(message.topic, message.data, message.t_s)
+            self._take(topic, data, t_s)
         except UNUSABLE as error:
-            raise StorageError(
-                f"{self._path}: a message on {message.topic} cannot be used by this version ({error})"
-            ) from None
+            raise StorageError(f"{self._path}: a message on {topic} cannot be used by this version ({error})") from None
 
     def _take(self, topic: str, data: bytes, t_s: float) -> None:
         if topic == messages.START:
@@ -258,9 +256,9 @@ def replay(paths: Iterable[Path]) -> Result:
     for path in paths:
         recording = Recording(path)
         for item in recording.items():
-            if isinstance(item, Message):
+            if not isinstance(item, Head):
                 if found is not None:
-                    found.take(item)
+                    found.take(*item)
             elif found is None:
                 found = Replay(item, path)
             elif not found.goes_on(item):

@@ -81,15 +81,8 @@ class Used(msgspec.Struct, frozen=True, kw_only=True):
     """Assumptions, in words."""
 
 
-class LogEstimate(msgspec.Struct, frozen=True):
-    """Record and used part of a log."""
-
-    record: Record
-    used: Used
-
-
-def estimate(log: StillLog, given: Given, *, max_still_s: float = MAX_STILL_S) -> LogEstimate:
-    """Estimate the biases from the longest still stretch of a log."""
+def estimate(log: StillLog, given: Given, *, max_still_s: float = MAX_STILL_S) -> tuple[Record, Used]:
+    """Estimate the biases from the longest still stretch of a log; return also which part of it was used."""
     return _Pass(log, given, max_still_s).run()
 
 
@@ -119,7 +112,7 @@ class _Pass:
         self._still_s = 0.0
         self._obstacle = ""
 
-    def run(self) -> LogEstimate:
+    def run(self) -> tuple[Record, Used]:
         """Run from the first sample to the last."""
         log, collector = self._log, self._collector
         began_at = datetime.datetime.now(tz=datetime.UTC)
@@ -140,9 +133,9 @@ class _Pass:
         if best is None:
             why = refused or f"no {MIN_STILL_S:.0f} s at rest in it: {self._obstacle or self._unusable(seconds)}"
             record = record_of(None, began_at, seconds, state="failed", reason=why)
-            return LogEstimate(record, self._used([], seconds))
+            return record, self._used([], seconds)
         measurement, window = best
-        return LogEstimate(self._solved(began_at, window, seconds), self._used(measurement.slots, seconds))
+        return self._solved(began_at, window, seconds), self._used(measurement.slots, seconds)
 
     def _look(self, now_s: float, longer: float = _LONGER) -> None:
         """Measure at the end of a second if the stretch has grown enough."""

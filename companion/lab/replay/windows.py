@@ -94,7 +94,7 @@ def windows(log: StillLog, given: Given, length_s: float) -> Windows:
         # What was switched on before the window says how far a warm-up may still go.
         at = int(np.searchsorted(starts_s, log.t_s[start], side="right")) - 1
         powered_s = float(log.t_s[start] - starts_s[at]) + (posed.powered if at == 0 else 0.0)
-        record = estimate(part, msgspec.structs.replace(posed, powered=powered_s), max_still_s=length_s).record
+        record, _ = estimate(part, msgspec.structs.replace(posed, powered=powered_s), max_still_s=length_s)
         imu = record.imus[0] if record.imus else None
         one = None if imu is None else _figures(imu)
         found.append(one)

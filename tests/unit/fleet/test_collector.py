@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 
 from companion.errors import ConfigError
-from companion.fleet.collector import BATCH, BATCH_BYTES, WAITING, WAITING_BYTES, Inbox, Waiting, load_broker
+from companion.fleet.collector import BATCH, BATCH_BYTES, WAITING, WAITING_BYTES, BoundedMessages, Inbox, load_broker
 from companion.fleet.contract import MOST_BYTES
-from companion.fleet.store import Message
+from companion.mqtt.client import Incoming
 
-LARGEST = Message("fleet/0/item", bytes(MOST_BYTES))
+LARGEST = Incoming("fleet/0/item", bytes(MOST_BYTES))
 
 
 @pytest.mark.parametrize(
-    ("queue", "most", "most_bytes"), [(Waiting, WAITING, WAITING_BYTES), (Inbox, BATCH, BATCH_BYTES)]
+    ("queue", "most", "most_bytes"), [(BoundedMessages, WAITING, WAITING_BYTES), (Inbox, BATCH, BATCH_BYTES)]
 )
-def test_what_waits_is_bounded_in_bytes_and_in_number(queue: type[Waiting], most: int, most_bytes: int) -> None:
+def test_what_waits_is_bounded_in_bytes_and_in_number(queue: type[BoundedMessages], most: int, most_bytes: int) -> None:
     waiting = queue(most)
     while not waiting.full():
         waiting.put_nowait(LARGEST)
@@ -30,9 +30,9 @@ def test_what_waits_is_bounded_in_bytes_and_in_number(queue: type[Waiting], most
     while not waiting.empty():
         waiting.get_nowait()
     for _ in range(most):
-        waiting.put_nowait(Message("fleet/0/hello", b"{}"))
+        waiting.put_nowait(Incoming("fleet/0/hello", b"{}"))
     with pytest.raises(asyncio.QueueFull):
-        waiting.put_nowait(Message("fleet/0/hello", b"{}"))
+        waiting.put_nowait(Incoming("fleet/0/hello", b"{}"))
 
 
 @pytest.mark.parametrize(

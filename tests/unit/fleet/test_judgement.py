@@ -14,7 +14,8 @@ import sqlalchemy as sa
 
 from companion.fleet import page
 from companion.fleet.judgement import judge_zero
-from companion.fleet.store import Message, Store
+from companion.fleet.store import Store
+from companion.mqtt.client import Incoming
 from companion.physics.units import DEG_H
 from sim.fleet.aircraft import Aircraft
 from tests import judgement_study as study
@@ -51,8 +52,8 @@ def faulty(number: int = 1, after: int = 30) -> Aircraft:
     return one
 
 
-def messages_of(one: Aircraft) -> list[Message]:
-    return [Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()]
+def messages_of(one: Aircraft) -> list[Incoming]:
+    return [Incoming(f"fleet/{one.id}/item", payload) for payload in one.told.values()]
 
 
 def changed(one: Aircraft, sequence: int, **news: Any) -> None:
@@ -62,7 +63,7 @@ def changed(one: Aircraft, sequence: int, **news: Any) -> None:
     one.told[sequence] = json.dumps(item, separators=(",", ":")).encode()
 
 
-def judged(store: Store, database: str, messages: Sequence[Message]) -> list[Any]:
+def judged(store: Store, database: str, messages: Sequence[Incoming]) -> list[Any]:
     """The findings, once all is judged."""
     store.take(messages)
     while store.judge():

@@ -13,7 +13,8 @@ import sqlalchemy as sa
 from companion.fleet import page, schema
 from companion.fleet.database import engine_of
 from companion.fleet.server import Renderer
-from companion.fleet.store import Message, Store
+from companion.fleet.store import Store
+from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW
 
@@ -33,8 +34,8 @@ def store(database: str) -> Iterator[Store]:
 
 def tell(store: Store, *fleet: Aircraft) -> None:
     for one in fleet:
-        items = [Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()]
-        store.take([Message(f"fleet/{one.id}/hello", one.hello), *items])
+        items = [Incoming(f"fleet/{one.id}/item", payload) for payload in one.told.values()]
+        store.take([Incoming(f"fleet/{one.id}/hello", one.hello), *items])
 
 
 def shown(database: str, number: int = 1) -> str | None:

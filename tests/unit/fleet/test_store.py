@@ -19,7 +19,8 @@ from companion.errors import CompanionError, LinkError, StorageError
 from companion.fleet import contract, schema
 from companion.fleet.contract import MOST_RANGES, answers, ranges
 from companion.fleet.database import url_of
-from companion.fleet.store import Message, Outcome, Store
+from companion.fleet.store import BatchResult, Store
+from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft
 from tests.support.collecting import NOW, items_in, rows_of, told_by
 from tests.support.fleet import check
@@ -44,16 +45,16 @@ def aircraft(flights: int = 5, number: int = 1) -> Aircraft:
     return one
 
 
-def items_of(one: Aircraft) -> list[Message]:
-    return [Message(f"fleet/{one.id}/item", payload) for payload in one.told.values()]
+def items_of(one: Aircraft) -> list[Incoming]:
+    return [Incoming(f"fleet/{one.id}/item", payload) for payload in one.told.values()]
 
 
-def changed(message: Message, **news: Any) -> Message:
+def changed(message: Incoming, **news: Any) -> Incoming:
     return message._replace(payload=json.dumps(json.loads(message.payload) | news).encode())
 
 
-def hello_of(one: Aircraft) -> Message:
-    return Message(f"fleet/{one.id}/hello", one.hello)
+def hello_of(one: Aircraft) -> Incoming:
+    return Incoming(f"fleet/{one.id}/hello", one.hello)
 
 
 def query(database: str, text: str) -> list[tuple[Any, ...]]:
@@ -298,7 +299,7 @@ def test_what_the_database_refuses_takes_nothing_else_with_it(
     messages = items_of(one)
     real = Store._take
 
-    def refuses(self: Store, some: list[Message], now: datetime.datetime) -> Outcome:
+    def refuses(self: Store, some: list[Incoming], now: datetime.datetime) -> BatchResult:
         if messages[3] in some:
             raise sa.exc.DataError("INSERT", {}, ValueError("no such number"))
         return real(self, some, now)
@@ -311,7 +312,7 @@ def test_what_the_database_refuses_takes_nothing_else_with_it(
     assert query(database, "SELECT sequence FROM items WHERE state = 'rejected'") == [(4,)]
     assert query(database, "SELECT times, payload FROM rejected") == [(1, messages[3].payload[:4096])]
     assert sorted(outcome.confirmed[one.id, one.epoch]) == list(range(1, len(messages) + 1))
-    assert store.take([Message(f"fleet/{one.id}/hello", one.hello)]).wanted == {}
+    assert store.take([Incoming(f"fleet/{one.id}/hello", one.hello)]).wanted == {}
 
 
 @pytest.mark.parametrize(("version", "remedy"), [(3, "name a new database with --database"), (5, "update this one")])

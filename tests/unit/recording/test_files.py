@@ -14,11 +14,10 @@ from mcap.reader import make_reader
 
 from companion.errors import StorageError
 from companion.estimation.solution.site import Whereabouts
-from companion.lab.logs.recording import Message, Recording
+from companion.lab.logs.recording import Head, Recording
 from companion.recording import tape as tape_module
 from companion.recording.files import RESERVE_BYTES, Beginning, RecordingFile, Ring
-from companion.recording.messages import PLACE, START, decode, encode
-from companion.recording.messages import Message as Written
+from companion.recording.messages import PLACE, START, Message, decode, encode
 from companion.recording.tape import Tape
 
 MB = 1 << 20
@@ -28,14 +27,14 @@ def beginning(t_s: float = 1000.0) -> Beginning:
     return Beginning(t_s=t_s, offset_ns=1_700_000_000 * 10**9, config=b"{}", states=())
 
 
-def raw(count: int, size: int, seed: int = 0) -> list[Written]:
+def raw(count: int, size: int, seed: int = 0) -> list[Message]:
     """Messages that do not get smaller by compression."""
     rng = random.Random(seed)
     return [("/serial/own", 1000.0 + k / 100, rng.randbytes(size)) for k in range(count)]
 
 
 def on_topic(path: Path, topic: str) -> list[Message]:
-    return [item for item in Recording(path).items() if isinstance(item, Message) and item.topic == topic]
+    return [item for item in Recording(path).items() if not isinstance(item, Head) and item[0] == topic]
 
 
 def numbers(folder: Path) -> list[int]:
@@ -149,22 +148,21 @@ def test_what_finds_no_room_is_lost_in_one_piece_and_said_in_the_file(
     file = RecordingFile(tmp_path / "a.mcap")
     for k in range(20):
         tape.put("/serial/own", 1000.0 + k, bytes([k]))
-    file.write(tape.drain(1020.0).messages, beginning())
+    file.write(tape.drain(1020.0)[2], beginning())
     for k in range(20, 90):  # the disk hangs
         tape.put("/serial/own", 1000.0 + k, bytes([k]))
-    assert tape.drain(1090.0).messages == [], "nothing of a part with a hole in it"
+    assert tape.drain(1090.0)[2] == [], "nothing of a part with a hole in it"
     assert tape.lost == tape.lost_in_all == 70
     tape.begin(1090.0)
     for k in range(90, 95):
         tape.put("/serial/own", 1000.0 + k, bytes([k]))
-    file.write(tape.drain(1095.0).messages, beginning())
+    file.write(tape.drain(1095.0)[2], beginning())
     file.close()
-    starts = [decode(START, message.data) for message in on_topic(tmp_path / "a.mcap", START)]
+    starts = [decode(START, data) for _, _, data in on_topic(tmp_path / "a.mcap", START)]
     assert [start.lost for start in starts] == [0, 0, 70], "the file, the tape, the tape again"
     found = on_topic(tmp_path / "a.mcap", "/serial/own")
     wanted = [*range(20), *range(90, 95)]
-    assert [message.data for message in found] == [bytes([k]) for k in wanted]
-    assert [message.t_s for message in found] == [1000.0 + k for k in wanted]
+    assert found == [("/serial/own", 1000.0 + k, bytes([k])) for k in wanted]
 
 
 def test_a_file_begins_with_the_states_in_force_and_says_whether_it_follows_on_another(tmp_path: Path) -> None:
@@ -172,12 +170,12 @@ def test_a_file_begins_with_the_states_in_force_and_says_whether_it_follows_on_a
     tape.put_state(PLACE, 990.0, encode(Whereabouts(height_m=1.0)))
     tape.begin(1000.0)
     for height in (2.0, 3.0):
-        batch = tape.drain(1000.0 + height)
-        ring.write(batch.messages, Beginning(batch.since_s, 10**18, b"{}", batch.states))
+        since_s, states, batch = tape.drain(1000.0 + height)
+        ring.write(batch, Beginning(since_s, 10**18, b"{}", states))
         ring.close()
         tape.put_state(PLACE, 1000.0 + height, encode(Whereabouts(height_m=height)))
     first, second = tmp_path / "000001.mcap", tmp_path / "000002.mcap"
-    heights = [[decode(PLACE, each.data).height_m for each in on_topic(path, PLACE)] for path in (first, second)]
+    heights = [[decode(PLACE, data).height_m for _, _, data in on_topic(path, PLACE)] for path in (first, second)]
     assert heights == [[1.0], [1.0, 2.0]]
-    (_, _), (follows,) = ([decode(START, each.data) for each in on_topic(path, START)] for path in (first, second))
+    (_, _), (follows,) = ([decode(START, data) for _, _, data in on_topic(path, START)] for path in (first, second))
     assert follows.continues
