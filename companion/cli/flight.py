@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import datetime
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,7 +41,7 @@ async def flight(options: argparse.Namespace) -> int:
     path = options.file
     known, store = _knowledge(options)
     starts, imus, lines, found = 0, 0, [], []
-    for boot in read(path, _Progress()):
+    for boot in read(path):
         starts, imus = starts + 1, imus + len(boot.imus)
         for each in await flights(boot, known):
             found.append(each)
@@ -58,18 +57,6 @@ async def flight(options: argparse.Namespace) -> int:
     answer = {"state": "done", "reason": "", "file": str(path), "numbers": numbers}
     answer["flights"] = msgspec.to_builtins(found)
     return conclude(options, answer, lines, good=True)
-
-
-class _Progress:
-    """Prints the progress of reading once a second."""
-
-    def __init__(self) -> None:
-        self._next_s = time.monotonic() + 1.0
-
-    def __call__(self, share: float) -> None:
-        if (now_s := time.monotonic()) >= self._next_s:
-            self._next_s = now_s + 1.0
-            print_lines(f"reading: {share:.0%}", error=True)
 
 
 def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | None]:

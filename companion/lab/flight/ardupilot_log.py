@@ -14,7 +14,6 @@ from companion.autopilot.firmware.ardupilot import ArduPilot
 from companion.lab.flight.inertial import joined
 from companion.lab.flight.log import Boot, BootMessages, Estimated, FlownImu, changes, starts
 from companion.lab.logs.dataflash import dataflash
-from companion.lab.logs.log import Progress
 from companion.physics.frames import Floats
 from companion.physics.units import DEG
 
@@ -47,10 +46,10 @@ _MOTOR_FUNCTIONS: Final = (*range(33, 41), *range(82, 86), 70)
 _TURNING_US: Final = 30.0
 
 
-def read(path: Path, progress: Progress) -> Iterator[Boot]:
+def read(path: Path) -> Iterator[Boot]:
     """Each start of the autopilot in it, one after another: memory is that of one."""
     fields = {name: len(columns) for name, (_, columns) in _ROWS.items()}
-    return map(_boot, starts(dataflash(path, _ROWS, progress), fields))
+    return map(_boot, starts(dataflash(path, _ROWS), fields))
 
 
 def _boot(start: BootMessages) -> Boot:

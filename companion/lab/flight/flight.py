@@ -27,7 +27,6 @@ from companion.lab.flight import ardupilot_log, inertial, px4_log
 from companion.lab.flight.inertial import FlightWindow, Increments, Navigation, World
 from companion.lab.flight.log import Boot, FlownImu
 from companion.lab.flight.split import LENGTH_S, SHORT_S, split
-from companion.lab.logs.log import Progress
 from companion.lab.logs.log_files import read_ulog, reader_of
 from companion.physics.earth import earth_rate_ned_rad_s, gravity_m_s2
 from companion.physics.frames import Floats
@@ -62,7 +61,7 @@ class Knowledge(msgspec.Struct, frozen=True, kw_only=True):
     biases: Mapping[str, KnownImu] = {}
 
 
-def read(path: Path, progress: Progress) -> Iterator[Boot]:
+def read(path: Path) -> Iterator[Boot]:
     """Read each start of the autopilot in a log."""
     try:
         reader = reader_of(path)
@@ -73,7 +72,7 @@ def read(path: Path, progress: Progress) -> Iterator[Boot]:
             if file.read(len(_ENCRYPTED)) == _ENCRYPTED:
                 raise StorageError(f"{path}: encrypted by PX4: decrypt it first (Tools/log_encryption of PX4)")
         raise StorageError(f"{path}: no log of ArduPilot (.bin) or PX4 (.ulg)")
-    return px4_log.read(path, progress) if reader is read_ulog else ardupilot_log.read(path, progress)
+    return px4_log.read(path) if reader is read_ulog else ardupilot_log.read(path)
 
 
 async def flights(boot: Boot, known: Knowledge) -> list[Flight]:

@@ -11,7 +11,7 @@ import numpy as np
 from companion.autopilot.firmware.px4 import PX4
 from companion.lab.flight.inertial import Navigation, joined
 from companion.lab.flight.log import Boot, BootMessages, Estimated, FlownImu, ascending, changes, starts
-from companion.lab.logs.log import US, Progress
+from companion.lab.logs.log import US
 from companion.lab.logs.ulog import ulog
 from companion.physics.frames import Floats
 
@@ -41,10 +41,10 @@ _TOPICS: Final[dict[str, tuple[str, ...]]] = {
 _TURNING: Final = 0.02
 
 
-def read(path: Path, progress: Progress) -> Iterator[Boot]:
+def read(path: Path) -> Iterator[Boot]:
     """Each start of the autopilot in it: of PX4 there is one in a file, unless somebody has put several together."""
     fields = {name: len(columns) for name, columns in _TOPICS.items()}
-    return map(_boot, starts(ulog(path, _TOPICS, progress), fields))
+    return map(_boot, starts(ulog(path, _TOPICS), fields))
 
 
 def _boot(start: BootMessages) -> Boot:

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from companion.errors import StorageError
-from companion.lab.logs.log import PARAMETERS, US, Block, Progress, nobody
+from companion.lab.logs.log import PARAMETERS, US, Block
 
 MAGIC: Final = b"\xa3\x95\x80"
 """Beginning of a file: the head of a format message that describes format messages."""
@@ -62,11 +62,11 @@ class _Kind:
                 yield Block(self.name, int(instance), rows[messages[key] == instance])
 
 
-def dataflash(path: Path, fields: Fields, progress: Progress = nobody) -> Iterator[Block | None]:
+def dataflash(path: Path, fields: Fields) -> Iterator[Block | None]:
     """Give these messages and the parameters; None where another log begins in the same file."""
     kinds: dict[bytes, _Kind] = {MAGIC: _Kind(_FMT.itemsize + 3)}
     left = b""
-    for piece in _pieces(path, progress):
+    for piece in _pieces(path):
         # So the last message is followed by a head, as any other.
         data = left + (piece or _HEAD)
         at, end = 0, len(data)
@@ -97,14 +97,11 @@ def dataflash(path: Path, fields: Fields, progress: Progress = nobody) -> Iterat
             yield from each.blocks(fields)
 
 
-def _pieces(path: Path, progress: Progress) -> Iterator[bytes]:
+def _pieces(path: Path) -> Iterator[bytes]:
     """Give the bytes of a file; an empty piece is the last one."""
     try:
         with path.open("rb") as file:
-            size = max(path.stat().st_size, 1)
-            while piece := file.read(min(_PIECE, size - file.tell())):
-                yield piece
-                progress(min(file.tell() / size, 1.0))
+            yield from iter(lambda: file.read(_PIECE), b"")
     except OSError as error:
         raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
     yield b""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import itertools
-from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import msgspec
@@ -20,13 +19,6 @@ US: Final = 1e-6
 PARAMETERS: Final = "parameters"
 DROPOUTS: Final = "dropouts"
 """Name of the blocks with the times in which the autopilot could not write, ms."""
-
-Progress = Callable[[float], None]
-"""Called with the share of a file that has been read, from 0 to 1."""
-
-
-def nobody(_share: float) -> None:
-    """Ignore the progress."""
 
 
 class Block(NamedTuple):

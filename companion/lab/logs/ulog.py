@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from companion.errors import StorageError
-from companion.lab.logs.log import DROPOUTS, PARAMETERS, US, Block, Progress, nobody
+from companion.lab.logs.log import DROPOUTS, PARAMETERS, US, Block
 
 MAGIC: Final = b"ULog\x01\x12\x35"
 _MOST_TIMES: Final = 4
@@ -25,24 +25,22 @@ Topics = Mapping[str, tuple[str, ...]]
 
 
 class _Counted(io.BufferedReader):
-    """A file that counts what is read of it."""
+    """A file of which only so much can be read."""
 
-    def __init__(self, path: Path, progress: Progress) -> None:
+    def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path))
-        self._size, self._read, self._progress = max(path.stat().st_size, 1), 0, progress
+        self._left = _MOST_TIMES * path.stat().st_size + (1 << 20)
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read so many bytes."""
         data = super().read(size)
-        before, self._read = self._read, self._read + len(data)
-        if before >> 20 != self._read >> 20:
-            self._progress(min(self._read / self._size, 1.0))
-        if self._read > _MOST_TIMES * self._size + (1 << 20):
+        self._left -= len(data)
+        if self._left < 0:
             raise StorageError("its messages lead back to where they began")
         return data
 
 
-def ulog(path: Path, topics: Topics, progress: Progress = nobody) -> Iterator[Block]:
+def ulog(path: Path, topics: Topics) -> Iterator[Block]:
     """Give these topics, the parameters and the dropouts."""
     try:
         from pyulog import ULog
@@ -50,13 +48,12 @@ def ulog(path: Path, topics: Topics, progress: Progress = nobody) -> Iterator[Bl
         raise StorageError(_NEEDS_MORE) from None
     try:
         # It prints what is damaged to stdout, where an answer may stand.
-        with _Counted(path, progress) as file, contextlib.redirect_stdout(None):
+        with _Counted(path) as file, contextlib.redirect_stdout(None):
             log = ULog(file, [*topics])
     except OSError as error:
         raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Exception as error:  # noqa: BLE001 - pyulog raises anything of a damaged file
         raise StorageError(f"{path}: not a readable log of PX4: {' '.join(str(error).split())[:200]}") from None
-    progress(1.0)
     told = [(log.start_timestamp, name, value) for name, value in log.initial_parameters.items()]
     told = [each for each in (*told, *log.changed_parameters) if isinstance(each[2], int | float)]
     if told:
