@@ -16,7 +16,7 @@ from typing import Any, Final
 import sqlalchemy as sa
 
 from companion.fleet import schema
-from companion.fleet.database import engine_of
+from companion.fleet.schema import engine_of
 from companion.fleet.store import Store
 from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft

@@ -11,7 +11,7 @@ import sqlalchemy as sa
 from companion.fleet.schema import UtcTime, findings, rejected
 from companion.fleet.schema import aircraft as known
 from companion.physics.units import UNITS
-from companion.report.markup import Child, Markup, join, row, tag
+from companion.report.markup import Child, Markup, row, tag
 from companion.report.page import NAMES, PlotPoint, arming_items, card, drift, page, seconds_of, with_sigma
 from companion.samples import TRIADS, Triad, Vector
 
@@ -19,7 +19,7 @@ STALE: Final = datetime.timedelta(days=30)
 """A calibration that is older is shown as stale."""
 SILENT: Final = datetime.timedelta(days=7)
 MOST_AIRCRAFT: Final = 500
-"""Most aircraft on one page of some 90 kB."""
+"""Most aircraft on the page, of some 90 kB; the views have all."""
 MOST_CALIBRATIONS: Final = 120
 """Most calibrations of one IMU in a plot, the latest ones."""
 MOST_LISTED: Final = 25
@@ -48,9 +48,9 @@ _FLEET: Final = (
 _ORDERED: Final = (
     f"SELECT s.* FROM ({_FLEET}) s LEFT JOIN findings w ON w.aircraft = s.aircraft AND w.place = 0"  # noqa: S608 - constants
     " ORDER BY w.size DESC NULLS LAST, s.untold, s.standing, s.heard_at DESC NULLS LAST, s.aircraft"
-    " LIMIT :most OFFSET :first"
+    " LIMIT :most"
 )
-"""Ids without a calibration come last, so that invented ids move no real aircraft from the first page."""
+"""Ids without a calibration come last, so that invented ids move no real aircraft from the page."""
 
 
 def standing(one: Any) -> tuple[str, str, str]:
@@ -66,16 +66,14 @@ def standing(one: Any) -> tuple[str, str, str]:
     return kind, word, why
 
 
-def glance(connection: sa.Connection, now: datetime.datetime, number: int = 1) -> str | None:
-    """Show the fleet, `MOST_AIRCRAFT` on each numbered page; None: there is no such page."""
+def glance(connection: sa.Connection, now: datetime.datetime) -> str:
+    """Show the fleet: the worst `MOST_AIRCRAFT`."""
     since = {"stale": now - STALE, "silent": now - SILENT}
     counted = f"SELECT standing, COUNT(*) AS number, SUM(silent) AS silent FROM ({_FLEET}) s GROUP BY standing"  # noqa: S608 - constants
     groups = _rows(connection, f"{counted} ORDER BY standing", **since)
     known_in_all = sum(group.number for group in groups)
-    first = (number - 1) * MOST_AIRCRAFT
-    if number > 1 and first >= known_in_all:
-        return None
-    found = _rows(connection, _ORDERED, **since, most=MOST_AIRCRAFT, first=first)
+    left_out = known_in_all > MOST_AIRCRAFT
+    found = _rows(connection, _ORDERED, **since, most=MOST_AIRCRAFT)
     found = sorted(found, key=lambda one: (one.standing, one.name or one.aircraft))
     silent = sum(group.silent for group in groups)
     words = [f"{group.number} {_STANDINGS[group.standing][1]}" for group in groups]
@@ -91,9 +89,8 @@ def glance(connection: sa.Connection, now: datetime.datetime, number: int = 1) -
             class_="lead",
         ),
         _findings(connection),
-        _other_pages(number, known_in_all),
         tag("table", head, *(_line(one, now) for one in found), class_="fleet") if found else None,
-        _other_pages(number, known_in_all),
+        tag("p", f"The {MOST_AIRCRAFT} with findings, worst and latest heard are listed.") if left_out else None,
         _refused(connection, now),
         source=SOURCE,
     )
@@ -107,23 +104,6 @@ def _line(one: Any, now: datetime.datetime) -> Markup:
         tag("td", tag("a", one.name or one.aircraft, href=f"/aircraft/{one.aircraft}"), _small(why)),
         tag("td", word, _small(calibrated), class_=_CLASSES[kind]),
         tag("td", _ago(one.heard_at, now), class_="warn" if one.silent else None),
-    )
-
-
-def _other_pages(number: int, known_in_all: int) -> Markup | None:
-    """Say which part of the fleet this page lists, with links to the pages around it."""
-    last = -(-known_in_all // MOST_AIRCRAFT)
-    if last <= 1:
-        return None
-    first = (number - 1) * MOST_AIRCRAFT + 1
-    links = [
-        tag("a", words, href="/" if to == 1 else f"/page/{to}")
-        for words, to in (("Previous", number - 1), ("Next", number + 1))
-        if 1 <= to <= last
-    ]
-    words = f"{first} to {min(first + MOST_AIRCRAFT - 1, known_in_all)} of {known_in_all}, findings first, then the"
-    return tag(
-        "p", f"{words} worst and the latest heard; page {number} of {last}. ", *(join(link, " ") for link in links)
     )
 
 

@@ -25,7 +25,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from companion.config.rules import bind_problem
 from companion.errors import ConfigError
 from companion.fleet import page
-from companion.fleet.database import engine_of, why
+from companion.fleet.schema import engine_of, why
 from companion.links.system.connection import Backoff, Reconnection
 from companion.storage.state import read_regular
 from companion.web.access import Access, is_loopback, page_url, split_address
@@ -39,17 +39,7 @@ AGAIN_S: Final = 30
 """Period after which a browser loads the first page again."""
 SOON_S: Final = 2
 """Period after which a browser tries again when the database could not be read."""
-FRESH_S: Final = 2.0
-"""Time for which a rendered page is given to further clients."""
-_GLANCE: Final = re.compile(r"/(?:page/([1-9][0-9]{0,6}))?")
 _AIRCRAFT: Final = re.compile(r"/aircraft/([0-9a-f]{16,36})")
-_HEADERS: Final = (
-    ("X-Content-Type-Options", "nosniff"),
-    ("X-Frame-Options", "DENY"),
-    ("Referrer-Policy", "no-referrer"),
-    ("Cross-Origin-Resource-Policy", "same-origin"),
-    ("Cache-Control", "no-store"),
-)
 
 
 def read_password(path: Path) -> str:
@@ -68,47 +58,9 @@ def read_password(path: Path) -> str:
     return found
 
 
-class Renderer:
-    """Pages of one database.
-
-    Rendering is work for the processor: at once, 20 of them would take 20 times as long each, and as much memory.
-    """
-
-    def __init__(self, engine: sa.Engine) -> None:
-        self._engine = engine
-        self._thread = ThreadPoolExecutor(1, "fleet-pages")
-        self._pages: dict[str, asyncio.Task[bytes | None]] = {}
-
-    async def get(self, path: str) -> bytes | None:
-        """Return a page that is at most `FRESH_S` old, or render it; None: there is none.
-
-        Raises:
-            SQLAlchemyError: the database cannot be read.
-        """
-        if (task := self._pages.get(path)) is None:
-            task = self._pages[path] = asyncio.create_task(self._render(path), name=f"fleet page {path}")
-        # A client that disconnects does not cancel the rendering for the others.
-        return await asyncio.shield(task)
-
-    async def _render(self, path: str) -> bytes | None:
-        loop = asyncio.get_running_loop()
-        keep_s = 0.0
-        try:
-            found = await loop.run_in_executor(self._thread, self._rendered, path)
-            keep_s = 0.0 if found is None else FRESH_S
-            return found
-        finally:
-            loop.call_later(keep_s, self._pages.pop, path, None)
-
-    def _rendered(self, path: str) -> bytes | None:
-        with self._engine.begin() as connection:
-            found = _page_at(connection, path, datetime.datetime.now(tz=datetime.UTC))
-        return None if found is None else found.encode()
-
-
 def _page_at(connection: sa.Connection, path: str, now: datetime.datetime) -> str | None:
-    if (match := _GLANCE.fullmatch(path)) is not None:
-        return page.glance(connection, now, int(match[1] or 1))
+    if path == "/":
+        return page.glance(connection, now)
     if (match := _AIRCRAFT.fullmatch(path)) is not None:
         return page.aircraft(connection, match[1], now)
     return None
@@ -134,7 +86,8 @@ class Server:
                 "page: whoever listens on the network can read its password: put a proxy with https before it"
             )
         self._engine = engine_of(database, reads_only=True)
-        self._pages = Renderer(self._engine)
+        # Rendering is work for the processor: at once, 20 of them would take 20 times as long each, and as much memory.
+        self._thread = ThreadPoolExecutor(1, "fleet-pages")
         self._app = Starlette(
             routes=[Route("/{path:path}", self._page)], middleware=[Middleware(_Door, password=password)]
         )
@@ -151,7 +104,7 @@ class Server:
 
     async def _serve(self) -> str:
         try:
-            async with listening(self._app, self._host, self._port, _HEADERS) as self._port:
+            async with listening(self._app, self._host, self._port) as self._port:
                 self._reconnection.up(self.url)
                 never: asyncio.Future[str] = asyncio.get_running_loop().create_future()
                 return await never
@@ -160,9 +113,13 @@ class Server:
         finally:
             self._engine.dispose()
 
+    def _rendered(self, path: str) -> str | None:
+        with self._engine.begin() as connection:
+            return _page_at(connection, path, datetime.datetime.now(tz=datetime.UTC))
+
     async def _page(self, request: Request) -> Response:
         try:
-            found = await self._pages.get(request.url.path)
+            found = await asyncio.get_running_loop().run_in_executor(self._thread, self._rendered, request.url.path)
         except sa.exc.SQLAlchemyError as error:
             logger.warning("page: the database cannot be read: %s", why(error))
             words = "the database cannot be read at the moment; the collector's log says why"

@@ -30,8 +30,8 @@ from companion.fleet.contract import (
     read_item,
     read_key,
 )
-from companion.fleet.database import OF_THE_DATABASE, OF_THE_ITEM, engine_of, why
 from companion.fleet.judgement import judged
+from companion.fleet.schema import OF_THE_DATABASE, OF_THE_ITEM, engine_of, why
 from companion.mqtt.client import Incoming
 
 logger = logging.getLogger(__name__)

@@ -17,7 +17,14 @@ from uvicorn.config import Config
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
-Headers = tuple[tuple[str, str], ...]
+HEADERS: Final = (
+    ("X-Content-Type-Options", "nosniff"),
+    ("X-Frame-Options", "DENY"),
+    ("Referrer-Policy", "no-referrer"),
+    ("Cross-Origin-Resource-Policy", "same-origin"),
+    ("Cache-Control", "no-store"),
+)
+"""Headers of every answer."""
 
 ANSWERED_WITHIN_S: Final = 20.0
 """Request, work and answer together; an action takes 10 s at most."""
@@ -78,8 +85,8 @@ class Connection(H11Protocol):
 
 
 @contextlib.asynccontextmanager
-async def listening(app: ASGIApp, host: str, port: int, headers: Headers) -> AsyncIterator[int]:
-    """Serve the application, with `headers` on every answer; yield the port.
+async def listening(app: ASGIApp, host: str, port: int, *more: tuple[str, str]) -> AsyncIterator[int]:
+    """Serve the application, with `more` headers on every answer; yield the port.
 
     Raises:
         OSError: the address cannot be used.
@@ -96,7 +103,7 @@ async def listening(app: ASGIApp, host: str, port: int, headers: Headers) -> Asy
         access_log=False,
         proxy_headers=False,
         server_header=False,
-        headers=[("Connection", "close"), *headers],
+        headers=[("Connection", "close"), *HEADERS, *more],
         h11_max_incomplete_event_size=MAX_HEAD_BYTES,
     )
     config.load()

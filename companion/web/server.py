@@ -53,7 +53,7 @@ class Page:
                 self.access = Access(kept_token(self._directory), handed_out=False)
             self._site = PageRoutes(self.access, self._ask, self._viewers, self._html)
             headers = _security_headers(self._html)
-            async with listening(self._site.app, self._host, self._port, headers) as self._port:
+            async with listening(self._site.app, self._host, self._port, *headers) as self._port:
                 self._reconnection.up(self.url)
                 await self._viewers.run()
         except OSError as error:
@@ -101,12 +101,4 @@ def _security_headers(html: bytes) -> tuple[tuple[str, str], ...]:
         f"default-src 'none'; script-src {hashes(b'script')}; style-src {hashes(b'style')}; connect-src 'self'; "
         "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     )
-    return (
-        ("Content-Security-Policy", policy),
-        ("X-Content-Type-Options", "nosniff"),
-        ("X-Frame-Options", "DENY"),
-        ("Referrer-Policy", "no-referrer"),
-        ("Cross-Origin-Resource-Policy", "same-origin"),
-        ("Cross-Origin-Opener-Policy", "same-origin"),
-        ("Cache-Control", "no-store"),
-    )
+    return ("Content-Security-Policy", policy), ("Cross-Origin-Opener-Policy", "same-origin")

@@ -71,8 +71,7 @@ def test_names_and_reasons_of_aircraft_are_no_markup(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-def test_who_lies_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.fleet.server.FRESH_S", 0.0)
+def test_who_lies_is_named(tmp_path: Path) -> None:
     liar, other = Aircraft(1), Aircraft(2)
     other.calibrate(NOW)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
-from companion.fleet.database import engine_of
+from companion.fleet.schema import engine_of
 from companion.fleet.store import Store
 from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft

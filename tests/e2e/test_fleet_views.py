@@ -14,7 +14,7 @@ import sqlalchemy as sa
 
 from companion.estimation.records.flight_record import Drift, Flight, ImuFlight, KeptFlight, Split, Stages, Term
 from companion.fleet import schema
-from companion.fleet.database import engine_of
+from companion.fleet.schema import engine_of
 from companion.fleet.store import Store
 from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft

@@ -17,7 +17,7 @@ import sqlalchemy as sa
 
 from companion.fleet import schema
 from companion.fleet.collector import stop
-from companion.fleet.database import engine_of
+from companion.fleet.schema import engine_of
 from companion.fleet.server import Server
 from companion.fleet.store import Store
 from companion.mqtt.client import Incoming

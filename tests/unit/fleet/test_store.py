@@ -18,7 +18,7 @@ import sqlalchemy as sa
 from companion.errors import CompanionError, LinkError, StorageError
 from companion.fleet import contract, schema
 from companion.fleet.contract import MOST_RANGES, answers, ranges
-from companion.fleet.database import url_of
+from companion.fleet.schema import url_of
 from companion.fleet.store import BatchResult, Store
 from companion.mqtt.client import Incoming
 from sim.fleet.aircraft import Aircraft
