@@ -15,6 +15,7 @@ import msgspec
 
 from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.estimation.records.flight_record import KeptFlight
+from companion.samples import TRIADS
 
 FORMAT_VERSION: Final = 1
 MOST_RANGES: Final = 256
@@ -86,15 +87,10 @@ class _Found(msgspec.Struct, frozen=True):
     measured_m_s2: _Axes = None
 
 
-class _Prior(msgspec.Struct, frozen=True):
-    gyro: _Found | None = None
-    accel: _Found | None = None
-
-
 class _Imu(msgspec.Struct, frozen=True):
     name: Annotated[str, msgspec.Meta(max_length=64)]
     samples: Annotated[int, msgspec.Meta(ge=0, le=MOST_SEQUENCE)] | None = None
-    prior: _Prior | None = None
+    prior: dict[str, _Found | None] | None = None
     written: dict[str, msgspec.Raw] = {}
     temperature_degc: _Number | None = None
     held_back: list[_Word] = []
@@ -139,8 +135,7 @@ def _calibration(body: bytes) -> Rows:
     for imu in {imu.name: imu for imu in told.imus}.values():
         about = {"imu": imu.name} | {name: getattr(imu, name) for name in _ABOUT}
         # Biases before earlier power-ups were weighed in; None: none were.
-        prior = imu.prior or _Prior()
-        gyro, accel = prior.gyro or _Found(), prior.accel or _Found()
+        gyro, accel = ((imu.prior or {}).get(triad) or _Found() for triad in TRIADS)
         triads = {name: getattr(imu, name) for name in _TRIADS}
         triads |= {"gyro_read_rad_s": gyro.measured_rad_s, "accel_read_m_s2": accel.measured_m_s2}
         for number, axis in enumerate("xyz"):

@@ -39,21 +39,6 @@ SELECT a.aircraft, a.name, a.heard_at,
             ORDER BY o.armed_at DESC LIMIT 1)) AS armed_sequence
 FROM aircraft a;
 
--- in_force: The latest calibration of each aircraft that stands
-SELECT c.aircraft, c.epoch, c.sequence, c.started_at, c.held_back
-FROM latest l CROSS JOIN calibrations c
-WHERE c.aircraft = l.aircraft AND c.epoch = l.force_epoch AND c.sequence = l.force_sequence;
-
--- latest_tries: The latest calibration of each aircraft, however it ended
-SELECT c.aircraft, c.started_at, c.state, c.reason
-FROM latest l CROSS JOIN calibrations c
-WHERE c.aircraft = l.aircraft AND c.epoch = l.tried_epoch AND c.sequence = l.tried_sequence;
-
--- latest_armings: The latest arming of each aircraft
-SELECT r.aircraft, r.armed_at, r.state, r.reason
-FROM latest l CROSS JOIN armings r
-WHERE r.aircraft = l.aircraft AND r.epoch = l.armed_epoch AND r.sequence = l.armed_sequence;
-
 -- fleet: A row for each aircraft: what is in force, how the latest calibration and arming went, when it was heard
 SELECT l.aircraft, l.name, l.heard_at, f.started_at AS calibrated_at, f.held_back,
        t.started_at AS tried_at, t.state AS tried_state, t.reason AS tried_reason,

@@ -13,7 +13,7 @@ import msgspec
 from companion.errors import StorageError
 from companion.estimation.records.record import ArmingRecord, ImuRecord, Outcome, Record, outcome_word
 from companion.physics.units import UNITS
-from companion.report.markup import Child, Markup, cell, join, number, row, tag
+from companion.report.markup import Child, Markup, join, row, tag
 from companion.report.page import (
     AXES,
     MAX_IMUS,
@@ -186,14 +186,13 @@ def _triad(imu: ImuRecord, triad: Triad) -> Markup:
     rows = []
     for k in range(3):
         value, sigma = with_sigma(bias[k], use[k], unit)
-        of, axis = f"{imu.name}.{triad}", AXES[k]
         rows.append(
             row(
-                axis,
-                cell(f"{of}.bias.{axis}", value),
-                cell(f"{of}.sigma_use.{axis}", "±", sigma),
-                cell(f"{of}.sigma_stat.{axis}", with_sigma(0.0, stat[k], unit)[1]),
-                cell(f"{of}.residual.{axis}", with_sigma(left[k], use[k], unit)[0]) if left else None,
+                AXES[k],
+                value,
+                f"±{sigma}",
+                with_sigma(0.0, stat[k], unit)[1],
+                with_sigma(left[k], use[k], unit)[0] if left else None,
             )
         )
     heads = ["", "bias", "σ use", "σ stat", *(["residual"] if left else [])]
@@ -223,10 +222,7 @@ def _written(record: Record) -> Markup | None:
             rows += [
                 row(head, class_="name"),
                 row(
-                    *(
-                        cell(f"{name}.{words.replace(' ', '_')}", tag("small", words), _setting(value))
-                        for words, value in values
-                    ),
+                    *(tag("td", tag("small", words), _setting(value)) for words, value in values),
                     class_="values",
                 ),
             ]
@@ -235,8 +231,8 @@ def _written(record: Record) -> Markup | None:
     return tag("section", *parts)
 
 
-def _setting(value: float | None) -> Markup:
-    return tag("span", "unknown") if value is None else number(value, ".6g")
+def _setting(value: float | None) -> str:
+    return tag("span", "unknown") if value is None else f"{value:.6g}"
 
 
 def _pose(record: Record) -> Markup:
@@ -246,26 +242,20 @@ def _pose(record: Record) -> Markup:
         parts.append(card("", "Not determined."))
     else:
         angles = (
-            ("pitch, nose up", "theta", pose.theta_deg, pose.sigma_deg.theta, "+"),
-            ("roll, right side down", "gamma", pose.gamma_deg, pose.sigma_deg.gamma, "+"),
-            ("heading, true", "psi", pose.psi_deg, pose.sigma_deg.psi, ""),
+            ("pitch, nose up", pose.theta_deg, pose.sigma_deg.theta, "+"),
+            ("roll, right side down", pose.gamma_deg, pose.sigma_deg.gamma, "+"),
+            ("heading, true", pose.psi_deg, pose.sigma_deg.psi, ""),
         )
-        rows = (
-            row(words, cell(f"pose.{key}", _angle(value, sigma, sign))) for words, key, value, sigma, sign in angles
-        )
-        parts.append(tag("table", *rows))
+        parts.append(tag("table", *(row(words, _angle(value, sigma, sign)) for words, value, sigma, sign in angles)))
     if record.magnetic is not None:
         parts.append(tag("p", f"Compass: {record.magnetic.in_words()}."))
     return tag("section", *parts)
 
 
-def _angle(value: float | None, sigma: float | None, sign: str) -> Markup:
+def _angle(value: float | None, sigma: float | None, sign: str) -> str:
     if value is None:
-        return join("unknown")
-    if sigma is None:
-        return join(number(value, f"{sign}.2f"), " deg")
-    shown, width = with_sigma(value, sigma, 1.0, sign)
-    return join(shown, " ± ", width, " deg")
+        return "unknown"
+    return f"{value:{sign}.2f} deg" if sigma is None else f"{' ± '.join(with_sigma(value, sigma, 1.0, sign))} deg"
 
 
 def _drift(material: Material) -> Markup:

@@ -57,13 +57,3 @@ def tag(element: str, /, *children: Child, **attributes: str | float | None) -> 
 def row(*cells: Child, class_: str | None = None) -> Markup:
     """A row of a table, of cells, and of words to be put into one; None is no cell."""
     return tag("tr", *(one if isinstance(one, Markup | None) else tag("td", one) for one in cells), class_=class_)
-
-
-def cell(key: str, *children: Child) -> Markup:
-    """A cell with a key for programs."""
-    return tag("td", *children, data_key=key)
-
-
-def number(value: float, form: str, unit_value: float | None = None) -> Markup:
-    """A figure for people and its exact value for programs: <data value="…">; people see `unit_value`, if given."""
-    return tag("data", format(value if unit_value is None else unit_value, form), value=repr(float(value)))

@@ -15,7 +15,7 @@ from companion import __version__
 from companion.estimation.records.record import Record
 from companion.physics.units import UNITS
 from companion.report import svg
-from companion.report.markup import Child, Markup, join, number, tag
+from companion.report.markup import Child, Markup, join, tag
 from companion.samples import Triad, Vector
 
 NAMES: Final[Mapping[Triad, str]] = {"gyro": "Gyro", "accel": "Accelerometer"}
@@ -76,11 +76,11 @@ def damaged(problems: Sequence[str]) -> Markup | None:
     )
 
 
-def with_sigma(value: float, sigma: float, unit: float, sign: str = "+") -> tuple[Markup, Markup]:
-    """A figure and its sigma, written to the second digit of sigma."""
+def with_sigma(value: float, sigma: float, unit: float, sign: str = "+") -> tuple[str, str]:
+    """Write a figure and its sigma in a unit, to the second digit of sigma."""
     shown = abs(sigma / unit)
     digits = min(max(1 - math.floor(math.log10(shown)), 0), 5) if 0 < shown < 1e9 else 1
-    return number(value, f"{sign}.{digits}f", value / unit), number(sigma, f".{digits}f", sigma / unit)
+    return f"{value / unit:{sign}.{digits}f}", f"{sigma / unit:.{digits}f}"
 
 
 class PlotPoint(msgspec.Struct, frozen=True):

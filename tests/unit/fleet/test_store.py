@@ -135,10 +135,10 @@ def test_a_clock_that_is_wrong_by_a_year_changes_no_order(store: Store, database
     for days in (0, 365, 1, -365):
         last = one.calibrate(NOW + datetime.timedelta(days=days))
     store.take([*items_of(one), hello_of(one)])
-    assert query(database, "SELECT sequence FROM in_force") == [(last,)]
+    assert query(database, "SELECT force_sequence FROM latest") == [(last,)]
     one.undo(NOW)
     store.take(items_of(one))
-    assert query(database, "SELECT sequence FROM in_force") == [(3,)]
+    assert query(database, "SELECT force_sequence FROM latest") == [(3,)]
 
 
 def test_told_again_under_a_new_epoch_is_one_thing(store: Store, database: str) -> None:

@@ -35,9 +35,8 @@ class Page(HTMLParser):
         self.open: list[str] = []
         self.tags: list[tuple[str, dict[str, str | None]]] = []
         self.words: list[str] = []
-        self.shown: dict[str, str] = {}
-        self.exact: dict[str, list[float]] = {}
-        self._key: str | None = None
+        self.rows: list[list[str]] = []
+        """The cells of each row of a table."""
         self.feed(content)
         self.close()
         assert self.open == []
@@ -51,26 +50,23 @@ class Page(HTMLParser):
         if tag in VOID:
             return
         self.open.append(tag)
-        held = dict(attrs)
-        if held.get("data-key"):
-            self._key = held["data-key"]
-        if tag == "data" and self._key is not None:
-            self.exact.setdefault(self._key, []).append(float(held["value"] or "nan"))
+        if tag == "tr":
+            self.rows.append([])
+        if tag == "td":
+            self.rows[-1].append("")
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
-        if tag == "td":
-            self._key = None
 
     def handle_data(self, data: str) -> None:
         if self.open and self.open[-1] == "style":
             return
         self.words.append(data)
-        if self._key is not None:
-            self.shown[self._key] = self.shown.get(self._key, "") + data
+        if "td" in self.open:
+            self.rows[-1][-1] += data
 
 
 def _calibration(folder: Path, wanted: int | None = None) -> str:
@@ -81,27 +77,31 @@ def test_the_figures_are_those_of_the_record(tmp_path: Path) -> None:
     one = record()
     RecordStore(tmp_path).save(one)
     found = Page(_calibration(tmp_path))
+    axes = (row for row in found.rows if row[:1] in (["x"], ["y"], ["z"]))
     for imu in one.imus:
-        for triad, unit, columns in (
-            ("gyro", DEG_H, (imu.gyro_bias_rad_s, imu.gyro_sigma_use_rad_s, imu.gyro_sigma_stat_rad_s)),
-            ("accel", MG, (imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, imu.accel_sigma_stat_m_s2)),
+        for unit, columns in (
+            (DEG_H, (imu.gyro_bias_rad_s, imu.gyro_sigma_use_rad_s, imu.gyro_sigma_stat_rad_s)),
+            (MG, (imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, imu.accel_sigma_stat_m_s2)),
         ):
-            for column, values in zip(("bias", "sigma_use", "sigma_stat"), columns, strict=True):
-                assert values is not None
-                for axis, value in zip("xyz", values, strict=True):
-                    key = f"{imu.name}.{triad}.{column}.{axis}"
-                    assert found.exact[key] == [value]
-                    shown = float(found.shown[key].strip("±"))
-                    assert shown == pytest.approx(value / unit, rel=0.06 if "sigma" in column else 0.02)
+            for axis in range(3):
+                shown = [float(cell.strip("±")) for cell in next(axes)[1:4]]
+                for column, values in enumerate(columns):
+                    assert values is not None
+                    assert shown[column] == pytest.approx(values[axis] / unit, rel=0.06 if column else 0.02)
     for parameter, written in one.imus[0].written.items():
-        assert found.exact[f"{parameter}.after"] == [written.after]
-        assert found.exact.get(f"{parameter}.before", [None]) == [written.before]
-        assert float(found.shown[f"{parameter}.after"].removeprefix("after")) == pytest.approx(written.after, rel=1e-5)
+        at = next(k for k, row in enumerate(found.rows) if row and row[0].startswith(f"{parameter}: "))
+        before, after, _ = found.rows[at + 1]
+        assert before == ("beforeunknown" if written.before is None else f"before{written.before:.6g}")
+        assert after == f"after{written.after:.6g}"
         assert f"{parameter}: {written.outcome}" in found.text.replace(" :", ":")
     assert "before unknown" in found.text
     assert one.pose is not None
-    assert found.exact["pose.theta"] == [one.pose.theta_deg, one.pose.sigma_deg.theta]
-    assert found.exact["pose.psi"] == [one.pose.psi_deg, one.pose.sigma_deg.psi]
+    angles = {row[0]: row[1].removesuffix(" deg").split(" ± ") for row in found.rows if row and " deg" in row[-1]}
+    for words, *figures in (
+        ("pitch, nose up", one.pose.theta_deg, one.pose.sigma_deg.theta),
+        ("heading, true", one.pose.psi_deg, one.pose.sigma_deg.psi),
+    ):
+        assert [float(each) for each in angles[words]] == pytest.approx(figures, rel=0.06)
     assert "DONE" in found.text
     assert one.reason in found.text
 
@@ -149,7 +149,7 @@ def test_nothing_from_a_file_becomes_a_tag(tmp_path: Path) -> None:
         found = Page(content)
         assert {tag for tag, _ in found.tags} <= {
             "html", "head", "meta", "title", "style", "body", "h1", "h2", "h3", "p", "span", "div", "section", "strong",
-            "small", "ul", "li", "table", "tr", "th", "td", "br", "data", "figure", "figcaption", "details", "summary",
+            "small", "ul", "li", "table", "tr", "th", "td", "br", "figure", "figcaption", "details", "summary",
             "svg", "path", "rect", "text", "circle",
         }  # fmt: skip
         assert not any(name.startswith("on") for _, held in found.tags for name in held)
