@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from companion.autopilot.firmware.ardupilot import ArduPilot
 from companion.lab.flight.inertial import joined
 from companion.lab.flight.log import Boot, BootMessages, Estimated, FlownImu, changes, starts
-from companion.lab.logs.dataflash import dataflash
+from companion.lab.logs.autopilot_logs import dataflash
 from companion.physics.frames import Floats
 from companion.physics.units import DEG
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from companion.autopilot.parameters.reading import FirmwareName
 from companion.lab.flight.inertial import Navigation
-from companion.lab.logs.log import DROPOUTS, PARAMETERS, Block
+from companion.lab.logs.autopilot_logs import DROPOUTS, PARAMETERS, Block
 from companion.physics.frames import Floats
 
 _MOST_PARAMETERS: Final = 1 << 16

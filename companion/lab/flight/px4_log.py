@@ -11,8 +11,7 @@ import numpy as np
 from companion.autopilot.firmware.px4 import PX4
 from companion.lab.flight.inertial import Navigation, joined
 from companion.lab.flight.log import Boot, BootMessages, Estimated, FlownImu, ascending, changes, starts
-from companion.lab.logs.log import US
-from companion.lab.logs.ulog import ulog
+from companion.lab.logs.autopilot_logs import US, ulog
 from companion.physics.frames import Floats
 
 

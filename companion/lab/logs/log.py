@@ -1,10 +1,10 @@
-"""Logs as numbers, whatever kind of file they came from: one IMU at rest, or blocks of an autopilot's messages."""
+"""Readings of one IMU at rest, whatever kind of file they came from."""
 
 from __future__ import annotations
 
 import datetime
 import itertools
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -15,22 +15,6 @@ from companion.physics.frames import Floats
 NAME: Final = "imu"
 
 LAST_S: Final = 1e11
-US: Final = 1e-6
-PARAMETERS: Final = "parameters"
-DROPOUTS: Final = "dropouts"
-"""Name of the blocks with the times in which the autopilot could not write, ms."""
-
-
-class Block(NamedTuple):
-    """Messages of one kind and instance, in the order of the file."""
-
-    name: str
-    """`PARAMETERS`: parameters of the autopilot, whatever the format calls them."""
-    instance: int
-    rows: Floats
-    """(n, 1 + fields): the autopilot's clock in s, and the fields to read; NaN: this log has no such field."""
-    texts: tuple[str, ...] = ()
-    """Names of parameters; their values are the one field."""
 
 
 class StillLog(msgspec.Struct, frozen=True, kw_only=True):

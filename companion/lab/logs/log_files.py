@@ -18,8 +18,9 @@ import numpy as np
 
 from companion.config.sections import Config
 from companion.errors import StorageError
-from companion.lab.logs import csv_log, dataflash, ulog
-from companion.lab.logs.log import DROPOUTS, LAST_S, NAME, Block, StillLog
+from companion.lab.logs import csv_log
+from companion.lab.logs.autopilot_logs import DATAFLASH_MAGIC, DROPOUTS, ULOG_MAGIC, Block, dataflash, ulog
+from companion.lab.logs.log import LAST_S, NAME, StillLog
 from companion.lab.logs.playback import UNUSABLE, Playback, config_of
 from companion.lab.logs.recording import Head, Recording, is_text
 from companion.physics.frames import Floats
@@ -172,15 +173,15 @@ def _goes_on(before: StillLog, log: StillLog) -> bool:
 def reader_of(path: Path) -> Callable[[Path], list[StillLog]] | None:
     """Return the reader of an autopilot's log; None: the file is none."""
     with path.open("rb") as file:
-        head = file.read(len(ulog.MAGIC))
-    if head.startswith(ulog.MAGIC):
+        head = file.read(len(ULOG_MAGIC))
+    if head.startswith(ULOG_MAGIC):
         return read_ulog
-    return read_dataflash if head.startswith(dataflash.MAGIC) else None
+    return read_dataflash if head.startswith(DATAFLASH_MAGIC) else None
 
 
 def read_ulog(path: Path) -> list[StillLog]:
     """Read the IMUs of a PX4 log: sensor_combined, which PX4 flies by, and pairs of sensor_gyro and sensor_accel."""
-    data = _joined_blocks(ulog.ulog(path, _TOPICS))
+    data = _joined_blocks(ulog(path, _TOPICS))
     dropouts = len(data.get((DROPOUTS, 0), ()))
     notes = (f"gaps in it, in which PX4 could not write: {dropouts}",) if dropouts else ()
     logs: list[StillLog] = []
@@ -199,7 +200,7 @@ def read_ulog(path: Path) -> list[StillLog]:
 
 def read_dataflash(path: Path) -> list[StillLog]:
     """Read the IMUs of an ArduPilot log, from its IMU messages."""
-    data = _joined_blocks(dataflash.dataflash(path, {"IMU": ("I", _FIELDS)}))
+    data = _joined_blocks(dataflash(path, {"IMU": ("I", _FIELDS)}))
     logs: list[StillLog] = []
     for (_, instance), rows in sorted((key, rows) for key, rows in data.items() if key[0] == "IMU"):
         logs += _log(path, f"imu{instance}", rows[:, 0], rows[:, 1:7], rows[:, 7], (_CORRECTED,))

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from pymavlink.DFReader import DFReader_binary
 
-from companion.lab.logs.dataflash import dataflash
-from companion.lab.logs.log import PARAMETERS, Block
+from companion.lab.logs.autopilot_logs import PARAMETERS, Block, dataflash
 from tests.support import flown
 from tests.support.made_noise import Floats
 
@@ -34,7 +33,7 @@ def parameters_of(blocks: list[Block | None]) -> list[tuple[float, str, float]]:
 
 @WHERE
 def test_dataflash_is_read_as_pymavlink_reads_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, piece: int) -> None:
-    monkeypatch.setattr("companion.lab.logs.dataflash._PIECE", piece)
+    monkeypatch.setattr("companion.lab.logs.autopilot_logs._PIECE", piece)
     flight = flown.fly(seconds=70.0, rate_hz=20.0)
     path = flown.dataflash(tmp_path / "log.bin", flown.messages(flight, flown.parameters(), from_s=55.0))
     fields = {
