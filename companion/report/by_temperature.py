@@ -7,8 +7,7 @@ from typing import Final
 
 from companion.estimation.solution.by_temperature import ByTemperature
 from companion.physics.units import UNITS
-from companion.report import svg
-from companion.report.markup import Child, Markup, tag
+from companion.report.markup import Child, Markup, Plot, linear, tag
 from companion.report.page import AXES, CLASSES, NAMES
 from companion.samples import TRIADS, Triad, Vector
 
@@ -47,16 +46,16 @@ def _figure(imu: ByTemperature, triad: Triad) -> Markup | None:
     if not gyro:
         rows = [(row.degc, row.accel_mg, row.sigma_mg) for row in imu.accel_curve]
     now = imu.now if gyro else None
-    across = svg.linear([*(degc for degc, _, _ in seen), *([now.degc] if now else [])], least=_LEAST_K)
+    across = linear([*(degc for degc, _, _ in seen), *([now.degc] if now else [])], least=_LEAST_K)
     plots = []
     for axis in range(3):
         class_ = CLASSES[axis]
         curve = [(degc, bias[axis], 2.0 * sigma[axis]) for degc, bias, sigma in rows]
         dots = [(degc, bias[axis], sigma[axis]) for degc, bias, sigma in seen]
         ends = [value + sign * by for _, value, by in (*dots, *curve) for sign in (-1.0, 1.0)]
-        plot = svg.Plot(
+        plot = Plot(
             across,
-            svg.linear([*ends, *([now.gyro_deg_h[axis]] if now else [])], ticks=3),
+            linear([*ends, *([now.gyro_deg_h[axis]] if now else [])], ticks=3),
             name=f"IMU {imu.imu}, {NAMES[triad].lower()} {AXES[axis]}: bias by temperature",
             told=f"{len(dots)} points, {min(b for _, b, _ in dots):+.1f} to {max(b for _, b, _ in dots):+.1f}.",
             height=110.0,

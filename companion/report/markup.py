@@ -1,14 +1,20 @@
-"""HTML built from parts that are escaped unless they are markup already.
+"""HTML and plots in SVG, built from parts that are escaped unless they are markup already.
 
 Names, reasons and warnings come from files and from the autopilot: nothing of them may become a tag, and no invisible
-character may turn the reading direction of what stands beside it.
+character may turn the reading direction of what stands beside it. Plots are drawn in classes (`sx`, `sy`, `sz`, ...):
+colours, dark and print are the style sheet's, and series differ by the shape of their markers as well.
 """
 
 from __future__ import annotations
 
+import datetime
 import html
+import math
 import re
+from collections.abc import Sequence
 from typing import Final
+
+import msgspec
 
 MAX_TEXT: Final = 600
 """The most characters of one piece of text: a page stays bounded whatever a file holds."""
@@ -16,6 +22,14 @@ MAX_TEXT: Final = 600
 # Controls (but line breaks and tabs), direction marks and overrides, zero-width characters, lone surrogates.
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
 _VOID: Final = frozenset({"meta", "path", "line", "rect", "circle", "br"})
+
+WIDTH: Final = 360.0
+_LEFT, _RIGHT, _TOP, _TITLE = 58.0, 12.0, 8.0, 20.0
+_TICKS_HEIGHT, _LABEL_HEIGHT = 20.0, 16.0
+_MARK: Final = 3.6
+_MOST: Final = 1e12
+
+Pair = tuple[float, float]
 
 
 class Markup(str):
@@ -57,3 +71,179 @@ def tag(element: str, /, *children: Child, **attributes: str | float | None) -> 
 def row(*cells: Child, class_: str | None = None) -> Markup:
     """A row of a table, of cells, and of words to be put into one; None is no cell."""
     return tag("tr", *(one if isinstance(one, Markup | None) else tag("td", one) for one in cells), class_=class_)
+
+
+# --- plots
+
+
+class Axis(msgspec.Struct, frozen=True):
+    """A range of values, with the places that are written at it."""
+
+    low: float
+    high: float
+    ticks: tuple[tuple[float, str], ...]
+
+    def share(self, value: float) -> float:
+        """0 at the low end, 1 at the high end; what lies outside is moved to the end."""
+        return min(max((value - self.low) / (self.high - self.low), 0.0), 1.0)
+
+
+def linear(values: Sequence[float], *, ticks: int = 4, least: float = 0.0) -> Axis:
+    """A linear axis around the values, `least` wide at least: a scatter of nothing is not blown up to fill the plot."""
+    known = [value for value in values if abs(value) < _MOST] or [0.0]
+    low, high = min(known), max(known)
+    width = max(high - low, least, 1e-4 * max(abs(low), abs(high)), 1e-9)
+    middle = (low + high) / 2.0
+    low, high = middle - 0.56 * width, middle + 0.56 * width
+    step = _nice((high - low) / ticks)
+    if step > (high - low) / 2.0:  # there might be one tick only, from which nobody reads a scale
+        step = _nice(step / 2.6)
+    digits = max(0, -math.floor(math.log10(step) + 1e-9))
+    first = math.ceil(low / step - 1e-9)
+    places = [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+    return Axis(low, high, tuple((place, f"{place:.{digits}f}") for place in places))
+
+
+def in_order(labels: Sequence[str]) -> Axis:
+    """Make an axis on which each label has the place of its number, counted from 0; at most four are written."""
+    every = math.ceil(len(labels) / 4)
+    ticks = tuple((float(k), labels[k]) for k in range(0, len(labels), every))
+    return Axis(-0.5, len(labels) - 0.5, ticks)
+
+
+def dates(values: Sequence[float]) -> Axis:
+    """Make an axis of UTC times, in seconds since 1970, in their order; within one day the labels are times of day."""
+    moments = [datetime.datetime.fromtimestamp(value, tz=datetime.UTC) for value in values]
+    form = "%H:%M" if len({each.date() for each in moments}) == 1 else "%-d %b %y"
+    return in_order([each.strftime(form) for each in moments])
+
+
+def _nice(step: float) -> float:
+    power = 10.0 ** math.floor(math.log10(step))
+    return power * next(mark for mark in (1.0, 2.0, 5.0, 10.0) if step <= mark * power * 1.25)
+
+
+class Plot:
+    """One frame with axes, of that height, the whole 360 wide; what is drawn first lies below.
+
+    Without an `x_label` no ticks are written either, for a plot with another one below it; empty: only these. `name`
+    is what a screen reader says, `told` what it shows, in words.
+    """
+
+    def __init__(
+        self,
+        x: Axis,
+        y: Axis,
+        *,
+        name: str,
+        told: str = "",
+        height: float = 96.0,
+        x_label: str | None = None,
+        y_label: str = "",
+    ) -> None:
+        self._top = _TOP + (_TITLE if y_label else 0.0)
+        self._x, self._y, self._name, self._told, self._height = x, y, name, told, height
+        self._x_label, self._y_label = x_label, y_label
+        self._below: list[Markup] = []
+        self._parts: list[Markup] = []
+
+    def at(self, x: float, y: float) -> Pair:
+        """Return the place of a point in the picture."""
+        across = _LEFT + self._x.share(x) * (WIDTH - _LEFT - _RIGHT)
+        return across, self._top + (1.0 - self._y.share(y)) * self._height
+
+    def line(self, points: Sequence[Pair], class_: str) -> None:
+        """Join points."""
+        if len(points) > 1:
+            self._below.append(_path("M" + "L".join(_xy(*self.at(*point)) for point in points), class_))
+
+    def area(self, ends: Sequence[tuple[float, float, float]], class_: str) -> None:
+        """Fill what lies between two lines, of (x, low, high)."""
+        if len(ends) > 1:
+            around = [*((x, low) for x, low, _ in ends), *((x, high) for x, _, high in reversed(ends))]
+            self._below.append(_path("M" + "L".join(_xy(*self.at(*point)) for point in around) + "z", class_))
+
+    def upright(self, x: float, class_: str) -> None:
+        """A line from below to above."""
+        self._below.append(_path(f"M{_xy(*self.at(x, self._y.low))}V{_n(self._top)}", class_))
+
+    def points(self, points: Sequence[Pair], class_: str, spans: Sequence[Pair]) -> None:
+        """Markers: `sy` (squares), `sz` (triangles) or others (circles), each with an upright bar over its span."""
+        bars: list[str] = []
+        for (x, _), (low, high) in zip(points, spans, strict=True):
+            across, bottom = self.at(x, low)
+            bars.append(f"M{_n(across)} {_n(bottom)}V{_n(self.at(x, high)[1])}")
+        self._parts.append(_path("".join(bars), f"bar {class_}"))
+        if class_ not in {"sy", "sz"}:
+            # A round end of a line without length: a quarter of the characters that a circle takes.
+            self._parts.append(_path("".join(f"M{_xy(*self.at(*point))}h.01" for point in points), f"dot {class_}"))
+            return
+        marker = _square if class_ == "sy" else _triangle
+        self._parts.append(_path("".join(marker(*self.at(*point)) for point in points), f"mark {class_}"))
+
+    def ring(self, x: float, y: float) -> None:
+        """Draw a ring around a point."""
+        across, height = self.at(x, y)
+        self._parts.append(tag("circle", cx=_n(across), cy=_n(height), r=8, class_="ring"))
+
+    def svg(self) -> Markup:
+        """The element."""
+        bottom = self._top + self._height
+        below = 6.0 if self._x_label is None else _TICKS_HEIGHT + _LABEL_HEIGHT * bool(self._x_label)
+        grid: list[Markup] = []
+        for place, label in self._x.ticks:
+            across = self.at(place, self._y.low)[0]
+            grid.append(_path(f"M{_n(across)} {_n(self._top)}V{_n(bottom)}", "grid"))
+            if self._x_label is not None:
+                grid.append(tag("text", label, x=_n(across), y=_n(bottom + 15.0), class_="mid"))
+        for place, label in self._y.ticks:
+            height = self.at(self._x.low, place)[1]
+            grid.append(_path(f"M{_n(_LEFT)} {_n(height)}H{_n(WIDTH - _RIGHT)}", "grid"))
+            grid.append(tag("text", label, x=_n(_LEFT - 6.0), y=_n(height + 4.5), class_="end"))
+        frame = tag(
+            "rect", x=_n(_LEFT), y=_n(self._top), width=_n(WIDTH - _LEFT - _RIGHT), height=_n(self._height),
+            class_="frame",
+        )  # fmt: skip
+        labels: list[Markup] = []
+        if self._x_label:
+            middle = (_LEFT + WIDTH - _RIGHT) / 2.0
+            labels.append(tag("text", self._x_label, x=_n(middle), y=_n(bottom + 31.0), class_="mid label"))
+        if self._y_label:
+            labels.append(tag("text", self._y_label, x="0", y=_n(self._top - 8.0), class_="label"))
+        return tag(
+            "svg",
+            tag("title", self._name),
+            tag("desc", self._told) if self._told else None,
+            *grid,
+            frame,
+            *self._below,
+            *self._parts,
+            *labels,
+            viewBox=f"0 0 {_n(WIDTH)} {_n(bottom + below)}",
+            role="img",
+            class_="plot",
+        )
+
+
+def _path(course: str, class_: str) -> Markup:
+    """A path; its course is numbers of our own, of any length."""
+    return tag("path", d=Markup(course), class_=class_)
+
+
+def _square(x: float, y: float) -> str:
+    side = 1.8 * _MARK
+    return f"M{_xy(x - side / 2, y - side / 2)}h{_n(side)}v{_n(side)}h{_n(-side)}z"
+
+
+def _triangle(x: float, y: float) -> str:
+    return f"M{_xy(x, y - 1.25 * _MARK)}l{_xy(1.15 * _MARK, 2.1 * _MARK)}h{_n(-2.3 * _MARK)}z"
+
+
+def _xy(x: float, y: float) -> str:
+    return f"{_n(x)} {_n(y)}"
+
+
+def _n(value: float) -> str:
+    """A tenth of a unit is a tenth of a pixel."""
+    found = f"{value:.1f}"
+    return found.removesuffix(".0") if found != "-0.0" else "0"

@@ -14,8 +14,7 @@ import msgspec
 from companion import __version__
 from companion.estimation.records.record import Record
 from companion.physics.units import UNITS
-from companion.report import svg
-from companion.report.markup import Child, Markup, join, tag
+from companion.report.markup import Child, Markup, Plot, dates, in_order, join, linear, tag
 from companion.samples import Triad, Vector
 
 NAMES: Final[Mapping[Triad, str]] = {"gyro": "Gyro", "accel": "Accelerometer"}
@@ -132,9 +131,9 @@ def drift(points: Sequence[PlotPoint], triad: Triad, *, name: str, this: int | N
     times = [point.unix_s for point in points]
     dated = [each for each in times if each is not None] if clock_is_sound(points) else []
     if dated:
-        across, label = svg.dates(dated), "time (UTC), in their order"
+        across, label = dates(dated), "time (UTC), in their order"
     else:
-        across = svg.in_order([str(point.number) for point in points])
+        across = in_order([str(point.number) for point in points])
         label = "number of the calibration (clock not sound)"
     plots: list[Markup] = []
     for axis in range(3):
@@ -142,9 +141,9 @@ def drift(points: Sequence[PlotPoint], triad: Triad, *, name: str, this: int | N
             ((point.bias[axis] - point.sigma_use[axis]) / unit, (point.bias[axis] + point.sigma_use[axis]) / unit)
             for point in points
         ]
-        plot = svg.Plot(
+        plot = Plot(
             across,
-            svg.linear([end for pair in ends for end in pair], ticks=3),
+            linear([end for pair in ends for end in pair], ticks=3),
             name=f"{name} {AXES[axis]}: bias against time",
             height=84.0,
             x_label=label if axis == 2 else None,

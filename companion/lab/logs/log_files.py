@@ -57,11 +57,14 @@ def read_logs(
         except OSError as error:
             raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
         if autopilots is not None:
-            found += autopilots(path)
+            logs = autopilots(path)
         elif text:
-            found.append(csv_log.read(path, columns, rate_hz, csv_name))
+            logs = [csv_log.read(path, columns, rate_hz, csv_name)]
         else:
-            found += _read_recording(path)
+            logs = _read_recording(path)
+        if not logs:
+            raise StorageError(f"{path}: no samples of an IMU in it")
+        found += logs
     return _joined(found)
 
 
@@ -98,8 +101,8 @@ def _read_recording(path: Path) -> list[StillLog]:
             except UNUSABLE as error:
                 raise StorageError(f"{path}: a message on {item[0]} cannot be used by this version ({error})") from None
     found = {name: each for name, each in found.items() if each.rows or each.truncated}
-    if head is None or config is None or not found:
-        raise StorageError(f"{path}: no samples of an IMU in it")
+    if head is None or config is None:
+        return []
     profiles = {imu.name: imu.profile for imu in config.imu}
     offset_s = head.offset_ns / 1e9
     logs = []
@@ -195,7 +198,7 @@ def read_ulog(path: Path) -> list[StillLog]:
             at = np.searchsorted(0.5 * (beside[1:, 0] + beside[:-1, 0]), times)
             readings = np.hstack([rows[:, 1:4], beside[at, 1:4]])
             logs += _log(path, f"sensor{instance}", times, readings, rows[:, 4], (_RAW, *notes))
-    return _some(path, logs)
+    return logs
 
 
 def read_dataflash(path: Path) -> list[StillLog]:
@@ -204,7 +207,7 @@ def read_dataflash(path: Path) -> list[StillLog]:
     logs: list[StillLog] = []
     for (_, instance), rows in sorted((key, rows) for key, rows in data.items() if key[0] == "IMU"):
         logs += _log(path, f"imu{instance}", rows[:, 0], rows[:, 1:7], rows[:, 7], (_CORRECTED,))
-    return _some(path, logs)
+    return logs
 
 
 def _joined_blocks(blocks: Iterable[Block | None]) -> dict[tuple[str, int], Floats]:
@@ -213,12 +216,6 @@ def _joined_blocks(blocks: Iterable[Block | None]) -> dict[tuple[str, int], Floa
         if block is not None and block.instance < _IMUS:
             found[block.name, block.instance].append(block.rows)
     return {key: np.concatenate(rows) for key, rows in found.items()}
-
-
-def _some(path: Path, logs: list[StillLog]) -> list[StillLog]:
-    if not logs:
-        raise StorageError(f"{path}: no samples of an IMU in it")
-    return logs
 
 
 def _log(
