@@ -61,17 +61,16 @@ async def flight(options: argparse.Namespace) -> int:
 
 def _knowledge(options: argparse.Namespace) -> tuple[Knowledge, FlightStore | None]:
     """Read what the companion has on disk, and give its store of flights; None: this user may not."""
-    from companion.lab.flight.flight import Knowledge
     from companion.storage.learned import BiasStore
     from companion.storage.records import FlightStore, RecordStore
 
     directory = storage_path(options)
     try:
-        known = Knowledge(records=RecordStore(directory).history(), biases=BiasStore(directory).all())
+        known = RecordStore(directory).history(), BiasStore(directory).all()
     except StorageError as error:
         words = "looked at without the companion's history, and not kept; sudo may help"
         print_lines(f"note: {error}: {words}", error=True)
-        return Knowledge(), None
+        return ((), {}), None
     return known, FlightStore(directory)
 
 

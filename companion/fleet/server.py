@@ -58,14 +58,6 @@ def read_password(path: Path) -> str:
     return found
 
 
-def _page_at(connection: sa.Connection, path: str, now: datetime.datetime) -> str | None:
-    if path == "/":
-        return page.glance(connection, now)
-    if (match := _AIRCRAFT.fullmatch(path)) is not None:
-        return page.aircraft(connection, match[1], now)
-    return None
-
-
 class Server:
     """Server of the pages at HOST:PORT, read only; `run` it as a task.
 
@@ -114,8 +106,11 @@ class Server:
             self._engine.dispose()
 
     def _rendered(self, path: str) -> str | None:
+        match, now = _AIRCRAFT.fullmatch(path), datetime.datetime.now(tz=datetime.UTC)
         with self._engine.begin() as connection:
-            return _page_at(connection, path, datetime.datetime.now(tz=datetime.UTC))
+            if path == "/":
+                return page.glance(connection, now)
+            return None if match is None else page.aircraft(connection, match[1], now)
 
     async def _page(self, request: Request) -> Response:
         try:

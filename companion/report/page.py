@@ -63,16 +63,11 @@ def moment(iso: str) -> str:
 
 
 def damaged(problems: Sequence[str]) -> Markup | None:
-    """List files that could not be read."""
-    if not problems:
-        return None
-    more = f" and {len(problems) - 10} more" if len(problems) > 10 else ""
-    return card(
-        "caution",
-        tag("p", "These files cannot be read and were skipped:"),
-        tag("ul", *(tag("li", problem) for problem in problems[:10])),
-        tag("p", f"{more.strip()}. " if more else "", "They can be removed; nothing else depends on them."),
-    )
+    """List files that could not be read, the first ten."""
+    more = [f"and {len(problems) - 10} more"] if len(problems) > 10 else []
+    lines = [tag("li", problem) for problem in (*problems[:10], *more)]
+    head = tag("p", "These files cannot be read and were skipped. They can be removed; nothing else depends on them.")
+    return card("caution", head, tag("ul", *lines)) if problems else None
 
 
 def with_sigma(value: float, sigma: float, unit: float, sign: str = "+") -> tuple[str, str]:

@@ -53,12 +53,8 @@ _SYSTEM_ID: Final = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
 """ArduPilot's up to 4.6, from 4.7 on; PX4's."""
 
 
-class Knowledge(msgspec.Struct, frozen=True, kw_only=True):
-    """Records and biases on the companion's disk."""
-
-    records: Sequence[Record] = ()
-    """The newest first."""
-    biases: Mapping[str, KnownImu] = {}
+Knowledge = tuple[Sequence[Record], Mapping[str, KnownImu]]
+"""Records, the newest first, and learned biases on the companion's disk."""
 
 
 def read(path: Path) -> Iterator[Boot]:
@@ -172,7 +168,8 @@ async def _imu(
         calibration = await _calibration_in(boot.firmware, boot.parameters_at(stages.armed_s), imu)
     except AutopilotError as error:
         notes.append(str(error))
-    match = None if calibration is None else _written_in(calibration, known.records)
+    records, biases = known
+    match = None if calibration is None else _written_in(calibration, records)
     if match is not None and boot.unix_offset_s is not None:
         began_s = datetime.datetime.fromisoformat(match[0].started_at).timestamp()
         after_s = began_s - boot.unix_offset_s - stages.armed_s
@@ -205,7 +202,7 @@ async def _imu(
         drift = inertial.drift(found, reference, world, in_air, SPANS_S, offsets)
     warmth: Sequence[Term | None] = [None] * 4
     if calibration is not None and in_air is not None:
-        warmth = _warmth(imu, calibration, known, stages, in_air)
+        warmth = _warmth(imu, calibration, biases, stages, in_air)
     return ImuFlight(
         imu=imu.number,
         rate_hz=imu.rate_hz,
@@ -285,11 +282,15 @@ def _offset_sets(
 
 
 def _warmth(
-    imu: FlownImu, calibration: ImuCalibration, known: Knowledge, stages: Stages, in_air: tuple[float, float]
+    imu: FlownImu,
+    calibration: ImuCalibration,
+    biases: Mapping[str, KnownImu],
+    stages: Stages,
+    in_air: tuple[float, float],
 ) -> list[Term | None]:
     """Predict by the learnt curve the step of the gyros from before the motors to the air."""
     nothing: list[Term | None] = [None] * 4
-    own = next((one for one in known.biases.values() if _is_same(one.identity, imu, calibration)), None)
+    own = next((one for one in biases.values() if _is_same(one.identity, imu, calibration)), None)
     start_s = stages.motors_s or stages.armed_s
     seen = [
         imu.degc[(imu.degc[:, 0] >= a) & (imu.degc[:, 0] <= b), 1] for a, b in ((start_s - _STOOD_S, start_s), in_air)
