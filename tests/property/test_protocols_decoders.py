@@ -22,7 +22,7 @@ from companion.protocols.imus import xsens as xsens_protocol
 from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.protocols.imus.mip import MipDecoder
 from companion.protocols.imus.stim300 import Stim300Decoder
-from companion.protocols.imus.vectornav import SENTENCE_LIMIT, VectorNavDecoder
+from companion.protocols.imus.vectornav import VectorNavDecoder
 from companion.protocols.imus.witmotion import FRAME_BYTES as WIT_BYTES
 from companion.protocols.imus.witmotion import WitMotionDecoder
 from companion.protocols.imus.xsens import XsensDecoder
@@ -230,12 +230,12 @@ def feed_in(decoder: Decoder, stream: bytes, cuts: list[int]) -> list[Sample]:
 def held_bytes(decoder: Decoder) -> int:
     if isinstance(decoder, FrameDecoder):
         return len(decoder._buffer)
-    assert isinstance(decoder, LineDecoder | SentenceDecoder)
+    assert isinstance(decoder, LineDecoder)
     return len(decoder._partial)
 
 
 LIMITS: dict[type[Decoder], int] = {
-    VectorNavDecoder: max(VECTORNAV_BYTES, SENTENCE_LIMIT + 1),
+    VectorNavDecoder: max(VECTORNAV_BYTES, VectorNavDecoder.LIMIT + 1),
     MipDecoder: MIP_BYTES,
     XsensDecoder: XSENS_BYTES,
     Stim300Decoder: STIM300_BYTES,

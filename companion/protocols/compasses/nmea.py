@@ -67,20 +67,18 @@ class NmeaDecoder(SentenceDecoder):
         super().interrupted()
         self._heading_from = self._tilt_from = _NOBODY
 
-    def _read(self, body: bytes, t_s: float, samples: list[Sample]) -> None:
+    def _read(self, body: bytes, t_s: float) -> list[Sample]:
         fields = body.split(b",")
         head = fields[0]
+        if head == b"PTNTHPR":
+            return [self._hpr(fields, t_s)]
+        if head == b"PTNTCCD":
+            return [self._ccd(fields, t_s)]
         plain = _PLAIN.get(head[2:])
+        if head[2:] == b"XDR" and len(head) == 5:
+            return self._xdr(fields, t_s)
         if plain is None or len(head) != 5:
-            if head == b"PTNTHPR":
-                self._hpr(fields, t_s, samples)
-            elif head == b"PTNTCCD":
-                self._ccd(fields, t_s, samples)
-            elif head[2:] == b"XDR" and len(head) == 5:
-                self._xdr(fields, t_s, samples)
-            else:
-                raise RejectedError(reasons.UNKNOWN_SENTENCE)
-            return
+            raise RejectedError(reasons.UNKNOWN_SENTENCE)
         rank, size, marks, north = plain
         if len(fields) != size:
             raise RejectedError(reasons.FIELD_COUNT)
@@ -92,7 +90,7 @@ class NmeaDecoder(SentenceDecoder):
             raise RejectedError(reasons.NOT_A_MEASUREMENT if rank == _THS else reasons.UNKNOWN_FIELD)
         heading_deg = full_circle(heading_deg)
         self._claim_heading(rank, t_s)
-        samples.append(CompassSample(t_s, heading_deg, None, None, north))
+        return [CompassSample(t_s, heading_deg, None, None, north)]
 
     def _claim_heading(self, sentence: int, t_s: float) -> None:
         leader = self._heading_from
@@ -103,7 +101,7 @@ class NmeaDecoder(SentenceDecoder):
                 raise RejectedError(reasons.DUPLICATE)
         self._heading_from, self._heading_s = sentence, t_s
 
-    def _hpr(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
+    def _hpr(self, fields: list[bytes], t_s: float) -> Sample:
         if len(fields) != 7:
             raise RejectedError(reasons.FIELD_COUNT)
         _, heading, magnetic, pitch, pitch_status, roll, roll_status = fields
@@ -123,11 +121,10 @@ class NmeaDecoder(SentenceDecoder):
             raise out_of_range(pitch_deg + roll_deg)
         heading_deg = full_circle(heading_deg)
         if no_heading:
-            samples.append(TiltSample(t_s, roll_deg, pitch_deg))
-        else:
-            samples.append(CompassSample(t_s, heading_deg, pitch_deg, roll_deg))
+            return TiltSample(t_s, roll_deg, pitch_deg)
+        return CompassSample(t_s, heading_deg, pitch_deg, roll_deg)
 
-    def _ccd(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
+    def _ccd(self, fields: list[bytes], t_s: float) -> Sample:
         if len(fields) != 8:
             raise RejectedError(reasons.FIELD_COUNT)
         pitch_deg, roll_deg = (math.degrees(math.atan(float(field) / _CCD_SCALE)) for field in fields[1:3])
@@ -142,12 +139,10 @@ class NmeaDecoder(SentenceDecoder):
         try:
             self._claim_heading(_CCD, t_s)
         except RejectedError:
-            samples.append(TiltSample(t_s, roll_deg, pitch_deg))
-        else:
-            north = _NORTHS[_CCD]
-            samples.append(CompassSample(t_s, full_circle(heading_deg), pitch_deg, roll_deg, north))
+            return TiltSample(t_s, roll_deg, pitch_deg)
+        return CompassSample(t_s, full_circle(heading_deg), pitch_deg, roll_deg, _NORTHS[_CCD])
 
-    def _xdr(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
+    def _xdr(self, fields: list[bytes], t_s: float) -> list[Sample]:
         if len(fields) % 4 != 1:
             raise RejectedError(reasons.FIELD_COUNT)
         angles_deg: dict[bytes, float] = {}
@@ -170,7 +165,7 @@ class NmeaDecoder(SentenceDecoder):
             found.append(MagSample(t_s, (x, y, z)))
         if not found:
             raise RejectedError(reasons.DUPLICATE if len(angles_deg) == 2 else reasons.NOTHING_OF_USE)
-        samples += found
+        return found
 
 
 def _check_statuses(statuses: tuple[bytes, bytes, bytes]) -> None:

@@ -31,18 +31,19 @@ class Os5000Decoder(SentenceDecoder):
     LIMIT = 250
     """Bytes from the "$" on; with every field that can be switched on there are some 150."""
 
-    def _read(self, body: bytes, t_s: float, samples: list[Sample]) -> None:
+    def _read(self, body: bytes, t_s: float) -> list[Sample]:
         match = _TAGS.fullmatch(body)
         if match is None:
             raise RejectedError(reasons.NOT_A_MEASUREMENT if body[:1] == b"C" else reasons.UNKNOWN_SENTENCE)
         heading, pitch, roll, temperature, more, _ = match.groups()
+        samples: list[Sample]
         temperature_degc = None if temperature is None else float(temperature)
         if temperature_degc is not None and not -TEMPERATURE_LIMIT_DEGC <= temperature_degc <= TEMPERATURE_LIMIT_DEGC:
             raise RejectedError(reasons.OUT_OF_RANGE)
         if pitch is None or roll is None:
             if heading is None:
                 raise RejectedError(reasons.NOTHING_OF_USE)
-            samples.append(CompassSample(t_s, full_circle(float(heading)), None, None, None, temperature_degc))
+            samples = [CompassSample(t_s, full_circle(float(heading)), None, None, None, temperature_degc)]
         else:
             pitch_deg, roll_deg = float(pitch), float(roll)
             if not (-90.0 <= pitch_deg <= 90.0 and -180.0 <= roll_deg <= 180.0):
@@ -50,11 +51,12 @@ class Os5000Decoder(SentenceDecoder):
             if heading is None:
                 if abs(roll_deg) > 90.0:  # upside down: no gradienter
                     raise RejectedError(reasons.OUT_OF_RANGE)
-                samples.append(TiltSample(t_s, roll_deg, pitch_deg, temperature_degc))
+                samples = [TiltSample(t_s, roll_deg, pitch_deg, temperature_degc)]
             else:
                 heading_deg = full_circle(float(heading))
-                samples.append(CompassSample(t_s, heading_deg, pitch_deg, roll_deg, None, temperature_degc))
+                samples = [CompassSample(t_s, heading_deg, pitch_deg, roll_deg, None, temperature_degc)]
         if more and (vector := _VECTOR.search(more)):
             x, y, z = (float(field) / 1000.0 for field in vector.groups())
             if max(abs(x), abs(y), abs(z)) <= FIELD_LIMIT_GAUSS:
                 samples.append(MagSample(t_s, (x, y, z)))
+        return samples

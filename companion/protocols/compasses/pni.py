@@ -17,6 +17,7 @@ from __future__ import annotations
 import binascii
 import functools
 import math
+import re
 import struct
 from typing import Final
 
@@ -69,33 +70,32 @@ class PniDecoder(FrameDecoder):
     _little = False
     _contrary = 0
 
-    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        if buffer[at]:
-            return self._skip_to(b"\0", buffer, at)
+    START = re.compile(b"\0")
+
+    def _size(self, buffer: bytes, at: int) -> int:
         available = len(buffer) - at
         if available < 2:
             return WAIT
         size = buffer[at + 1]
         if not SHORTEST <= size <= LONGEST or (available >= 3 and buffer[at + 2] not in _KNOWN):
-            return at + 1
+            return 1
         if available < 3:
             return WAIT
-        frame_id, end = buffer[at + 2], at + size
-        try:
-            parts = _components(buffer, at, end) if frame_id == _DATA else []
-            if available < size:
-                return WAIT
-            if binascii.crc_hqx(buffer[at:end], 0) != 0:
-                raise RejectedError(reasons.CHECKSUM)
-        except RejectedError as error:
-            return self._reject(error.reason, at + 1)
-        if frame_id != _DATA:
-            return self._reject(ECHO if frame_id in _COMMANDS else reasons.REPLY, end)
-        return self._accept(samples, self._samples, buffer, parts, self._time_of(origin + end), end=end)
+        frame = buffer[at : at + size]
+        if frame[2] == _DATA:
+            _components(frame, size)
+        if available < size:
+            return WAIT
+        if binascii.crc_hqx(frame, 0) != 0:
+            raise RejectedError(reasons.CHECKSUM)
+        return size
 
-    def _samples(self, buffer: bytes, parts: list[tuple[int, int]], t_s: float) -> list[Sample]:
-        flags = {part: buffer[place] for part, place in parts if part in _BYTES}
-        values = self._values(buffer, [(part, place) for part, place in parts if part not in _BYTES])
+    def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
+        if frame[2] != _DATA:
+            raise RejectedError(ECHO if frame[2] in _COMMANDS else reasons.REPLY)
+        parts = _components(frame, len(frame))
+        flags = {part: frame[place] for part, place in parts if part in _BYTES}
+        values = self._values(frame, [(part, place) for part, place in parts if part not in _BYTES])
         if flags.get(_DISTORTION, 0) > 1 or flags.get(_CALIBRATED, 0) > 1:
             raise RejectedError(reasons.OUT_OF_RANGE)
         if flags.get(_DISTORTION):
@@ -119,8 +119,8 @@ class PniDecoder(FrameDecoder):
             self.warned[NOT_CALIBRATED] += 1
         return samples
 
-    def _values(self, buffer: bytes, parts: list[tuple[int, int]]) -> dict[int, float]:
-        raw = b"".join(buffer[place : place + _SIZES[part]] for part, place in parts)
+    def _values(self, frame: bytes, parts: list[tuple[int, int]]) -> dict[int, float]:
+        raw = b"".join(frame[place : place + _SIZES[part]] for part, place in parts)
         names = [part for part, _ in parts for _ in range(_SIZES[part] // 4)]
         big, little = (struct.unpack(f"{order}{len(names)}f", raw) for order in "><")
         possible = _possible(names, little), _possible(names, big)
@@ -144,22 +144,21 @@ def _possible(names: list[int], values: tuple[float, ...]) -> bool:
     return True
 
 
-def _components(buffer: bytes, at: int, end: int) -> list[tuple[int, int]]:
-    here, last = at + 4, end - 2
+def _components(frame: bytes, size: int) -> list[tuple[int, int]]:
+    """List the components of a frame of `size` bytes, as far as it has come, and where their values begin."""
+    here, last = 4, size - 2
     parts: list[tuple[int, int]] = []
-    if at + 3 >= len(buffer):
-        return parts
-    for _ in range(buffer[at + 3]):
+    for _ in range(frame[3] if len(frame) > 3 else 0):
         if here >= last:
             raise RejectedError(reasons.FIELD_COUNT)
-        if here >= len(buffer):
+        if here >= len(frame):
             return parts
-        part = buffer[here]
+        part = frame[here]
         if part not in _SIZES:
             raise RejectedError(reasons.UNKNOWN_FIELD)
         parts.append((part, here + 1))
         here += 1 + _SIZES[part]
-    if here != last:
+    if here != last and len(frame) > 3:
         raise RejectedError(reasons.FIELD_COUNT)
     return parts
 

@@ -13,7 +13,6 @@ import operator
 import re
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable
 from typing import ClassVar, Final
 
 from companion.protocols.decoding import reasons
@@ -126,60 +125,6 @@ class LineDecoder(Decoder):
         """
 
 
-class SentenceDecoder(Decoder):
-    r"""Frames sentences `$...` that end in "\r", "\n" or both, or where the next "$" begins one."""
-
-    LIMIT: ClassVar[int] = 160
-
-    _partial = b""
-
-    def feed(self, data: bytes, t_s: float) -> list[Sample]:  # noqa: D102 - as in the base class
-        text = self._partial + data.replace(b"\r", b"\n")
-        lines = text.split(b"\n")
-        remaining, partial = len(text), lines.pop()
-        samples: list[Sample] = []
-        for line in lines:
-            if not line:
-                remaining -= 1
-                continue
-            remaining -= len(line) + 1
-            sentence = self._last_sentence(line)
-            if not sentence:
-                continue
-            try:
-                self._read(body_of_sentence(sentence), t_s - self.seconds_per_byte * remaining, samples)
-            except RejectedError as error:
-                self.rejected[error.reason] += 1
-            except ValueError:
-                self.rejected[reasons.NOT_A_NUMBER] += 1
-            else:
-                self.accepted += 1
-                self.frame_bytes = len(line) + 1
-        if partial or self._partial:
-            self._partial = self._last_sentence(partial)
-        return samples
-
-    def interrupted(self) -> None:  # noqa: D102 - as in the base class
-        if self._partial:
-            self.rejected[reasons.CUT_SHORT] += 1
-        self._partial = b""
-
-    @abstractmethod
-    def _read(self, body: bytes, t_s: float, samples: list[Sample]) -> None:
-        """Append the samples of a body with a right checksum; RejectedError or ValueError reject it."""
-
-    def _last_sentence(self, text: bytes) -> bytes:
-        _, *begun = text.split(b"$")
-        if not begun:
-            return b""
-        for each in begun[:-1]:
-            self.rejected[reasons.TOO_LONG if len(each) >= self.LIMIT else reasons.CUT_SHORT] += 1
-        if len(begun[-1]) >= self.LIMIT:
-            self.rejected[reasons.TOO_LONG] += 1
-            return b""
-        return b"$" + begun[-1]
-
-
 def xor_checksum(body: bytes) -> int:
     """The checksum of NMEA 0183 and of its imitators: all bytes between "$" and "*" exclusive-ored."""
     return functools.reduce(operator.xor, body, 0)
@@ -206,18 +151,6 @@ ACCEL_LIMIT_M_S2 = 2000.0
 TEMPERATURE_LIMIT_DEGC = 200.0
 ANY_TEMPERATURE = 800.0
 """Limit for an IMU, in kelvin or tenths too: `estimation/temperature/thermometer.py` names what cannot be degC."""
-
-
-def numbers(fields: list[bytes]) -> list[float]:
-    """Parse decimal numbers; raise RejectedError unless all are finite."""
-    try:
-        values = list(map(float, fields))
-    except ValueError:
-        raise RejectedError(reasons.NOT_A_NUMBER) from None
-    # One test for all of them: whatever is not finite makes the sum so.
-    if not math.isfinite(sum(values)):
-        raise RejectedError(reasons.NON_FINITE)
-    return values
 
 
 def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | None) -> None:
@@ -256,17 +189,21 @@ def check_vector(vector: Vector) -> None:
 
 WAIT: Final = -1
 ECHO: Final = "echo of a command"
-"""Our own words, or another master's, on a line that both sides hear."""
+"""A command of ours, or of another master, on a line that both sides hear."""
 
 
 class FrameDecoder(Decoder):
-    """Takes frames one by one from a stream of bytes; a subclass says where each one ends."""
+    """Finds frames in a stream of bytes; a subclass checks and reads each."""
+
+    START: ClassVar[re.Pattern[bytes]]
+    """The bytes that may begin a frame."""
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)
         self._buffer = b""
         """Bytes of a possible frame; never longer than the longest frame."""
-        self._received = 0
+        self._received = self._origin = 0
+        """Stream positions of the last byte and of the buffer."""
         self._chunks: deque[tuple[int, float]] = deque()
         """Stream position of the end of each chunk that still has bytes in the buffer, and when it was read."""
 
@@ -276,19 +213,19 @@ class FrameDecoder(Decoder):
         self._received += len(data)
         self._chunks.append((self._received, t_s))
         buffer = self._buffer + data if self._buffer else bytes(data)
-        origin = self._received - len(buffer)
+        self._origin = self._received - len(buffer)
         samples: list[Sample] = []
-        at, size = 0, len(buffer)
-        while at < size:
-            accepted = self.accepted
-            end = self._next(buffer, at, origin, samples)
-            if end == WAIT:
+        at, find = 0, self.START.search
+        while match := find(buffer, at):
+            at = match.start()
+            size = self._take(buffer, at, samples)
+            if size == WAIT:
                 break
-            if self.accepted != accepted:
-                self.frame_bytes = end - at
-            at = end
+            at += size
+        else:
+            at = len(buffer)
         self._buffer = buffer[at:]
-        while self._chunks and self._chunks[0][0] <= origin + at:
+        while self._chunks and self._chunks[0][0] <= self._origin + at:
             self._chunks.popleft()
         return samples
 
@@ -298,32 +235,38 @@ class FrameDecoder(Decoder):
         self._buffer = b""
         self._chunks.clear()
 
-    @abstractmethod
-    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        """Parse at `at` (`origin`: stream position of the buffer); return where to go on, or `WAIT`."""
-
-    def _skip_to(self, start: bytes, buffer: bytes, at: int) -> int:
-        found = buffer.find(start, at)
-        return len(buffer) if found < 0 else found
-
-    def _find_mark(self, mark: bytes, buffer: bytes, at: int) -> int:
-        if buffer[at] != mark[0]:
-            return self._skip_to(mark[:1], buffer, at)
-        if len(buffer) == at + 1:
-            return WAIT
-        return at + 1
-
-    def _reject(self, reason: str, end: int) -> int:
-        self.rejected[reason] += 1
-        return end
-
-    def _accept(self, samples: list[Sample], found: Callable[..., list[Sample]], *arguments: object, end: int) -> int:
+    def _take(self, buffer: bytes, at: int, samples: list[Sample]) -> int:
+        """Append the samples of the frame at `at`, if it is one; return the bytes to pass over, or `WAIT`."""
         try:
-            samples += found(*arguments)
-            self.accepted += 1
+            size = self._size(buffer, at)
         except RejectedError as error:
             self.rejected[error.reason] += 1
-        return end
+            return 1
+        if size <= 1:
+            return size
+        end = at + size
+        try:
+            found = self._decode(buffer[at:end], self._time_of(self._origin + end))
+        except RejectedError as error:
+            self.rejected[error.reason] += 1
+            return size
+        if found:
+            samples += found
+            self.accepted += 1
+            self.frame_bytes = size
+        return size
+
+    @abstractmethod
+    def _size(self, buffer: bytes, at: int) -> int:
+        """Return the length of the frame at `at`, checked; 1 where none begins, or `WAIT` for more bytes.
+
+        Raises:
+            RejectedError: what begins there is to be counted as rejected; only its first byte is passed over.
+        """
+
+    @abstractmethod
+    def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
+        """Read a whole frame; raise RejectedError where it gives no sample and is to be counted so."""
 
     def _time_of(self, end: int) -> float:
         chunks = self._chunks
@@ -331,3 +274,33 @@ class FrameDecoder(Decoder):
             chunks.popleft()
         chunk_end, t_s = chunks[0]
         return t_s - self.seconds_per_byte * (chunk_end - end)
+
+
+class SentenceDecoder(FrameDecoder):
+    r"""Sentences `$...` that end in "\r" or "\n"; one that the next "$" ends is cut short."""
+
+    START = re.compile(rb"\$")
+    END: ClassVar[re.Pattern[bytes]] = re.compile(rb"[\r\n$]")
+    LIMIT: ClassVar[int] = 160
+    """The most bytes of a sentence, from the "$" to before the line end."""
+
+    def _size(self, buffer: bytes, at: int) -> int:
+        limit = at + 1 + self.LIMIT
+        match = self.END.search(buffer, at + 1, limit)
+        if match is None:
+            if len(buffer) < limit:
+                return WAIT
+            raise RejectedError(reasons.TOO_LONG)
+        if match[0] not in b"\r\n":
+            raise RejectedError(reasons.CUT_SHORT)
+        return match.end() - at
+
+    def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
+        try:
+            return self._read(body_of_sentence(frame[:-1]), t_s)
+        except ValueError:
+            raise RejectedError(reasons.NOT_A_NUMBER) from None
+
+    @abstractmethod
+    def _read(self, body: bytes, t_s: float) -> list[Sample]:
+        """Return the samples of a body with a right checksum; RejectedError or ValueError reject it."""

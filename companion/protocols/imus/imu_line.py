@@ -21,7 +21,7 @@ class ImuLineDecoder(SentenceDecoder):
     device_clock_wraps_s: ClassVar[float | None] = 2**32 / 1e6
     sequence_modulus: ClassVar[int | None] = 2**16
 
-    def _read(self, body: bytes, t_s: float, samples: list[Sample]) -> None:
+    def _read(self, body: bytes, t_s: float) -> list[Sample]:
         if not body.startswith(b"IMU,"):
             raise RejectedError(reasons.UNKNOWN_SENTENCE)
         fields = body.split(b",")
@@ -33,4 +33,4 @@ class ImuLineDecoder(SentenceDecoder):
             raise RejectedError(reasons.OUT_OF_RANGE)
         gyro_rad_s, accel_m_s2 = (gx, gy, gz), (ax, ay, az)
         check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
-        samples.append(ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, sequence, t_us / 1e6))
+        return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, sequence, t_us / 1e6)]

@@ -11,6 +11,7 @@ and its base down has the mounting ROTATION_NONE.
 
 from __future__ import annotations
 
+import re
 import struct
 from itertools import accumulate
 from typing import ClassVar, Final
@@ -21,7 +22,6 @@ from companion.protocols.decoding.base import WAIT, FrameDecoder, RejectedError,
 from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.samples import ImuSample, Sample, Vector
 
-_MARK = b"\x75\x65"
 _SENSOR_DATA = 0x80
 _ACCEL, _GYRO, _GPS_TIME = 0x04, 0x05, 0x12
 _VECTOR = struct.Struct(">3f")
@@ -34,55 +34,50 @@ class MipDecoder(FrameDecoder):
 
     device_clock_wraps_s: ClassVar[float | None] = 7 * 86400.0  # GPS time of week
 
-    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        if not buffer.startswith(_MARK, at):
-            return self._find_mark(_MARK, buffer, at)
+    START = re.compile(rb"\x75(?:\x65|\Z)")
+
+    def _size(self, buffer: bytes, at: int) -> int:
         if len(buffer) < at + 4:
             return WAIT
-        end = at + 4 + buffer[at + 3] + 2
-        if len(buffer) < end:
+        size = 4 + buffer[at + 3] + 2
+        if len(buffer) < at + size:
             return WAIT
-        if fletcher(buffer[at : end - 2]) != buffer[end - 2 : end]:
-            # Not `end`: in what a false start took for its own, a good frame may begin.
-            return self._reject(reasons.CHECKSUM, at + 1)
-        return self._accept(samples, _decode, buffer, at, end - 2, self._time_of(origin + end), end=end)
+        if fletcher(buffer[at : at + size - 2]) != buffer[at + size - 2 : at + size]:
+            raise RejectedError(reasons.CHECKSUM)
+        return size
+
+    def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
+        if frame[2] != _SENSOR_DATA:
+            raise RejectedError(reasons.REPLY if frame[2] < _SENSOR_DATA else reasons.NOTHING_OF_USE)
+        found: dict[int, Vector] = {}
+        t_device_s: float | None = None
+        field, stop = 4, len(frame) - 2
+        while field < stop:
+            length = frame[field]
+            if length < 2 or field + length > stop:
+                raise RejectedError(reasons.FIELD_COUNT)
+            kind = frame[field + 1]
+            if kind in {_ACCEL, _GYRO, _GPS_TIME}:
+                if length != 14:
+                    raise RejectedError(reasons.FIELD_COUNT)
+                if kind == _GPS_TIME:
+                    t_device_s, _week, _flags = _TIME.unpack_from(frame, field + 2)
+                    check_vector((t_device_s, 0.0, 0.0))
+                else:
+                    found[kind] = _VECTOR.unpack_from(frame, field + 2)
+            field += length
+        x, y, z = found.get(_ACCEL, _ABSENT)
+        gyro_rad_s, accel_m_s2 = found.get(_GYRO, _ABSENT), (x * G, y * G, z * G)
+        check_imu(gyro_rad_s, accel_m_s2, None)
+        if len(found) < 2:
+            raise RejectedError(reasons.NOTHING_OF_USE)
+        return [ImuSample(t_s, gyro_rad_s, accel_m_s2, None, None, t_device_s)]
 
 
 def fletcher(data: bytes) -> bytes:
     """The two bytes at the end of a packet: the sum of all before, and the sum of all the running sums."""
     sums = list(accumulate(data))
     return bytes((sums[-1] & 0xFF, sum(sums) & 0xFF))
-
-
-def _decode(buffer: bytes, at: int, stop: int, t_s: float) -> list[Sample]:
-    if buffer[at + 2] != _SENSOR_DATA:
-        raise RejectedError(reasons.REPLY if buffer[at + 2] < _SENSOR_DATA else reasons.NOTHING_OF_USE)
-    found: dict[int, Vector] = {}
-    t_device_s: float | None = None
-    field = at + 4
-    while field < stop:
-        length = buffer[field]
-        if length < 2 or field + length > stop:
-            raise RejectedError(reasons.FIELD_COUNT)
-        kind = buffer[field + 1]
-        if kind in {_ACCEL, _GYRO, _GPS_TIME}:
-            if length != 14:
-                raise RejectedError(reasons.FIELD_COUNT)
-            if kind == _GPS_TIME:
-                t_device_s, _week, _flags = _TIME.unpack_from(buffer, field + 2)
-                check_vector((t_device_s, 0.0, 0.0))
-            else:
-                found[kind] = _VECTOR.unpack_from(buffer, field + 2)
-        field += length
-    accel_g, gyro_rad_s = found.get(_ACCEL), found.get(_GYRO)
-    accel_m_s2 = _ABSENT
-    if accel_g is not None:
-        x, y, z = accel_g
-        accel_m_s2 = (x * G, y * G, z * G)
-    check_imu(gyro_rad_s or _ABSENT, accel_m_s2, None)
-    if accel_g is None or gyro_rad_s is None:
-        raise RejectedError(reasons.NOTHING_OF_USE)
-    return [ImuSample(t_s, gyro_rad_s, accel_m_s2, None, None, t_device_s)]
 
 
 class MipDialogue(WakeDialogue):

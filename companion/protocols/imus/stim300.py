@@ -27,7 +27,7 @@ import math
 import re
 import struct
 import zlib
-from typing import ClassVar, Final, NamedTuple
+from typing import ClassVar, Final
 
 from companion.physics.units import DEG, G
 from companion.protocols.decoding import reasons
@@ -50,19 +50,8 @@ _VECTOR = "bHbHbHB"
 _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
-class Layout(NamedTuple):
-    """One normal mode datagram: its unpacked values, and the places of its parts among them."""
-
-    values: struct.Struct
-    places: dict[str, int]
-
-    @property
-    def frame_bytes(self) -> int:
-        """Size with the CRC."""
-        return self.values.size + CRC_BYTES
-
-
-def _layout(*, accel: bool, inclination: bool, temperature: bool, extra: bool) -> Layout:
+def _layout(*, accel: bool, inclination: bool, temperature: bool, extra: bool) -> tuple[struct.Struct, dict[str, int]]:
+    """Return the values of a normal mode datagram without its CRC, and the places of its parts among them."""
     code, count = ">x" + _VECTOR, 7
     places: dict[str, int] = {}
     for name, present in (("accel", accel), ("inclination", inclination)):
@@ -76,11 +65,11 @@ def _layout(*, accel: bool, inclination: bool, temperature: bool, extra: bool) -
     if extra:
         code, count = code + "xxxB", count + 1
     places["counter"] = count
-    return Layout(struct.Struct(code + "BH"), places)
+    return struct.Struct(code + "BH"), places
 
 
-def _normal_mode() -> dict[int, Layout]:
-    layouts: dict[int, Layout] = {}
+def _normal_mode() -> dict[int, tuple[struct.Struct, dict[str, int]]]:
+    layouts: dict[int, tuple[struct.Struct, dict[str, int]]] = {}
     for content in range(8):
         accel, inclination, temperature = bool(content & 1), bool(content & 2), bool(content & 4)
         plain = _layout(accel=accel, inclination=inclination, temperature=temperature, extra=False)
@@ -91,7 +80,7 @@ def _normal_mode() -> dict[int, Layout]:
 
 
 NORMAL_MODE: Final = _normal_mode()
-FRAME_BYTES: Final = {name: layout.frame_bytes for name, layout in NORMAL_MODE.items()} | SPECIAL_BYTES
+FRAME_BYTES: Final = {name: values.size + CRC_BYTES for name, (values, _) in NORMAL_MODE.items()} | SPECIAL_BYTES
 
 
 def is_whole(frame: bytes) -> bool:
@@ -124,7 +113,7 @@ _GYRO_SCALE: Final = DEG / 2**14
 _GYRO_UNIT, _ACCEL_UNIT, _INCLINATION_UNIT, _ACCEL_RANGE = 5, 8, 11, 17
 
 _SYSTEM, _START_UP, _CONDITIONS, _OVERLOAD, _CHANNEL = 0x80, 0x40, 0x20, 0x10, 0x08
-_IDENTIFIER = re.compile(b"[" + b"".join(re.escape(bytes((name,))) for name in sorted(FRAME_BYTES)) + b"]")
+_IDENTIFIERS = re.compile(b"[" + b"".join(re.escape(bytes((name,))) for name in sorted(FRAME_BYTES)) + b"]")
 
 
 class Stim300Decoder(FrameDecoder):
@@ -134,6 +123,7 @@ class Stim300Decoder(FrameDecoder):
     used is counted, though the datagram may have given an `ImuSample`.
     """
 
+    START = _IDENTIFIERS
     sequence_modulus: ClassVar[int | None] = 256
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
@@ -152,31 +142,17 @@ class Stim300Decoder(FrameDecoder):
         super().interrupted()
         self._forget()
 
-    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        identifier = buffer[at]
-        size = FRAME_BYTES.get(identifier)
-        if size is None:
-            match = _IDENTIFIER.search(buffer, at)
-            return match.start() if match else len(buffer)
-        end = at + size
-        if len(buffer) < end:
+    def _size(self, buffer: bytes, at: int) -> int:
+        size = FRAME_BYTES[buffer[at]]
+        frame = buffer[at : at + size]
+        if len(frame) < size:
             return WAIT
-        frame = buffer[at:end]
-        if not is_whole(frame):
-            if self._in_step:
-                self.rejected[reasons.CHECKSUM] += 1
-                self._in_step = False
-            return at + 1
-        self._in_step = True
-        layout = NORMAL_MODE.get(identifier)
-        if layout is None:
-            self._special(identifier, frame)
-            return self._reject(reasons.REPLY, end)
-        return self._accept(samples, self._decode, layout, frame, self._time_of(origin + end), end=end)
+        was_in_step, self._in_step = self._in_step, is_whole(frame)
+        if was_in_step and not self._in_step:
+            raise RejectedError(reasons.CHECKSUM)
+        return size if self._in_step else 1
 
-    def _special(self, identifier: int, frame: bytes) -> None:
-        if identifier not in CONFIGURATION:
-            return
+    def _configure(self, frame: bytes) -> None:
         codes = (frame[_ACCEL_RANGE] >> 4, frame[_ACCEL_RANGE] & 0x0F, frame[_ACCEL_RANGE + 1] >> 4)
         known = [_RANGE_CODES.get(code) for code in codes]
         bits = [each for each in known if each is not None]
@@ -186,9 +162,13 @@ class Stim300Decoder(FrameDecoder):
         self._imu_unit_right = frame[_GYRO_UNIT] & 0x05 == 0 and frame[_ACCEL_UNIT] & 0x0D == 0
         self._inclination_unit_right = frame[_INCLINATION_UNIT] & 0x0D == 0
 
-    def _decode(self, layout: Layout, frame: bytes, t_s: float) -> list[Sample]:
-        values = layout.values.unpack_from(frame)
-        places = layout.places
+    def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
+        if frame[0] in CONFIGURATION:
+            self._configure(frame)
+        if frame[0] in SPECIAL_BYTES:
+            raise RejectedError(reasons.REPLY)
+        layout, places = NORMAL_MODE[frame[0]]
+        values = layout.unpack_from(frame)
         counter, latency_us = values[places["counter"] :]
         t_s -= latency_us * 1e-6
         samples: list[Sample] = []

@@ -16,21 +16,13 @@ from __future__ import annotations
 
 import binascii
 import functools
+import math
 import re
 import struct
-from dataclasses import dataclass
 from typing import ClassVar
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import (
-    WAIT,
-    FrameDecoder,
-    RejectedError,
-    body_of_sentence,
-    check_imu,
-    numbers,
-    xor_checksum,
-)
+from companion.protocols.decoding.base import WAIT, RejectedError, SentenceDecoder, check_imu, xor_checksum
 from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.samples import ImuSample, Sample, Vector
 
@@ -85,43 +77,15 @@ _PARTS = {
 }
 
 
-def header_bytes(groups: int) -> int:
-    """Return the length of a header with these groups; raise RejectedError for an unknown group, or none."""
-    if groups == 0 or groups & ~_KNOWN_GROUPS:
-        raise RejectedError(reasons.UNKNOWN_GROUP)
-    return 2 + 2 * groups.bit_count()
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Layout of one kind of frame: its length and the place of each value among the unpacked ones."""
-
-    frame_bytes: int
-    payload: struct.Struct
-    payload_offset: int
-    time_startup: int | None
-    imu: tuple[int, int] | None
-    temperature: int | None
-
-    def samples(self, frame: bytes, start: int, t_s: float) -> list[Sample]:
-        """Return the samples of a frame at `start` with a right CRC; raise RejectedError where none is of use."""
-        values = self.payload.unpack_from(frame, start + self.payload_offset)
-        if self.imu is None:
-            raise RejectedError(reasons.NOTHING_OF_USE)
-        gyro, accel = self.imu
-        gyro_rad_s: Vector = values[gyro : gyro + 3]
-        accel_m_s2: Vector = values[accel : accel + 3]
-        temperature_degc = None if self.temperature is None else values[self.temperature]
-        check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
-        t_device_s = None if self.time_startup is None else values[self.time_startup] / 1e9
-        return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, None, t_device_s)]
-
-
 @functools.lru_cache(maxsize=16)
-def layout_of(header: bytes) -> Layout:
-    """Parse a whole header; raise RejectedError for an unknown field, or a group without fields."""
+def layout_of(header: bytes) -> tuple[struct.Struct, dict[str, int]]:
+    """Parse the masks of a header: the frame before its CRC, and the places of what is used among its values.
+
+    Raises:
+        RejectedError: a field is unknown, or a group has none.
+    """
     places: dict[str, int] = {}
-    code, count = "<", 0
+    code, count = f"<{len(header)}x", 0
     masks = iter(struct.unpack_from(f"<{len(header) // 2 - 1}H", header, 2))
     for group, fields in _GROUPS.items():
         if not header[1] & group:
@@ -135,85 +99,89 @@ def layout_of(header: bytes) -> Layout:
                 places.update({part: count + offset for part, offset in parts.items()})
                 code += field_code
                 count += int(field_code[:-1] or 1)
-    payload = struct.Struct(code)
-    return Layout(
-        frame_bytes=len(header) + payload.size + 2,
-        payload=payload,
-        payload_offset=len(header),
-        time_startup=places.get("time_startup_ns"),
-        imu=_pair(places),
-        temperature=_first(places, _TEMPERATURES),
-    )
+    used = {
+        "gyro": None, "accel": None, "temperature": _first(places, _TEMPERATURES),
+        "time": places.get("time_startup_ns"),
+    }  # fmt: skip
+    for kind in (slice(0, 2), slice(2, 4), slice(0, 4)):
+        gyro, accel = _first(places, _RATES[kind]), _first(places, _ACCELERATIONS[kind])
+        if gyro is not None and accel is not None:
+            used |= {"gyro": gyro, "accel": accel}
+            break
+    return struct.Struct(code), {name: place for name, place in used.items() if place is not None}
 
 
 def _first(places: dict[str, int], names: tuple[str, ...]) -> int | None:
     return next((places[name] for name in names if name in places), None)
 
 
-def _pair(places: dict[str, int]) -> tuple[int, int] | None:
-    for kind in (slice(0, 2), slice(2, 4), slice(0, 4)):
-        gyro, accel = _first(places, _RATES[kind]), _first(places, _ACCELERATIONS[kind])
-        if gyro is not None and accel is not None:
-            return gyro, accel
-    return None
-
-
-SENTENCE_LIMIT = 250
-"""Bytes of a sentence after its "$"; the longest asynchronous one has some 200."""
-
 _SYNC = 0xFA
-_DOLLAR = ord("$")
-_START = re.compile(rb"[\xfa$]")
-_END_OF_TEXT = re.compile(rb"[^ -#%-~]")
-"""The first byte that cannot be inside a sentence: a line end, a "$", or nothing printable."""
-
 _REPLIES = frozenset((b"VNRRG", b"VNWRG", b"VNWNV", b"VNRFS", b"VNRST", b"VNTAR", b"VNASY", b"VNSGB", b"VNCMD"))
 
 
-class VectorNavDecoder(FrameDecoder):
+class VectorNavDecoder(SentenceDecoder):
     """VectorNav outputs; gives `ImuSample`."""
 
+    START = re.compile(rb"\xfa|\$(?:V(?:N|\Z)|\Z)")
+    END = re.compile(rb"[^ -#%-~]")
+    """The first byte that cannot be inside a sentence: a line end, a "$", or nothing printable."""
+    LIMIT = 250
+    """The longest asynchronous sentence has some 200 bytes."""
     device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
     clock_from_start: ClassVar[bool] = True
 
-    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        if buffer[at] == _SYNC:
-            return self._binary(buffer, at, origin, samples)
-        if buffer[at] == _DOLLAR:
-            return self._sentence(buffer, at, origin, samples)
-        match = _START.search(buffer, at)
-        return match.start() if match else len(buffer)
-
-    def _binary(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+    def _size(self, buffer: bytes, at: int) -> int:
+        if buffer[at] != _SYNC:
+            return super()._size(buffer, at)
         available = len(buffer) - at
         if available < 2:
             return WAIT
-        try:
-            header_size = header_bytes(buffer[at + 1])
-            if available < header_size:
-                return WAIT
-            layout = layout_of(buffer[at : at + header_size])
-        except RejectedError as error:
-            return self._reject(error.reason, at + 1)
-        if available < layout.frame_bytes:
+        header_bytes = _header_bytes(buffer[at + 1])
+        if available < header_bytes:
             return WAIT
-        end = at + layout.frame_bytes
-        if binascii.crc_hqx(buffer[at + 1 : end], 0) != 0:
-            return self._reject(reasons.CHECKSUM, at + 1)
-        return self._accept(samples, layout.samples, buffer, at, self._time_of(origin + end), end=end)
+        size = layout_of(buffer[at : at + header_bytes])[0].size + 2
+        if available < size:
+            return WAIT
+        if binascii.crc_hqx(buffer[at + 1 : at + size], 0) != 0:
+            raise RejectedError(reasons.CHECKSUM)
+        return size
 
-    def _sentence(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        begin = buffer[at : at + 3]
-        if not b"$VN".startswith(begin):
-            return at + 1
-        limit = at + 1 + SENTENCE_LIMIT
-        match = _END_OF_TEXT.search(buffer, at + 1, limit)
-        if match is None:
-            return WAIT if len(buffer) < limit else self._reject(reasons.TOO_LONG, at + 1)
-        end = match.start()
-        if buffer[end] not in b"\r\n":
-            return self._reject(reasons.CUT_SHORT, end)
-        return self._accept(samples, _decode, buffer[at:end], self._time_of(origin + end + 1), end=end)
+    def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
+        if frame[0] != _SYNC:
+            return super()._decode(frame, t_s)
+        layout, places = layout_of(frame[: _header_bytes(frame[1])])
+        if "gyro" not in places:
+            raise RejectedError(reasons.NOTHING_OF_USE)
+        values, gyro, accel = layout.unpack_from(frame), places["gyro"], places["accel"]
+        gyro_rad_s: Vector = values[gyro : gyro + 3]
+        accel_m_s2: Vector = values[accel : accel + 3]
+        temperature_degc = values[places["temperature"]] if "temperature" in places else None
+        check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
+        t_device_s = values[places["time"]] / 1e9 if "time" in places else None
+        return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, None, t_device_s)]
+
+    def _read(self, body: bytes, t_s: float) -> list[Sample]:
+        head, *fields = body.split(b",")
+        if head == b"VNERR":
+            raise RejectedError("VNERR")
+        if head not in _SENTENCES:
+            raise RejectedError(reasons.REPLY if head in _REPLIES else reasons.UNKNOWN_SENTENCE)
+        count, vectors, temperature = _SENTENCES[head]
+        if len(fields) != count:
+            raise RejectedError(reasons.FIELD_COUNT)
+        values = [float(field) for field in fields]
+        if not math.isfinite(sum(values)):
+            raise RejectedError(reasons.NON_FINITE)
+        ax, ay, az, gx, gy, gz = values[vectors]
+        gyro_rad_s, accel_m_s2, temperature_degc = (gx, gy, gz), (ax, ay, az), next(iter(values[temperature]), None)
+        check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
+        return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc)]
+
+
+def _header_bytes(groups: int) -> int:
+    if groups == 0 or groups & ~_KNOWN_GROUPS:
+        raise RejectedError(reasons.UNKNOWN_GROUP)
+    return 2 + 2 * groups.bit_count()
 
 
 _SENTENCES: dict[bytes, tuple[int, slice, slice]] = {
@@ -221,22 +189,6 @@ _SENTENCES: dict[bytes, tuple[int, slice, slice]] = {
     b"VNIMU": (11, slice(3, 9), slice(9, 10)),
 }
 """Count of numbers, and the places of force and rate, and of the temperature."""
-
-
-def _decode(sentence: bytes, t_s: float) -> list[Sample]:
-    head, *fields = body_of_sentence(sentence).split(b",")
-    if head == b"VNERR":
-        raise RejectedError("VNERR")
-    if head not in _SENTENCES:
-        raise RejectedError(reasons.REPLY if head in _REPLIES else reasons.UNKNOWN_SENTENCE)
-    count, vectors, temperature = _SENTENCES[head]
-    if len(fields) != count:
-        raise RejectedError(reasons.FIELD_COUNT)
-    values = numbers(fields)
-    ax, ay, az, gx, gy, gz = values[vectors]
-    gyro_rad_s, accel_m_s2, temperature_degc = (gx, gy, gz), (ax, ay, az), next(iter(values[temperature]), None)
-    check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
-    return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc)]
 
 
 def _command(body: bytes) -> bytes:

@@ -20,18 +20,18 @@ forward being the device's X. The temperature is as these documents have it; six
 
 from __future__ import annotations
 
+import re
 import struct
 from typing import Final
 
 from companion.physics.units import DEG, MG
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import WAIT, FrameDecoder
+from companion.protocols.decoding.base import WAIT, FrameDecoder, RejectedError
 from companion.samples import ImuSample, Sample, TiltSample, Vector
 
 FRAME_BYTES: Final = 11
 ALONE: Final = "without company"
 
-_START: Final = b"\x55"
 _FIRST_TYPE, _LAST_TYPE = 0x50, 0x5F
 _ACCEL, _GYRO, _ANGLE, _FIELD = 0x51, 0x52, 0x53, 0x54
 _NUMBERS: Final = struct.Struct("<4h")
@@ -40,7 +40,6 @@ _ACCEL_SCALE: Final = 16.0 * _G_M_S2 / 32768.0
 _GYRO_SCALE: Final = 2000.0 * DEG / 32768.0
 _ANGLE_SCALE: Final = 180.0 / 32768.0
 _LEAST, _GREATEST = -32768, 32767
-_WRONG_SUM: Final = 0
 
 
 class WitMotionDecoder(FrameDecoder):
@@ -55,57 +54,48 @@ class WitMotionDecoder(FrameDecoder):
         super().interrupted()
         self._drop_accel()
 
-    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        if buffer[at] != 0x55:
-            return self._skip_to(_START, buffer, at)
-        if self._good_at != origin + at:
-            size = _good(buffer, at)
-            if size == WAIT:
-                return WAIT
-            if size != FRAME_BYTES:
-                return self._reject(reasons.CHECKSUM, at + 1) if size == _WRONG_SUM else at + 1
-            self._good_at = origin + at
-        end = at + FRAME_BYTES
-        following = _good(buffer, end)
-        if following == WAIT:
-            return WAIT
-        if following != FRAME_BYTES:
-            return self._reject(ALONE, at + 1)
-        self._good_at = origin + end
-        self._read_frame(buffer, at, origin, samples)
-        return end
+    START = re.compile(b"\x55")
 
-    def _read_frame(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> None:
-        kind, end = buffer[at + 1], origin + at + FRAME_BYTES
+    def _size(self, buffer: bytes, at: int) -> int:
+        here = self._origin + at
+        if self._good_at != here and (size := _good(buffer, at)) != FRAME_BYTES:
+            return size
+        self._good_at = here
+        try:
+            following = _good(buffer, at + FRAME_BYTES)
+        except RejectedError:
+            following = 1
+        if following == 1:
+            raise RejectedError(ALONE)
+        if following == FRAME_BYTES:
+            self._good_at = here + FRAME_BYTES
+        return following
+
+    def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
+        kind, end = frame[1], self._good_at
         accel = self._accel
-        if accel is not None and not (kind == _GYRO and accel[0] == origin + at):
+        if accel is not None and not (kind == _GYRO and accel[0] == end - FRAME_BYTES):
             self._drop_accel()
             accel = None
         if kind == _FIELD:
             self.accepted += 1  # not used, but it shows whose frames these are
         if not _ACCEL <= kind <= _ANGLE:
-            return  # field, time, ports, pressure, position, quaternion: right, but nothing for us
-        x, y, z, last = _NUMBERS.unpack_from(buffer, at + 2)
-        if kind == _ACCEL:
-            if max(x, y, z) == _GREATEST or min(x, y, z) == _LEAST:
-                self.rejected[reasons.OVER_RANGE] += 1
-                return
-            self._accel = end, (x * _ACCEL_SCALE, y * _ACCEL_SCALE, z * _ACCEL_SCALE), last / 100.0
-        elif kind == _GYRO:
-            self._accel = None
-            if accel is None:
-                self.rejected[reasons.ORPHAN] += 1
-            elif max(x, y, z) == _GREATEST or min(x, y, z) == _LEAST:
-                self.rejected[reasons.OVER_RANGE] += 1
-            else:
-                gyro_rad_s = (x * _GYRO_SCALE, y * _GYRO_SCALE, z * _GYRO_SCALE)
-                samples.append(ImuSample(self._time_of(end), gyro_rad_s, accel[1], accel[2]))
-                self.accepted += 1
-        elif max(abs(x), abs(y)) > 16384:  # beyond 90 degrees
-            self.rejected[reasons.OUT_OF_RANGE] += 1
-        else:
-            samples.append(TiltSample(self._time_of(end), x * _ANGLE_SCALE, -y * _ANGLE_SCALE))
-            self.accepted += 1
+            return []  # field, time, ports, pressure, position, quaternion: right, but nothing for us
+        x, y, z, last = _NUMBERS.unpack_from(frame, 2)
+        if kind == _ANGLE:
+            if max(abs(x), abs(y)) > 16384:  # beyond 90 degrees
+                raise RejectedError(reasons.OUT_OF_RANGE)
+            return [TiltSample(t_s, x * _ANGLE_SCALE, -y * _ANGLE_SCALE)]
+        self._accel = None
+        if kind == _GYRO and accel is None:
+            raise RejectedError(reasons.ORPHAN)
+        if max(x, y, z) == _GREATEST or min(x, y, z) == _LEAST:
+            raise RejectedError(reasons.OVER_RANGE)
+        if accel is not None:
+            gyro_rad_s = (x * _GYRO_SCALE, y * _GYRO_SCALE, z * _GYRO_SCALE)
+            return [ImuSample(t_s, gyro_rad_s, accel[1], accel[2])]
+        self._accel = end, (x * _ACCEL_SCALE, y * _ACCEL_SCALE, z * _ACCEL_SCALE), last / 100.0
+        return []
 
     def _drop_accel(self) -> None:
         if self._accel is not None:
@@ -114,7 +104,7 @@ class WitMotionDecoder(FrameDecoder):
 
 
 def _good(buffer: bytes, at: int) -> int:
-    """`FRAME_BYTES` where a frame begins, `_WRONG_SUM` where it only looks so, 1 where not even that, or `WAIT`."""
+    """Return `FRAME_BYTES` where a frame begins, else 1 or `WAIT`; raise RejectedError for a wrong sum."""
     available = len(buffer) - at
     if available < 1:
         return WAIT
@@ -127,4 +117,6 @@ def _good(buffer: bytes, at: int) -> int:
     if available < FRAME_BYTES:
         return WAIT
     last = at + FRAME_BYTES - 1
-    return FRAME_BYTES if sum(buffer[at:last]) & 0xFF == buffer[last] else _WRONG_SUM
+    if sum(buffer[at:last]) & 0xFF != buffer[last]:
+        raise RejectedError(reasons.CHECKSUM)
+    return FRAME_BYTES

@@ -14,6 +14,7 @@ its base with X forward becomes forward, right, down by the mounting ROTATION_RO
 
 from __future__ import annotations
 
+import re
 import struct
 from typing import ClassVar, Final
 
@@ -24,7 +25,6 @@ from companion.samples import ImuSample, Sample, Vector
 
 MAX_DATA_BYTES: Final = 1024
 
-_MARK = b"\xfa\xff"
 _MT_DATA_2 = 0x36
 _EXTENDED = 0xFF
 _HEAD = struct.Struct(">HB")
@@ -42,6 +42,7 @@ _FLOAT32 = struct.Struct(">3f")
 class XsensDecoder(FrameDecoder):
     """MTData2 messages; gives `ImuSample`."""
 
+    START = re.compile(rb"\xfa(?:\xff|\Z)")
     device_clock_wraps_s: ClassVar[float | None] = 2**32 / _TICKS_A_SECOND
     clock_from_start: ClassVar[bool] = True
     sequence_modulus: ClassVar[int | None] = 2**16
@@ -51,54 +52,53 @@ class XsensDecoder(FrameDecoder):
         super().interrupted()
         self._temperature_degc = None
 
-    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        if not buffer.startswith(_MARK, at):
-            return self._find_mark(_MARK, buffer, at)
+    def _size(self, buffer: bytes, at: int) -> int:
         available = len(buffer) - at
         if available < 4:
             return WAIT
-        data, length = at + 4, buffer[at + 3]
-        if length == _EXTENDED:
+        size = 4 + buffer[at + 3] + 1
+        if buffer[at + 3] == _EXTENDED:
             if available < 6:
                 return WAIT
-            data, length = at + 6, int.from_bytes(buffer[at + 4 : at + 6], "big")
+            length = int.from_bytes(buffer[at + 4 : at + 6], "big")
             if length > MAX_DATA_BYTES:
-                return self._reject(reasons.TOO_LONG, at + 1)
-        end = data + length + 1
-        if len(buffer) < end:
+                raise RejectedError(reasons.TOO_LONG)
+            size = 6 + length + 1
+        if available < size:
             return WAIT
-        if sum(buffer[at + 1 : end]) & 0xFF:
-            return self._reject(reasons.CHECKSUM, at + 1)
-        if buffer[at + 2] != _MT_DATA_2:
-            return self._reject(reasons.REPLY, end)
-        return self._accept(samples, self._decode, buffer, data, end - 1, self._time_of(origin + end), end=end)
+        if sum(buffer[at + 1 : at + size]) & 0xFF:
+            raise RejectedError(reasons.CHECKSUM)
+        return size
 
-    def _decode(self, buffer: bytes, field: int, stop: int, t_s: float) -> list[Sample]:
+    def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
+        if frame[2] != _MT_DATA_2:
+            raise RejectedError(reasons.REPLY)
+        field, stop = 6 if frame[3] == _EXTENDED else 4, len(frame) - 1
         vectors: dict[int, Vector] = {}
         counter: int | None = None
         t_device_s: float | None = None
         while field < stop:
             if stop - field < 3:
                 raise RejectedError(reasons.FIELD_COUNT)
-            kind, size = _HEAD.unpack_from(buffer, field)
+            kind, size = _HEAD.unpack_from(frame, field)
             field += 3
             if field + size > stop:
                 raise RejectedError(reasons.FIELD_COUNT)
             if kind & 0xFFF0 in _VECTORS:
                 if size == 12 and not kind & 0x0F:
-                    vectors[kind] = _FLOAT32.unpack_from(buffer, field)
+                    vectors[kind] = _FLOAT32.unpack_from(frame, field)
                 else:
-                    x, y, z = _numbers(buffer[field : field + size], kind & 0x0F, 3)
+                    x, y, z = _numbers(frame[field : field + size], kind & 0x0F, 3)
                     vectors[kind & 0xFFF0] = (x, y, z)
             elif kind == _COUNTER:
-                counter = _unsigned(buffer[field : field + size], 2)
+                counter = _unsigned(frame[field : field + size], 2)
             elif kind == _TIME:
-                t_device_s = _unsigned(buffer[field : field + size], 4) / _TICKS_A_SECOND
+                t_device_s = _unsigned(frame[field : field + size], 4) / _TICKS_A_SECOND
             elif kind == _STATUS:
-                if _unsigned(buffer[field : field + size], 4) & _CLIPPED:
+                if _unsigned(frame[field : field + size], 4) & _CLIPPED:
                     raise RejectedError(reasons.OVER_RANGE)
             elif kind & 0xFFF0 == _TEMPERATURE:
-                (temperature_degc,) = _numbers(buffer[field : field + size], kind & 0x0F, 1)
+                (temperature_degc,) = _numbers(frame[field : field + size], kind & 0x0F, 1)
                 check_imu(_ABSENT, _ABSENT, temperature_degc)
                 self._temperature_degc = temperature_degc
             field += size

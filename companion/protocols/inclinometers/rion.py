@@ -15,6 +15,7 @@ said to be the compass', and is read as that. Records of floats (0x94) are not a
 from __future__ import annotations
 
 import functools
+import re
 from typing import Final
 
 from companion.protocols.decoding import reasons
@@ -24,7 +25,6 @@ from companion.samples import CompassSample, Sample, TiltSample
 
 LONGEST: Final = 51
 
-_START: Final = b"\x68"
 _READ, _ANSWER, _REPLY_BIT = 0x04, 0x84, 0x80
 _ANGLES_LENGTH, _LONG_ANGLES_LENGTH = 0x0D, 0x0F
 _DOCUMENTED: Final = frozenset((*range(0x04, 0x10), 0x14, 0x2A, *range(0x41, 0x51)))
@@ -40,32 +40,32 @@ _LENGTHS: Final[dict[int, frozenset[int]]] = {
 class RionDecoder(FrameDecoder):
     """Frames of a RION device; gives `CompassSample`, or `TiltSample` for the inclinometer's longer frame."""
 
-    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        if buffer[at] != _START[0]:
-            return self._skip_to(_START, buffer, at)
+    START = re.compile(b"\x68")
+
+    def _size(self, buffer: bytes, at: int) -> int:
         available = len(buffer) - at
         if available < 2:
             return WAIT
         length = buffer[at + 1]
         if not 4 <= length < LONGEST or (available >= 4 and length not in _LENGTHS.get(buffer[at + 3], ())):
-            return at + 1
+            return 1
         if available <= length:
             return WAIT
-        end = at + 1 + length
-        if sum(buffer[at + 1 : end - 1]) & 0xFF != buffer[end - 1]:
-            return self._reject(reasons.CHECKSUM, at + 1)
-        command = buffer[at + 3]
-        if command != _ANSWER:
-            return self._reject(reasons.REPLY if command & _REPLY_BIT else ECHO, end)
-        try:
-            samples.append(_measurement(buffer[at + 4 : end - 1], self._time_of(origin + end)))
-            self.accepted += 1
-        except RejectedError as error:
-            return self._reject(error.reason, at + 1)  # rather no frame at all, with a sum that is right by chance
-        return end
+        frame = buffer[at : at + 1 + length]
+        if sum(frame[1:-1]) & 0xFF != frame[-1]:
+            raise RejectedError(reasons.CHECKSUM)
+        if frame[3] == _ANSWER:
+            _measurement(frame, 0.0)  # without angles it is rather no frame, with a sum that is right by chance
+        return 1 + length
+
+    def _decode(self, frame: bytes, t_s: float) -> list[Sample]:
+        if frame[3] != _ANSWER:
+            raise RejectedError(reasons.REPLY if frame[3] & _REPLY_BIT else ECHO)
+        return [_measurement(frame, t_s)]
 
 
-def _measurement(data: bytes, t_s: float) -> Sample:
+def _measurement(frame: bytes, t_s: float) -> Sample:
+    data = frame[4:-1]
     if len(data) == 9:
         pitch_deg, roll_deg, heading_deg = (_degrees(data[at : at + 3], 100) for at in (0, 3, 6))
         if not 0.0 <= heading_deg < 360.0 or max(abs(pitch_deg), abs(roll_deg)) > 90.0:
@@ -86,6 +86,4 @@ def _degrees(digits: bytes, per_degree: int) -> float:
 
 
 # The mode it comes in (HCM370B p. 11, HCM705B p. 12). Question and answer have up to 21 bytes, 97 ms at 2400 baud.
-RionDialogue = functools.partial(
-    PollDialogue, bytes((_START[0], 4, 0, _READ, 4 + _READ)), "68 04 00 04 08", period_s=0.2
-)
+RionDialogue = functools.partial(PollDialogue, bytes((0x68, 4, 0, _READ, 4 + _READ)), "68 04 00 04 08", period_s=0.2)
